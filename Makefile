@@ -1,0 +1,30 @@
+# make demo  sets everything up in .venv and runs the whole chain on the built-in face task
+# make test  sets up and runs the tests
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+# Two BLAS pools on two shared cores spin against each other; one thread each is the fast setting there.
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
+export OMP_WAIT_POLICY ?= PASSIVE
+
+.PHONY: demo test lint clean
+
+$(BIN)/.ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+demo: $(BIN)/.ready
+	$(BIN)/python examples/demo.py
+
+test: $(BIN)/.ready
+	$(BIN)/python -m ruff check .
+	$(BIN)/python -m pytest
+
+lint: $(BIN)/.ready
+	$(BIN)/python -m ruff check .
+
+clean:
+	rm -rf $(VENV) build dist runs *.egg-info

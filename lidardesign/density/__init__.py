@@ -1,0 +1,1 @@
+"""The learned density over design space: fields, visibility, target, flow, learning."""

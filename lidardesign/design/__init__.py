@@ -1,0 +1,1 @@
+"""Designs: constrained mixtures of physical sensors, their rays and their files."""

@@ -1,0 +1,193 @@
+"""A sensor is one mixture component over design space; a design is a list of them with a ray layout.
+
+A component is a product q(d) = N(x) N(u) N(r): the origin with its full covariance, the direction in the
+tangent plane of the boresight, the range. Tangent coordinates u = (horizontal, vertical) are true angles
+(azimuthal equidistant): a direction at the angle t from the boresight has |u| = t. Densities are per
+solid angle, so the tangent map's Jacobian t / sin t is part of them. (Paper, section 5, with the angle on
+the sphere instead of in azimuth and elevation.)
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from scipy.special import ndtri
+
+from lidardesign.space import direction
+
+DEFAULT_LEVEL = 0.95
+Layout = Literal["grid", "density", "scan"]
+
+
+def interval_factor(level: float) -> float:
+    """The number of standard deviations on each side of the mean that hold `level` of a normal distribution."""
+    return float(ndtri((1 + level) / 2))
+
+
+def boresight_frame(azimuth_rad: float, elevation_rad: float, roll_rad: float = 0.0) -> np.ndarray:
+    """Rows forward, horizontal, vertical of a boresight, shape (3, 3).
+
+    Horizontal is the direction of growing azimuth, vertical that of growing elevation, both turned by the
+    roll about the boresight (right-handed). At the poles the azimuth fixes the frame, so it stays defined.
+    """
+    sin_a, cos_a = math.sin(azimuth_rad), math.cos(azimuth_rad)
+    sin_e, cos_e = math.sin(elevation_rad), math.cos(elevation_rad)
+    forward = np.array([cos_e * cos_a, cos_e * sin_a, sin_e])
+    horizontal = np.array([-sin_a, cos_a, 0.0])
+    vertical = np.array([-sin_e * cos_a, -sin_e * sin_a, cos_e])
+    sin_r, cos_r = math.sin(roll_rad), math.cos(roll_rad)
+    return np.stack([forward, cos_r * horizontal + sin_r * vertical, cos_r * vertical - sin_r * horizontal])
+
+
+def tangent_coordinates(frame: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Angles (horizontal, vertical) of unit vectors from a boresight: (3, 3), (N, 3) to (N, 2) [rad]."""
+    local = directions @ frame.T
+    sine = np.hypot(local[:, 1], local[:, 2])
+    angle = np.arctan2(sine, local[:, 0])
+    return local[:, 1:] * angle_over_sine(angle, sine)[:, None]
+
+
+def tangent_directions(frame: np.ndarray, tangent: np.ndarray) -> np.ndarray:
+    """Unit vectors at angles (horizontal, vertical) from a boresight: (3, 3), (N, 2) to (N, 3)."""
+    angle = np.hypot(tangent[:, 0], tangent[:, 1])
+    local = np.concatenate([np.cos(angle)[:, None], tangent * np.sinc(angle / np.pi)[:, None]], axis=1)
+    return local @ frame
+
+
+def angle_over_sine(angle: np.ndarray, sine: np.ndarray) -> np.ndarray:
+    """t / sin t, 1 at t = 0; finite for every direction but the exact antipode, where it is capped."""
+    near = sine < 1e-8
+    ratio = angle / np.where(near, 1.0, sine)
+    return np.where(near, np.where(angle < 1.0, 1.0, np.pi / 1e-8), ratio)
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """One mixture component, read as a physical sensor.
+
+    Arguments:
+        name: Unique within its design.
+        weight: Share of the rays, 0 to 1.
+        origin_m: Mean origin [m], shape (3,).
+        origin_covariance_m2: Covariance of the origin [m^2], shape (3, 3); zero along fixed axes.
+        azimuth_rad, elevation_rad, roll_rad: The boresight.
+        spread_horizontal_rad, spread_vertical_rad: Standard deviations in the boresight's tangent plane.
+        range_m, spread_range_m: Mean and standard deviation of the range.
+        level: The share of each marginal that its reported interval holds.
+        rays: Rays per frame, where the design fixes them.
+    """
+
+    name: str
+    weight: float
+    origin_m: np.ndarray
+    origin_covariance_m2: np.ndarray
+    azimuth_rad: float
+    elevation_rad: float
+    roll_rad: float
+    spread_horizontal_rad: float
+    spread_vertical_rad: float
+    range_m: float
+    spread_range_m: float
+    level: float = DEFAULT_LEVEL
+    rays: int | None = None
+
+    @cached_property
+    def frame(self) -> np.ndarray:
+        """Rows forward, horizontal, vertical, shape (3, 3)."""
+        return boresight_frame(self.azimuth_rad, self.elevation_rad, self.roll_rad)
+
+    @property
+    def field_of_view_rad(self) -> tuple[float, float]:
+        """Full horizontal and vertical angles that hold `level` of the rays each."""
+        width = 2 * interval_factor(self.level)
+        return width * self.spread_horizontal_rad, width * self.spread_vertical_rad
+
+    @property
+    def gate_m(self) -> tuple[float, float]:
+        """Start and end of the range interval that holds `level` of the returns."""
+        half = interval_factor(self.level) * self.spread_range_m
+        return max(self.range_m - half, 0.0), self.range_m + half
+
+    @property
+    def boresight(self) -> np.ndarray:
+        """The unit vector that it points along, shape (3,)."""
+        return direction(self.azimuth_rad, self.elevation_rad)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The contract's JSON and YAML form of a sensor."""
+        horizontal, vertical = self.field_of_view_rad
+        start, end = self.gate_m
+        return {
+            "name": self.name,
+            "weight": float(self.weight),
+            "origin_m": {
+                "mean": [float(v) for v in self.origin_m],
+                "covariance": [[float(v) for v in row] for row in self.origin_covariance_m2],
+            },
+            "boresight": {
+                "azimuth_rad": float(self.azimuth_rad),
+                "elevation_rad": float(self.elevation_rad),
+                "roll_rad": float(self.roll_rad),
+            },
+            "field_of_view_rad": {"horizontal": float(horizontal), "vertical": float(vertical)},
+            "gate_m": {"start": float(start), "end": float(end)},
+            "spread": {
+                "horizontal_rad": float(self.spread_horizontal_rad),
+                "vertical_rad": float(self.spread_vertical_rad),
+                "range_m": float(self.spread_range_m),
+            },
+            "rays": self.rays,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class RayTable:
+    """Explicit rays of a `density` or `scan` layout, as they stand in a design file.
+
+    Arguments:
+        origin_m: Shape (N, 3).
+        azimuth_rad, elevation_rad: Shape (N,).
+        gate_m: Shape (N, 2).
+        sensor: Index of the sensor that fires each ray, shape (N,).
+    """
+
+    origin_m: np.ndarray
+    azimuth_rad: np.ndarray
+    elevation_rad: np.ndarray
+    gate_m: np.ndarray
+    sensor: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """A LiDAR system: sensors, how its rays are laid out, and where it came from.
+
+    Arguments:
+        name: The file's stem, the row's name in tables.
+        sensors: At least one.
+        layout: `grid`, `density` or `scan`.
+        rays: Rays per frame that it was made for; None leaves the budget to `evaluate`.
+        ray_table: The explicit rays of a `density` or `scan` layout.
+        constraints: The constraint document that it satisfies (plain values).
+        provenance: Command, seed, run and versions, for people.
+        level: The share of each marginal that intervals hold.
+    """
+
+    name: str
+    sensors: tuple[Sensor, ...]
+    layout: Layout = "grid"
+    rays: int | None = None
+    ray_table: RayTable | None = None
+    constraints: dict[str, Any] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict)
+    level: float = DEFAULT_LEVEL
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Shares of the rays, shape (G,), summing to 1."""
+        weights = np.array([sensor.weight for sensor in self.sensors], dtype=np.float64)
+        return weights / weights.sum()

@@ -1,0 +1,108 @@
+"""The error tree of lidardesign: every error says where, what was found, what is allowed, and what to do.
+
+Exit codes (design contract): 0 ok, 1 threshold missed, 2 usage or config, 3 bad input data,
+4 infeasible constraints, 5 numerical failure, 6 plugin failure, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+class LidardesignError(Exception):
+    """The root of every error that a user can meet.
+
+    Arguments:
+        message: What was found, in one sentence.
+        where: File, line, field or option that it concerns.
+        allowed: What would have been accepted.
+        hint: What to do next.
+    """
+
+    exit_code = 2
+    kind = "error"
+
+    def __init__(
+        self, message: str, *, where: str | None = None, allowed: str | None = None, hint: str | None = None
+    ) -> None:
+        self.message, self.where, self.allowed, self.hint = message, where, allowed, hint
+        super().__init__(self.render())
+
+    def render(self) -> str:
+        """The whole message: location, finding, what is allowed, next step."""
+        text = f"{self.where}: {self.message}" if self.where else self.message
+        if self.allowed:
+            text += f"\n  allowed: {self.allowed}"
+        if self.hint:
+            text += f"\n  try: {self.hint}"
+        return text
+
+    def as_dict(self) -> dict[str, object]:
+        """The same content for `--json`."""
+        fields = {"where": self.where, "allowed": self.allowed, "hint": self.hint}
+        return {"kind": self.kind, "message": self.message, **{k: v for k, v in fields.items() if v}}
+
+
+class ConfigError(LidardesignError):
+    """A usage, configuration or constraint file error (exit 2)."""
+
+    exit_code, kind = 2, "config"
+
+
+class DataError(LidardesignError):
+    """An input file or mesh that cannot be used (exit 3)."""
+
+    exit_code, kind = 3, "data"
+
+
+class InfeasibleError(LidardesignError):
+    """Constraints that no design can satisfy, or that hold too little of the density (exit 4).
+
+    Arguments:
+        conflicts: Names of the constraints that contradict each other.
+        admissible_mass: The share of the density inside the constraints, where it was measured.
+    """
+
+    exit_code, kind = 4, "infeasible"
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        conflicts: Sequence[str] = (),
+        admissible_mass: float | None = None,
+        where: str | None = None,
+        allowed: str | None = None,
+        hint: str | None = None,
+    ) -> None:
+        self.conflicts, self.admissible_mass = tuple(conflicts), admissible_mass
+        super().__init__(message, where=where, allowed=allowed, hint=hint)
+
+    def as_dict(self) -> dict[str, object]:
+        """The same content for `--json`, with the conflicting names and the measured mass."""
+        fields: dict[str, object] = {**super().as_dict(), "conflicts": list(self.conflicts)}
+        if self.admissible_mass is not None:
+            fields["admissible_mass"] = self.admissible_mass
+        return fields
+
+
+class NumericalError(LidardesignError):
+    """A computation that left the numbers it can trust (exit 5)."""
+
+    exit_code, kind = 5, "numerical"
+
+
+class DivergenceError(NumericalError):
+    """Learning that diverged; the message names the last good checkpoint (exit 5)."""
+
+
+class PluginError(LidardesignError):
+    """A task plugin that failed to load or broke its contract (exit 6)."""
+
+    exit_code, kind = 6, "plugin"
+
+
+class ThresholdError(LidardesignError):
+    """A threshold that the user set was missed (exit 1)."""
+
+    exit_code, kind = 1, "threshold"

@@ -1,0 +1,188 @@
+"""Scenes: bodies with a shape, a role and poses, in metres and a right-handed frame with z up.
+
+Shapes are in their body's own frame; a pose is a 4x4 rigid transform from body to world. Checked meshes come from
+`lidardesign.meshio.load_mesh`. Signed distances are positive outside.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+
+from lidardesign.errors import DataError
+
+Role = Literal["target", "occluder", "both"]
+Sign = Literal["auto", "solid", "winding", "unsigned"]
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A ball around the body's origin."""
+
+    radius_m: float
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box centred on the body's origin, by its half extents along x, y, z."""
+
+    half_extents_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """All points within a radius of the segment from (0, 0, -half_length) to (0, 0, +half_length)."""
+
+    radius_m: float
+    half_length_m: float
+
+
+@dataclass(frozen=True)
+class Plane:
+    """The half space z <= 0, whose surface is the infinite plane z = 0 with the normal +z."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh.
+
+    Arguments:
+        vertices: Positions [m], shape (V, 3) float64.
+        faces: Vertex indices, shape (F, 3) int32.
+        sign: How the inside is told from the outside: `solid` (closed and consistently wound), `winding`
+            (generalised winding number above 1/2), `unsigned` (no inside: distances are never negative).
+        notes: What loading mended or found, one line each.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    sign: Literal["solid", "winding", "unsigned"] = "solid"
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
+        faces = np.ascontiguousarray(self.faces, dtype=np.int32)
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
+            raise DataError(f"a mesh needs (V, 3) vertices and (F, 3) faces, found {vertices.shape} and {faces.shape}")
+        if not np.isfinite(vertices).all():
+            raise DataError("a mesh has vertices that are NaN or infinite")
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise DataError(f"a mesh of {len(vertices)} vertices has faces that name vertex {int(faces.max())}")
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces)
+
+    @cached_property
+    def content_hash(self) -> str:
+        """SHA-256 of vertices, faces and sign rule: the name of everything cached about this mesh."""
+        digest = hashlib.sha256(self.sign.encode())
+        digest.update(self.vertices.tobytes())
+        digest.update(self.faces.tobytes())
+        return digest.hexdigest()
+
+    @cached_property
+    def bounds_m(self) -> np.ndarray:
+        """Axis-aligned bounds of the used vertices, shape (2, 3)."""
+        used = self.vertices[np.unique(self.faces)]
+        return np.stack([used.min(axis=0), used.max(axis=0)])
+
+    def transformed(self, pose: np.ndarray) -> Mesh:
+        """The same surface with a rigid 4x4 pose applied to its vertices."""
+        return Mesh(self.vertices @ pose[:3, :3].T + pose[:3, 3], self.faces, self.sign, self.notes)
+
+
+Shape = Sphere | Box | Capsule | Plane | Mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """One rigid thing in a scene.
+
+    Arguments:
+        shape: Its geometry in its own frame.
+        name: For people and messages.
+        role: `target` counts as surface worth observing, `occluder` blocks rays, `both` does both.
+        poses: Body to world, shape (4, 4) for a body at rest or (frames, 4, 4).
+        reflectance: Lambertian albedo, 0 to 1.
+    """
+
+    shape: Shape
+    name: str = "body"
+    role: Role = "both"
+    poses: np.ndarray = field(default_factory=lambda: np.eye(4))
+    reflectance: float = 0.5
+
+    def __post_init__(self) -> None:
+        poses = np.asarray(self.poses, dtype=np.float64)
+        if poses.shape[-2:] != (4, 4) or poses.ndim not in (2, 3) or not np.isfinite(poses).all():
+            raise DataError(f"body {self.name!r}: poses must be finite with shape (4, 4) or (frames, 4, 4), found {poses.shape}")
+        rotation = poses[..., :3, :3]
+        if not np.allclose(rotation @ np.swapaxes(rotation, -1, -2), np.eye(3), atol=1e-6):
+            raise DataError(f"body {self.name!r}: a pose is not rigid (its 3x3 part is no rotation)")
+        object.__setattr__(self, "poses", poses)
+
+    @property
+    def is_target(self) -> bool:
+        """Whether its surface is worth observing."""
+        return self.role != "occluder"
+
+    @property
+    def is_occluder(self) -> bool:
+        """Whether it blocks rays in the density."""
+        return self.role != "target"
+
+    def pose(self, frame: int = 0) -> np.ndarray:
+        """The 4x4 pose at a frame; a body at rest has the same one in all frames."""
+        return self.poses if self.poses.ndim == 2 else self.poses[frame]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What the sensors look at: bodies, optionally moving over frames, and what the task knows of the truth.
+
+    Arguments:
+        bodies: At least one, and at least one target.
+        name: For people and messages.
+        truth: Arrays that the task's score needs (never read by designs, densities or estimates).
+        frame_rate_hz: Frames per second where bodies move.
+    """
+
+    bodies: tuple[Body, ...]
+    name: str = "scene"
+    truth: Mapping[str, Any] = field(default_factory=dict)
+    frame_rate_hz: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not any(body.is_target for body in self.bodies):
+            raise DataError(f"scene {self.name!r} has no target body", hint="give one body the role target or both")
+        counts = {len(body.poses) for body in self.bodies if body.poses.ndim == 3}
+        if len(counts) > 1:
+            raise DataError(f"scene {self.name!r}: bodies have different numbers of frames {sorted(counts)}")
+
+    @cached_property
+    def frames(self) -> int:
+        """The number of time frames; 1 for a scene at rest."""
+        return max((len(body.poses) for body in self.bodies if body.poses.ndim == 3), default=1)
+
+
+def rigid(rotation: np.ndarray | None = None, translation_m: Any = (0.0, 0.0, 0.0)) -> np.ndarray:
+    """A 4x4 pose of a 3x3 rotation and a translation."""
+    pose = np.eye(4)
+    if rotation is not None:
+        pose[:3, :3] = rotation
+    pose[:3, 3] = translation_m
+    return pose
+
+
+def inverse_rigid(pose: np.ndarray) -> np.ndarray:
+    """The inverse of rigid transforms, shape (..., 4, 4)."""
+    rotation = np.swapaxes(pose[..., :3, :3], -1, -2)
+    inverse = np.zeros_like(pose)
+    inverse[..., :3, :3] = rotation
+    inverse[..., :3, 3] = -(rotation @ pose[..., :3, 3:])[..., 0]
+    inverse[..., 3, 3] = 1.0
+    return inverse

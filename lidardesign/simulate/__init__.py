@@ -1,0 +1,1 @@
+"""What a design sees: first hits, gates and outcomes of every ray."""

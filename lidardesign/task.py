@@ -1,0 +1,112 @@
+"""The task plugin contract: scenes of a task, and what a set of returns is worth there.
+
+A plugin is a class with the members of `Task`, registered under the entry-point group
+`lidardesign.tasks`. It is instantiated without arguments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from lidardesign.scene import Scene
+from lidardesign.simulate.returns import Returns
+from lidardesign.space import DesignSpace
+
+API_VERSION = 1
+Split = Literal["train", "test"]
+
+
+class TaskConfig(BaseModel):
+    """The base of a task's configuration: unknown keys are errors, values are frozen."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+@dataclass(frozen=True)
+class Metric:
+    """What a task's score means.
+
+    Arguments:
+        name: For tables, as "Chamfer distance".
+        unit: As "mm".
+        better: Whether lower or higher values are better.
+        worst: The value of a scene in which a design fails.
+        tolerance: Differences below this one do not matter to the task.
+    """
+
+    name: str
+    unit: str
+    better: Literal["lower", "higher"]
+    worst: float
+    tolerance: float
+
+
+@dataclass(frozen=True)
+class Score:
+    """The score of one design in one scene.
+
+    Arguments:
+        value: In the metric's unit; the metric's worst value where `failed`.
+        failed: Whether the returns were too few to compute the metric.
+        details: Further figures by name (with their unit), for the report.
+    """
+
+    value: float
+    failed: bool = False
+    details: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Defaults:
+    """What a task suggests where the user says nothing.
+
+    Arguments:
+        sensors: The number of sensors to fit.
+        rays: Ray budgets per frame to evaluate at.
+        density: Overrides of the `density` configuration section (for example {"sigma_m": 0.005}).
+        learning: Overrides of the `learning` section, by preset name.
+    """
+
+    sensors: int = 4
+    rays: tuple[int, ...] = (36, 100, 196, 361, 576)
+    density: Mapping[str, Any] = field(default_factory=dict)
+    learning: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+
+@runtime_checkable
+class Task(Protocol):
+    """What a task plugin provides; see the module docstring.
+
+    `scenes` is deterministic in (config, split, seed), and the splits are disjoint. `score` may use
+    `scene.truth` for judging only; the estimate is built from the returns alone.
+    """
+
+    name: ClassVar[str]
+    summary: ClassVar[str]
+    api_version: ClassVar[int]
+    Config: ClassVar[type[TaskConfig]]
+    metric: ClassVar[Metric]
+    defaults: ClassVar[Defaults]
+
+    def space(self, config: Any) -> DesignSpace:
+        """The design space of a configuration."""
+        ...
+
+    def scenes(self, config: Any, split: Split, seed: int) -> Sequence[Scene]:
+        """The scenes of a split."""
+        ...
+
+    def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
+        """The score of one design's returns in a scene, one `Returns` per time frame of the scene."""
+        ...
+
+
+def random_generator(seed: int, *labels: str | int) -> np.random.Generator:
+    """An independent generator per purpose, so that adding a draw to one never changes another."""
+    words = [int.from_bytes(str(label).encode(), "little") % (2**63) for label in labels]
+    return np.random.default_rng(np.random.SeedSequence([seed, *words]))
