@@ -1,0 +1,56 @@
+"""Settings of the target density and of learning it, with their defaults, units and presets."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Visibility = Literal["auto", "raycast", "quadrature", "off"]
+Preset = Literal["draft", "standard", "fine"]
+PRESETS: tuple[str, ...] = ("draft", "standard", "fine")
+
+
+class DensitySettings(BaseModel):
+    """The target density p*(d) (design contract, section 2). `None` means: derived from the others."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    sigma_m: float = Field(0.005, gt=0, description="standard deviation of the surface proximity [m]")
+    visibility: Visibility = Field("auto", description="how occlusion is computed; auto probes whether it is needed")
+    attenuation_per_m: float | None = Field(None, gt=0, description="beta [1/m]; default max(1000, 5 / sigma)")
+    sharpness_per_m: float | None = Field(None, gt=0, description="k [1/m] of the quadrature; default max(1000, 5 / sigma)")
+    margin_m: float | None = Field(None, ge=0, description="m [m]: a surface does not occlude itself; default sigma")
+    quadrature_points: int = Field(64, ge=4, le=4096, description="midpoints of the visibility quadrature")
+    field_resolution: int = Field(64, ge=8, le=512, description="grid points along the longest side of mesh fields")
+    surface_tolerance_nats: float = Field(
+        16.0, gt=0, description="scenes whose surface term is this far below the best one skip visibility [nats]"
+    )
+
+
+class LearningSettings(BaseModel):
+    """The flow, its optimiser and what is measured after training."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    steps: int = Field(1200, ge=1, description="optimiser steps")
+    batch: int = Field(2048, ge=2, description="design points per step")
+    rate: float = Field(1e-2, gt=0, description="initial Adam step size; decays to its hundredth")
+    layers: int = Field(5, ge=1, le=32, description="autoregressive spline layers")
+    hidden: int = Field(64, ge=4, description="hidden width of each layer's network")
+    bins: int = Field(16, ge=2, description="spline bins per dimension")
+    dtype: Literal["float64", "float32"] = Field("float64", description="arithmetic of the flow")
+    entropy: float = Field(0.0, ge=0, description="eta of the paper; annealed to 0")
+    sigma_start_m: float | None = Field(None, gt=0, description="where sigma's annealing starts; default 10 sigma")
+    anneal: float = Field(0.6, ge=0, lt=1, description="share of the steps over which sigma falls to its final value")
+    clip_norm: float = Field(5.0, gt=0, description="gradient norm that steps are clipped to")
+    checkpoint_seconds: float = Field(20.0, gt=0, description="time between checkpoints [s]")
+    samples: int = Field(100_000, ge=1000, description="fresh samples for ESS, KL, log Z, fit and constrain")
+    coverage_proposals: int = Field(8192, ge=256, description="independent proposals that coverage is measured on")
+
+
+PRESET_LEARNING: dict[str, dict[str, Any]] = {
+    "draft": {"steps": 300, "batch": 1024, "layers": 4, "samples": 40_000, "coverage_proposals": 4096},
+    "standard": {},
+    "fine": {"steps": 4000, "batch": 4096, "layers": 6, "bins": 24, "samples": 200_000},
+}

@@ -1,0 +1,101 @@
+"""Weighted samples of the learned density, kept in the run so that `fit` and `constrain` need no flow."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from lidardesign.errors import DataError
+from lidardesign.run.files import write_atomic
+from lidardesign.run.manifest import record, verify
+from lidardesign.space import DesignSpace
+
+FILE_NAME = "samples.npz"
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Samples of the flow with what is needed to weight them to the target.
+
+    Arguments:
+        points: Design points, shape (N, 6).
+        log_prob: The density that they were drawn from, per chart volume, shape (N,).
+        log_target: log p* at them, unnormalised, shape (N,).
+        space: The design space of both densities.
+    """
+
+    points: np.ndarray
+    log_prob: np.ndarray
+    log_target: np.ndarray
+    space: DesignSpace
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def log_weights(self) -> np.ndarray:
+        """log p* - log p, the unclipped importance weights, shape (N,)."""
+        return self.log_target - self.log_prob
+
+    @cached_property
+    def weights(self) -> np.ndarray:
+        """Importance weights that sum to 1, shape (N,)."""
+        log_weights = self.log_weights
+        peak = log_weights.max()
+        if not np.isfinite(peak):
+            raise DataError("no sample of the run has a finite weight", hint="learn the run again")
+        weights = np.exp(log_weights - peak)
+        return weights / weights.sum()
+
+    @property
+    def effective_sample_size(self) -> float:
+        """ESS = (sum w)^2 / (N sum w^2), a share of N between 0 and 1."""
+        return float(1.0 / (len(self) * np.square(self.weights).sum()))
+
+    def subset(self, keep: np.ndarray) -> Samples:
+        """The samples at an index or mask."""
+        return Samples(self.points[keep], self.log_prob[keep], self.log_target[keep], self.space)
+
+    def resample(self, count: int, generator: np.random.Generator) -> np.ndarray:
+        """Design points drawn from p* by systematic importance resampling, shape (count, 6)."""
+        positions = (np.arange(count) + generator.uniform()) / count
+        chosen = np.searchsorted(np.cumsum(self.weights), positions)
+        return self.points[generator.permutation(np.minimum(chosen, len(self) - 1))]
+
+
+def save_samples(samples: Samples, run: Path) -> None:
+    """Write the samples into a run folder, atomically, with their hash in the manifest."""
+    buffer = io.BytesIO()
+    np.savez(
+        buffer,
+        points=samples.points,
+        log_prob=samples.log_prob,
+        log_target=samples.log_target,
+        space=np.frombuffer(json.dumps(samples.space.as_dict()).encode(), dtype=np.uint8),
+    )
+    write_atomic(run / FILE_NAME, buffer.getvalue())
+    record(run, [FILE_NAME])
+
+
+def load_samples(run: Path) -> Samples:
+    """Read the samples of a run folder.
+
+    Raises:
+        DataError: The file is missing, damaged, or holds values that are not finite.
+    """
+    verify(run, FILE_NAME)
+    path = run / FILE_NAME
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            space = DesignSpace.from_dict(json.loads(arrays["space"].tobytes()))
+            samples = Samples(arrays["points"], arrays["log_prob"], arrays["log_target"], space)
+    except (OSError, ValueError, KeyError) as error:
+        raise DataError(f"cannot be read: {error}", where=str(path), hint="learn the run again") from None
+    if not (np.isfinite(samples.points).all() and np.isfinite(samples.log_prob).all()):
+        raise DataError("holds values that are not finite", where=str(path), hint="learn the run again")
+    return samples
