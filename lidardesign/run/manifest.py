@@ -1,0 +1,131 @@
+"""The manifest of a run: what made it, when, and the SHA-256 of every file in it."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Iterable
+from datetime import datetime, timezone
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from lidardesign import __version__
+from lidardesign.errors import DataError
+from lidardesign.run.files import sha256_file, write_atomic
+
+FILE_NAME = "manifest.json"
+SCHEMA_VERSION = 1
+PACKAGES = ("numpy", "torch", "zuko", "embreex")
+LEARN_HINT = "lidardesign learn TASK --out RUN makes a run"
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on, read without importing any of it."""
+    found = {"lidardesign": __version__, "python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "absent"
+    return found
+
+
+def start_manifest(run: Path, *, command: list[str], seed: int) -> dict[str, Any]:
+    """Write the manifest of a new run: versions, command and time; no files yet."""
+    manifest = {
+        "schema_version": SCHEMA_VERSION,
+        "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "command": list(command),
+        "seed": seed,
+        "versions": versions(),
+        "timings": {},
+        "files": {},
+    }
+    write_manifest(run, manifest)
+    return manifest
+
+
+def read_manifest(run: Path) -> dict[str, Any]:
+    """The manifest of a run.
+
+    Raises:
+        DataError: There is no such run, or its manifest is damaged or of a newer version.
+    """
+    run = Path(run)
+    path = run / FILE_NAME
+    if not run.exists():
+        raise DataError("no such run", where=str(run), hint=LEARN_HINT)
+    if not path.is_file():
+        raise DataError(f"is no run folder: it has no {FILE_NAME}", where=str(run), hint=LEARN_HINT)
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DataError(
+            f"the manifest cannot be read: {error}", where=str(path), hint="learn the run again"
+        ) from None
+    if not isinstance(manifest, dict) or not isinstance(manifest.get("files"), dict):
+        raise DataError("the manifest lists no files", where=str(path), hint="learn the run again")
+    found = manifest.get("schema_version")
+    if found != SCHEMA_VERSION:
+        raise DataError(
+            f"the manifest has schema version {found!r}", where=str(path), allowed=str(SCHEMA_VERSION),
+            hint="use the version of lidardesign that made the run, or a newer one",
+        )  # fmt: skip
+    return manifest
+
+
+def write_manifest(run: Path, manifest: dict[str, Any]) -> None:
+    """Replace the manifest of a run, atomically."""
+    write_atomic(Path(run) / FILE_NAME, json.dumps(manifest, indent=2) + "\n")
+
+
+def record(run: Path, names: Iterable[str]) -> None:
+    """Enter the present size and SHA-256 of files of a run (names relative to it, with forward slashes)."""
+    run = Path(run)
+    manifest = read_manifest(run) if (run / FILE_NAME).exists() else start_manifest(run, command=[], seed=0)
+    for name in names:
+        path = run / name
+        manifest["files"][Path(name).as_posix()] = {"sha256": sha256_file(path), "bytes": path.stat().st_size}
+    write_manifest(run, manifest)
+
+
+def note(run: Path, **fields: Any) -> None:
+    """Merge fields into the manifest; a mapping merges into a mapping of the same name."""
+    run = Path(run)
+    manifest = read_manifest(run) if (run / FILE_NAME).exists() else start_manifest(run, command=[], seed=0)
+    for name, value in fields.items():
+        old = manifest.get(name)
+        manifest[name] = {**old, **value} if isinstance(old, dict) and isinstance(value, dict) else value
+    write_manifest(run, manifest)
+
+
+def verify(run: Path, name: str) -> None:
+    """Check that a file of a run is there and is the one that was recorded.
+
+    Raises:
+        DataError: No such run; the file was never recorded; it is missing, truncated or changed.
+    """
+    run = Path(run)
+    path = run / name
+    entry = read_manifest(run)["files"].get(Path(name).as_posix())
+    if entry is None:
+        hint = "learning was not finished: continue with --resume"
+        raise DataError(f"the run holds no {name} yet", where=str(run), hint=hint)
+    if not path.is_file():
+        raise DataError(
+            "the manifest lists this file, but it is missing", where=str(path), hint="learn the run again"
+        )
+    size = path.stat().st_size
+    if size < entry["bytes"]:
+        raise DataError(
+            f"is truncated: {size} of {entry['bytes']} bytes",
+            where=str(path),
+            hint="restore it or learn the run again",
+        )
+    if sha256_file(path) != entry["sha256"]:
+        raise DataError(
+            "was changed since it was written (its SHA-256 is not the manifest's)",
+            where=str(path),
+            hint="restore it or learn the run again",
+        )
