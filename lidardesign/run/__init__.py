@@ -1,1 +1,1 @@
-"""Runs on disk: configuration, YAML with positions, checkpoints, manifest. A side library of every command."""
+"""Runs on disk: configuration, YAML with positions, checkpoints, manifest. A side library of all commands."""

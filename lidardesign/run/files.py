@@ -15,7 +15,7 @@ CHUNK_BYTES = 1 << 20
 
 
 def write_atomic(path: Path, content: bytes | str) -> None:
-    """Write a file so that a reader, or a crash at any time, finds the old content or the new, never a mixture.
+    """Write a file so that a reader, or a crash at any time, finds the old content or the new one.
 
     The content goes to a temporary file in the same folder, is flushed to the disk, and takes the name by a
     rename. A pipe or a device (as /dev/stdout) is written straight.

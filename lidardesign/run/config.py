@@ -1,0 +1,435 @@
+"""The configuration of a run: defaults, preset, file and `--set`, in that order, checked with positions.
+
+The document has the sections task, space, density and learning. Every value remembers where it came from, so
+that an error can point at file, line and column, or at the `--set` that brought it.
+"""
+
+from __future__ import annotations
+
+import difflib
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from lidardesign.density.settings import PRESET_LEARNING, PRESETS, DensitySettings, LearningSettings
+from lidardesign.errors import ConfigError
+from lidardesign.registry import load_task, plugin_guard
+from lidardesign.run.files import write_atomic
+from lidardesign.run.manifest import record, verify
+from lidardesign.run.overrides import Override, apply_override, parse_override
+from lidardesign.run.yaml import Document, KeyPath, dump_yaml, leaves, load_yaml
+from lidardesign.space import DIMENSIONS, DesignSpace
+from lidardesign.task import Task, TaskConfig
+
+FILE_NAME = "config.yaml"
+SCHEMA_VERSION = 1
+SECTIONS = ("task", "space", "density", "learning")
+HEADER = ("schema_version", "task_name", "seed", "preset")
+MAX_SEED = 2**63 - 1
+Model = TypeVar("Model", bound=BaseModel)
+
+
+class Locate(typing.Protocol):
+    """Where a value or its key stands, as `Document.locate`."""
+
+    def __call__(self, path: KeyPath, *, key: bool = False) -> str:
+        """The position, for messages."""
+        ...
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that decides what a run computes.
+
+    Arguments:
+        task_name: The task plugin's name.
+        seed: Root of every random stream.
+        preset: draft, standard or fine.
+        task: The task's own configuration.
+        space: The design space, with the task's bounds or the user's.
+        density: The target density.
+        learning: The flow and its optimiser.
+    """
+
+    task_name: str
+    seed: int
+    preset: str
+    task: TaskConfig
+    space: DesignSpace
+    density: DensitySettings
+    learning: LearningSettings
+
+    def as_document(self) -> dict[str, Any]:
+        """The form that config.yaml has."""
+        return {
+            "schema_version": SCHEMA_VERSION,
+            "task_name": self.task_name,
+            "seed": self.seed,
+            "preset": self.preset,
+            "task": self.task.model_dump(mode="json"),
+            "space": self.space.as_dict(),
+            "density": self.density.model_dump(mode="json"),
+            "learning": self.learning.model_dump(mode="json"),
+        }
+
+
+class _SpaceSection(BaseModel):
+    """Bounds that replace the task's: a pair [low, high], or one number that fixes the dimension."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    x_m: float | tuple[float, float]
+    y_m: float | tuple[float, float]
+    z_m: float | tuple[float, float]
+    azimuth_rad: float | tuple[float, float]
+    elevation_rad: float | tuple[float, float]
+    range_m: float | tuple[float, float]
+    condition: tuple[Literal[DIMENSIONS], ...] = Field(())
+    measure: Literal["solid_angle", "angles"] = Field("solid_angle")
+
+
+@dataclass
+class _Layers:
+    """The merged document and the origin of each of its values."""
+
+    values: dict[str, Any]
+    origins: dict[KeyPath, str] = field(default_factory=dict)
+    keys: dict[KeyPath, str] = field(default_factory=dict)
+
+    def merge(self, section: str, values: Mapping[str, Any], origin: str) -> None:
+        """Lay values over a section."""
+        _merge(self.values.setdefault(section, {}), values)
+        for path, _ in leaves(dict(values)):
+            self.origins[(section, *path)] = origin
+
+    def forget(self, path: KeyPath) -> None:
+        """Drop the origins of a path, of all it holds, and of what holds it, before it is replaced."""
+        touching = [
+            known for known in self.origins if known[: len(path)] == path or path[: len(known)] == known
+        ]
+        for known in touching:
+            del self.origins[known]
+            self.keys.pop(known, None)
+
+    def origin(self, path: KeyPath, *, key: bool = False) -> str:
+        """Where the value (or the key) of a path came from: its own origin, a parent's, or of what it holds."""
+        if key and path in self.keys:
+            return self.keys[path]
+        for length in range(len(path), 0, -1):
+            if path[:length] in self.origins:
+                return self.origins[path[:length]]
+        held = [origin for known, origin in self.origins.items() if known[: len(path)] == path]
+        return held[0] if held else ".".join(map(str, path))
+
+
+def resolve(
+    task: Task,
+    *,
+    preset: str | None = None,
+    config_file: Path | None = None,
+    overrides: typing.Sequence[str] = (),
+    seed: int | None = None,
+) -> RunConfig:
+    """The configuration of a new run: defaults < preset < the task's suggestions < file < `--set`.
+
+    Arguments:
+        task: The task plugin.
+        preset: draft, standard or fine; None takes the file's, else standard.
+        config_file: A YAML file of the document form (any part of it).
+        overrides: `KEY=VALUE` with dotted keys; a key without a section belongs to the task.
+        seed: None takes the file's, else 0.
+
+    Raises:
+        ConfigError: At file:line:column or at the `--set` option.
+    """
+    document = load_yaml(config_file) if config_file else Document({}, "defaults")
+    header = _header(task, document, preset, seed)
+    layers = _Layers({section: {} for section in SECTIONS})
+    layers.merge("learning", PRESET_LEARNING[header["preset"]], f"preset {header['preset']}")
+    layers.merge("density", task.defaults.density, f"defaults of task {task.name}")
+    layers.merge(
+        "learning", task.defaults.learning.get(header["preset"], {}), f"defaults of task {task.name}"
+    )
+    _lay_file(layers, task, document)
+    for text in overrides:
+        _lay_override(layers, task, parse_override(text))
+    return _build(task, header, layers)
+
+
+def load_run_config(run: Path) -> tuple[Task, RunConfig]:
+    """The task and configuration of a run folder, checked against the manifest.
+
+    Raises:
+        DataError: There is no such run, or its configuration was damaged or changed.
+        ConfigError: It is of another version of this program.
+        PluginError: The task is installed but broken.
+    """
+    run = Path(run)
+    verify(run, FILE_NAME)
+    document = load_yaml(run / FILE_NAME)
+    task = load_task(str(document.mapping.get("task_name")))
+    layers = _Layers({section: {} for section in SECTIONS})
+    header = _header(task, document, None, None)
+    _lay_file(layers, task, document)
+    return task, _build(task, header, layers)
+
+
+def save_run_config(config: RunConfig, run: Path) -> None:
+    """Write config.yaml into a run folder and enter it in the manifest."""
+    write_atomic(Path(run) / FILE_NAME, dump_yaml(config.as_document()))
+    record(run, [FILE_NAME])
+
+
+def check_model(
+    model: type[Model], values: Any, locate: typing.Callable[[KeyPath], str], section: str = ""
+) -> Model:
+    """Validate values with a pydantic model; the first error becomes a ConfigError at its position.
+
+    Arguments:
+        model: The section's model.
+        values: Plain values.
+        locate: Where the value, or with `key=True` the key, of a path (section in front) came from.
+        section: Name of the section in messages.
+    """
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise _explain(model, values, error, locate, section) from None
+
+
+def _header(task: Task, document: Document, preset: str | None, seed: int | None) -> dict[str, Any]:
+    values = document.mapping
+    unknown = [key for key in values if key not in (*HEADER, *SECTIONS)]
+    if unknown:
+        where = document.locate((unknown[0],), key=True)
+        raise ConfigError(
+            f"unknown section {unknown[0]!r}",
+            where=where,
+            allowed=", ".join((*HEADER, *SECTIONS)),
+            hint=_suggest(unknown[0], (*HEADER, *SECTIONS)),
+        )
+    if values.get("schema_version", SCHEMA_VERSION) != SCHEMA_VERSION:
+        found = values["schema_version"]
+        raise ConfigError(
+            f"schema version {found!r}",
+            where=document.locate(("schema_version",)),
+            allowed=str(SCHEMA_VERSION),
+            hint="use the version of lidardesign that wrote it, or a newer one",
+        )
+    if values.get("task_name", task.name) != task.name:
+        raise ConfigError(
+            f"the file is for task {values['task_name']!r}",
+            where=document.locate(("task_name",)),
+            allowed=task.name,
+        )
+    return {
+        "preset": _checked_preset(preset or values.get("preset") or "standard", document, preset is not None),
+        "seed": _checked_seed(values.get("seed", 0) if seed is None else seed, document, seed is not None),
+    }
+
+
+def _checked_preset(preset: Any, document: Document, from_option: bool) -> str:
+    if preset not in PRESETS:
+        where = "--preset" if from_option else document.locate(("preset",))
+        raise ConfigError(f"unknown preset {preset!r}", where=where, allowed=", ".join(PRESETS))
+    return preset
+
+
+def _checked_seed(seed: Any, document: Document, from_option: bool) -> int:
+    if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed <= MAX_SEED:
+        where = "--seed" if from_option else document.locate(("seed",))
+        raise ConfigError(f"seed {seed!r}", where=where, allowed=f"a whole number from 0 to {MAX_SEED}")
+    return seed
+
+
+def _lay_file(layers: _Layers, task: Task, document: Document) -> None:
+    for section in SECTIONS:
+        values = document.mapping.get(section)
+        if values is None:
+            continue
+        if not isinstance(values, dict):
+            where = document.locate((section,), key=True)
+            raise ConfigError(f"section {section!r} holds {values!r}", where=where, allowed="keys and values")
+        _merge(layers.values[section], values)
+        for path, _ in leaves(values, (section,)):
+            for length in range(2, len(path) + 1):
+                layers.origins[path[:length]] = document.locate(path[:length])
+                layers.keys[path[:length]] = document.locate(path[:length], key=True)
+    base = Path(document.where).absolute().parent
+    _anchor_paths(layers.values["task"], document.mapping.get("task") or {}, task.Config, base)
+
+
+def _lay_override(layers: _Layers, task: Task, override: Override) -> None:
+    path = (
+        override.path if override.path[0] in SECTIONS and len(override.path) > 1 else ("task", *override.path)
+    )
+    layers.forget(path)
+    path = apply_override(layers.values, replace(override, path=path))
+    layers.origins[path] = override.where
+    if path[0] == "task":
+        touched: Any = override.value
+        for key in reversed(path[1:]):
+            touched = {key: touched}
+        _anchor_paths(layers.values["task"], touched, task.Config, Path.cwd())
+
+
+def _build(task: Task, header: dict[str, Any], layers: _Layers) -> RunConfig:
+    config = check_model(task.Config, layers.values["task"], layers.origin, "task")
+    density = check_model(DensitySettings, layers.values["density"], layers.origin, "density")
+    learning = check_model(LearningSettings, layers.values["learning"], layers.origin, "learning")
+    return RunConfig(
+        task_name=task.name,
+        seed=header["seed"],
+        preset=header["preset"],
+        task=config,
+        space=_space(task, config, layers),
+        density=density,
+        learning=learning,
+    )
+
+
+def _space(task: Task, config: TaskConfig, layers: _Layers) -> DesignSpace:
+    given = layers.values["space"]
+    if set(DIMENSIONS) <= set(given):
+        base: dict[str, Any] = {}
+    else:
+        with plugin_guard(task.name):
+            base = task.space(config).as_dict()
+    section = check_model(_SpaceSection, {**base, **given}, layers.origin, "space")
+    try:
+        return DesignSpace.from_dict(section.model_dump())
+    except ConfigError as error:
+        path: KeyPath = tuple((error.where or "space").split("."))
+        raise ConfigError(
+            f"{'.'.join(map(str, path))}: {error.message}", where=layers.origin(path), allowed=error.allowed
+        ) from None
+
+
+def _merge(base: dict[str, Any], values: Mapping[str, Any]) -> None:
+    for key, value in values.items():
+        if isinstance(value, Mapping) and isinstance(base.get(key), dict):
+            _merge(base[key], value)
+        else:
+            base[key] = dict(value) if isinstance(value, Mapping) else value
+
+
+def _anchor_paths(values: Any, given: Any, model: type[BaseModel], base: Path) -> None:
+    """Make the relative paths among the given values absolute, where the model says that they are paths."""
+    if not isinstance(values, dict) or not isinstance(given, dict):
+        return
+    for name, value in given.items():
+        info = model.model_fields.get(name) if isinstance(name, str) else None
+        if info is None or name not in values:
+            continue
+        nested = _nested_model(info.annotation)
+        if isinstance(value, dict) and nested:
+            _anchor_paths(values[name], value, nested, base)
+        elif _holds_path(info.annotation):
+            values[name] = _absolute(value, base)
+
+
+def _absolute(value: Any, base: Path) -> Any:
+    if isinstance(value, str) and value:
+        return str((base / Path(value).expanduser()).resolve())
+    if isinstance(value, list):
+        return [_absolute(item, base) for item in value]
+    return value
+
+
+def _parts(annotation: Any) -> list[Any]:
+    """An annotation and everything that it is a union, list or annotated form of."""
+    origin = typing.get_origin(annotation)
+    if origin is None:
+        return [annotation]
+    if origin in (typing.Union, UnionType, list, tuple, typing.Annotated):
+        return [part for argument in typing.get_args(annotation) for part in _parts(argument)]
+    return []
+
+
+def _holds_path(annotation: Any) -> bool:
+    return any(isinstance(part, type) and issubclass(part, Path) for part in _parts(annotation))
+
+
+def _nested_model(annotation: Any) -> type[BaseModel] | None:
+    models = [part for part in _parts(annotation) if isinstance(part, type) and issubclass(part, BaseModel)]
+    return models[0] if models else None
+
+
+def _explain(
+    model: type[BaseModel],
+    values: Any,
+    error: ValidationError,
+    locate: Locate,
+    section: str,
+) -> ConfigError:
+    """The ConfigError of a pydantic error: unknown keys first, since they often explain the others."""
+    details = sorted(error.errors(), key=lambda detail: detail["type"] != "extra_forbidden")
+    detail = details[0]
+    path = _real_path(detail["loc"], values)
+    prefix = (section,) if section else ()
+    name = ".".join(map(str, (*prefix, *path))) or section or model.__name__
+    where = locate((*prefix, *path), key=detail["type"] == "extra_forbidden")
+    if detail["type"] == "extra_forbidden":
+        allowed = _fields_at(model, path[:-1])
+        message, hint = f"unknown key {name!r}", _suggest(str(path[-1]), allowed)
+        return ConfigError(message, where=where, allowed=", ".join(allowed), hint=hint)
+    if detail["type"] == "missing":
+        return ConfigError(
+            f"{name} is missing", where=where, hint=f"--set {name.removeprefix('task.')}=VALUE"
+        )
+    text = detail["msg"].removeprefix("Value error, ")
+    found = "" if detail["type"] == "value_error" and not path else f": found {_short(detail['input'])}"
+    more = (
+        f" (and {len(details) - 1} more)" if len(details) > 1 and not _is_union(detail["loc"], path) else ""
+    )
+    if detail["type"] in ("value_error", "assertion_error"):
+        return ConfigError(f"{name}: {text}{found if path else ''}{more}", where=where)
+    return ConfigError(
+        f"{name}{found}{more}", where=where, allowed=_lower(text.removeprefix("Input should be "))
+    )
+
+
+def _real_path(location: tuple[Any, ...], values: Any) -> KeyPath:
+    """The part of a pydantic location that is in the values (it also names the members of unions)."""
+    path: list[str | int] = []
+    for index, key in enumerate(location):
+        last = index == len(location) - 1
+        inside = isinstance(values, Mapping) and key in values
+        inside = inside or (isinstance(values, list | tuple) and isinstance(key, int) and key < len(values))
+        if inside:
+            path.append(key)
+            values = values[key]
+        elif last and isinstance(values, Mapping):
+            path.append(key)
+    return tuple(path)
+
+
+def _is_union(location: tuple[Any, ...], path: KeyPath) -> bool:
+    return len(location) != len(path)
+
+
+def _fields_at(model: type[BaseModel], path: KeyPath) -> list[str]:
+    for key in path:
+        info = model.model_fields.get(str(key))
+        nested = _nested_model(info.annotation) if info else None
+        model = nested or model
+    return list(model.model_fields)
+
+
+def _suggest(key: str, allowed: typing.Iterable[str]) -> str | None:
+    close = difflib.get_close_matches(key, list(allowed), n=1)
+    return f"did you mean {close[0]!r}?" if close else None
+
+
+def _short(value: Any, limit: int = 60) -> str:
+    text = repr(value)
+    return text if len(text) <= limit else f"{text[: limit - 3]}..."
+
+
+def _lower(text: str) -> str:
+    return text[:1].lower() + text[1:]
