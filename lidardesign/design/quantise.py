@@ -1,0 +1,156 @@
+"""Weighted Lloyd quantisation: a few centres that stand for many weighted points.
+
+Lloyd's iteration (S. P. Lloyd, Least squares quantization in PCM, 1982) with k-means++ seeding (D. Arthur and
+S. Vassilvitskii, 2007). Every step lowers the weighted sum of squared distances, so the iteration ends.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from lidardesign.errors import ConfigError
+
+# The iteration stops when no centre moves by more than this share of the features' extent: far below the
+# spacing of any ray layout, far above rounding.
+MOVEMENT_TOLERANCE = 1e-6
+# Relative weights below this one count as it, so that the mass of a cell never underflows to nothing.
+SMALLEST_WEIGHT = 1e-200
+
+
+def lloyd(
+    features: np.ndarray,
+    weights: np.ndarray,
+    count: int,
+    generator: np.random.Generator,
+    *,
+    iterations: int = 50,
+) -> tuple[np.ndarray, np.ndarray]:
+    r"""Centres that minimise $\sum_n w_n \min_k |f_n - c_k|^2$ locally.
+
+    Deterministic for a given generator state. It stops after `iterations` steps, or before, once no centre
+    moves by more than 1e-6 of the features' extent. A cell that loses all its points takes the point that is
+    worst represented, so with at least `count` distinct points of positive weight no cell is empty; with
+    fewer, every distinct point is a centre and the rest repeat them in order of weight, with empty cells.
+
+    Arguments:
+        features: Points, shape (N, F), in units that make the Euclidean distance the right one.
+        weights: Non-negative, not all zero, shape (N,).
+        count: Number of centres K, at least 1.
+        generator: Source of the seeding.
+        iterations: At most this many steps.
+
+    Returns:
+        Centres, shape (K, F), and the centre of each point, shape (N,).
+
+    Raises:
+        ConfigError: No points, shapes that do not fit, values that are not finite, or a count below 1.
+    """
+    features, weights = _checked(features, weights, count)
+    distinct, inverse, merged = _distinct(features, weights)
+    if len(distinct) <= count:
+        return _repeat(distinct, merged, inverse, count)
+    offset = distinct.mean(axis=0)
+    points = distinct - offset
+    tolerance = MOVEMENT_TOLERANCE * np.ptp(points, axis=0).max()
+    centres = _seed(points, merged, count, generator)
+    for _ in range(iterations):
+        labels, _ = _assign(points, merged, centres)
+        moved = _centroids(points, merged, labels, count)
+        shift = np.abs(moved - centres).max()
+        centres = moved
+        if shift <= tolerance:
+            break
+    labels, refilled = _assign(points, merged, centres)
+    centres[refilled] = _centroids(points, merged, labels, count)[refilled]
+    return centres + offset, labels[inverse]
+
+
+def _checked(features: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    features = np.asarray(features, dtype=np.float64)
+    weights = np.asarray(weights, dtype=np.float64)
+    if features.ndim != 2 or not features.size or weights.shape != features.shape[:1]:
+        found = f"features of shape {features.shape} with weights of shape {weights.shape}"
+        raise ConfigError(found, where="quantisation", allowed="(N, F) and (N,), at least one point")
+    if not (np.isfinite(features).all() and np.isfinite(weights).all()):
+        raise ConfigError("features or weights are NaN or infinite", where="quantisation")
+    if weights.min() < 0 or weights.max() <= 0:
+        raise ConfigError("weights are negative or all zero", where="quantisation", allowed="0 or more")
+    if count < 1:
+        raise ConfigError(f"{count} centres", where="quantisation", allowed="1 or more")
+    return features, weights
+
+
+def _distinct(features: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distinct points, the distinct point of each point, and summed weights.
+
+    Points without weight are kept out; each of them belongs to its nearest point with weight.
+    """
+    positive = weights > 0
+    distinct, inner = np.unique(features[positive], axis=0, return_inverse=True)
+    inner = inner.reshape(-1)
+    inverse = np.zeros(len(features), dtype=np.int64)
+    inverse[positive] = inner
+    if not positive.all():
+        inverse[~positive] = cKDTree(distinct).query(features[~positive])[1]
+    merged = np.bincount(inner, weights=weights[positive], minlength=len(distinct))
+    return distinct, inverse, np.maximum(merged / merged.sum(), SMALLEST_WEIGHT)
+
+
+def _repeat(
+    distinct: np.ndarray, merged: np.ndarray, inverse: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """At most as many distinct points as centres: the points themselves, the heaviest repeated."""
+    heaviest = np.argsort(-merged, kind="stable")
+    extra = np.resize(heaviest, count - len(distinct))
+    return np.concatenate([distinct, distinct[extra]]), inverse
+
+
+def _seed(points: np.ndarray, weights: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
+    """k-means++: each seed is drawn with probability weight times squared distance to the seeds so far."""
+    draws = generator.uniform(size=count)
+    chosen = np.empty(count, dtype=np.int64)
+    squared = np.full(len(points), 1.0)
+    for k, draw in enumerate(draws):
+        chosen[k] = _draw(weights * squared, draw)
+        away = np.square(points - points[chosen[k]]).sum(axis=1)
+        squared = np.minimum(squared, away) if k else away
+    return points[chosen]
+
+
+def _draw(mass: np.ndarray, draw: float) -> int:
+    """The index at which the cumulative mass passes a share `draw`; never one without mass."""
+    cumulative = np.cumsum(mass)
+    if cumulative[-1] <= 0:
+        # every distance underflowed: points that differ by less than the square root of the smallest number
+        return int(draw * len(mass))
+    index = int(np.searchsorted(cumulative, draw * cumulative[-1], side="right"))
+    return min(index, int(np.flatnonzero(mass)[-1]))
+
+
+def _centroids(points: np.ndarray, weights: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:
+    """Weighted means of the cells, shape (K, F)."""
+    mass = np.bincount(labels, weights=weights, minlength=count)
+    sums = [np.bincount(labels, weights=weights * column, minlength=count) for column in points.T]
+    return np.stack(sums, axis=1) / mass[:, None]
+
+
+def _assign(points: np.ndarray, weights: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The nearest centre of each point, shape (N,), and the cells that had to be refilled.
+
+    A cell without points takes the point with the largest weighted squared distance from its centre that is
+    not alone in its cell; this can only lower the cost.
+    """
+    distance, labels = cKDTree(centres).query(points)
+    counts = np.bincount(labels, minlength=len(centres))
+    empty = np.flatnonzero(counts == 0)
+    waiting = list(empty)
+    worst = np.argsort(-weights * np.square(distance), kind="stable") if waiting else ()
+    for point in worst:
+        if not waiting:
+            break
+        if counts[labels[point]] > 1:
+            counts[labels[point]] -= 1
+            labels[point] = waiting.pop(0)
+            counts[labels[point]] = 1
+    return labels, empty
