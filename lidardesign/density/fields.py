@@ -1,0 +1,258 @@
+"""Distances of many scenes at once: one column per scene, or per frame of a moving scene.
+
+Meshes at rest share one table (grid points by columns); primitives and moving bodies are evaluated exactly or in
+their own frame by transforming the query. Distances are positive outside and exact for primitives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from lidardesign.density import kernels
+from lidardesign.density.grids import Grid, cached_distance_grids, grid_around
+from lidardesign.errors import ConfigError
+from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, inverse_rigid
+
+MAXIMUM_TABLE_BYTES = 6 * 2**30
+FAR_M = np.float32(1e9)  # the distance of a column without a mesh in the table
+
+
+class Field(Protocol):
+    """Signed distances of all columns, with contracted gradients.
+
+    `shell_m` is half the thickness given to surfaces without an inside where they occlude, shape (columns,).
+    """
+
+    columns: int
+    shell_m: np.ndarray
+
+    def distances(self, points: np.ndarray) -> np.ndarray:
+        """Distances at points: (N, 3) to (N, columns) [m]."""
+        ...
+
+    def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Gradients of sum_c weights_nc * d_c(points_n): (N, 3), (N, columns) to (N, 3)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class TableField:
+    """Meshes at rest: one row of distances per grid point.
+
+    Arguments:
+        table: Shape (grid points, columns) float32 [m].
+        grid: Where the rows are.
+        shell_m: See `Field`.
+    """
+
+    table: np.ndarray
+    grid: Grid
+    shell_m: np.ndarray
+
+    @property
+    def columns(self) -> int:
+        """The number of columns."""
+        return self.table.shape[1]
+
+    @property
+    def geometry(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Counts, low corner and inverse step, as the kernels take them."""
+        return self.grid.counts, self.grid.low, 1.0 / self.grid.step
+
+    def distances(self, points: np.ndarray) -> np.ndarray:
+        """See `Field`."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        out = np.empty((len(points), self.columns), dtype=np.float32)
+        kernels.table_distances(self.table, *self.geometry, points, out)
+        return out
+
+    def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """See `Field`."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        out = np.empty_like(points)
+        kernels.table_gradient(self.table, *self.geometry, points, np.ascontiguousarray(weights, np.float64), out)
+        return out
+
+
+class BodyField:
+    """Primitives and moving bodies, each evaluated in its own frame.
+
+    Arguments:
+        entries: Column, body and frame of every body that counts.
+        columns: The number of columns.
+        build_grid: Gives the distance grid of a mesh in its own frame.
+    """
+
+    def __init__(
+        self,
+        entries: Sequence[tuple[int, Body, int]],
+        columns: int,
+        build_grid: Callable[[Mesh], tuple[Grid, np.ndarray]],
+    ) -> None:
+        self.columns = columns
+        self.shell_m = np.zeros(columns)
+        self._kinds = np.array([_KINDS[type(body.shape)] for _, body, _ in entries], dtype=np.int64)
+        self._sizes = np.array([_size(body) for _, body, _ in entries]).reshape(-1, 3)
+        poses = np.array([body.pose(frame) for _, body, frame in entries]).reshape(-1, 4, 4)
+        self._to_body = np.ascontiguousarray(inverse_rigid(poses)[:, :3])
+        self._columns = np.array([column for column, _, _ in entries], dtype=np.int64)
+        self._place_grids(entries, build_grid)
+
+    def _place_grids(self, entries: Sequence[tuple[int, Body, int]], build_grid: Callable) -> None:
+        count = len(entries)
+        self._starts, self._counts = np.zeros(count, np.int64), np.full((count, 3), 2, np.int64)
+        self._lows, self._inverse_steps = np.zeros((count, 3)), np.ones(count)
+        values: list[np.ndarray] = [np.zeros(8, np.float32)]
+        known: dict[str, tuple[int, Grid]] = {}
+        for row, (column, body, _) in enumerate(entries):
+            if not isinstance(body.shape, Mesh):
+                continue
+            key = body.shape.content_hash
+            if key not in known:
+                grid, distances = build_grid(body.shape)
+                known[key] = (sum(map(len, values)), grid)
+                values.append(distances)
+            self._starts[row], grid = known[key]
+            self._counts[row], self._lows[row], self._inverse_steps[row] = grid.counts, grid.low, 1.0 / grid.step
+            if body.shape.sign == "unsigned":
+                self.shell_m[column] = grid.step
+        self._grids = np.concatenate(values)
+
+    @property
+    def _geometry(self) -> tuple[np.ndarray, ...]:
+        return self._grids, self._starts, self._counts, self._lows, self._inverse_steps
+
+    def _evaluate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        shape = (len(points), self.columns)
+        distances, nearest = np.empty(shape), np.empty(shape, dtype=np.int64)
+        kernels.body_distances(
+            self._kinds, self._sizes, self._to_body, self._columns, *self._geometry, points, distances, nearest
+        )
+        return distances, nearest
+
+    def distances(self, points: np.ndarray) -> np.ndarray:
+        """See `Field`."""
+        return self._evaluate(points)[0]
+
+    def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """See `Field`."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        out = np.empty_like(points)
+        weights = np.ascontiguousarray(weights, dtype=np.float64)
+        nearest = self._evaluate(points)[1]
+        kernels.body_gradient(
+            self._kinds, self._sizes, self._to_body, *self._geometry, points, nearest, weights, out
+        )
+        return out
+
+
+_KINDS = {
+    Sphere: kernels.SPHERE,
+    Box: kernels.BOX,
+    Capsule: kernels.CAPSULE,
+    Plane: kernels.PLANE,
+    Mesh: kernels.GRID,
+}
+
+
+def _size(body: Body) -> tuple[float, float, float]:
+    match body.shape:
+        case Sphere(radius_m=radius):
+            return radius, 0.0, 0.0
+        case Capsule(radius_m=radius, half_length_m=half_length):
+            return radius, half_length, 0.0
+        case Box(half_extents_m=half):
+            return half[0], half[1], half[2]
+        case _:
+            return 0.0, 0.0, 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class UnionField:
+    """The nearest of two fields over the same columns."""
+
+    first: Field
+    second: Field
+
+    @property
+    def columns(self) -> int:
+        """The number of columns."""
+        return self.first.columns
+
+    @property
+    def shell_m(self) -> np.ndarray:
+        """See `Field`."""
+        return np.maximum(self.first.shell_m, self.second.shell_m)
+
+    def distances(self, points: np.ndarray) -> np.ndarray:
+        """See `Field`."""
+        return np.minimum(self.first.distances(points), self.second.distances(points))
+
+    def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """See `Field`."""
+        nearer = self.first.distances(points) <= self.second.distances(points)
+        first = self.first.gradient(points, np.where(nearer, weights, 0.0))
+        return first + self.second.gradient(points, np.where(nearer, 0.0, weights))
+
+
+def scene_columns(scenes: Sequence[Scene]) -> list[tuple[int, int]]:
+    """Scene and frame of every column, in order."""
+    return [(index, frame) for index, scene in enumerate(scenes) for frame in range(scene.frames)]
+
+
+def build_field(
+    scenes: Sequence[Scene], chosen: Callable[[Body], bool], *, resolution: int, padding_m: float
+) -> Field:
+    """The distances of the chosen bodies of all scenes.
+
+    Arguments:
+        scenes: One column per scene and frame, in the order of `scene_columns`.
+        chosen: Which bodies count, as `lambda body: body.is_target`.
+        resolution: Grid points along the longest side of a mesh field.
+        padding_m: How far grids reach beyond their meshes [m].
+    """
+    columns = scene_columns(scenes)
+    at_rest: list[tuple[int, Body]] = []
+    others: list[tuple[int, Body, int]] = []
+    for column, (index, frame) in enumerate(columns):
+        for body in filter(chosen, scenes[index].bodies):
+            if isinstance(body.shape, Mesh) and scenes[index].frames == 1:
+                at_rest.append((column, body))
+            else:
+                others.append((column, body, frame))
+    fields: list[Field] = []
+    if at_rest:
+        fields.append(_table_field(at_rest, len(columns), resolution, padding_m))
+    if others or not at_rest:
+        fields.append(BodyField(others, len(columns), lambda mesh: _own_grid(mesh, resolution, padding_m)))
+    return fields[0] if len(fields) == 1 else UnionField(*fields)
+
+
+def _own_grid(mesh: Mesh, resolution: int, padding_m: float) -> tuple[Grid, np.ndarray]:
+    grid = grid_around(mesh.bounds_m, resolution, padding_m)
+    return grid, cached_distance_grids([mesh], grid)[0]
+
+
+def _table_field(bodies: list[tuple[int, Body]], columns: int, resolution: int, padding_m: float) -> TableField:
+    meshes = [body.shape.transformed(body.pose()) for _, body in bodies]
+    corners = np.concatenate([mesh.bounds_m for mesh in meshes])
+    grid = grid_around(np.stack([corners.min(axis=0), corners.max(axis=0)]), resolution, padding_m)
+    if grid.size * columns * 4 > MAXIMUM_TABLE_BYTES:
+        raise ConfigError(
+            f"fields of {columns} scenes at {grid.size} points need {grid.size * columns * 4 / 2**30:.1f} GiB",
+            where="density.field_resolution",
+            allowed=f"{MAXIMUM_TABLE_BYTES / 2**30:.0f} GiB",
+            hint="lower density.field_resolution or use fewer scenes",
+        )
+    table = np.full((grid.size, columns), FAR_M, dtype=np.float32)
+    shell_m = np.zeros(columns)
+    for (column, _), mesh, values in zip(bodies, meshes, cached_distance_grids(meshes, grid), strict=True):
+        np.minimum(table[:, column], values, out=table[:, column])
+        if mesh.sign == "unsigned":
+            shell_m[column] = grid.step
+    return TableField(table, grid, shell_m)

@@ -1,0 +1,163 @@
+"""Signed distance grids of meshes: exact near the surface, filled from the nearest exact points beyond, cached on disk.
+
+libigl gives the unsigned distance in a narrow band and the generalised winding number gives the sign (its combined
+mode scales the distance and is not used). Beyond the band the distance to the nearest closest point of the band is
+taken, found by an exact Euclidean distance transform, so that gradients reach from afar.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.scene import Mesh
+
+ALGORITHM = "narrow band 3 cells, igl winding sign, filled by distance transform, float32"
+BAND_CELLS = 3.0
+MAXIMUM_CELLS = 40_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """A regular grid of points low + step * (i, j, k).
+
+    Arguments:
+        low: The first point [m], shape (3,).
+        step: The spacing [m].
+        counts: Points per axis, at least 2 each, shape (3,).
+    """
+
+    low: np.ndarray
+    step: float
+    counts: np.ndarray
+
+    @property
+    def size(self) -> int:
+        """The number of points."""
+        return int(np.prod(self.counts))
+
+    def points(self) -> np.ndarray:
+        """All points in C order, shape (size, 3) [m]."""
+        axes = [self.low[k] + self.step * np.arange(self.counts[k]) for k in range(3)]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def grid_around(bounds_m: np.ndarray, resolution: int, padding_m: float) -> Grid:
+    """A grid over an axis-aligned box, shape (2, 3), with `resolution` points along its longest padded side."""
+    low, high = bounds_m[0] - padding_m, bounds_m[1] + padding_m
+    step = float((high - low).max() / (resolution - 1))
+    if not step > 0:
+        raise DataError("the meshes have no extent")
+    counts = np.maximum(np.ceil((high - low) / step - 1e-9).astype(np.int64) + 1, 2)
+    if counts.prod() > MAXIMUM_CELLS:
+        raise ConfigError(
+            f"a field of {' x '.join(map(str, counts))} points is too large",
+            where="density.field_resolution",
+            allowed=f"at most {MAXIMUM_CELLS} points",
+        )
+    return Grid(low, step, counts)
+
+
+def distance_grid(mesh: Mesh, grid: Grid) -> np.ndarray:
+    """Distances at all grid points, negative inside unless the mesh has no inside: shape (size,) float32 [m]."""
+    points = grid.points()
+    faces = mesh.faces.astype(np.int64)
+    distance = _filled(*_narrow_band(points, mesh.vertices, faces, grid), points, grid)
+    if mesh.sign != "unsigned":
+        import igl
+
+        inside = igl.fast_winding_number(mesh.vertices, faces, points) > 0.5
+        distance = np.where(inside, -distance, distance)
+    return distance.astype(np.float32)
+
+
+def _narrow_band(
+    points: np.ndarray, vertices: np.ndarray, faces: np.ndarray, grid: Grid
+) -> tuple[np.ndarray, np.ndarray]:
+    """Exact unsigned distances within the band (NaN beyond) and the closest surface points."""
+    import igl
+
+    unsigned = igl.SIGNED_DISTANCE_TYPE_UNSIGNED
+    reach = BAND_CELLS * grid.step
+    distance, _, closest, _ = igl.signed_distance(
+        points, vertices, faces, sign_type=unsigned, lower_bound=0.0, upper_bound=reach
+    )
+    if np.isnan(distance).all():  # a surface that no grid point comes near: exact everywhere
+        distance, _, closest, _ = igl.signed_distance(points, vertices, faces, sign_type=unsigned)
+    return distance, closest
+
+
+def _filled(distance: np.ndarray, closest: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray:
+    from scipy.ndimage import distance_transform_edt
+
+    beyond = np.isnan(distance)
+    if not beyond.any():
+        return distance
+    nearest = distance_transform_edt(
+        beyond.reshape(grid.counts), return_distances=False, return_indices=True
+    ).reshape(3, -1)[:, beyond]
+    rows = np.ravel_multi_index(tuple(nearest), tuple(grid.counts))
+    filled = distance.copy()
+    filled[beyond] = np.linalg.norm(points[beyond] - closest[rows], axis=1)
+    return filled
+
+
+def cache_folder() -> Path:
+    """Where grids are cached: $LIDARDESIGN_CACHE, else the user's cache folder."""
+    chosen = os.environ.get("LIDARDESIGN_CACHE")
+    if chosen:
+        return Path(chosen)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lidardesign"
+
+
+def cached_distance_grids(meshes: list[Mesh], grid: Grid, workers: int = 2) -> list[np.ndarray]:
+    """One distance grid per mesh, from the cache where its content hash is known; damaged files are built again."""
+
+    def load_or_build(mesh: Mesh) -> np.ndarray:
+        path = _cache_path(mesh, grid)
+        loaded = _load(path, grid.size)
+        if loaded is None:
+            loaded = distance_grid(mesh, grid)
+            _store(path, loaded)
+        return loaded
+
+    # libigl and SciPy release the interpreter lock
+    with ThreadPoolExecutor(max_workers=workers) as pool:
+        return list(pool.map(load_or_build, meshes))
+
+
+def _cache_path(mesh: Mesh, grid: Grid) -> Path:
+    digest = hashlib.sha256(mesh.content_hash.encode())
+    digest.update(ALGORITHM.encode())
+    digest.update(np.array([*grid.low, grid.step, *grid.counts]).tobytes())
+    return cache_folder() / "fields" / f"{digest.hexdigest()}.npy"
+
+
+def _load(path: Path, size: int) -> np.ndarray | None:
+    try:
+        values = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError):
+        return None
+    usable = values.shape == (size,) and values.dtype == np.float32 and np.isfinite(values).all()
+    return values if usable else None
+
+
+def _store(path: Path, values: np.ndarray) -> None:
+    import io
+
+    from lidardesign.run.files import write_atomic
+
+    buffer = io.BytesIO()
+    np.save(buffer, values, allow_pickle=False)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, buffer.getvalue())
+    except (OSError, DataError):
+        # a cache that cannot be written costs time, never the result
+        return

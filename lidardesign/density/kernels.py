@@ -1,0 +1,357 @@
+"""Compiled loops over grid tables and primitive bodies: distances, their contracted gradients, the visibility quadrature.
+
+A table holds the distances of all C columns (scenes, or frames of scenes) at every grid point in one row, so that the
+eight corners of a cell are eight contiguous reads. Gradients are never formed per column: a caller hands in one weight
+per column and gets the weighted sum, which costs one more pass over the same rows.
+
+Outside the grid a point p with nearest grid point q gets sqrt(|p - q|^2 + d(q)^2), a lower bound of the distance
+because the surface lies inside the convex box; it is continuous across the box's faces.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+# Reassociation vectorises the sums; NaN and infinity keep their meaning (no `nnan`, no `ninf`).
+FAST = {"reassoc", "contract", "nsz", "arcp"}
+
+SPHERE, BOX, CAPSULE, PLANE, GRID = range(5)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _locate(counts, low, inverse_step, p, cell, fraction, excess):  # noqa: ANN001, ANN202
+    """Cell, fraction in it and excess beyond the grid of one point; returns the squared excess."""
+    squared = 0.0
+    for k in range(3):
+        t = (p[k] - low[k]) * inverse_step
+        top = counts[k] - 1.0
+        clamped = min(max(t, 0.0), top)
+        excess[k] = (t - clamped) / inverse_step
+        squared += excess[k] * excess[k]
+        cell[k] = min(int(clamped), counts[k] - 2)
+        fraction[k] = clamped - cell[k]
+    return squared
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _corners(counts, cell, fraction, index, weight):  # noqa: ANN001, ANN202
+    """Row indices and trilinear weights of a cell's eight corners."""
+    for corner in range(8):
+        i, j, k = corner & 1, (corner >> 1) & 1, (corner >> 2) & 1
+        index[corner] = ((cell[0] + i) * counts[1] + cell[1] + j) * counts[2] + cell[2] + k
+        wx = fraction[0] if i else 1.0 - fraction[0]
+        wy = fraction[1] if j else 1.0 - fraction[1]
+        wz = fraction[2] if k else 1.0 - fraction[2]
+        weight[corner] = wx * wy * wz
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+def _blend(table, index, weight, out):  # noqa: ANN001, ANN202
+    """The eight rows summed with their weights, shape (C,)."""
+    w0, w1, w2, w3 = weight[0], weight[1], weight[2], weight[3]
+    w4, w5, w6, w7 = weight[4], weight[5], weight[6], weight[7]
+    r0, r1, r2, r3 = table[index[0]], table[index[1]], table[index[2]], table[index[3]]
+    r4, r5, r6, r7 = table[index[4]], table[index[5]], table[index[6]], table[index[7]]
+    for c in range(table.shape[1]):
+        out[c] = (
+            w0 * r0[c] + w1 * r1[c] + w2 * r2[c] + w3 * r3[c] + w4 * r4[c] + w5 * r5[c] + w6 * r6[c] + w7 * r7[c]
+        )
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+def _contract(table, index, column_weight, fraction, inverse_step, out):  # noqa: ANN001, ANN202
+    """Gradient of sum_c weight_c * d_c inside one cell, added to out (3,)."""
+    dots = np.zeros(8)
+    for corner in range(8):
+        row = table[index[corner]]
+        total = 0.0
+        for c in range(table.shape[1]):
+            total += row[c] * column_weight[c]
+        dots[corner] = total
+    fx, fy, fz = fraction[0], fraction[1], fraction[2]
+    gx = gy = gz = 0.0
+    for corner in range(8):
+        i, j, k = corner & 1, (corner >> 1) & 1, (corner >> 2) & 1
+        wx = fx if i else 1.0 - fx
+        wy = fy if j else 1.0 - fy
+        wz = fz if k else 1.0 - fz
+        gx += (1.0 if i else -1.0) * wy * wz * dots[corner]
+        gy += (1.0 if j else -1.0) * wx * wz * dots[corner]
+        gz += (1.0 if k else -1.0) * wx * wy * dots[corner]
+    out[0] += gx * inverse_step
+    out[1] += gy * inverse_step
+    out[2] += gz * inverse_step
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def table_distances(table, counts, low, inverse_step, points, out):  # noqa: ANN001, ANN201
+    """Distances of all columns at points: table (G, C), points (N, 3), out (N, C)."""
+    cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
+    index, weight = np.zeros(8, np.int64), np.zeros(8, table.dtype)
+    for n in range(points.shape[0]):
+        squared = _locate(counts, low, inverse_step, points[n], cell, fraction, excess)
+        _corners(counts, cell, fraction, index, weight)
+        _blend(table, index, weight, out[n])
+        if squared > 0.0:
+            for c in range(table.shape[1]):
+                inner = max(out[n, c], 0.0)
+                out[n, c] = math.sqrt(squared + inner * inner)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def table_gradient(table, counts, low, inverse_step, points, weights, out):  # noqa: ANN001, ANN201
+    """Gradients of sum_c weights_nc * d_c(points_n): weights (N, C), out (N, 3)."""
+    columns = table.shape[1]
+    cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
+    index, corner_weight = np.zeros(8, np.int64), np.zeros(8, table.dtype)
+    row, column_weight = np.zeros(columns, table.dtype), np.zeros(columns)
+    gradient = np.zeros(3)
+    for n in range(points.shape[0]):
+        squared = _locate(counts, low, inverse_step, points[n], cell, fraction, excess)
+        _corners(counts, cell, fraction, index, corner_weight)
+        gradient[:] = 0.0
+        outward = 0.0
+        for c in range(columns):
+            column_weight[c] = weights[n, c]
+        if squared > 0.0:
+            _blend(table, index, corner_weight, row)
+            for c in range(columns):
+                inner = max(row[c], 0.0)
+                share = column_weight[c] / math.sqrt(squared + inner * inner)
+                outward += share
+                column_weight[c] = share * inner
+        _contract(table, index, column_weight, fraction, inverse_step, gradient)
+        for k in range(3):
+            out[n, k] = outward * excess[k] if excess[k] != 0.0 else gradient[k]
+
+
+@njit(cache=True, nogil=True)
+def cell_minimum(table, counts, out):  # noqa: ANN001, ANN201
+    """The smallest distance of any column at any corner of each cell, stored at its first corner: out (G,)."""
+    columns = table.shape[1]
+    smallest = np.empty(table.shape[0], table.dtype)
+    for g in range(table.shape[0]):
+        value = table[g, 0]
+        for c in range(1, columns):
+            value = min(value, table[g, c])
+        smallest[g] = value
+    for i in range(counts[0]):
+        for j in range(counts[1]):
+            for k in range(counts[2]):
+                value = np.inf
+                for corner in range(8):
+                    a = min(i + (corner & 1), counts[0] - 1)
+                    b = min(j + ((corner >> 1) & 1), counts[1] - 1)
+                    c = min(k + ((corner >> 2) & 1), counts[2] - 1)
+                    value = min(value, smallest[(a * counts[1] + b) * counts[2] + c])
+                out[(i * counts[1] + j) * counts[2] + k] = value
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def table_quadrature(
+    table, clear, counts, low, inverse_step, shell, origins, directions, lengths, points_per_ray,  # noqa: ANN001
+    attenuation, sharpness, cutoff, depth, slope,  # noqa: ANN001
+):  # fmt: skip  # noqa: ANN201
+    """Optical depths along rays by midpoints, and the slopes that their gradient needs.
+
+    Cells whose every column is further than `cutoff` from a surface cannot attenuate and are never read.
+
+    Arguments:
+        table, clear: Distances (G, C) and their cell minima (G,).
+        shell: Half thickness of surfaces without an inside, per column, shape (C,) [m].
+        origins, directions, lengths: Rays, shapes (N, 3), (N, 3), (N,); lengths are integrated from 0 [m].
+        depth: Out: integral of attenuation * sigmoid(-sharpness * d), shape (N, C).
+        slope: Out: derivative of the integrand by the distance times the step, shape (N, M, C); pass shape
+            (0, 0, 0) when no gradient is needed.
+    """
+    columns = table.shape[1]
+    cell, fraction, excess, p = np.zeros(3, np.int64), np.zeros(3), np.zeros(3), np.zeros(3)
+    index, weight, row = np.zeros(8, np.int64), np.zeros(8, table.dtype), np.zeros(columns, table.dtype)
+    keep = slope.shape[0] > 0
+    for n in range(origins.shape[0]):
+        step = lengths[n] / points_per_ray
+        for c in range(columns):
+            depth[n, c] = 0.0
+        for m in range(points_per_ray):
+            along = (m + 0.5) * step
+            for k in range(3):
+                p[k] = origins[n, k] + along * directions[n, k]
+            squared = _locate(counts, low, inverse_step, p, cell, fraction, excess)
+            first = (cell[0] * counts[1] + cell[1]) * counts[2] + cell[2]
+            if squared > cutoff * cutoff or clear[first] > cutoff:
+                continue
+            _corners(counts, cell, fraction, index, weight)
+            _blend(table, index, weight, row)
+            for c in range(columns):
+                distance = row[c] - shell[c]
+                if squared > 0.0:
+                    inner = max(row[c], 0.0)
+                    distance = math.sqrt(squared + inner * inner) - shell[c]
+                exponent = min(max(sharpness * distance, -60.0), 60.0)
+                inside = 1.0 / (1.0 + math.exp(exponent))
+                depth[n, c] += attenuation * step * inside
+                if keep:
+                    slope[n, m, c] = -attenuation * step * sharpness * inside * (1.0 - inside)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def table_quadrature_gradient(
+    table, clear, counts, low, inverse_step, origins, directions, lengths, cutoff, slope, weights,  # noqa: ANN001
+    by_origin, by_direction, by_length,  # noqa: ANN001
+):  # fmt: skip  # noqa: ANN201
+    """Gradients of sum_c weights_nc * depth_nc by origin (N, 3), direction (N, 3) and length (N,), at fixed step.
+
+    The caller adds the derivative by the step itself, which is depth / length.
+    """
+    columns = table.shape[1]
+    points_per_ray = slope.shape[1]
+    cell, fraction, excess, p = np.zeros(3, np.int64), np.zeros(3), np.zeros(3), np.zeros(3)
+    index, corner_weight = np.zeros(8, np.int64), np.zeros(8, table.dtype)
+    row, column_weight, gradient = np.zeros(columns, table.dtype), np.zeros(columns), np.zeros(3)
+    for n in range(origins.shape[0]):
+        step = lengths[n] / points_per_ray
+        for m in range(points_per_ray):
+            along = (m + 0.5) * step
+            for k in range(3):
+                p[k] = origins[n, k] + along * directions[n, k]
+            squared = _locate(counts, low, inverse_step, p, cell, fraction, excess)
+            first = (cell[0] * counts[1] + cell[1]) * counts[2] + cell[2]
+            if squared > cutoff * cutoff or clear[first] > cutoff:
+                continue
+            for c in range(columns):
+                column_weight[c] = weights[n, c] * slope[n, m, c]
+            _corners(counts, cell, fraction, index, corner_weight)
+            outward = 0.0
+            if squared > 0.0:
+                _blend(table, index, corner_weight, row)
+                for c in range(columns):
+                    inner = max(row[c], 0.0)
+                    share = column_weight[c] / math.sqrt(squared + inner * inner)
+                    outward += share
+                    column_weight[c] = share * inner
+            gradient[:] = 0.0
+            _contract(table, index, column_weight, fraction, inverse_step, gradient)
+            for k in range(3):
+                value = outward * excess[k] if excess[k] != 0.0 else gradient[k]
+                by_origin[n, k] += value
+                by_direction[n, k] += along * value
+                by_length[n] += (m + 0.5) / points_per_ray * value * directions[n, k]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _body_distance(kind, size, grids, start, counts, low, inverse_step, q, gradient):  # noqa: ANN001, ANN202
+    """Signed distance of one body at a point in its own frame; its gradient goes to `gradient` (3,)."""
+    if kind == SPHERE:
+        length = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+        for k in range(3):
+            gradient[k] = q[k] / length if length > 0.0 else 0.0
+        return length - size[0]
+    if kind == CAPSULE:
+        z = q[2] - min(max(q[2], -size[1]), size[1])
+        length = math.sqrt(q[0] * q[0] + q[1] * q[1] + z * z)
+        gradient[0] = q[0] / length if length > 0.0 else 0.0
+        gradient[1] = q[1] / length if length > 0.0 else 0.0
+        gradient[2] = z / length if length > 0.0 else 0.0
+        return length - size[0]
+    if kind == PLANE:
+        gradient[0], gradient[1], gradient[2] = 0.0, 0.0, 1.0
+        return q[2]
+    if kind == BOX:
+        return _box_distance(size, q, gradient)
+    return _grid_distance(grids, start, counts, low, inverse_step, q, gradient)
+
+
+@njit(cache=True, nogil=True)
+def _box_distance(size, q, gradient):  # noqa: ANN001, ANN202
+    squared, deepest, axis = 0.0, -np.inf, 0
+    for k in range(3):
+        beyond = abs(q[k]) - size[k]
+        if beyond > deepest:
+            deepest, axis = beyond, k
+        if beyond > 0.0:
+            squared += beyond * beyond
+        gradient[k] = 0.0
+    if squared == 0.0:
+        gradient[axis] = 1.0 if q[axis] >= 0.0 else -1.0
+        return deepest
+    distance = math.sqrt(squared)
+    for k in range(3):
+        beyond = abs(q[k]) - size[k]
+        if beyond > 0.0:
+            gradient[k] = beyond / distance * (1.0 if q[k] >= 0.0 else -1.0)
+    return distance
+
+
+@njit(cache=True, nogil=True)
+def _grid_distance(grids, start, counts, low, inverse_step, q, gradient):  # noqa: ANN001, ANN202
+    cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
+    index, weight = np.zeros(8, np.int64), np.zeros(8)
+    squared = _locate(counts, low, inverse_step, q, cell, fraction, excess)
+    _corners(counts, cell, fraction, index, weight)
+    value = 0.0
+    for corner in range(8):
+        value += weight[corner] * grids[start + index[corner]]
+    for axis in range(3):
+        total = 0.0
+        for corner in range(8):
+            upper = (corner >> axis) & 1
+            other = 1.0
+            for k in range(3):
+                if k != axis:
+                    other *= fraction[k] if (corner >> k) & 1 else 1.0 - fraction[k]
+            total += (1.0 if upper else -1.0) * other * grids[start + index[corner]]
+        gradient[axis] = total * inverse_step
+    if squared == 0.0:
+        return value
+    inner = max(value, 0.0)
+    distance = math.sqrt(squared + inner * inner)
+    for k in range(3):
+        gradient[k] = excess[k] / distance if excess[k] != 0.0 else gradient[k] * inner / distance
+    return distance
+
+
+@njit(cache=True, nogil=True)
+def body_distances(  # noqa: ANN201
+    kinds, sizes, to_body, columns, grids, starts, counts, lows, inverse_steps, points, out, nearest,  # noqa: ANN001
+):  # fmt: skip
+    """Distances of the nearest body of each column: out (N, C), and which body it was: nearest (N, C)."""
+    q, gradient = np.zeros(3), np.zeros(3)
+    out[:] = np.inf
+    nearest[:] = -1
+    for n in range(points.shape[0]):
+        for b in range(kinds.shape[0]):
+            _to_frame(to_body[b], points[n], q)
+            value = _body_distance(
+                kinds[b], sizes[b], grids, starts[b], counts[b], lows[b], inverse_steps[b], q, gradient
+            )
+            if value < out[n, columns[b]]:
+                out[n, columns[b]] = value
+                nearest[n, columns[b]] = b
+
+
+@njit(cache=True, nogil=True)
+def body_gradient(  # noqa: ANN201
+    kinds, sizes, to_body, grids, starts, counts, lows, inverse_steps, points, nearest, weights, out,  # noqa: ANN001
+):  # fmt: skip
+    """Gradients of sum_c weights_nc * d_c: out (N, 3)."""
+    q, gradient = np.zeros(3), np.zeros(3)
+    out[:] = 0.0
+    for n in range(points.shape[0]):
+        for c in range(weights.shape[1]):
+            b = nearest[n, c]
+            if b < 0 or weights[n, c] == 0.0:
+                continue
+            _to_frame(to_body[b], points[n], q)
+            _body_distance(kinds[b], sizes[b], grids, starts[b], counts[b], lows[b], inverse_steps[b], q, gradient)
+            for k in range(3):
+                for i in range(3):
+                    out[n, k] += weights[n, c] * to_body[b, i, k] * gradient[i]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _to_frame(pose, p, q):  # noqa: ANN001, ANN202
+    for k in range(3):
+        q[k] = pose[k, 0] * p[0] + pose[k, 1] * p[1] + pose[k, 2] * p[2] + pose[k, 3]

@@ -1,0 +1,147 @@
+"""The target density p*(d): how often, over the scenes of a task, a design point sees a surface (paper, eq. 3 to 5).
+
+log p*(d) = logsumexp_i [ log w_i - SDF_i(s)^2 / (2 sigma^2) + log T_i(d) ], s = M(d); one term per column, that is
+per scene, or per frame of a moving scene with w_i = 1 / frames. Visibility is only computed for columns whose
+surface term is within `surface_tolerance_nats` (t) of the best one at that point; the others are left out, which
+changes p* by less than columns * exp(-t) of the largest surface proximity there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidardesign.density.fields import Field, build_field, scene_columns
+from lidardesign.density.settings import DensitySettings
+from lidardesign.density.visibility import (
+    NoVisibility,
+    Optics,
+    Quadrature,
+    RayBatch,
+    RayGradient,
+    Raycast,
+    Visibility,
+)
+from lidardesign.scene import Scene
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
+
+PADDING_SIGMAS = 4.0
+EVALUATION_CHUNK = 8192
+# d direction / d sin(elevation) grows without bound at the poles; it is capped at this cosine of the elevation.
+MINIMUM_POLE_COSINE = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """The unnormalised target density of a set of scenes.
+
+    Arguments:
+        field: Distances to the targets, one column per scene and frame.
+        visibility: How occlusion is computed.
+        log_column_weights: log w_i per column, shape (columns,).
+        optics: The final sigma and what goes with it.
+        space: The design space; it fixes the chart that gradients are given in.
+        surface_tolerance_nats: See the module docstring.
+    """
+
+    field: Field
+    visibility: Visibility
+    log_column_weights: np.ndarray
+    optics: Optics
+    space: DesignSpace
+    surface_tolerance_nats: float = 16.0
+
+    def log_density(self, points: np.ndarray, sigma_m: float | None = None) -> np.ndarray:
+        """log p* of design points, (N, 6) to (N,), at the final sigma unless a wider one is given."""
+        return self._in_chunks(points, sigma_m, gradient=False)[0]
+
+    def log_density_and_gradient(
+        self, points: np.ndarray, sigma_m: float | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """log p* and its gradient by the chart coordinates of `space`: (N, 6) to (N,) and (N, 6)."""
+        return self._in_chunks(points, sigma_m, gradient=True)
+
+    def _in_chunks(
+        self, points: np.ndarray, sigma_m: float | None, gradient: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        points = np.asarray(points, dtype=np.float64)
+        optics = self.optics if sigma_m is None else self.optics.widened(sigma_m)
+        values, gradients = np.empty(len(points)), np.empty((len(points) if gradient else 0, 6))
+        for start in range(0, len(points), EVALUATION_CHUNK):
+            rows = slice(start, start + EVALUATION_CHUNK)
+            values[rows], by_chart = self._evaluate(points[rows], optics, gradient)
+            if gradient:
+                gradients[rows] = by_chart
+        return values, gradients
+
+    def _evaluate(self, points: np.ndarray, optics: Optics, gradient: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        rays = RayBatch(
+            np.ascontiguousarray(points[:, :3]),
+            direction(points[:, AZIMUTH], points[:, ELEVATION]),
+            np.ascontiguousarray(points[:, RANGE]),
+        )
+        observed = rays.origins + rays.ranges[:, None] * rays.directions
+        distances = self.field.distances(observed).astype(np.float64)
+        surface = self.log_column_weights - np.square(distances / optics.sigma_m) / 2
+        active = surface >= surface.max(axis=1, keepdims=True) - self.surface_tolerance_nats
+        passed = self.visibility.transmittance(rays, active, optics)
+        terms = np.where(active, surface + passed.log_values, -np.inf)
+        peak = terms.max(axis=1, keepdims=True)
+        shares = np.exp(terms - peak)
+        total = shares.sum(axis=1, keepdims=True)
+        values = (peak + np.log(total))[:, 0]
+        if not gradient:
+            return values, None
+        shares /= total
+        by_point = self.field.gradient(observed, -shares * distances / optics.sigma_m**2)
+        by_ray = passed.gradient(shares)
+        by_ray.origins += by_point
+        by_ray.directions += rays.ranges[:, None] * by_point
+        by_ray.ranges += np.einsum("nk,nk->n", by_point, rays.directions)
+        return values, self._by_chart(points, by_ray)
+
+    def _by_chart(self, points: np.ndarray, by_ray: RayGradient) -> np.ndarray:
+        sin_a, cos_a = np.sin(points[:, AZIMUTH]), np.cos(points[:, AZIMUTH])
+        sin_e, cos_e = np.sin(points[:, ELEVATION]), np.cos(points[:, ELEVATION])
+        by_elevation = np.stack([-sin_e * cos_a, -sin_e * sin_a, cos_e], axis=1)
+        if self.space.measure == "solid_angle":
+            by_elevation /= np.maximum(cos_e, MINIMUM_POLE_COSINE)[:, None]
+        by_azimuth = np.stack([-cos_e * sin_a, cos_e * cos_a, np.zeros_like(sin_a)], axis=1)
+        by_chart = np.empty((len(points), 6))
+        by_chart[:, :3] = by_ray.origins
+        by_chart[:, AZIMUTH] = np.einsum("nk,nk->n", by_ray.directions, by_azimuth)
+        by_chart[:, ELEVATION] = np.einsum("nk,nk->n", by_ray.directions, by_elevation)
+        by_chart[:, RANGE] = by_ray.ranges
+        return by_chart
+
+
+def build_target(
+    scenes: Sequence[Scene], space: DesignSpace, settings: DensitySettings, visibility: str
+) -> Target:
+    """The target of scenes; `visibility` is one of raycast, quadrature, off (see `choose_visibility` for auto)."""
+    optics = Optics.of(settings)
+    fields = {"resolution": settings.field_resolution, "padding_m": PADDING_SIGMAS * settings.sigma_m}
+    field = build_field(scenes, lambda body: body.is_target, **fields)
+    frames = [scenes[index].frames for index, _ in scene_columns(scenes)]
+    return Target(
+        field=field,
+        visibility=_build_visibility(scenes, settings, visibility, field, fields),
+        log_column_weights=-np.log(np.array(frames, dtype=np.float64)),
+        optics=optics,
+        space=space,
+        surface_tolerance_nats=settings.surface_tolerance_nats,
+    )
+
+
+def _build_visibility(
+    scenes: Sequence[Scene], settings: DensitySettings, visibility: str, field: Field, fields: dict
+) -> Visibility:
+    if visibility == "off":
+        return NoVisibility()
+    if visibility == "raycast":
+        return Raycast(scenes)
+    same = all(body.role == "both" for scene in scenes for body in scene.bodies)
+    occluders = field if same else build_field(scenes, lambda body: body.is_occluder, **fields)
+    return Quadrature(occluders, settings.quadrature_points)
