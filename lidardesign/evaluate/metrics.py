@@ -2,13 +2,223 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+from lidardesign.errors import DataError
+from lidardesign.evaluate.sampling import sample_body, sample_triangles
+from lidardesign.scene import Scene
+from lidardesign.simulate.raycast import SceneCaster
+from lidardesign.space import RANGE, DesignSpace, aim
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+# Embree works in float32: its ranges are good to 4e-7 of the scene's size, and worse at grazing incidence
+HIT_TOLERANCE = 1e-4
+RANDOM_ORIGINS = 7  # beside the corners and the centre of a free origin box
+LARGEST_DRAW = 200_000  # candidates per round; bounds memory
+DRAW_ROUNDS = 12
 
 
 def chamfer_m(first: np.ndarray, second: np.ndarray) -> float:
-    """The sum of the two mean nearest distances between point sets, shapes (N, D) and (M, D) [m]."""
+    """The Chamfer distance of two point sets: the sum of the two mean nearest distances [m].
+
+    Arguments:
+        first: Points, shape (N, D).
+        second: Points, shape (M, D).
+    """
     from scipy.spatial import cKDTree
 
     forth, _ = cKDTree(second).query(first)
     back, _ = cKDTree(first).query(second)
     return float(forth.mean() + back.mean())
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceCloud:
+    r"""A surface as points that each know the triangle they lie on.
+
+    Between two clouds of density n the nearest *points* are :math:`0.5 / \sqrt{n}` apart even if the
+    surfaces agree (1.6 mm for 5000 points on a head). Distances to the nearest point's triangle do not have
+    that floor.
+
+    Arguments:
+        points: Area-uniform points [m], shape (K, 3).
+        triangles: Corners of each point's triangle [m], shape (K, 3, 3).
+    """
+
+    points: np.ndarray
+    triangles: np.ndarray
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """The search tree of the points, built once."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.points)
+
+    def distance_m(self, queries: np.ndarray) -> np.ndarray:
+        """Distances to the surface [m], (N, 3) to (N,): exact for the triangle of the nearest point."""
+        _, nearest = self.tree.query(queries)
+        return triangle_distance_m(queries, self.triangles[nearest])
+
+
+def triangle_distance_m(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """The distance of each point to its own triangle [m], (N, 3) and (N, 3, 3) to (N,).
+
+    Over the inside it is the distance to the plane, elsewhere the least of the three edges' distances; a
+    triangle without area has no inside.
+    """
+    corners = [triangles[:, i] for i in range(3)]
+    squared = np.min(
+        [_segment_squared(points, a, b) for a, b in itertools.pairwise([*corners, corners[0]])], axis=0
+    )
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    area = np.einsum("nk,nk->n", normal, normal)
+    inside = area > 0
+    for a, b in itertools.pairwise([*corners, corners[0]]):
+        inside &= np.einsum("nk,nk->n", np.cross(b - a, points - a), normal) >= 0
+    height = np.einsum("nk,nk->n", points - corners[0], normal)
+    above = np.divide(height**2, area, out=np.full(len(points), np.inf), where=inside)
+    return np.sqrt(np.minimum(squared, above))
+
+
+def _segment_squared(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    along, offset = end - start, points - start
+    length = np.einsum("nk,nk->n", along, along)
+    share = np.divide(
+        np.einsum("nk,nk->n", offset, along), length, out=np.zeros(len(points)), where=length > 0
+    )
+    offset -= np.clip(share, 0.0, 1.0)[:, None] * along
+    return np.einsum("nk,nk->n", offset, offset)
+
+
+def delaunay_surface(points: np.ndarray, viewpoint: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """The surface through returns that are neighbours as seen from a viewpoint.
+
+    Delaunay triangulation of the directions in stereographic coordinates about their mean, which maps
+    circles to circles, so that the triangles are those of the sphere. Points are sorted first: the result
+    does not depend on their order, not even on regular grids, where the triangulation is not unique.
+
+    Arguments:
+        points: Measured points [m], shape (N, 3).
+        viewpoint: Where they are seen from [m], shape (3,).
+
+    Returns:
+        Vertices (V, 3) and faces (F, 3), or `None` below 3 directions or when all are collinear.
+    """
+    from scipy.spatial import Delaunay, QhullError
+
+    points = np.unique(np.asarray(points, dtype=np.float64), axis=0)
+    offset = points - viewpoint
+    range_m = np.linalg.norm(offset, axis=1)
+    points, offset, range_m = (values[range_m > 0] for values in (points, offset, range_m))
+    if len(points) < 3:
+        return None
+    plane, seen = _stereographic(offset / range_m[:, None])
+    try:
+        triangulation = Delaunay(plane[seen])
+    except QhullError:  # fewer than 3 points, or all of them collinear
+        return None
+    return points[seen], triangulation.simplices
+
+
+def _stereographic(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates about the mean direction, shape (N, 2), and a mask without the point opposite to it."""
+    mean = directions.mean(axis=0)
+    length = np.linalg.norm(mean)
+    opposite = 1e-9  # directions this near (in 1 + cos) to the antipode have no finite coordinates
+    mean = mean / length if length > opposite else np.array([0.0, 0.0, 1.0])
+    helper = np.eye(3)[np.argmin(np.abs(mean))]
+    right = np.cross(helper, mean) / np.linalg.norm(np.cross(helper, mean))
+    scale = 1 + directions @ mean
+    seen = scale > opposite
+    across = directions @ np.stack([right, np.cross(mean, right)], axis=1)
+    return 2 * across / np.where(seen, scale, 1.0)[:, None], seen
+
+
+def sample_surface(
+    vertices: np.ndarray, faces: np.ndarray, count: int, generator: np.random.Generator
+) -> np.ndarray:
+    """Points uniform in area on a triangle mesh, shape (count, 3) [m], in the order of its faces."""
+    return sample_triangles(vertices, faces, count, generator)[0]
+
+
+def surface_cloud(
+    vertices: np.ndarray, faces: np.ndarray, count: int, generator: np.random.Generator
+) -> SurfaceCloud:
+    """A triangle mesh as area-uniform points with their triangles."""
+    points, chosen = sample_triangles(vertices, faces, count, generator)
+    return SurfaceCloud(points, vertices[faces[chosen]])
+
+
+def visible_surface_points(
+    scene: Scene, space: DesignSpace, count: int, generator: np.random.Generator, *, frame: int = 0
+) -> np.ndarray:
+    """Area-uniform points on targets that some admissible ray sees, (count, 3) [m]: `visible_surface`."""
+    return visible_surface(scene, space, count, generator, frame=frame).points
+
+
+def visible_surface(
+    scene: Scene, space: DesignSpace, count: int, generator: np.random.Generator, *, frame: int = 0
+) -> SurfaceCloud:
+    """The part of the targets' surface that some admissible ray could see: the truth of a metric.
+
+    A point counts when, from one of the tried origins, its direction and distance lie in the space and
+    nothing is in front of it. A free origin box is tried at its corners, its centre and a few random places.
+
+    Raises:
+        DataError: No part of any target can be seen.
+    """
+    caster, origins = SceneCaster(scene, frame), trial_origins(space, generator)
+    targets = [body for body in scene.bodies if body.is_target]
+    points, triangles, found, draw = [], [], 0, 2 * count
+    for _ in range(DRAW_ROUNDS):
+        candidates = sample_body(targets, space, min(draw, LARGEST_DRAW), generator, frame)
+        seen = is_visible(caster, space, origins, candidates.points)
+        points.append(candidates.points[seen])
+        triangles.append(candidates.triangles[seen])
+        found += int(seen.sum())
+        if found >= count:
+            break
+        draw = int(1.5 * (count - found) * len(seen) / max(int(seen.sum()), 1)) + 1
+    if not found:
+        raise DataError(
+            "no admissible ray sees any part of a target",
+            where=f"scene {scene.name!r}",
+            hint="move the sensors, or widen angles and range of the design space, to reach the targets",
+        )
+    keep = np.sort(generator.choice(found, count, replace=found < count))
+    return SurfaceCloud(np.concatenate(points)[keep], np.concatenate(triangles)[keep])
+
+
+def trial_origins(space: DesignSpace, generator: np.random.Generator) -> np.ndarray:
+    """Origins that visibility is tried from, shape (K, 3): corners, centre, random places of the box."""
+    low, high = np.array(space.low[:3]), np.array(space.high[:3])
+    free = np.flatnonzero(low < high)
+    if not len(free):
+        return low[None]
+    corners = np.repeat(low[None], 2 ** len(free), axis=0)
+    corners[:, free] = list(itertools.product(*[(low[i], high[i]) for i in free]))
+    inside = generator.uniform(low, high, (RANDOM_ORIGINS, 3))
+    return np.concatenate([(low + high)[None] / 2, corners, inside])
+
+
+def is_visible(
+    caster: SceneCaster, space: DesignSpace, origins: np.ndarray, points: np.ndarray
+) -> np.ndarray:
+    """Which points an admissible ray from one of the origins sees first, (O, 3) and (N, 3) to (N,) bool."""
+    visible = np.zeros(len(points), dtype=bool)
+    for origin in origins:
+        left = np.flatnonzero(~visible)
+        design = aim(origin, points[left])
+        admissible = space.contains(design) & (design[:, RANGE] > 0)
+        left, design = left[admissible], design[admissible]
+        hits = caster.first_hit(design[:, :3], points[left] - origin)
+        visible[left] = hits.range_m > design[:, RANGE] * (1 - HIT_TOLERANCE)
+    return visible

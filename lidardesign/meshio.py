@@ -1,0 +1,280 @@
+"""Mesh files, read through trimesh and checked: refused or mended with a note, never silently wrong."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from lidardesign.errors import DataError, LidardesignError
+from lidardesign.scene import Mesh, Sign
+
+SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+LARGEST_FILE_BYTES = 2 * 1024**3
+# a triangle whose double area is a smaller share of its longest edge squared has a normal of rounding noise
+FLATTEST_TRIANGLE = 1e-12
+
+
+def list_mesh_files(folder: str | Path) -> list[Path]:
+    """The mesh files directly inside a folder, sorted by name.
+
+    Raises:
+        DataError: No such folder, or no mesh file in it.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise DataError("is not a folder", where=str(folder), hint="name a folder that holds mesh files")
+    entries = sorted(folder.iterdir())
+    files = [
+        p for p in entries if p.suffix.lower() in SUFFIXES and p.is_file() and not p.name.startswith(".")
+    ]
+    if not files:
+        raise DataError("holds no mesh file", where=str(folder), allowed=", ".join(SUFFIXES))
+    return files
+
+
+def load_mesh(path: str | Path, *, sign: Sign = "auto", scale: float = 1.0) -> Mesh:
+    """A checked mesh from a file; all geometry in it becomes one mesh.
+
+    Arguments:
+        path: A file of one of the formats `SUFFIXES`.
+        sign: How the inside is told from the outside, see `check_mesh`.
+        scale: Factor from the file's unit to metres (0.001 for millimetres).
+
+    Raises:
+        DataError: The file is missing, unreadable, empty, or its mesh cannot be used; the message names it.
+    """
+    path = Path(path)
+    if not (np.isfinite(scale) and scale > 0):
+        raise DataError(
+            f"the scale {scale} is no factor to metres", where=str(path), allowed="a positive number"
+        )
+    vertices, faces = _read(path)
+    return check_mesh(vertices * scale, faces, sign=sign, where=str(path))
+
+
+def check_mesh(vertices: Any, faces: Any, *, sign: Sign = "auto", where: str = "mesh") -> Mesh:
+    """A mesh without degenerate, duplicate or dangling parts, with a sign rule that it can bear.
+
+    `auto` takes `solid` for a closed, consistently wound mesh, `winding` for a closed one with mixed winding
+    and `unsigned` for an open one, with a note. Only an explicit `solid` refuses. A mesh that is inside
+    out is turned, with a note.
+
+    Arguments:
+        vertices: Positions [m], shape (V, 3).
+        faces: Vertex indices, shape (F, 3).
+        sign: How the inside is told from the outside.
+        where: The file or object that messages name.
+
+    Raises:
+        DataError: Nothing usable is left, values are not finite, indices are wrong, or `sign` does not fit.
+    """
+    try:
+        vertices = np.asarray(vertices, dtype=np.float64)
+        faces = np.asarray(faces)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"vertices or faces are not numbers ({error})", where=where) from error
+    _refuse_unusable(vertices, faces, where)
+    notes: list[str] = []
+    vertices, faces = _merge_vertices(vertices, faces.astype(np.int64))
+    faces = _drop_bad_faces(vertices, faces, notes)
+    if not len(faces):
+        raise DataError(f"no usable face is left ({'; '.join(notes)})", where=where)
+    used, faces = np.unique(faces, return_inverse=True)
+    vertices, faces = vertices[used], faces.reshape(-1, 3)
+    faces, rule = _oriented(vertices, faces, sign, notes, where)
+    return Mesh(vertices, faces, rule, tuple(notes))
+
+
+def _refuse_unusable(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
+    if vertices.size == 0 or faces.size == 0:
+        raise DataError(
+            "has no faces (an empty or unreadable mesh)", where=where, hint="open it in a mesh viewer"
+        )
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise DataError(
+            f"vertices and faces have shapes {vertices.shape} and {faces.shape}",
+            where=where,
+            allowed="(V, 3) and (F, 3)",
+        )
+    if not np.issubdtype(faces.dtype, np.integer):
+        raise DataError(f"faces are of type {faces.dtype}", where=where, allowed="integer vertex indices")
+    bad = int((~np.isfinite(vertices).all(axis=1)).sum())
+    if bad:
+        raise DataError(
+            f"{bad} of {len(vertices)} vertices are NaN or infinite",
+            where=where,
+            hint="export the mesh again",
+        )
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        wrong = int(((faces < 0) | (faces >= len(vertices))).any(axis=1).sum())
+        raise DataError(
+            f"{wrong} faces name vertices that do not exist", where=where, allowed=f"0 to {len(vertices) - 1}"
+        )
+
+
+def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices at exactly the same place become one, as formats without shared vertices (STL) need."""
+    unique, index = np.unique(vertices + 0.0, axis=0, return_inverse=True)  # -0.0 and 0.0 are one place
+    return unique, index.reshape(-1)[faces]
+
+
+def _drop_bad_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray:
+    edges = np.roll(vertices[faces], -1, axis=1) - vertices[faces]
+    double_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    longest = np.einsum("fek,fek->fe", edges, edges).max(axis=1)
+    degenerate = double_area <= FLATTEST_TRIANGLE * longest
+    if degenerate.any():
+        notes.append(f"dropped {int(degenerate.sum())} degenerate faces (without area)")
+        faces = faces[~degenerate]
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    if len(first) < len(faces):
+        notes.append(f"dropped {len(faces) - len(first)} duplicate faces")
+    return faces[np.sort(first)]
+
+
+def _oriented(
+    vertices: np.ndarray, faces: np.ndarray, sign: Sign, notes: list[str], where: str
+) -> tuple[np.ndarray, Literal["solid", "winding", "unsigned"]]:
+    """Faces that point outwards where that is defined, and the sign rule that holds for them."""
+    open_edges, mixed_edges = edge_defects(faces)
+    if not open_edges and not mixed_edges and signed_volume_m3(vertices, faces) < 0:
+        faces = faces[:, ::-1]
+        notes.append("the mesh was inside out: all faces were turned")
+    defects = [f"{open_edges} open edges"] * bool(open_edges)
+    defects += [f"{mixed_edges} edges between faces of opposite winding"] * bool(mixed_edges)
+    found = " and ".join(defects)
+    if sign == "solid" and found:
+        raise DataError(
+            f"is not a solid: it has {found}",
+            where=where,
+            allowed="a closed, consistently wound mesh",
+            hint="sign: auto, winding or unsigned, or close the mesh",
+        )
+    if sign != "auto":
+        return faces, sign
+    if open_edges:
+        notes.append(f"open mesh ({found}): unsigned distances, no inside")
+        return faces, "unsigned"
+    if mixed_edges:
+        notes.append(f"closed mesh with {found}: the inside is where the winding number is above 1/2")
+        return faces, "winding"
+    return faces, "solid"
+
+
+def edge_defects(faces: np.ndarray) -> tuple[int, int]:
+    """How many edges are open, and how many join faces that run along them the same way.
+
+    An edge is open when an odd number of faces meets there. Where closed parts touch, four faces share an
+    edge, two in each direction: that is no defect.
+    """
+    directed = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+    sense = np.where(directed[:, 0] < directed[:, 1], 1.0, -1.0)
+    _, edge, count = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True)
+    balance = np.bincount(edge.reshape(-1), weights=sense)
+    is_open = count % 2 == 1
+    return int(is_open.sum()), int((~is_open & (balance != 0)).sum())
+
+
+def signed_volume_m3(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """The enclosed volume of a closed mesh [m^3]; negative when its normals point inwards."""
+    a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
+    return float(np.einsum("fk,fk->f", a, np.cross(b, c)).sum() / 6)
+
+
+def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of everything in a file, with every way to fail turned into a `DataError`."""
+    where = str(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise DataError(f"has the suffix {path.suffix!r}", where=where, allowed=", ".join(SUFFIXES))
+    try:
+        data = path.read_bytes() if path.stat().st_size <= LARGEST_FILE_BYTES else None
+    except OSError as error:
+        raise DataError(
+            f"cannot be read ({error.strerror or error})", where=where, hint="check the path"
+        ) from error
+    if data is None:
+        raise DataError("is larger than 2 GiB", where=where, hint="simplify the mesh")
+    if not data.strip():
+        raise DataError("is an empty file", where=where)
+    try:
+        with _quiet_trimesh():
+            return _geometry(path, data)
+    except LidardesignError:
+        raise
+    # loaders raise anything on garbage: IndexError, KeyError, ModuleNotFoundError, struct.error
+    except Exception as error:
+        raise DataError(
+            f"cannot be read as a mesh ({_reason(error)})",
+            where=where,
+            allowed=", ".join(SUFFIXES),
+            hint="open it in a mesh viewer and export it again",
+        ) from error
+
+
+def _reason(error: Exception) -> str:
+    """One line for people; trimesh guesses the encoding of text that is not UTF-8 with an optional package."""
+    if isinstance(error, ModuleNotFoundError):
+        return "its bytes are not UTF-8 text" if error.name == "charset_normalizer" else f"needs {error.name}"
+    return f"{type(error).__name__}: {(str(error) or 'no reason given').splitlines()[0]}"
+
+
+def _geometry(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """All triangles of a file as one mesh, each part at its place in the file's scene."""
+    import trimesh
+
+    suffix = path.suffix.lower()[1:]
+    if suffix == "gltf":
+        json.loads(
+            data
+        )  # on garbage trimesh would silently read a file called model.gltf from the same folder
+    options = {"skip_materials": True} if suffix in ("glb", "gltf", "obj") else {}
+    scene = trimesh.load_scene(
+        io.BytesIO(data), file_type=suffix, resolver=_SameFolder(path), process=False, **options
+    )
+    vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
+    for node in scene.graph.nodes_geometry:
+        transform, name = scene.graph[node]
+        part = scene.geometry[name]
+        if isinstance(part, trimesh.Trimesh):
+            vertices.append(part.vertices @ transform[:3, :3].T + transform[:3, 3])
+            faces.append(np.asarray(part.faces, dtype=np.int64) + count)
+            count += len(part.vertices)
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+class _SameFolder:
+    """Gives loaders the files beside a mesh file (the .bin buffers of a .gltf), nothing from elsewhere."""
+
+    def __init__(self, path: Path) -> None:
+        self._folder = path.resolve().parent
+
+    def get(self, name: str) -> bytes:
+        """The content of a file of the same folder."""
+        path = (self._folder / name).resolve()
+        if path.parent != self._folder:
+            raise DataError(f"refers to {name!r}, which is outside its folder", where=str(self._folder))
+        return path.read_bytes()
+
+    __getitem__ = get
+
+
+@contextmanager
+def _quiet_trimesh() -> Iterator[None]:
+    """Loaders speak through the errors raised here, not through log lines and warnings of their own."""
+    log = logging.getLogger("trimesh")
+    level = log.level
+    log.setLevel(logging.CRITICAL + 1)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        log.setLevel(level)
