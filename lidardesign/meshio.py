@@ -220,7 +220,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _reason(error: Exception) -> str:
-    """One line for people; trimesh guesses the encoding of text that is not UTF-8 with an optional package."""
+    """One line for people; trimesh asks an optional package about text that is not UTF-8."""
     if isinstance(error, ModuleNotFoundError):
         return "its bytes are not UTF-8 text" if error.name == "charset_normalizer" else f"needs {error.name}"
     return f"{type(error).__name__}: {(str(error) or 'no reason given').splitlines()[0]}"
