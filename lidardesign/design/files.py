@@ -1,0 +1,341 @@
+r"""The design file: one readable YAML document with units in its keys (schema: design.schema.json).
+
+Of a sensor's spreads and its intervals one is enough. The spread is authoritative: where a file gives both
+`spread` and `field_of_view_rad` or `gate_m`, they must agree at the file's level. Where it gives only the
+interval, the spread follows, so that people can write designs: with z standard deviations on each side that
+hold `level` of a normal distribution, field of view = 2 z spread and gate = mean range -+ z spread, its start
+cut at 0. Numbers are written with all their digits: what is loaded is bit for bit what was saved.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidardesign.design.document import Locate, Node
+from lidardesign.design.sensor import (
+    DEFAULT_LEVEL,
+    Design,
+    RayTable,
+    Sensor,
+    interval_factor,
+)
+from lidardesign.design.sensor_csv import looks_like_sensor_csv, read_sensor_csv
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.run.files import write_atomic
+from lidardesign.run.yaml import Document, dump_yaml, load_yaml
+
+SCHEMA_VERSION = 1
+SCHEMA_FILE = Path(__file__).with_name("design.schema.json")
+LAYOUTS = ("grid", "density", "scan")
+# A file of a hundred thousand explicit rays; the YAML reader's own limit is for settings.
+MAX_BYTES = 64_000_000
+# How far a written interval may be from the one that the spread gives: digits that a person may have rounded.
+AGREEMENT = 1e-6
+# Weights that sum to 1 within this are taken as they stand, so that loading changes no bit.
+WEIGHT_SUM_TOLERANCE = 1e-9
+# How much below zero rounding may push an eigenvalue of a covariance, relative to the largest.
+COVARIANCE_ROUNDING = 1e-9
+
+REQUIRED = ("schema_version", "sensors")
+OPTIONAL = ("name", "layout", "level", "rays", "ray_table", "constraints", "provenance")
+SENSOR_REQUIRED = ("origin_m", "boresight")
+SENSOR_OPTIONAL = ("name", "weight", "field_of_view_rad", "gate_m", "range_m", "spread", "rays")
+TABLE_KEYS = (
+    "origin_x_m",
+    "origin_y_m",
+    "origin_z_m",
+    "azimuth_rad",
+    "elevation_rad",
+    "gate_start_m",
+    "gate_end_m",
+    "sensor",
+)
+
+
+def design_document(design: Design) -> dict[str, Any]:
+    """The plain document of a design, in the order in which it is written."""
+    document: dict[str, Any] = {
+        "schema_version": SCHEMA_VERSION,
+        "name": design.name,
+        "layout": design.layout,
+        "level": float(design.level),
+        "rays": design.rays,
+        "sensors": [_sensor_document(sensor) for sensor in design.sensors],
+    }
+    if design.ray_table is not None:
+        document["ray_table"] = _table_document(design.ray_table)
+    document["constraints"] = design.constraints
+    document["provenance"] = design.provenance
+    return document
+
+
+def _sensor_document(sensor: Sensor) -> dict[str, Any]:
+    values = sensor.as_dict()
+    rays = values.pop("rays")
+    # the gate's start is cut at 0, so the mean range cannot be told from the gate alone
+    return {**values, "range_m": float(sensor.range_m), "rays": rays}
+
+
+def _table_document(table: RayTable) -> dict[str, list[float] | list[int]]:
+    origin, gate = np.asarray(table.origin_m, np.float64), np.asarray(table.gate_m, np.float64)
+    angles = (np.asarray(table.azimuth_rad, np.float64), np.asarray(table.elevation_rad, np.float64))
+    columns = (*origin.T, *angles, *gate.T, np.asarray(table.sensor, np.int64))
+    return {key: column.tolist() for key, column in zip(TABLE_KEYS, columns, strict=True)}
+
+
+def save_design(design: Design, path: Path) -> None:
+    """Write a design file, atomically.
+
+    Raises:
+        DataError: The file cannot be written.
+        NumericalError: The design holds a number that is not finite.
+    """
+    write_atomic(Path(path), dump_yaml(design_document(design)))
+
+
+def load_design(path: Path) -> Design:
+    """Read a design from a design file or from the research code's sensor CSV, told apart by content.
+
+    The design takes the file's stem as its name, as tables name designs by their files.
+
+    Raises:
+        DataError: The file cannot be read, or a CSV holds what cannot be used (exit 3).
+        ConfigError: The file is not YAML, or not a design (exit 2).
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            head = file.read(4096)
+    except OSError as error:
+        hint = "give a design file, as RUN/designs/NAME.yaml"
+        raise DataError(f"cannot be read: {error.strerror or error}", where=str(path), hint=hint) from None
+    if looks_like_sensor_csv(head):
+        return read_sensor_csv(path)
+    document = load_yaml(path, max_bytes=MAX_BYTES)
+    design = design_from_document(document.value, str(path), locate=document.locate)
+    return replace(design, name=path.stem)
+
+
+def design_from_document(
+    document: Any, where: str = "design", *, locate: Locate | Document | None = None
+) -> Design:
+    """Build a design from its plain document.
+
+    Arguments:
+        document: The mapping of a design file.
+        where: What to call it in messages.
+        locate: Positions of key paths in the file, where there is one.
+
+    Raises:
+        ConfigError: A key is missing, unknown, of the wrong kind, or contradicts another.
+    """
+    if isinstance(locate, Document):
+        locate = locate.locate
+    root = Node(document, (), locate or (lambda _path: where))
+    keys = _versioned(root).mapping(REQUIRED, OPTIONAL)
+    level = keys["level"].number(0, 1) if "level" in keys else DEFAULT_LEVEL
+    if not 0 < level < 1:
+        raise keys["level"].wrong("a share between 0 and 1")
+    sensors = _sensors(keys["sensors"], level)
+    rays = keys["rays"].integer(0) if "rays" in keys else None
+    table = _ray_table(keys["ray_table"], len(sensors)) if "ray_table" in keys else None
+    _check_rays(keys, sensors, rays, table)
+    return Design(
+        name=keys["name"].text() if "name" in keys else Path(where).stem,
+        sensors=sensors,
+        layout=keys["layout"].choice(LAYOUTS) if "layout" in keys else "grid",  # type: ignore[arg-type]
+        rays=rays,
+        ray_table=table,
+        constraints=keys["constraints"].plain() if "constraints" in keys else {},
+        provenance=keys["provenance"].plain() if "provenance" in keys else {},
+        level=level,
+    )
+
+
+def _versioned(root: Node) -> Node:
+    """The root, once it is known to be a design of a version that this program reads."""
+    if not isinstance(root.value, dict) or "sensors" not in root.value:
+        raise ConfigError(
+            "this is no design: it has no key `sensors`",
+            where=root.locate(()),
+            hint="docs/design-file.md shows a design written by hand",
+        )
+    version = root.value.get("schema_version")
+    if isinstance(version, int) and not isinstance(version, bool) and version > SCHEMA_VERSION:
+        raise root.child("schema_version").error(
+            f"is {version}", allowed=str(SCHEMA_VERSION), hint="use a newer version of lidardesign"
+        )
+    if version is not None and version != SCHEMA_VERSION:
+        raise root.child("schema_version").wrong(str(SCHEMA_VERSION))
+    return root
+
+
+def _sensors(node: Node, level: float) -> tuple[Sensor, ...]:
+    nodes = node.items()
+    if not nodes:
+        raise node.error("is empty", allowed="at least one sensor")
+    sensors = tuple(_sensor(item, index, level) for index, item in enumerate(nodes))
+    first: dict[str, int] = {}
+    for index, sensor in enumerate(sensors):
+        if sensor.name in first:
+            raise nodes[index].error(f"has the name of sensors[{first[sensor.name]}], {sensor.name!r}")
+        first[sensor.name] = index
+    return _weighted(node, nodes, sensors)
+
+
+def _weighted(node: Node, nodes: list[Node], sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
+    """Sensors with shares that sum to 1: equal where no sensor has a weight, else in their proportion."""
+    given = [item.value.get("weight") is not None for item in nodes]
+    if not any(given):
+        return tuple(replace(sensor, weight=1 / len(sensors)) for sensor in sensors)
+    if not all(given):
+        missing = nodes[given.index(False)]
+        raise missing.error("has no weight, but another sensor has", hint="give all weights or none")
+    total = math.fsum(sensor.weight for sensor in sensors)
+    if not (math.isfinite(total) and total > 0):
+        raise node.error(f"has weights that sum to {total}", allowed="a finite sum above 0")
+    if abs(total - 1) <= WEIGHT_SUM_TOLERANCE:
+        return sensors
+    return tuple(replace(sensor, weight=sensor.weight / total) for sensor in sensors)
+
+
+def _sensor(node: Node, index: int, level: float) -> Sensor:
+    keys = node.mapping(SENSOR_REQUIRED, SENSOR_OPTIONAL)
+    mean, covariance = _origin(keys["origin_m"])
+    boresight = keys["boresight"].mapping(("azimuth_rad", "elevation_rad"), ("roll_rad",))
+    horizontal, vertical = _angular_spreads(node, keys, level)
+    range_m, spread_range = _range(node, keys, level)
+    return Sensor(
+        name=keys["name"].text() if "name" in keys else f"sensor_{index + 1}",
+        weight=keys["weight"].number(0) if "weight" in keys else 0.0,
+        origin_m=mean,
+        origin_covariance_m2=covariance,
+        azimuth_rad=boresight["azimuth_rad"].number(),
+        elevation_rad=boresight["elevation_rad"].number(-math.pi / 2, math.pi / 2),
+        roll_rad=boresight["roll_rad"].number() if "roll_rad" in boresight else 0.0,
+        spread_horizontal_rad=horizontal,
+        spread_vertical_rad=vertical,
+        range_m=range_m,
+        spread_range_m=spread_range,
+        level=level,
+        rays=keys["rays"].integer(0) if "rays" in keys else None,
+    )
+
+
+def _origin(node: Node) -> tuple[np.ndarray, np.ndarray]:
+    keys = node.mapping(("mean",), ("covariance",))
+    mean = keys["mean"].numbers(3)
+    if "covariance" not in keys:
+        return mean, np.zeros((3, 3))
+    rows = keys["covariance"].items()
+    if len(rows) != 3:
+        raise keys["covariance"].error(f"has {len(rows)} rows", allowed="3 rows of 3 numbers [m^2]")
+    covariance = np.stack([row.numbers(3) for row in rows])
+    slack = COVARIANCE_ROUNDING * np.abs(covariance).max()
+    if np.abs(covariance - covariance.T).max() > slack:
+        raise keys["covariance"].error("is not symmetric")
+    if np.linalg.eigvalsh(covariance).min() < -slack:
+        raise keys["covariance"].error("has a negative eigenvalue", allowed="a covariance matrix [m^2]")
+    return mean, covariance
+
+
+def _angular_spreads(node: Node, keys: dict[str, Node], level: float) -> tuple[float, float]:
+    spreads = (
+        keys["spread"].mapping((), ("horizontal_rad", "vertical_rad", "range_m")) if "spread" in keys else {}
+    )
+    fields = (
+        keys["field_of_view_rad"].mapping((), ("horizontal", "vertical"))
+        if "field_of_view_rad" in keys
+        else {}
+    )
+    full = 2 * interval_factor(level)
+    found = []
+    for axis in ("horizontal", "vertical"):
+        spread, field = spreads.get(f"{axis}_rad"), fields.get(axis)
+        if spread is not None:
+            found.append(spread.number(0))
+            if field is not None:
+                _agree(field, full * found[-1], "radians", level)
+        elif field is not None:
+            found.append(field.number(0, 2 * math.pi) / full)
+        else:
+            raise node.error(
+                f"has neither field_of_view_rad.{axis} nor spread.{axis}_rad", hint="give one of them"
+            )
+    return found[0], found[1]
+
+
+def _range(node: Node, keys: dict[str, Node], level: float) -> tuple[float, float]:
+    """Mean and spread of the range, from two of mean, spread and gate, or from the gate alone."""
+    spreads = keys["spread"].value if "spread" in keys else {}
+    spread = keys["spread"].child("range_m").number(0) if spreads.get("range_m") is not None else None
+    mean = keys["range_m"].number(0) if "range_m" in keys else None
+    half = interval_factor(level)
+    if "gate_m" not in keys:
+        if spread is None or mean is None:
+            raise node.error("has no gate", hint="give gate_m {start, end}, or range_m and spread.range_m")
+        return mean, spread
+    gate = keys["gate_m"].mapping(("start", "end"))
+    start, end = gate["start"].number(0), gate["end"].number(0)
+    if end < start:
+        raise gate["end"].error(f"is {end}, before the gate's start {start}")
+    if spread is None:
+        mean = (start + end) / 2 if mean is None else mean
+        spread = max(end - mean, 0.0) / half
+    elif mean is None:
+        mean = end - half * spread
+    _agree(gate["start"], max(mean - half * spread, 0.0), "m", level, scale=end)
+    _agree(gate["end"], mean + half * spread, "m", level)
+    return mean, spread
+
+
+def _agree(node: Node, expected: float, unit: str, level: float, scale: float = 0.0) -> None:
+    """Refuse an interval that contradicts the spread, which would mean two different sensors."""
+    found = node.number(0)
+    if abs(found - expected) > AGREEMENT * max(expected, found, scale):
+        raise node.error(
+            f"is {found!r} {unit}, but the spread gives {expected:.9g} at level {level:g}",
+            hint="remove either of the two; the other follows",
+        )
+
+
+def _ray_table(node: Node, sensors: int) -> RayTable:
+    keys = node.mapping(TABLE_KEYS)
+    count = len(keys["sensor"].items())
+    column = {key: keys[key].numbers(count) for key in TABLE_KEYS[:3]}
+    column["azimuth_rad"] = keys["azimuth_rad"].numbers(count)
+    column["elevation_rad"] = keys["elevation_rad"].numbers(count, -math.pi / 2, math.pi / 2)
+    start, end = keys["gate_start_m"].numbers(count, 0), keys["gate_end_m"].numbers(count, 0)
+    if (end < start).any():
+        bad = int(np.argmax(end < start))
+        raise keys["gate_end_m"].child(bad).error(f"is {end[bad]}, before the gate's start {start[bad]}")
+    indices = [item.integer(0, sensors - 1) for item in keys["sensor"].items()]
+    return RayTable(
+        origin_m=np.stack([column[key] for key in TABLE_KEYS[:3]], axis=1),
+        azimuth_rad=column["azimuth_rad"],
+        elevation_rad=column["elevation_rad"],
+        gate_m=np.stack([start, end], axis=1),
+        sensor=np.array(indices, dtype=np.int64),
+    )
+
+
+def _check_rays(
+    keys: dict[str, Node], sensors: tuple[Sensor, ...], rays: int | None, table: RayTable | None
+) -> None:
+    """The three places that may count rays must agree."""
+    counts: dict[str, int] = {}
+    if rays is not None:
+        counts["rays"] = rays
+    if all(sensor.rays is not None for sensor in sensors):
+        counts["the sum of sensors[].rays"] = sum(sensor.rays or 0 for sensor in sensors)
+    if table is not None:
+        counts["ray_table"] = len(table.sensor)
+    if len(set(counts.values())) > 1:
+        node = keys.get("rays", keys["sensors"])
+        found = ", ".join(f"{name} {count}" for name, count in counts.items())
+        raise node.error(f"contradicts another count of rays: {found}", hint="remove all but one")
