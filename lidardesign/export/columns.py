@@ -1,0 +1,36 @@
+"""The columns of a ray list, with their units in their names: shared by the csv and npz formats."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidardesign.design.sensor import Design
+from lidardesign.simulate.returns import Rays
+from lidardesign.space import angles
+
+
+def ray_columns(rays: Rays) -> dict[str, np.ndarray]:
+    """Columns by name, each of shape (N,), in the order in which they are written."""
+    azimuth, elevation = angles(rays.direction)
+    return {
+        "origin_x_m": rays.origin_m[:, 0],
+        "origin_y_m": rays.origin_m[:, 1],
+        "origin_z_m": rays.origin_m[:, 2],
+        "direction_x": rays.direction[:, 0],
+        "direction_y": rays.direction[:, 1],
+        "direction_z": rays.direction[:, 2],
+        "azimuth_rad": azimuth,
+        "elevation_rad": elevation,
+        "gate_start_m": rays.gate_m[:, 0],
+        "gate_end_m": rays.gate_m[:, 1],
+        "sensor": rays.sensor,
+        "time_s": rays.time_s,
+    }
+
+
+def losses(design: Design) -> list[str]:
+    """What a ray list says nothing of."""
+    notes = ["sensors appear by index only: their weights, spreads and origin covariances are not held"]
+    if design.constraints:
+        notes.append("the constraints of the design are not held")
+    return notes

@@ -1,0 +1,15 @@
+"""The sensors as the research code's 16-column table; it holds sensors, not rays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lidardesign.design.sensor import Design
+from lidardesign.design.sensor_csv import write_sensor_csv
+from lidardesign.simulate.returns import Rays
+
+
+def write(design: Design, rays: Rays, path: Path) -> list[str]:
+    """Write the file, atomically; returns notes of what the format cannot hold."""
+    notes = write_sensor_csv(design, path)
+    return [*notes, f"the {len(rays)} rays are not held"] if len(rays) else notes
