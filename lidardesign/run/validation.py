@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 import typing
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -59,7 +60,7 @@ def anchor_paths(values: Any, given: Any, model: type[BaseModel], base: Path) ->
 
 def _absolute(value: Any, base: Path) -> Any:
     if isinstance(value, str) and value:
-        return str((base / Path(value).expanduser()).resolve())
+        return os.path.abspath(base / Path(value).expanduser())
     if isinstance(value, list):
         return [_absolute(item, base) for item in value]
     return value
@@ -146,6 +147,7 @@ def _fields_at(model: type[BaseModel], path: KeyPath) -> list[str]:
 
 
 def suggest(key: str, allowed: Iterable[str]) -> str | None:
+    """A hint at the allowed name that an unknown one is most like, if any is."""
     close = difflib.get_close_matches(key, list(allowed), n=1)
     return f"did you mean {close[0]!r}?" if close else None
 

@@ -1,0 +1,156 @@
+"""What commands print and how they end: one JSON document or text for people, messages, exit codes."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+import typer
+
+from lidardesign.cli.environment import TerminatedError
+from lidardesign.errors import LidardesignError
+
+if TYPE_CHECKING:
+    from rich.console import Console as RichConsole
+    from rich.progress import Progress
+
+SCHEMA_VERSION = 1
+EXIT_INTERNAL = 70
+EXIT_INTERRUPTED = 130
+EXIT_BROKEN_PIPE = 141
+EXIT_TERMINATED = 143
+PLAIN_WIDTH = 120
+
+
+def plain_json(value: Any) -> Any:
+    """Values as JSON has them: numpy becomes lists and numbers, paths text, NaN and infinity null."""
+    if isinstance(value, dict):
+        return {str(key): plain_json(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain_json(item) for item in value]
+    if hasattr(value, "tolist"):
+        return plain_json(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+@dataclass
+class Console:
+    """Where a command's output goes.
+
+    Arguments:
+        json: Print one JSON document on stdout and nothing else there.
+        quiet: No progress and no notes.
+        debug: Show tracebacks.
+        output: Where the result goes: the program's stdout.
+        when_interrupted: What to tell the user after Ctrl-C or SIGTERM.
+        answered: Whether the one JSON document was printed; an error after it adds none.
+    """
+
+    json: bool = False
+    quiet: bool = False
+    debug: bool = False
+    output: TextIO = field(default_factory=lambda: sys.stdout)
+    when_interrupted: Callable[[], str | None] = field(default=lambda: None)
+    answered: bool = False
+
+    def rich(self, *, stderr: bool = False) -> RichConsole:
+        """A rich console; it honours NO_COLOR and prints plain text where there is no terminal."""
+        from rich.console import Console as RichConsole
+
+        file = sys.stderr if stderr else self.output
+        width = None if file.isatty() or "COLUMNS" in os.environ else PLAIN_WIDTH
+        return RichConsole(file=file, highlight=False, width=width)
+
+    def note(self, text: str) -> None:
+        """Tell something by the way, on stderr."""
+        if not self.quiet:
+            print(text, file=sys.stderr)
+
+    def result(self, document: dict[str, Any], show: Callable[[RichConsole], None]) -> None:
+        """Give the result: as JSON, or shown for people."""
+        if self.json:
+            self.answered = True
+            print_json(document, self.output)
+        else:
+            show(self.rich())
+
+    @contextlib.contextmanager
+    def progress(self, *columns: str) -> Iterator[Progress | None]:
+        """A progress bar with further fields as columns, on a terminal; None where there is none."""
+        if self.quiet or not sys.stderr.isatty():
+            yield None
+            return
+        from rich.progress import BarColumn, Progress, TextColumn
+
+        shown = [TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %")]
+        fields = [TextColumn("{task.fields[" + name + "]}") for name in columns]
+        with Progress(*shown, *fields, console=self.rich(stderr=True), transient=True) as bar:
+            yield bar
+
+
+def print_json(document: dict[str, Any], output: TextIO | None = None) -> None:
+    """Print the one JSON document of a command, on stdout."""
+    text = json.dumps({"schema_version": SCHEMA_VERSION, **plain_json(document)}, allow_nan=False, indent=2)
+    print(text, file=output or sys.stdout, flush=True)
+
+
+@contextlib.contextmanager
+def command(*, json: bool, quiet: bool, debug: bool) -> Iterator[Console]:
+    """Run a command's body: its errors become one message and an exit code.
+
+    With `--json`, whatever plugins and libraries print meanwhile goes to stderr.
+    """
+    console = Console(json=json, quiet=quiet, debug=debug, output=sys.stdout)
+    try:
+        with contextlib.redirect_stdout(sys.stderr) if json else contextlib.nullcontext():
+            yield console
+        console.output.flush()
+    except (typer.Exit, BrokenPipeError):
+        raise
+    except (Exception, KeyboardInterrupt) as error:
+        raise typer.Exit(report_error(error, console)) from None
+
+
+def report_error(error: BaseException, console: Console) -> int:
+    """Print what went wrong, once, and return the exit code."""
+    document, code, text = describe_error(error, console)
+    if console.json and not console.answered:
+        print_json({"error": document, "exit_code": code}, console.output)
+    print(text, file=sys.stderr)
+    if console.debug:
+        traceback.print_exception(error)
+    return code
+
+
+def describe_error(error: BaseException, console: Console) -> tuple[dict[str, Any], int, str]:
+    """The JSON form of an error, its exit code, and its text for people."""
+    if isinstance(error, LidardesignError):
+        return error.as_dict(), error.exit_code, f"{error.kind} error: {error}"
+    if isinstance(error, KeyboardInterrupt):
+        terminated = isinstance(error, TerminatedError)
+        kind, code = ("terminated", EXIT_TERMINATED) if terminated else ("interrupted", EXIT_INTERRUPTED)
+        further = console.when_interrupted()
+        text = f"{kind}: {further}" if further else kind
+        return {"kind": kind, "message": text}, code, text
+    if isinstance(error, MemoryError):
+        text = "the computer has no memory left; a smaller batch, field_resolution or preset needs less"
+        return {"kind": "memory", "message": text}, EXIT_INTERNAL, f"memory error: {text}"
+    text = f"{type(error).__name__}: {' '.join(str(error).split())}"
+    hint = "this is a fault of lidardesign; --debug shows where, please report it"
+    return (
+        {"kind": "internal", "message": text, "hint": hint},
+        EXIT_INTERNAL,
+        f"internal error: {text}\n  {hint}",
+    )

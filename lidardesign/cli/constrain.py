@@ -1,0 +1,121 @@
+"""`lidardesign constrain`: fit again under constraints; never trains and needs no torch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lidardesign.cli import options
+from lidardesign.cli.console import command
+from lidardesign.cli.fit import GATES, LAYOUTS, fit_and_write
+from lidardesign.cli.runs import check_choice, check_name, need_run, open_target, sensor_count
+
+if TYPE_CHECKING:
+    from lidardesign.design.constraints import Constraints
+    from lidardesign.design.sensor import Design
+    from lidardesign.run.yaml import KeyPath
+
+
+def constrain(
+    target: Annotated[
+        Path, typer.Argument(metavar="RUN|DESIGN", help="A run folder, or a design that came from one.")
+    ],
+    constraints: Annotated[
+        Path | None,
+        typer.Option("--constraints", metavar="FILE", help="YAML file of constraints.", show_default=False),
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="One constraint, as gate.width_m.max=0.1; repeatable.",
+            show_default=False,
+        ),
+    ] = None,
+    sensors: options.Sensors = None,
+    layout: options.Layout = None,
+    rays: options.RayCount = None,
+    gates: options.Gates = "sensor",
+    name: options.Name = "constrained",
+    seed: options.Seed = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Fit sensors again under constraints: no learning, seconds."""
+    with command(json=json, quiet=quiet, debug=debug) as console:
+        check_name(name)
+        check_choice(gates, "--gates", GATES)
+        if layout is not None:
+            check_choice(layout, "--layout", LAYOUTS)
+        count = sensor_count(sensors, None)
+        checked = load_constraints(constraints, overrides or [])
+        opened, design = open_target(target)
+        run = need_run(opened, target)
+        layout = layout or (design.layout if design else "grid")
+        fit_and_write(
+            run,
+            console,
+            command_name="constrain",
+            name=name,
+            seed=run.config.seed if seed is None else seed,
+            constraints=checked,
+            sensors=_sensors(count, checked, design, run.task.defaults.sensors),
+            layout=layout,
+            rays=_rays(rays, checked, design, layout, run.task.defaults.rays),
+            gates=gates,
+        )
+
+
+def load_constraints(file: Path | None, overrides: list[str]) -> Constraints:
+    """Constraints of a file with `--set` laid over it.
+
+    Raises:
+        ConfigError: At file:line:column, or at the `--set` option.
+    """
+    from lidardesign.design.constraints import Constraints
+    from lidardesign.run.overrides import apply_override, parse_override
+    from lidardesign.run.yaml import Document, load_yaml
+
+    document = load_yaml(file) if file else Document({}, "constraints")
+    values: dict[str, Any] = document.mapping
+    origins: dict[KeyPath, str] = {}
+    for text in overrides:
+        override = parse_override(text)
+        origins[apply_override(values, override)] = override.where
+
+    def locate(path: KeyPath) -> str:
+        path = tuple(path)
+        for origin, where in origins.items():
+            if path[: len(origin)] == origin or origin[: len(path)] == path != ():
+                return where
+        return document.locate(path)
+
+    return Constraints.from_mapping(values, where=str(file) if file else "constraints", locate=locate)
+
+
+def _sensors(given: Any, constraints: Constraints, design: Design | None, usual: int) -> Any:
+    """The number of sensors: the option's, then what the constraints ask for, the design's, the task's."""
+    asked = constraints.sensors
+    if given is not None or (asked is not None and asked.count is not None):
+        return given
+    usual = len(design.sensors) if design else usual
+    if asked is None:
+        return usual
+    return min(max(usual, asked.min or usual), asked.max or usual)
+
+
+def _rays(
+    given: int | None, constraints: Constraints, design: Design | None, layout: str, budgets: tuple[int, ...]
+) -> int | None:
+    """The number of rays: the option's, then the constraints', the design's; a ray table needs one."""
+    if given is not None:
+        return given
+    if constraints.budget is not None and constraints.budget.rays is not None:
+        return constraints.budget.rays
+    if design is not None and design.rays is not None:
+        return design.rays
+    return None if layout == "grid" else max(budgets)

@@ -1,0 +1,99 @@
+"""Writing and showing the designs that `fit` and `constrain` make."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console as RichConsole
+
+    from lidardesign.design.check import ConstraintCheck
+    from lidardesign.design.sensor import Design
+
+MAX_SHOWN = 20
+
+
+def number(value: Any, digits: int = 4) -> str:
+    """A figure for people; a dash where there is none."""
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return "-"
+    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
+
+
+def show_design(design: Design, rich: RichConsole) -> None:
+    """Print a design's sensors as a table, with angles in degrees."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    rays = f"{design.rays} rays per frame" if design.rays else "rays per frame left open"
+    title = f"{escape(design.name)}: {len(design.sensors)} sensors, layout {design.layout}, {rays}"
+    table = Table(title=title, title_justify="left")
+    for heading in (
+        "sensor",
+        "weight",
+        "rays",
+        "origin [m]",
+        "azimuth, elevation [deg]",
+        "field of view [deg]",
+        "gate [m]",
+    ):
+        table.add_column(heading, justify="left" if heading == "sensor" else "right", overflow="fold")
+    for sensor in design.sensors[:MAX_SHOWN]:
+        horizontal, vertical = sensor.field_of_view_rad
+        start, end = sensor.gate_m
+        table.add_row(
+            escape(sensor.name),
+            f"{sensor.weight:.3f}",
+            number(sensor.rays),
+            " ".join(f"{value:.3f}" for value in sensor.origin_m),
+            f"{math.degrees(sensor.azimuth_rad):.2f}, {math.degrees(sensor.elevation_rad):.2f}",
+            f"{math.degrees(horizontal):.2f} x {math.degrees(vertical):.2f}",
+            f"{start:.4f} - {end:.4f}",
+        )
+    rich.print(table)
+    if len(design.sensors) > MAX_SHOWN:
+        rich.print(f"... and {len(design.sensors) - MAX_SHOWN} more sensors; --json lists all")
+
+
+def show_constraints(checks: Sequence[ConstraintCheck], rich: RichConsole) -> None:
+    """Print a table of constraints: bound, value and whether it holds."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    if not checks:
+        return
+    table = Table("constraint", "bound", "value", "holds", title="constraints", title_justify="left")
+    for check in checks:
+        bound = check.bound if isinstance(check.bound, str) else number(check.bound, 6)
+        value = check.value if isinstance(check.value, str) else number(check.value, 6)
+        table.add_row(
+            escape(check.name), escape(bound), escape(value), "yes" if check.satisfied else "[bold]no[/bold]"
+        )
+    rich.print(table)
+
+
+def show_fit(document: dict[str, Any], design: Design, checks: Sequence[Any], rich: RichConsole) -> None:
+    """Print what `fit` and `constrain` made."""
+    from rich.markup import escape
+
+    show_design(design, rich)
+    show_constraints(checks, rich)
+    figures = [f"log-likelihood {number(document['log_likelihood'])}", f"ESS {number(document['ess'], 3)}"]
+    if document["admissible_mass"] is not None:
+        figures.append(f"admissible mass {number(document['admissible_mass'], 3)}")
+    rich.print(f"{', '.join(figures)}, {number(document['seconds'], 3)} s")
+    rich.print(f"design: {escape(str(document['design']))}", soft_wrap=True)
+
+
+def write_design(design: Design, run: Path, path: Path) -> None:
+    """Write a design into its run, under the run's lock, and enter it in the manifest."""
+    from lidardesign.design.files import save_design
+    from lidardesign.run.lock import run_lock
+    from lidardesign.run.manifest import record
+
+    with run_lock(run):
+        save_design(design, path)
+        record(run, [path.relative_to(run).as_posix()])

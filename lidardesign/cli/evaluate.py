@@ -1,0 +1,298 @@
+"""`lidardesign evaluate`: score designs on held-out scenes against baselines."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lidardesign.cli import options
+from lidardesign.cli.console import Console, command
+from lidardesign.cli.designs import number
+from lidardesign.cli.runs import open_run, run_of
+from lidardesign.errors import ConfigError, DataError, ThresholdError
+
+if TYPE_CHECKING:
+    from rich.console import Console as RichConsole
+
+    from lidardesign.cli.runs import Run
+    from lidardesign.design.sensor import Design
+    from lidardesign.evaluate.score import Evaluation, EvaluationRequest
+
+
+ALWAYS = ("uniform", "random", "bounding")
+
+
+@dataclass
+class _Entry:
+    """One design to evaluate and the run that it came from."""
+
+    design: Design
+    path: Path
+    run: Run | None
+
+
+def evaluate(
+    targets: Annotated[
+        list[Path], typer.Argument(metavar="RUN|DESIGN...", help="Runs (all their designs) or design files.")
+    ],
+    rays: Annotated[
+        list[int] | None,
+        typer.Option(
+            "--rays", metavar="N", min=1, help="Rays per frame; repeatable.", show_default="the task's"
+        ),
+    ] = None,
+    baseline: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--baseline", metavar="NAME", help="A further baseline; repeatable.", show_default=False
+        ),
+    ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option("--report", metavar="FILE.html", help="Write one HTML page.", show_default=False),
+    ] = None,
+    plots: Annotated[
+        Path | None, typer.Option("--plots", metavar="DIR", help="Write PNG curves.", show_default=False)
+    ] = None,
+    csv: Annotated[
+        Path | None, typer.Option("--csv", metavar="FILE", help="Write the rows as CSV.", show_default=False)
+    ] = None,
+    fail_above: Annotated[
+        float | None,
+        typer.Option(
+            "--fail-above", metavar="VALUE", help="Exit 1 if a design scores above this.", show_default=False
+        ),
+    ] = None,
+    seed: options.Seed = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Score designs on held-out scenes against the baselines uniform, random and bounding."""
+    with command(json=json, quiet=quiet, debug=debug) as console:
+        if fail_above is not None and not math.isfinite(fail_above):
+            raise ConfigError(f"{fail_above}", where="--fail-above", allowed="a finite number")
+        entries, runs = _collect(targets)
+        run = _common_run(_named_apart(entries), runs)
+        request = _request(run, entries, rays, baseline or [], seed)
+        evaluation = _evaluate(request, console)
+        written = _write_files(evaluation, request, report, plots, csv)
+        document = {**evaluation.as_dict(), "files": [str(path) for path in written]}
+        console.result(document, lambda rich: _show(document, written, rich))
+        _check_threshold(document, {entry.design.name for entry in entries}, fail_above)
+
+
+def _collect(targets: list[Path]) -> tuple[list[_Entry], list[Run]]:
+    """The designs that were named, and the runs: of folders all designs, of files the file."""
+    from lidardesign.design.files import load_design
+
+    entries: list[_Entry] = []
+    runs: list[Run] = []
+    for target in targets:
+        if target.is_dir():
+            runs.append(open_run(target))
+            entries += [_Entry(load_design(path), path, runs[-1]) for path in runs[-1].designs()]
+        else:
+            design = load_design(target)
+            entries.append(_Entry(design, target, run_of(design, target)))
+    seen: dict[Path, _Entry] = {}
+    for entry in entries:
+        seen.setdefault(entry.path.resolve(), entry)
+    return list(seen.values()), runs
+
+
+def _named_apart(entries: list[_Entry]) -> list[_Entry]:
+    """Designs of different runs that share a name take their run's name in front."""
+    names = [entry.design.name for entry in entries]
+    for entry in entries:
+        if names.count(entry.design.name) > 1:
+            folder = entry.run.folder if entry.run else entry.path.parent
+            entry.design = replace(entry.design, name=f"{folder.resolve().name}/{entry.design.name}")
+    names = [entry.design.name for entry in entries]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice:
+        raise ConfigError(f"two designs are called {twice!r}", hint="rename one of the files")
+    return entries
+
+
+def _common_run(entries: list[_Entry], runs: list[Run]) -> Run:
+    """The run whose task and configuration all designs are judged by."""
+    candidates = [*runs, *(entry.run for entry in entries if entry.run is not None)]
+    if not candidates:
+        raise ConfigError(
+            "no design names a run that is there, so the task is unknown",
+            hint="give the run folder too: lidardesign evaluate RUN DESIGN",
+        )
+    first = candidates[0]
+    for other in candidates[1:]:
+        if (other.config.task_name, other.config.task, other.config.space) != (
+            first.config.task_name,
+            first.config.task,
+            first.config.space,
+        ):
+            raise ConfigError(
+                f"{first.folder} and {other.folder} differ in task, configuration or design space",
+                hint="evaluate them one by one: scores of different scenes do not compare",
+            )
+    if not entries:
+        raise DataError(
+            "the run has no designs yet", where=str(first.folder), hint=f"lidardesign fit {first.folder}"
+        )
+    return first
+
+
+def _request(
+    run: Run, entries: list[_Entry], rays: list[int] | None, baselines: list[str], seed: int | None
+) -> EvaluationRequest:
+    from lidardesign.design.samples import FILE_NAME, load_samples
+    from lidardesign.evaluate.baselines import BASELINES
+    from lidardesign.evaluate.score import EvaluationRequest
+    from lidardesign.registry import plugin_guard
+
+    unknown = [name for name in baselines if name not in BASELINES]
+    if unknown:
+        raise ConfigError(
+            f"unknown baseline {unknown[0]!r}", where="--baseline", allowed=", ".join(BASELINES)
+        )
+    config, task = run.config, run.task
+    seed = config.seed if seed is None else seed
+    with plugin_guard(task.name):
+        train = task.scenes(config.task, "train", seed)
+        test = task.scenes(config.task, "test", seed)
+    samples = {
+        entry.design.name: load_samples(entry.run.folder)
+        for entry in entries
+        if entry.run is not None and entry.design.layout != "grid" and (entry.run.folder / FILE_NAME).exists()
+    }
+    return EvaluationRequest(
+        task=task,
+        config=config.task,
+        space=config.space,
+        seed=seed,
+        designs=[entry.design for entry in entries],
+        rays=sorted(set(rays or task.defaults.rays)),
+        baselines=tuple(dict.fromkeys([*ALWAYS, *baselines])),
+        samples=samples,
+        train=train,
+        test=test,
+    )
+
+
+def _evaluate(request: EvaluationRequest, console: Console) -> Evaluation:
+    from lidardesign.evaluate.score import evaluate as score
+
+    with console.progress("row") as bar:
+        line = bar.add_task("evaluating", total=None, row="") if bar else None
+
+        def show(done: int, total: int, row: str = "") -> None:
+            if bar is not None and line is not None:
+                bar.update(line, completed=done, total=total, row=row)
+
+        return score(request, progress=show)
+
+
+def _write_files(
+    evaluation: Evaluation,
+    request: EvaluationRequest,
+    report: Path | None,
+    plots: Path | None,
+    csv: Path | None,
+) -> list[Path]:
+    written: list[Path] = []
+    if csv is not None:
+        from lidardesign.evaluate.tables import write_csv
+
+        write_csv(evaluation, csv)
+        written.append(csv)
+    if plots is not None:
+        from lidardesign.evaluate.plots import write_plots
+
+        written += write_plots(evaluation, plots)
+    if report is not None:
+        _write_report(evaluation, request, report)
+        written.append(report)
+    return written
+
+
+def _write_report(evaluation: Evaluation, request: EvaluationRequest, path: Path) -> None:
+    from lidardesign.design.rays import lay_out
+    from lidardesign.evaluate.report import write_report
+
+    rays = {}
+    for design in request.designs:
+        count = design.rays or max(request.rays)
+        rays[design.name] = lay_out(design, count, samples=request.samples.get(design.name))
+    write_report(evaluation, request.designs, rays, request.test[0], path)
+
+
+def _check_threshold(document: dict[str, Any], designs: set[str], limit: float | None) -> None:
+    """Exit 1 where a design scores above the limit; baselines do not count."""
+    if limit is None:
+        return
+    above = [
+        row
+        for row in document["rows"]
+        if row["design"] in designs and not (row["value"] is not None and row["value"] <= limit)
+    ]
+    if above:
+        unit = document["metric"]["unit"]
+        rows = ", ".join(
+            f"{row['design']} with {row['rays']} rays: {number(row['value'])} {unit}" for row in above
+        )
+        raise ThresholdError(rows, where="--fail-above", allowed=f"at most {limit:g} {unit}")
+
+
+def _show(document: dict[str, Any], written: Sequence[Path], rich: RichConsole) -> None:
+    from rich.markup import escape
+
+    metric = document["metric"]
+    figure = f"{metric['name']} [{metric['unit']}], {metric['better']} is better"
+    title = f"{figure}, over {document['scenes']} held-out scenes"
+    _show_rows(document["rows"], escape(title), rich)
+    if document.get("equal_bandwidth"):
+        _show_rows(document["equal_bandwidth"], "at equal bandwidth", rich)
+    _show_paired(document.get("paired", []), escape(metric["unit"]), rich)
+    for path in written:
+        rich.print(f"wrote {escape(str(path))}", soft_wrap=True)
+
+
+def _show_rows(rows: Sequence[dict[str, Any]], title: str, rich: RichConsole) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    for heading in ("design", "rays", "value", "95 % interval", "failures", "Mbit/s", "seconds"):
+        table.add_column(heading, justify="left" if heading == "design" else "right")
+    for row in rows:
+        interval = f"{number(row['ci_low'])} - {number(row['ci_high'])}"
+        cells = (row["rays"], row["value"], interval, row["failures"], row["bandwidth_mbps"], row["seconds"])
+        table.add_row(escape(row["design"]), *(number(cell) for cell in cells))
+    rich.print(table)
+
+
+def _show_paired(paired: Sequence[dict[str, Any]], unit: str, rich: RichConsole) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    if not paired:
+        return
+    table = Table(
+        "a",
+        "b",
+        "rays",
+        f"a - b \\[{unit}]",
+        "95 % interval",
+        title="paired differences",
+        title_justify="left",
+    )
+    for entry in paired:
+        interval = f"{number(entry['ci_low'])} to {number(entry['ci_high'])}"
+        table.add_row(
+            escape(entry["a"]), escape(entry["b"]), str(entry["rays"]), number(entry["difference"]), interval
+        )
+    rich.print(table)

@@ -1,0 +1,113 @@
+"""`lidardesign export`: write a design for other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lidardesign.cli import options
+from lidardesign.cli.console import Console, command
+from lidardesign.errors import ConfigError
+
+if TYPE_CHECKING:
+    from rich.console import Console as RichConsole
+
+    from lidardesign.design.sensor import Design
+    from lidardesign.simulate.returns import Rays
+
+
+def export(
+    design: Annotated[
+        Path | None, typer.Argument(metavar="DESIGN", help="A design file.", show_default=False)
+    ] = None,
+    format_: Annotated[
+        str | None,
+        typer.Option("--format", metavar="NAME", help="Format; --list shows them.", show_default=False),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="PATH", help="File to write.", show_default="beside the design"),
+    ] = None,
+    rays: options.RayCount = None,
+    list_formats: Annotated[bool, typer.Option("--list", help="List the formats.")] = False,
+    seed: options.Seed = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Write a design in another program's format."""
+    with command(json=json, quiet=quiet, debug=debug) as console:
+        if list_formats:
+            _list(console)
+        else:
+            _export(design, format_, out, rays, console)
+
+
+def _list(console: Console) -> None:
+    from lidardesign.export.registry import EXPORTERS
+
+    formats = [
+        {"name": name, "suffix": exporter.suffix, "summary": exporter.summary}
+        for name, exporter in EXPORTERS.items()
+    ]
+
+    def show(rich: RichConsole) -> None:
+        from rich.markup import escape
+        from rich.table import Table
+
+        table = Table("format", "suffix", "what it is")
+        for entry in formats:
+            table.add_row(*(escape(entry[key]) for key in ("name", "suffix", "summary")))
+        rich.print(table)
+
+    console.result({"formats": formats}, show)
+
+
+def _export(
+    path: Path | None, name: str | None, out: Path | None, rays: int | None, console: Console
+) -> None:
+    from lidardesign.design.files import load_design
+    from lidardesign.export.registry import EXPORTERS
+
+    if path is None:
+        raise ConfigError(
+            "no design was given", where="DESIGN", hint="lidardesign export --list shows the formats"
+        )
+    if name not in EXPORTERS:
+        found = "no format was given" if name is None else f"unknown format {name!r}"
+        raise ConfigError(found, where="--format", allowed=", ".join(EXPORTERS))
+    design = load_design(path)
+    exporter = EXPORTERS[name]
+    target = out if out is not None else path.with_suffix(exporter.suffix)
+    if target.exists() and path.exists() and target.samefile(path):
+        raise ConfigError("would overwrite the design itself", where=str(target), hint="give another --out")
+    laid_out = _rays(design, path, rays)
+    notes = list(exporter.write(design, laid_out, target))
+    for note in notes:
+        console.note(f"note: {note}")
+    document = {
+        "design": str(path), "format": name, "out": str(target), "rays": len(laid_out),
+        "bytes": target.stat().st_size if target.is_file() else None, "notes": notes,
+    }  # fmt: skip
+    console.result(
+        document,
+        lambda rich: rich.print(f"wrote {target} ({len(laid_out)} rays)", soft_wrap=True, markup=False),
+    )
+
+
+def _rays(design: Design, path: Path, count: int | None) -> Rays:
+    """The explicit rays of a design; another number than its own may need the samples of its run."""
+    from lidardesign.cli.runs import run_of
+    from lidardesign.design.rays import lay_out
+
+    if count is None and design.rays is None and any(sensor.rays is None for sensor in design.sensors):
+        raise ConfigError("the design leaves the number of rays open", where=str(path), hint="--rays N")
+    samples = None
+    if design.layout != "grid" and count not in (None, design.rays):
+        from lidardesign.design.samples import load_samples
+
+        run = run_of(design, path)
+        samples = load_samples(run.folder) if run else None
+    return lay_out(design, count, samples=samples)

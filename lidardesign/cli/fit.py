@@ -1,0 +1,126 @@
+"""`lidardesign fit`: fit sensors to a learned density."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lidardesign.cli import options
+from lidardesign.cli.console import Console, command
+from lidardesign.cli.runs import check_choice, check_name, open_run, provenance, sensor_count
+
+if TYPE_CHECKING:
+    from lidardesign.cli.runs import Run
+    from lidardesign.design.fit import FitResult
+
+LAYOUTS = ("grid", "density", "scan")
+GATES = ("sensor", "ray")
+
+
+def fit(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder that `learn` made.")],
+    sensors: options.Sensors = None,
+    layout: options.Layout = None,
+    rays: options.RayCount = None,
+    gates: options.Gates = "sensor",
+    name: options.Name = "fit",
+    seed: options.Seed = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Fit sensors to the density of RUN."""
+    with command(json=json, quiet=quiet, debug=debug) as console:
+        check_name(name)
+        layout = check_choice(layout or "grid", "--layout", LAYOUTS)
+        check_choice(gates, "--gates", GATES)
+        count = sensor_count(sensors, None)
+        opened = open_run(run)
+        budget = rays if rays is not None or layout == "grid" else max(opened.task.defaults.rays)
+        fit_and_write(
+            opened,
+            console,
+            command_name="fit",
+            name=name,
+            seed=opened.config.seed if seed is None else seed,
+            sensors=opened.task.defaults.sensors if count is None else count,
+            layout=layout,
+            rays=budget,
+            gates=gates,
+        )
+
+
+def fit_and_write(
+    run: Run,
+    console: Console,
+    *,
+    command_name: str,
+    name: str,
+    seed: int,
+    constraints: Any = None,
+    **choices: Any,
+) -> None:
+    """Fit a design to a run's samples, write it, and give the result.
+
+    Arguments:
+        run: An opened run.
+        console: Where the result goes.
+        command_name: For the design's provenance.
+        name: The design's name and its file's.
+        seed: Root of the random streams.
+        constraints: Checked constraints, or None.
+        choices: sensors, layout, rays and gates, as `lidardesign.design.fit.fit` takes them.
+    """
+    from dataclasses import replace
+
+    from lidardesign.cli.designs import show_fit, write_design
+    from lidardesign.design.fit import fit as fit_design
+    from lidardesign.design.samples import load_samples
+
+    path = run.design_path(name)
+    result: FitResult = fit_design(
+        load_samples(run.folder), constraints=constraints, seed=seed, name=name, **choices
+    )
+    made_by = provenance(run, path, command_name, seed)
+    design = replace(result.design, provenance={**result.design.provenance, **made_by})
+    checks = check_written(design, constraints)
+    write_design(design, run.folder, path)
+    document = {
+        **result.as_dict(),
+        "design": str(path),
+        "constraints": [_check_dict(check) for check in checks],
+    }
+    document["satisfied"] = all(check.satisfied for check in checks)
+    console.result(document, lambda rich: show_fit(document, design, checks, rich))
+
+
+def check_written(design: Any, constraints: Any) -> list[Any]:
+    """Check a design's own text against its constraints with code that the fit does not share.
+
+    Raises:
+        InfeasibleError: A constraint does not hold; nothing was written.
+    """
+    if constraints is None:
+        return []
+    from lidardesign.design.check import check_design
+    from lidardesign.design.files import design_document
+    from lidardesign.errors import InfeasibleError
+    from lidardesign.run.yaml import dump_yaml, parse_yaml
+
+    written = parse_yaml(dump_yaml(design_document(design)), where=design.name).value
+    checks = list(check_design(written, constraints))
+    broken = [check for check in checks if not check.satisfied]
+    if broken:
+        first = broken[0]
+        raise InfeasibleError(
+            f"the best design found breaks {first.name}: {first.value}, bound {first.bound}",
+            conflicts=[check.name for check in broken],
+            hint="loosen one of the constraints; no file was written",
+        )
+    return checks
+
+
+def _check_dict(check: Any) -> dict[str, Any]:
+    return {"name": check.name, "bound": check.bound, "value": check.value, "satisfied": check.satisfied}

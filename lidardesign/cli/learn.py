@@ -1,0 +1,227 @@
+"""`lidardesign learn`: learn where rays are worth firing for a task."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lidardesign.cli import options
+from lidardesign.cli.console import Console, command
+from lidardesign.cli.runs import check_choice
+from lidardesign.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    from rich.console import Console as RichConsole
+
+    from lidardesign.density.learn import LearnProgress, LearnResult
+    from lidardesign.run.config import RunConfig
+    from lidardesign.task import Task
+
+DEVICES = ("auto", "cpu", "cuda")
+STARTED_FILES = {"config.yaml", "manifest.json", ".lock"}
+
+
+def learn(
+    task: Annotated[
+        str, typer.Argument(metavar="TASK", help="Name of a task; `lidardesign tasks` lists them.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="RUN", help="Run folder to make.", show_default="runs/TASK"),
+    ] = None,
+    preset: Annotated[
+        str | None,
+        typer.Option("--preset", metavar="draft|standard|fine", help="Effort.", show_default="standard"),
+    ] = None,
+    config: options.ConfigFile = None,
+    overrides: options.Overrides = None,
+    seed: options.Seed = None,
+    device: Annotated[
+        str, typer.Option("--device", metavar="auto|cpu|cuda", help="Where to compute.")
+    ] = "auto",
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")] = False,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Learn where rays are worth firing: TASK to a run folder."""
+    with command(json=json, quiet=quiet, debug=debug) as console:
+        check_choice(device, "--device", DEVICES)
+        from lidardesign.registry import load_task
+        from lidardesign.run.config import load_run_config, resolve
+
+        plugin = load_task(task)
+        run = out if out is not None else Path("runs") / task
+        given = bool(preset or config or overrides or seed is not None)
+        if resume:
+            _check_can_resume(run)
+            plugin, settings = load_run_config(run)
+            if given or plugin.name != task:
+                _check_same(
+                    settings,
+                    resolve(
+                        load_task(task),
+                        preset=preset,
+                        config_file=config,
+                        overrides=overrides or (),
+                        seed=seed,
+                    ),
+                    run,
+                )
+        else:
+            _check_can_start(run)
+            settings = resolve(
+                plugin, preset=preset, config_file=config, overrides=overrides or (), seed=seed
+            )
+        result = _learn_in_folder(plugin, settings, run, resume, device, console)
+        console.result(_document(result), lambda rich: _show(result, rich))
+
+
+def _check_can_start(run: Path) -> None:
+    """Refuse a folder that holds anything, so that no run is ever overwritten."""
+    if run.is_file():
+        raise ConfigError("is a file", where=f"--out {run}", allowed="a folder that is new or empty")
+    if run.is_dir() and any(run.iterdir()):
+        hint = "continue it with --resume, or give another --out"
+        raise ConfigError(
+            "the folder is not empty", where=f"--out {run}", allowed="a new or empty folder", hint=hint
+        )
+
+
+def _check_can_resume(run: Path) -> None:
+    if not run.is_dir():
+        raise DataError("there is no run to resume", where=str(run), hint="leave out --resume to start it")
+
+
+def _check_same(stored: RunConfig, wanted: RunConfig, run: Path) -> None:
+    """Refuse to resume a run under another configuration."""
+    from lidardesign.run.yaml import leaves
+
+    old, new = dict(leaves(stored.as_document())), dict(leaves(wanted.as_document()))
+    for path in [*old, *new]:
+        if old.get(path) != new.get(path):
+            key = ".".join(map(str, path))
+            raise ConfigError(
+                f"the run was started with {key} = {old.get(path)!r}, not {new.get(path)!r}",
+                where=str(run / "config.yaml"),
+                hint="resume without options, or start a new run with another --out",
+            )
+
+
+def _learn_in_folder(
+    task: Task, settings: RunConfig, run: Path, resume: bool, device: str, console: Console
+) -> LearnResult:
+    from lidardesign.run.config import save_run_config
+    from lidardesign.run.lock import run_lock
+    from lidardesign.run.manifest import start_manifest
+
+    with _undone_on_failure(run), run_lock(run):
+        if not resume:
+            start_manifest(run, command=["lidardesign", *sys.argv[1:]], seed=settings.seed)
+            save_run_config(settings, run)
+        console.when_interrupted = lambda: _interruption(task.name, run)
+        with _progress(console) as progress:
+            from lidardesign.density.learn import learn as learn_density
+
+            return learn_density(task, settings, run, resume=resume, device=device, progress=progress)
+
+
+@contextlib.contextmanager
+def _undone_on_failure(run: Path) -> Iterator[None]:
+    """Make the folder; when nothing was learned before a failure, take away what this command put there."""
+    made = [folder for folder in (run, *run.parents) if not folder.exists()]
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"cannot be made: {error.strerror or error}", where=f"--out {run}") from None
+    started_empty = not any(run.iterdir())
+    try:
+        yield
+    except BaseException:
+        _take_away(run, made, started_empty)
+        raise
+
+
+def _take_away(run: Path, made: list[Path], started_empty: bool) -> None:
+    entries = list(run.iterdir())
+    nothing_learned = all(entry.name in STARTED_FILES or entry.stat().st_size == 0 for entry in entries)
+    if not started_empty or not nothing_learned:
+        return
+    with contextlib.suppress(OSError):
+        for entry in entries:
+            entry.unlink()
+        for folder in made:
+            folder.rmdir()
+
+
+def _interruption(task: str, run: Path) -> str | None:
+    checkpoints = sorted(path.name for path in run.glob("checkpoint*"))
+    if not checkpoints:
+        return "before the first checkpoint; nothing was kept"
+    return (
+        f"the last checkpoint is {run / checkpoints[-1]}\n"
+        f"  continue with: lidardesign learn {task} --out {run} --resume"
+    )
+
+
+@contextlib.contextmanager
+def _progress(console: Console) -> Iterator[Callable[[LearnProgress], None]]:
+    """A function that shows the progress: a bar on a terminal, else one note per phase."""
+    with console.progress("loss", "ess", "left") as bar:
+        line = bar.add_task("learning", total=None, loss="", ess="", left="") if bar else None
+        phase = ""
+
+        def show(now: Any) -> None:
+            nonlocal phase
+            if bar is None or line is None:
+                if now.phase != phase:
+                    console.note(f"{now.phase} ...")
+            else:
+                bar.update(
+                    line,
+                    description=now.phase,
+                    completed=now.step,
+                    total=now.steps or None,
+                    loss=f"loss {now.loss:.3f}" if now.loss is not None else "",
+                    ess=f"ESS {now.ess:.2f}" if now.ess is not None else "",
+                    left=f"{now.seconds_left:.0f} s left" if now.seconds_left is not None else "",
+                )
+            phase = now.phase
+
+        yield show
+
+
+def _document(result: LearnResult) -> dict[str, Any]:
+    return {
+        "run": str(result.run),
+        "task": result.task,
+        "seconds": result.seconds,
+        "steps": result.steps,
+        "ess": result.ess,
+        "kl_nats": result.kl_nats,
+        "log_z": result.log_z,
+        "coverage": result.coverage,
+        "notes": list(result.notes),
+        "timings": dict(result.timings),
+    }
+
+
+def _show(result: LearnResult, rich: RichConsole) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table("", "value", "", title=f"learned {escape(str(result.task))}", title_justify="left")
+    table.add_row("ESS", f"{result.ess:.3f}", "share of the samples that count")
+    table.add_row("KL", f"{result.kl_nats:.3f} nats", "from the learned density to the target")
+    table.add_row("log Z", f"{result.log_z:.3f}", "of the target density")
+    table.add_row("coverage", f"{result.coverage:.3f}", "share of the target's mass that the density reaches")
+    table.add_row("time", f"{result.seconds:.1f} s", f"{result.steps} steps")
+    rich.print(table)
+    for note in result.notes:
+        rich.print(f"note: {escape(note)}")
+    rich.print(f"run: {escape(str(result.run))}", soft_wrap=True)

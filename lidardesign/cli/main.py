@@ -1,0 +1,109 @@
+"""The `lidardesign` program. Only what a command needs is imported, inside that command."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Annotated, Any
+
+import typer
+
+from lidardesign import __version__
+from lidardesign.cli.console import EXIT_BROKEN_PIPE, Console, print_json, report_error
+from lidardesign.cli.constrain import constrain
+from lidardesign.cli.environment import make_streams_tolerant, set_thread_defaults, terminate_cleanly
+from lidardesign.cli.evaluate import evaluate
+from lidardesign.cli.export import export
+from lidardesign.cli.fit import fit
+from lidardesign.cli.learn import learn
+from lidardesign.cli.show import show
+from lidardesign.cli.tasks import tasks_app
+
+EXIT_USAGE = 2
+SETTINGS = {"help_option_names": ["-h", "--help"]}
+
+app = typer.Typer(
+    name="lidardesign",
+    help="Design LiDARs: learn which rays are worth firing, fit sensors, prove what they are worth.",
+    epilog="Exit codes: 0 ok, 1 threshold missed, 2 usage or config, 3 bad input data, "
+    "4 infeasible constraints, 5 numerical failure, 6 plugin failure, 70 internal error, 130 interrupted.",
+    context_settings=SETTINGS,
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+app.add_typer(tasks_app, name="tasks")
+app.command(context_settings=SETTINGS)(learn)
+app.command(context_settings=SETTINGS)(fit)
+app.command(context_settings=SETTINGS)(constrain)
+app.command(context_settings=SETTINGS)(evaluate)
+app.command(context_settings=SETTINGS)(export)
+app.command(context_settings=SETTINGS)(show)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"lidardesign {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def program(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Declare the options of the program itself; the typer object carries its help."""
+
+
+def run(arguments: list[str] | None = None) -> None:
+    """Run the program on command line arguments and exit."""
+    set_thread_defaults()
+    make_streams_tolerant()
+    terminate_cleanly()
+    arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        code = _invoke(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        _forget_stdout()
+        code = EXIT_BROKEN_PIPE
+    sys.exit(code)
+
+
+def _invoke(arguments: list[str]) -> int:
+    """Run typer without letting it print or exit for errors."""
+    console = Console(json="--json" in arguments, debug="--debug" in arguments)
+    try:
+        code: Any = app(arguments, standalone_mode=False)
+    except typer.Exit as error:
+        code = error.exit_code
+    except typer.Abort:
+        return report_error(KeyboardInterrupt(), console)
+    except BrokenPipeError:
+        raise
+    except Exception as error:
+        if not hasattr(error, "format_message"):
+            return report_error(error, console)
+        return _report_usage(error, console)
+    return code if isinstance(code, int) else 0
+
+
+def _report_usage(error: Any, console: Console) -> int:
+    """One message for what typer finds wrong with the command line."""
+    context = getattr(error, "ctx", None)
+    path = context.command_path if context else "lidardesign"
+    message, hint = error.format_message().rstrip(), f"{path} --help"
+    if type(error).__name__ == "NoArgsIsHelpError":
+        print(message, file=sys.stderr)
+        message = "no command was given"
+    if console.json:
+        document = {"kind": "usage", "message": message, "where": path, "hint": hint}
+        print_json({"error": document, "exit_code": EXIT_USAGE})
+    print(f"usage error: {path}: {message}\n  try: {hint}", file=sys.stderr)
+    return EXIT_USAGE
+
+
+def _forget_stdout() -> None:
+    """Point stdout nowhere, so that the interpreter's last flush does not complain about the closed pipe."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,0 +1,143 @@
+"""Runs and designs as commands are given them."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lidardesign.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    from lidardesign.design.sensor import Design
+    from lidardesign.run.config import RunConfig
+    from lidardesign.task import Task
+
+DESIGN_FOLDER = "designs"
+NAME_PATTERN = re.compile(r"[^\W.][\w.+-]{0,99}")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder that was opened: its task and configuration."""
+
+    folder: Path
+    task: Task
+    config: RunConfig
+
+    def design_path(self, name: str) -> Path:
+        """Where a design of this run is written."""
+        return self.folder / DESIGN_FOLDER / f"{name}.yaml"
+
+    def designs(self) -> list[Path]:
+        """The designs of this run by name."""
+        return sorted((self.folder / DESIGN_FOLDER).glob("*.yaml"))
+
+
+def open_run(folder: Path) -> Run:
+    """Open a run folder.
+
+    Raises:
+        DataError: There is none, or it is damaged.
+    """
+    from lidardesign.run.config import load_run_config
+
+    task, config = load_run_config(folder)
+    return Run(folder, task, config)
+
+
+def open_target(path: Path) -> tuple[Run | None, Design | None]:
+    """Open what a command was given: a run folder, or a design file and the run that it came from.
+
+    Returns:
+        (run, None) for a folder, (run or None, design) for a file.
+
+    Raises:
+        DataError: There is no such file or folder, or it cannot be read.
+    """
+    if path.is_dir():
+        return open_run(path), None
+    if not path.exists():
+        raise DataError("no such run or design", where=str(path), hint="give a run folder or a design file")
+    from lidardesign.design.files import load_design
+
+    design = load_design(path)
+    return run_of(design, path), design
+
+
+def run_of(design: Design, path: Path) -> Run | None:
+    """The run that a design came from, if it is there: its provenance names it relative to its file."""
+    named = design.provenance.get("run")
+    if not isinstance(named, str):
+        return None
+    folder = Path(os.path.normpath(path.parent / named))
+    return open_run(folder) if folder.is_dir() else None
+
+
+def need_run(run: Run | None, path: Path) -> Run:
+    """The run of a target.
+
+    Raises:
+        DataError: The design was not made by a run, or the run has gone.
+    """
+    if run is None:
+        raise DataError(
+            "the run of this design is not there",
+            where=str(path),
+            hint="give the run folder, or put the design back into its designs folder",
+        )
+    return run
+
+
+def provenance(run: Run, path: Path, command: str, seed: int, **further: Any) -> dict[str, Any]:
+    """What a design file says about where it came from; the run's place is relative to the design's."""
+    from lidardesign.run.manifest import versions
+
+    return {
+        "command": command,
+        "task": run.task.name,
+        "run": os.path.relpath(run.folder.absolute(), path.parent.absolute()),
+        "seed": seed,
+        "versions": versions(),
+        **further,
+    }
+
+
+def check_name(name: str) -> str:
+    """A design's name, which is also its file's.
+
+    Raises:
+        ConfigError: It could not be a file's name everywhere.
+    """
+    if not NAME_PATTERN.fullmatch(name):
+        allowed = "letters, digits, _, -, + and . (not in front), at most 100"
+        raise ConfigError(f"{name!r} is no name for a design", where="--name", allowed=allowed)
+    return name
+
+
+def check_choice(value: str, option: str, allowed: tuple[str, ...]) -> str:
+    """A value that must be one of a few words.
+
+    Raises:
+        ConfigError: It is none of them.
+    """
+    if value not in allowed:
+        raise ConfigError(f"{value!r}", where=option, allowed=", ".join(allowed))
+    return value
+
+
+def sensor_count(text: str | None, fallback: int | str | None) -> int | str | None:
+    """The value of `--sensors`: a number from 1, `auto`, or the fallback.
+
+    Raises:
+        ConfigError: It is neither.
+    """
+    if text is None:
+        return fallback
+    if text == "auto":
+        return "auto"
+    if not text.isdecimal() or int(text) < 1:
+        raise ConfigError(f"{text!r}", where="--sensors", allowed="a whole number from 1, or auto")
+    return int(text)
