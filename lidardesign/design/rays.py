@@ -1,114 +1,231 @@
 """From a design to the explicit list of rays that it fires.
 
-Budgets are split by largest remainder. Rays start at their sensor's mean origin, are ordered by sensor, and
-fire evenly over the frame: ray i of n starts at i / (n * rate).
+Budgets are split by largest remainder. Rays start at their sensor's mean origin, are ordered by sensor (an
+explicit table keeps its own order), and fire evenly over the frame: ray i of n at i / (n * rate).
 """
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from lidardesign.design.sensor import Design, Sensor, tangent_directions
+from lidardesign.design.grid import field_on_sphere, grid_tangent
+from lidardesign.design.membership import Members, members
+from lidardesign.design.quantise import lloyd
+from lidardesign.design.samples import Samples
+from lidardesign.design.sensor import Design, RayTable, Sensor, tangent_directions
 from lidardesign.errors import ConfigError
 from lidardesign.simulate.returns import Rays
+from lidardesign.space import angles, direction
+from lidardesign.task import random_generator
 
+Gates = Literal["sensor", "ray"]
+DEFAULT_RATE_HZ = 10.0
 # Shares of a ray closer than this are the same share: weights that were normalised differ by a few ulp.
 REMAINDER_DECIMALS = 9
+# Lloyd's cells need no more samples than this: the centre of a cell is then known to a tenth of its width.
+SAMPLES_PER_RAY = 64
+SMALLEST_SAMPLE = 2000
+# A 95 % interval of ranges means nothing from fewer (effective) samples: one in forty lies beyond each end.
+SMALLEST_CELL = 20.0
 
 
 def split_budget(weights: np.ndarray, count: int) -> np.ndarray:
     """Whole numbers of rays in proportion to weights: (G,) to int64 (G,) with the sum `count` exactly.
 
     Largest remainder (Hamilton): every sensor gets the whole part of its quota, the rays left over go to the
-    largest fractional parts, the lower index first where they tie.
+    largest fractional parts, the lower index first where they tie. Too few rays leave some sensors without.
 
     Raises:
         ConfigError: Weights that are negative, not finite or all zero; a negative count.
     """
     weights = np.asarray(weights, dtype=np.float64)
     if weights.ndim != 1 or not len(weights):
-        raise ConfigError(
-            f"weights of shape {weights.shape}", where="budget", allowed="one weight per sensor"
-        )
+        raise ConfigError(f"weights of shape {weights.shape}", where="budget", allowed="one per sensor")
     if not (np.isfinite(weights).all() and (weights >= 0).all() and weights.max() > 0):
         raise ConfigError(
             "weights are negative, not finite or all zero", where="budget", allowed="0 or more, one above 0"
         )
-    if count < 0:
-        raise ConfigError(f"{count} rays", where="budget", allowed="0 or more")
+    if count < 0 or count != int(count):
+        raise ConfigError(f"{count} rays", where="budget", allowed="a whole number of 0 or more")
     scaled = weights / weights.max()
     quotas = scaled / scaled.sum() * count
     shares = np.floor(quotas).astype(np.int64)
     order = np.argsort(-np.round(quotas - shares, REMAINDER_DECIMALS), kind="stable")
-    shares[order[: count - int(shares.sum())]] += 1
+    shares[order[: int(count) - int(shares.sum())]] += 1
     return shares
 
 
-def grid_rows(horizontal: float, vertical: float, count: int) -> np.ndarray:
-    """Rays per row of an even grid: field of view [rad], rays to int64 (rows,), summing to `count`.
+def lay_out(
+    design: Design,
+    count: int | None = None,
+    samples: Samples | None = None,
+    *,
+    gates: Gates = "sensor",
+    rate_hz: float = DEFAULT_RATE_HZ,
+    seed: int = 0,
+) -> Rays:
+    """The rays of a design.
 
-    The number of rows makes the cells as square as whole numbers allow; the rays are spread over them as
-    evenly and as symmetrically as possible, so a k by k budget in a square field is the regular grid.
-    """
-    if count == 0:
-        return np.zeros(0, dtype=np.int64)
-    if vertical <= 0 or horizontal <= 0:
-        rows = 1 if vertical <= 0 else count
-    else:
-        ideal = math.sqrt(count * vertical / horizontal)
-        fewer = max(math.floor(ideal), 1)
-        rows = min(fewer if ideal**2 <= fewer * (fewer + 1) else fewer + 1, count)
-    # floor((2 i n + rows) / (2 rows)) rounds i n / rows half up in whole numbers, without a rounding error
-    edges = (2 * np.arange(rows + 1, dtype=np.int64) * count + rows) // (2 * rows)
-    return np.diff(edges)
-
-
-def grid_tangent(horizontal: float, vertical: float, count: int) -> np.ndarray:
-    """Cell-centred angles of an even grid in a field of view, row by row upwards: shape (count, 2) [rad]."""
-    rows = grid_rows(horizontal, vertical, count)
-    across = [(np.arange(n) + 0.5) / n - 0.5 for n in rows]
-    up = [np.full(n, (row + 0.5) / len(rows) - 0.5) for row, n in enumerate(rows)]
-    if not rows.size:
-        return np.zeros((0, 2))
-    return np.stack([horizontal * np.concatenate(across), vertical * np.concatenate(up)], axis=1)
-
-
-def field_on_sphere(sensor: Sensor) -> tuple[float, float]:
-    """The field of view, shrunk in proportion where its corner would lie beyond the antipode [rad]."""
-    horizontal, vertical = sensor.field_of_view_rad
-    corner = math.hypot(horizontal, vertical) / 2
-    scale = math.pi / corner if corner > math.pi else 1.0
-    return scale * horizontal, scale * vertical
-
-
-def grid_directions(sensor: Sensor, count: int) -> np.ndarray:
-    """Unit vectors of an even grid in a sensor's own field of view, shape (count, 3)."""
-    return tangent_directions(sensor.frame, grid_tangent(*field_on_sphere(sensor), count))
-
-
-def lay_out(design: Design, count: int | None = None, *, rate_hz: float = 10.0) -> Rays:
-    """The rays of a design with an even grid in each sensor's field of view.
+    At the number of rays of its explicit table, the design's table is the answer, gates included. Otherwise
+    `grid` is even in each sensor's field of view; `density` quantises the samples inside each sensor; `scan`
+    fires along each sensor's boresight.
 
     Arguments:
         design: The design.
         count: Rays per frame; None takes the design's own number.
+        samples: Samples of the learned density, for `density` at a new count and for gates per ray.
+        gates: `sensor` gives each ray its sensor's gate; `ray` the interval of the ranges seen around it.
         rate_hz: Frames per second [Hz].
+        seed: For the quantisation.
 
     Raises:
-        ConfigError: No budget is known.
+        ConfigError: No number of rays is known, or the layout at this count needs samples.
     """
-    total = design.rays if count is None else count
-    if total is None:
-        raise ConfigError("the design names no number of rays", where=design.name, hint="give --rays N")
-    shares = split_budget(design.weights, total)
+    total = own_count(design) if count is None else count
+    if design.ray_table is not None and len(design.ray_table.sensor) == total:
+        return _table_rays(design.ray_table, rate_hz)
+    shares = _shares(design, total)
+    seen = members(design, samples.points, samples.weights) if samples is not None else None
+    if seen is None and (gates == "ray" or design.layout == "density") and total:
+        raise _needs_samples(design, total, gates)
+    tangents = [
+        _tangent(design.layout, sensor, int(n), seen[index] if seen else None, seed)
+        for index, (sensor, n) in enumerate(zip(design.sensors, shares, strict=True))
+    ]
     sensor = np.repeat(np.arange(len(shares)), shares)
-    directions = [grid_directions(s, int(n)) for s, n in zip(design.sensors, shares, strict=True)]
-    return Rays(
-        origin_m=np.array([s.origin_m for s in design.sensors])[sensor],
-        direction=np.concatenate(directions),
-        gate_m=np.array([s.gate_m for s in design.sensors])[sensor],
-        sensor=sensor,
-        time_s=np.arange(total) / (max(total, 1) * rate_hz),
+    gate = np.array([s.gate_m for s in design.sensors])[sensor]
+    if gates == "ray" and seen is not None:
+        gate = _ray_gates(design, tangents, seen)
+    looking = [tangent_directions(s.frame, t) for s, t in zip(design.sensors, tangents, strict=True)]
+    origin = np.array([s.origin_m for s in design.sensors], dtype=np.float64)[sensor]
+    return Rays(origin, np.concatenate(looking), gate, sensor, fire_times(int(total), rate_hz))
+
+
+def make_ray_table(
+    design: Design, count: int, samples: Samples | None = None, gates: Gates = "sensor", *, seed: int = 0
+) -> RayTable:
+    """The explicit rays of a design's layout, laid out anew, as they are kept in its file."""
+    rays = lay_out(replace(design, ray_table=None), count, samples, gates=gates, seed=seed)
+    azimuth, elevation = angles(rays.direction)
+    return RayTable(rays.origin_m, azimuth, elevation, rays.gate_m, rays.sensor)
+
+
+def own_count(design: Design) -> int:
+    """The number of rays that a design was made for.
+
+    Raises:
+        ConfigError: The design leaves it open.
+    """
+    if design.rays is not None:
+        return design.rays
+    if design.ray_table is not None:
+        return len(design.ray_table.sensor)
+    if all(sensor.rays is not None for sensor in design.sensors):
+        return sum(sensor.rays or 0 for sensor in design.sensors)
+    if design.layout == "scan":
+        return len(design.sensors)
+    raise ConfigError("the design names no number of rays", where=design.name, hint="give --rays N")
+
+
+def fire_times(count: int, rate_hz: float) -> np.ndarray:
+    """When each ray fires in its frame, i / (n * rate), shape (n,) [s]."""
+    return np.arange(count) / (max(count, 1) * rate_hz)
+
+
+def _shares(design: Design, total: int) -> np.ndarray:
+    """Rays per sensor: the design's own at its own number, one each in a scan, else by weight."""
+    own = [sensor.rays for sensor in design.sensors]
+    if None not in own and sum(n or 0 for n in own) == total:
+        return np.array(own, dtype=np.int64)
+    if design.layout != "scan":
+        return split_budget(design.weights, total)
+    if total != len(design.sensors):
+        raise ConfigError(
+            f"every ray of a scan is a component of its own: it has {own_count(design)} rays, not {total}",
+            where=design.name,
+            hint=f"lidardesign fit RUN --layout scan --rays {total}",
+        )
+    return np.ones(total, dtype=np.int64)
+
+
+def _needs_samples(design: Design, total: int, gates: Gates) -> ConfigError:
+    wanted = "gates per ray" if gates == "ray" else f"{total} rays in the layout `{design.layout}`"
+    return ConfigError(
+        f"{wanted} need samples of the learned density, and a design file alone has none",
+        where=design.name,
+        allowed=f"{len(design.ray_table.sensor)} rays" if design.ray_table is not None else None,
+        hint=f"lidardesign fit RUN --layout {design.layout} --rays {total}",
     )
+
+
+def _table_rays(table: RayTable, rate_hz: float) -> Rays:
+    looking = direction(table.azimuth_rad, table.elevation_rad)
+    return Rays(table.origin_m, looking, table.gate_m, table.sensor, fire_times(len(table.sensor), rate_hz))
+
+
+def _tangent(layout: str, sensor: Sensor, count: int, seen: Members | None, seed: int) -> np.ndarray:
+    """Angles of a sensor's rays in its tangent plane, shape (count, 2) [rad]."""
+    if layout == "scan":
+        return np.zeros((count, 2))
+    even = grid_tangent(*field_on_sphere(sensor), count)
+    if layout == "grid" or seen is None or count == 0:
+        return even
+    return _density_tangent(sensor, count, seen, seed, even)
+
+
+def _density_tangent(sensor: Sensor, count: int, seen: Members, seed: int, even: np.ndarray) -> np.ndarray:
+    """Rays at the centres of Lloyd's cells of the samples inside a sensor; an even grid where too few.
+
+    In two dimensions the centres' density follows the square root of the samples' (Zador 1982): more rays
+    where the density is, and none of its thin parts left without.
+    """
+    generator = random_generator(seed, "density layout")
+    tangent, weights = seen.tangent, seen.weights
+    most = max(SAMPLES_PER_RAY * count, SMALLEST_SAMPLE)
+    if len(seen) > most:
+        tangent, weights = _thinned(tangent, weights, most, generator)
+    if len(np.unique(tangent, axis=0)) < count:
+        return even
+    centres, _ = lloyd(tangent, weights, count, generator)
+    # row by row upwards, as the grid is: an order that depends on where the rays are, not on the seeding
+    return centres[np.lexsort((centres[:, 0], centres[:, 1]))]
+
+
+def _thinned(
+    tangent: np.ndarray, weights: np.ndarray, count: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Systematic resampling to fewer points of equal weight."""
+    cumulative = np.cumsum(weights)
+    positions = (np.arange(count) + generator.uniform()) / count * cumulative[-1]
+    chosen = np.minimum(np.searchsorted(cumulative, positions), len(weights) - 1)
+    return tangent[chosen], np.ones(count)
+
+
+def _ray_gates(design: Design, tangents: list[np.ndarray], seen: list[Members]) -> np.ndarray:
+    """The gate of each ray, from the ranges of the samples that are nearest to it, shape (N, 2) [m]."""
+    gates = []
+    for sensor, tangent, inside in zip(design.sensors, tangents, seen, strict=True):
+        own = np.tile(sensor.gate_m, (len(tangent), 1))
+        if len(tangent) and len(inside):
+            cell = cKDTree(tangent).query(inside.tangent)[1]
+            for ray in range(len(tangent)):
+                _narrow(own[ray], inside.range_m[cell == ray], inside.weights[cell == ray], design.level)
+        gates.append(own)
+    return np.concatenate(gates)
+
+
+def _narrow(gate: np.ndarray, range_m: np.ndarray, weights: np.ndarray, level: float) -> None:
+    """Narrow a gate in place to the central `level` of weighted ranges, where they are enough to say."""
+    if not len(range_m) or weights.sum() ** 2 < SMALLEST_CELL * np.square(weights).sum():
+        return
+    order = np.argsort(range_m, kind="stable")
+    cumulative = np.cumsum(weights[order])
+    share = (cumulative - weights[order] / 2) / cumulative[-1]
+    ends = np.interp([(1 - level) / 2, (1 + level) / 2], share, range_m[order])
+    start, end = max(ends[0], gate[0]), min(ends[1], gate[1])
+    if end > start:
+        gate[:] = start, end

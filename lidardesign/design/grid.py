@@ -1,0 +1,60 @@
+"""The even layout: a cell-centred grid of any number of rays in a sensor's own field of view."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from lidardesign.design.sensor import Sensor
+
+
+def grid_rows(horizontal_rad: float, vertical_rad: float, count: int) -> np.ndarray:
+    """Rays per row of an even grid, int64 (rows,), summing to `count`.
+
+    The number of rows makes the cells as square as whole numbers allow; the rays are spread over the rows as
+    evenly as possible, so a budget of k * k in a square field is the regular k by k grid.
+    """
+    if count == 0:
+        return np.zeros(0, dtype=np.int64)
+    rows = _row_count(horizontal_rad, vertical_rad, count)
+    # floor((2 i n + rows) / (2 rows)) rounds i n / rows half up in whole numbers, without a rounding error
+    edges = (2 * np.arange(rows + 1, dtype=np.int64) * count + rows) // (2 * rows)
+    return np.diff(edges)
+
+
+def _row_count(horizontal_rad: float, vertical_rad: float, count: int) -> int:
+    """The number of rows whose cells are closest to square by ratio; a field without height is one row."""
+    if vertical_rad <= 0:
+        return 1
+    if horizontal_rad <= 0:
+        return count
+    ideal = math.sqrt(count * (vertical_rad / horizontal_rad))
+    if ideal >= count:
+        return count
+    fewer = max(math.floor(ideal), 1)
+    return fewer if ideal**2 <= fewer * (fewer + 1) else min(fewer + 1, count)
+
+
+def grid_tangent(horizontal_rad: float, vertical_rad: float, count: int) -> np.ndarray:
+    """Angles of an even grid in a field of view, row by row upwards, shape (count, 2) [rad].
+
+    Cell-centred: ray i of n in a row stands at -FoV/2 + FoV * (i + 1/2) / n, never on the field's edge.
+    """
+    rows = grid_rows(horizontal_rad, vertical_rad, count)
+    if not rows.size:
+        return np.zeros((0, 2))
+    across = np.concatenate([(np.arange(n) + 0.5) / n - 0.5 for n in rows])
+    up = np.repeat((np.arange(len(rows)) + 0.5) / len(rows) - 0.5, rows)
+    return np.stack([horizontal_rad * across, vertical_rad * up], axis=1)
+
+
+def field_on_sphere(sensor: Sensor) -> tuple[float, float]:
+    """The field of view, shrunk in proportion where its corner would lie beyond the antipode [rad].
+
+    Past the angle pi the tangent plane covers the sphere a second time, so rays there would point elsewhere.
+    """
+    horizontal, vertical = sensor.field_of_view_rad
+    corner = math.hypot(horizontal, vertical) / 2
+    scale = math.pi / corner if corner > math.pi else 1.0
+    return scale * horizontal, scale * vertical
