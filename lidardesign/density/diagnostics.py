@@ -1,0 +1,58 @@
+"""What a learned density is worth: effective sample size, KL divergence, log Z, and coverage.
+
+The first three come from fresh samples of the flow with unclipped importance weights w = p* / p and cannot see a mode
+that the flow dropped. Coverage can: it is the share of the target's mass, estimated from independent proposals, that
+lies where the flow's density is at least a tenth of the normalised target's.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logsumexp
+
+# A point counts as covered where p >= COVERED_RATIO * p* / Z.
+COVERED_RATIO = 0.1
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Figures of a learned density against its target.
+
+    Arguments:
+        ess: (sum w)^2 / (N sum w^2), 0 to 1.
+        kl_nats: KL(p || p* / Z) = mean(log p - log p*) + log Z [nats].
+        log_z: log of the integral of p* over the chart.
+    """
+
+    ess: float
+    kl_nats: float
+    log_z: float
+
+
+def quality(log_prob: np.ndarray, log_target: np.ndarray, groups: np.ndarray | None = None) -> Quality:
+    """ESS, KL and log Z of samples of p, shapes (N,); with `groups` (one per condition value) each is averaged."""
+    if groups is None:
+        return _quality(log_target - log_prob)
+    parts = [_quality((log_target - log_prob)[groups == group]) for group in np.unique(groups)]
+    return Quality(*(float(np.mean([getattr(part, name) for part in parts])) for name in ("ess", "kl_nats", "log_z")))
+
+
+def _quality(log_weights: np.ndarray) -> Quality:
+    log_count = math.log(len(log_weights))
+    log_sum = float(logsumexp(log_weights))
+    log_z = log_sum - log_count
+    ess = math.exp(2 * log_sum - float(logsumexp(2 * log_weights)) - log_count)
+    return Quality(ess=ess, kl_nats=float(log_z - log_weights.mean()), log_z=log_z)
+
+
+def coverage(
+    log_prob: np.ndarray, log_target: np.ndarray, log_proposal: np.ndarray, log_z: float
+) -> float:
+    """The covered share of the target's mass, from proposals with their three log densities, shapes (N,)."""
+    log_mass = log_target - log_proposal
+    mass = np.exp(log_mass - log_mass.max())
+    covered = log_prob >= log_target - log_z + math.log(COVERED_RATIO)
+    return float(mass[covered].sum() / mass.sum())

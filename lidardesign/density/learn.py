@@ -1,0 +1,268 @@
+"""`learn`: from a task's training scenes to a run folder with the flow, its quality and its weighted samples."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lidardesign.density.diagnostics import coverage, quality
+from lidardesign.density.flow import DesignFlow
+from lidardesign.density.objective import Coordinates
+from lidardesign.density.proposals import occluded_share, propose
+from lidardesign.density.target import Target, build_target
+from lidardesign.density.training import PROGRESS, LearnProgress, Trainer, draw_conditions
+from lidardesign.density.visibility import Optics
+from lidardesign.design.samples import Samples, save_samples
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.run.checkpoint import save_arrays
+from lidardesign.run.config import RunConfig
+from lidardesign.run.manifest import note, record
+from lidardesign.scene import Scene
+from lidardesign.space import AZIMUTH
+from lidardesign.task import Task, random_generator
+
+FLOW = "flow.safetensors"
+SAMPLE_CHUNK = 16384
+PROBES = 4096
+OCCLUDED_SHARE_TO_CARE = 1e-3
+CONDITION_GROUPS = 32
+
+
+@dataclass(frozen=True)
+class LearnResult:
+    """What learning reached; `timings` are seconds by phase, `notes` what the user should know."""
+
+    run: str
+    task: str
+    seconds: float
+    steps: int
+    ess: float
+    kl_nats: float
+    log_z: float
+    coverage: float
+    notes: tuple[str, ...] = ()
+    timings: dict[str, float] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The contract's JSON form."""
+        return {**asdict(self), "notes": list(self.notes)}
+
+
+class _Clock:
+    """Seconds by phase."""
+
+    def __init__(self) -> None:
+        self.started = self._mark = time.perf_counter()
+        self.timings: dict[str, float] = {}
+
+    def lap(self, phase: str) -> None:
+        now = time.perf_counter()
+        self.timings[phase] = round(now - self._mark, 3)
+        self._mark = now
+
+
+def learn(
+    task: Task,
+    config: RunConfig,
+    run: Path,
+    *,
+    resume: bool = False,
+    device: str = "auto",
+    progress: Callable[[LearnProgress], None] | None = None,
+) -> LearnResult:
+    """Learn the density of a task into a run folder.
+
+    Arguments:
+        task: The plugin.
+        config: The resolved configuration.
+        run: The run folder; its config.yaml is written by the caller.
+        resume: Continue from the run's checkpoint; the result is that of an uninterrupted run, bit for bit.
+        device: auto, cpu or cuda: where the flow lives. The target is always evaluated on the CPU.
+        progress: Called about every tenth step.
+
+    Raises:
+        ConfigError, DataError: Unusable settings or scenes.
+        DivergenceError: Learning stayed non-finite; the last good checkpoint is kept.
+    """
+    clock = _Clock()
+    place = choose_device(device)
+    scenes = list(task.scenes(config.task, "train", config.seed))
+    if not scenes:
+        raise DataError(f"the task {config.task_name!r} gave no training scenes", where="task")
+    clock.lap("scenes")
+    target, notes = prepare_target(scenes, config)
+    clock.lap("fields")
+    trainer = _trainer(target, config, run, place)
+    if resume:
+        trainer.resume()
+    else:
+        (run / PROGRESS).unlink(missing_ok=True)
+    trainer.train(progress)
+    clock.lap("learning")
+    samples, figures = _measure(trainer, scenes, config)
+    clock.lap("measuring")
+    if trainer.skipped:
+        notes.append(f"{trainer.skipped} steps were not finite and skipped")
+    _store(trainer, samples, config, run)
+    clock.lap("writing")
+    result = LearnResult(
+        run=str(run),
+        task=config.task_name,
+        seconds=round(time.perf_counter() - clock.started, 3),
+        steps=trainer.step,
+        notes=tuple(notes),
+        timings=clock.timings,
+        **figures,
+    )
+    note(run, learn=result.as_dict(), timings=clock.timings)
+    return result
+
+
+def choose_device(name: str) -> torch.device:
+    """The device of a name; auto takes CUDA when it is there.
+
+    Raises:
+        ConfigError: CUDA was asked for and is not there.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("no CUDA device is available", where="--device", allowed="auto, cpu")
+    return torch.device(name)
+
+
+def prepare_target(scenes: Sequence[Scene], config: RunConfig) -> tuple[Target, list[str]]:
+    """The target of training scenes with visibility `auto` decided, and notes on what was decided or is doubtful."""
+    settings, notes = config.density, []
+    visibility = settings.visibility
+    if visibility == "auto":
+        visibility, reason = _choose_visibility(scenes, config)
+        notes.append(reason)
+    target = build_target(scenes, config.space, settings, visibility)
+    if visibility == "quadrature":
+        target, refined = _refine_quadrature(target, scenes, config)
+        notes.extend(refined)
+    notes.extend(_resolution_notes(target, settings.sigma_m))
+    notes.extend(sorted({line for scene in scenes for body in scene.bodies for line in getattr(body.shape, "notes", ())}))
+    return target, notes
+
+
+def _choose_visibility(scenes: Sequence[Scene], config: RunConfig) -> tuple[str, str]:
+    generator = random_generator(config.seed, "visibility")
+    optics = Optics.of(config.density)
+    proposals = propose(scenes, config.space, PROBES, optics.sigma_m, generator)
+    share = occluded_share(scenes, proposals, optics.margin_m + 3 * optics.sigma_m)
+    if share < OCCLUDED_SHARE_TO_CARE:
+        return "off", f"visibility off: of {len(proposals.points)} probed rays {share:.2%} had anything in the way"
+    return "raycast", f"visibility by ray casting: {share:.1%} of {len(proposals.points)} probed rays were occluded"
+
+
+def _refine_quadrature(target: Target, scenes: Sequence[Scene], config: RunConfig) -> tuple[Target, list[str]]:
+    from lidardesign.density.refinement import refine_quadrature
+
+    generator = random_generator(config.seed, "quadrature")
+    proposals = propose(scenes, config.space, PROBES, config.density.sigma_m, generator)
+    return refine_quadrature(target, scenes, proposals.points)
+
+
+def _resolution_notes(target: Target, sigma_m: float) -> list[str]:
+    grid = getattr(target.field, "grid", None)
+    if grid is None or sigma_m >= grid.step / 2:
+        return []
+    return [
+        f"sigma {sigma_m:g} m is below half the field's grid step {grid.step:.3g} m: "
+        "surfaces are blurred more than sigma says; raise density.field_resolution"
+    ]
+
+
+def _trainer(target: Target, config: RunConfig, run: Path, device: torch.device) -> Trainer:
+    coordinates = Coordinates(config.space)
+    if not coordinates.learned:
+        raise ConfigError("every dimension of the design space is fixed", where="space", hint="free at least one")
+    settings = config.learning
+    generator = torch.Generator().manual_seed(config.seed)
+    circular = [config.space.free[n] == AZIMUTH and config.space.full_azimuth for n in coordinates.learned]
+    flow = DesignFlow(
+        len(coordinates.learned),
+        len(coordinates.conditions),
+        layers=settings.layers,
+        hidden=settings.hidden,
+        bins=settings.bins,
+        periodic=circular,
+        generator=generator,
+    ).to(device=device, dtype=getattr(torch, settings.dtype))
+    return Trainer(flow, target, coordinates, settings, run, generator)
+
+
+def draw_samples(trainer: Trainer, count: int) -> Samples:
+    """Fresh samples of the flow with their log density and log target, in chunks."""
+    points, log_prob = [], []
+    with torch.no_grad():
+        for start in range(0, count, SAMPLE_CHUNK):
+            size = min(SAMPLE_CHUNK, count - start)
+            conditions = draw_conditions(trainer.flow, size, trainer.generator)
+            learned, log_density = trainer.flow(trainer.flow.draw_base(size, trainer.generator), conditions)
+            unit = trainer.coordinates.join(learned, conditions)
+            points.append(trainer.coordinates.space.from_unit(unit.cpu().double().numpy()))
+            log_prob.append(log_density.cpu().double().numpy())
+    points = np.concatenate(points)
+    offset = trainer.coordinates.log_condition_density - trainer.coordinates.log_unit_volume
+    return Samples(
+        points, np.concatenate(log_prob) + offset, trainer.target.log_density(points), trainer.coordinates.space
+    )
+
+
+def log_density_of(trainer: Trainer, points: np.ndarray) -> np.ndarray:
+    """The flow's log density per chart volume at any design points, (N, 6) to (N,)."""
+    coordinates = trainer.coordinates
+    like = next(trainer.flow.parameters())
+    unit = torch.as_tensor(coordinates.space.to_unit(points)).to(like)
+    conditions = unit[:, coordinates.conditions] if coordinates.conditions else None
+    with torch.no_grad():
+        parts = [
+            trainer.flow.log_prob(
+                unit[rows][:, coordinates.learned], None if conditions is None else conditions[rows]
+            )
+            for rows in torch.arange(len(unit)).split(SAMPLE_CHUNK)
+        ]
+    log_prob = torch.cat(parts).cpu().double().numpy()
+    return log_prob + coordinates.log_condition_density - coordinates.log_unit_volume
+
+
+def _measure(trainer: Trainer, scenes: Sequence[Scene], config: RunConfig) -> tuple[Samples, dict[str, float]]:
+    samples = draw_samples(trainer, config.learning.samples)
+    found = quality(samples.log_prob, samples.log_target, _condition_groups(samples))
+    generator = random_generator(config.seed, "coverage")
+    proposals = propose(
+        scenes, config.space, config.learning.coverage_proposals, trainer.target.optics.sigma_m, generator
+    )
+    covered = coverage(
+        log_density_of(trainer, proposals.points),
+        trainer.target.log_density(proposals.points),
+        proposals.log_density,
+        found.log_z,
+    )
+    return samples, {"ess": found.ess, "kl_nats": found.kl_nats, "log_z": found.log_z, "coverage": covered}
+
+
+def _condition_groups(samples: Samples) -> np.ndarray | None:
+    conditioned = samples.space.conditioned
+    if not conditioned:
+        return None
+    low, high = np.array(samples.space.low), np.array(samples.space.high)
+    share = (samples.points[:, conditioned[0]] - low[conditioned[0]]) / (high - low)[conditioned[0]]
+    return np.minimum((share * CONDITION_GROUPS).astype(int), CONDITION_GROUPS - 1)
+
+
+def _store(trainer: Trainer, samples: Samples, config: RunConfig, run: Path) -> None:
+    weights = {name: value.detach().cpu().numpy() for name, value in trainer.flow.state_dict().items()}
+    save_arrays(run, FLOW, weights, {"features": trainer.flow.features, "context": trainer.flow.context})
+    save_samples(samples, run)
+    if (run / PROGRESS).exists():
+        record(run, [PROGRESS])

@@ -1,0 +1,239 @@
+"""Training the flow on the target by reverse KL, with annealing, divergence handling and exact resume.
+
+The loss is the mean over flow samples of (1 + eta) log p(d) - log p*(d) (paper, eq. 7). Sigma falls geometrically
+from its start to its final value over the first share of the steps, so that modes are found while they are wide;
+eta falls to zero with it. A step whose loss or gradient is not finite is skipped; several in a row take the last good
+state back and halve the step size; when that does not help either, training stops with the last good checkpoint.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lidardesign.density.flow import DesignFlow
+from lidardesign.density.objective import Coordinates, log_target
+from lidardesign.density.settings import LearningSettings
+from lidardesign.density.target import Target
+from lidardesign.errors import DataError, DivergenceError
+from lidardesign.run.checkpoint import load_arrays, save_arrays
+from lidardesign.run.manifest import record
+
+CHECKPOINT = "checkpoint.safetensors"
+PROGRESS = "progress.jsonl"
+SIGMA_START_RATIO = 10.0
+FINAL_RATE_SHARE = 0.01
+SKIPS_BEFORE_BACKING_OFF = 5
+HALVINGS_BEFORE_GIVING_UP = 6
+SNAPSHOT_STEPS = 50
+PROGRESS_STEPS = 10
+
+
+@dataclass(frozen=True)
+class LearnProgress:
+    """Where learning stands, for progress bars and progress.jsonl.
+
+    Arguments:
+        step, steps: Done and planned.
+        loss: Mean of (1 + eta) log p - log p* over the batch [nats].
+        ess: Effective share of the batch at the present sigma.
+        seconds: Spent so far; seconds_left: estimated.
+        phase: "fields", "learning" or "measuring".
+    """
+
+    step: int
+    steps: int
+    loss: float
+    ess: float
+    seconds: float
+    seconds_left: float
+    phase: str = "learning"
+
+
+@dataclass
+class Trainer:
+    """The state of training: flow, optimiser, random stream and counters."""
+
+    flow: DesignFlow
+    target: Target
+    coordinates: Coordinates
+    settings: LearningSettings
+    run: Path
+    generator: torch.Generator
+    step: int = 0
+    skipped: int = 0
+    skipped_in_a_row: int = 0
+    halvings: int = 0
+    seconds_before: float = 0.0
+    _snapshot: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.optimiser = torch.optim.Adam(self.flow.parameters(), lr=self.settings.rate, betas=(0.9, 0.99))
+        self._started = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Time spent learning, over all resumed parts."""
+        return self.seconds_before + time.perf_counter() - self._started
+
+    def sigma_m(self, step: int) -> float:
+        """The annealed sigma of a step [m]."""
+        final = self.target.optics.sigma_m
+        start = max(self.settings.sigma_start_m or SIGMA_START_RATIO * final, final)
+        fraction = min(step / max(self.settings.anneal * self.settings.steps, 1.0), 1.0)
+        return start * (final / start) ** fraction
+
+    def _rate(self) -> float:
+        share = self.step / self.settings.steps
+        decay = FINAL_RATE_SHARE + (1 - FINAL_RATE_SHARE) * (1 + math.cos(math.pi * share)) / 2
+        return self.settings.rate * decay / 2**self.halvings
+
+    def train(self, progress: Callable[[LearnProgress], None] | None = None) -> None:
+        """Run the remaining steps, with checkpoints; raises DivergenceError."""
+        checkpointed = time.perf_counter()
+        while self.step < self.settings.steps:
+            if self.step % SNAPSHOT_STEPS == 0:
+                self._snapshot = self._state_arrays()
+            loss, ess = self._advance()
+            done = self.step == self.settings.steps
+            if self.step % PROGRESS_STEPS == 0 or done:
+                self._report(loss, ess, progress)
+            if time.perf_counter() - checkpointed > self.settings.checkpoint_seconds:
+                self.save()
+                checkpointed = time.perf_counter()
+        self.save()
+
+    def _advance(self) -> tuple[float, float]:
+        for group in self.optimiser.param_groups:
+            group["lr"] = self._rate()
+        self.optimiser.zero_grad(set_to_none=True)
+        loss, ess = self._loss()
+        if torch.isfinite(loss):
+            loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.flow.parameters(), self.settings.clip_norm)
+        if torch.isfinite(loss) and torch.isfinite(norm):
+            self.optimiser.step()
+            self.skipped_in_a_row = 0
+        else:
+            self._skip()
+        self.step += 1
+        return float(loss.detach()), ess
+
+    def _loss(self) -> tuple[torch.Tensor, float]:
+        base = self.flow.draw_base(self.settings.batch, self.generator)
+        conditions = draw_conditions(self.flow, self.settings.batch, self.generator)
+        learned, log_prob = self.flow(base, conditions)
+        unit = self.coordinates.join(learned, conditions)
+        sigma_m = self.sigma_m(self.step)
+        log_p_star = log_target(unit, self.target, self.coordinates, sigma_m)
+        eta = self.settings.entropy * max(0.0, 1 - self.step / (self.settings.anneal * self.settings.steps + 1))
+        weights = (log_p_star - log_prob).detach().double()
+        ess = torch.exp(2 * weights.logsumexp(0) - (2 * weights).logsumexp(0)) / len(weights)
+        return ((1 + eta) * log_prob - log_p_star).mean(), float(ess)
+
+    def _skip(self) -> None:
+        self.skipped += 1
+        self.skipped_in_a_row += 1
+        if self.skipped_in_a_row < SKIPS_BEFORE_BACKING_OFF:
+            return
+        self.halvings += 1
+        self.skipped_in_a_row = 0
+        if self.halvings > HALVINGS_BEFORE_GIVING_UP:
+            self._restore_arrays(self._snapshot)
+            self.save()
+            raise DivergenceError(
+                f"learning diverged at step {self.step}: loss or gradient stayed non-finite after "
+                f"{self.halvings - 1} halvings of the step size; the last good state is {self.run / CHECKPOINT}",
+                hint="a smaller learning.rate, a larger density.sigma_m, or learning.dtype=float64",
+            )
+        self._restore_arrays(self._snapshot)
+
+    def _report(self, loss: float, ess: float, progress: Callable[[LearnProgress], None] | None) -> None:
+        seconds = self.seconds
+        left = seconds / self.step * (self.settings.steps - self.step)
+        row = {
+            "step": self.step,
+            "loss": loss if math.isfinite(loss) else None,
+            "ess": ess if math.isfinite(ess) else None,
+            "sigma_m": self.sigma_m(self.step),
+            "rate": self._rate(),
+            "skipped": self.skipped,
+            "seconds": round(seconds, 3),
+        }
+        with (self.run / PROGRESS).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+        if progress:
+            progress(LearnProgress(self.step, self.settings.steps, loss, ess, seconds, left))
+
+    def _state_arrays(self) -> dict[str, np.ndarray]:
+        arrays = {f"flow.{name}": value.detach().cpu().numpy().copy() for name, value in self.flow.state_dict().items()}
+        for index, parameter in enumerate(self.flow.parameters()):
+            for name, value in self.optimiser.state.get(parameter, {}).items():
+                arrays[f"adam.{index}.{name}"] = torch.as_tensor(value).cpu().numpy().copy()
+        arrays["generator"] = self.generator.get_state().numpy().copy()
+        return arrays
+
+    def _restore_arrays(self, arrays: dict[str, np.ndarray], *, with_generator: bool = False) -> None:
+        prefix = "flow."
+        flow = {key[len(prefix) :]: torch.as_tensor(value) for key, value in arrays.items() if key.startswith(prefix)}
+        try:
+            self.flow.load_state_dict(flow)
+        except RuntimeError as error:
+            raise DataError(
+                f"the checkpoint is of another flow: {str(error).splitlines()[-1].strip()}",
+                where=str(self.run / CHECKPOINT),
+                hint="resume with the run's own configuration",
+            ) from None
+        for index, parameter in enumerate(self.flow.parameters()):
+            start = f"adam.{index}."
+            found = {key[len(start) :]: torch.as_tensor(v) for key, v in arrays.items() if key.startswith(start)}
+            if found:
+                state = {k: v.clone() if k == "step" else v.clone().to(parameter) for k, v in found.items()}
+                self.optimiser.state[parameter] = state
+        if with_generator:
+            self.generator.set_state(torch.as_tensor(arrays["generator"]))
+
+    def save(self) -> None:
+        """Write the checkpoint."""
+        state = {
+            name: getattr(self, name) for name in ("step", "skipped", "skipped_in_a_row", "halvings")
+        } | {"seconds": self.seconds}
+        save_arrays(self.run, CHECKPOINT, self._state_arrays(), state)
+        if (self.run / PROGRESS).exists():
+            record(self.run, [PROGRESS])
+
+    def resume(self) -> None:
+        """Take the state of the run's checkpoint; progress.jsonl is cut back to it."""
+        arrays, state = load_arrays(self.run, CHECKPOINT)
+        self._restore_arrays(arrays, with_generator=True)
+        self.step, self.skipped = state["step"], state["skipped"]
+        self.skipped_in_a_row, self.halvings = state["skipped_in_a_row"], state["halvings"]
+        self.seconds_before = state["seconds"]
+        path = self.run / PROGRESS
+        if path.exists():
+            kept = [line for line in path.read_text(encoding="utf-8").splitlines() if _step_of(line) <= self.step]
+            path.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+
+
+def _step_of(line: str) -> float:
+    """The step of a progress line; a line that was cut by a kill counts as beyond every checkpoint."""
+    try:
+        return json.loads(line)["step"]
+    except (ValueError, KeyError, TypeError):
+        return math.inf
+
+
+def draw_conditions(flow: DesignFlow, count: int, generator: torch.Generator) -> torch.Tensor | None:
+    """Uniform conditions in [-1, 1], shape (count, context), or None for a flow without any."""
+    if not flow.context:
+        return None
+    like = next(flow.parameters())
+    return (2 * torch.rand(count, flow.context, generator=generator, dtype=torch.float64) - 1).to(like)
