@@ -1,0 +1,402 @@
+"""Rays of a design: exact budgets, even grids, density layouts, gates, and their equivariance."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidardesign.design.grid import grid_rows, grid_tangent
+from lidardesign.design.membership import log_density, members, owners
+from lidardesign.design.rays import lay_out, make_ray_table, own_count, split_budget
+from lidardesign.design.samples import Samples
+from lidardesign.design.sensor import (
+    Design,
+    Sensor,
+    interval_factor,
+    tangent_coordinates,
+    tangent_directions,
+)
+from lidardesign.errors import ConfigError
+from lidardesign.space import DesignSpace, angles, direction
+
+SPACE = DesignSpace((-5, -5, -5, 0, -math.pi / 2, 0), (5, 5, 5, 2 * math.pi, math.pi / 2, 10))
+TURN = 0.7
+
+
+def sensor(name="s", weight=1.0, **changes):
+    values = {
+        "origin_m": np.array([0.1, -0.2, 0.3]), "origin_covariance_m2": np.zeros((3, 3)),
+        "azimuth_rad": 1.0, "elevation_rad": -0.3, "roll_rad": 0.2, "spread_horizontal_rad": 0.12,
+        "spread_vertical_rad": 0.06, "range_m": 1.0, "spread_range_m": 0.1, **changes,
+    }  # fmt: skip
+    return Sensor(name=name, weight=weight, **values)
+
+
+def three_sensors(**changes):
+    return (
+        sensor("a", 0.5, azimuth_rad=0.2, **changes),
+        sensor("b", 0.3, azimuth_rad=1.0, elevation_rad=0.9, **changes),
+        sensor("c", 0.2, azimuth_rad=2.5, spread_range_m=0.3, **changes),
+    )
+
+
+def drawn_from(design, count=6000, seed=0):
+    """Samples of the mixture itself, with random weights."""
+    generator = np.random.default_rng(seed)
+    parts = []
+    for component, n in zip(design.sensors, split_budget(design.weights, count), strict=True):
+        tangent = generator.normal(0, [0.12, 0.06], (n, 2))
+        azimuth, elevation = angles(tangent_directions(component.frame, tangent))
+        distance = np.abs(generator.normal(component.range_m, component.spread_range_m, n))
+        origin = np.tile(component.origin_m, (n, 1))
+        parts.append(np.column_stack([origin, azimuth, elevation, distance]))
+    points = np.concatenate(parts)
+    log_weights = generator.normal(0, 0.3, len(points))
+    return Samples(points, np.zeros(len(points)), log_weights, SPACE)
+
+
+def turned(design, samples, angle):
+    cosine, sine = math.cos(angle), math.sin(angle)
+    turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    moved = tuple(
+        replace(s, origin_m=turn @ s.origin_m, azimuth_rad=s.azimuth_rad + angle) for s in design.sensors
+    )
+    points = samples.points.copy()
+    points[:, :3] = points[:, :3] @ turn.T
+    points[:, 3] += angle
+    return replace(design, sensors=moved), replace_points(samples, points), turn
+
+
+def replace_points(samples, points):
+    return Samples(points, samples.log_prob, samples.log_target, samples.space)
+
+
+def coordinates(design, rays):
+    """Tangent coordinates of every ray in its own sensor, shape (N, 2)."""
+    found = np.zeros((len(rays), 2))
+    for index, component in enumerate(design.sensors):
+        mine = rays.sensor == index
+        found[mine] = tangent_coordinates(component.frame, rays.direction[mine])
+    return found
+
+
+# --- budgets
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    weights=st.lists(st.floats(0, 1e6), min_size=1, max_size=20).filter(lambda w: max(w) > 1e-3),
+    count=st.integers(0, 5000),
+)
+def test_a_budget_sums_exactly_and_no_share_is_a_whole_ray_off(weights, count):
+    shares = split_budget(np.array(weights), count)
+    assert shares.sum() == count
+    assert (shares >= 0).all()
+    quotas = np.array(weights) / math.fsum(weights) * count
+    assert np.abs(shares - quotas).max() < 1 + 1e-6
+    assert (shares[np.array(weights) == 0] == 0).all()
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    weights=st.lists(st.integers(1, 1000), min_size=1, max_size=10, unique=True), count=st.integers(0, 400)
+)
+def test_a_budget_does_not_depend_on_the_scale_of_the_weights(weights, count):
+    weights = np.array(weights, float)
+    assert (split_budget(weights, count) == split_budget(weights / weights.sum(), count)).all()
+
+
+def test_seven_equal_sensors_share_a_hundred_rays_the_first_ones_ahead():
+    assert split_budget(np.full(7, 1 / 7), 100).tolist() == [15, 15, 14, 14, 14, 14, 14]
+    assert split_budget(np.ones(7), 100).tolist() == [15, 15, 14, 14, 14, 14, 14]
+
+
+def test_fewer_rays_than_sensors_leave_some_without():
+    assert split_budget(np.array([1, 1, 1, 1.0]), 2).tolist() == [1, 1, 0, 0]
+    assert split_budget(np.array([0.1, 0.2, 0.7]), 1).tolist() == [0, 0, 1]
+    assert split_budget(np.array([0.1, 0.2, 0.7]), 0).tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("weights", "count"),
+    [([], 3), ([0.0, 0.0], 3), ([-1.0, 2.0], 3), ([np.nan], 3), ([1.0], -1), ([1.0], 2.5)],
+)
+def test_a_budget_that_cannot_be_split_is_refused(weights, count):
+    with pytest.raises(ConfigError, match="budget"):
+        split_budget(np.array(weights), count)
+
+
+# --- grids
+
+
+@settings(max_examples=200, deadline=None)
+@given(count=st.integers(0, 700), horizontal=st.floats(0, 6.2), vertical=st.floats(0, 3.1))
+def test_a_grid_has_exactly_its_rays_spread_over_rows_that_differ_by_one_at_most(count, horizontal, vertical):
+    rows = grid_rows(horizontal, vertical, count)
+    assert rows.sum() == count
+    if count:
+        assert rows.min() >= 1
+        assert rows.max() - rows.min() <= 1
+    tangent = grid_tangent(horizontal, vertical, count)
+    assert tangent.shape == (count, 2)
+    assert (np.abs(tangent[:, 0]) <= horizontal / 2).all()
+    assert (np.abs(tangent[:, 1]) <= vertical / 2).all()
+    if count and min(horizontal, vertical) > 1e-3:
+        assert len(np.unique(tangent, axis=0)) == count
+        np.testing.assert_allclose(tangent.mean(axis=0)[0], 0, atol=1e-9)
+
+
+@pytest.mark.parametrize("side", [1, 2, 5, 6, 10, 14, 19, 24])
+def test_a_square_budget_in_a_square_field_is_the_regular_grid(side):
+    centres = (np.arange(side) + 0.5) / side - 0.5
+    across, up = np.meshgrid(centres, centres)
+    expected = 0.4 * np.stack([across.ravel(), up.ravel()], axis=1)
+    np.testing.assert_allclose(grid_tangent(0.4, 0.4, side**2), expected, atol=1e-15)
+
+
+@given(across=st.integers(1, 25), up=st.integers(1, 25))
+def test_a_budget_in_the_proportion_of_the_field_is_the_regular_grid(across, up):
+    assert grid_rows(0.03 * across, 0.03 * up, across * up).tolist() == [across] * up
+
+
+def test_no_ray_stands_on_the_edge_of_its_field():
+    tangent = grid_tangent(0.5, 0.3, 60)
+    assert np.abs(tangent[:, 0]).max() <= 0.25 - 0.5 / (2 * 10) + 1e-12
+    assert np.abs(tangent[:, 1]).max() <= 0.15 - 0.3 / (2 * 6) + 1e-12
+
+
+@pytest.mark.parametrize("elevation", [-math.pi / 2, -1.2, 0.0, 1.0, math.pi / 2])
+@pytest.mark.parametrize("layout", ["grid", "density"])
+@pytest.mark.parametrize("spread", [0.05, 0.4, 1.7])
+def test_all_rays_are_inside_the_field_of_view_also_straight_down(elevation, layout, spread):
+    looking = sensor(elevation_rad=elevation, spread_horizontal_rad=spread)
+    design = Design("d", (looking,), layout=layout)
+    rays = lay_out(design, 137, drawn_from(design))
+    tangent = coordinates(design, rays)
+    horizontal, vertical = looking.field_of_view_rad
+    assert (np.abs(tangent[:, 0]) <= horizontal / 2 + 1e-9).all()
+    assert (np.abs(tangent[:, 1]) <= vertical / 2 + 1e-9).all()
+    assert len(np.unique(np.round(rays.direction, 9), axis=0)) == 137
+
+
+def test_a_field_beyond_the_sphere_is_shrunk_so_that_no_ray_goes_round():
+    design = Design("d", (sensor(spread_horizontal_rad=4.0, spread_vertical_rad=2.0),))
+    rays = lay_out(design, 50)
+    assert len(np.unique(np.round(rays.direction, 9), axis=0)) == 50
+    assert len(lay_out(design, 1)) == 1
+
+
+# --- lists
+
+
+@pytest.mark.parametrize("layout", ["grid", "density"])
+@pytest.mark.parametrize("gates", ["sensor", "ray"])
+def test_turning_a_design_about_the_vertical_turns_its_rays(layout, gates):
+    design = Design("d", three_sensors(), layout=layout)
+    samples = drawn_from(design)
+    rays = lay_out(design, 100, samples, gates=gates)
+    moved_design, moved_samples, turn = turned(design, samples, TURN)
+    moved = lay_out(moved_design, 100, moved_samples, gates=gates)
+    np.testing.assert_allclose(moved.direction, rays.direction @ turn.T, atol=1e-6)
+    np.testing.assert_allclose(moved.origin_m, rays.origin_m @ turn.T, atol=1e-12)
+    np.testing.assert_allclose(moved.gate_m, rays.gate_m, atol=1e-6)
+
+
+@pytest.mark.parametrize("layout", ["grid", "density"])
+def test_permuting_the_sensors_permutes_their_rays(layout):
+    design = Design("d", three_sensors(), layout=layout)
+    samples = drawn_from(design)
+    order = [2, 0, 1]
+    shuffled = replace(design, sensors=tuple(design.sensors[i] for i in order))
+    rays, other = lay_out(design, 101, samples), lay_out(shuffled, 101, samples)
+    for new, old in enumerate(order):
+        assert (rays.direction[rays.sensor == old] == other.direction[other.sensor == new]).all()
+
+
+@pytest.mark.parametrize("layout", ["grid", "density"])
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 50])
+def test_rays_are_ordered_by_sensor_and_fire_evenly_over_the_frame(layout, count):
+    design = Design("d", three_sensors(), layout=layout)
+    rays = lay_out(design, count, drawn_from(design), rate_hz=20)
+    assert len(rays) == count
+    assert (np.diff(rays.sensor) >= 0).all()
+    np.testing.assert_allclose(rays.time_s, np.arange(count) / (max(count, 1) * 20))
+    assert np.bincount(rays.sensor, minlength=3).tolist() == split_budget(design.weights, count).tolist()
+
+
+def test_the_same_call_gives_the_same_bits():
+    design = Design("d", three_sensors(), layout="density")
+    first, second = (lay_out(design, 60, drawn_from(design), gates="ray") for _ in range(2))
+    assert (first.direction == second.direction).all()
+    assert (first.gate_m == second.gate_m).all()
+
+
+def test_rays_of_each_sensor_can_be_fixed_by_the_design():
+    own = tuple(replace(s, rays=n) for s, n in zip(three_sensors(), (1, 2, 30), strict=True))
+    design = Design("d", own)
+    assert own_count(design) == 33
+    assert np.bincount(lay_out(design).sensor).tolist() == [1, 2, 30]
+    assert np.bincount(lay_out(design, 10).sensor).tolist() == [5, 3, 2]
+
+
+def test_a_design_without_a_number_of_rays_asks_for_one():
+    with pytest.raises(ConfigError, match="--rays"):
+        lay_out(Design("d", three_sensors()))
+
+
+# --- density
+
+
+def test_more_rays_stand_where_the_density_is():
+    generator = np.random.default_rng(0)
+    wide = sensor(azimuth_rad=0.0, elevation_rad=0.0, roll_rad=0.0, spread_horizontal_rad=0.3)
+    dense = generator.normal(0.25, 0.05, 9000)
+    thin = generator.uniform(-0.5, 0.5, 1000)
+    azimuth = np.concatenate([dense, thin])
+    elevation = generator.normal(0, 0.05, 10000)
+    origin = np.tile(wide.origin_m, (10000, 1))
+    points = np.column_stack([origin, azimuth, elevation, np.full(10000, 1.0)])
+    samples = Samples(points, np.zeros(10000), np.zeros(10000), SPACE)
+    tangent = coordinates(Design("d", (wide,)), lay_out(Design("d", (wide,), layout="density"), 100, samples))
+    near = np.abs(tangent[:, 0] - 0.25) < 0.1
+    assert near.sum() > 55
+    assert (tangent[:, 0] < 0).sum() > 5
+
+
+def test_a_density_layout_needs_samples_unless_its_table_has_that_many_rays():
+    design = Design("d", three_sensors(), layout="density", rays=40)
+    samples = drawn_from(design)
+    kept = replace(design, ray_table=make_ray_table(design, 40, samples, "ray"))
+    direct, tabled = lay_out(design, 40, samples, gates="ray"), lay_out(kept)
+    np.testing.assert_allclose(direct.direction, tabled.direction, atol=1e-15)
+    assert (direct.gate_m == tabled.gate_m).all()
+    with pytest.raises(ConfigError, match="samples"):
+        lay_out(kept, 41)
+    assert len(lay_out(kept, 41, samples)) == 41
+    assert len(lay_out(design, 0)) == 0
+
+
+def test_a_sensor_with_too_few_samples_falls_back_to_the_grid():
+    design = Design("d", three_sensors(), layout="density")
+    few = drawn_from(design).subset(np.arange(5))
+    even = lay_out(replace(design, layout="grid"), 60)
+    assert (lay_out(design, 60, few).direction == even.direction).all()
+
+
+def test_every_ray_of_a_scan_is_a_component():
+    design = Design("d", three_sensors(), layout="scan")
+    rays = lay_out(design)
+    assert len(rays) == 3
+    np.testing.assert_allclose(rays.direction, [s.boresight for s in design.sensors], atol=1e-15)
+    with pytest.raises(ConfigError, match="--layout scan --rays 4"):
+        lay_out(design, 4)
+
+
+# --- gates
+
+
+@pytest.mark.parametrize("layout", ["grid", "density"])
+def test_a_gate_per_ray_is_within_its_sensors_gate_and_holds_the_level_of_what_it_sees(layout):
+    design = Design("d", (sensor(),), layout=layout, level=0.9)
+    samples = drawn_from(design, 20000)
+    rays = lay_out(design, 30, samples, gates="ray")
+    start, end = design.sensors[0].gate_m
+    assert (rays.gate_m[:, 0] >= start).all()
+    assert (rays.gate_m[:, 1] <= end).all()
+    assert (rays.gate_m[:, 1] > rays.gate_m[:, 0]).all()
+    inside = members(design, samples.points, samples.weights)[0]
+    tangent = coordinates(design, rays)
+    cell = np.square(inside.tangent[:, None] - tangent[None]).sum(-1).argmin(axis=1)
+    gate = rays.gate_m[cell]
+    held = (inside.range_m >= gate[:, 0]) & (inside.range_m < gate[:, 1])
+    assert np.average(held, weights=inside.weights) == pytest.approx(0.9, abs=0.01)
+
+
+def test_a_slanted_surface_needs_a_fraction_of_the_gate_per_ray():
+    generator = np.random.default_rng(1)
+    flat = sensor(azimuth_rad=0.0, elevation_rad=0.0, roll_rad=0.0, spread_horizontal_rad=0.2)
+    azimuth = generator.uniform(-0.3, 0.3, 8000)
+    distance = 1.0 + 0.5 * azimuth + generator.normal(0, 0.005, 8000)
+    elevation = generator.uniform(-0.1, 0.1, 8000)
+    points = np.column_stack([np.tile(flat.origin_m, (8000, 1)), azimuth, elevation, distance])
+    samples = Samples(points, np.zeros(8000), np.zeros(8000), SPACE)
+    rays = lay_out(Design("d", (flat,)), 100, samples, gates="ray")
+    seen = np.abs(coordinates(Design("d", (flat,)), rays)[:, 0]) < 0.25
+    assert np.ptp(rays.gate_m[seen], axis=1).mean() < 0.25 * np.ptp(flat.gate_m)
+
+
+def test_gates_per_ray_need_samples_and_fall_back_where_there_are_few():
+    design = Design("d", (sensor(),))
+    with pytest.raises(ConfigError, match="gates per ray"):
+        lay_out(design, 10, gates="ray")
+    few = drawn_from(design, 12)
+    assert (lay_out(design, 10, few, gates="ray").gate_m == np.array(design.sensors[0].gate_m)).all()
+
+
+def test_a_gate_that_would_begin_behind_the_sensor_begins_at_it():
+    rays = lay_out(Design("d", (sensor(range_m=0.05, spread_range_m=0.2),)), 4)
+    assert (rays.gate_m[:, 0] == 0).all()
+
+
+# --- membership
+
+
+def test_the_log_density_is_the_naive_product_of_normals_up_to_a_constant():
+    covariance = np.array([[0.04, 0.01, 0.0], [0.01, 0.09, 0.02], [0.0, 0.02, 0.05]])
+    component = sensor(origin_covariance_m2=covariance)
+    generator = np.random.default_rng(3)
+    points = np.column_stack(
+        [component.origin_m + generator.normal(0, 0.2, (50, 3)), generator.normal(1, 0.3, 50),
+         generator.normal(-0.3, 0.2, 50), generator.normal(1, 0.1, 50)]
+    )  # fmt: skip
+    naive = []
+    for x, y, z, azimuth, elevation, distance in points:
+        offset = np.array([x, y, z]) - component.origin_m
+        looking = direction(azimuth, elevation)
+        forward, right, up = component.frame
+        angle = math.acos(looking @ forward)
+        scale = angle / math.sin(angle)
+        u, v = scale * (looking @ right), scale * (looking @ up)
+        squares = offset @ np.linalg.solve(covariance, offset) + (u / 0.12) ** 2 + (v / 0.06) ** 2
+        squares += ((distance - 1.0) / 0.1) ** 2
+        constant = -0.5 * math.log(np.linalg.det(covariance)) - math.log(0.12 * 0.06 * 0.1)
+        naive.append(-squares / 2 + constant + math.log(scale))
+    np.testing.assert_allclose(log_density(component, points, smallest_m=1e-6), naive, rtol=1e-9)
+
+
+def test_a_sample_belongs_to_the_nearer_of_two_pinned_sensors_and_to_none_without_weight():
+    left, right = (
+        sensor("l", 0.5, origin_m=np.array([-1.0, 0, 0])),
+        sensor("r", 0.5, origin_m=np.array([1.0, 0, 0])),
+    )
+    points = np.array([[-0.9, 0, 0, 1.0, -0.3, 1.0], [0.8, 0, 0, 1.0, -0.3, 1.0]])
+    assert owners(Design("d", (left, right)), points).tolist() == [0, 1]
+    assert owners(Design("d", (left, replace(right, weight=0.0))), points).tolist() == [0, 0]
+
+
+def test_samples_of_a_distributed_origin_are_aimed_anew_from_the_mean_origin():
+    component = sensor(
+        origin_m=np.zeros(3),
+        origin_covariance_m2=np.eye(3) * 0.01,
+        azimuth_rad=0.0,
+        elevation_rad=0.0,
+        roll_rad=0.0,
+    )
+    beside = np.array([[0.0, 0.2, 0.0, -math.atan2(0.2, 1.0), 0.0, math.hypot(0.2, 1.0)]])
+    found = members(Design("d", (component,)), beside, np.ones(1))[0]
+    np.testing.assert_allclose(found.tangent, [[0, 0]], atol=1e-12)
+    np.testing.assert_allclose(found.range_m, [1.0])
+
+
+def test_the_share_of_a_sensors_own_samples_inside_is_the_level_to_the_third_power():
+    component = sensor(elevation_rad=0.0, roll_rad=0.0, spread_horizontal_rad=0.05, spread_vertical_rad=0.05)
+    generator = np.random.default_rng(5)
+    count = 40000
+    origin = np.tile(component.origin_m, (count, 1))
+    drawn = generator.normal([1.0, 0.0, 1.0], [0.05, 0.05, 0.1], (count, 3))
+    inside = members(Design("d", (component,)), np.column_stack([origin, drawn]), np.ones(count))[0]
+    assert interval_factor(0.95) == pytest.approx(1.959964, abs=1e-6)
+    assert len(inside) / count == pytest.approx(0.95**3, abs=0.006)
