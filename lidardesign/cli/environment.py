@@ -8,8 +8,8 @@ import signal
 import sys
 from typing import Any
 
-# One thread each: two thread pools that spin on shared cores make each other 8 to 40 times slower. Both must be
-# set before torch and numpy are imported; whoever sets one of them in the environment keeps it.
+# One thread each: two thread pools that spin on shared cores make each other 8 to 40 times slower. These must
+# be set before torch and numpy are imported; whoever sets one of them in the environment keeps it.
 THREAD_DEFAULTS = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",

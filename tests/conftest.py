@@ -1,0 +1,43 @@
+"""What every test keeps to: no global random state, default dtype or thread count is touched."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+# Set before numpy and torch are imported: two thread pools on shared cores spin against each other.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, settings
+
+settings.register_profile("dev", max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("ci", max_examples=100, deadline=None, derandomize=True, print_blob=True)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci" if os.environ.get("CI") else "dev"))
+
+
+def _torch_state() -> tuple[object, ...] | None:
+    torch = sys.modules.get("torch")
+    if torch is None or not hasattr(torch, "get_rng_state"):
+        return None
+    return bytes(torch.get_rng_state().numpy()), torch.get_default_dtype(), torch.get_num_threads()
+
+
+@pytest.fixture(autouse=True)
+def global_state_is_untouched():
+    """Fail a test that draws from a global generator or changes torch's default dtype or threads."""
+    numpy_before, torch_before = _numpy_state(), _torch_state()
+    yield
+    assert _numpy_state() == numpy_before, "the test changed numpy's global random state"
+    if torch_before is not None:
+        names = ("global random state", "default dtype", "thread count")
+        for name, before, after in zip(names, torch_before, _torch_state(), strict=True):
+            assert after == before, f"the test changed torch's {name}"
+
+
+def _numpy_state() -> tuple[object, ...]:
+    name, keys, *rest = np.random.get_state()  # noqa: NPY002 (it is this state that must not change)
+    return name, keys.tobytes(), *rest
