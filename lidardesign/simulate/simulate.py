@@ -1,0 +1,67 @@
+"""What a list of rays returns in a scene, with the detector `ideal`: exact first hits, no bins, no noise.
+
+Rays are traced from the sensor, not from the start of the gate, so whatever stands between the sensor and the
+gate hides what is behind it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lidardesign.errors import ConfigError
+from lidardesign.scene import Scene
+from lidardesign.simulate.raycast import SceneCaster
+from lidardesign.simulate.returns import Outcome, Rays, Returns
+
+
+def simulate(scene: Scene, rays: Rays, *, casters: Sequence[SceneCaster] | None = None) -> list[Returns]:
+    """The returns of rays in every time frame of a scene.
+
+    Arguments:
+        scene: What the rays meet; targets and occluders both stop them.
+        rays: The rays, fired anew in each frame, N of them.
+        casters: One caster per frame, as `build_casters` makes them; None builds them here.
+
+    Returns:
+        One `Returns` per frame, each with N outcomes.
+
+    Raises:
+        ConfigError: The number of casters is not the scene's number of frames.
+    """
+    casters = build_casters(scene) if casters is None else casters
+    if len(casters) != scene.frames:
+        raise ConfigError(f"{len(casters)} casters", where=f"scene {scene.name}", allowed=f"{scene.frames}")
+    return [_frame_returns(caster, rays, frame) for frame, caster in enumerate(casters)]
+
+
+def build_casters(scene: Scene) -> list[SceneCaster]:
+    """One caster per time frame of a scene, to be shared by all designs that are simulated in it."""
+    return [SceneCaster(scene, frame) for frame in range(scene.frames)]
+
+
+def gate_outcomes(range_m: np.ndarray, gate_m: np.ndarray) -> np.ndarray:
+    """Outcomes of first hits: ranges (N,) [m], infinite on a miss, and gates (N, 2) [m] to `Outcome` (N,).
+
+    A gate is closed at its start and open at its end: start <= range < end is a return, a hit before the
+    start is an occlusion, one at or behind the end lies after the gate.
+    """
+    outcome = np.full(len(range_m), Outcome.RETURN, dtype=np.int64)
+    outcome[range_m < gate_m[:, 0]] = Outcome.OCCLUDED
+    outcome[range_m >= gate_m[:, 1]] = Outcome.AFTER_GATE
+    outcome[np.isinf(range_m)] = Outcome.MISS
+    return outcome
+
+
+def _frame_returns(caster: SceneCaster, rays: Rays, frame: int) -> Returns:
+    hits = caster.first_hit(rays.origin_m, rays.direction)
+    outcome = gate_outcomes(hits.range_m, rays.gate_m)
+    returned = outcome == Outcome.RETURN
+    return Returns(
+        rays=rays,
+        outcome=outcome,
+        range_m=np.where(returned, hits.range_m, np.nan),
+        body=np.where(returned, hits.body, -1),
+        frame=frame,
+    )

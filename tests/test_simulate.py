@@ -1,0 +1,118 @@
+"""First hits, gates and outcomes against closed forms."""
+
+import numpy as np
+import pytest
+
+from lidardesign.errors import ConfigError
+from lidardesign.scene import Body, Box, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.simulate.raycast import SceneCaster
+from lidardesign.simulate.returns import Outcome, Rays
+from lidardesign.simulate.simulate import build_casters, gate_outcomes, simulate
+from lidardesign.space import direction
+
+
+def make_rays(origins, directions, gate=(0.0, 10.0)):
+    directions = np.atleast_2d(np.asarray(directions, float))
+    origins = np.broadcast_to(np.asarray(origins, float), directions.shape)
+    count = len(directions)
+    return Rays(origins, directions, np.broadcast_to(gate, (count, 2)), np.zeros(count), np.zeros(count))
+
+
+def ball(radius=0.5, centre=(3.0, 0.0, 0.0), role="both"):
+    return Body(Sphere(radius), "ball", role, rigid(translation_m=centre))
+
+
+def fan(count=400, spread=0.3):
+    generator = np.random.default_rng(1)
+    return direction(generator.uniform(-spread, spread, count), generator.uniform(-spread, spread, count))
+
+
+def test_ranges_on_a_sphere_are_the_closed_form():
+    directions = fan()
+    (returns,) = simulate(Scene((ball(),)), make_rays((0, 0, 0), directions))
+    along = directions @ [3.0, 0.0, 0.0]
+    discriminant = along**2 - (9.0 - 0.25)
+    hit = discriminant > 0
+    assert np.array_equal(returns.returned, hit)
+    # both sides round a root of numbers near 9: a few ulp, magnified near the silhouette
+    expected = along[hit] - np.sqrt(discriminant[hit])
+    np.testing.assert_allclose(returns.range_m[hit], expected, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(returns.points_m - [3, 0, 0], axis=1), 0.5, atol=1e-9)
+    assert np.isnan(returns.range_m[~hit]).all()
+    assert (returns.body[~hit] == -1).all()
+    assert (returns.body[hit] == 0).all()
+
+
+def test_whatever_stands_before_the_gate_hides_what_is_in_it():
+    plate = Body(Box((0.01, 0.2, 0.2)), "plate", "occluder", rigid(translation_m=(1.0, 0.0, 0.0)))
+    rays = make_rays((0, 0, 0), [[1.0, 0.0, 0.0]], gate=(2.0, 4.0))
+    (alone,) = simulate(Scene((ball(),)), rays)
+    (hidden,) = simulate(Scene((ball(), plate)), rays)
+    assert alone.outcome.tolist() == [Outcome.RETURN]
+    assert hidden.outcome.tolist() == [Outcome.OCCLUDED]
+    assert np.isnan(hidden.range_m).all()
+    assert len(hidden.points_m) == 0
+
+
+def test_a_gate_is_closed_at_its_start_and_open_at_its_end():
+    wall = Scene((Body(Plane(), "floor"),))
+    down = [[0.0, 0.0, -1.0]] * 4
+    rays = Rays(
+        np.tile([0.0, 0.0, 2.0], (4, 1)),
+        np.array(down),
+        np.array([[2.0, 3.0], [1.0, 2.0], [np.nextafter(2.0, 3.0), 3.0], [1.0, np.nextafter(2.0, 3.0)]]),
+        np.zeros(4),
+        np.zeros(4),
+    )
+    (returns,) = simulate(wall, rays)
+    expected = [Outcome.RETURN, Outcome.AFTER_GATE, Outcome.OCCLUDED, Outcome.RETURN]
+    assert returns.outcome.tolist() == expected
+
+
+def test_outcomes_of_edges_without_a_scene():
+    ranges = np.array([0.0, 1.0, 2.0, np.inf])
+    gates = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 1.0]])
+    expected = [Outcome.RETURN, Outcome.AFTER_GATE, Outcome.RETURN, Outcome.MISS]
+    assert gate_outcomes(ranges, gates).tolist() == expected
+
+
+def test_the_order_of_rays_does_not_matter():
+    rays = make_rays((0, 0, 0), fan(), gate=(2.4, 2.8))
+    order = np.random.default_rng(2).permutation(len(rays))
+    scene = Scene((ball(), Body(Box((0.1, 0.1, 0.1)), "box", "both", rigid(translation_m=(1.5, 0.2, 0.1)))))
+    (straight,), (shuffled,) = simulate(scene, rays), simulate(scene, rays.subset(order))
+    assert np.array_equal(straight.outcome[order], shuffled.outcome)
+    assert np.array_equal(straight.range_m[order], shuffled.range_m, equal_nan=True)
+    assert np.array_equal(straight.body[order], shuffled.body)
+    assert sum(straight.counts().values()) == len(rays)
+
+
+def test_casters_that_are_shared_change_nothing():
+    scene = Scene((ball(),))
+    rays = make_rays((0, 0, 0), fan())
+    (fresh,), (shared,) = simulate(scene, rays), simulate(scene, rays, casters=build_casters(scene))
+    assert np.array_equal(fresh.range_m, shared.range_m, equal_nan=True)
+
+
+def test_a_moving_body_gives_one_set_of_returns_per_frame():
+    poses = np.stack([rigid(translation_m=(x, 0.0, 0.0)) for x in (2.0, 3.0, 4.0)])
+    scene = Scene((Body(Sphere(0.5), "ball", "both", poses),))
+    returns = simulate(scene, make_rays((0, 0, 0), [[1.0, 0.0, 0.0]]))
+    assert [frame.frame for frame in returns] == [0, 1, 2]
+    np.testing.assert_allclose([frame.range_m[0] for frame in returns], [1.5, 2.5, 3.5], atol=1e-12)
+
+
+def test_a_wrong_number_of_casters_is_refused():
+    scene = Scene((ball(),))
+    with pytest.raises(ConfigError, match="2 casters"):
+        simulate(scene, make_rays((0, 0, 0), fan(3)), casters=[SceneCaster(scene)] * 2)
+
+
+@pytest.mark.parametrize("with_mesh", [False, True])
+def test_no_rays_give_no_returns(with_mesh):
+    triangle = Mesh(np.eye(3), np.array([[0, 1, 2]]), "unsigned")
+    scene = Scene((Body(triangle),) if with_mesh else (ball(),))
+    none = Rays(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+    (returns,) = simulate(scene, none)
+    assert len(returns.outcome) == 0
+    assert len(returns.points_m) == 0
