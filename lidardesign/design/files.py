@@ -36,6 +36,8 @@ LAYOUTS = ("grid", "density", "scan")
 MAX_BYTES = 64_000_000
 # How far a written interval may be from the one that the spread gives: digits that a person may have rounded.
 AGREEMENT = 1e-6
+# Beyond these an interval is next to nothing, or next to everything, of a normal distribution.
+LEVELS = (0.01, 0.999999)
 # Weights that sum to 1 within this are taken as they stand, so that loading changes no bit.
 WEIGHT_SUM_TOLERANCE = 1e-9
 # How much below zero rounding may push an eigenvalue of a covariance, relative to the largest.
@@ -138,9 +140,7 @@ def design_from_document(
         locate = locate.locate
     root = Node(document, (), locate or (lambda _path: where))
     keys = _versioned(root).mapping(REQUIRED, OPTIONAL)
-    level = keys["level"].number(0, 1) if "level" in keys else DEFAULT_LEVEL
-    if not 0 < level < 1:
-        raise keys["level"].wrong("a share between 0 and 1")
+    level = keys["level"].number(*LEVELS) if "level" in keys else DEFAULT_LEVEL
     sensors = _sensors(keys["sensors"], level)
     rays = keys["rays"].integer(0) if "rays" in keys else None
     table = _ray_table(keys["ray_table"], len(sensors)) if "ray_table" in keys else None
@@ -165,13 +165,12 @@ def _versioned(root: Node) -> Node:
             where=root.locate(()),
             hint="docs/design-file.md shows a design written by hand",
         )
-    version = root.value.get("schema_version")
-    if isinstance(version, int) and not isinstance(version, bool) and version > SCHEMA_VERSION:
-        raise root.child("schema_version").error(
-            f"is {version}", allowed=str(SCHEMA_VERSION), hint="use a newer version of lidardesign"
-        )
-    if version is not None and version != SCHEMA_VERSION:
+    version = root.value.get("schema_version", SCHEMA_VERSION)
+    if type(version) is not int or version < SCHEMA_VERSION:
         raise root.child("schema_version").wrong(str(SCHEMA_VERSION))
+    if version > SCHEMA_VERSION:
+        hint = "use a newer version of lidardesign"
+        raise root.child("schema_version").error(f"is {version}", allowed=str(SCHEMA_VERSION), hint=hint)
     return root
 
 
