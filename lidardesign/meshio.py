@@ -84,7 +84,7 @@ def check_mesh(vertices: Any, faces: Any, *, sign: Sign = "auto", where: str = "
     _refuse_unusable(vertices, faces, where)
     notes: list[str] = []
     vertices, faces = _merge_vertices(vertices, faces.astype(np.int64))
-    faces = _drop_bad_faces(vertices, faces, notes)
+    faces = usable_faces(vertices, faces, notes)
     if not len(faces):
         raise DataError(f"no usable face is left ({'; '.join(notes)})", where=where)
     used, faces = np.unique(faces, return_inverse=True)
@@ -126,7 +126,8 @@ def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
     return unique, index.reshape(-1)[faces]
 
 
-def _drop_bad_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray:
+def usable_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray:
+    """The faces that have an area and are no duplicate of another; what was dropped is added to `notes`."""
     edges = np.roll(vertices[faces], -1, axis=1) - vertices[faces]
     double_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     longest = np.einsum("fek,fek->fe", edges, edges).max(axis=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -98,7 +99,9 @@ def _segment_squared(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> 
     return np.einsum("nk,nk->n", offset, offset)
 
 
-def delaunay_surface(points: np.ndarray, viewpoint: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+def delaunay_surface(
+    points: np.ndarray, viewpoint: np.ndarray, *, steepest_deg: float = 90.0
+) -> tuple[np.ndarray, np.ndarray] | None:
     """The surface through returns that are neighbours as seen from a viewpoint.
 
     Delaunay triangulation of the directions in stereographic coordinates about their mean, which maps
@@ -108,6 +111,8 @@ def delaunay_surface(points: np.ndarray, viewpoint: np.ndarray) -> tuple[np.ndar
     Arguments:
         points: Measured points [m], shape (N, 3).
         viewpoint: Where they are seen from [m], shape (3,).
+        steepest_deg: Triangles seen at a flatter angle than this from their normal are left out: they bridge
+            from one surface to another behind it. If all are, all stay.
 
     Returns:
         Vertices (V, 3) and faces (F, 3), or `None` below 3 directions or when all are collinear.
@@ -125,7 +130,18 @@ def delaunay_surface(points: np.ndarray, viewpoint: np.ndarray) -> tuple[np.ndar
         triangulation = Delaunay(plane[seen])
     except QhullError:  # fewer than 3 points, or all of them collinear
         return None
-    return points[seen], triangulation.simplices
+    vertices, faces = points[seen], triangulation.simplices
+    facing = _facing_cosine(vertices[faces], viewpoint) >= math.cos(math.radians(steepest_deg))
+    return vertices, faces[facing] if facing.any() else faces
+
+
+def _facing_cosine(triangles: np.ndarray, viewpoint: np.ndarray) -> np.ndarray:
+    """Cosine of the angle between a triangle's normal and the line of sight, 0 to 1, shape (F,)."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    normal, sight = np.cross(b - a, c - a), (a + b + c) / 3 - viewpoint
+    lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(sight, axis=1)
+    across = np.abs(np.einsum("fk,fk->f", normal, sight))
+    return np.divide(across, lengths, out=np.zeros(len(a)), where=lengths > 0)
 
 
 def _stereographic(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -177,7 +193,7 @@ def visible_surface(
     """
     caster, origins = SceneCaster(scene, frame), trial_origins(space, generator)
     targets = [body for body in scene.bodies if body.is_target]
-    points, triangles, found, draw = [], [], 0, 2 * count
+    points, triangles, found, draw = [], [], 0, 3 * count
     for _ in range(DRAW_ROUNDS):
         candidates = sample_body(targets, space, min(draw, LARGEST_DRAW), generator, frame)
         seen = is_visible(caster, space, origins, candidates.points)

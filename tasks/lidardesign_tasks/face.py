@@ -1,0 +1,153 @@
+"""Flash-LiDAR face scanning: one place in front of a head, and which rays are worth firing from there.
+
+World frame: the nose of the mean head points along +x with its tip at the origin, z is up. The sensor is at
+(distance, 0, 0) and looks back at the face. Heads are random identities of a morphable model (the embedded
+one, or any in the layout of the Basel Face Model) with a small random pose.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from importlib.resources import as_file, files
+from typing import ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from lidardesign.meshio import check_mesh, usable_faces
+from lidardesign.scene import Body, Mesh, Scene, Sign
+from lidardesign.simulate.returns import Returns
+from lidardesign.space import DesignSpace
+from lidardesign.task import Defaults, Metric, Score, Split, TaskConfig, random_generator
+from lidardesign_tasks.basel import MorphableModel, Unit, load_model
+from lidardesign_tasks.pose import jittered_pose
+from lidardesign_tasks.surface import surface_score, with_visible_truth
+
+Vector = tuple[float, float, float]
+# columns: the world's x, y, z are the model's z (out of the face), x (to the head's left) and y (up)
+WORLD_AXES = [2, 0, 1]
+LARGEST_COEFFICIENT = (
+    3.0  # identities further from the mean than this in any mode are cut, as no faces are so
+)
+
+
+class FaceConfig(TaskConfig):
+    """The model, how many heads, how much they move, and where the sensor may be."""
+
+    model: str | None = Field(
+        None, description="HDF5 file of a morphable model; empty: the embedded head model"
+    )
+    unit: Unit = Field("auto", description="unit of length of the model file")
+    sign: Sign = Field(
+        "auto", description="inside rule of the head's surface; auto: unsigned where it is open"
+    )
+    train: int = Field(50, ge=1, le=10_000, description="training heads")
+    test: int = Field(50, ge=1, le=10_000, description="held-out heads")
+    modes: int = Field(100, ge=1, description="use at most so many modes of the model")
+    identity_scale: float = Field(
+        1.0, ge=0, le=3, description="scale of the identity coefficients; 0: the mean head"
+    )
+    jitter_rotation_deg: float = Field(4.0, ge=0, le=60, description="standard deviation of the pose [deg]")
+    jitter_translation_m: float = Field(
+        0.008, ge=0, le=0.5, description="standard deviation of the place [m]"
+    )
+    distance_m: float = Field(0.40, ge=0.1, le=5, description="from the mean nose tip to the sensor [m]")
+    origin_box_m: float | Vector = Field(
+        0.0, description="half size of the box of sensor origins [m]; 0: fixed"
+    )
+    half_angle_deg: float = Field(30.0, gt=0, le=80, description="azimuth and elevation span +- this [deg]")
+    range_m: tuple[float, float] = Field((0.05, 1.05), description="shortest and longest range [m]")
+    truth_points: int = Field(
+        5000, ge=100, le=200_000, description="points of the visible surface to judge by"
+    )
+
+
+class FaceTask:
+    """Reconstruct the surface of unknown faces from few rays."""
+
+    name: ClassVar[str] = "face"
+    summary: ClassVar[str] = (
+        "flash-LiDAR face scanning on heads of a morphable model, 0.40 m in front of the face"
+    )
+    api_version: ClassVar[int] = 1
+    Config: ClassVar[type[FaceConfig]] = FaceConfig
+    metric: ClassVar[Metric] = Metric("Chamfer distance", "mm", "lower", worst=200.0, tolerance=0.1)
+    defaults: ClassVar[Defaults] = Defaults(
+        sensors=4, rays=(36, 100, 196, 361, 576), density={"sigma_m": 0.005}
+    )
+
+    def space(self, config: FaceConfig) -> DesignSpace:
+        """Origins in a box around (distance, 0, 0), directions around -x."""
+        half = np.broadcast_to(np.abs(np.asarray(config.origin_box_m, dtype=np.float64)), 3)
+        angle, centre = math.radians(config.half_angle_deg), np.array([config.distance_m, 0.0, 0.0])
+        return DesignSpace(
+            low=(*(centre - half).tolist(), math.pi - angle, -angle, config.range_m[0]),
+            high=(*(centre + half).tolist(), math.pi + angle, angle, config.range_m[1]),
+        )
+
+    def scenes(
+        self, config: FaceConfig, split: Split, seed: int, space: DesignSpace | None = None
+    ) -> Sequence[Scene]:
+        """Random heads; each has generators of its own, so counts do not change them."""
+        space = space or self.space(config)
+        heads = HeadFamily.load(config)
+        count = config.train if split == "train" else config.test
+        return [heads.scene(config, space, split, seed, index) for index in range(count)]
+
+    def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
+        """Chamfer distance [mm] between the reconstruction and the part of the face that could be seen."""
+        return surface_score(self.metric, scene, returns)
+
+
+class HeadFamily:
+    """The heads of a model in the world frame: cleaned faces, sign rule, and the nose tip as origin."""
+
+    def __init__(self, model: MorphableModel, sign: Sign, where: str) -> None:
+        self.model = model
+        notes = list(model.notes)
+        self.faces = usable_faces(model.mean, model.faces, notes)
+        checked = check_mesh(model.mean, self.faces, sign=sign, where=where)
+        self.sign, self.notes = checked.sign, (*notes, *checked.notes)
+        mean = model.mean[:, WORLD_AXES]
+        self.nose_tip = mean[mean[:, 0].argmax()]
+        self.centre = (mean - self.nose_tip)[np.unique(self.faces)].mean(axis=0)
+
+    @classmethod
+    def load(cls, config: FaceConfig) -> HeadFamily:
+        """The family of a configuration.
+
+        Raises:
+            DataError: The model cannot be used; see `load_model` and `check_mesh`.
+        """
+        if config.model is not None:
+            return cls(
+                load_model(config.model, unit=config.unit, modes=config.modes), config.sign, config.model
+            )
+        return cls(_embedded_model(config.modes), config.sign, "the embedded head model")
+
+    def mesh(self, coefficients: np.ndarray) -> Mesh:
+        """The head with standardised coefficients, in the world frame before its pose."""
+        vertices = self.model.shape(coefficients)[:, WORLD_AXES] - self.nose_tip
+        return Mesh(vertices, self.faces, self.sign, self.notes)
+
+    def scene(self, config: FaceConfig, space: DesignSpace, split: Split, seed: int, index: int) -> Scene:
+        """One head of a split with its pose and truth."""
+        drawn = random_generator(seed, "face", split, index, "identity").normal(size=len(self.model.modes))
+        coefficients = config.identity_scale * np.clip(drawn, -LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
+        pose = jittered_pose(
+            random_generator(seed, "face", split, index, "pose"),
+            config.jitter_rotation_deg,
+            config.jitter_translation_m,
+            self.centre,
+        )
+        scene = Scene((Body(self.mesh(coefficients), "head", "both", pose),), f"{split} head {index}")
+        generator = random_generator(seed, "face", split, index, "truth")
+        return with_visible_truth(scene, space, config.truth_points, generator)
+
+
+@lru_cache(maxsize=1)
+def _embedded_model(modes: int) -> MorphableModel:
+    with as_file(files("lidardesign_tasks") / "data" / "head_model.h5") as path:
+        return load_model(path, modes=modes)

@@ -1,0 +1,215 @@
+"""Bring your own meshes: a folder of mesh files and a design space.
+
+Every file is one object of a class (or one scan). Files are split into training and held-out ones; each is
+shown in a few slightly different poses. With a single file the poses alone make the splits. The world's z axis
+is up, and unless told otherwise one sensor place is in front (+x) of the objects, at twice their extent, and
+looks at them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from lidardesign.errors import ConfigError
+from lidardesign.meshio import list_mesh_files, load_mesh
+from lidardesign.scene import Body, Mesh, Scene, Sign
+from lidardesign.simulate.returns import Returns
+from lidardesign.space import DesignSpace, aim
+from lidardesign.task import Defaults, Metric, Score, Split, TaskConfig, random_generator
+from lidardesign_tasks.pose import jittered_pose
+from lidardesign_tasks.surface import surface_score, with_visible_truth
+
+Vector = tuple[float, float, float]
+Axis = Literal["x", "y", "z"]
+# which of the file's axes become the world's x, y, z: turns the up axis to z without mirroring
+WORLD_AXES = {"x": [1, 2, 0], "y": [2, 0, 1], "z": [0, 1, 2]}
+RELATIVE_JITTER = 0.02  # of the largest extent, where no shift is given
+SENSOR_DISTANCE = 2.0  # extents
+ROOM = 1.1  # around the bounding sphere, for the pose jitter
+
+
+class MeshesConfig(TaskConfig):
+    """Where the meshes are, how to read them, how they are split and moved, and where the sensor may be."""
+
+    folder: str | None = Field(None, description="folder of mesh files (glb, gltf, obj, off, ply, stl)")
+    scale: float = Field(1.0, gt=0, description="factor from the files' unit to metres (0.001 for mm)")
+    sign: Sign = Field("auto", description="inside rule: auto, solid, winding or unsigned")
+    up: Axis = Field("z", description="the axis of the files that points up")
+    centre: bool = Field(True, description="move the centre of each mesh's bounds to the origin")
+    test_share: float = Field(0.5, gt=0, lt=1, description="share of the files that is held out")
+    poses: int = Field(4, ge=1, le=1000, description="scenes per mesh")
+    jitter_rotation_deg: float = Field(4.0, ge=0, le=180, description="standard deviation of the pose [deg]")
+    jitter_translation_m: float | None = Field(
+        None, ge=0, description="of the place [m]; 2 % of the extent if empty"
+    )
+    occluders: str | None = Field(
+        None, description="folder of meshes that stand in front, in world coordinates"
+    )
+    origin_m: Vector | None = Field(None, description="sensor place [m]; if empty: in front, at 2 extents")
+    origin_box_m: float | Vector = Field(
+        0.0, description="half size of the box of sensor origins [m]; 0: fixed"
+    )
+    truth_points: int = Field(
+        5000, ge=100, le=200_000, description="points of the visible surface to judge by"
+    )
+
+
+class MeshesTask:
+    """Reconstruct the surface of your objects from few rays."""
+
+    name: ClassVar[str] = "meshes"
+    summary: ClassVar[str] = (
+        "your own folder of meshes, with a design space in YAML or one derived from their size"
+    )
+    api_version: ClassVar[int] = 1
+    Config: ClassVar[type[MeshesConfig]] = MeshesConfig
+    metric: ClassVar[Metric] = Metric("Chamfer distance", "mm", "lower", worst=1000.0, tolerance=0.1)
+    defaults: ClassVar[Defaults] = Defaults(
+        sensors=4, rays=(36, 100, 196, 361, 576), density={"sigma_m": 0.005}
+    )
+
+    def space(self, config: MeshesConfig) -> DesignSpace:
+        """A sensor in front of all meshes that sees every one of them whole."""
+        return derived_space(config, [mesh for _, mesh in load_folder(config)])
+
+    def scenes(
+        self, config: MeshesConfig, split: Split, seed: int, space: DesignSpace | None = None
+    ) -> Sequence[Scene]:
+        """Each mesh of the split in `poses` poses; the occluders stand in every scene.
+
+        Raises:
+            DataError: The folder or a file in it cannot be used, or no ray can reach a mesh.
+            ConfigError: No folder is set, or one mesh without pose jitter would make both splits the same.
+        """
+        meshes = load_folder(config)
+        space = space or derived_space(config, [mesh for _, mesh in meshes])
+        occluders = tuple(Body(mesh, name, "occluder") for name, mesh in load_occluders(config))
+        shift = jitter_m(config, [mesh for _, mesh in meshes])
+        if len(meshes) == 1 and config.jitter_rotation_deg == 0 and shift == 0:
+            raise ConfigError(
+                "one mesh without pose jitter makes training and held-out scenes the same",
+                where="task.jitter_rotation_deg",
+                hint="add meshes, or set jitter_rotation_deg or jitter_translation_m above 0",
+            )
+        scenes = []
+        for (name, mesh), pose in itertools.product(
+            split_meshes(meshes, config, split, seed), range(config.poses)
+        ):
+            generator = random_generator(seed, "meshes", split, name, pose)
+            centre = mesh.bounds_m.mean(axis=0)
+            placed = Body(
+                mesh, name, "both", jittered_pose(generator, config.jitter_rotation_deg, shift, centre)
+            )
+            scene = Scene((placed, *occluders), f"{split} {name} pose {pose}")
+            scenes.append(with_visible_truth(scene, space, config.truth_points, generator))
+        return scenes
+
+    def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
+        """Chamfer distance [mm] between the reconstruction and the part of the surface that could be seen."""
+        return surface_score(self.metric, scene, returns)
+
+
+def load_folder(config: MeshesConfig) -> list[tuple[str, Mesh]]:
+    """Name and mesh of every file, in metres, z up, centred if so configured."""
+    if config.folder is None:
+        raise ConfigError("no folder of meshes is set", where="task.folder", hint="--set folder=PATH")
+    return _load(config.folder, config, config.sign, config.centre)
+
+
+def load_occluders(config: MeshesConfig) -> list[tuple[str, Mesh]]:
+    """Name and mesh of every occluder, in metres, z up, where the files put them."""
+    return _load(config.occluders, config, "auto", False) if config.occluders is not None else []
+
+
+def _load(folder: str, config: MeshesConfig, sign: Sign, centre: bool) -> list[tuple[str, Mesh]]:
+    meshes = []
+    for path in list_mesh_files(folder):
+        state = path.stat()
+        mesh = _load_file(path, state.st_mtime_ns, state.st_size, sign, config.scale, config.up, centre)
+        meshes.append((path.name, mesh))
+    return meshes
+
+
+@lru_cache(maxsize=256)
+def _load_file(
+    path: Path, changed_ns: int, size: int, sign: Sign, scale: float, up: Axis, centre: bool
+) -> Mesh:
+    """One file; the same file unchanged is read once per process, as space and both splits need it."""
+    mesh = load_mesh(path, sign=sign, scale=scale)
+    vertices = mesh.vertices[:, WORLD_AXES[up]]
+    if centre:
+        vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    return Mesh(vertices, mesh.faces, mesh.sign, mesh.notes)
+
+
+def split_meshes(
+    meshes: Sequence[tuple[str, Mesh]], config: MeshesConfig, split: Split, seed: int
+) -> list[tuple[str, Mesh]]:
+    """The meshes of a split, each in exactly one; a single mesh is in both, told apart by its poses."""
+    if len(meshes) == 1:
+        return list(meshes)
+    order = random_generator(seed, "meshes", "split").permutation(len(meshes))
+    held_out = min(max(round(config.test_share * len(meshes)), 1), len(meshes) - 1)
+    chosen = order[:held_out] if split == "test" else order[held_out:]
+    return [meshes[i] for i in np.sort(chosen)]
+
+
+def extent_m(meshes: Sequence[Mesh]) -> float:
+    """The longest side of the box around all meshes [m]."""
+    low, high = _bounds(meshes)
+    return float((high - low).max())
+
+
+def jitter_m(config: MeshesConfig, meshes: Sequence[Mesh]) -> float:
+    """Standard deviation of the shift along each axis [m]."""
+    given = config.jitter_translation_m
+    return RELATIVE_JITTER * extent_m(meshes) if given is None else given
+
+
+def _bounds(meshes: Sequence[Mesh]) -> tuple[np.ndarray, np.ndarray]:
+    corners = np.concatenate([mesh.bounds_m for mesh in meshes])
+    return corners.min(axis=0), corners.max(axis=0)
+
+
+def derived_space(config: MeshesConfig, meshes: Sequence[Mesh]) -> DesignSpace:
+    """The directions and ranges in which the sphere around all meshes lies, from every origin of the box.
+
+    An origin inside that sphere looks everywhere.
+    """
+    low, high = _bounds(meshes)
+    centre = (low + high) / 2
+    radius = ROOM * (float(np.linalg.norm(high - low)) / 2 + 2 * jitter_m(config, meshes))
+    ahead = centre + np.array([max(SENSOR_DISTANCE * extent_m(meshes), 2 * radius), 0.0, 0.0])
+    origin = ahead if config.origin_m is None else np.array(config.origin_m)
+    half = np.broadcast_to(np.abs(np.asarray(config.origin_box_m, dtype=np.float64)), 3)
+    corners = origin + half * np.array([(0, 0, 0), *itertools.product((-1, 1), repeat=3)])
+    seen = aim(corners, centre)
+    azimuth, elevation, distance = seen[:, 3], seen[:, 4], seen[:, 5]
+    nearest = float(distance.min())
+    box = [*(origin - half).tolist()], [*(origin + half).tolist()]
+    if nearest <= radius:
+        return DesignSpace(
+            low=(*box[0], 0.0, -math.pi / 2, 0.0),
+            high=(*box[1], 2 * math.pi, math.pi / 2, float(distance.max()) + radius),
+        )
+    angle = math.asin(radius / nearest)
+    bottom = max(float(elevation.min()) - angle, -math.pi / 2)
+    top = min(float(elevation.max()) + angle, math.pi / 2)
+    turn = np.mod(azimuth - azimuth[0] + math.pi, 2 * math.pi) - math.pi
+    # seen from above or below, a sphere covers more azimuth than its angle; over the pole, all of it
+    steepest = math.cos(max(abs(bottom), abs(top)))
+    widest = math.asin(math.sin(angle) / steepest) if math.sin(angle) < steepest else math.pi
+    left = max(float(azimuth[0] + turn.min()) - widest, float(azimuth[0]) - math.pi)
+    right = min(float(azimuth[0] + turn.max()) + widest, float(azimuth[0]) + math.pi)
+    return DesignSpace(
+        low=(*box[0], left, bottom, nearest - radius),
+        high=(*box[1], right, top, float(distance.max()) + radius),
+    )
