@@ -26,6 +26,7 @@ COLUMNS = (
     "azimuth_sigma", "elevation_sigma", "time_sigma", "weight",
 )  # fmt: skip
 QUERY_COLUMN = "x_query"
+YAML_BEGINNINGS = ("{", "[", "- ", "#", "%")
 NOT_NEGATIVE = ("time_mean", "azimuth_sigma", "elevation_sigma", "time_sigma", "weight")
 # An elevation may exceed a right angle by its rounding in a file of few digits.
 ELEVATION_ROUNDING = 1e-6
@@ -34,12 +35,10 @@ WEIGHT_SUM_TOLERANCE = 1e-9
 
 
 def looks_like_sensor_csv(head: bytes) -> bool:
-    """Whether a file's first bytes are a row of 16 or 17 comma-separated cells that are no YAML."""
-    lines = [line for line in head.decode("utf-8-sig", errors="replace").splitlines() if line.strip()]
-    if not lines or (lines[0].lstrip()[:1] in ("{", "[", "-", "#") and ":" in lines[0]):
-        return False
-    cells = [cell.strip() for cell in lines[0].split(",")]
-    return bool({COLUMNS[0], QUERY_COLUMN} & set(cells)) or (len(cells) >= 2 and ":" not in lines[0])
+    """Whether a file begins with a line of comma-separated cells that no YAML mapping begins with."""
+    text = head.decode("utf-8-sig", errors="replace")
+    first = next((line.strip() for line in text.splitlines() if line.strip()), "")
+    return "," in first and ":" not in first and not first.startswith(YAML_BEGINNINGS)
 
 
 def read_sensor_csv(path: Path) -> Design:

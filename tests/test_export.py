@@ -1,0 +1,119 @@
+"""Exports: what is written is what the rays are, whole files only, and honest notes of what is lost."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from lidardesign.design.files import load_design
+from lidardesign.design.rays import lay_out
+from lidardesign.design.sensor import Design, Sensor
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.export.columns import ray_columns
+from lidardesign.export.registry import EXPORTERS, find_exporter
+
+
+def design(count=2):
+    numbers = (0.0, 0.1, 0.05, 1.0, 0.1)
+    sensors = tuple(
+        Sensor(
+            f"s{i}, größe",
+            1 / count,
+            np.array([0.1 * i, -0.2, 1 / 3]),
+            np.eye(3),
+            i * 2.0,
+            -0.7 * i,
+            *numbers,
+        )
+        for i in range(count)
+    )
+    return Design("two", sensors, rays=37, constraints={"gate": {"width_m": {"max": 1.0}}})
+
+
+def read_csv(path):
+    header, *rows = path.read_text(encoding="utf-8").splitlines()
+    values = np.array([[float(cell) for cell in row.split(",")] for row in rows]).reshape(
+        -1, len(header.split(","))
+    )
+    return dict(zip(header.split(","), values.T, strict=True))
+
+
+def read_npz(path):
+    with np.load(path, allow_pickle=False) as arrays:
+        return dict(arrays)
+
+
+@pytest.mark.parametrize(("name", "read"), [("csv", read_csv), ("npz", read_npz)])
+@pytest.mark.parametrize("count", [0, 1, 37])
+def test_a_ray_list_comes_back_to_the_last_bit(tmp_path, name, read, count):
+    rays = lay_out(design(), count)
+    path = tmp_path / "out"
+    notes = EXPORTERS[name].write(design(), rays, path)
+    columns = read(path)
+    np.testing.assert_array_equal(np.stack([columns[f"origin_{a}_m"] for a in "xyz"], 1), rays.origin_m)
+    np.testing.assert_array_equal(np.stack([columns[f"direction_{a}"] for a in "xyz"], 1), rays.direction)
+    gate = np.stack([columns["gate_start_m"], columns["gate_end_m"]], 1)
+    np.testing.assert_array_equal(gate, rays.gate_m)
+    np.testing.assert_array_equal(columns["sensor"], rays.sensor)
+    np.testing.assert_array_equal(columns["time_s"], rays.time_s)
+    assert any("covariances" in note for note in notes)
+    assert any("constraints" in note for note in notes)
+
+
+def test_the_angles_of_a_ray_list_give_its_directions():
+    rays = lay_out(design(), 100)
+    columns = ray_columns(rays)
+    azimuth, elevation = columns["azimuth_rad"], columns["elevation_rad"]
+    flat = np.cos(elevation)
+    again = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], 1)
+    np.testing.assert_allclose(again, rays.direction, atol=1e-14)
+
+
+def test_every_column_has_its_unit_in_its_name_or_has_none():
+    without = {"direction_x", "direction_y", "direction_z", "sensor"}
+    for name in ray_columns(lay_out(design())):
+        assert name in without or name.rsplit("_", 1)[1] in {"m", "rad", "s"}
+
+
+def test_the_names_of_the_sensors_travel_in_the_npz(tmp_path):
+    EXPORTERS["npz"].write(design(), lay_out(design()), tmp_path / "x.npz")
+    assert read_npz(tmp_path / "x.npz")["sensor_names"].tolist() == ["s0, größe", "s1, größe"]
+
+
+def test_the_sensor_table_is_a_design_again(tmp_path):
+    path = tmp_path / "two.csv"
+    notes = EXPORTERS["sensors-csv"].write(design(), lay_out(design()), path)
+    assert any("37 rays" in note for note in notes)
+    loaded = load_design(path)
+    np.testing.assert_allclose(lay_out(loaded, 37).direction, lay_out(design()).direction, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", EXPORTERS)
+def test_every_format_is_written_whole_or_not_at_all(tmp_path, name):
+    exporter = EXPORTERS[name]
+    assert exporter.name == name
+    assert exporter.suffix.startswith(".")
+    path = tmp_path / f"a design{exporter.suffix}"
+    exporter.write(design(), lay_out(design()), path)
+    first = path.read_bytes()
+    exporter.write(design(), lay_out(design()), path)
+    assert path.read_bytes() == first
+    assert list(tmp_path.iterdir()) == [path]
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    with pytest.raises(DataError):
+        exporter.write(design(), lay_out(design()), folder)
+    assert not list(folder.iterdir())
+
+
+def test_an_unknown_format_names_the_known_ones():
+    with pytest.raises(ConfigError, match="csv, npz, sensors-csv"):
+        find_exporter("obj")
+
+
+def test_listing_the_formats_imports_none_of_them():
+    code = "import sys\nfrom lidardesign.export.registry import EXPORTERS\n"
+    code += "print([exporter.module in sys.modules for exporter in EXPORTERS.values()])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "True" not in done.stdout

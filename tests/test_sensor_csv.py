@@ -1,0 +1,208 @@
+"""The research code's sensor table: exact round trips, spreads on the sphere, and errors with positions."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidardesign.design.files import load_design
+from lidardesign.design.sensor import Design, Sensor, tangent_coordinates
+from lidardesign.design.sensor_csv import COLUMNS, looks_like_sensor_csv, read_sensor_csv, write_sensor_csv
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.space import direction
+
+ROW = "3,0,0,3.14,0.1,1.2,0.04,0.01,0,0.09,0.02,0.05,0.2,0.1,0.3,1"
+HEADER = ",".join(COLUMNS)
+
+
+@st.composite
+def designs(draw):
+    number = st.floats(-100, 100)
+    spread = st.floats(0, 1.5)
+    count = draw(st.integers(1, 5))
+    raw = np.array(draw(st.lists(st.floats(0.01, 1), min_size=count, max_size=count)))
+    sensors = []
+    for index, weight in enumerate(raw / raw.sum()):
+        root = np.array(draw(st.lists(st.floats(-1, 1), min_size=9, max_size=9))).reshape(3, 3)
+        covariance = root @ root.T
+        sensors.append(
+            Sensor(
+                name=f"sensor_{index + 1}",
+                weight=float(weight),
+                origin_m=np.array(draw(st.tuples(number, number, number))),
+                origin_covariance_m2=(covariance + covariance.T) / 2,
+                azimuth_rad=draw(st.floats(-10, 10)),
+                elevation_rad=draw(st.floats(-1.3, 1.3)),
+                roll_rad=0.0,
+                spread_horizontal_rad=draw(spread),
+                spread_vertical_rad=draw(spread),
+                range_m=draw(st.floats(0, 100)),
+                spread_range_m=draw(st.floats(0, 100)),
+            )
+        )
+    return Design(name="table", sensors=tuple(sensors))
+
+
+FIELDS = (
+    "weight", "origin_m", "origin_covariance_m2", "azimuth_rad", "elevation_rad", "roll_rad",
+    "spread_horizontal_rad", "spread_vertical_rad", "range_m", "spread_range_m", "level",
+)  # fmt: skip
+
+
+@settings(max_examples=60, deadline=None)
+@given(design=designs())
+def test_sensors_come_back_from_the_table(design, tmp_path_factory):
+    path = tmp_path_factory.mktemp("csv") / "table.csv"
+    write_sensor_csv(design, path)
+    loaded = load_design(path)
+    assert loaded.name == "table"
+    for before, after in zip(design.sensors, loaded.sensors, strict=True):
+        for field in FIELDS:
+            np.testing.assert_allclose(getattr(after, field), getattr(before, field), rtol=1e-12, atol=1e-12)
+
+
+def test_the_text_of_a_table_comes_back_from_the_sensors(tmp_path):
+    first, second = tmp_path / "first.csv", tmp_path / "second.csv"
+    first.write_text(f"{HEADER}\n{ROW}\n")
+    write_sensor_csv(read_sensor_csv(first), second)
+    numbers = [
+        [float(cell) for cell in path.read_text().splitlines()[1].split(",")] for path in (first, second)
+    ]
+    np.testing.assert_allclose(numbers[1], numbers[0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("elevation", [-1.2, 0.0, 0.9])
+def test_an_azimuth_sigma_is_the_angle_that_it_spans_on_the_sphere(tmp_path, elevation):
+    path = tmp_path / "one.csv"
+    sigma = 1e-4
+    cells = ROW.split(",")
+    cells[4], cells[12] = repr(elevation), repr(sigma)
+    path.write_text(",".join(cells))
+    sensor = read_sensor_csv(path).sensors[0]
+    beside = tangent_coordinates(sensor.frame, direction(np.array([3.14 + sigma]), np.array([elevation])))
+    assert sensor.spread_horizontal_rad == pytest.approx(beside[0, 0], rel=1e-6)
+
+
+def test_the_header_the_order_of_named_columns_and_a_byte_order_mark_do_not_matter(tmp_path):
+    plain, shuffled = tmp_path / "plain.csv", tmp_path / "shuffled.csv"
+    plain.write_text(f"\n{ROW}\n\n")
+    order = np.random.default_rng(0).permutation(16)
+    rows = [[line.split(",")[i] for i in order] for line in (HEADER, ROW)]
+    shuffled.write_text("\ufeff" + "\r\n".join(" , ".join(row) for row in rows), encoding="utf-8")
+    assert looks_like_sensor_csv(shuffled.read_bytes())
+    first, second = load_design(plain).sensors[0], load_design(shuffled).sensors[0]
+    for field in FIELDS:
+        np.testing.assert_array_equal(getattr(first, field), getattr(second, field))
+
+
+def test_azimuths_beyond_a_turn_point_the_same_way(tmp_path):
+    boresights = []
+    for azimuth in (3.5, 3.5 - 2 * math.pi, 3.5 + 2 * math.pi):
+        path = tmp_path / "a.csv"
+        path.write_text(ROW.replace("3.14", repr(azimuth)))
+        boresights.append(load_design(path).sensors[0].boresight)
+    np.testing.assert_allclose(boresights, [boresights[0]] * 3, atol=1e-12)
+
+
+def test_weights_are_normalised_with_a_note(tmp_path):
+    path = tmp_path / "w.csv"
+    path.write_text(f"{ROW}\n{ROW[:-1]}3\n")
+    design = read_sensor_csv(path)
+    assert [s.weight for s in design.sensors] == [0.25, 0.75]
+    assert "normalised" in design.provenance["notes"][0]
+    path.write_text(f"{ROW[:-1]}0.5\n{ROW[:-1]}0.5\n")
+    assert read_sensor_csv(path).provenance["notes"] == []
+
+
+def test_the_moving_robots_variant_is_read_at_one_position_and_refused_at_several(tmp_path):
+    path = tmp_path / "warehouse.csv"
+    path.write_text(f"x_query,{HEADER}\n1.2,{ROW}\n1.2,{ROW}\n")
+    design = load_design(path)
+    assert len(design.sensors) == 2
+    assert "x_query = 1.2" in design.provenance["notes"][0]
+    for text in (f"x_query,{HEADER}\n0,{ROW}\n1.2,{ROW}\n", f"0,{ROW}\n1.2,{ROW}\n"):
+        path.write_text(text)
+        with pytest.raises(DataError, match=r"2 positions .*x_query = 0, 1\.2"):
+            load_design(path)
+
+
+def test_straight_down_is_written_with_the_azimuth_spread_cut_at_a_turn(tmp_path):
+    sensor = Sensor("down", 1.0, np.zeros(3), np.zeros((3, 3)), 0.5, -math.pi / 2, 0.0, 0.2, 0.1, 1.0, 0.1)
+    notes = write_sensor_csv(Design("d", (sensor,)), tmp_path / "d.csv")
+    assert any("pole" in note for note in notes)
+    loaded = load_design(tmp_path / "d.csv").sensors[0]
+    assert np.isfinite(loaded.spread_horizontal_rad)
+    assert loaded.spread_vertical_rad == 0.1
+    assert loaded.elevation_rad == -math.pi / 2
+
+
+def test_a_quarter_turn_of_roll_swaps_the_spreads_and_is_noted(tmp_path):
+    sensor = Sensor("r", 1.0, np.zeros(3), np.zeros((3, 3)), 0.5, 0.0, math.pi / 2, 0.2, 0.1, 1.0, 0.1)
+    notes = write_sensor_csv(Design("d", (sensor,)), tmp_path / "d.csv")
+    assert any("roll" in note for note in notes)
+    loaded = load_design(tmp_path / "d.csv").sensors[0]
+    assert (loaded.spread_horizontal_rad, loaded.spread_vertical_rad) == pytest.approx((0.1, 0.2))
+
+
+def test_another_level_is_noted(tmp_path):
+    sensor = Sensor("r", 1.0, np.zeros(3), np.zeros((3, 3)), 0.5, 0.0, 0.0, 0.2, 0.1, 1.0, 0.1, level=0.9)
+    design = Design("d", (sensor,), level=0.9)
+    assert any("0.9 is not held" in note for note in write_sensor_csv(design, tmp_path / "d.csv"))
+    plain = replace(design, level=0.95)
+    assert not any("is not held: intervals" in note for note in write_sensor_csv(plain, tmp_path / "d.csv"))
+
+
+@pytest.mark.parametrize(
+    ("text", "position", "says"),
+    [
+        (ROW.replace("3.14", "abc"), ":1:4", "azimuth_mean is 'abc'"),
+        (ROW.replace("3.14", "nan"), ":1:4", "finite"),
+        (ROW.replace("3.14", ""), ":1:4", "azimuth_mean is ''"),
+        (f"{HEADER}\n{ROW}\n{ROW.replace('0.3,1', '-0.3,1')}", ":3:15", "time_sigma"),
+        (f"{HEADER}\n{ROW[:-1]}-1", ":2:16", "at least 0"),
+        (f"{HEADER}\n{ROW[:-2]}", ":2", "15 columns"),
+        (f"{HEADER}\n{ROW},1,2", ":2", "18 columns"),
+        (ROW.replace("0.1,1.2", "1.7,1.2"), ":1", "elevation_mean"),
+        (ROW.replace("0.04,0.01", "0.04,0.9"), ":1", "eigenvalue"),
+        (ROW[:-1] + "0", "", "sum to 0"),
+        (HEADER, "", "no sensor"),
+        (
+            f"{HEADER.replace('weight', 'wieght')}\n{ROW}",
+            ":1",
+            "missing columns: weight; unknown or repeated: wieght",
+        ),
+        (f"{HEADER.replace('weight', 'time_sigma')}\n{ROW}", ":1", "missing columns: weight"),
+    ],
+)
+def test_a_bad_table_is_refused_with_its_position(tmp_path, text, position, says):
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    with pytest.raises(DataError) as caught:
+        load_design(path)
+    assert f"bad.csv{position}: " in str(caught.value)
+    assert says in str(caught.value)
+    assert caught.value.exit_code == 3
+
+
+def test_an_empty_file_and_bytes_that_are_no_text_are_refused(tmp_path):
+    path = tmp_path / "bad.csv"
+    path.write_text("\n \n")
+    with pytest.raises(DataError, match="empty"):
+        read_sensor_csv(path)
+    path.write_bytes(b"1,\xff\xfe,3\n")
+    with pytest.raises(DataError, match="UTF-8"):
+        load_design(path)
+
+
+@pytest.mark.parametrize(
+    "text", ["schema_version: 1\nsensors: [1, 2]\n", "a: 1, 2", "{a: 1, b: 2}", "[1, 2]", "- 1"]
+)
+def test_yaml_is_not_taken_for_a_table(tmp_path, text):
+    assert not looks_like_sensor_csv(text.encode())
+    path = tmp_path / "a.csv"
+    path.write_text(text)
+    with pytest.raises(ConfigError):
+        load_design(path)
