@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from lidardesign.density.settings import PRESET_LEARNING, PRESETS, DensitySettings, LearningSettings
 from lidardesign.errors import ConfigError
@@ -67,17 +67,24 @@ class RunConfig:
         }
 
 
+def _pair(value: Any) -> Any:
+    return (value, value) if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+_Bounds = Annotated[tuple[float, float], BeforeValidator(_pair)]
+
+
 class _SpaceSection(BaseModel):
     """Bounds that replace the task's: a pair [low, high], or one number that fixes the dimension."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    x_m: float | tuple[float, float]
-    y_m: float | tuple[float, float]
-    z_m: float | tuple[float, float]
-    azimuth_rad: float | tuple[float, float]
-    elevation_rad: float | tuple[float, float]
-    range_m: float | tuple[float, float]
+    x_m: _Bounds
+    y_m: _Bounds
+    z_m: _Bounds
+    azimuth_rad: _Bounds
+    elevation_rad: _Bounds
+    range_m: _Bounds
     condition: tuple[Literal[DIMENSIONS], ...] = Field(())
     measure: Literal["solid_angle", "angles"] = Field("solid_angle")
 

@@ -55,7 +55,7 @@ def anchor_paths(values: Any, given: Any, model: type[BaseModel], base: Path) ->
         if isinstance(value, dict) and nested:
             anchor_paths(values[name], value, nested, base)
         elif _holds_path(info.annotation):
-            values[name] = _absolute(value, base)
+            values[name] = _absolute(values[name], base)
 
 
 def _absolute(value: Any, base: Path) -> Any:

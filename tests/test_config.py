@@ -1,0 +1,241 @@
+"""A configuration is merged in the promised order, and its errors point at where the value came from."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import pytest
+from pydantic import Field, model_validator
+
+from lidardesign.density.settings import DensitySettings, LearningSettings
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.run import config as config_module
+from lidardesign.run.config import load_run_config, resolve, save_run_config
+from lidardesign.run.manifest import start_manifest
+from lidardesign.run.overrides import parse_override
+from lidardesign.space import DIMENSIONS, DesignSpace
+from lidardesign.task import Defaults, Metric, TaskConfig
+
+
+class Jitter(TaskConfig):
+    angle_rad: float = Field(0.1, ge=0)
+    folder: Path | None = None
+
+
+class ToyConfig(TaskConfig):
+    model: Path | None = None
+    extra: tuple[Path, ...] = ()
+    count: int = Field(3, ge=1)
+    label: str = "a"
+    jitter: Jitter = Jitter()
+    low: float = 0.0
+    high: float = 1.0
+
+    @model_validator(mode="after")
+    def _ordered(self):
+        if self.low > self.high:
+            raise ValueError("low is above high")
+        return self
+
+
+class ToyTask:
+    name = "toy"
+    summary = "for tests"
+    api_version = 1
+    Config = ToyConfig
+    metric = Metric("error", "mm", "lower", 100.0, 0.1)
+    defaults = Defaults(density={"sigma_m": 0.01}, learning={"draft": {"steps": 77}})
+
+    def space(self, config):
+        return DesignSpace((0, 0, 0, 0, 0, 0.1), (1, 0, 0, 1, 0.5, float(config.count)))
+
+    def scenes(self, config, split, seed):
+        return []
+
+    def score(self, scene, returns):
+        raise NotImplementedError
+
+
+TASK = ToyTask()
+
+
+@pytest.fixture
+def write(tmp_path):
+    def to_file(text: str) -> Path:
+        path = tmp_path / "config.yaml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return to_file
+
+
+def test_later_layers_win_over_earlier_ones(write):
+    assert resolve(TASK).learning.steps == LearningSettings().steps
+    assert resolve(TASK, preset="draft").learning.batch == 1024
+    assert resolve(TASK, preset="draft").learning.steps == 77
+    assert resolve(TASK).density.sigma_m == 0.01
+    file = write("preset: draft\nseed: 5\nlearning: {steps: 88}\ndensity: {sigma_m: 1e-3}\n")
+    resolved = resolve(TASK, config_file=file)
+    assert (resolved.preset, resolved.seed, resolved.learning.steps) == ("draft", 5, 88)
+    assert resolved.density.sigma_m == 1e-3
+    resolved = resolve(TASK, config_file=file, overrides=["learning.steps=99"], seed=6, preset="fine")
+    assert (resolved.preset, resolved.seed, resolved.learning.steps) == ("fine", 6, 99)
+    assert resolve(TASK, overrides=["learning.steps=1", "learning.steps=2"]).learning.steps == 2
+
+
+def test_a_bare_or_unknown_first_key_belongs_to_the_task():
+    resolved = resolve(TASK, overrides=["count=7", "jitter.angle_rad=0.5", "task.label=b"])
+    assert (resolved.task.count, resolved.task.jitter.angle_rad, resolved.task.label) == (7, 0.5, "b")
+    assert resolved.space.high[5] == 7.0
+
+
+def test_bounds_replace_those_of_the_task_and_one_number_fixes_a_dimension():
+    resolved = resolve(TASK, overrides=["space.x_m=[-1, 2]", "space.z_m=1.5", "space.condition=[x_m]"])
+    assert (resolved.space.low[0], resolved.space.high[0]) == (-1, 2)
+    assert resolved.space.low[2] == resolved.space.high[2] == 1.5
+    assert resolved.space.condition == ("x_m",)
+    assert 2 not in resolved.space.free
+
+
+def test_values_are_read_as_yaml():
+    assert parse_override("a=1e-3").value == 1e-3
+    assert parse_override("a=null").value is None
+    assert parse_override("a=no").value == "no"
+    assert parse_override("a=C:/models: one.h5").value == "C:/models: one.h5"
+    assert parse_override("a=@file").value == "@file"
+    assert parse_override("a='1'").value == "1"
+    assert parse_override("a.b=[1, {c: 2}]").value == [1, {"c": 2}]
+    assert parse_override("a=x=y").value == "x=y"
+
+
+def test_paths_become_absolute_from_where_they_were_written(write, tmp_path, monkeypatch):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    file = write("task: {model: data/a.h5, extra: [b.ply], jitter: {folder: c}, label: d}\n")
+    resolved = resolve(TASK, config_file=file).task
+    assert resolved.model == tmp_path / "data" / "a.h5"
+    assert resolved.extra == (tmp_path / "b.ply",)
+    assert resolved.jitter.folder == tmp_path / "c"
+    assert resolved.label == "d"
+    resolved = resolve(TASK, config_file=file, overrides=["model=../m.h5", "jitter.folder=f"]).task
+    assert resolved.model == tmp_path / "m.h5"
+    assert resolved.jitter.folder == elsewhere / "f"
+    assert resolved.extra == (tmp_path / "b.ply",)
+    assert resolve(TASK, overrides=["model=null"]).task.model is None
+    assert resolve(TASK, overrides=["model=~/m.h5"]).task.model == Path.home() / "m.h5"
+
+
+BAD_FILES = {
+    "unknown section": ("desnity: {sigma_m: 1}", "1:1", "did you mean 'density'"),
+    "unknown key": ("density:\n  sigma: 0.1\n", "2:3", "did you mean 'sigma_m'"),
+    "unknown task key": ("task:\n  cuont: 1\n", "2:3", "did you mean 'count'"),
+    "nested unknown key": ("task:\n  jitter:\n    angle: 1\n", "3:5", "angle_rad"),
+    "negative sigma": ("density:\n  sigma_m: -0.1\n", "2:12", "greater than 0"),
+    "wrong type": ("learning:\n  steps: many\n", "2:10", "valid integer"),
+    "wrong word": ("density: {visibility: perhaps}\n", "1:23", "raycast"),
+    "boolean for a word": ("density: {visibility: true}\n", "1:23", "raycast"),
+    "reversed bounds": ("space:\n  x_m: [2, 1]\n", "2:8", "above the upper bound"),
+    "bounds of three": ("space:\n  x_m: [0, 1, 2]\n", "2:8", "at most 2 items"),
+    "too steep": ("space:\n  elevation_rad: [-2, 0]\n", "2:18", "leaves the sphere"),
+    "unknown dimension": ("space:\n  condition: [w_m]\n", "2:15", "x_m"),
+    "section without keys": ("density: 3\n", "1:1", "keys and values"),
+    "other task": ("task_name: face\n", "1:12", "toy"),
+    "newer schema": ("schema_version: 2\n", "1:17", "schema version 2"),
+    "preset": ("preset: quick\n", "1:9", "draft, standard, fine"),
+    "seed": ("seed: -1\n", "1:7", "whole number"),
+    "rule of the task": ("task:\n  low: 2\n", "", "low is above high"),
+    "duplicate": ("density:\n  sigma_m: 1\n  sigma_m: 2\n", "3:3", "given before"),
+    "list": ("- a\n", "1:1", "keys and values"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_FILES)
+def test_errors_in_a_file_point_at_line_and_column(write, case):
+    text, position, words = BAD_FILES[case]
+    file = write(text)
+    with pytest.raises(ConfigError) as caught:
+        resolve(TASK, config_file=file)
+    assert caught.value.where.startswith(f"{file}:{position}"), caught.value.where
+    assert words in str(caught.value)
+    assert caught.value.exit_code == 2
+
+
+BAD_OVERRIDES = {
+    "density.sigma_m=-1": "greater than 0",
+    "density.sigma=1": "did you mean 'sigma_m'",
+    "density.sigma_m=": "valid number",
+    "density=3": "unknown key 'task.density'",
+    "count=0": "greater than or equal to 1",
+    "count=1.5": "valid integer",
+    "cuont=1": "did you mean 'count'",
+    "space.x_m=[2,1]": "above the upper bound",
+    "space.x_m=[a,1]": "valid number",
+    "space.x_m=[0,1": "not YAML",
+    "space.x_m=[0,.inf]": "finite",
+    "space.range_m=[-1,1]": "negative",
+    "space.x_m.0=[1]": "x_m",
+    "learning.rate.x=1": "valid number",
+    "label.x=1": "label",
+    "extra.0.x=1": "extra",
+    "nothing": "KEY=VALUE",
+    "=1": "KEY=VALUE",
+    "a..b=1": "KEY=VALUE",
+}
+
+
+@pytest.mark.parametrize("override", BAD_OVERRIDES)
+def test_errors_in_an_override_show_it(override):
+    with pytest.raises(ConfigError) as caught:
+        resolve(TASK, overrides=[override])
+    assert caught.value.where == f"--set {override}" or caught.value.where.startswith(f"--set {override}:")
+    assert BAD_OVERRIDES[override] in str(caught.value)
+
+
+def test_an_override_of_a_file_takes_the_blame_for_its_value(write):
+    file = write("density: {sigma_m: 0.1}\n")
+    with pytest.raises(ConfigError, match=r"^--set density\.sigma_m=-1"):
+        resolve(TASK, config_file=file, overrides=["density.sigma_m=-1"])
+
+
+def test_a_list_item_is_set_by_its_index(write):
+    file = write("task: {extra: [a.ply, b.ply]}\n")
+    resolved = resolve(TASK, config_file=file, overrides=["extra.1=/c.ply"])
+    assert resolved.task.extra[1] == Path("/c.ply")
+    with pytest.raises(ConfigError, match="0 to 1"):
+        resolve(TASK, config_file=file, overrides=["extra.2=/c.ply"])
+
+
+def test_what_was_saved_is_loaded_back(tmp_path, monkeypatch):
+    monkeypatch.setattr(config_module, "load_task", lambda name: {"toy": TASK}[name])
+    start_manifest(tmp_path, command=[], seed=0)
+    overrides = [
+        "space.x_m=[-1, 2]",
+        "density.sigma_m=1e-5",
+        "model=m.h5",
+        "label='1e-3'",
+        "jitter.angle_rad=0.3",
+    ]
+    saved = resolve(TASK, preset="fine", overrides=overrides, seed=11)
+    save_run_config(saved, tmp_path)
+    task, loaded = load_run_config(tmp_path)
+    assert task is TASK
+    assert loaded == saved
+    assert DensitySettings().model_dump().keys() <= loaded.as_document()["density"].keys()
+    assert [name for name in DIMENSIONS if name not in loaded.as_document()["space"]] == []
+
+
+def test_a_saved_configuration_that_was_edited_is_noticed(tmp_path):
+    start_manifest(tmp_path, command=[], seed=0)
+    save_run_config(resolve(TASK), tmp_path)
+    path = tmp_path / "config.yaml"
+    path.write_text(path.read_text().replace("0.01", "0.02"))
+    with pytest.raises(DataError, match="changed"):
+        load_run_config(tmp_path)
+
+
+def test_no_validation_warns(write):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        resolve(TASK, config_file=write("task: {model: a}"), overrides=["count=2"]).as_document()

@@ -1,0 +1,131 @@
+"""A broken plugin is listed with its reason and never takes the program down."""
+
+from __future__ import annotations
+
+import sys
+import time
+from importlib.metadata import EntryPoint
+
+import pytest
+
+from lidardesign import registry
+from lidardesign.errors import ConfigError, PluginError
+from lidardesign.registry import list_tasks, load_task, plugin_guard
+
+GOOD = """
+from lidardesign.task import Defaults, Metric, Score, TaskConfig
+
+class GoodTask:
+    name = "good"
+    summary = "a task that keeps the contract"
+    api_version = 1
+    Config = TaskConfig
+    metric = Metric("error", "mm", "lower", 100.0, 0.1)
+    defaults = Defaults()
+    def space(self, config): ...
+    def scenes(self, config, split, seed): ...
+    def score(self, scene, returns): ...
+"""
+
+BROKEN = {
+    "missing_import": ("import a_module_that_is_not_there", "ModuleNotFoundError"),
+    "leaves": ("raise SystemExit(3)", "exit 3"),
+    "syntax": ("def (", "SyntaxError"),
+    "no_class": ("", "AttributeError"),
+    "raises_base": ("raise RuntimeError('no\\nlicence')", "no licence"),
+    "old": (GOOD.replace("api_version = 1", "api_version = 99"), "version 99"),
+    "unversioned": (GOOD.replace("api_version = 1", ""), "version None"),
+    "no_metric": (GOOD.replace('Metric("error", "mm", "lower", 100.0, 0.1)', "'mm'"), "metric is no Metric"),
+    "no_config": (GOOD.replace("Config = TaskConfig", "Config = dict"), "TaskConfig"),
+    "no_score": (GOOD.replace("def score(self, scene, returns): ...", ""), "no method score"),
+    "other_name": (GOOD, "calls itself 'good'"),
+    "fails_to_start": (
+        GOOD.replace("def space", "def __init__(self): raise ValueError('x')\n    def space"),
+        "ValueError",
+    ),
+}
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Install plugin modules by name, in place of the ones of this environment."""
+    offers = []
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(registry, "entry_points", lambda group: [o for o in offers if o.group == group])
+
+    def add(name, source, module=None):
+        module = module or f"plugin_{name}"
+        (tmp_path / f"{module}.py").write_text(source)
+        offers.append(EntryPoint(name, f"{module}:GoodTask", registry.GROUP))
+
+    yield add
+    for name in [name for name in sys.modules if name.startswith("plugin_")]:
+        del sys.modules[name]
+
+
+def test_every_way_to_break_is_listed_and_the_others_still_load(install):
+    install("good", GOOD)
+    for name, (source, _) in BROKEN.items():
+        install(name, source)
+    listings = {listing.name: listing for listing in list_tasks()}
+    assert listings["good"].error is None
+    assert listings["good"].summary == "a task that keeps the contract"
+    for name, (_, words) in BROKEN.items():
+        assert words in listings[name].error, name
+    assert load_task("good").name == "good"
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_using_a_broken_plugin_names_it_and_exits_6(install, name):
+    install(name, BROKEN[name][0])
+    with pytest.raises(PluginError, match=name) as caught:
+        load_task(name)
+    assert caught.value.exit_code == 6
+
+
+def test_an_unknown_name_lists_what_there_is(install):
+    install("good", GOOD)
+    with pytest.raises(ConfigError, match="did you mean 'good'") as caught:
+        load_task("god")
+    assert caught.value.exit_code == 2
+    with pytest.raises(ConfigError, match="tasks list"):
+        load_task("zzz")
+
+
+def test_a_name_that_two_packages_offer_is_refused_by_both_names(install):
+    install("good", GOOD, module="plugin_one")
+    install("good", GOOD, module="plugin_two")
+    with pytest.raises(PluginError, match=r"plugin_one.*plugin_two"):
+        load_task("good")
+    assert "plugin_one" in list_tasks()[0].error
+
+
+def test_the_same_entry_point_found_twice_counts_once(install):
+    install("good", GOOD)
+    install("good", GOOD)
+    assert load_task("good").name == "good"
+
+
+def test_a_plugin_that_prints_on_import_leaves_stdout_alone(install, capsys):
+    install("good", "print('hello')\n" + GOOD)
+    load_task("good")
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "hello" in captured.err
+
+
+def test_an_import_that_hangs_is_interrupted(install, monkeypatch):
+    monkeypatch.setattr(registry, "IMPORT_SECONDS", 0.05)
+    install("good", "import time\ntime.sleep(30)\n" + GOOD)
+    started = time.monotonic()
+    assert "was not imported within" in list_tasks()[0].error
+    assert time.monotonic() - started < 10
+
+
+def test_the_guard_turns_what_a_plugin_raises_into_a_plugin_error():
+    with pytest.raises(PluginError, match="ZeroDivisionError"), plugin_guard("good"):
+        _ = 1 / 0
+    with pytest.raises(ConfigError, match="mine"), plugin_guard("good"):
+        raise ConfigError("mine")
+    with pytest.raises(KeyboardInterrupt), plugin_guard("good"):
+        raise KeyboardInterrupt
