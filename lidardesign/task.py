@@ -6,6 +6,7 @@ A plugin is a class with the members of `Task`, registered under the entry-point
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
@@ -110,3 +111,14 @@ def random_generator(seed: int, *labels: str | int) -> np.random.Generator:
     """An independent generator per purpose, so that adding a draw to one never changes another."""
     words = [int.from_bytes(str(label).encode(), "little") % (2**63) for label in labels]
     return np.random.default_rng(np.random.SeedSequence([seed, *words]))
+
+
+def scenes_of(task: Task, config: Any, split: Split, seed: int, space: DesignSpace) -> Sequence[Scene]:
+    """The scenes of a split, judged by what a run's own design space can see.
+
+    A task whose `scenes` takes a keyword `space` gets it; its truth then follows a space set in the run's
+    configuration. Other tasks judge by the space of their configuration.
+    """
+    if "space" in inspect.signature(task.scenes).parameters:
+        return task.scenes(config, split, seed, space=space)  # type: ignore[call-arg]
+    return task.scenes(config, split, seed)

@@ -1,9 +1,9 @@
 """Bring your own meshes: a folder of mesh files and a design space.
 
 Every file is one object of a class (or one scan). Files are split into training and held-out ones; each is
-shown in a few slightly different poses. With a single file the poses alone make the splits. The world's z axis
-is up, and unless told otherwise one sensor place is in front (+x) of the objects, at twice their extent, and
-looks at them.
+shown in a few slightly different poses. With a single file the poses alone make the splits. The world's z
+axis is up, and unless told otherwise one sensor place is in front (+x) of the objects, at twice their extent,
+and looks at them.
 """
 
 from __future__ import annotations
