@@ -400,3 +400,18 @@ def test_the_share_of_a_sensors_own_samples_inside_is_the_level_to_the_third_pow
     inside = members(Design("d", (component,)), np.column_stack([origin, drawn]), np.ones(count))[0]
     assert interval_factor(0.95) == pytest.approx(1.959964, abs=1e-6)
     assert len(inside) / count == pytest.approx(0.95**3, abs=0.006)
+
+
+def test_a_fan_without_height_keeps_its_samples_and_lays_them_out_in_its_plane():
+    fan = sensor(elevation_rad=0.3, roll_rad=0.0, spread_vertical_rad=0.0)
+    generator = np.random.default_rng(6)
+    drawn = np.column_stack(
+        [generator.normal(1.0, 0.1, 4000), np.full(4000, 0.3), generator.normal(1, 0.1, 4000)]
+    )
+    points = np.column_stack([np.tile(fan.origin_m, (4000, 1)), drawn])
+    samples = Samples(points, np.zeros(4000), np.zeros(4000), SPACE)
+    design = Design("d", (fan, replace(fan, name="t", azimuth_rad=2.0)), layout="density")
+    assert (owners(design, points) == 0).mean() > 0.99
+    tangent = coordinates(design, lay_out(design, 20, samples))[:10]
+    np.testing.assert_allclose(tangent[:, 1], 0, atol=1e-12)
+    assert not np.allclose(np.diff(np.sort(tangent[:, 0])), np.ptp(tangent[:, 0]) / 9, atol=1e-3)

@@ -59,6 +59,7 @@ def members(design: Design, points: np.ndarray, weights: np.ndarray) -> list[Mem
 def _inside(sensor: Sensor, index: np.ndarray, observed: np.ndarray, weights: np.ndarray) -> Members:
     aimed = aim(sensor.origin_m, observed[index])
     tangent = tangent_coordinates(sensor.frame, direction(aimed[:, AZIMUTH], aimed[:, ELEVATION]))
+    tangent[:, ~_spreading(sensor)] = 0.0
     half_field = np.array(sensor.field_of_view_rad) / 2 + FIELD_ROUNDING_RAD
     start, end = sensor.gate_m
     distance = aimed[:, RANGE]
@@ -66,6 +67,12 @@ def _inside(sensor: Sensor, index: np.ndarray, observed: np.ndarray, weights: np
     keep &= weights[index] > 0
     kept = index[keep]
     return Members(kept, tangent[keep], distance[keep], weights[kept])
+
+
+def _spreading(sensor: Sensor) -> np.ndarray:
+    """Which tangent axes say where a sample lies, shape (2,): in a fan of rays only the one along it."""
+    spread = np.array([sensor.spread_horizontal_rad, sensor.spread_vertical_rad]) > 0
+    return spread if spread.any() else np.ones(2, dtype=bool)
 
 
 def owners(design: Design, points: np.ndarray) -> np.ndarray:
@@ -95,9 +102,11 @@ def log_density(sensor: Sensor, points: np.ndarray, *, smallest_m: float) -> np.
     offset = (points[:, :3] - sensor.origin_m) @ axes
     looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
     tangent = tangent_coordinates(sensor.frame, looking)
-    angular = np.maximum([sensor.spread_horizontal_rad, sensor.spread_vertical_rad], SMALLEST_ANGLE_RAD)
+    used = _spreading(sensor)
+    spreads = np.array([sensor.spread_horizontal_rad, sensor.spread_vertical_rad])
+    angular = np.maximum(spreads, SMALLEST_ANGLE_RAD)[used]
     depth = max(sensor.spread_range_m, smallest_m)
-    squares = np.square(offset / spread).sum(axis=1) + np.square(tangent / angular).sum(axis=1)
+    squares = np.square(offset / spread).sum(axis=1) + np.square(tangent[:, used] / angular).sum(axis=1)
     squares += np.square((points[:, RANGE] - sensor.range_m) / depth)
     angle = np.hypot(tangent[:, 0], tangent[:, 1])
     log_jacobian = np.log(angle_over_sine(angle, np.sin(angle)))

@@ -89,9 +89,11 @@ def lay_out(
     if design.ray_table is not None and len(design.ray_table.sensor) == total:
         return _table_rays(design.ray_table, rate_hz)
     shares = _shares(design, total)
-    seen = members(design, samples.points, samples.weights) if samples is not None else None
-    if seen is None and (gates == "ray" or design.layout == "density") and total:
-        raise _needs_samples(design, total, gates)
+    seen = None
+    if total and (gates == "ray" or design.layout == "density"):
+        if samples is None:
+            raise _needs_samples(design, total, gates)
+        seen = members(design, samples.points, samples.weights)
     tangents = [
         _tangent(design.layout, sensor, int(n), seen[index] if seen else None, seed)
         for index, (sensor, n) in enumerate(zip(design.sensors, shares, strict=True))
