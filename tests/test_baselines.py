@@ -1,0 +1,205 @@
+"""The simple rivals: exact numbers of rays, inside the space, the same every time."""
+
+import math
+
+import numpy as np
+import pytest
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.errors import ConfigError
+from lidardesign.evaluate.baselines import BASELINES, Baselines, build_baseline, unrolled
+from lidardesign.evaluate.placement import even_placement, low_discrepancy, opened_gate
+from lidardesign.scene import Body, Box, Scene, Sphere, rigid
+from lidardesign.simulate.simulate import simulate
+from lidardesign.space import DesignSpace, angles
+
+FIXED = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))
+FLAT = DesignSpace((0, 0, 0, math.pi / 4, 0, 0), (1, 0, 0, 3 * math.pi / 4, 0, 1.2))
+CEILING = DesignSpace((-1, -1, 1, 0, -math.pi / 2, 0.1), (1, 1, 1, 2 * math.pi, 0, 2.0))
+FREE = DesignSpace((-0.1, -0.1, -0.1, -0.5, -0.5, 0.05), (0.1, 0.1, 0.1, 0.5, 0.5, 4.0))
+TURN = DesignSpace((0, 0, 0, 0, -0.5, 0.05), (0, 0, 0, 2 * math.pi, 0.5, 4.0))
+FROZEN = DesignSpace((0, 0, 0, 0, 0, 3), (0, 0, 0, 0, 0, 3))
+
+
+def balls(centre, radius=0.4, jitter=0.05, count=3):
+    generator = np.random.default_rng(8)
+    return [
+        Scene(
+            (
+                Body(
+                    Sphere(radius),
+                    "ball",
+                    "both",
+                    rigid(translation_m=centre + generator.normal(0, jitter, 3)),
+                ),
+            )
+        )
+        for _ in range(count)
+    ]
+
+
+CASES = {
+    "fixed origin": (FIXED, balls(np.array([3.0, 0, 0]))),
+    "flatland": (FLAT, balls(np.array([0.5, 0.8, 0.0]), 0.15, 0.0)),
+    "ceiling": (CEILING, balls(np.array([0.3, 0.2, 0.0]), 0.2)),
+    "free origin": (FREE, balls(np.array([3.0, 0, 0]))),
+    "full turn": (TURN, balls(np.array([3.0, 0, 0]))),
+    "one point": (FROZEN, balls(np.array([3.4, 0, 0]), jitter=0.0)),
+}
+
+
+def design_points(rays):
+    azimuth, elevation = angles(rays.direction)
+    return np.column_stack([rays.origin_m, azimuth, elevation, rays.gate_m[:, 0]])
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("name", BASELINES)
+def test_any_number_of_rays_is_met_exactly_inside_the_space_and_repeats(case, name):
+    space, train = CASES[case]
+    source = Baselines(space, train, seed=4)
+    for count in (0, 1, 2, 7, 36, 101):
+        rays = source.rays(name, count)
+        again = build_baseline(name, space, train, count, seed=4)
+        assert len(rays) == count
+        # angles pass through unit vectors and back: near the poles that costs half of the digits
+        widened = DesignSpace(space.low, space.high, measure=space.measure)
+        points = design_points(rays)
+        points[:, 5] = np.clip(points[:, 5], space.low[5], space.high[5])
+        polar = np.abs(points[:, 4]) > math.pi / 2 - 1e-6
+        points[polar, 3] = space.low[3]
+        assert widened.contains(points, tolerance=1e-7).all()
+        assert np.array_equal(rays.direction, again.direction)
+        assert np.array_equal(rays.gate_m, again.gate_m)
+        assert np.array_equal(rays.origin_m, again.origin_m)
+
+
+def test_uniform_is_the_regular_grid_in_azimuth_and_elevation_with_the_whole_range():
+    rays = build_baseline("uniform", FIXED, [], 25, seed=0)
+    azimuth, elevation = angles(rays.direction)
+    steps = np.array([-0.4, -0.2, 0.0, 0.2, 0.4])
+    signed = np.where(azimuth > math.pi, azimuth - 2 * math.pi, azimuth)
+    np.testing.assert_allclose(signed.reshape(5, 5), np.tile(steps, (5, 1)), atol=1e-12)
+    np.testing.assert_allclose(elevation.reshape(5, 5), np.tile(steps[:, None], (1, 5)), atol=1e-12)
+    np.testing.assert_allclose(rays.gate_m, np.tile([0.05, 4.0], (25, 1)), rtol=1e-12)
+
+
+def test_bounding_lies_inside_uniforms_box_and_round_the_training_returns():
+    space, train = CASES["fixed origin"]
+    rays = build_baseline("bounding", space, train, 400, seed=0)
+    half = np.abs(np.asarray([math.asin(0.4 / 3.0)]))[0]
+    angle = np.arccos(rays.direction[:, 0])
+    assert angle.max() < 0.5
+    # the corner of a square round the largest ball, moved by up to three times the jitter of 0.05 m at 3 m
+    assert angle.max() < math.sqrt(2) * (half + 0.07)
+    start, end = rays.gate_m[0]
+    assert 2.4 < start < 2.7
+    assert end < 3.2
+    returned = np.mean([simulate(scene, rays)[0].returned.mean() for scene in train])
+    uniform = build_baseline("uniform", space, train, 400, seed=0)
+    assert returned > 3 * np.mean([simulate(scene, uniform)[0].returned.mean() for scene in train])
+
+
+def test_bounding_follows_a_target_across_the_end_of_the_turn():
+    space, train = CASES["full turn"]
+    rays = build_baseline("bounding", space, train, 100, seed=0)
+    assert (rays.direction[:, 0] > math.cos(0.4)).all()
+
+
+def test_bounding_does_not_count_returns_of_occluders():
+    space, train = CASES["fixed origin"]
+    post = Body(Box((0.05, 0.05, 0.5)), "post", "occluder", rigid(translation_m=(1.0, 0.35, 0.0)))
+    with_post = [Scene((*scene.bodies, post)) for scene in train]
+    start, _ = build_baseline("bounding", space, with_post, 100, seed=0).gate_m[0]
+    assert start > 2.0
+
+
+def test_bounding_from_the_ceiling_looks_straight_down_where_that_returns_more():
+    space, train = CASES["ceiling"]
+    rays = build_baseline("bounding", space, train, 100, seed=0)
+    np.testing.assert_allclose(rays.direction, np.tile([0.0, 0.0, -1.0], (100, 1)), atol=1e-12)
+    np.testing.assert_allclose(rays.origin_m[:, 2], 1.0)
+    assert np.ptp(rays.origin_m[:, 0]) < 1.0
+
+
+def test_a_judge_decides_between_the_candidates_of_bounding():
+    space, train = CASES["ceiling"]
+    vertical = build_baseline(
+        "bounding", space, train, 50, 0, judge=lambda rays: -abs(rays.direction[:, 2]).mean()
+    )
+    slanted = build_baseline(
+        "bounding", space, train, 50, 0, judge=lambda rays: abs(rays.direction[:, 2]).mean()
+    )
+    assert np.abs(vertical.direction[:, 2]).min() > 0.999
+    assert np.abs(slanted.direction[:, 2]).mean() < 0.99
+
+
+def test_bounding_without_any_return_is_uniform():
+    nothing = balls(np.array([-3.0, 0, 0]))
+    bounding = build_baseline("bounding", FIXED, nothing, 30, seed=0)
+    uniform = build_baseline("uniform", FIXED, nothing, 30, seed=0)
+    assert np.array_equal(bounding.direction, uniform.direction)
+    assert np.array_equal(bounding.gate_m, uniform.gate_m)
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("name", BASELINES)
+@pytest.mark.parametrize("limit", [0.0, 0.01, 0.5, 3.0])
+def test_as_many_rays_as_fit_in_a_bandwidth_fit_and_one_more_does_not(case, name, limit):
+    space, train = CASES[case]
+    bandwidth = Bandwidth()
+    source = Baselines(space, train, seed=0)
+    rays = source.rays_within(name, limit, bandwidth)
+    assert bandwidth.mbps(rays) <= limit
+    fitting = [
+        option for option in source.candidates(name) if len(option.rays_within(limit, bandwidth)) == len(rays)
+    ]
+    assert all(bandwidth.mbps(option.rays(len(rays) + 1)) > limit for option in fitting)
+
+
+def test_the_seed_moves_only_the_random_baseline():
+    space, train = CASES["free origin"]
+    for name in BASELINES:
+        first, second = (build_baseline(name, space, train, 20, seed) for seed in (1, 2))
+        assert np.array_equal(first.direction, second.direction) == (name != "random")
+
+
+def test_the_random_baseline_is_uniform_in_solid_angle():
+    space = DesignSpace((0, 0, 0, 0, -math.pi / 2, 0), (0, 0, 0, 2 * math.pi, math.pi / 2, 1))
+    rays = build_baseline("random", space, [], 4000, seed=0)
+    # the mean of uniform directions has variance 1 / 3 per axis; four standard errors
+    assert np.abs(rays.direction.mean(axis=0)).max() < 4 / math.sqrt(3 * 4000)
+
+
+def test_an_unknown_baseline_names_the_known_ones():
+    with pytest.raises(ConfigError, match="uniform, random, bounding"):
+        build_baseline("bouncing", FIXED, [], 3, seed=0)
+
+
+@pytest.mark.parametrize("axes", [1, 2, 3, 5])
+def test_low_discrepancy_points_fill_every_slab_evenly(axes):
+    points = low_discrepancy(1000, axes)
+    assert points.shape == (1000, axes)
+    for column in points.T:
+        counts = np.histogram(column, 20, (0, 1))[0]
+        # of 20 independent counts the largest would stray by about 14
+        assert np.abs(counts - 50).max() <= 6
+
+
+def test_even_placement_of_two_lengths_has_square_cells():
+    points = even_placement(np.zeros(5), np.array([2.0, 1.0, 0, 0, 0]), 50)
+    assert len(np.unique(points[:, 0])) == 10
+    assert len(np.unique(points[:, 1])) == 5
+
+
+def test_unrolled_azimuths_lie_on_the_smallest_arc():
+    azimuth = np.array([6.2, 0.1, 0.3, 6.0])
+    arc = unrolled(azimuth)
+    assert np.ptp(arc) == pytest.approx(2 * math.pi - 6.0 + 0.3)
+    np.testing.assert_allclose(np.cos(arc), np.cos(azimuth), atol=1e-12)
+
+
+def test_gates_hear_their_own_ends():
+    assert opened_gate(1.0, 2.0)[1] > 2.0
+    start, end = opened_gate(3.0, 3.0)
+    assert start < 3.0 < end
