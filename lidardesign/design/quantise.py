@@ -14,6 +14,8 @@ from lidardesign.errors import ConfigError
 # The iteration stops when no centre moves by more than this share of the features' extent: far below the
 # spacing of any ray layout, far above rounding.
 MOVEMENT_TOLERANCE = 1e-6
+# Seeds are drawn among at most so many points per centre: seeding costs N * K, an iteration only N log K.
+SEED_POOL = 16
 # Relative weights below this one count as it, so that the mass of a cell never underflows to nothing.
 SMALLEST_WEIGHT = 1e-200
 
@@ -108,6 +110,9 @@ def _repeat(
 
 def _seed(points: np.ndarray, weights: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
     """k-means++: each seed is drawn with probability weight times squared distance to the seeds so far."""
+    if len(points) > SEED_POOL * count:
+        pool = generator.choice(len(points), SEED_POOL * count, replace=False, shuffle=False)
+        points, weights = points[pool], weights[pool]
     draws = generator.uniform(size=count)
     chosen = np.empty(count, dtype=np.int64)
     squared = np.full(len(points), 1.0)
