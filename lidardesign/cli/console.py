@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 SCHEMA_VERSION = 1
+EXIT_SYSTEM = 3
 EXIT_INTERNAL = 70
 EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
@@ -117,10 +118,18 @@ def command(*, json: bool, quiet: bool, debug: bool) -> Iterator[Console]:
         with contextlib.redirect_stdout(sys.stderr) if json else contextlib.nullcontext():
             yield console
         console.output.flush()
-    except (typer.Exit, BrokenPipeError):
+    except typer.Exit:
         raise
+    except BrokenPipeError:
+        forget_stdout()
+        raise typer.Exit(EXIT_BROKEN_PIPE) from None
     except (Exception, KeyboardInterrupt) as error:
         raise typer.Exit(report_error(error, console)) from None
+
+
+def forget_stdout() -> None:
+    """Point stdout nowhere once it was closed, so that the last flush of the interpreter does not complain."""
+    sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - lives as long as the process
 
 
 def report_error(error: BaseException, console: Console) -> int:
@@ -147,6 +156,10 @@ def describe_error(error: BaseException, console: Console) -> tuple[dict[str, An
     if isinstance(error, MemoryError):
         text = "the computer has no memory left; a smaller batch, field_resolution or preset needs less"
         return {"kind": "memory", "message": text}, EXIT_INTERNAL, f"memory error: {text}"
+    if isinstance(error, OSError):
+        name = f"{error.filename}: " if error.filename else ""
+        text = f"{name}{error.strerror or error}"
+        return {"kind": "system", "message": text}, EXIT_SYSTEM, f"system error: {text}"
     text = f"{type(error).__name__}: {' '.join(str(error).split())}"
     hint = "this is a fault of lidardesign; --debug shows where, please report it"
     return (

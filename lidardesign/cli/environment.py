@@ -29,7 +29,11 @@ def set_thread_defaults() -> None:
 
 
 def make_streams_tolerant() -> None:
-    """Characters that the terminal's encoding lacks are written escaped instead of ending the program."""
+    """Escape characters that the terminal lacks; a stream that was closed swallows its output."""
+    if sys.stdout is None:
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - lives as long as the process
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(AttributeError, ValueError):
             stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]

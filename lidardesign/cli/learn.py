@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from lidardesign.task import Task
 
 DEVICES = ("auto", "cpu", "cuda")
-STARTED_FILES = {"config.yaml", "manifest.json", ".lock"}
+STARTED_FILES = {"config.yaml", "manifest.json", "progress.jsonl", ".lock"}
+CHECKPOINTS = "checkpoint*"
 
 
 def learn(
@@ -57,27 +58,17 @@ def learn(
 
         plugin = load_task(task)
         run = out if out is not None else Path("runs") / task
-        given = bool(preset or config or overrides or seed is not None)
+        choices = {"preset": preset, "config_file": config, "overrides": overrides or (), "seed": seed}
         if resume:
             _check_can_resume(run)
             plugin, settings = load_run_config(run)
-            if given or plugin.name != task:
-                _check_same(
-                    settings,
-                    resolve(
-                        load_task(task),
-                        preset=preset,
-                        config_file=config,
-                        overrides=overrides or (),
-                        seed=seed,
-                    ),
-                    run,
-                )
+            resume = any(run.glob(CHECKPOINTS))
+            if not resume:
+                console.note("the run has no checkpoint yet; it starts from the beginning")
+            _check_same(settings, plugin if plugin.name == task else load_task(task), choices, run)
         else:
             _check_can_start(run)
-            settings = resolve(
-                plugin, preset=preset, config_file=config, overrides=overrides or (), seed=seed
-            )
+            settings = resolve(plugin, **choices)
         result = _learn_in_folder(plugin, settings, run, resume, device, console)
         console.result(_document(result), lambda rich: _show(result, rich))
 
@@ -98,10 +89,18 @@ def _check_can_resume(run: Path) -> None:
         raise DataError("there is no run to resume", where=str(run), hint="leave out --resume to start it")
 
 
-def _check_same(stored: RunConfig, wanted: RunConfig, run: Path) -> None:
-    """Refuse to resume a run under another configuration."""
+def _check_same(stored: RunConfig, task: Task, choices: dict[str, Any], run: Path) -> None:
+    """Refuse to resume a run under another configuration; repeating its own options is fine."""
+    from lidardesign.run.config import resolve
     from lidardesign.run.yaml import leaves
 
+    wanted = resolve(
+        task,
+        preset=choices["preset"] or stored.preset,
+        config_file=choices["config_file"] or run / "config.yaml",
+        overrides=choices["overrides"],
+        seed=stored.seed if choices["seed"] is None else choices["seed"],
+    )
     old, new = dict(leaves(stored.as_document())), dict(leaves(wanted.as_document()))
     for path in [*old, *new]:
         if old.get(path) != new.get(path):
@@ -160,7 +159,7 @@ def _take_away(run: Path, made: list[Path], started_empty: bool) -> None:
 
 
 def _interruption(task: str, run: Path) -> str | None:
-    checkpoints = sorted(path.name for path in run.glob("checkpoint*"))
+    checkpoints = sorted(path.name for path in run.glob(CHECKPOINTS))
     if not checkpoints:
         return "before the first checkpoint; nothing was kept"
     return (

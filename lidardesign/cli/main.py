@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from typing import Annotated, Any
 
 import typer
 
 from lidardesign import __version__
-from lidardesign.cli.console import EXIT_BROKEN_PIPE, Console, print_json, report_error
+from lidardesign.cli.console import EXIT_BROKEN_PIPE, Console, forget_stdout, print_json, report_error
 from lidardesign.cli.constrain import constrain
 from lidardesign.cli.environment import make_streams_tolerant, set_thread_defaults, terminate_cleanly
 from lidardesign.cli.evaluate import evaluate
@@ -66,8 +65,11 @@ def run(arguments: list[str] | None = None) -> None:
         code = _invoke(arguments)
         sys.stdout.flush()
     except BrokenPipeError:
-        _forget_stdout()
+        forget_stdout()
         code = EXIT_BROKEN_PIPE
+    except OSError as error:
+        forget_stdout()
+        code = report_error(error, Console())
     sys.exit(code)
 
 
@@ -102,8 +104,3 @@ def _report_usage(error: Any, console: Console) -> int:
         print_json({"error": document, "exit_code": EXIT_USAGE})
     print(f"usage error: {path}: {message}\n  try: {hint}", file=sys.stderr)
     return EXIT_USAGE
-
-
-def _forget_stdout() -> None:
-    """Point stdout nowhere, so that the interpreter's last flush does not complain about the closed pipe."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
