@@ -316,6 +316,25 @@ def test_the_good_file_of_the_table_of_bad_ones_is_good(tmp_path):
     assert len(lay_out(load_design(path))) == 2
 
 
+@settings(max_examples=300, deadline=None)
+@given(
+    at=st.integers(0, len(GOOD) - 1),
+    length=st.integers(0, 12),
+    insert=st.text("[]{}:,-#&*!|>'\"%@ \n\t0a.é", max_size=4),
+)
+def test_a_damaged_file_is_read_or_refused_but_never_crashes(tmp_path_factory, at, length, insert):
+    path = tmp_path_factory.getbasetemp() / "damaged.yaml"
+    path.write_text(GOOD[:at] + insert + GOOD[at + length :], encoding="utf-8")
+    try:
+        design = load_design(path)
+    except (ConfigError, DataError) as error:
+        design, message = None, str(error)
+    if design is None:
+        assert "damaged.yaml" in message
+    else:
+        assert same(design_from_document(design_document(design)), design)
+
+
 @pytest.mark.parametrize("content", ["", "[]", "3", "just text", "a: 1", "sensors: []\nschema_version: 1\n"])
 def test_a_file_that_is_no_design_is_refused(tmp_path, content):
     path = tmp_path / "other.yaml"
@@ -343,3 +362,12 @@ def test_a_design_with_numbers_that_are_not_finite_is_not_written(tmp_path):
     with pytest.raises(NumericalError):
         save_design(broken, tmp_path / "broken.yaml")
     assert not list(tmp_path.iterdir())
+
+
+def test_the_file_has_one_level_and_the_sensors_keep_their_spreads():
+    design = load_design(EXAMPLE)
+    other = replace(design, level=0.8, rays=np.int64(100))
+    loaded = design_from_document(json.loads(json.dumps(design_document(other))))
+    assert {sensor.level for sensor in loaded.sensors} == {0.8}
+    spreads = [sensor.spread_horizontal_rad for sensor in design.sensors]
+    assert [sensor.spread_horizontal_rad for sensor in loaded.sensors] == spreads

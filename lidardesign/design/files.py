@@ -66,8 +66,9 @@ def design_document(design: Design) -> dict[str, Any]:
         "name": design.name,
         "layout": design.layout,
         "level": float(design.level),
-        "rays": design.rays,
-        "sensors": [_sensor_document(sensor) for sensor in design.sensors],
+        "rays": _count(design.rays),
+        # one level holds for the whole file, whatever level a sensor was made at: its spread says what it is
+        "sensors": [_sensor_document(replace(sensor, level=design.level)) for sensor in design.sensors],
     }
     if design.ray_table is not None:
         document["ray_table"] = _table_document(design.ray_table)
@@ -78,9 +79,13 @@ def design_document(design: Design) -> dict[str, Any]:
 
 def _sensor_document(sensor: Sensor) -> dict[str, Any]:
     values = sensor.as_dict()
-    rays = values.pop("rays")
+    rays = _count(values.pop("rays"))
     # the gate's start is cut at 0, so the mean range cannot be told from the gate alone
     return {**values, "range_m": float(sensor.range_m), "rays": rays}
+
+
+def _count(rays: int | None) -> int | None:
+    return None if rays is None else int(rays)
 
 
 def _table_document(table: RayTable) -> dict[str, list[float] | list[int]]:
