@@ -128,7 +128,7 @@ def command(*, json: bool, quiet: bool, debug: bool) -> Iterator[Console]:
 
 
 def forget_stdout() -> None:
-    """Point stdout nowhere once it was closed, so that the last flush of the interpreter does not complain."""
+    """Point stdout nowhere once it was closed, so that the interpreter's last flush is quiet."""
     sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - lives as long as the process
 
 

@@ -87,12 +87,12 @@ def load_constraints(file: Path | None, overrides: list[str]) -> Constraints:
         override = parse_override(text)
         origins[apply_override(values, override)] = override.where
 
-    def locate(path: KeyPath) -> str:
+    def locate(path: KeyPath, *, key: bool = False) -> str:
         path = tuple(path)
         for origin, where in origins.items():
             if path[: len(origin)] == origin or origin[: len(path)] == path != ():
                 return where
-        return document.locate(path)
+        return document.locate(path, key=key)
 
     return Constraints.from_mapping(values, where=str(file) if file else "constraints", locate=locate)
 
@@ -100,11 +100,9 @@ def load_constraints(file: Path | None, overrides: list[str]) -> Constraints:
 def _sensors(given: Any, constraints: Constraints, design: Design | None, usual: int) -> Any:
     """The number of sensors: the option's, then what the constraints ask for, the design's, the task's."""
     asked = constraints.sensors
-    if given is not None or (asked is not None and asked.count is not None):
-        return given
+    if given is not None or asked.count is not None:
+        return given if given is not None else asked.count
     usual = len(design.sensors) if design else usual
-    if asked is None:
-        return usual
     return min(max(usual, asked.min or usual), asked.max or usual)
 
 
@@ -114,7 +112,7 @@ def _rays(
     """The number of rays: the option's, then the constraints', the design's; a ray table needs one."""
     if given is not None:
         return given
-    if constraints.budget is not None and constraints.budget.rays is not None:
+    if constraints.budget.rays is not None:
         return constraints.budget.rays
     if design is not None and design.rays is not None:
         return design.rays

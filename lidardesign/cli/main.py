@@ -82,6 +82,9 @@ def _invoke(arguments: list[str]) -> int:
         code = error.exit_code
     except typer.Abort:
         return report_error(KeyboardInterrupt(), console)
+    except SystemExit as error:
+        # neither typer nor rich exits by itself here but for a closed pipe
+        raise BrokenPipeError from error
     except BrokenPipeError:
         raise
     except Exception as error:
