@@ -1,0 +1,147 @@
+"""What an evaluation found: one row per design or baseline and number of rays, and paired differences.
+
+A mean over scenes says little where scenes differ more than designs do. Differences are therefore taken scene
+by scene, and their intervals are the ones that tell two designs apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lidardesign.task import Metric
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One design or baseline at one number of rays.
+
+    Arguments:
+        design: Its name.
+        rays: Rays per frame.
+        value: Mean score over the held-out scenes, failures at the metric's worst value.
+        ci_low, ci_high: Ends of the 95 % bootstrap interval of the mean.
+        failures: Scenes with too few returns to score.
+        bandwidth_mbps: What its gates cost to read out [Mbit/s].
+        seconds: Time to simulate and score all scenes [s]; measured once where rows share their rays.
+        per_scene: The score in every held-out scene, shape (S,).
+        baseline: Whether it is a baseline.
+        matched_to, matched_rays: The design and its number of rays whose bandwidth this baseline was given;
+            None outside the comparison at equal bandwidth.
+    """
+
+    design: str
+    rays: int
+    value: float
+    ci_low: float
+    ci_high: float
+    failures: int
+    bandwidth_mbps: float
+    seconds: float
+    per_scene: np.ndarray
+    baseline: bool = False
+    matched_to: str | None = None
+    matched_rays: int | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The contract's keys; a row at equal bandwidth also says which design it was matched to."""
+        values: dict[str, Any] = {
+            "design": self.design,
+            "rays": self.rays,
+            "value": self.value,
+            "ci_low": self.ci_low,
+            "ci_high": self.ci_high,
+            "failures": self.failures,
+            "bandwidth_mbps": self.bandwidth_mbps,
+            "seconds": self.seconds,
+        }
+        if self.matched_to is not None:
+            values |= {"matched_to": self.matched_to, "matched_rays": self.matched_rays}
+        return values
+
+
+@dataclass(frozen=True)
+class Paired:
+    """The mean over scenes of a's score minus b's, in the metric's unit, with its 95 % bootstrap interval.
+
+    Arguments:
+        a, b: Names of the two.
+        rays: Rays per frame of both; of a alone at equal bandwidth.
+        difference: Negative where a is lower.
+        ci_low, ci_high: Ends of the interval.
+        rays_b: Rays per frame of b, where they differ: the comparison at equal bandwidth.
+    """
+
+    a: str
+    b: str
+    rays: int
+    difference: float
+    ci_low: float
+    ci_high: float
+    rays_b: int | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The contract's keys, with `rays_b` at equal bandwidth."""
+        names = ("a", "b", "rays", "difference", "ci_low", "ci_high")
+        values = {name: getattr(self, name) for name in names}
+        return values if self.rays_b is None else {**values, "rays_b": self.rays_b}
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """All rows of an evaluation.
+
+    Arguments:
+        metric: What the values mean.
+        scenes: The number of held-out scenes.
+        rows: Designs, then baselines, at equal numbers of rays.
+        paired: Every design against every baseline and every later design, at equal numbers of rays.
+        equal_bandwidth: Every baseline with as many rays as fit in the bandwidth of each row of a design.
+        paired_bandwidth: Every design against those.
+        notes: What a reader should know, one line each.
+    """
+
+    metric: Metric
+    scenes: int
+    rows: Sequence[Row]
+    paired: Sequence[Paired]
+    equal_bandwidth: Sequence[Row] = ()
+    paired_bandwidth: Sequence[Paired] = ()
+    notes: Sequence[str] = ()
+
+    def as_dict(self) -> dict[str, Any]:
+        """The contract's JSON form of `evaluate`.
+
+        Beyond the contract: `equal_bandwidth` rows name the design and rays that they are `matched_to`,
+        `paired_equal_bandwidth` compares each design with them (`rays_b` are the baseline's), and `notes`.
+        """
+        metric = self.metric
+        return {
+            "metric": {
+                "name": metric.name,
+                "unit": metric.unit,
+                "better": metric.better,
+                "worst": float(metric.worst),
+            },
+            "scenes": self.scenes,
+            "rows": [row.as_dict() for row in self.rows],
+            "paired": [pair.as_dict() for pair in self.paired],
+            "equal_bandwidth": [row.as_dict() for row in self.equal_bandwidth],
+            "paired_equal_bandwidth": [pair.as_dict() for pair in self.paired_bandwidth],
+            "effects": [],
+            "accuracy": [],
+            "notes": list(self.notes),
+        }
+
+
+def worse_than_threshold(evaluation: Evaluation, limit: float) -> list[Row]:
+    """Rows of designs whose mean misses a limit in the metric's unit; baselines never count.
+
+    Where lower is better, a row misses the limit by lying above it; where higher is better, by lying below
+    it: `--fail-above` then reads as "fail where worse than". A value equal to the limit meets it.
+    """
+    sign = 1.0 if evaluation.metric.better == "lower" else -1.0
+    return [row for row in evaluation.rows if not row.baseline and sign * row.value > sign * limit]

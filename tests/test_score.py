@@ -1,0 +1,285 @@
+"""Scoring on held-out scenes, with a task of a few lines: the share of rays without a return."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.sensor import Design, Sensor
+from lidardesign.errors import ConfigError, DataError, PluginError
+from lidardesign.evaluate.score import EvaluationRequest, evaluate, worse_than_threshold
+from lidardesign.scene import Body, Scene, Sphere, rigid
+from lidardesign.space import DesignSpace
+from lidardesign.task import Defaults, Metric, Score, TaskConfig
+
+SPACE = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))
+RAYS = (9, 25)
+
+
+class MissTask:
+    """Percent of rays without a return; fewer than three returns are a failure."""
+
+    name = "miss"
+    summary = "rays without a return"
+    api_version = 1
+    Config = TaskConfig
+    metric = Metric("misses", "%", "lower", worst=150.0, tolerance=1.0)
+    defaults = Defaults()
+
+    def space(self, config):
+        return SPACE
+
+    def scenes(self, config, split, seed):
+        return scenes(seed)
+
+    def score(self, scene, returns):
+        hit = sum(int(frame.returned.sum()) for frame in returns)
+        if hit < 3:
+            return Score(self.metric.worst, failed=True)
+        return Score(100.0 * (1 - hit / sum(len(frame.outcome) for frame in returns)))
+
+
+class HitTask(MissTask):
+    """Percent of rays with a return: higher is better."""
+
+    metric = Metric("hits", "%", "higher", worst=0.0, tolerance=1.0)
+
+    def score(self, scene, returns):
+        return Score(100.0 * float(np.mean(returns[0].returned)) if len(returns[0].outcome) else 0.0)
+
+
+def scenes(seed, count=6, side=0.0):
+    generator = np.random.default_rng(seed)
+    return [
+        Scene(
+            (
+                Body(
+                    Sphere(0.4),
+                    "ball",
+                    "both",
+                    rigid(translation_m=np.array([3, side, 0]) + generator.normal(0, 0.05, 3)),
+                ),
+            ),
+            f"ball {index}",
+        )
+        for index in range(count)
+    ]
+
+
+def design(name="aimed", azimuth=0.0, spread=0.03, range_m=2.65, weight=1.0):
+    sensor = Sensor(
+        "s0", weight, np.zeros(3), np.zeros((3, 3)), azimuth, 0.0, 0.0, spread, spread, range_m, 0.05
+    )
+    return Design(name, (sensor,))
+
+
+def make_request(designs=None, **changes):
+    task = changes.pop("task", MissTask())
+    values = {
+        "task": task,
+        "config": TaskConfig(),
+        "space": SPACE,
+        "seed": 3,
+        "designs": [design()] if designs is None else designs,
+        "rays": RAYS,
+        "train": scenes(1),
+        "test": scenes(2),
+    }
+    return EvaluationRequest(**{**values, **changes})
+
+
+def rows_by_key(evaluation):
+    return {(row.design, row.rays): row for row in evaluation.rows}
+
+
+def test_rows_are_designs_then_baselines_at_every_number_of_rays():
+    evaluation = evaluate(make_request())
+    names = ["aimed", "uniform", "random", "bounding"]
+    assert [(row.design, row.rays) for row in evaluation.rows] == [(name, n) for name in names for n in RAYS]
+    for row in evaluation.rows:
+        assert row.ci_low <= row.value <= row.ci_high
+        assert row.value == pytest.approx(row.per_scene.mean())
+        assert len(row.per_scene) == 6
+        assert row.seconds > 0
+    rows = rows_by_key(evaluation)
+    assert rows["aimed", 25].value < rows["uniform", 25].value
+
+
+def test_failures_are_counted_at_the_worst_value_and_never_dropped():
+    blind = design("blind", azimuth=0.45)
+    row = rows_by_key(evaluate(make_request([blind])))["blind", 25]
+    assert row.failures == 6
+    assert row.value == row.ci_low == row.ci_high == 150.0
+    mixed = [*scenes(2, 3), *scenes(2, 3, side=1.5)]
+    row = rows_by_key(evaluate(make_request(test=mixed)))["aimed", 25]
+    assert row.failures == 3
+    assert row.value == pytest.approx((row.per_scene[:3].sum() + 3 * 150.0) / 6)
+
+
+def test_every_design_is_paired_with_every_baseline_and_every_later_design():
+    evaluation = evaluate(make_request([design("first"), design("second", azimuth=0.05)]))
+    pairs = {(pair.a, pair.b, pair.rays): pair for pair in evaluation.paired}
+    others = ("second", "uniform", "random", "bounding")
+    expected = [("first", other, n) for n in RAYS for other in others]
+    expected += [("second", other, n) for n in RAYS for other in others[1:]]
+    assert sorted(pairs) == sorted(expected)
+    rows = rows_by_key(evaluation)
+    for (a, b, n), pair in pairs.items():
+        difference = rows[a, n].per_scene - rows[b, n].per_scene
+        assert pair.difference == pytest.approx(difference.mean())
+        assert pair.ci_low <= pair.difference <= pair.ci_high
+
+
+def test_baselines_at_equal_bandwidth_never_exceed_the_design_and_one_more_ray_would():
+    evaluation = evaluate(make_request([design(), design("wide", range_m=2.0, spread=0.1)]))
+    rows = rows_by_key(evaluation)
+    assert len(evaluation.equal_bandwidth) == 2 * len(RAYS) * 3
+    for row in evaluation.equal_bandwidth:
+        own = rows[row.matched_to, row.matched_rays]
+        assert row.bandwidth_mbps <= own.bandwidth_mbps
+        if row.rays and row.design in ("uniform", "random"):
+            assert row.bandwidth_mbps * (row.rays + 1) / row.rays > own.bandwidth_mbps
+    keys = {(pair.a, pair.rays, pair.b, pair.rays_b) for pair in evaluation.paired_bandwidth}
+    assert keys == {
+        (row.matched_to, row.matched_rays, row.design, row.rays) for row in evaluation.equal_bandwidth
+    }
+    without = evaluate(make_request(equal_bandwidth=False))
+    assert not without.equal_bandwidth
+    assert not without.paired_bandwidth
+
+
+def test_a_baseline_without_a_single_ray_in_the_bandwidth_fails_and_is_noted():
+    evaluation = evaluate(make_request(rays=(1,), bandwidth=Bandwidth(bin_ps=100.0)))
+    row = next(row for row in evaluation.equal_bandwidth if row.design == "uniform")
+    assert row.rays == 0
+    assert row.failures == 6
+    assert any("not one ray of" in note for note in evaluation.notes)
+
+
+def test_the_order_of_designs_changes_no_number():
+    designs = [design("first"), design("second", azimuth=0.05), design("third", spread=0.05)]
+
+    def numbers(order):
+        evaluation = evaluate(make_request([designs[i] for i in order]))
+        return {(r.design, r.rays): (r.value, r.ci_low, r.ci_high, r.failures) for r in evaluation.rows}
+
+    assert numbers([0, 1, 2]) == numbers([2, 0, 1])
+
+
+def test_a_judged_baseline_of_free_origins_is_scored_too():
+    space = DesignSpace((-0.1, -0.1, -0.1, -0.5, -0.5, 0.05), (0.1, 0.1, 0.1, 0.5, 0.5, 4.0))
+    for task in (MissTask(), HitTask()):
+        evaluation = evaluate(make_request(space=space, task=task))
+        rows = rows_by_key(evaluation)
+        sign = 1 if task.metric.better == "lower" else -1
+        assert sign * rows["bounding", 25].value < sign * rows["uniform", 25].value
+
+
+def test_the_document_has_the_keys_of_the_contract_and_is_plain_json():
+    document = evaluate(make_request()).as_dict()
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
+    keys = {"metric", "scenes", "rows", "paired", "equal_bandwidth", "effects", "accuracy"}
+    assert keys <= set(document)
+    row = {"design", "rays", "value", "ci_low", "ci_high", "failures", "bandwidth_mbps", "seconds"}
+    assert all(set(entry) == row for entry in document["rows"])
+    assert all(set(entry) == {*row, "matched_to", "matched_rays"} for entry in document["equal_bandwidth"])
+    pair = {"a", "b", "rays", "difference", "ci_low", "ci_high"}
+    assert all(set(entry) == pair for entry in document["paired"])
+    assert document["metric"] == {"name": "misses", "unit": "%", "better": "lower", "worst": 150.0}
+
+
+def test_one_held_out_scene_is_noted():
+    evaluation = evaluate(make_request(test=scenes(2, 1)))
+    assert any("one held-out scene" in note for note in evaluation.notes)
+
+
+def test_rows_that_fire_the_same_rays_are_scored_once():
+    calls = []
+
+    class Counting(MissTask):
+        def score(self, scene, returns):
+            calls.append(scene.name)
+            return super().score(scene, returns)
+
+    evaluate(make_request(task=Counting(), baselines=("uniform",), rays=(25, 25), test=scenes(2, 2)))
+    # one design and one baseline at 25 rays, and the baseline at the design's bandwidth, in two scenes each
+    assert len(calls) == 6
+
+
+def test_progress_counts_scenes():
+    seen = []
+    evaluate(make_request(), progress=lambda done, total, row: seen.append((done, total)))
+    assert seen == [(i, 6) for i in range(7)]
+
+
+class BrokenTask(MissTask):
+    def __init__(self, result):
+        self.result = result
+
+    def score(self, scene, returns):
+        if isinstance(self.result, BaseException):
+            raise self.result
+        return self.result
+
+
+@pytest.mark.parametrize(
+    "result",
+    [
+        ValueError("boom"),
+        SystemExit(0),
+        None,
+        1.0,
+        Score(float("nan")),
+        Score(float("inf")),
+        Score("3"),
+        Score(True),
+    ],
+    ids=str,
+)
+def test_a_broken_score_is_a_plugin_error_naming_task_metric_and_scene(result):
+    with pytest.raises(PluginError) as caught:
+        evaluate(make_request(task=BrokenTask(result)))
+    assert caught.value.exit_code == 6
+    for word in ("task miss", "metric misses", "scene ball 0"):
+        assert word in str(caught.value)
+
+
+def test_errors_about_data_keep_their_kind():
+    with pytest.raises(DataError):
+        evaluate(make_request(task=BrokenTask(DataError("no such file"))))
+
+
+def test_a_failure_has_the_worst_value_whatever_the_task_put_there():
+    row = evaluate(make_request(task=BrokenTask(Score(-5.0, failed=True)))).rows[0]
+    assert row.value == 150.0
+    row = evaluate(make_request(task=BrokenTask(Score(1e9)))).rows[0]
+    assert (row.value, row.failures) == (150.0, 0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"test": []}, "no held-out scenes"),
+        ({"designs": [design("a"), design("a")]}, "another design"),
+        ({"designs": [design("uniform")]}, "a baseline"),
+        ({"baselines": ("nothing",)}, "unknown baseline"),
+        ({"rays": (0,)}, "0 rays"),
+    ],
+)
+def test_requests_that_make_no_sense_are_refused(changes, message):
+    designs = changes.pop("designs", None)
+    with pytest.raises(ConfigError, match=message):
+        evaluate(make_request(designs, **changes))
+
+
+def test_a_threshold_knows_which_way_is_better():
+    evaluation = evaluate(make_request())
+    aimed = rows_by_key(evaluation)["aimed", 9].value
+    best = min(row.value for row in evaluation.rows if row.design == "aimed")
+    assert {row.design for row in worse_than_threshold(evaluation, best - 1e-9)} == {"aimed"}
+    assert not worse_than_threshold(evaluation, 150.0)
+    upward = replace(evaluation, metric=HitTask.metric)
+    assert not worse_than_threshold(upward, best)
+    assert worse_than_threshold(upward, aimed + 1e-9)
