@@ -72,6 +72,18 @@ class BoundedSpline(MonotonicRQSTransform):
         return self._turned(x)
 
 
+def _order(features: int, layer: int) -> Tensor:
+    """The rank of each dimension in a layer: reversed in every other layer, but the last one (the range) stays last.
+
+    Where a ray's surface lies is a function of the ray, so the range is always drawn given all the others.
+    """
+    import os
+    if os.environ.get("ORD") == "alt":
+        return torch.arange(features) if layer % 2 == 0 else torch.arange(features).flip(0)
+    rank = torch.arange(features)
+    return rank if layer % 2 == 0 else torch.cat([rank[:-1].flip(0), rank[-1:]])
+
+
 class DesignFlow(nn.Module):
     """A density over the free dimensions of design space, scaled to [-1, 1].
 
@@ -105,7 +117,7 @@ class DesignFlow(nn.Module):
             MaskedAutoregressiveTransform(
                 features,
                 context,
-                order=torch.arange(features) if layer % 2 == 0 else torch.arange(features).flip(0),
+                order=_order(features, layer),
                 univariate=self._spline,
                 shapes=shapes,
                 hidden_features=(hidden, hidden),

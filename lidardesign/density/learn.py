@@ -104,6 +104,8 @@ def learn(
     else:
         (run / PROGRESS).unlink(missing_ok=True)
     trainer.train(progress)
+    # float32 steps train as well and 2.4 times faster, but float32 splines give wrong densities: measure in float64
+    trainer.flow.double()
     clock.lap("learning")
     samples, figures = _measure(trainer, scenes, config)
     clock.lap("measuring")

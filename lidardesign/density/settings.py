@@ -39,7 +39,9 @@ class LearningSettings(BaseModel):
     layers: int = Field(5, ge=1, le=32, description="autoregressive spline layers")
     hidden: int = Field(64, ge=4, description="hidden width of each layer's network")
     bins: int = Field(16, ge=2, description="spline bins per dimension")
-    dtype: Literal["float64", "float32"] = Field("float64", description="arithmetic of the flow")
+    dtype: Literal["float64", "float32"] = Field(
+        "float32", description="arithmetic of training steps; samples and densities are always float64"
+    )
     entropy: float = Field(0.0, ge=0, description="eta of the paper; annealed to 0")
     sigma_start_m: float | None = Field(None, gt=0, description="where sigma's annealing starts; default 10 sigma")
     anneal: float = Field(0.6, ge=0, lt=1, description="share of the steps over which sigma falls to its final value")

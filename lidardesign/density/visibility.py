@@ -175,13 +175,13 @@ class Raycast:
         self, column: int, rays: RayBatch, active: np.ndarray, optics: Optics
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         rows = np.flatnonzero(active[:, column])
-        hits = self._casters[column].first_hit(rays.origins[rows], rays.directions[rows])
-        excess = rays.ranges[rows] - optics.margin_m - hits.range_m
-        blocked = excess > 0
-        rows, normal = rows[blocked], hits.normal[blocked]
+        limit_m = rays.ranges[rows] - optics.margin_m
+        hits = self._casters[column].trace(rays.origins[rows], rays.directions[rows], limit_m)
+        blocked = np.flatnonzero(hits.body >= 0)
+        rows, normal, excess = rows[blocked], hits.normal[blocked], (limit_m - hits.range_m)[blocked]
         # normals face the origin, so the cosine with the direction is negative
         cosine = np.minimum(np.einsum("nk,nk->n", normal, rays.directions[rows]), -MINIMUM_COSINE)
-        return rows, hits.range_m[blocked], normal / cosine[:, None], excess[blocked]
+        return rows, hits.range_m[blocked], normal / cosine[:, None], excess
 
 
 @dataclass(frozen=True, eq=False)

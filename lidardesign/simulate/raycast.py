@@ -15,6 +15,8 @@ import numpy as np
 from lidardesign.errors import ConfigError
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, inverse_rigid
 
+FARTHEST_M = 1e30  # what Embree takes for an unlimited ray
+
 Only = Literal["all", "targets", "occluders"]
 
 
@@ -55,11 +57,16 @@ class SceneCaster:
             ConfigError: An origin or direction that is not finite, or a direction of zero length.
         """
         origins, directions = _checked_rays(origins, directions)
-        hits = self._meshes.first_hit(origins, directions)
+        return self.trace(origins, directions, np.full(len(origins), np.inf))
+
+    def trace(self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Hits:
+        """`first_hit` of rays known to be finite, float64 and of unit length; from its limit (N,) on, a hit is a miss."""
+        hits = self._meshes.trace(origins, directions, limit_m)
         for index, body, pose in self._primitives:
-            _keep_nearer(hits, index, *_primitive_hit(body, pose, origins, directions))
-        facing = np.einsum("nk,nk->n", hits.normal, directions) > 0
-        hits.normal[facing] *= -1
+            _keep_nearer(hits, index, limit_m, *_primitive_hit(body, pose, origins, directions))
+        rows = np.flatnonzero(hits.body >= 0)
+        facing = np.einsum("nk,nk->n", hits.normal[rows], directions[rows]) > 0
+        hits.normal[rows[facing]] *= -1
         return hits
 
 
@@ -72,8 +79,8 @@ def _checked_rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarr
     return origins, directions / lengths[:, None]
 
 
-def _keep_nearer(hits: Hits, index: int, range_m: np.ndarray, normal: np.ndarray) -> None:
-    nearer = range_m < hits.range_m
+def _keep_nearer(hits: Hits, index: int, limit_m: np.ndarray, range_m: np.ndarray, normal: np.ndarray) -> None:
+    nearer = (range_m < hits.range_m) & (range_m < limit_m)
     hits.range_m[nearer], hits.body[nearer], hits.normal[nearer] = range_m[nearer], index, normal[nearer]
 
 
@@ -95,19 +102,21 @@ class _MeshCaster:
             TriangleMesh(self._scene, (mesh.vertices - self._centre).astype(np.float32), mesh.faces) for mesh in world
         ]
 
-    def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
+    def trace(self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Hits:
         count = len(origins)
         hits = Hits(np.full(count, np.inf), np.full(count, -1, dtype=np.int64), np.zeros((count, 3)))
         if not len(self._body_of_geometry) or not count:
             return hits
         found = self._scene.run(
-            (origins - self._centre).astype(np.float32), directions.astype(np.float32), output=True
+            (origins - self._centre).astype(np.float32),
+            directions.astype(np.float32),
+            dists=np.clip(limit_m, 0.0, FARTHEST_M).astype(np.float32),
+            output=True,
         )
-        hit = found["primID"] >= 0
-        hits.range_m[hit] = found["tfar"][hit]
-        hits.body[hit] = self._body_of_geometry[found["geomID"][hit]]
-        normal = found["Ng"][hit].astype(np.float64)
-        hits.normal[hit] = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
+        rows = np.flatnonzero((found["primID"] >= 0) & (found["tfar"] < limit_m))
+        hits.range_m[rows] = found["tfar"][rows]
+        hits.body[rows] = self._body_of_geometry[found["geomID"][rows]]
+        hits.normal[rows] = _unit(found["Ng"][rows].astype(np.float64))
         return hits
 
 
