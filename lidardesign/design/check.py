@@ -1,0 +1,298 @@
+"""The independent checker: does a written design keep a written constraint file?
+
+It reads plain documents only and shares no code with the fit: intervals are recomputed from means and spreads,
+compared with the reported ones, and bounds are applied to both. Definitions are those of `constraints`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Any
+
+# Rounding of the checker's own conversions between radians and degrees, as a share of the bound.
+ROUNDING = 1e-12
+# A reported interval may differ from its mean and spread by this share (decimal digits in a file).
+AGREEMENT = 1e-6
+# The bandwidth model counts a width this share above whole bins as whole bins.
+BIN_ROUNDING = 1e-9
+LIGHT_M_PER_S = 299792458.0
+
+
+@dataclass(frozen=True)
+class ConstraintCheck:
+    """One verified bound.
+
+    Arguments:
+        name: Sensor and key, as `s0.gate.width_m.max`.
+        bound: What was asked for.
+        value: What the design has.
+        satisfied: Whether it keeps the bound.
+    """
+
+    name: str
+    bound: Any
+    value: Any
+    satisfied: bool
+
+    def as_dict(self) -> dict[str, Any]:
+        """The contract's JSON form."""
+        return {"name": self.name, "bound": self.bound, "value": self.value, "satisfied": self.satisfied}
+
+
+def check_design(document: Mapping[str, Any], constraints: Any, space: Any = None) -> list[ConstraintCheck]:
+    """Verify every bound of a constraint document on a design document.
+
+    Arguments:
+        document: A design as plain values (the file, or its JSON form).
+        constraints: A constraint file as plain values, or an object with `as_document()`.
+        space: The design space as `DesignSpace` or its `as_dict()`; its range and origin bounds are then checked.
+
+    Returns:
+        One entry per sensor and bound, and one per budget line.
+    """
+    rules = constraints.as_document() if hasattr(constraints, "as_document") else dict(constraints or {})
+    bounds = space.as_dict() if hasattr(space, "as_dict") else space
+    level = float(document.get("level", 0.95))
+    z = NormalDist().inv_cdf((1 + level) / 2)
+    sensors = list(document["sensors"])
+    each = list(rules.get("each") or [])
+    checks = _count(rules, len(sensors))
+    for index, sensor in enumerate(sensors):
+        own = _over(rules, each[index]) if index < len(each) else rules
+        name = str(sensor.get("name", index))
+        checks += _consistency(name, sensor, z)
+        checks += _origin(name, sensor, own) + _boresight(name, sensor, own)
+        checks += _intervals(name, sensor, own, z)
+        if bounds is not None:
+            checks += _inside_space(name, sensor, bounds)
+    return checks + _table(document, rules) + _budget(document, rules)
+
+
+def _over(common: Mapping[str, Any], special: Mapping[str, Any] | None) -> dict[str, Any]:
+    result = dict(common)
+    for key, value in (special or {}).items():
+        if isinstance(value, Mapping) and isinstance(result.get(key), Mapping):
+            result[key] = _over(result[key], value)
+        elif value is not None:
+            result[key] = value
+    return result
+
+
+def _get(values: Any, *keys: str) -> Any:
+    for key in keys:
+        values = values.get(key) if isinstance(values, Mapping) else None
+    return values
+
+
+def _slack(bound: float) -> float:
+    return ROUNDING * max(abs(bound), 1.0)
+
+
+def _between(name: str, value: float, rules: Any) -> list[ConstraintCheck]:
+    """Checks of `min` and `max` where they are given."""
+    checks = []
+    low, high = _get(rules, "min"), _get(rules, "max")
+    if low is not None:
+        checks.append(ConstraintCheck(f"{name}.min", low, value, bool(value >= low - _slack(low))))
+    if high is not None:
+        checks.append(ConstraintCheck(f"{name}.max", high, value, bool(value <= high + _slack(high))))
+    return checks
+
+
+def _count(rules: Mapping[str, Any], found: int) -> list[ConstraintCheck]:
+    checks = _between("sensors", found, rules.get("sensors"))
+    wanted = _get(rules, "sensors", "count")
+    if wanted is not None:
+        checks.append(ConstraintCheck("sensors.count", wanted, found, wanted == found))
+    return checks
+
+
+def _consistency(name: str, sensor: Mapping[str, Any], z: float) -> list[ConstraintCheck]:
+    """Reported intervals against means and spreads."""
+    spread = sensor["spread"]
+    pairs = []
+    for axis in ("horizontal", "vertical"):
+        pairs.append(
+            (f"field_of_view_rad.{axis}", sensor["field_of_view_rad"][axis], 2 * z * spread[f"{axis}_rad"])
+        )
+    start, end = sensor["gate_m"]["start"], sensor["gate_m"]["end"]
+    mean = sensor.get("range_m")
+    if mean is not None:
+        pairs.append(("gate_m.start", start, max(mean - z * spread["range_m"], 0.0)))
+        pairs.append(("gate_m.end", end, mean + z * spread["range_m"]))
+    elif start > 0:
+        pairs.append(("gate_m.width", end - start, 2 * z * spread["range_m"]))
+    size = max(abs(value) for _, *values in pairs for value in values)
+    checks = [
+        ConstraintCheck(
+            f"{name}.{key}", expected, found, bool(abs(found - expected) <= AGREEMENT * max(size, 1e-9))
+        )
+        for key, found, expected in pairs
+    ]
+    # agreement is no news; a contradiction is
+    return [check for check in checks if not check.satisfied]
+
+
+def _origin(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any]) -> list[ConstraintCheck]:
+    mean, covariance = sensor["origin_m"]["mean"], sensor["origin_m"]["covariance"]
+    checks = []
+    tests = {
+        "low_m": lambda value, bound: value >= bound - _slack(bound),
+        "high_m": lambda value, bound: value <= bound + _slack(bound),
+        "fixed_m": lambda value, bound: abs(value - bound) <= _slack(bound),
+    }
+    for key, test in tests.items():
+        bound = _get(rules, "origin", key)
+        if bound is not None:
+            kept = all(test(value, limit) for value, limit in zip(mean, bound, strict=True))
+            checks.append(ConstraintCheck(f"{name}.origin.{key}", list(bound), list(mean), bool(kept)))
+    largest = _get(rules, "origin", "spread_m", "max")
+    spread = math.sqrt(max(_largest_eigenvalue(covariance), 0.0))
+    if largest is not None:
+        checks += _between(f"{name}.origin.spread_m", spread, {"max": largest})
+    if _get(rules, "origin", "fixed_m") is not None:
+        checks.append(ConstraintCheck(f"{name}.origin.fixed_m.spread", 0.0, spread, spread == 0.0))
+    return checks
+
+
+def _largest_eigenvalue(matrix: Any) -> float:
+    """Of a symmetric 3x3 matrix, in closed form (O. K. Smith, Eigenvalues of a symmetric 3x3 matrix, 1961)."""
+    (a, d, f), (_, b, e), (_, _, c) = matrix
+    off = d * d + e * e + f * f
+    if off == 0:
+        return max(a, b, c)
+    q = (a + b + c) / 3
+    p = math.sqrt(((a - q) ** 2 + (b - q) ** 2 + (c - q) ** 2 + 2 * off) / 6)
+    x, y, w = (a - q) / p, (b - q) / p, (c - q) / p
+    u, v, t = d / p, e / p, f / p
+    half_determinant = (x * (y * w - v * v) - u * (u * w - v * t) + t * (u * v - y * t)) / 2
+    return q + 2 * p * math.cos(math.acos(min(max(half_determinant, -1.0), 1.0)) / 3)
+
+
+def _boresight(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any]) -> list[ConstraintCheck]:
+    elevation = math.degrees(sensor["boresight"]["elevation_rad"])
+    checks = _between(f"{name}.boresight.elevation_deg", elevation, _get(rules, "boresight", "elevation_deg"))
+    given = _get(rules, "boresight", "azimuth_deg") or {}
+    low, high = given.get("min"), given.get("max")
+    if low is None and high is None:
+        return checks
+    azimuth = math.degrees(sensor["boresight"]["azimuth_rad"])
+    if low is None or high is None:
+        return checks + _one_sided(name, azimuth, low, high)
+    width = high - low if high - low >= 360 else (high - low) % 360
+    past = (azimuth - low) % 360
+    kept = past <= width + _slack(360) or past >= 360 - _slack(360)
+    return [*checks, ConstraintCheck(f"{name}.boresight.azimuth_deg", [low, high], azimuth, bool(kept))]
+
+
+def _one_sided(name: str, azimuth: float, low: float | None, high: float | None) -> list[ConstraintCheck]:
+    """A single bound holds for some number of whole turns within half a turn of it."""
+    bound = low if low is not None else high
+    assert bound is not None
+    offset = (azimuth - bound) % 360
+    kept = (
+        offset <= 180 + _slack(360)
+        if low is not None
+        else offset >= 180 - _slack(360) or offset <= _slack(360)
+    )
+    key = "min" if low is not None else "max"
+    return [ConstraintCheck(f"{name}.boresight.azimuth_deg.{key}", bound, azimuth, bool(kept))]
+
+
+def _intervals(
+    name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], z: float
+) -> list[ConstraintCheck]:
+    """Gate and field of view: the worse of the reported and the recomputed interval is checked."""
+    checks = []
+    spread = sensor["spread"]
+    for axis in ("horizontal", "vertical"):
+        bounds = _get(rules, "field_of_view", f"{axis}_deg")
+        key = f"{name}.field_of_view.{axis}_deg"
+        both = [math.degrees(v) for v in (sensor["field_of_view_rad"][axis], 2 * z * spread[f"{axis}_rad"])]
+        checks += _worse(key, both, bounds)
+    start, end = sensor["gate_m"]["start"], sensor["gate_m"]["end"]
+    starts, ends, widths = [start], [end], [end - start]
+    mean = sensor.get("range_m")
+    if mean is not None:
+        half = z * spread["range_m"]
+        starts.append(max(mean - half, 0.0))
+        ends.append(mean + half)
+        widths.append(ends[1] - starts[1])
+    for key, values in (("start_m", starts), ("end_m", ends), ("width_m", widths)):
+        checks += _worse(f"{name}.gate.{key}", values, _get(rules, "gate", key))
+    return checks
+
+
+def _worse(name: str, values: list[float], rules: Any) -> list[ConstraintCheck]:
+    low = _between(name, min(values), {"min": _get(rules, "min")})
+    return low + _between(name, max(values), {"max": _get(rules, "max")})
+
+
+def _inside_space(name: str, sensor: Mapping[str, Any], space: Mapping[str, Any]) -> list[ConstraintCheck]:
+    near, far = (float(v) for v in space["range_m"])
+    start, end = float(sensor["gate_m"]["start"]), float(sensor["gate_m"]["end"])
+    inside = start >= near - _slack(near) and end <= far + _slack(far)
+    checks = [ConstraintCheck(f"{name}.space.range_m", [near, far], [start, end], bool(inside))]
+    for value, key in zip(sensor["origin_m"]["mean"], ("x_m", "y_m", "z_m"), strict=True):
+        low, high = (float(v) for v in space[key])
+        kept = low - _slack(low) <= value <= high + _slack(high)
+        checks.append(ConstraintCheck(f"{name}.space.{key}", [low, high], value, bool(kept)))
+    return checks
+
+
+def _widths(document: Mapping[str, Any]) -> list[tuple[float, int]] | None:
+    """Gate widths and how many rays have them; None where the document fixes no rays."""
+    table = document.get("ray_table")
+    if table:
+        pairs = zip(table["gate_start_m"], table["gate_end_m"], strict=True)
+        return [(end - start, 1) for start, end in pairs]
+    sensors = document["sensors"]
+    if any(sensor.get("rays") is None for sensor in sensors):
+        return None
+    return [(s["gate_m"]["end"] - s["gate_m"]["start"], int(s["rays"])) for s in sensors]
+
+
+def _table(document: Mapping[str, Any], rules: Mapping[str, Any]) -> list[ConstraintCheck]:
+    """Gates of explicit rays keep the gate bounds of their sensor."""
+    table = document.get("ray_table")
+    if not table:
+        return []
+    each = list(rules.get("each") or [])
+    columns = zip(table["gate_start_m"], table["gate_end_m"], table["sensor"], strict=True)
+    failed = []
+    for ray, (start, end, sensor) in enumerate(columns):
+        own = _over(rules, each[sensor]) if sensor < len(each) else rules
+        for key, value in (("start_m", start), ("end_m", end), ("width_m", end - start)):
+            failed += [
+                c for c in _between(f"ray{ray}.gate.{key}", value, _get(own, "gate", key)) if not c.satisfied
+            ]
+    return failed
+
+
+def _budget(document: Mapping[str, Any], rules: Mapping[str, Any]) -> list[ConstraintCheck]:
+    budget = rules.get("budget") or {}
+    widths = _widths(document)
+    total = None if widths is None else sum(count for _, count in widths)
+    checks = []
+    declared = document.get("rays")
+    if declared is not None and total is not None and declared != total:
+        checks.append(ConstraintCheck("rays", declared, total, False))
+    if budget.get("rays") is not None:
+        found = total if total is not None else declared
+        checks.append(ConstraintCheck("budget.rays", budget["rays"], found, found == budget["rays"]))
+    limit = budget.get("bandwidth_mbps")
+    if limit is not None:
+        found = None if widths is None else _mbps(widths, budget)
+        kept = found is not None and found <= limit + _slack(limit)
+        checks.append(ConstraintCheck("budget.bandwidth_mbps", limit, found, kept))
+    return checks
+
+
+def _mbps(widths: list[tuple[float, int]], budget: Mapping[str, Any]) -> float:
+    """Rays times whole bins times bits times frames [Mbit/s]."""
+    bin_m = LIGHT_M_PER_S * budget.get("bin_ps", 100.0) * 1e-12 / 2
+    bins = sum(count * max(math.ceil(width / bin_m * (1 - BIN_ROUNDING)), 1) for width, count in widths)
+    return bins * budget.get("bits_per_bin", 40.0) * budget.get("rate_hz", 10.0) / 1e6

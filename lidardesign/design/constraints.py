@@ -1,0 +1,214 @@
+"""The constraint file (design contract, section 6): its keys, its checks, and what each sensor must keep.
+
+What the bounds mean, here and in `check`, which verifies them on the finished file:
+
+- `gate` and `field_of_view` bound the reported intervals, mean -+ z spread;
+- `origin.low_m`, `high_m` bound the sensor's mean origin; samples are taken from inside the box too;
+- `origin.spread_m.max` bounds the standard deviation of the origin along every direction;
+- `boresight.azimuth_deg` is an interval on the circle: with `min` above `max` it passes through 0;
+- every gate stays inside the range bounds of the design space, whatever the file says.
+
+Entries of `each` apply to the first, second, ... sensor over the common keys.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from lidardesign.errors import ConfigError
+from lidardesign.run.validation import check_model
+
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+Distance = Annotated[float, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0)]
+
+
+class _Keys(BaseModel):
+    """Unknown keys are errors; numbers are numbers, not text."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
+
+
+class SensorCount(_Keys):
+    """`{count: 4}` or `{min: 1, max: 8}`."""
+
+    count: Annotated[int, Field(ge=1)] | None = None
+    min: Annotated[int, Field(ge=1)] | None = None
+    max: Annotated[int, Field(ge=1)] | None = None
+
+    @model_validator(mode="after")
+    def _one_form(self) -> SensorCount:
+        if self.count is not None and (self.min is not None or self.max is not None):
+            raise ValueError("give either count, or min and max")
+        return self
+
+
+class DistanceRange(_Keys):
+    """Bounds on a distance [m]."""
+
+    min: Distance | None = None
+    max: Positive | None = None
+
+
+class AngleRange(_Keys):
+    """Bounds on an azimuth [degrees], any number of turns."""
+
+    min: float | None = None
+    max: float | None = None
+
+
+class ElevationRange(_Keys):
+    """Bounds on an elevation [degrees]."""
+
+    min: Annotated[float, Field(ge=-90, le=90)] | None = None
+    max: Annotated[float, Field(ge=-90, le=90)] | None = None
+
+
+class FieldRange(_Keys):
+    """Bounds on a full angle of view [degrees]."""
+
+    min: Annotated[float, Field(ge=0, le=360)] | None = None
+    max: Annotated[float, Field(gt=0, le=360)] | None = None
+
+
+class SpreadLimit(_Keys):
+    """The largest standard deviation of the origin along any direction [m]."""
+
+    max: Positive | None = None
+
+
+class Origin(_Keys):
+    """Where a sensor may sit [m]."""
+
+    low_m: Vector | None = None
+    high_m: Vector | None = None
+    fixed_m: Vector | None = None
+    spread_m: SpreadLimit = SpreadLimit()
+
+
+class Boresight(_Keys):
+    """Where it may point."""
+
+    azimuth_deg: AngleRange = AngleRange()
+    elevation_deg: ElevationRange = ElevationRange()
+
+
+class FieldOfView(_Keys):
+    """How wide it may see, horizontally and vertically in its own frame."""
+
+    horizontal_deg: FieldRange = FieldRange()
+    vertical_deg: FieldRange = FieldRange()
+
+
+class Gate(_Keys):
+    """When it may listen, as one-way distances [m]."""
+
+    start_m: DistanceRange = DistanceRange()
+    end_m: DistanceRange = DistanceRange()
+    width_m: DistanceRange = DistanceRange()
+
+
+class Budget(_Keys):
+    """Rays per frame and the read-out of the whole design."""
+
+    rays: Annotated[int, Field(ge=1)] | None = None
+    bandwidth_mbps: Positive | None = None
+    bin_ps: Positive = 100.0
+    bits_per_bin: Positive = 40.0
+    rate_hz: Positive = 10.0
+
+
+class SensorConstraints(_Keys):
+    """The keys that may also stand under `each`."""
+
+    origin: Origin = Origin()
+    boresight: Boresight = Boresight()
+    field_of_view: FieldOfView = FieldOfView()
+    gate: Gate = Gate()
+
+
+class Constraints(SensorConstraints):
+    """A whole constraint file; every key is optional."""
+
+    sensors: SensorCount = SensorCount()
+    budget: Budget = Budget()
+    each: list[SensorConstraints] = []
+
+    @classmethod
+    def from_mapping(
+        cls,
+        values: Mapping[str, Any] | None,
+        *,
+        where: str = "constraints",
+        locate: Callable[..., str] | None = None,
+    ) -> Constraints:
+        """Constraints of plain values, as read from YAML.
+
+        Arguments:
+            values: The mapping; None is an empty one.
+            where: Name of the file or option, for messages.
+            locate: The position `file:line:column` of a key path.
+
+        Raises:
+            ConfigError: Unknown keys, wrong types, numbers outside their physical range.
+        """
+        if values is not None and not isinstance(values, Mapping):
+            found = type(values).__name__
+            raise ConfigError(f"found one {found}", where=where, allowed="a mapping, as `gate: {...}`")
+
+        def named(path: tuple[str | int, ...], *, key: bool = False) -> str:
+            return where
+
+        # YAML writes an empty section as null; it says nothing
+        given = _without_empty(dict(values or {}))
+        return check_model(cls, given, locate or named)
+
+    def of_sensor(self, index: int) -> SensorConstraints:
+        """The constraints of one sensor: its entry of `each` over the common keys."""
+        common = self.model_dump(exclude_none=True, include=set(SensorConstraints.model_fields))
+        if index < len(self.each):
+            common = _merged(common, self.each[index].model_dump(exclude_none=True))
+        return SensorConstraints.model_validate(common)
+
+    def name_of(self, index: int, key: str) -> str:
+        """The path under which sensor `index` finds `key`, as `each[1].gate.width_m.max`."""
+        if index < len(self.each):
+            values: Any = self.each[index].model_dump(exclude_none=True)
+            for part in key.split("."):
+                values = values.get(part) if isinstance(values, dict) else None
+            if values is not None:
+                return f"each[{index}].{key}"
+        return key
+
+    def as_document(self) -> dict[str, Any]:
+        """The plain values that were given, for the design file."""
+        return self.model_dump(exclude_none=True, exclude_unset=True)
+
+
+def _merged(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    result = dict(base)
+    for key, value in over.items():
+        both = isinstance(value, Mapping) and isinstance(result.get(key), dict)
+        result[key] = _merged(result[key], value) if both else value
+    return result
+
+
+def _without_empty(values: dict[str, Any]) -> dict[str, Any]:
+    kept = {}
+    for key, value in values.items():
+        if isinstance(value, dict):
+            kept[key] = _without_empty(value)
+        elif value is not None:
+            kept[key] = value
+    return kept
+
+
+def check_feasible(constraints: Constraints, space: Any, *, sensors: int | None = None) -> None:
+    """Refuse constraints that no design can satisfy; see `feasibility.check_feasible`."""
+    # the checks need the constraint models, and callers look for them here
+    from lidardesign.design.feasibility import check_feasible as check
+
+    check(constraints, space, sensors=sensors)

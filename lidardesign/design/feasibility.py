@@ -1,0 +1,224 @@
+"""Contradictions among constraints, found before anything is sampled, by the smallest set that conflicts.
+
+Start, end and width of a gate are difference constraints on two numbers, so every contradiction is a cycle
+through at most three bounds: all five kinds of cycle are checked with the tightest bound of each kind.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.constraints import Constraints, SensorConstraints
+from lidardesign.errors import InfeasibleError
+from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace
+
+# Bounds that differ by less come from the same number through degrees and radians [m or rad].
+AGREEMENT = 1e-9
+
+
+@dataclass(frozen=True)
+class _Bound:
+    """One bound and the name it is found under; an empty name needs no mention."""
+
+    value: float
+    name: str
+
+
+def check_feasible(constraints: Constraints, space: DesignSpace, *, sensors: int | None = None) -> None:
+    """Refuse constraints that contradict each other or the design space.
+
+    Arguments:
+        constraints: A checked constraint file.
+        space: The design space of the density.
+        sensors: The number of sensors asked for elsewhere (an option), if any.
+
+    Raises:
+        InfeasibleError: With the conflicting names.
+    """
+    _check_count(constraints, sensors)
+    for index in range(max(len(constraints.each), 1)):
+        one = constraints.of_sensor(index)
+        _check_origin(constraints, one, index, space)
+        _check_boresight(constraints, one, index, space)
+        _check_field(constraints, one, index, space)
+        _check_gate(constraints, one, index, space)
+    _check_budget(constraints, sensors)
+
+
+def _refuse(message: str, conflicts: Sequence[str]) -> None:
+    names = [name for name in dict.fromkeys(conflicts) if name]
+    raise InfeasibleError(
+        f"{message} ({', '.join(names)})", conflicts=names, hint="relax one of the constraints named"
+    )
+
+
+def _check_count(constraints: Constraints, sensors: int | None) -> None:
+    count = constraints.sensors
+    if count.min is not None and count.max is not None and count.min > count.max:
+        _refuse(f"at least {count.min} and at most {count.max} sensors", ["sensors.min", "sensors.max"])
+    named = [("sensors.count", count.count, count.count), ("--sensors", sensors, sensors)]
+    named += [("sensors.min", count.min, None), ("sensors.max", None, count.max)]
+    named.append(("each", len(constraints.each) or None, None))
+    for low_name, low, _ in named:
+        for high_name, _, high in named:
+            if low is not None and high is not None and low > high:
+                _refuse(f"{low} sensors wanted, but at most {high} admitted", [low_name, high_name])
+
+
+def _check_origin(constraints: Constraints, one: SensorConstraints, index: int, space: DesignSpace) -> None:
+    low_name, high_name = (constraints.name_of(index, f"origin.{key}_m") for key in ("low", "high"))
+    fixed_name = constraints.name_of(index, "origin.fixed_m")
+    for axis in range(3):
+        bounds = f"space.{DIMENSIONS[axis]}"
+        lows = [_Bound(space.low[axis], bounds)]
+        highs = [_Bound(space.high[axis], bounds)]
+        if one.origin.low_m is not None:
+            lows.append(_Bound(one.origin.low_m[axis], low_name))
+        if one.origin.high_m is not None:
+            highs.append(_Bound(one.origin.high_m[axis], high_name))
+        if one.origin.fixed_m is not None:
+            fixed = _Bound(one.origin.fixed_m[axis], fixed_name)
+            lows.append(fixed)
+            highs.append(fixed)
+        for low in lows:
+            for high in highs:
+                if low.value > high.value + AGREEMENT:
+                    _refuse(
+                        f"{DIMENSIONS[axis]} of the origin is at least {low.value:g} and at most {high.value:g}",
+                        [low.name, high.name],
+                    )
+
+
+def _check_boresight(
+    constraints: Constraints, one: SensorConstraints, index: int, space: DesignSpace
+) -> None:
+    elevation = one.boresight.elevation_deg
+    name = constraints.name_of(index, "boresight.elevation_deg.min")
+    other = constraints.name_of(index, "boresight.elevation_deg.max")
+    if elevation.min is not None and elevation.max is not None and elevation.min > elevation.max:
+        _refuse(f"elevation at least {elevation.min:g} and at most {elevation.max:g} degrees", [name, other])
+    if elevation.min is not None and math.radians(elevation.min) > space.high[ELEVATION] + AGREEMENT:
+        _refuse("the boresight's elevation lies above the design space", [name, "space.elevation_rad"])
+    if elevation.max is not None and math.radians(elevation.max) < space.low[ELEVATION] - AGREEMENT:
+        _refuse("the boresight's elevation lies below the design space", [other, "space.elevation_rad"])
+    given = one.boresight.azimuth_deg
+    if (given.min is None and given.max is None) or space.full_azimuth:
+        return
+    low, high = azimuth_interval(one, space)
+    if not _arcs_meet(low, high, space.low[AZIMUTH], space.high[AZIMUTH]):
+        names = [
+            constraints.name_of(index, f"boresight.azimuth_deg.{end}")
+            for end in ("min", "max")
+            if getattr(given, end) is not None
+        ]
+        _refuse("the boresight's azimuth lies outside the design space", [*names, "space.azimuth_rad"])
+
+
+def azimuth_interval(one: SensorConstraints, space: DesignSpace) -> tuple[float, float]:
+    """The admitted azimuths as low and high of one arc, high in [low, low + 2 pi]; a missing end is the space's."""
+    given = one.boresight.azimuth_deg
+    low = space.low[AZIMUTH] if given.min is None else math.radians(given.min)
+    high = space.high[AZIMUTH] if given.max is None else math.radians(given.max)
+    if high - low >= 2 * math.pi:
+        return low, low + 2 * math.pi
+    return low, low + math.fmod(math.fmod(high - low, 2 * math.pi) + 2 * math.pi, 2 * math.pi)
+
+
+def _arcs_meet(low: float, high: float, other_low: float, other_high: float) -> bool:
+    def inside(angle: float, start: float, end: float) -> bool:
+        turned = math.fmod(math.fmod(angle - start, 2 * math.pi) + 2 * math.pi, 2 * math.pi)
+        return turned <= end - start + AGREEMENT or turned >= 2 * math.pi - AGREEMENT
+
+    return inside(low, other_low, other_high) or inside(other_low, low, high)
+
+
+def _check_field(constraints: Constraints, one: SensorConstraints, index: int, space: DesignSpace) -> None:
+    for axis, dimension in (("horizontal", AZIMUTH), ("vertical", ELEVATION)):
+        bounds = getattr(one.field_of_view, f"{axis}_deg")
+        name = constraints.name_of(index, f"field_of_view.{axis}_deg.min")
+        other = constraints.name_of(index, f"field_of_view.{axis}_deg.max")
+        if bounds.min is not None and bounds.max is not None and bounds.min > bounds.max:
+            _refuse(
+                f"{axis} field of view at least {bounds.min:g} and at most {bounds.max:g} degrees",
+                [name, other],
+            )
+        fixed = dimension not in space.free
+        if bounds.min and fixed:
+            _refuse(
+                f"a {axis} field of view, but the design space fixes that angle",
+                [name, f"space.{DIMENSIONS[dimension]}"],
+            )
+
+
+def _check_gate(constraints: Constraints, one: SensorConstraints, index: int, space: DesignSpace) -> None:
+    def bound(part: str, end: str, otherwise: float) -> _Bound:
+        value = getattr(getattr(one.gate, part), end)
+        key = constraints.name_of(index, f"gate.{part}.{end}")
+        return _Bound(otherwise, "") if value is None else _Bound(value, key)
+
+    near, far = _Bound(space.low[RANGE], "space.range_m"), _Bound(space.high[RANGE], "space.range_m")
+    start_low = max(bound("start_m", "min", -math.inf), near, key=lambda b: b.value)
+    end_high = min(bound("end_m", "max", math.inf), far, key=lambda b: b.value)
+    start_high, end_low = bound("start_m", "max", math.inf), bound("end_m", "min", -math.inf)
+    width_low, width_high = bound("width_m", "min", 0.0), bound("width_m", "max", math.inf)
+    if RANGE not in space.free:
+        width_high = min(width_high, _Bound(0.0, "space.range_m"), key=lambda b: b.value)
+    text = "no gate can satisfy this"
+    for low, high in ((start_low, start_high), (end_low, end_high), (width_low, width_high)):
+        if low.value > high.value + AGREEMENT:
+            _refuse(f"{text}: at least {low.value:g} and at most {high.value:g} m", [low.name, high.name])
+    zero, thick = _Bound(0.0, ""), RANGE in space.free
+    # a bound that the others do not need to conflict is not named: distances are at least 0, and so are widths
+    for start, width in ((zero, width_low), (start_low, zero), (start_low, width_low)):
+        room = end_high.value - start.value
+        if width.value > room + AGREEMENT or (thick and room <= 0):
+            _refuse(
+                f"{text}: it starts at {start.value:g} m or later, is at least {width.value:g} m wide, "
+                f"and ends at {end_high.value:g} m or earlier",
+                [start.name, width.name, end_high.name],
+            )
+    if end_low.value - width_high.value > start_high.value + AGREEMENT:
+        _refuse(
+            f"{text}: it ends at {end_low.value:g} m or later, is at most {width_high.value:g} m wide, "
+            f"and starts at {start_high.value:g} m or earlier",
+            [end_low.name, width_high.name, start_high.name],
+        )
+
+
+def least_sensors(constraints: Constraints, sensors: int | None = None) -> _Bound:
+    """The smallest number of sensors that the constraints admit, and where it stands."""
+    count = constraints.sensors
+    named = [
+        (sensors, "--sensors"),
+        (count.count, "sensors.count"),
+        (count.min, "sensors.min"),
+        (len(constraints.each) or None, "each"),
+    ]
+    bounds = [_Bound(value, name) for value, name in named if value is not None]
+    return max(bounds, key=lambda b: b.value, default=_Bound(1, ""))
+
+
+def _check_budget(constraints: Constraints, sensors: int | None) -> None:
+    budget = constraints.budget
+    least = least_sensors(constraints, sensors)
+    if budget.rays is not None and budget.rays < least.value:
+        _refuse(f"{budget.rays} rays for {least.value:g} sensors", ["budget.rays", least.name or "sensors"])
+    if budget.bandwidth_mbps is None:
+        return
+    widths = [constraints.of_sensor(i).gate.width_m.min or 0.0 for i in range(max(len(constraints.each), 1))]
+    model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
+    rays, rays_name = (
+        (budget.rays, "budget.rays") if budget.rays is not None else (int(least.value), least.name)
+    )
+    needed = model.mbps_of_widths([min(widths)], rays)
+    if needed > budget.bandwidth_mbps:
+        single = model.mbps_of_widths([0.0], rays)
+        names = [rays_name, "budget.bandwidth_mbps"]
+        if single <= budget.bandwidth_mbps:
+            names.append(constraints.name_of(widths.index(min(widths)), "gate.width_m.min"))
+        _refuse(
+            f"{rays} rays need at least {needed:g} Mbit/s, more than {budget.bandwidth_mbps:g} Mbit/s", names
+        )
