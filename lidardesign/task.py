@@ -120,5 +120,5 @@ def scenes_of(task: Task, config: Any, split: Split, seed: int, space: DesignSpa
     configuration. Other tasks judge by the space of their configuration.
     """
     if "space" in inspect.signature(task.scenes).parameters:
-        return task.scenes(config, split, seed, space=space)  # type: ignore[call-arg]
+        return task.scenes(config, split, seed, space=space)
     return task.scenes(config, split, seed)

@@ -1,0 +1,204 @@
+"""Mesh files: what loads is clean, what cannot be used is refused by name, nothing is mended in silence."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from lidardesign.errors import DataError
+from lidardesign.meshio import (
+    SUFFIXES,
+    check_mesh,
+    edge_defects,
+    list_mesh_files,
+    load_mesh,
+    signed_volume_m3,
+)
+
+BOX_VERTICES = np.array([(x, y, z) for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
+BOX_SIDES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+BOX_FACES = np.array([(a, *pair) for a, b, c, d in BOX_SIDES for pair in ((b, c), (c, d))])
+
+
+def write_box(path, vertices=BOX_VERTICES, faces=BOX_FACES):
+    trimesh = pytest.importorskip("trimesh")
+    content = trimesh.Trimesh(vertices, faces, process=False).export(file_type=path.suffix[1:])
+    if isinstance(content, dict):
+        for name in content.keys() - {"model.gltf"}:
+            path.with_name(name).write_bytes(content[name])
+        content = content["model.gltf"]
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_closed_box_comes_back_from_every_format_as_a_solid(tmp_path, suffix):
+    mesh = load_mesh(write_box(tmp_path / f"box{suffix}"))
+    assert mesh.sign == "solid"
+    assert mesh.notes == ()
+    assert len(mesh.vertices) == 8
+    assert signed_volume_m3(mesh.vertices, mesh.faces) == pytest.approx(1.0)
+
+
+def test_the_scale_turns_millimetres_into_metres(tmp_path):
+    mesh = load_mesh(write_box(tmp_path / "box.ply"), scale=0.001)
+    np.testing.assert_allclose(mesh.bounds_m, [[0, 0, 0], [0.001] * 3])
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan")])
+def test_a_scale_that_is_no_factor_is_refused(tmp_path, scale):
+    with pytest.raises(DataError, match="scale"):
+        load_mesh(write_box(tmp_path / "box.ply"), scale=scale)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"  \n", b"hello\nworld", bytes(range(256)) * 20, b"{}", b"solid nothing\nendsolid nothing\n"],
+    ids=["empty", "blank", "text", "bytes", "json", "no facets"],
+)
+def test_garbage_is_refused_with_the_name_of_the_file(tmp_path, suffix, content):
+    write_box(tmp_path / "model.gltf")  # a good neighbour must not be read in its place
+    path = tmp_path / f"bad{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=f"bad\\{suffix}"):
+        load_mesh(path)
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".ply", ".stl"])
+def test_a_truncated_file_is_refused(tmp_path, suffix):
+    path = write_box(tmp_path / f"cut{suffix}")
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(DataError, match="cut"):
+        load_mesh(path)
+
+
+def test_a_missing_file_and_an_unknown_suffix_are_refused(tmp_path):
+    with pytest.raises(DataError, match="cannot be read"):
+        load_mesh(tmp_path / "nowhere.stl")
+    (tmp_path / "box.txt").write_text("v 0 0 0")
+    with pytest.raises(DataError, match="suffix"):
+        load_mesh(tmp_path / "box.txt")
+
+
+def test_a_gltf_cannot_reach_outside_its_folder(tmp_path):
+    inside = tmp_path / "inside"
+    inside.mkdir()
+    path = write_box(inside / "box.gltf")
+    buffer = inside / "gltf_buffer_0.bin"
+    buffer.rename(tmp_path / "secret.bin")
+    document = json.loads(path.read_text())
+    document["buffers"][0]["uri"] = "../secret.bin"
+    path.write_text(json.dumps(document))
+    with pytest.raises(DataError, match="outside its folder"):
+        load_mesh(path)
+
+
+def test_the_parts_of_a_scene_stay_in_their_places(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    box = trimesh.Trimesh(BOX_VERTICES, BOX_FACES, process=False)
+    moved = np.eye(4)
+    moved[0, 3] = 5.0
+    scene = trimesh.Scene([box])
+    scene.add_geometry(box.copy(), transform=moved)
+    (tmp_path / "two.glb").write_bytes(scene.export(file_type="glb"))
+    mesh = load_mesh(tmp_path / "two.glb")
+    np.testing.assert_allclose(mesh.bounds_m, [[0, 0, 0], [6, 1, 1]], atol=1e-6)
+    assert len(mesh.faces) == 24
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_vertices_that_are_not_finite_are_counted_and_refused(value):
+    vertices = BOX_VERTICES.copy()
+    vertices[2, 1] = value
+    with pytest.raises(DataError, match="scan: 1 of 8 vertices"):
+        check_mesh(vertices, BOX_FACES, where="scan")
+
+
+@pytest.mark.parametrize("index", [-1, 8])
+def test_faces_that_name_missing_vertices_are_refused(index):
+    with pytest.raises(DataError, match="1 faces name vertices that do not exist"):
+        check_mesh(BOX_VERTICES, np.vstack([BOX_FACES, [0, 1, index]]))
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces"),
+    [
+        (np.zeros((0, 3)), np.zeros((0, 3), int)),
+        (BOX_VERTICES, np.zeros((0, 3), int)),
+        (BOX_VERTICES[:, :2], BOX_FACES),
+        (BOX_VERTICES, BOX_FACES[:, :2]),
+        (BOX_VERTICES, BOX_FACES.astype(float)),
+        ([["a"] * 3] * 3, [[0, 1, 2]]),
+        (BOX_VERTICES * 0, BOX_FACES),
+    ],
+    ids=["nothing", "no faces", "2D", "edges", "float faces", "text", "one point"],
+)
+def test_what_is_no_mesh_is_refused(vertices, faces):
+    with pytest.raises(DataError, match="part"):
+        check_mesh(vertices, faces, where="part")
+
+
+def test_degenerate_and_duplicate_faces_are_dropped_with_a_count():
+    line = len(BOX_VERTICES)
+    vertices = np.vstack([BOX_VERTICES, [[0.5, 0.0, 0.0]]])
+    faces = np.vstack([BOX_FACES, [(0, line, 4), (0, 0, 1)], BOX_FACES[:3, ::-1]])
+    mesh = check_mesh(vertices, faces)
+    assert mesh.notes == ("dropped 2 degenerate faces (without area)", "dropped 3 duplicate faces")
+    assert len(mesh.faces) == len(BOX_FACES)
+    assert len(mesh.vertices) == 8
+    assert mesh.sign == "solid"
+
+
+def test_a_mesh_without_shared_vertices_is_still_closed():
+    mesh = check_mesh(BOX_VERTICES[BOX_FACES].reshape(-1, 3), np.arange(36).reshape(-1, 3))
+    assert mesh.sign == "solid"
+    assert len(mesh.vertices) == 8
+
+
+def test_an_open_mesh_is_unsigned_with_a_note_and_no_solid():
+    mesh = check_mesh(BOX_VERTICES, BOX_FACES[:-2])
+    assert mesh.sign == "unsigned"
+    assert "4 open edges" in mesh.notes[0]
+    with pytest.raises(DataError, match="cup: is not a solid: it has 4 open edges"):
+        check_mesh(BOX_VERTICES, BOX_FACES[:-2], sign="solid", where="cup")
+
+
+def test_mixed_winding_takes_the_winding_number_with_a_note_and_is_no_solid():
+    mixed = BOX_FACES.copy()
+    mixed[0] = mixed[0, ::-1]
+    mesh = check_mesh(BOX_VERTICES, mixed)
+    assert mesh.sign == "winding"
+    assert "opposite winding" in mesh.notes[0]
+    with pytest.raises(DataError, match="not a solid"):
+        check_mesh(BOX_VERTICES, mixed, sign="solid")
+
+
+def test_a_mesh_inside_out_is_turned_with_a_note():
+    mesh = check_mesh(BOX_VERTICES, BOX_FACES[:, ::-1], sign="solid")
+    assert signed_volume_m3(mesh.vertices, mesh.faces) == pytest.approx(1.0)
+    assert mesh.notes == ("the mesh was inside out: all faces were turned",)
+
+
+@pytest.mark.parametrize("sign", ["winding", "unsigned"])
+def test_an_explicit_rule_without_an_inside_is_taken_as_it_is(sign):
+    assert check_mesh(BOX_VERTICES, BOX_FACES[:-2], sign=sign).sign == sign
+
+
+def test_two_boxes_that_share_an_edge_are_closed():
+    faces = np.vstack([BOX_FACES, BOX_FACES + 8])
+    mesh = check_mesh(np.vstack([BOX_VERTICES, BOX_VERTICES + np.array([1.0, 1.0, 0.0])]), faces)
+    assert mesh.sign == "solid"
+    assert edge_defects(mesh.faces) == (0, 0)
+
+
+def test_a_folder_lists_its_meshes_by_name_and_an_empty_one_is_refused(tmp_path):
+    with pytest.raises(DataError, match="holds no mesh file"):
+        list_mesh_files(tmp_path)
+    for name in ("b.stl", "a.PLY", ".hidden.stl", "notes.txt"):
+        (tmp_path / name).write_text("x")
+    assert [path.name for path in list_mesh_files(tmp_path)] == ["a.PLY", "b.stl"]
+    with pytest.raises(DataError, match="is not a folder"):
+        list_mesh_files(tmp_path / "a.PLY")

@@ -1,0 +1,231 @@
+"""Distances, reconstructions and visible surfaces, against closed forms and naive twins."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from lidardesign.errors import DataError
+from lidardesign.evaluate.metrics import (
+    chamfer_m,
+    delaunay_surface,
+    sample_surface,
+    surface_cloud,
+    triangle_distance_m,
+    visible_surface_points,
+)
+from lidardesign.evaluate.sampling import sample_body
+from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.space import DesignSpace, angles
+
+STANDARD_ERRORS = 4  # the tolerance of every sampled mean below
+
+
+def generator(seed=0):
+    return np.random.default_rng(seed)
+
+
+def looking_along_minus_x(distance=2.0, half_angle=0.6, reach=5.0, box=0.0):
+    return DesignSpace(
+        (distance - box, -box, -box, math.pi - half_angle, -half_angle, 0.0),
+        (distance + box, box, box, math.pi + half_angle, half_angle, reach),
+    )
+
+
+def naive_chamfer(first, second):
+    pairs = np.linalg.norm(first[:, None] - second[None], axis=2)
+    return pairs.min(axis=1).mean() + pairs.min(axis=0).mean()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_chamfer_equals_all_pairs_and_is_symmetric(dimension):
+    first, second = generator(1).normal(size=(40, dimension)), generator(2).normal(size=(70, dimension))
+    assert chamfer_m(first, second) == pytest.approx(naive_chamfer(first, second), rel=1e-12)
+    assert chamfer_m(first, second) == pytest.approx(chamfer_m(second, first), rel=1e-12)
+    assert chamfer_m(first, first) == 0
+    assert chamfer_m(1000 * first, 1000 * second) == pytest.approx(1000 * chamfer_m(first, second), rel=1e-12)
+
+
+def test_distances_to_triangles_equal_the_least_over_a_dense_grid_on_them():
+    random = generator(3)
+    triangles, points = random.normal(size=(30, 3, 3)), 2 * random.normal(size=(30, 3))
+    steps = 120
+    shares = np.array([(i, j, steps - i - j) for i in range(steps + 1) for j in range(steps + 1 - i)]) / steps
+    naive = np.linalg.norm(np.einsum("sk,nkd->nsd", shares, triangles) - points[:, None], axis=2).min(axis=1)
+    found = triangle_distance_m(points, triangles)
+    assert (found <= naive + 1e-12).all()
+    np.testing.assert_allclose(found, naive, atol=0.03)  # half a grid step of the largest triangle
+
+
+def test_distances_to_triangles_without_area_are_those_to_points_and_segments():
+    point, start, end = np.array([[1.0, 2.0, 2.0]]), np.zeros(3), np.array([3.0, 0.0, 0.0])
+    assert triangle_distance_m(point, np.array([[start, start, start]])) == pytest.approx(3.0)
+    assert triangle_distance_m(point, np.array([[start, end, end]])) == pytest.approx(math.sqrt(8))
+
+
+def test_two_samplings_of_one_surface_have_no_distance():
+    vertices, faces = (
+        np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+    )
+    first, second = (surface_cloud(vertices, faces, 300, generator(seed)) for seed in (1, 2))
+    assert first.distance_m(second.points).mean() < 1e-3
+    assert first.distance_m(second.points + np.array([0, 0, 0.1])) == pytest.approx(0.1, abs=1e-3)
+
+
+def directions_around_x(count, spread=0.5):
+    offset = np.column_stack([np.ones(count), spread * generator(4).uniform(-1, 1, (count, 2))])
+    return offset / np.linalg.norm(offset, axis=1, keepdims=True)
+
+
+def test_the_reconstruction_does_not_depend_on_the_order_of_returns():
+    y, z = np.meshgrid(np.linspace(-0.3, 0.3, 7), np.linspace(-0.3, 0.3, 7))
+    points = np.column_stack([np.ones(49), y.ravel(), z.ravel()])
+    vertices, faces = delaunay_surface(points, np.zeros(3))
+    for seed in range(3):
+        again_vertices, again_faces = delaunay_surface(generator(seed).permutation(points), np.zeros(3))
+        np.testing.assert_array_equal(vertices, again_vertices)
+        np.testing.assert_array_equal(faces, again_faces)
+
+
+def test_the_triangles_of_returns_tile_what_was_seen():
+    points = np.vstack(
+        [directions_around_x(60), [[1, y, z] for y, z in itertools.product((-0.6, 0.6), repeat=2)]]
+    )
+    points = (
+        points / points[:, :1]
+    )  # all on the plane x = 1, whose outermost returns are the corners of a square
+    vertices, faces = delaunay_surface(points, np.zeros(3))
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+    assert area == pytest.approx(1.44)
+    np.testing.assert_allclose(sample_surface(vertices, faces, 100, generator())[:, 0], 1.0)
+
+
+def test_every_triangle_is_delaunay_on_the_sphere_even_over_more_than_half_a_turn():
+    directions = generator(5).normal(size=(60, 3)) + np.array([0.8, 0.0, 0.0])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    vertices, faces = delaunay_surface(directions, np.zeros(3))
+    for a, b, c in vertices[faces]:
+        normal = np.cross(b - a, c - a)
+        side = (vertices - a) @ normal / np.linalg.norm(normal)
+        inside = (side > 1e-9).any() and (side < -1e-9).any()
+        assert not inside, "a return lies inside the circle of three others"
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.zeros((0, 3)),
+        np.array([[1.0, 0, 0], [1, 1, 0]]),
+        np.array([[1.0, 0, 0]] * 5),
+        np.array([[1.0, y, 0] for y in (-0.2, 0.0, 0.1, 0.3)]),
+        np.array([[r, 0.0, 0.0] for r in (1.0, 2.0, 3.0, 4.0)]),
+        np.zeros((4, 3)),
+    ],
+    ids=["none", "two", "one place", "a line", "one direction", "at the viewpoint"],
+)
+def test_returns_that_span_no_surface_give_none(points):
+    assert delaunay_surface(points, np.zeros(3)) is None
+
+
+def test_triangles_that_bridge_a_depth_step_can_be_left_out():
+    y, z = np.meshgrid(np.linspace(-0.3, 0.3, 13), np.linspace(-0.3, 0.3, 13))
+    depth = np.where(y.ravel() < 0.01, 1.0, 2.0)
+    points = depth[:, None] * np.column_stack([np.ones(169), y.ravel(), z.ravel()])
+    vertices, faces = delaunay_surface(points, np.zeros(3), steepest_deg=80)
+    spans = np.ptp(vertices[faces][:, :, 0], axis=1)
+    assert spans.max() == 0
+    everything, all_faces = delaunay_surface(points, np.zeros(3))
+    assert len(all_faces) > len(faces)
+    assert np.ptp(everything[all_faces][:, :, 0], axis=1).max() == 1
+
+
+def test_points_on_a_mesh_are_uniform_in_area_and_repeatable():
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 3], [2, 0, 3]])
+    faces = np.array([[0, 1, 2], [0, 3, 4]])  # areas 0.5 and 3
+    points = sample_surface(vertices, faces, 7000, generator())
+    np.testing.assert_array_equal(points, sample_surface(vertices, faces, 7000, generator()))
+    on_second = points[points[:, 2] > 0]
+    assert len(on_second) == pytest.approx(6000, abs=2)  # places along the area are stratified
+    spread = STANDARD_ERRORS * on_second.std(axis=0) / math.sqrt(len(on_second))
+    np.testing.assert_array_less(np.abs(on_second.mean(axis=0) - [2 / 3, 0, 2]), spread + 1e-9)
+
+
+SHAPES = {
+    "sphere": (Sphere(0.5), lambda p: np.linalg.norm(p, axis=1) - 0.5),
+    "box": (Box((0.1, 0.2, 0.3)), lambda p: (np.abs(p) / [0.1, 0.2, 0.3]).max(axis=1) - 1),
+    "capsule": (
+        Capsule(0.2, 0.4),
+        lambda p: np.linalg.norm(p - np.clip(p * [0, 0, 1], -0.4, 0.4), axis=1) - 0.2,
+    ),
+    "plane": (Plane(), lambda p: p[:, 2]),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_points_on_primitives_lie_on_them(name):
+    shape, distance = SHAPES[name]
+    points = sample_body([Body(shape)], looking_along_minus_x(), 500, generator()).points
+    np.testing.assert_allclose(distance(points), 0, atol=1e-12)
+
+
+def test_the_shares_of_a_capsule_and_a_box_follow_their_areas():
+    count = 20_000
+    capsule = sample_body([Body(Capsule(0.2, 0.4))], looking_along_minus_x(), count, generator()).points
+    box = sample_body([Body(Box((0.1, 0.2, 0.3)))], looking_along_minus_x(), count, generator()).points
+    for share, expected in (
+        ((np.abs(capsule[:, 2]) < 0.4).mean(), 0.4 / 0.6),
+        ((np.abs(np.abs(box[:, 0]) - 0.1) < 1e-12).mean(), 0.06 / 0.11),
+    ):
+        assert abs(share - expected) < STANDARD_ERRORS * math.sqrt(expected * (1 - expected) / count)
+
+
+def test_the_visible_part_of_a_sphere_is_the_cap_that_faces_the_sensor():
+    scene = Scene((Body(Sphere(0.5)),))
+    points = visible_surface_points(scene, looking_along_minus_x(), 2000, generator())
+    lowest = 0.5**2 / 2.0  # x of the horizon seen from 2 m
+    assert points.shape == (2000, 3)
+    assert points[:, 0].min() >= lowest - 1e-3
+    # area on a sphere is uniform in x (Archimedes)
+    error = STANDARD_ERRORS * (0.5 - lowest) / math.sqrt(12 * 2000)
+    assert abs(points[:, 0].mean() - (lowest + 0.5) / 2) < error
+
+
+def test_a_free_origin_sees_more_than_a_fixed_one():
+    scene = Scene((Body(Sphere(0.5)),))
+    wide = visible_surface_points(scene, looking_along_minus_x(box=1.0, half_angle=1.2), 3000, generator())
+    assert wide[:, 0].min() < 0.0
+
+
+def test_angles_and_range_of_the_space_bound_what_counts_as_visible():
+    scene = Scene((Body(Box((0.1, 2.0, 2.0))),))
+    points = visible_surface_points(scene, looking_along_minus_x(half_angle=0.3), 500, generator())
+    azimuth, elevation = angles(points - np.array([2.0, 0.0, 0.0]))
+    assert np.abs(azimuth - math.pi).max() <= 0.3
+    assert np.abs(elevation).max() <= 0.3
+    with pytest.raises(DataError, match="no admissible ray sees"):
+        visible_surface_points(scene, looking_along_minus_x(reach=1.8), 100, generator())
+
+
+def test_what_an_occluder_hides_is_not_visible():
+    plate = Body(Box((0.01, 0.5, 1.0)), "plate", "occluder", rigid(translation_m=(1.0, 0.5, 0.0)))
+    points = visible_surface_points(
+        Scene((Body(Sphere(0.5)), plate)), looking_along_minus_x(), 500, generator()
+    )
+    assert points[:, 1].max() < 0.01
+    hidden = Body(Box((0.01, 2.0, 2.0)), "wall", "occluder", rigid(translation_m=(1.0, 0.0, 0.0)))
+    with pytest.raises(DataError, match="no admissible ray sees"):
+        visible_surface_points(Scene((Body(Sphere(0.5)), hidden)), looking_along_minus_x(), 100, generator())
+
+
+def test_a_mesh_in_a_pose_is_seen_where_the_pose_puts_it():
+    square = Mesh(np.array([[0.0, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array([[0, 1, 2]]), "unsigned")
+    scene = Scene((Body(square, poses=rigid(translation_m=(0.5, -0.2, 0.1))),))
+    points = visible_surface_points(scene, looking_along_minus_x(half_angle=1.0), 400, generator())
+    np.testing.assert_allclose(points[:, 0], 0.5, atol=1e-12)
+    assert points[:, 1].min() >= -0.2
+    assert points[:, 2].min() >= 0.1
