@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -184,6 +185,13 @@ def test_rays_without_a_return_do_not_change_the_reconstruction(case):
     assert task.score(scene, [lost]).value == task.score(scene, [returns]).value
 
 
+def test_scenes_survive_the_way_to_a_worker_process(case):
+    task, config, scenes = case
+    scene = pickle.loads(pickle.dumps(scenes["train"][0]))
+    rays = rays_at_truth(task, config, scene, 60)
+    assert score(task, scene, rays).value == score(task, scenes["train"][0], rays).value
+
+
 def test_a_score_reads_only_rays_and_ranges_not_what_was_hit(case):
     task, config, scenes = case
     scene = scenes["train"][0]
@@ -230,6 +238,12 @@ def test_one_mesh_without_jitter_is_refused_as_both_splits_would_be_the_same(fol
     config = MeshesTask.Config(folder=str(folders / "one"), jitter_rotation_deg=0, jitter_translation_m=0)
     with pytest.raises(ConfigError, match="the same"):
         MeshesTask().scenes(config, "train", 0)
+
+
+def test_heads_that_are_all_the_same_are_refused():
+    config = FaceTask.Config(identity_scale=0, jitter_rotation_deg=0, jitter_translation_m=0)
+    with pytest.raises(ConfigError, match="all heads are the same"):
+        FaceTask().scenes(config, "train", 0)
 
 
 def test_each_mesh_is_in_exactly_one_split(folders):

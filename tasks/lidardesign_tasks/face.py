@@ -16,6 +16,7 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field
 
+from lidardesign.errors import ConfigError
 from lidardesign.meshio import check_mesh, usable_faces
 from lidardesign.scene import Body, Mesh, Scene, Sign
 from lidardesign.simulate.returns import Returns
@@ -90,7 +91,22 @@ class FaceTask:
     def scenes(
         self, config: FaceConfig, split: Split, seed: int, space: DesignSpace | None = None
     ) -> Sequence[Scene]:
-        """Random heads; each has generators of its own, so counts do not change them."""
+        """Random heads; each has generators of its own, so counts do not change them.
+
+        Raises:
+            DataError: The model cannot be used, or no ray can reach a head.
+            ConfigError: All heads would be the same.
+        """
+        if (
+            config.identity_scale == 0
+            and config.jitter_rotation_deg == 0
+            and config.jitter_translation_m == 0
+        ):
+            raise ConfigError(
+                "without identities and pose jitter all heads are the same, and held-out ones would be known",
+                where="task.identity_scale",
+                hint="set identity_scale, jitter_rotation_deg or jitter_translation_m above 0",
+            )
         space = space or self.space(config)
         heads = HeadFamily.load(config)
         count = config.train if split == "train" else config.test

@@ -39,7 +39,7 @@ class FlatlandConfig(TaskConfig):
     )
     train: int = Field(20, ge=1, le=10_000, description="training scenes")
     test: int = Field(20, ge=1, le=10_000, description="held-out scenes")
-    variation: float = Field(1.0, ge=0, le=2, description="how much scenes differ; 0 makes them all the same")
+    variation: float = Field(1.0, gt=0, le=2, description="how much scenes differ")
 
 
 class FlatlandTask:
