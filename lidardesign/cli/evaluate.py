@@ -77,6 +77,7 @@ def evaluate(
     with command(json=json, quiet=quiet, debug=debug) as console:
         if fail_above is not None and not math.isfinite(fail_above):
             raise ConfigError(f"{fail_above}", where="--fail-above", allowed="a finite number")
+        _check_baselines(baseline or [])
         entries, runs = _collect(targets)
         run = _common_run(_named_apart(entries), runs)
         request = _request(run, entries, rays, baseline or [], seed)
@@ -85,6 +86,16 @@ def evaluate(
         document = {**evaluation.as_dict(), "files": [str(path) for path in written]}
         console.result(document, lambda rich: _show(document, written, rich))
         _check_threshold(document, {entry.design.name for entry in entries}, fail_above)
+
+
+def _check_baselines(names: list[str]) -> None:
+    from lidardesign.evaluate.baselines import BASELINES
+
+    unknown = [name for name in names if name not in BASELINES]
+    if unknown:
+        raise ConfigError(
+            f"unknown baseline {unknown[0]!r}", where="--baseline", allowed=", ".join(BASELINES)
+        )
 
 
 def _collect(targets: list[Path]) -> tuple[list[_Entry], list[Run]]:
@@ -150,15 +161,9 @@ def _request(
     run: Run, entries: list[_Entry], rays: list[int] | None, baselines: list[str], seed: int | None
 ) -> EvaluationRequest:
     from lidardesign.design.samples import FILE_NAME, load_samples
-    from lidardesign.evaluate.baselines import BASELINES
     from lidardesign.evaluate.score import EvaluationRequest
     from lidardesign.registry import plugin_guard
 
-    unknown = [name for name in baselines if name not in BASELINES]
-    if unknown:
-        raise ConfigError(
-            f"unknown baseline {unknown[0]!r}", where="--baseline", allowed=", ".join(BASELINES)
-        )
     config, task = run.config, run.task
     seed = config.seed if seed is None else seed
     with plugin_guard(task.name):

@@ -13,7 +13,11 @@ from lidardesign.cli.runs import check_choice, check_name, open_run, provenance,
 
 if TYPE_CHECKING:
     from lidardesign.cli.runs import Run
+    from lidardesign.design.check import ConstraintCheck
+    from lidardesign.design.constraints import Constraints
     from lidardesign.design.fit import FitResult
+    from lidardesign.design.sensor import Design
+    from lidardesign.space import DesignSpace
 
 LAYOUTS = ("grid", "density", "scan")
 GATES = ("sensor", "ray")
@@ -85,7 +89,7 @@ def fit_and_write(
     )
     made_by = provenance(run, path, command_name, seed)
     design = replace(result.design, provenance={**result.design.provenance, **made_by})
-    checks = check_written(design, constraints)
+    checks = check_written(design, constraints, run.config.space)
     write_design(design, run.folder, path)
     document = {
         **result.as_dict(),
@@ -96,7 +100,9 @@ def fit_and_write(
     console.result(document, lambda rich: show_fit(document, design, checks, rich))
 
 
-def check_written(design: Any, constraints: Any) -> list[Any]:
+def check_written(
+    design: Design, constraints: Constraints | None, space: DesignSpace
+) -> list[ConstraintCheck]:
     """Check a design's own text against its constraints with code that the fit does not share.
 
     Raises:
@@ -110,7 +116,7 @@ def check_written(design: Any, constraints: Any) -> list[Any]:
     from lidardesign.run.yaml import dump_yaml, parse_yaml
 
     written = parse_yaml(dump_yaml(design_document(design)), where=design.name).value
-    checks = list(check_design(written, constraints))
+    checks = list(check_design(written, constraints, space))
     broken = [check for check in checks if not check.satisfied]
     if broken:
         first = broken[0]

@@ -1,0 +1,405 @@
+"""The command line: one clear message and the right exit code for each mistake, and nothing half-written."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidardesign import __version__
+from lidardesign.cli import console as console_module
+from lidardesign.cli.console import Console, command, plain_json
+from lidardesign.cli.main import run as run_program
+from lidardesign.design.samples import Samples, save_samples
+from lidardesign.errors import InfeasibleError
+from lidardesign.registry import load_task
+from lidardesign.run.config import resolve, save_run_config
+from lidardesign.run.manifest import start_manifest
+from lidardesign.run.yaml import load_yaml
+
+COMMANDS = ["learn", "fit", "constrain", "evaluate", "export", "show", "tasks", "tasks list", "tasks show"]
+
+
+class Result:
+    """What a command did."""
+
+    def __init__(self, code, captured):
+        self.code, self.out, self.err = code, captured.out, captured.err
+
+    @property
+    def json(self):
+        return json.loads(self.out)
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    """Run the program in this process, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def call(*arguments):
+        with pytest.raises(SystemExit) as ended:
+            run_program([str(argument) for argument in arguments])
+        return Result(ended.value.code or 0, capsys.readouterr())
+
+    return call
+
+
+def make_run(folder: Path, count: int = 4000) -> Path:
+    """A run as `learn` leaves it, with samples around two spots of flatland instead of a learned density."""
+    task = load_task("flatland")
+    config = resolve(task, preset="draft", seed=3)
+    generator = np.random.default_rng(0)
+    points = config.space.sample(count, generator)
+    low, high = np.array(config.space.low), np.array(config.space.high)
+    scaled = (points - low) / np.where(high > low, high - low, 1.0)
+    spots = np.array([[0.3, 0, 0, 0.4, 0, 0.6], [0.7, 0, 0, 0.6, 0, 0.5]])
+    distance = ((scaled[:, None] - spots) ** 2).sum(-1)
+    log_target = np.logaddexp(*(-distance.T / (2 * 0.1**2)))
+    start_manifest(folder, command=["lidardesign", "learn"], seed=3)
+    save_run_config(config, folder)
+    log_prob = np.full(count, -config.space.log_volume)
+    save_samples(Samples(points, log_prob, log_target, config.space), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished_run(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("runs") / "flat land ü")
+
+
+@pytest.fixture
+def flat(tmp_path):
+    return make_run(tmp_path / "run")
+
+
+def files_under(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+BAD_YAML = {
+    "typo.yaml": "density\n  sigma_m: 1\n",
+    "unknown.yaml": "density: {sigma: 0.1}\n",
+    "negative.yaml": "density: {sigma_m: -0.1}\n",
+    "design.yaml": "schema_version: 1\nsensors: 3\n",
+    "gate.yaml": "gate: {width_m: {max: -1}}\n",
+    "gates.yaml": "gates: {width_m: {max: 1}}\n",
+    "contradiction.yaml": "gate: {start_m: {min: 0.8}, end_m: {max: 0.5}}\n",
+    "empty.yaml": "",
+    "notes.txt": "not a design at all",
+}
+
+MISTAKES = [
+    ("learn nothing", 2, "unknown task 'nothing'"),
+    ("learn flatlnd", 2, "did you mean 'flatland'"),
+    ("learn", 2, "TASK"),
+    ("learn flatland --preset quick", 2, "draft, standard, fine"),
+    ("learn flatland --device tpu", 2, "auto, cpu, cuda"),
+    ("learn flatland --seed -1", 2, "seed"),
+    ("learn flatland --seed x", 2, "seed"),
+    ("learn flatland --config absent.yaml", 2, "absent.yaml: cannot be read: No such file"),
+    ("learn flatland --config typo.yaml", 2, "typo.yaml:2:"),
+    ("learn flatland --config unknown.yaml", 2, "unknown.yaml:1:11: unknown key 'density.sigma'"),
+    ("learn flatland --config negative.yaml", 2, "negative.yaml:1:20"),
+    ("learn flatland --set density.sigma_m=-1", 2, "--set density.sigma_m=-1"),
+    ("learn flatland --set sigma", 2, "KEY=VALUE"),
+    ("learn flatland --out taken", 2, "not empty"),
+    ("learn flatland --out notes.txt", 2, "is a file"),
+    ("learn flatland --out notes.txt/run", 3, "cannot be made"),
+    ("learn flatland --resume --out absent", 3, "no run to resume"),
+    ("learn flatland --unknown", 2, "unknown"),
+    ("learn face --set model=absent.h5", 3, "absent.h5"),
+    ("learn face --set model=notes.txt", 3, "notes.txt"),
+    ("learn meshes --set folder=absent", 3, "absent"),
+    ("fit absent", 3, "no such run"),
+    ("fit taken", 3, "no run folder"),
+    ("fit run --sensors 0", 2, "from 1, or auto"),
+    ("fit run --sensors many", 2, "from 1, or auto"),
+    ("fit run --layout spiral", 2, "grid, density, scan"),
+    ("fit run --gates one", 2, "sensor, ray"),
+    ("fit run --rays 0", 2, "rays"),
+    ("fit run --name ../elsewhere", 2, "no name for a design"),
+    ("constrain run --constraints absent.yaml", 2, "absent.yaml"),
+    ("constrain run --constraints gate.yaml", 2, "gate.yaml:1:23"),
+    ("constrain run --constraints gates.yaml", 2, "did you mean 'gate'"),
+    ("constrain run --constraints contradiction.yaml", 4, "gate."),
+    ("constrain run --set gate.width_m.max=wide", 2, "--set gate.width_m.max=wide"),
+    ("constrain run --set gate.width_m.most=1", 2, "--set gate.width_m.most=1"),
+    ("constrain absent.yaml", 3, "absent.yaml"),
+    ("evaluate absent", 3, "absent"),
+    ("evaluate run", 3, "no designs yet"),
+    ("evaluate run --baseline best", 2, "uniform"),
+    ("evaluate run --rays 0", 2, "rays"),
+    ("evaluate run --fail-above nan", 2, "finite"),
+    ("evaluate design.yaml", 2, "design.yaml:2:10"),
+    ("export", 2, "no design"),
+    ("export absent.yaml --format csv", 3, "absent.yaml"),
+    ("export design.yaml --format csv", 2, "design.yaml"),
+    ("export design.yaml --format jpeg", 2, "csv"),
+    ("export design.yaml", 2, "no format"),
+    ("export empty.yaml --format csv", 2, "empty.yaml"),
+    ("show notes.txt", 2, "notes.txt"),
+    ("show absent.yaml", 3, "absent.yaml"),
+    ("tasks show nothing", 2, "unknown task"),
+    ("tasks remove", 2, "remove"),
+    ("fly", 2, "fly"),
+]
+
+
+@pytest.fixture
+def mistakes(tmp_path, lidardesign):
+    """A folder with everything that can be got wrong in it."""
+    make_run(tmp_path / "run", count=1000)
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "letter.txt").write_text("keep me")
+    for name, text in BAD_YAML.items():
+        (tmp_path / name).write_text(text)
+    return lidardesign
+
+
+@pytest.mark.parametrize(("arguments", "code", "words"), MISTAKES, ids=[entry[0] for entry in MISTAKES])
+def test_a_mistake_gets_one_message_its_exit_code_and_writes_nothing(
+    mistakes, tmp_path, arguments, code, words
+):
+    before = files_under(tmp_path)
+    result = mistakes(*arguments.split(), "--json")
+    assert result.code == code, result.err
+    document = result.json
+    assert document["schema_version"] == 1
+    assert document["exit_code"] == code
+    assert words in f"{document['error'].get('where')}: {document['error']}" or words in result.err
+    assert words in result.err
+    assert "Traceback" not in result.err
+    assert len(result.err.strip().splitlines()) <= 4
+    assert files_under(tmp_path) == before
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_explains_itself_and_has_the_common_options(lidardesign, name):
+    result = lidardesign(*name.split(), "--help")
+    assert result.code == 0
+    for option in ("--json", "--seed", "--quiet", "--debug"):
+        assert option in result.out
+
+
+def test_options_of_later_parts_are_absent(lidardesign):
+    text = "".join(
+        lidardesign(name, "--help").out for name in ("fit", "constrain", "evaluate", "export", "learn")
+    )
+    for option in ("--refine", "--at", "--effects", "--accuracy", "--workers", "--detector"):
+        assert option not in text
+
+
+def test_the_version_is_printed(lidardesign):
+    assert lidardesign("--version").out == f"lidardesign {__version__}\n"
+
+
+def test_tasks_alone_lists_them_and_json_is_one_document(lidardesign):
+    assert "flatland" in lidardesign("tasks").out
+    listed = lidardesign("tasks", "list", "--json").json["tasks"]
+    assert {"face", "flatland", "meshes"} <= {entry["name"] for entry in listed}
+    assert lidardesign("tasks", "--json").json["tasks"] == listed
+
+
+def test_a_task_shows_its_keys_and_its_space(lidardesign):
+    document = lidardesign("tasks", "show", "flatland", "--json").json
+    assert document["metric"]["unit"] == "mm"
+    assert document["space"]["range_m"][0] >= 0
+    assert all(entry["description"] for entry in document["config"])
+    assert "design space" in lidardesign("tasks", "show", "flatland").out
+
+
+def test_the_chain_works_from_a_run_to_exported_rays(lidardesign, flat, tmp_path):
+    fitted = lidardesign("fit", flat, "--sensors", 2, "--json").json
+    assert {
+        "design",
+        "sensors",
+        "log_likelihood",
+        "admissible_mass",
+        "ess",
+        "satisfied",
+        "constraints",
+        "seconds",
+    } <= {*fitted}
+    assert Path(fitted["design"]) == flat / "designs" / "fit.yaml"
+    assert len(fitted["sensors"]) == 2
+    arguments = ("--set", "gate.width_m.max=0.3", "--set", "budget.rays=40", "--name", "tight")
+    tight = lidardesign("constrain", flat / "designs" / "fit.yaml", *arguments, "--json").json
+    assert tight["satisfied"] is True
+    assert {"name", "bound", "value", "satisfied"} == {*tight["constraints"][0]}
+    written = load_yaml(Path(tight["design"])).value
+    assert all(sensor["gate_m"]["end"] - sensor["gate_m"]["start"] <= 0.3 for sensor in written["sensors"])
+    assert (flat / "designs" / written["provenance"]["run"]).resolve() == flat.resolve()
+    exported = lidardesign("export", tight["design"], "--format", "csv", "--json").json
+    assert exported["rays"] == 40
+    assert Path(exported["out"]).is_file()
+    assert "tight" in lidardesign("show", tight["design"]).out
+
+
+def test_evaluate_scores_designs_and_baselines_and_holds_a_threshold(lidardesign, flat):
+    lidardesign("fit", flat, "--sensors", 2)
+    arguments = ("evaluate", flat, "--rays", 16, "--csv", "rows.csv", "--json")
+    result = lidardesign(*arguments, "--fail-above", 1e-9)
+    assert result.code == 1
+    assert "fail-above" in result.err
+    rows = result.json["rows"]
+    assert {"fit", "uniform", "random", "bounding"} <= {row["design"] for row in rows}
+    assert Path("rows.csv").is_file()
+    assert lidardesign(*arguments, "--fail-above", 1e9).code == 0
+    assert "held-out" in lidardesign("evaluate", flat, "--rays", 16).out
+
+
+def test_the_same_seed_writes_the_same_design(lidardesign, flat):
+    texts = []
+    for seed in (1, 1):
+        lidardesign("fit", flat, "--sensors", 2, "--seed", seed)
+        texts.append((flat / "designs" / "fit.yaml").read_text())
+    assert texts[0] == texts[1]
+
+
+def test_a_damaged_run_is_noticed_before_anything_is_written(lidardesign, flat):
+    samples = flat / "samples.npz"
+    samples.write_bytes(samples.read_bytes()[:-100])
+    result = lidardesign("fit", flat)
+    assert result.code == 3
+    assert "truncated" in result.err
+    assert not (flat / "designs").exists()
+
+
+def test_a_design_that_breaks_a_constraint_is_never_written(lidardesign, flat, monkeypatch):
+    from lidardesign.cli import fit as fit_module
+
+    def refuse(design, constraints, space):
+        raise InfeasibleError("broken", conflicts=["gate.width_m.max"])
+
+    monkeypatch.setattr(fit_module, "check_written", refuse)
+    result = lidardesign("constrain", flat, "--set", "gate.width_m.max=0.3", "--json")
+    assert result.code == 4
+    assert result.json["error"]["conflicts"] == ["gate.width_m.max"]
+    assert not (flat / "designs").exists()
+
+
+def test_a_run_that_is_being_written_is_left_alone(lidardesign, flat):
+    (flat / ".lock").write_text(json.dumps({"pid": 1, "host": "elsewhere"}))
+    result = lidardesign("fit", flat)
+    assert result.code == 2
+    assert "is writing this run" in result.err
+
+
+def test_names_with_spaces_and_letters_of_all_kinds_work(lidardesign, finished_run):
+    assert lidardesign("fit", finished_run, "--sensors", 1, "--name", "größe-1").code == 0
+    assert (finished_run / "designs" / "größe-1.yaml").is_file()
+
+
+def test_an_unexpected_error_is_one_line_with_a_hint(capsys):
+    for debug in (False, True):
+        with pytest.raises(console_module.typer.Exit) as ended, command(json=True, quiet=False, debug=debug):
+            raise ZeroDivisionError("division by zero")
+        captured = capsys.readouterr()
+        assert ended.value.exit_code == 70
+        assert json.loads(captured.out)["error"]["kind"] == "internal"
+        assert "--debug" in captured.err
+        assert ("Traceback" in captured.err) == debug
+
+
+def test_what_libraries_print_does_not_spoil_the_document(capsys):
+    with command(json=True, quiet=False, debug=False) as console:
+        print("a library says hello")
+        console.result({"value": 1}, lambda rich: None)
+    captured = capsys.readouterr()
+    assert json.loads(captured.out) == {"schema_version": 1, "value": 1}
+    assert "hello" in captured.err
+
+
+def test_an_error_after_the_document_adds_no_second_one(capsys):
+    def body():
+        with command(json=True, quiet=False, debug=False) as console:
+            console.result({"value": 1}, lambda rich: None)
+            raise InfeasibleError("late")
+
+    with pytest.raises(console_module.typer.Exit):
+        body()
+    assert json.loads(capsys.readouterr().out)["value"] == 1
+
+
+def test_numbers_that_json_lacks_become_null():
+    values = {
+        "a": float("nan"),
+        "b": [np.inf, np.float64(1.5)],
+        "c": np.arange(2),
+        "d": Path("x"),
+        "e": (None, True),
+    }
+    assert plain_json(values) == {"a": None, "b": [None, 1.5], "c": [0, 1], "d": "x", "e": [None, True]}
+
+
+def test_quiet_says_nothing_by_the_way(capsys):
+    Console(quiet=True).note("something")
+    Console().note("something else")
+    assert capsys.readouterr().err == "something else\n"
+
+
+def program(*arguments, **options) -> subprocess.Popen:
+    code = f"from lidardesign.cli.main import run; run({[str(a) for a in arguments]!r})"
+    return subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options
+    )
+
+
+def test_a_closed_pipe_ends_quietly(tmp_path):
+    for arguments in (["tasks", "list", "--json"], ["tasks", "list"], ["--help"]):
+        process = program(*arguments, cwd=tmp_path)
+        process.stdout.close()
+        assert process.wait() == 141
+        assert process.stderr.read() == b""
+        process.stderr.close()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs the device /dev/full")
+def test_a_full_disk_behind_stdout_is_one_message(tmp_path):
+    with open("/dev/full", "w") as full:
+        code = "from lidardesign.cli.main import run; run(['tasks', 'list'])"
+        result = subprocess.run(
+            [sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, check=False
+        )
+    assert result.returncode == 3
+    assert result.stderr.splitlines() == [b"system error: No space left on device"]
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+def test_any_output_encoding_works_and_no_colour_is_written_to_a_pipe(tmp_path, encoding):
+    process = program(
+        "tasks", "list", env={**os.environ, "PYTHONIOENCODING": encoding, "NO_COLOR": "1"}, cwd=tmp_path
+    )
+    out, err = process.communicate()
+    assert process.returncode == 0, err
+    assert b"flatland" in out
+    assert b"\x1b[" not in out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interruption_keeps_the_checkpoint_and_says_how_to_continue(tmp_path, sent, code):
+    settings = ["learning.steps=100000", "learning.batch=64", "learning.checkpoint_seconds=0.2"]
+    options = [word for setting in settings for word in ("--set", setting)]
+    process = program(
+        "learn", "flatland", "--preset", "draft", "--out", "run", *options, "--json", cwd=tmp_path
+    )
+    deadline = time.monotonic() + 120
+    while not list((tmp_path / "run").glob("checkpoint*")) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    process.send_signal(sent)
+    out, err = process.communicate()
+    assert process.returncode == code, err
+    assert "--resume" in json.loads(out)["error"]["message"]
+    assert (tmp_path / "run" / "config.yaml").is_file()
+    assert not (tmp_path / "run" / ".lock").exists()
+    assert not list((tmp_path / "run").glob(".*.tmp"))
