@@ -85,7 +85,7 @@ def evaluate(
         written = _write_files(evaluation, request, report, plots, csv)
         document = {**evaluation.as_dict(), "files": [str(path) for path in written]}
         console.result(document, lambda rich: _show(document, written, rich))
-        _check_threshold(document, {entry.design.name for entry in entries}, fail_above)
+        _check_threshold(evaluation, fail_above)
 
 
 def _check_baselines(names: list[str]) -> None:
@@ -235,21 +235,18 @@ def _write_report(evaluation: Evaluation, request: EvaluationRequest, path: Path
     write_report(evaluation, request.designs, rays, request.test[0], path)
 
 
-def _check_threshold(document: dict[str, Any], designs: set[str], limit: float | None) -> None:
-    """Exit 1 where a design scores above the limit; baselines do not count."""
+def _check_threshold(evaluation: Evaluation, limit: float | None) -> None:
+    """Exit 1 where a design is worse than the limit; baselines do not count."""
     if limit is None:
         return
-    above = [
-        row
-        for row in document["rows"]
-        if row["design"] in designs and not (row["value"] is not None and row["value"] <= limit)
-    ]
-    if above:
-        unit = document["metric"]["unit"]
-        rows = ", ".join(
-            f"{row['design']} with {row['rays']} rays: {number(row['value'])} {unit}" for row in above
-        )
-        raise ThresholdError(rows, where="--fail-above", allowed=f"at most {limit:g} {unit}")
+    from lidardesign.evaluate.results import worse_than_threshold
+
+    missed = worse_than_threshold(evaluation, limit)
+    if missed:
+        unit = evaluation.metric.unit
+        bound = "at most" if evaluation.metric.better == "lower" else "at least"
+        rows = ", ".join(f"{row.design} with {row.rays} rays: {number(row.value)} {unit}" for row in missed)
+        raise ThresholdError(rows, where="--fail-above", allowed=f"{bound} {limit:g} {unit}")
 
 
 def _show(document: dict[str, Any], written: Sequence[Path], rich: RichConsole) -> None:
@@ -262,6 +259,8 @@ def _show(document: dict[str, Any], written: Sequence[Path], rich: RichConsole) 
     if document.get("equal_bandwidth"):
         _show_rows(document["equal_bandwidth"], "at equal bandwidth", rich)
     _show_paired(document.get("paired", []), escape(metric["unit"]), rich)
+    for note in document.get("notes", []):
+        rich.print(f"note: {escape(note)}", soft_wrap=True)
     for path in written:
         rich.print(f"wrote {escape(str(path))}", soft_wrap=True)
 
@@ -273,11 +272,22 @@ def _show_rows(rows: Sequence[dict[str, Any]], title: str, rich: RichConsole) ->
     table = Table(title=title, title_justify="left")
     for heading in ("design", "rays", "value", "95 % interval", "failures", "Mbit/s", "seconds"):
         table.add_column(heading, justify="left" if heading == "design" else "right")
+    matched = any("matched_to" in row for row in rows)
+    if matched:
+        table.add_column("as much as")
     for row in rows:
         interval = f"{number(row['ci_low'])} - {number(row['ci_high'])}"
         cells = (row["rays"], row["value"], interval, row["failures"], row["bandwidth_mbps"], row["seconds"])
-        table.add_row(escape(row["design"]), *(number(cell) for cell in cells))
+        partner = [_partner(row)] if matched else []
+        table.add_row(escape(row["design"]), *(number(cell) for cell in cells), *partner)
     rich.print(table)
+
+
+def _partner(row: dict[str, Any]) -> str:
+    """The design and number of rays whose bandwidth a baseline was given."""
+    from rich.markup import escape
+
+    return escape(f"{row['matched_to']}, {row['matched_rays']} rays") if row.get("matched_to") else ""
 
 
 def _show_paired(paired: Sequence[dict[str, Any]], unit: str, rich: RichConsole) -> None:
