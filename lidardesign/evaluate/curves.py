@@ -1,0 +1,76 @@
+"""What the curves of plots and reports have in common: one series per name, its look, and the axes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from lidardesign.evaluate.results import Evaluation, Row
+
+Against = Literal["rays", "bandwidth"]
+
+# Okabe and Ito 2008, without yellow (too faint on white) and with black kept for text.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+GREYS = ("#555555", "#777777", "#949494", "#333333")
+MARKERS = ("o", "s", "^", "D", "v", "P")
+BASELINE_MARKERS = ("x", "+", "1", "2")
+DASHES = ("solid", "dashed", "dashdot", "dotted")
+MANY_DECADES = 4.0  # a range of values wider than this factor is easier to read on a logarithmic axis
+
+
+@dataclass(frozen=True)
+class Series:
+    """One curve.
+
+    Arguments:
+        name: Of the design or baseline.
+        rows: By growing number of rays.
+        colour, marker, dash: Distinct in more than colour; baselines are grey, with open markers and dashes.
+        baseline: Whether it is a baseline.
+    """
+
+    name: str
+    rows: tuple[Row, ...]
+    colour: str
+    marker: str
+    dash: str
+    baseline: bool
+
+
+def series(evaluation: Evaluation) -> list[Series]:
+    """One series per name, in the order of the rows."""
+    found: list[Series] = []
+    for name in dict.fromkeys(row.design for row in evaluation.rows):
+        rows = tuple(sorted((row for row in evaluation.rows if row.design == name), key=lambda row: row.rays))
+        kind = sum(other.baseline == rows[0].baseline for other in found)
+        found.append(_styled(name, rows, kind))
+    return found
+
+
+def _styled(name: str, rows: tuple[Row, ...], index: int) -> Series:
+    if rows[0].baseline:
+        grey, marker = GREYS[index % len(GREYS)], BASELINE_MARKERS[index % len(BASELINE_MARKERS)]
+        return Series(name, rows, grey, marker, DASHES[1 + index % (len(DASHES) - 1)], baseline=True)
+    dash = DASHES[index // len(COLOURS) % len(DASHES)]
+    return Series(
+        name, rows, COLOURS[index % len(COLOURS)], MARKERS[index % len(MARKERS)], dash, baseline=False
+    )
+
+
+def position(row: Row, against: Against) -> float:
+    """Where a row stands on the horizontal axis: rays per frame, or Mbit/s."""
+    return float(row.rays) if against == "rays" else row.bandwidth_mbps
+
+
+def logarithmic(values: Sequence[float]) -> bool:
+    """Whether values span so much that a logarithmic axis shows them better."""
+    positive = [value for value in values if value > 0]
+    return len(positive) == len(values) > 1 and max(positive) > MANY_DECADES * min(positive)
+
+
+def axis_titles(evaluation: Evaluation, against: Against) -> tuple[str, str]:
+    """Titles of the horizontal and the vertical axis, with their units."""
+    metric = evaluation.metric
+    across = "rays per frame" if against == "rays" else "bandwidth [Mbit/s]"
+    return across, f"{metric.name} [{metric.unit}], {metric.better} is better"
