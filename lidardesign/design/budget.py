@@ -50,10 +50,8 @@ class ReadOut:
 
     def affordable_rays(self, widths_m: np.ndarray, weights: np.ndarray) -> int:
         """The number of rays that the budget pays for, at least one per sensor (which may exceed it)."""
-        per_ray = self.model.mbps_of_widths(widths_m, 1) * 0 + float(
-            np.dot(weights / np.sum(weights), self.model.bins(widths_m))
-        )
-        per_ray *= self.model.mbps_of_widths(np.zeros(1), 1)
+        bins_per_ray = float(np.dot(weights / np.sum(weights), self.model.bins(widths_m)))
+        per_ray = bins_per_ray * self.model.mbps_of_widths(np.zeros(1), 1)
         rays = int((self.limit_mbps or 0.0) / per_ray)
         # largest remainders may hand spare rays to the wider gates
         while rays > len(widths_m) and not self.fits(widths_m, weights, rays):
@@ -69,8 +67,8 @@ def within_budget(
 ) -> tuple[Fitted, int | None]:
     """A design that keeps the bandwidth budget, and its number of rays.
 
-    Where the fit is too expensive its gates are narrowed to a common number of bins and it is refitted from where
-    it was, until the count of whole bins keeps the budget.
+    Where the fit is too expensive its gates are narrowed to a common number of bins and it is refitted from
+    where it was, until the count of whole bins keeps the budget.
 
     Arguments:
         fitted: The fit without a budget.

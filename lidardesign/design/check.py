@@ -1,7 +1,7 @@
 """The independent checker: does a written design keep a written constraint file?
 
-It reads plain documents only and shares no code with the fit: intervals are recomputed from means and spreads,
-compared with the reported ones, and bounds are applied to both. Definitions are those of `constraints`.
+It reads plain documents only and shares no code with the fit: intervals are recomputed from means and
+spreads, compared with the reported ones, and bounds are applied to both. Definitions are those of `constraints`.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
         own = _over(rules, each[index]) if index < len(each) else rules
         name = str(sensor.get("name", index))
         checks += _consistency(name, sensor, z)
-        checks += _origin(name, sensor, own) + _boresight(name, sensor, own)
+        checks += _origin(name, sensor, own) + _boresight(name, sensor, own, bounds)
         checks += _intervals(name, sensor, own, z)
         if bounds is not None:
             checks += _inside_space(name, sensor, bounds)
@@ -172,7 +172,10 @@ def _largest_eigenvalue(matrix: Any) -> float:
     return q + 2 * p * math.cos(math.acos(min(max(half_determinant, -1.0), 1.0)) / 3)
 
 
-def _boresight(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any]) -> list[ConstraintCheck]:
+def _boresight(
+    name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], space: Any
+) -> list[ConstraintCheck]:
+    """Elevation, and azimuth on the circle; an end that is not given is the space's, or else 0 or 360 degrees."""
     elevation = math.degrees(sensor["boresight"]["elevation_rad"])
     checks = _between(f"{name}.boresight.elevation_deg", elevation, _get(rules, "boresight", "elevation_deg"))
     given = _get(rules, "boresight", "azimuth_deg") or {}
@@ -180,26 +183,13 @@ def _boresight(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any]) -
     if low is None and high is None:
         return checks
     azimuth = math.degrees(sensor["boresight"]["azimuth_rad"])
-    if low is None or high is None:
-        return checks + _one_sided(name, azimuth, low, high)
+    turn = _get(space, "azimuth_rad") or [0.0, 2 * math.pi]
+    low = math.degrees(turn[0]) if low is None else low
+    high = math.degrees(turn[1]) if high is None else high
     width = high - low if high - low >= 360 else (high - low) % 360
     past = (azimuth - low) % 360
     kept = past <= width + _slack(360) or past >= 360 - _slack(360)
     return [*checks, ConstraintCheck(f"{name}.boresight.azimuth_deg", [low, high], azimuth, bool(kept))]
-
-
-def _one_sided(name: str, azimuth: float, low: float | None, high: float | None) -> list[ConstraintCheck]:
-    """A single bound holds for some number of whole turns within half a turn of it."""
-    bound = low if low is not None else high
-    assert bound is not None
-    offset = (azimuth - bound) % 360
-    kept = (
-        offset <= 180 + _slack(360)
-        if low is not None
-        else offset >= 180 - _slack(360) or offset <= _slack(360)
-    )
-    key = "min" if low is not None else "max"
-    return [ConstraintCheck(f"{name}.boresight.azimuth_deg.{key}", bound, azimuth, bool(kept))]
 
 
 def _intervals(

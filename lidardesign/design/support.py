@@ -46,12 +46,14 @@ class Support:
         weights: Unnormalised, shape (N,).
         total: The sum of weights relative to the whole density, where it has a meaning.
         effective: The number of equal weights that are worth as much.
+        mass: The share of the density inside the constraints; None where an origin is pinned.
     """
 
     points: np.ndarray
     weights: np.ndarray
     total: float
     effective: float
+    mass: float | None = None
 
 
 def admissible(points: np.ndarray, constraints: Constraints, space: DesignSpace, group: Group) -> np.ndarray:

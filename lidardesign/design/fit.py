@@ -1,0 +1,337 @@
+"""From weighted samples of the density to a design that keeps its constraints."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from lidardesign.design.budget import ReadOut, within_budget
+from lidardesign.design.check import ConstraintCheck, check_design
+from lidardesign.design.constraints import Constraints
+from lidardesign.design.ensemble import Ensemble, Part, fit_parts, sensors_of
+from lidardesign.design.feasibility import check_feasible, least_sensors
+from lidardesign.design.features import Axes, Features
+from lidardesign.design.rays import make_ray_table, split_budget
+from lidardesign.design.resolve import bounds_of, groups
+from lidardesign.design.samples import Samples
+from lidardesign.design.scan import fit_scan
+from lidardesign.design.sensor import DEFAULT_LEVEL, Design, Layout, Sensor, interval_factor
+from lidardesign.design.support import Retarget, Support, check_support, pinned, restricted
+from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.task import random_generator
+
+DEFAULT_SENSORS = 4
+EM_SAMPLES = 20_000
+RESTARTS = 4
+# `auto` tries up to this many sensors.
+MOST_SENSORS = 12
+# It stops after this many counts in a row that gain less than one standard error.
+PATIENCE = 2
+HELD_OUT_SHARE = 1 / 3
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """A fitted design and how good it is.
+
+    Arguments:
+        design: The design; its provenance is for the caller to fill.
+        log_likelihood: Weighted mean log density of the samples [nats].
+        admissible_mass: The share of the density inside the constraints; None with pinned origins.
+        ess: Effective share of the samples that were admitted, 0 to 1.
+        satisfied: Whether every constraint holds on the finished design.
+        constraints: The independent checks.
+        seconds: Wall time [s].
+        notes: What happened to sensors, one line each.
+    """
+
+    design: Design
+    log_likelihood: float
+    admissible_mass: float | None
+    ess: float
+    satisfied: bool
+    constraints: list[ConstraintCheck]
+    seconds: float
+    notes: tuple[str, ...] = field(default=())
+
+    def as_dict(self) -> dict[str, Any]:
+        """The contract's JSON keys; the path of the design is for the caller to fill."""
+        return {
+            "design": self.design.name,
+            "sensors": [sensor.as_dict() for sensor in self.design.sensors],
+            "log_likelihood": self.log_likelihood,
+            "admissible_mass": self.admissible_mass,
+            "ess": self.ess,
+            "satisfied": self.satisfied,
+            "constraints": [check.as_dict() for check in self.constraints],
+            "seconds": self.seconds,
+        }
+
+
+@dataclass(frozen=True)
+class _Request:
+    """Everything that `fit` was asked for, with the defaults filled in."""
+
+    samples: Samples
+    constraints: Constraints
+    seed: int
+    restarts: int
+    em_samples: int
+    level: float
+    retarget: Retarget | None
+
+    @property
+    def interval(self) -> float:
+        """z, half an interval in standard deviations."""
+        return interval_factor(self.level)
+
+
+def fit(
+    samples: Samples,
+    *,
+    sensors: int | Literal["auto"] | None = None,
+    layout: Layout = "grid",
+    rays: int | None = None,
+    constraints: Constraints | None = None,
+    seed: int = 0,
+    restarts: int = RESTARTS,
+    em_samples: int = EM_SAMPLES,
+    level: float = DEFAULT_LEVEL,
+    name: str = "design",
+    gates: Literal["sensor", "ray"] = "sensor",
+    retarget: Retarget | None = None,
+) -> FitResult:
+    """Fit sensors to samples of the density under constraints.
+
+    Arguments:
+        samples: Weighted samples of the learned density.
+        sensors: How many; `auto` chooses by held-out likelihood; None takes the constraints' or 4. A scan has one
+            component per ray instead.
+        layout: How rays are laid out.
+        rays: Rays per frame; None takes the budget's.
+        constraints: A checked constraint file.
+        seed: Root of the random streams.
+        restarts: Seeds that are tried.
+        em_samples: Samples that the fit works on.
+        level: The share of each marginal that intervals hold.
+        name: The design's name.
+        gates: Whether explicit rays have their sensor's gate or their own.
+        retarget: log p* of design points (N, 6), needed where an origin is pinned that the density leaves free.
+
+    Raises:
+        InfeasibleError: Constraints that contradict each other or hold too little of the density.
+        ConfigError: Options that do not fit together.
+    """
+    started = time.perf_counter()
+    constraints = Constraints() if constraints is None else constraints
+    _check_options(constraints, samples, sensors, layout, rays)
+    request = _Request(samples, constraints, seed, restarts, em_samples, level, retarget)
+    read_out = ReadOut.of(constraints.budget, rays)
+    if layout == "scan":
+        supports = _supports(request, 1)
+        points = _features(request, supports, 1)[0]
+        fitted, score = fit_scan(
+            points.features, samples.space, constraints, points.group, read_out, level, seed
+        )
+        total: int | None = len(fitted)
+        notes: tuple[str, ...] = ()
+    else:
+        supports, ensemble = _fitted(request, sensors)
+        ensemble, total = within_budget(
+            ensemble, Ensemble.narrowed, lambda e: (e.widths_m, e.weights), read_out
+        )
+        fitted = sensors_of(ensemble, samples.space, level, by_weight=not constraints.each)
+        score, notes = ensemble.log_likelihood, ensemble.notes
+    design = _design(fitted, layout, total, request, name, gates)
+    checks = check_design(_document(design), constraints, samples.space)
+    return FitResult(
+        design=design,
+        log_likelihood=score,
+        admissible_mass=_mass(supports),
+        ess=sum(s.effective for s in supports) / max(sum(len(s.points) for s in supports), 1),
+        satisfied=all(check.satisfied for check in checks),
+        constraints=checks,
+        seconds=time.perf_counter() - started,
+        notes=notes,
+    )
+
+
+def _check_options(
+    constraints: Constraints, samples: Samples, sensors: int | str | None, layout: str, rays: int | None
+) -> None:
+    """Options against each other and against the constraints, before anything is computed."""
+    if isinstance(sensors, str) and sensors != "auto":
+        raise ConfigError(f"{sensors!r} sensors", where="--sensors", allowed="a whole number, or auto")
+    if isinstance(sensors, int) and sensors < 1:
+        raise ConfigError(f"{sensors} sensors", where="--sensors", allowed="1 or more")
+    if rays is not None and rays < 1:
+        raise ConfigError(f"{rays} rays", where="--rays", allowed="1 or more")
+    budget = constraints.budget.rays
+    if rays is not None and budget is not None and rays != budget:
+        raise InfeasibleError(f"{rays} and {budget} rays asked for", conflicts=["--rays", "budget.rays"])
+    if layout == "scan":
+        if constraints.each or any(v is not None for v in constraints.sensors.model_dump().values()):
+            raise ConfigError(
+                "every ray of a scan is a component of its own",
+                where="--layout scan",
+                hint="remove sensors and each from the constraints",
+            )
+        check_feasible(constraints, samples.space)
+        return
+    count = sensors if isinstance(sensors, int) else None
+    check_feasible(constraints, samples.space, sensors=count)
+    least = least_sensors(constraints, count)
+    if rays is not None and rays < least.value:
+        names = ["--rays", least.name or "sensors"]
+        raise InfeasibleError(f"{rays} rays for {least.value} sensors", conflicts=names)
+
+
+def _sensor_counts(constraints: Constraints, sensors: int | str | None) -> list[int]:
+    """The numbers of sensors to try: one where it is said, a range for `auto`."""
+    asked = constraints.sensors
+    if isinstance(sensors, int) or asked.count is not None:
+        return [sensors if isinstance(sensors, int) else int(asked.count or 1)]
+    low = max(asked.min or 1, len(constraints.each), 1)
+    high = MOST_SENSORS if asked.max is None else asked.max
+    if constraints.budget.rays is not None:
+        high = min(high, constraints.budget.rays)
+    if sensors == "auto":
+        return list(range(low, max(low, high) + 1))
+    usual = len(constraints.each) or DEFAULT_SENSORS
+    return [min(max(usual, low), max(low, high))]
+
+
+def _fitted(request: _Request, sensors: int | str | None) -> tuple[list[Support], Ensemble]:
+    counts = _sensor_counts(request.constraints, sensors)
+    supports = _supports(request, counts[-1])
+    count = counts[0] if len(counts) == 1 else _chosen_count(request, supports, counts)
+    kept = (
+        supports if len(supports) == len(groups(request.constraints, request.samples.space, count)) else None
+    )
+    supports = kept or _supports(request, count)
+    return supports, fit_parts(_features(request, supports, count), request.seed, request.restarts)
+
+
+def _supports(request: _Request, count: int) -> list[Support]:
+    """The samples of each group of sensors, refused where they are too few."""
+    found = []
+    members = groups(request.constraints, request.samples.space, count)
+    for index, group in enumerate(members):
+        free = all(pin is None for pin in group.pins)
+        if free:
+            support = restricted(request.samples, request.constraints, group)
+        else:
+            generator = random_generator(request.seed, "pinned", index)
+            support = pinned(
+                request.samples, request.constraints, group, request.retarget, request.em_samples, generator
+            )
+        mass = support.total if free else None
+        check_support(support, group, mass=mass, several=len(members) > 1)
+        found.append(replace(support, mass=mass))
+    return found
+
+
+def _mass(supports: list[Support]) -> float | None:
+    """The share of the density that the sensors may draw on; unknown where an origin is pinned."""
+    masses = [support.mass for support in supports]
+    return None if any(mass is None for mass in masses) else float(max(m for m in masses if m is not None))
+
+
+def _features(request: _Request, supports: list[Support], count: int) -> list[Part]:
+    """Features, bounds and shares of each group of sensors.
+
+    Pinned groups share by how much density each pinned origin sees; against groups with a free origin, whose
+    measure is another, they share by numbers of sensors.
+    """
+    space = request.samples.space
+    members = groups(request.constraints, space, count)
+    shares = np.array([len(group.sensors) for group in members], dtype=np.float64) / count
+    is_pinned = np.array([any(pin is not None for pin in group.pins) for group in members])
+    totals = np.array([support.total for support in supports])
+    if is_pinned.any():
+        shares[is_pinned] = shares[is_pinned].sum() * totals[is_pinned] / totals[is_pinned].sum()
+    parts = []
+    for index, (group, support) in enumerate(zip(members, supports, strict=True)):
+        points, weights = _thinned(support, request.em_samples, random_generator(request.seed, "em", index))
+        features = Features.of(points, weights, Axes.of(space, group.pins), space)
+        bounds = bounds_of(request.constraints, space, group.sensors, request.interval)
+        parts.append(Part(group, float(shares[index]), features, bounds))
+    return parts
+
+
+def _thinned(support: Support, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """At most `count` samples: systematic resampling to equal weights where there are more."""
+    if len(support.points) <= count:
+        return support.points, support.weights
+    cumulative = np.cumsum(support.weights)
+    positions = (np.arange(count) + generator.uniform()) / count * cumulative[-1]
+    chosen = np.minimum(np.searchsorted(cumulative, positions, side="right"), len(cumulative) - 1)
+    return support.points[generator.permutation(chosen)], np.ones(count)
+
+
+def _chosen_count(request: _Request, supports: list[Support], counts: list[int]) -> int:
+    """The smallest number of sensors within one standard error of the best held-out log-likelihood."""
+    scores: dict[int, tuple[float, float]] = {}
+    waiting, best = 0, -math.inf
+    for count in counts:
+        if len(groups(request.constraints, request.samples.space, count)) != len(supports):
+            continue
+        train, test = _split(_features(request, supports, count), request.seed)
+        mean, error = fit_parts(train, request.seed, request.restarts).held_out(test)
+        scores[count] = mean, error
+        waiting = 0 if mean > best + error else waiting + 1
+        best = max(best, mean)
+        if waiting >= PATIENCE:
+            break
+    top = max(scores, key=lambda count: scores[count][0])
+    return min(count for count, (mean, _) in scores.items() if mean >= scores[top][0] - scores[top][1])
+
+
+def _split(parts: list[Part], seed: int) -> tuple[list[Part], list[Part]]:
+    """Samples for fitting and for judging, apart."""
+    train, test = [], []
+    for index, part in enumerate(parts):
+        draw = random_generator(seed, "held out", index).uniform(size=len(part.features))
+        held = draw < HELD_OUT_SHARE
+        train.append(replace(part, features=part.features.subset(~held)))
+        test.append(replace(part, features=part.features.subset(held)))
+    return train, test
+
+
+def _design(
+    sensors: tuple[Sensor, ...],
+    layout: Layout,
+    total: int | None,
+    request: _Request,
+    name: str,
+    gates: Literal["sensor", "ray"],
+) -> Design:
+    if total is not None:
+        counts = split_budget(np.array([s.weight for s in sensors]), total)
+        sensors = tuple(replace(s, rays=int(n)) for s, n in zip(sensors, counts, strict=True))
+    design = Design(
+        name=name,
+        sensors=sensors,
+        layout=layout,
+        rays=total,
+        constraints=request.constraints.as_document(),
+        level=request.level,
+    )
+    if total is None or (layout == "grid" and gates == "sensor"):
+        return design
+    if layout == "scan":
+        return design
+    table = make_ray_table(design, total, request.samples, gates, seed=request.seed)
+    return replace(design, ray_table=table)
+
+
+def _document(design: Design) -> dict[str, Any]:
+    """The written form that the checker reads."""
+    # files reads and writes all formats; only its document is needed here
+    from lidardesign.design.files import design_document
+
+    return design_document(design)
