@@ -14,10 +14,13 @@ if TYPE_CHECKING:
     from lidardesign.design.sensor import Design
 
 MAX_SHOWN = 20
+SPACE_MARK = ".space."
 
 
 def number(value: Any, digits: int = 4) -> str:
-    """A figure for people; a dash where there is none."""
+    """A figure, a text or a list of them for people; a dash where there is none."""
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(number(item, digits) for item in value) + "]"
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "-"
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
@@ -59,7 +62,10 @@ def show_design(design: Design, rich: RichConsole) -> None:
 
 
 def show_constraints(checks: Sequence[ConstraintCheck], rich: RichConsole) -> None:
-    """Print a table of constraints: bound, value and whether it holds."""
+    """Print a table of constraints: bound, value and whether it holds.
+
+    The bounds of the design space hold for every sensor; they are shown where they are broken.
+    """
     from rich.markup import escape
     from rich.table import Table
 
@@ -67,12 +73,14 @@ def show_constraints(checks: Sequence[ConstraintCheck], rich: RichConsole) -> No
         return
     table = Table("constraint", "bound", "value", "holds", title="constraints", title_justify="left")
     for check in checks:
-        bound = check.bound if isinstance(check.bound, str) else number(check.bound, 6)
-        value = check.value if isinstance(check.value, str) else number(check.value, 6)
+        if SPACE_MARK in check.name and check.satisfied:
+            continue
+        holds = "yes" if check.satisfied else "[bold]no[/bold]"
         table.add_row(
-            escape(check.name), escape(bound), escape(value), "yes" if check.satisfied else "[bold]no[/bold]"
+            escape(check.name), escape(number(check.bound, 6)), escape(number(check.value, 6)), holds
         )
-    rich.print(table)
+    if table.row_count:
+        rich.print(table)
 
 
 def show_fit(document: dict[str, Any], design: Design, checks: Sequence[Any], rich: RichConsole) -> None:

@@ -12,6 +12,8 @@ from lidardesign.cli.console import Console, command
 from lidardesign.cli.runs import check_choice, check_name, open_run, provenance, sensor_count
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from lidardesign.cli.runs import Run
     from lidardesign.design.check import ConstraintCheck
     from lidardesign.design.constraints import Constraints
@@ -85,8 +87,15 @@ def fit_and_write(
 
     path = run.design_path(name)
     result: FitResult = fit_design(
-        load_samples(run.folder), constraints=constraints, seed=seed, name=name, **choices
+        load_samples(run.folder),
+        constraints=constraints,
+        seed=seed,
+        name=name,
+        retarget=lambda points: _log_target(run, points),
+        **choices,
     )
+    for note in result.notes:
+        console.note(f"note: {note}")
     made_by = provenance(run, path, command_name, seed)
     design = replace(result.design, provenance={**result.design.provenance, **made_by})
     checks = check_written(design, constraints, run.config.space)
@@ -98,6 +107,17 @@ def fit_and_write(
     }
     document["satisfied"] = all(check.satisfied for check in checks)
     console.result(document, lambda rich: show_fit(document, design, checks, rich))
+
+
+def _log_target(run: Run, points: np.ndarray) -> np.ndarray:
+    """log p* of design points, (N, 6) to (N,): only a pinned origin needs it, and only then it is loaded."""
+    from lidardesign.density.learn import prepare_target
+    from lidardesign.registry import plugin_guard
+
+    with plugin_guard(run.task.name):
+        scenes = list(run.task.scenes(run.config.task, "train", run.config.seed))
+    target, _ = prepare_target(scenes, run.config)
+    return target.log_density(points)
 
 
 def check_written(
