@@ -23,7 +23,7 @@ from lidardesign.space import DesignSpace, aim
 from lidardesign.task import Defaults, Metric, Score, Split, TaskConfig, random_generator
 
 MILLIMETRES = 1000.0
-SEGMENTS = 12  # capsules per surface: bends between them stay below the density's sigma
+BUMP_VERTICES = np.array([-1.5, -0.9, -0.4, 0.0, 0.4, 0.9, 1.5])  # in widths: the curve bends only there
 LARGEST_GAP_M = 0.15  # neighbouring returns further apart than this belong to different curves
 TRUTH_STEP_M = 0.004  # a fifth of the density's sigma
 TRUTH_ORIGINS = 17  # positions on the sensor line that the truth is looked at from
@@ -102,13 +102,14 @@ def build_scene(
 
 def surface(variation: float, generator: np.random.Generator) -> tuple[Body, ...]:
     """A curve with one bump whose place, height and width differ between scenes, and a few waves."""
-    ends = np.array([0.15, 0.85]) + variation * generator.normal(0.0, 0.015, 2)
-    x = np.linspace(*ends, SEGMENTS + 1)
+    ends = np.array([0.15, 0.85]) + np.clip(variation * generator.normal(0.0, 0.015, 2), -0.03, 0.03)
     height = 0.80 + variation * generator.normal(0.0, 0.02)
     tilt = variation * generator.normal(0.0, 0.08)
-    centre = 0.45 + variation * generator.normal(0.0, 0.04)
-    width = 0.09 * math.exp(variation * generator.normal(0.0, 0.15))
+    # bounded so that the bump stays between the ends
+    centre = 0.45 + np.clip(variation * generator.normal(0.0, 0.04), -0.06, 0.06)
+    width = 0.09 * math.exp(np.clip(variation * generator.normal(0.0, 0.15), -0.35, 0.35))
     bump = 0.14 * math.exp(variation * generator.normal(0.0, 0.2))
+    x = np.array([ends[0], *(centre + width * BUMP_VERTICES), ends[1]])
     y = height + tilt * (x - 0.5) - bump * np.exp(-(((x - centre) / width) ** 2))
     for wave, amplitude in enumerate(variation * generator.normal(0.0, 0.008, 3), start=1):
         y = y + amplitude * np.sin(2 * math.pi * wave * x + generator.uniform(0, 2 * math.pi))
