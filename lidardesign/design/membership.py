@@ -9,10 +9,10 @@ import numpy as np
 from lidardesign.design.sensor import Design, Sensor, angle_over_sine, tangent_coordinates
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, aim, direction, observed_point
 
-# A fixed origin, angle or range has no density of its own. These smallest spreads, far below any that
-# matters, order samples by their distance instead; lengths are relative to the sensors' mean range.
-SMALLEST_LENGTH = 1e-4
+# A direction or range without spread has no density. These smallest spreads, far below any that matters,
+# order samples by their distance instead; the one of the range is relative to the sensors' mean range.
 SMALLEST_ANGLE_RAD = 1e-4
+SMALLEST_LENGTH = 1e-4
 # Rays on the field's very edge belong to it: rounding of the tangent map, in radians.
 FIELD_ROUNDING_RAD = 1e-12
 
@@ -40,74 +40,70 @@ class Members:
 def members(design: Design, points: np.ndarray, weights: np.ndarray) -> list[Members]:
     """The samples inside each sensor's field of view and gate, each sample with one sensor at most.
 
-    A sample goes to the sensor that is most responsible for it (highest weighted density). Rays start at the
-    sensor's mean origin, so the sample is then aimed anew, from there at the scene point that it observes.
+    Rays start at their sensor's mean origin. So each sample is aimed anew, from there at the scene point that
+    it observes, and goes to the sensor with the highest weighted density of that direction and range, the
+    first where they tie.
 
     Arguments:
         design: G sensors.
         points: Design points, shape (N, 6).
         weights: Their weights, shape (N,).
     """
-    owner = owners(design, points)
     observed = observed_point(points)
+    smallest = SMALLEST_LENGTH * (float(np.mean([sensor.range_m for sensor in design.sensors])) or 1.0)
+    best = np.full(len(points), -np.inf)
+    owner = np.full(len(points), -1)
+    tangent, distance = np.zeros((len(points), 2)), np.zeros(len(points))
+    for index, (sensor, weight) in enumerate(zip(design.sensors, design.weights, strict=True)):
+        if weight == 0:
+            continue
+        angles, ranges = seen_from(sensor, observed)
+        score = np.log(weight) + log_density(sensor, angles, ranges, smallest_m=smallest)
+        better = score > best
+        best[better], owner[better] = score[better], index
+        tangent[better], distance[better] = angles[better], ranges[better]
     return [
-        _inside(sensor, np.flatnonzero(owner == index), observed, weights)
+        _inside(sensor, np.flatnonzero((owner == index) & (weights > 0)), tangent, distance, weights)
         for index, sensor in enumerate(design.sensors)
     ]
 
 
-def _inside(sensor: Sensor, index: np.ndarray, observed: np.ndarray, weights: np.ndarray) -> Members:
-    aimed = aim(sensor.origin_m, observed[index])
+def seen_from(sensor: Sensor, observed_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Tangent coordinates (N, 2) [rad] and ranges (N,) [m] of scene points (N, 3) from the mean origin.
+
+    In a fan of rays (one angle without spread) only the angle along the fan says where a point lies.
+    """
+    aimed = aim(sensor.origin_m, observed_m)
     tangent = tangent_coordinates(sensor.frame, direction(aimed[:, AZIMUTH], aimed[:, ELEVATION]))
-    tangent[:, ~_spreading(sensor)] = 0.0
-    half_field = np.array(sensor.field_of_view_rad) / 2 + FIELD_ROUNDING_RAD
-    start, end = sensor.gate_m
-    distance = aimed[:, RANGE]
-    keep = (np.abs(tangent) <= half_field).all(axis=1) & (distance >= start) & (distance < end)
-    keep &= weights[index] > 0
-    kept = index[keep]
-    return Members(kept, tangent[keep], distance[keep], weights[kept])
-
-
-def _spreading(sensor: Sensor) -> np.ndarray:
-    """Which tangent axes say where a sample lies, shape (2,): in a fan of rays only the one along it."""
     spread = np.array([sensor.spread_horizontal_rad, sensor.spread_vertical_rad]) > 0
-    return spread if spread.any() else np.ones(2, dtype=bool)
+    if spread.any():
+        tangent[:, ~spread] = 0.0
+    return tangent, aimed[:, RANGE]
 
 
-def owners(design: Design, points: np.ndarray) -> np.ndarray:
-    """The sensor with the highest weighted density at each design point, the first where they tie: (N,)."""
-    scale = float(np.mean([sensor.range_m for sensor in design.sensors])) or 1.0
-    best = np.full(len(points), -np.inf)
-    owner = np.zeros(len(points), dtype=np.int64)
-    for index, (sensor, weight) in enumerate(zip(design.sensors, design.weights, strict=True)):
-        if weight == 0:
-            continue
-        score = np.log(weight) + log_density(sensor, points, smallest_m=SMALLEST_LENGTH * scale)
-        better = score > best
-        best[better], owner[better] = score[better], index
-    return owner
-
-
-def log_density(sensor: Sensor, points: np.ndarray, *, smallest_m: float) -> np.ndarray:
-    """Log density of a sensor per volume, solid angle and length, up to a constant: (N, 6) to (N,).
+def log_density(sensor: Sensor, tangent: np.ndarray, range_m: np.ndarray, *, smallest_m: float) -> np.ndarray:
+    """Log density of directions and ranges per solid angle and length, up to a constant, shape (N,).
 
     Arguments:
         sensor: The component.
-        points: Design points, shape (N, 6).
-        smallest_m: Spreads of origin and range count as at least this [m].
+        tangent: Angles from its boresight, shape (N, 2) [rad].
+        range_m: Shape (N,) [m].
+        smallest_m: The spread of the range counts as at least this [m].
     """
-    variance, axes = np.linalg.eigh(np.asarray(sensor.origin_covariance_m2, dtype=np.float64))
-    spread = np.sqrt(np.maximum(variance, smallest_m**2))
-    offset = (points[:, :3] - sensor.origin_m) @ axes
-    looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
-    tangent = tangent_coordinates(sensor.frame, looking)
-    used = _spreading(sensor)
-    spreads = np.array([sensor.spread_horizontal_rad, sensor.spread_vertical_rad])
-    angular = np.maximum(spreads, SMALLEST_ANGLE_RAD)[used]
+    angular = np.maximum([sensor.spread_horizontal_rad, sensor.spread_vertical_rad], SMALLEST_ANGLE_RAD)
     depth = max(sensor.spread_range_m, smallest_m)
-    squares = np.square(offset / spread).sum(axis=1) + np.square(tangent[:, used] / angular).sum(axis=1)
-    squares += np.square((points[:, RANGE] - sensor.range_m) / depth)
+    squares = np.square(tangent / angular).sum(axis=1) + np.square((range_m - sensor.range_m) / depth)
     angle = np.hypot(tangent[:, 0], tangent[:, 1])
     log_jacobian = np.log(angle_over_sine(angle, np.sin(angle)))
-    return -squares / 2 - np.log(spread).sum() - np.log(angular).sum() - np.log(depth) + log_jacobian
+    return -squares / 2 - np.log(angular).sum() - np.log(depth) + log_jacobian
+
+
+def _inside(
+    sensor: Sensor, index: np.ndarray, tangent: np.ndarray, distance: np.ndarray, weights: np.ndarray
+) -> Members:
+    half_field = np.array(sensor.field_of_view_rad) / 2 + FIELD_ROUNDING_RAD
+    start, end = sensor.gate_m
+    within = (np.abs(tangent[index]) <= half_field).all(axis=1)
+    within &= (distance[index] >= start) & (distance[index] < end)
+    kept = index[within]
+    return Members(kept, tangent[kept], distance[kept], weights[kept])

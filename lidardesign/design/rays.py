@@ -72,12 +72,12 @@ def lay_out(
 
     At the number of rays of its explicit table, the design's table is the answer, gates included. Otherwise
     `grid` is even in each sensor's field of view; `density` quantises the samples inside each sensor; `scan`
-    fires along each sensor's boresight.
+    fires along each sensor's boresight, and at another number of rays is fitted anew to the samples.
 
     Arguments:
         design: The design.
         count: Rays per frame; None takes the design's own number.
-        samples: Samples of the learned density, for `density` at a new count and for gates per ray.
+        samples: Samples of the density, for `density` and `scan` at a new count and for gates per ray.
         gates: `sensor` gives each ray its sensor's gate; `ray` the interval of the ranges seen around it.
         rate_hz: Frames per second [Hz].
         seed: For the quantisation.
@@ -88,6 +88,8 @@ def lay_out(
     total = own_count(design) if count is None else count
     if design.ray_table is not None and len(design.ray_table.sensor) == total:
         return _table_rays(design.ray_table, rate_hz)
+    if design.layout == "scan" and total not in (0, own_count(design)):
+        return lay_out(_refitted(design, total, samples, seed), total, gates="sensor", rate_hz=rate_hz)
     shares = _shares(design, total)
     seen = None
     if total and (gates == "ray" or design.layout == "density"):
@@ -143,15 +145,40 @@ def _shares(design: Design, total: int) -> np.ndarray:
     own = [sensor.rays for sensor in design.sensors]
     if None not in own and sum(n or 0 for n in own) == total:
         return np.array(own, dtype=np.int64)
-    if design.layout != "scan":
-        return split_budget(design.weights, total)
-    if total != len(design.sensors):
+    if design.layout == "scan" and total not in (0, len(own)):
         raise ConfigError(
-            f"every ray of a scan is a component of its own: it has {own_count(design)} rays, not {total}",
+            f"{total} rays, but a scan of {len(own)} sensors fires one ray of each",
             where=design.name,
-            hint=f"lidardesign fit RUN --layout scan --rays {total}",
+            allowed=f"{len(own)} rays, or `rays` for every sensor",
         )
-    return np.ones(total, dtype=np.int64)
+    return split_budget(design.weights, total)
+
+
+def _refitted(design: Design, total: int, samples: Samples | None, seed: int) -> Design:
+    """A scan of another number of rays: every ray is a component, so the components are others.
+
+    Keeps the design's constraints, but for the number of rays itself.
+    """
+    if samples is None:
+        raise _needs_samples(design, total, "sensor")
+    # fit lays out what it fits, so it stands above this module
+    from lidardesign.design.constraints import Constraints
+    from lidardesign.design.fit import fit
+
+    document = {**design.constraints}
+    if "budget" in document:
+        document["budget"] = {key: value for key, value in document["budget"].items() if key != "rays"}
+    constraints = Constraints.from_mapping(document, where=f"constraints of {design.name}")
+    fitted = fit(
+        samples,
+        layout="scan",
+        rays=total,
+        constraints=constraints,
+        seed=seed,
+        level=design.level,
+        name=design.name,
+    )
+    return fitted.design
 
 
 def _needs_samples(design: Design, total: int, gates: Gates) -> ConfigError:
