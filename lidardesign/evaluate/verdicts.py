@@ -1,0 +1,159 @@
+"""The report's tables and sentences: who is better, by how much, and whether the scenes can tell."""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Sequence
+
+from lidardesign.design.sensor import Design
+from lidardesign.evaluate.results import Evaluation, Paired, Row
+
+MOST_SENSORS = 60  # listed in a table
+
+
+def figure(value: float) -> str:
+    """A number with four digits for people."""
+    return f"{value:#.4g}".removesuffix(".")
+
+
+def verdict(evaluation: Evaluation, pair: Paired) -> str:
+    """`better` or `worse` where the paired interval of a excludes zero, `open` where it does not."""
+    sign = 1.0 if evaluation.metric.better == "lower" else -1.0
+    low, high = sorted((sign * pair.ci_low, sign * pair.ci_high))
+    return "better" if high < 0 else "worse" if low > 0 else "open"
+
+
+def summary_sentences(evaluation: Evaluation) -> list[str]:
+    """One sentence per design at the largest number of rays, against each baseline."""
+    metric = evaluation.metric
+    sentences = [
+        f"{metric.name} in {metric.unit}, {metric.better} is better, mean over {evaluation.scenes} held-out "
+        f"scenes. A scene in which too few rays return counts as {figure(metric.worst)} {metric.unit}."
+    ]
+    values = {(row.design, row.rays): row.value for row in evaluation.rows}
+    baselines = {row.design for row in evaluation.rows if row.baseline}
+    for name in dict.fromkeys(row.design for row in evaluation.rows if not row.baseline):
+        most = max(row.rays for row in evaluation.rows if row.design == name)
+        pairs = [p for p in evaluation.paired if p.a == name and p.rays == most and p.b in baselines]
+        told = ", ".join(_told(evaluation, pair, values[pair.b, most]) for pair in pairs)
+        sentences.append(
+            f"{name} with {most} rays: {figure(values[name, most])} {metric.unit}"
+            + (f"; {told}." if told else ".")
+        )
+    return sentences
+
+
+def rows_table(evaluation: Evaluation) -> str:
+    """All rows at equal rays."""
+    unit = evaluation.metric.unit
+    headings = ["design", "rays", f"{evaluation.metric.name} [{unit}]", "95 % interval", "failures"]
+    return _table([*headings, "Mbit/s", "seconds"], _grouped(evaluation.rows), text_columns=1)
+
+
+def paired_table(evaluation: Evaluation) -> str:
+    """All paired differences, with a verdict in words."""
+    if not evaluation.paired:
+        return "<p>There is nothing to compare with.</p>"
+    headings = ["a", "b", "rays", f"a - b [{evaluation.metric.unit}]", "95 % interval", "a is"]
+    lines = [
+        (
+            [pair.a, pair.b, str(pair.rays), figure(pair.difference), _interval(pair), ""],
+            verdict(evaluation, pair),
+            bool(index and pair.a != evaluation.paired[index - 1].a),
+        )
+        for index, pair in enumerate(evaluation.paired)
+    ]
+    return _table(headings, lines, text_columns=2)
+
+
+def bandwidth_table(evaluation: Evaluation) -> str:
+    """Each design against baselines that were given as many rays as fit in its bandwidth."""
+    unit = evaluation.metric.unit
+    headings = ["design", "baseline", "rays", "its rays", "Mbit/s", f"design [{unit}]", f"baseline [{unit}]"]
+    own = {(row.design, row.rays): row for row in evaluation.rows if not row.baseline}
+    lines = []
+    for index, (row, pair) in enumerate(
+        zip(evaluation.equal_bandwidth, evaluation.paired_bandwidth, strict=True)
+    ):
+        mine = own[pair.a, pair.rays]
+        cells = [pair.a, pair.b, str(pair.rays), str(row.rays), figure(mine.bandwidth_mbps)]
+        cells += [figure(mine.value), figure(row.value), f"{figure(pair.difference)} ({_interval(pair)})", ""]
+        lines.append(
+            (
+                cells,
+                verdict(evaluation, pair),
+                bool(index and row.design == evaluation.equal_bandwidth[0].design),
+            )
+        )
+    return _table([*headings, "difference (95 % interval)", "design is"], lines, text_columns=2)
+
+
+def sensors_table(design: Design) -> str:
+    """A design's sensors in degrees and metres."""
+    headings = [
+        "sensor",
+        "share",
+        "origin [m]",
+        "azimuth, elevation [deg]",
+        "field of view [deg]",
+        "gate [m]",
+    ]
+    lines = []
+    for sensor, weight in zip(design.sensors[:MOST_SENSORS], design.weights, strict=False):
+        horizontal, vertical = (math.degrees(angle) for angle in sensor.field_of_view_rad)
+        start, end = sensor.gate_m
+        cells = [
+            sensor.name,
+            f"{weight:.3f}",
+            " ".join(f"{value:.3f}" for value in sensor.origin_m),
+            f"{math.degrees(sensor.azimuth_rad):.1f}, {math.degrees(sensor.elevation_rad):.1f}",
+            f"{horizontal:.1f} x {vertical:.1f}",
+            f"{start:.3f} to {end:.3f}",
+        ]
+        lines.append((cells, "", False))
+    rest = len(design.sensors) - MOST_SENSORS
+    return _table(headings, lines, text_columns=1) + (f"<p>and {rest} more.</p>" if rest > 0 else "")
+
+
+def _told(evaluation: Evaluation, pair: Paired, other: float) -> str:
+    word = verdict(evaluation, pair)
+    if word == "open":
+        return f"no clear difference from {pair.b} ({figure(other)})"
+    share = f"{abs(pair.difference) / abs(other):.0%} " if other else ""
+    return f"{share}{word} than {pair.b} ({figure(other)})"
+
+
+def _interval(item: Row | Paired) -> str:
+    return f"{figure(item.ci_low)} to {figure(item.ci_high)}"
+
+
+def _grouped(rows: Sequence[Row]) -> list[tuple[list[str], str, bool]]:
+    lines = []
+    for index, row in enumerate(rows):
+        cells = [row.design, str(row.rays), figure(row.value), _interval(row), str(row.failures)]
+        cells += [figure(row.bandwidth_mbps), f"{row.seconds:.2f}"]
+        lines.append((cells, "", bool(index and row.design != rows[index - 1].design)))
+    return lines
+
+
+def _table(
+    headings: Sequence[str], lines: Sequence[tuple[list[str], str, bool]], *, text_columns: int
+) -> str:
+    """An HTML table; a line is its cells, a verdict for the last cell, and whether a group begins."""
+    head = "".join(
+        f'<th{" class=text" if column < text_columns else ""} scope="col">{html.escape(heading)}</th>'
+        for column, heading in enumerate(headings)
+    )
+    body = "".join(_line(*line, text_columns) for line in lines)
+    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _line(cells: list[str], word: str, first: bool, text_columns: int) -> str:
+    shown = [
+        f"<td{' class=name' if column < text_columns else ''}>{html.escape(cell)}</td>"
+        for column, cell in enumerate(cells)
+    ]
+    if word:
+        shown[-1] = f'<td class="{word}">{"not clear" if word == "open" else word}</td>'
+    return f"<tr{' class=first' if first else ''}>{''.join(shown)}</tr>"
