@@ -65,7 +65,7 @@ def constrain(
             constraints=checked,
             sensors=_sensors(count, checked, design, run.task.defaults.sensors),
             layout=layout,
-            rays=_rays(rays, checked, design, layout, run.task.defaults.rays),
+            rays=_rays(rays, checked, design, layout == "grid" and gates == "sensor", run.task.defaults.rays),
             gates=gates,
         )
 
@@ -107,7 +107,11 @@ def _sensors(given: Any, constraints: Constraints, design: Design | None, usual:
 
 
 def _rays(
-    given: int | None, constraints: Constraints, design: Design | None, layout: str, budgets: tuple[int, ...]
+    given: int | None,
+    constraints: Constraints,
+    design: Design | None,
+    may_stay_open: bool,
+    budgets: tuple[int, ...],
 ) -> int | None:
     """The number of rays: the option's, then the constraints', the design's; a ray table needs one."""
     if given is not None:
@@ -116,4 +120,4 @@ def _rays(
         return constraints.budget.rays
     if design is not None and design.rays is not None:
         return design.rays
-    return None if layout == "grid" else max(budgets)
+    return None if may_stay_open else max(budgets)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import shlex
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,8 +22,10 @@ if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
     from lidardesign.cli.runs import Run
-    from lidardesign.design.sensor import Design
+    from lidardesign.design.samples import Samples
+    from lidardesign.design.sensor import Design, RayTable
     from lidardesign.evaluate.score import Evaluation, EvaluationRequest
+    from lidardesign.simulate.returns import Rays
 
 
 ALWAYS = ("uniform", "random", "bounding")
@@ -172,7 +176,9 @@ def _request(
     samples = {
         entry.design.name: load_samples(entry.run.folder)
         for entry in entries
-        if entry.run is not None and entry.design.layout != "grid" and (entry.run.folder / FILE_NAME).exists()
+        if entry.run is not None
+        and _may_need_samples(entry.design)
+        and (entry.run.folder / FILE_NAME).exists()
     }
     return EvaluationRequest(
         task=task,
@@ -185,7 +191,29 @@ def _request(
         samples=samples,
         train=train,
         test=test,
+        lay_out=_lay_out,
     )
+
+
+def _may_need_samples(design: Design) -> bool:
+    return design.layout != "grid" or design.ray_table is not None
+
+
+def _lay_out(design: Design, count: int, samples: Samples | None) -> Rays:
+    """A design's rays at a number of rays, with a gate per ray where its own table has one per ray."""
+    from lidardesign.design.rays import lay_out
+
+    table = design.ray_table
+    gates = "ray" if table is not None and _has_gates_per_ray(table) else "sensor"
+    return lay_out(design, count, samples, gates=gates if samples is not None else "sensor")
+
+
+def _has_gates_per_ray(table: RayTable) -> bool:
+    """Whether rays of one sensor listen at different times."""
+    import numpy as np
+
+    _, first, sensor = np.unique(table.sensor, return_index=True, return_inverse=True)
+    return bool((table.gate_m != table.gate_m[first[sensor]]).any())
 
 
 def _evaluate(request: EvaluationRequest, console: Console) -> Evaluation:
@@ -225,14 +253,15 @@ def _write_files(
 
 
 def _write_report(evaluation: Evaluation, request: EvaluationRequest, path: Path) -> None:
-    from lidardesign.design.rays import lay_out
     from lidardesign.evaluate.report import write_report
+    from lidardesign.run.manifest import versions
 
-    rays = {}
-    for design in request.designs:
-        count = design.rays or max(request.rays)
-        rays[design.name] = lay_out(design, count, samples=request.samples.get(design.name))
-    write_report(evaluation, request.designs, rays, request.test[0], path)
+    rays = {
+        design.name: _lay_out(design, design.rays or max(request.rays), request.samples.get(design.name))
+        for design in request.designs
+    }
+    reproduce = {"command": shlex.join(["lidardesign", *sys.argv[1:]]), "seed": request.seed, **versions()}
+    write_report(evaluation, request.designs, rays, request.test[0], path, reproduce=reproduce)
 
 
 def _check_threshold(evaluation: Evaluation, limit: float | None) -> None:
@@ -258,7 +287,8 @@ def _show(document: dict[str, Any], written: Sequence[Path], rich: RichConsole) 
     _show_rows(document["rows"], escape(title), rich)
     if document.get("equal_bandwidth"):
         _show_rows(document["equal_bandwidth"], "at equal bandwidth", rich)
-    _show_paired(document.get("paired", []), escape(metric["unit"]), rich)
+    baselines = [pair for pair in document["paired"] if pair["b"] in ALWAYS]
+    _show_paired(baselines, escape(metric["unit"]), rich)
     for note in document.get("notes", []):
         rich.print(f"note: {escape(note)}", soft_wrap=True)
     for path in written:
@@ -302,7 +332,7 @@ def _show_paired(paired: Sequence[dict[str, Any]], unit: str, rich: RichConsole)
         "rays",
         f"a - b \\[{unit}]",
         "95 % interval",
-        title="paired differences",
+        title="differences to the baselines, scene by scene",
         title_justify="left",
     )
     for entry in paired:

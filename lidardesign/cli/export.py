@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from lidardesign.simulate.returns import Rays
 
 
+# Formats that hold sensors only, so that the number of rays may stay open.
+WITHOUT_RAYS = ("sensors-csv",)
+
+
 def export(
     design: Annotated[
         Path | None, typer.Argument(metavar="DESIGN", help="A design file.", show_default=False)
@@ -83,7 +87,7 @@ def _export(
     target = out if out is not None else path.with_suffix(exporter.suffix)
     if target.exists() and path.exists() and target.samefile(path):
         raise ConfigError("would overwrite the design itself", where=str(target), hint="give another --out")
-    laid_out = _rays(design, path, rays)
+    laid_out = _rays(design, path, exporter.name, rays)
     notes = list(exporter.write(design, laid_out, target))
     for note in notes:
         console.note(f"note: {note}")
@@ -97,17 +101,15 @@ def _export(
     )
 
 
-def _rays(design: Design, path: Path, count: int | None) -> Rays:
+def _rays(design: Design, path: Path, name: str, count: int | None) -> Rays:
     """The explicit rays of a design; another number than its own may need the samples of its run."""
     from lidardesign.cli.runs import run_of
-    from lidardesign.design.rays import lay_out
+    from lidardesign.design.rays import lay_out, own_count
+    from lidardesign.design.samples import load_samples
 
-    if count is None and design.rays is None and any(sensor.rays is None for sensor in design.sensors):
-        raise ConfigError("the design leaves the number of rays open", where=str(path), hint="--rays N")
-    samples = None
-    if design.layout != "grid" and count not in (None, design.rays):
-        from lidardesign.design.samples import load_samples
-
-        run = run_of(design, path)
-        samples = load_samples(run.folder) if run else None
-    return lay_out(design, count, samples=samples)
+    if name in WITHOUT_RAYS:
+        return lay_out(design, 0)
+    if design.layout == "grid" or count is None or count == own_count(design):
+        return lay_out(design, count)
+    run = run_of(design, path)
+    return lay_out(design, count, load_samples(run.folder) if run else None)

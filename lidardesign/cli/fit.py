@@ -44,7 +44,8 @@ def fit(
         check_choice(gates, "--gates", GATES)
         count = sensor_count(sensors, None)
         opened = open_run(run)
-        budget = rays if rays is not None or layout == "grid" else max(opened.task.defaults.rays)
+        open_budget = layout == "grid" and gates == "sensor"
+        budget = rays if rays is not None or open_budget else max(opened.task.defaults.rays)
         fit_and_write(
             opened,
             console,
