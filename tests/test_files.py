@@ -371,3 +371,12 @@ def test_the_file_has_one_level_and_the_sensors_keep_their_spreads():
     assert {sensor.level for sensor in loaded.sensors} == {0.8}
     spreads = [sensor.spread_horizontal_rad for sensor in design.sensors]
     assert [sensor.spread_horizontal_rad for sensor in loaded.sensors] == spreads
+
+
+def test_more_explicit_rays_than_can_be_read_back_are_not_written(tmp_path):
+    design, count = load_design(EXAMPLE), 60_001
+    flat = np.zeros(count)
+    table = RayTable(np.zeros((count, 3)), flat, flat, np.tile([0.0, 1.0], (count, 1)), flat.astype(np.int64))
+    with pytest.raises(ConfigError, match="60001 explicit rays"):
+        save_design(replace(design, layout="density", rays=count, ray_table=table), tmp_path / "x.yaml")
+    assert not list(tmp_path.iterdir())

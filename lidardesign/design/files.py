@@ -34,6 +34,8 @@ SCHEMA_FILE = Path(__file__).with_name("design.schema.json")
 LAYOUTS = ("grid", "density", "scan")
 # A file of a hundred thousand explicit rays; the YAML reader's own limit is for settings.
 MAX_BYTES = 64_000_000
+# Eight numbers a ray stay below the number of values that the YAML reader accepts in one file.
+MOST_TABLE_RAYS = 60_000
 # How far a written interval may be from the one that the spread gives: digits that a person may have rounded.
 AGREEMENT = 1e-6
 # Beyond these an interval is next to nothing, or next to everything, of a normal distribution.
@@ -101,7 +103,15 @@ def save_design(design: Design, path: Path) -> None:
     Raises:
         DataError: The file cannot be written.
         NumericalError: The design holds a number that is not finite.
+        ConfigError: More explicit rays than a file can be read back with.
     """
+    if design.ray_table is not None and len(design.ray_table.sensor) > MOST_TABLE_RAYS:
+        raise ConfigError(
+            f"{len(design.ray_table.sensor)} explicit rays",
+            where=str(path),
+            allowed=f"at most {MOST_TABLE_RAYS}",
+            hint="the layout grid needs no table",
+        )
     write_atomic(Path(path), dump_yaml(design_document(design)))
 
 
