@@ -49,6 +49,7 @@ OUTCOME_COLOURS = {
     Outcome.NOT_DETECTED: "#CC79A7",
 }
 SENSOR_COLOUR = "#3b3f8f"
+LIGHT_DISTANCE = 1e4  # far away, so that light is parallel
 
 
 def curve_figure(evaluation: Evaluation, against: Against) -> dict[str, Any]:
@@ -85,7 +86,9 @@ def scene_figure(
     """Scene, sensors with their gates, rays by outcome; and by name which traces show each design."""
     shown = [design for design in designs if design.name in rays_by_design]
     rays = {design.name: _thinned(rays_by_design[design.name]) for design in shown}
-    traces = _body_traces(scene, frame, scene_bounds(scene, frame, list(rays.values())))
+    drawn = list(rays.values())
+    eye = _camera(_directions(drawn))["eye"]
+    traces = _body_traces(scene, frame, scene_bounds(scene, frame, drawn), eye)
     owners: list[str | None] = [None] * len(traces)
     for design in shown:
         own = [*_sensor_traces(design), *_ray_traces(scene, rays[design.name], frame)]
@@ -95,7 +98,7 @@ def scene_figure(
     if shown:
         for trace, visible in zip(traces, masks[shown[0].name], strict=True):
             trace["visible"] = visible
-    return {"data": traces, "layout": _scene_layout(list(rays.values()))}, masks
+    return {"data": traces, "layout": _scene_layout(drawn)}, masks
 
 
 def _scale(values: Sequence[float]) -> dict[str, Any]:
@@ -155,8 +158,11 @@ def _line_trace(points: np.ndarray, **looks: Any) -> dict[str, Any]:
     return {"type": "scatter3d", "mode": "lines", "x": x, "y": y, "z": z, "hoverinfo": "skip", **looks}
 
 
-def _body_traces(scene: Scene, frame: int, bounds_m: np.ndarray) -> list[dict[str, Any]]:
-    """All targets in one trace and all mere occluders in another, so that the legend stays short."""
+def _body_traces(
+    scene: Scene, frame: int, bounds_m: np.ndarray, eye: Mapping[str, float]
+) -> list[dict[str, Any]]:
+    """All targets in one trace and all mere occluders in another, lit from where the camera starts."""
+    light = {axis: LIGHT_DISTANCE * value for axis, value in eye.items()}
     looks = {
         True: {"name": "scene", "color": "#c9b8a8"},
         False: {"name": "occluders", "color": "#6b7280"},
@@ -177,6 +183,7 @@ def _body_traces(scene: Scene, frame: int, bounds_m: np.ndarray) -> list[dict[st
                     faces.astype(np.int32),
                     **look,
                     lighting=lighting,
+                    lightposition=light,
                     showlegend=True,
                     hoverinfo="name",
                 )
@@ -237,24 +244,29 @@ def _thinned(rays: Rays) -> Rays:
 
 def _scene_layout(rays: Sequence[Rays]) -> dict[str, Any]:
     axis = {"backgroundcolor": "#f7f8fa", "gridcolor": "#dfe3e8", "showbackground": True, "zeroline": False}
-    directions = np.concatenate([np.zeros((0, 3)), *(ray.direction for ray in rays)])
-    flat = len(directions) > 0 and np.abs(directions[:, 2]).max() < np.finfo(np.float32).eps
-    if flat:  # a world in the plane z = 0 is looked at from above, as on paper
-        camera: dict[str, Any] = {"eye": {"x": 0, "y": 0, "z": 1.6}, "up": {"x": 0, "y": 1, "z": 0}}
-        camera["projection"] = {"type": "orthographic"}
-    else:
-        camera = {"eye": _side_view(directions), "up": {"x": 0, "y": 0, "z": 1}}
+    axes = {f"{name}axis": {**axis, "title": {"text": f"{name} [m]"}} for name in "xyz"}
+    camera = _camera(_directions(rays))
+    if camera["up"]["z"] == 0:
+        axes["zaxis"]["visible"] = False
     return {
         "font": {**FONT, "size": 12},
         "paper_bgcolor": "#ffffff",
         "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
-        "scene": {
-            "aspectmode": "data",
-            "camera": camera,
-            **{f"{name}axis": {**axis, "title": {"text": f"{name} [m]"}} for name in "xyz"},
-        },
-        "legend": {"orientation": "h", "yanchor": "bottom", "y": 1.0, "x": 0, "itemsizing": "constant"},
+        "scene": {"aspectmode": "data", "camera": camera, **axes},
+        "legend": {"orientation": "h", "yanchor": "top", "y": 0.0, "x": 0, "itemsizing": "constant"},
     }
+
+
+def _directions(rays: Sequence[Rays]) -> np.ndarray:
+    return np.concatenate([np.zeros((0, 3)), *(ray.direction for ray in rays)])
+
+
+def _camera(directions: np.ndarray) -> dict[str, Any]:
+    """From behind and above the sensors; a world in the plane z = 0 is looked at from above, as on paper."""
+    if len(directions) and np.abs(directions[:, 2]).max() < np.finfo(np.float32).eps:
+        up, kind = {"x": 0, "y": 1, "z": 0}, {"type": "orthographic"}
+        return {"eye": {"x": 0, "y": 0, "z": 1.6}, "up": up, "projection": kind}
+    return {"eye": _side_view(directions), "up": {"x": 0, "y": 0, "z": 1}}
 
 
 def _side_view(directions: np.ndarray) -> dict[str, float]:
@@ -263,5 +275,5 @@ def _side_view(directions: np.ndarray) -> dict[str, float]:
     forward = np.array([mean[0], mean[1], 0.0])
     length = np.linalg.norm(forward)
     forward = forward / length if length > np.finfo(np.float32).eps else np.array([1.0, 0.0, 0.0])
-    eye = 1.5 * np.array([-forward[1], forward[0], 0.0]) - 0.6 * forward + np.array([0.0, 0.0, 0.7])
+    eye = 1.25 * np.array([-forward[1], forward[0], 0.0]) - 1.0 * forward + np.array([0.0, 0.0, 0.7])
     return {name: float(value) for name, value in zip("xyz", eye, strict=True)}

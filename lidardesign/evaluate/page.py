@@ -42,6 +42,7 @@ select { font: inherit; padding: 4px 8px; border: 1px solid #9aa5b1; border-radi
   h1 { font-size: 1.35rem; }
   th, td { padding: 4px 8px; }
   dl { grid-template-columns: 1fr; gap: 0; }
+  #view-scene { height: 380px !important; }
   dd { margin-bottom: 8px; }
 }
 @media print { section { break-inside: avoid; } }

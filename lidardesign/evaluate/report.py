@@ -76,7 +76,7 @@ def report_html(
             "Designs in a scene",
             f"<p>Held-out scene {html.escape(scene.name)}. Lines run from each sensor to the first hit, or "
             f"to the end of the gate; tinted shells are the gates.</p>"
-            f"{_chooser(masks)}{_figure(figure, SCENE_ID, 560)}",
+            f"{_chooser(masks)}{_figure(figure, SCENE_ID, 560, tools=True)}",
         ),
         _section("All scores", rows_table(evaluation)),
         _section("Paired differences at equal rays", paired_table(evaluation)),
@@ -93,8 +93,8 @@ def _plotly_source() -> str:
     return get_plotlyjs()
 
 
-def _figure(figure: dict[str, Any], identifier: str, height_px: int) -> str:
-    """A figure's division and script; plotly is loaded in the page's head."""
+def _figure(figure: dict[str, Any], identifier: str, height_px: int, *, tools: bool = False) -> str:
+    """A figure's division and script; plotly is loaded in the page's head. Tools are buttons for a 3D view."""
     import plotly.graph_objects as go
     from plotly.io import to_html
 
@@ -105,7 +105,13 @@ def _figure(figure: dict[str, Any], identifier: str, height_px: int) -> str:
         div_id=identifier,
         default_width="100%",
         default_height=f"{height_px}px",
-        config={"responsive": True, "displaylogo": False, "plotlyServerURL": "", "showTips": False},
+        config={
+            "responsive": True,
+            "displaylogo": False,
+            "displayModeBar": tools,
+            "plotlyServerURL": "",
+            "showTips": False,
+        },
     )
 
 
