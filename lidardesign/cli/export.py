@@ -87,7 +87,7 @@ def _export(
     target = out if out is not None else path.with_suffix(exporter.suffix)
     if target.exists() and path.exists() and target.samefile(path):
         raise ConfigError("would overwrite the design itself", where=str(target), hint="give another --out")
-    laid_out = _rays(design, path, exporter.name, rays)
+    laid_out = _rays(design, path, exporter.name, rays, console)
     notes = list(exporter.write(design, laid_out, target))
     for note in notes:
         console.note(f"note: {note}")
@@ -95,21 +95,38 @@ def _export(
         "design": str(path), "format": name, "out": str(target), "rays": len(laid_out),
         "bytes": target.stat().st_size if target.is_file() else None, "notes": notes,
     }  # fmt: skip
+    content = f"{len(laid_out)} rays" if len(laid_out) else f"{len(design.sensors)} sensors"
     console.result(
-        document,
-        lambda rich: rich.print(f"wrote {target} ({len(laid_out)} rays)", soft_wrap=True, markup=False),
+        document, lambda rich: rich.print(f"wrote {target} ({content})", soft_wrap=True, markup=False)
     )
 
 
-def _rays(design: Design, path: Path, name: str, count: int | None) -> Rays:
-    """The explicit rays of a design; another number than its own may need the samples of its run."""
+def _rays(design: Design, path: Path, name: str, count: int | None, console: Console) -> Rays:
+    """The explicit rays of a design; another number than its own may need the samples of its run.
+
+    A design that leaves its number of rays open takes the largest budget of its task.
+    """
     from lidardesign.cli.runs import run_of
     from lidardesign.design.rays import lay_out, own_count
     from lidardesign.design.samples import load_samples
 
     if name in WITHOUT_RAYS:
         return lay_out(design, 0)
+    if count is None and _is_open(design):
+        run = run_of(design, path)
+        if run is None:
+            raise ConfigError(
+                "the design leaves the number of rays open", where=str(path), hint="give --rays N"
+            )
+        count = max(run.task.defaults.rays)
+        console.note(f"note: the design leaves the number of rays open; {count} is the task's largest budget")
     if design.layout == "grid" or count is None or count == own_count(design):
         return lay_out(design, count)
     run = run_of(design, path)
     return lay_out(design, count, load_samples(run.folder) if run else None)
+
+
+def _is_open(design: Design) -> bool:
+    """Whether nothing in a design says how many rays it fires."""
+    counted = all(sensor.rays is not None for sensor in design.sensors)
+    return design.rays is None and design.ray_table is None and not counted and design.layout != "scan"

@@ -111,13 +111,17 @@ def _describe_field(name: str, info: Any) -> dict[str, Any]:
 
 
 def _default_space(task: Task) -> dict[str, Any] | None:
-    """The design space of the default configuration; None where the configuration has required keys."""
-    if any(info.is_required() for info in task.Config.model_fields.values()):
-        return None
+    """The design space of the default configuration; None where the user must set something first."""
+    from lidardesign.errors import ConfigError
     from lidardesign.registry import plugin_guard
 
-    with plugin_guard(task.name):
-        return task.space(task.Config()).as_dict()
+    if any(info.is_required() for info in task.Config.model_fields.values()):
+        return None
+    try:
+        with plugin_guard(task.name):
+            return task.space(task.Config()).as_dict()
+    except ConfigError:
+        return None
 
 
 def _show_task(document: dict[str, Any], rich: RichConsole) -> None:
@@ -141,9 +145,8 @@ def _show_task(document: dict[str, Any], rich: RichConsole) -> None:
         )
     rich.print(table)
     if document["space"]:
-        space = Table(
-            "dimension", "from", "to", title="design space (--set space.KEY=[LOW,HIGH])", title_justify="left"
-        )
+        rich.print("design space (--set space.KEY=[LOW,HIGH])", markup=False)
+        space = Table("dimension", "from", "to")
         for name, bounds in document["space"].items():
             if isinstance(bounds, list) and len(bounds) == 2 and name.endswith(("_m", "_rad")):
                 space.add_row(name, f"{bounds[0]:.4g}", f"{bounds[1]:.4g}")
