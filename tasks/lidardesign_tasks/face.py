@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from functools import lru_cache
 from importlib.resources import as_file, files
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -37,7 +38,7 @@ LARGEST_COEFFICIENT = (
 class FaceConfig(TaskConfig):
     """The model, how many heads, how much they move, and where the sensor may be."""
 
-    model: str | None = Field(
+    model: Path | None = Field(
         None, description="HDF5 file of a morphable model; empty: the embedded head model"
     )
     unit: Unit = Field("auto", description="unit of length of the model file")
@@ -139,7 +140,7 @@ class HeadFamily:
         """
         if config.model is not None:
             return cls(
-                load_model(config.model, unit=config.unit, modes=config.modes), config.sign, config.model
+                load_model(config.model, unit=config.unit, modes=config.modes), config.sign, str(config.model)
             )
         return cls(_embedded_model(config.modes), config.sign, "the embedded head model")
 

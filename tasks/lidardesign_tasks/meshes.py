@@ -39,7 +39,7 @@ ROOM = 1.1  # around the bounding sphere, for the pose jitter
 class MeshesConfig(TaskConfig):
     """Where the meshes are, how to read them, how they are split and moved, and where the sensor may be."""
 
-    folder: str | None = Field(None, description="folder of mesh files (glb, gltf, obj, off, ply, stl)")
+    folder: Path | None = Field(None, description="folder of mesh files (glb, gltf, obj, off, ply, stl)")
     scale: float = Field(1.0, gt=0, description="factor from the files' unit to metres (0.001 for mm)")
     sign: Sign = Field("auto", description="inside rule: auto, solid, winding or unsigned")
     up: Axis = Field("z", description="the axis of the files that points up")
@@ -50,7 +50,7 @@ class MeshesConfig(TaskConfig):
     jitter_translation_m: float | None = Field(
         None, ge=0, description="of the place [m]; 2 % of the extent if empty"
     )
-    occluders: str | None = Field(
+    occluders: Path | None = Field(
         None, description="folder of meshes that stand in front, in world coordinates"
     )
     origin_m: Vector | None = Field(None, description="sensor place [m]; if empty: in front, at 2 extents")
@@ -121,12 +121,12 @@ def load_folder(config: MeshesConfig) -> list[tuple[str, Mesh]]:
     """Name and mesh of every file, in metres, z up, centred if so configured."""
     if config.folder is None:
         raise ConfigError("no folder of meshes is set", where="task.folder", hint="--set folder=PATH")
-    return _load(config.folder, config, config.sign, config.centre)
+    return _load(str(config.folder), config, config.sign, config.centre)
 
 
 def load_occluders(config: MeshesConfig) -> list[tuple[str, Mesh]]:
     """Name and mesh of every occluder, in metres, z up, where the files put them."""
-    return _load(config.occluders, config, "auto", False) if config.occluders is not None else []
+    return _load(str(config.occluders), config, "auto", False) if config.occluders is not None else []
 
 
 def _load(folder: str, config: MeshesConfig, sign: Sign, centre: bool) -> list[tuple[str, Mesh]]:
