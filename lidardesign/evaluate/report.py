@@ -94,7 +94,7 @@ def _plotly_source() -> str:
 
 
 def _figure(figure: dict[str, Any], identifier: str, height_px: int, *, tools: bool = False) -> str:
-    """A figure's division and script; plotly is loaded in the page's head. Tools are buttons for a 3D view."""
+    """A figure's division and script; plotly is loaded in the page's head, tools are buttons."""
     import plotly.graph_objects as go
     from plotly.io import to_html
 

@@ -29,7 +29,7 @@ def summary_sentences(evaluation: Evaluation) -> list[str]:
     metric = evaluation.metric
     sentences = [
         f"{metric.name} in {metric.unit}, {metric.better} is better, mean over {evaluation.scenes} held-out "
-        f"scenes. A scene in which too few rays return counts as {figure(metric.worst)} {metric.unit}."
+        f"scenes. A scene in which too few rays return counts as {metric.worst:g} {metric.unit}."
     ]
     values = {(row.design, row.rays): row.value for row in evaluation.rows}
     baselines = {row.design for row in evaluation.rows if row.baseline}
