@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 import shlex
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,11 +15,10 @@ from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
 from lidardesign.cli.designs import number
 from lidardesign.cli.runs import open_run, run_of
+from lidardesign.cli.scores import show_evaluation
 from lidardesign.errors import ConfigError, DataError, ThresholdError
 
 if TYPE_CHECKING:
-    from rich.console import Console as RichConsole
-
     from lidardesign.cli.runs import Run
     from lidardesign.design.samples import Samples
     from lidardesign.design.sensor import Design, RayTable
@@ -88,7 +86,7 @@ def evaluate(
         evaluation = _evaluate(request, console)
         written = _write_files(evaluation, request, report, plots, csv)
         document = {**evaluation.as_dict(), "files": [str(path) for path in written]}
-        console.result(document, lambda rich: _show(document, written, rich))
+        console.result(document, lambda rich: show_evaluation(document, written, rich))
         _check_threshold(evaluation, fail_above)
 
 
@@ -276,68 +274,3 @@ def _check_threshold(evaluation: Evaluation, limit: float | None) -> None:
         bound = "at most" if evaluation.metric.better == "lower" else "at least"
         rows = ", ".join(f"{row.design} with {row.rays} rays: {number(row.value)} {unit}" for row in missed)
         raise ThresholdError(rows, where="--fail-above", allowed=f"{bound} {limit:g} {unit}")
-
-
-def _show(document: dict[str, Any], written: Sequence[Path], rich: RichConsole) -> None:
-    from rich.markup import escape
-
-    metric = document["metric"]
-    figure = f"{metric['name']} [{metric['unit']}], {metric['better']} is better"
-    title = f"{figure}, over {document['scenes']} held-out scenes"
-    _show_rows(document["rows"], escape(title), rich)
-    if document.get("equal_bandwidth"):
-        _show_rows(document["equal_bandwidth"], "at equal bandwidth", rich)
-    baselines = [pair for pair in document["paired"] if pair["b"] in ALWAYS]
-    _show_paired(baselines, escape(metric["unit"]), rich)
-    for note in document.get("notes", []):
-        rich.print(f"note: {escape(note)}", soft_wrap=True)
-    for path in written:
-        rich.print(f"wrote {escape(str(path))}", soft_wrap=True)
-
-
-def _show_rows(rows: Sequence[dict[str, Any]], title: str, rich: RichConsole) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(title=title, title_justify="left")
-    for heading in ("design", "rays", "value", "95 % interval", "failures", "Mbit/s", "seconds"):
-        table.add_column(heading, justify="left" if heading == "design" else "right")
-    matched = any("matched_to" in row for row in rows)
-    if matched:
-        table.add_column("as much as")
-    for row in rows:
-        interval = f"{number(row['ci_low'])} - {number(row['ci_high'])}"
-        cells = (row["rays"], row["value"], interval, row["failures"], row["bandwidth_mbps"], row["seconds"])
-        partner = [_partner(row)] if matched else []
-        table.add_row(escape(row["design"]), *(number(cell) for cell in cells), *partner)
-    rich.print(table)
-
-
-def _partner(row: dict[str, Any]) -> str:
-    """The design and number of rays whose bandwidth a baseline was given."""
-    from rich.markup import escape
-
-    return escape(f"{row['matched_to']}, {row['matched_rays']} rays") if row.get("matched_to") else ""
-
-
-def _show_paired(paired: Sequence[dict[str, Any]], unit: str, rich: RichConsole) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    if not paired:
-        return
-    table = Table(
-        "a",
-        "b",
-        "rays",
-        f"a - b \\[{unit}]",
-        "95 % interval",
-        title="differences to the baselines, scene by scene",
-        title_justify="left",
-    )
-    for entry in paired:
-        interval = f"{number(entry['ci_low'])} to {number(entry['ci_high'])}"
-        table.add_row(
-            escape(entry["a"]), escape(entry["b"]), str(entry["rays"]), number(entry["difference"]), interval
-        )
-    rich.print(table)

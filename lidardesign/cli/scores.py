@@ -1,0 +1,84 @@
+"""The tables that `evaluate` prints: scores, differences to the baselines, and equal bandwidth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lidardesign.cli.designs import number
+
+if TYPE_CHECKING:
+    from rich.console import Console as RichConsole
+
+Entry = dict[str, Any]
+
+
+def show_evaluation(document: dict[str, Any], written: Sequence[Path], rich: RichConsole) -> None:
+    """Print an evaluation for people; its JSON form holds more (all pairs, all intervals)."""
+    from rich.markup import escape
+
+    metric = document["metric"]
+    figure = f"{metric['name']} [{metric['unit']}], {metric['better']} is better"
+    _show_rows(document["rows"], escape(f"{figure}, over {document['scenes']} held-out scenes"), rich)
+    designs = {row["design"] for row in document["rows"]} - {
+        row["design"] for row in document["equal_bandwidth"]
+    }
+    against = [pair for pair in document["paired"] if pair["b"] not in designs]
+    unit = escape(metric["unit"])
+    title = f"difference to each baseline \\[{unit}], scene by scene, with its 95 % interval"
+    _show_grid(against, title, ("a", "rays"), "b", _difference, rich)
+    title = f"baselines with as much bandwidth as the design: value \\[{unit}] (rays)"
+    _show_grid(document["equal_bandwidth"], title, ("matched_to", "matched_rays"), "design", _value, rich)
+    for note in document.get("notes", []):
+        rich.print(f"note: {escape(note)}", soft_wrap=True)
+    for path in written:
+        rich.print(f"wrote {escape(str(path))}", soft_wrap=True)
+
+
+def _show_rows(rows: Sequence[Entry], title: str, rich: RichConsole) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    for heading in ("design", "rays", "value", "95 % interval", "failures", "Mbit/s", "seconds"):
+        table.add_column(heading, justify="left" if heading == "design" else "right")
+    for row in rows:
+        interval = f"{number(row['ci_low'])} - {number(row['ci_high'])}"
+        cells = (row["rays"], row["value"], interval, row["failures"], row["bandwidth_mbps"])
+        table.add_row(escape(row["design"]), *(number(cell) for cell in cells), number(row["seconds"], 2))
+    rich.print(table)
+
+
+def _show_grid(
+    entries: Sequence[Entry],
+    title: str,
+    keys: tuple[str, str],
+    column: str,
+    cell: Callable[[Entry], str],
+    rich: RichConsole,
+) -> None:
+    """One line per design and number of rays, one column per baseline."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    if not entries:
+        return
+    columns = list(dict.fromkeys(entry[column] for entry in entries))
+    lines: dict[tuple[Any, ...], dict[str, str]] = {}
+    for entry in entries:
+        lines.setdefault(tuple(entry[key] for key in keys), {})[entry[column]] = cell(entry)
+    table = Table("design", title=title, title_justify="left")
+    for heading in ("rays", *columns):
+        table.add_column(escape(heading), justify="right")
+    for (name, rays), cells in lines.items():
+        table.add_row(escape(name), str(rays), *(cells.get(heading, "-") for heading in columns))
+    rich.print(table)
+
+
+def _difference(pair: Entry) -> str:
+    return f"{number(pair['difference'], 3)} ({number(pair['ci_low'], 3)} to {number(pair['ci_high'], 3)})"
+
+
+def _value(row: Entry) -> str:
+    return f"{number(row['value'])} ({row['rays']})"
