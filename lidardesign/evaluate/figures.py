@@ -265,7 +265,7 @@ def _camera(directions: np.ndarray) -> dict[str, Any]:
     """From behind and above the sensors; a world in the plane z = 0 is looked at from above, as on paper."""
     if len(directions) and np.abs(directions[:, 2]).max() < np.finfo(np.float32).eps:
         up, kind = {"x": 0, "y": 1, "z": 0}, {"type": "orthographic"}
-        return {"eye": {"x": 0, "y": 0, "z": 1.6}, "up": up, "projection": kind}
+        return {"eye": {"x": 0, "y": 0, "z": 1.9}, "up": up, "projection": kind}
     return {"eye": _side_view(directions), "up": {"x": 0, "y": 0, "z": 1}}
 
 

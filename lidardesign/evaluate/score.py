@@ -315,6 +315,6 @@ def _notes(request: EvaluationRequest, matched: Sequence[Row]) -> list[str]:
     if empty:
         names = ", ".join(sorted({row.design for row in empty}))
         notes.append(
-            f"at equal bandwidth not one ray of {names} fits for {len(empty)} rows: those scenes fail"
+            f"at equal bandwidth not one ray of {names} fits in {len(empty)} rows, which fail in every scene"
         )
     return notes
