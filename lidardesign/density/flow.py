@@ -1,10 +1,15 @@
 """The normalizing flow: autoregressive rational-quadratic splines from a uniform box to the box of design space.
 
-Every layer maps u_i = h(z_i; z_<i) in one pass from base to design point (paper, section 4.3), so that sampling with
-its log determinant costs one network pass per layer; the density of foreign points inverts the layers and costs one
-pass per dimension and layer. Coordinates are the free dimensions scaled to [-1, 1]. Splines are zuko's, with two
-differences: all knot slopes are learned, the outer ones too, and for an azimuth that spans the full turn the outer
-slopes are tied and the spline starts half a turn away, so that the density is continuous across 0 / 2 pi.
+The density is a chain of blocks in the order of a ray's physics, p(origin) p(direction | origin) p(range | ray). Inside
+a block every layer maps u_i = h(z_i; z_<i) in one pass from base to design point (paper, section 4.3); a block sees the
+finished coordinates of the blocks before it. So where a surface lies along a ray is a function of the ray itself, and
+mass can move between directions without relearning the surface.
+Sampling with its log determinant costs one network pass per layer; the density of foreign points inverts the layers
+and costs one pass per layer and dimension of its block. Coordinates are the free dimensions scaled to [-1, 1].
+
+Splines are zuko's, with two differences: all knot slopes are learned, the outer ones too, and for an azimuth that spans
+the full turn the outer slopes are tied and the spline starts half a turn away, so that the density is continuous
+across 0 / 2 pi; later blocks see such an azimuth as its sine and cosine.
 
 References:
     Neural Spline Flows, Durkan et al. 2019. Normalizing Flows on Tori and Spheres, Rezende et al. 2020.
@@ -14,7 +19,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -72,34 +76,77 @@ class BoundedSpline(MonotonicRQSTransform):
         return self._turned(x)
 
 
-def _order(features: int, layer: int) -> Tensor:
-    """The rank of each dimension in a layer: reversed in every other layer, but the last one (the range) stays last.
+class _Block(nn.Module):
+    """Layers over a few dimensions, given a context.
 
-    Where a ray's surface lies is a function of the ray, so the range is always drawn given all the others.
+    Arguments:
+        dimensions: Positions of the block's coordinates among the flow's.
+        context: The number of context features.
+        periodic: Which of the block's dimensions lie on a circle.
     """
-    import os
-    if os.environ.get("ORD") == "alt":
-        return torch.arange(features) if layer % 2 == 0 else torch.arange(features).flip(0)
-    rank = torch.arange(features)
-    return rank if layer % 2 == 0 else torch.cat([rank[:-1].flip(0), rank[-1:]])
+
+    def __init__(
+        self, dimensions: Sequence[int], context: int, layers: int, hidden: int, bins: int, periodic: Sequence[bool]
+    ) -> None:
+        super().__init__()
+        self.dimensions = list(dimensions)
+        mask = torch.tensor(list(periodic), dtype=torch.bool) if any(periodic) else None
+        self.register_buffer("periodic", mask, persistent=False)
+        features = len(self.dimensions)
+        rank = torch.arange(features)
+        self.layers = nn.ModuleList(
+            MaskedAutoregressiveTransform(
+                features,
+                context,
+                order=rank if layer % 2 == 0 else rank.flip(0),
+                univariate=self._spline,
+                shapes=[(bins,), (bins,), (bins + 1,)],
+                hidden_features=(hidden, hidden),
+            )
+            for layer in range(layers)
+        )
+
+    def _spline(self, widths: Tensor, heights: Tensor, derivatives: Tensor) -> BoundedSpline:
+        return BoundedSpline(widths, heights, derivatives, self.periodic)
+
+    def forward(self, values: Tensor, context: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Outputs and the summed log slope: (N, d) to (N, d) and (N,)."""
+        total = torch.zeros_like(values[:, 0])
+        for layer in self.layers:
+            values, log_slope = layer(context).call_and_ladj(values)
+            total = total + _summed(log_slope)
+        return values, total
+
+    def log_slope(self, values: Tensor, context: Tensor | None) -> Tensor:
+        """The summed log slope at the base points of outputs: (N, d) to (N,)."""
+        total = torch.zeros_like(values[:, 0])
+        for layer in reversed(self.layers):
+            transform = layer(context)
+            values = transform.inv(values)
+            total = total + _summed(transform.call_and_ladj(values)[1])
+        return total
+
+
+def _summed(log_slope: Tensor) -> Tensor:
+    return log_slope.sum(dim=-1) if log_slope.ndim == 2 else log_slope
 
 
 class DesignFlow(nn.Module):
     """A density over the free dimensions of design space, scaled to [-1, 1].
 
     Arguments:
-        features: The number of learned dimensions D.
+        blocks: Positions of the learned dimensions per block, in the order of the chain.
         context: The number of conditioning dimensions.
-        layers: The number of spline layers.
+        layers: Spline layers per block.
         hidden: The width of each layer's two hidden layers.
         bins: Spline bins.
-        periodic: Which of the D dimensions lie on a circle.
+        periodic: Which of the learned dimensions lie on a circle.
         generator: Draws the initial weights.
     """
 
     def __init__(
         self,
-        features: int,
+        blocks: Sequence[Sequence[int]],
         context: int = 0,
         *,
         layers: int,
@@ -109,64 +156,64 @@ class DesignFlow(nn.Module):
         generator: torch.Generator,
     ) -> None:
         super().__init__()
-        self.features, self.context = features, context
-        mask = torch.tensor(list(periodic), dtype=torch.bool) if any(periodic) else None
-        self.register_buffer("periodic", mask, persistent=False)
-        shapes = [(bins,), (bins,), (bins + 1,)]
-        self.layers = nn.ModuleList(
-            MaskedAutoregressiveTransform(
-                features,
-                context,
-                order=_order(features, layer),
-                univariate=self._spline,
-                shapes=shapes,
-                hidden_features=(hidden, hidden),
-            )
-            for layer in reversed(range(layers))
-        )
+        self.features, self.context = sum(map(len, blocks)), context
+        self._periodic = list(periodic) or [False] * self.features
+        self.blocks = nn.ModuleList()
+        seen: list[int] = []
+        for dimensions in blocks:
+            width = context + len(seen) + sum(self._periodic[i] for i in seen)
+            circular = [self._periodic[i] for i in dimensions]
+            self.blocks.append(_Block(dimensions, width, layers, hidden, bins, circular))
+            seen += dimensions
         self._initialise(generator)
-
-    def _spline(self, widths: Tensor, heights: Tensor, derivatives: Tensor) -> BoundedSpline:
-        return BoundedSpline(widths, heights, derivatives, self.periodic)
 
     def _initialise(self, generator: torch.Generator) -> None:
         for parameter in self.parameters():
             bound = 1 / math.sqrt(parameter.shape[-1])
             with torch.no_grad():
                 parameter.uniform_(-bound, bound, generator=generator)
-        for layer in self.layers:
-            last = list(layer.parameters())[-2:]
-            with torch.no_grad():
-                for parameter in last:
-                    parameter.mul_(INITIAL_SCALE)
+        for block in self.blocks:
+            for layer in block.layers:
+                with torch.no_grad():
+                    for parameter in list(layer.parameters())[-2:]:
+                        parameter.mul_(INITIAL_SCALE)
 
     @property
     def log_base(self) -> float:
         """The log density of the uniform base on [-1, 1]^D."""
         return -self.features * math.log(2 * BOUND)
 
+    def _features(self, finished: list[tuple[int, Tensor]], context: Tensor | None) -> Tensor | None:
+        """What a block sees: conditions and finished coordinates, circular ones as cosine and sine."""
+        columns = [] if context is None else [context]
+        for dimension, values in finished:
+            if self._periodic[dimension]:
+                columns += [torch.cos(math.pi * values), torch.sin(math.pi * values)]
+            else:
+                columns.append(values)
+        return torch.cat(columns, dim=-1) if columns else None
+
     def forward(self, base: Tensor, context: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Samples and their log density of base points: (N, D), (N, context) to (N, D) and (N,)."""
-        values, log_prob = base, torch.full_like(base[:, 0], self.log_base)
-        for layer in self.layers:
-            values, log_slope = layer(context).call_and_ladj(values)
-            log_prob = log_prob - self._summed(log_slope)
-        return values, log_prob
+        log_prob = torch.full_like(base[:, 0], self.log_base)
+        finished: list[tuple[int, Tensor]] = []
+        for block in self.blocks:
+            values, log_slope = block(base[:, block.dimensions], self._features(finished, context))
+            log_prob = log_prob - log_slope
+            finished += [(dimension, values[:, [n]]) for n, dimension in enumerate(block.dimensions)]
+        ordered = [values for _, values in sorted(finished, key=lambda pair: pair[0])]
+        return torch.cat(ordered, dim=-1), log_prob
 
     def log_prob(self, values: Tensor, context: Tensor | None = None) -> Tensor:
         """The log density of any points in [-1, 1]^D, (N, D) to (N,); -inf outside."""
         outside = (values.abs() > BOUND).any(dim=-1)
         values = values.clamp(-BOUND, BOUND)
         log_prob = torch.full_like(values[:, 0], self.log_base)
-        for layer in reversed(self.layers):
-            transform = layer(context)
-            values = transform.inv(values)
-            _, log_slope = transform.call_and_ladj(values)
-            log_prob = log_prob - self._summed(log_slope)
+        finished: list[tuple[int, Tensor]] = []
+        for block in self.blocks:
+            log_prob = log_prob - block.log_slope(values[:, block.dimensions], self._features(finished, context))
+            finished += [(dimension, values[:, [dimension]]) for dimension in block.dimensions]
         return torch.where(outside, -torch.inf, log_prob)
-
-    def _summed(self, log_slope: Tensor) -> Tensor:
-        return log_slope.sum(dim=-1) if log_slope.ndim == 2 else log_slope
 
     def draw_base(self, count: int, generator: torch.Generator) -> Tensor:
         """Uniform base points, shape (count, D), in the parameters' type and place."""

@@ -13,10 +13,11 @@ import torch
 
 from lidardesign.density.diagnostics import coverage, quality
 from lidardesign.density.flow import DesignFlow
+from lidardesign.density.losses import Pool, draw_conditions
 from lidardesign.density.objective import Coordinates
 from lidardesign.density.proposals import occluded_share, propose
 from lidardesign.density.target import Target, build_target
-from lidardesign.density.training import PROGRESS, LearnProgress, Trainer, draw_conditions
+from lidardesign.density.training import PROGRESS, LearnProgress, Trainer
 from lidardesign.density.visibility import Optics
 from lidardesign.design.samples import Samples, save_samples
 from lidardesign.errors import ConfigError, DataError
@@ -98,7 +99,8 @@ def learn(
     clock.lap("scenes")
     target, notes = prepare_target(scenes, config)
     clock.lap("fields")
-    trainer = _trainer(target, config, run, place)
+    trainer = _trainer(target, scenes, config, run, place)
+    clock.lap("proposals")
     if resume:
         trainer.resume()
     else:
@@ -183,7 +185,9 @@ def _resolution_notes(target: Target, sigma_m: float) -> list[str]:
     ]
 
 
-def _trainer(target: Target, config: RunConfig, run: Path, device: torch.device) -> Trainer:
+def _trainer(
+    target: Target, scenes: Sequence[Scene], config: RunConfig, run: Path, device: torch.device
+) -> Trainer:
     coordinates = Coordinates(config.space)
     if not coordinates.learned:
         raise ConfigError("every dimension of the design space is fixed", where="space", hint="free at least one")
@@ -191,7 +195,7 @@ def _trainer(target: Target, config: RunConfig, run: Path, device: torch.device)
     generator = torch.Generator().manual_seed(config.seed)
     circular = [config.space.free[n] == AZIMUTH and config.space.full_azimuth for n in coordinates.learned]
     flow = DesignFlow(
-        len(coordinates.learned),
+        coordinates.blocks,
         len(coordinates.conditions),
         layers=settings.layers,
         hidden=settings.hidden,
@@ -199,7 +203,21 @@ def _trainer(target: Target, config: RunConfig, run: Path, device: torch.device)
         periodic=circular,
         generator=generator,
     ).to(device=device, dtype=getattr(torch, settings.dtype))
-    return Trainer(flow, target, coordinates, settings, run, generator)
+    return Trainer(flow, target, coordinates, settings, run, generator, _pool(target, scenes, config))
+
+
+def _pool(target: Target, scenes: Sequence[Scene], config: RunConfig) -> Pool:
+    """Proposals for balancing, independent of those that coverage is measured on."""
+    generator = random_generator(config.seed, "balancing")
+    proposals = propose(scenes, config.space, config.learning.balance_proposals, target.optics.sigma_m, generator)
+    if not len(proposals.points):
+        raise DataError(
+            "no ray of the design space reaches a target surface in any training scene",
+            where="space",
+            hint="widen the angles or the range, or move the origin",
+        )
+    log_weights = target.log_density(proposals.points) - proposals.log_density
+    return Pool.of(config.space.to_unit(proposals.points), log_weights)
 
 
 def draw_samples(trainer: Trainer, count: int) -> Samples:

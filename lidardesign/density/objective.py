@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lidardesign.density.target import Target
-from lidardesign.space import DesignSpace
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, X, Y, Z
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +32,13 @@ class Coordinates:
     def conditions(self) -> list[int]:
         """Positions of the conditioning dimensions among the free ones."""
         return [n for n, i in enumerate(self.space.free) if i in self.space.conditioned]
+
+    @property
+    def blocks(self) -> list[list[int]]:
+        """Learned dimensions by block of the flow's chain: origin, then direction, then range."""
+        names = [self.space.free[n] for n in self.learned]
+        parts = [[k for k, i in enumerate(names) if i in group] for group in ((X, Y, Z), (AZIMUTH, ELEVATION), (RANGE,))]
+        return [part for part in parts if part]
 
     @cached_property
     def half_widths(self) -> np.ndarray:

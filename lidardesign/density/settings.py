@@ -33,18 +33,20 @@ class LearningSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    steps: int = Field(1200, ge=1, description="optimiser steps")
-    batch: int = Field(2048, ge=2, description="design points per step")
-    rate: float = Field(1e-2, gt=0, description="initial Adam step size; decays to its hundredth")
-    layers: int = Field(5, ge=1, le=32, description="autoregressive spline layers")
-    hidden: int = Field(64, ge=4, description="hidden width of each layer's network")
+    steps: int = Field(700, ge=1, description="optimiser steps")
+    batch: int = Field(1024, ge=2, description="design points per step")
+    rate: float = Field(1e-2, gt=0, description="initial Adam step size")
+    layers: int = Field(3, ge=1, le=32, description="autoregressive spline layers per block of the chain")
+    hidden: int = Field(96, ge=4, description="hidden width of each layer's network")
     bins: int = Field(16, ge=2, description="spline bins per dimension")
     dtype: Literal["float64", "float32"] = Field(
         "float32", description="arithmetic of training steps; samples and densities are always float64"
     )
     entropy: float = Field(0.0, ge=0, description="eta of the paper; annealed to 0")
     sigma_start_m: float | None = Field(None, gt=0, description="where sigma's annealing starts; default 10 sigma")
-    anneal: float = Field(0.6, ge=0, lt=1, description="share of the steps over which sigma falls to its final value")
+    anneal: float = Field(0.7, ge=0, le=1, description="share of the path-wise steps over which sigma falls")
+    balance: float = Field(0.4, ge=0, le=1, description="share of the steps, the last ones, that balance by values")
+    balance_proposals: int = Field(16384, ge=256, description="independent proposals that balancing draws from")
     clip_norm: float = Field(5.0, gt=0, description="gradient norm that steps are clipped to")
     checkpoint_seconds: float = Field(20.0, gt=0, description="time between checkpoints [s]")
     samples: int = Field(100_000, ge=1000, description="fresh samples for ESS, KL, log Z, fit and constrain")
@@ -52,7 +54,14 @@ class LearningSettings(BaseModel):
 
 
 PRESET_LEARNING: dict[str, dict[str, Any]] = {
-    "draft": {"steps": 300, "batch": 1024, "layers": 4, "samples": 40_000, "coverage_proposals": 4096},
+    "draft": {
+        "steps": 250,
+        "layers": 2,
+        "hidden": 64,
+        "samples": 40_000,
+        "balance_proposals": 8192,
+        "coverage_proposals": 4096,
+    },
     "standard": {},
-    "fine": {"steps": 4000, "batch": 4096, "layers": 6, "bins": 24, "samples": 200_000},
+    "fine": {"steps": 2400, "batch": 4096, "layers": 4, "hidden": 128, "bins": 24, "samples": 200_000},
 }

@@ -20,8 +20,8 @@ from lidardesign.density.visibility import (
     Optics,
     Quadrature,
     RayBatch,
-    RayGradient,
     Raycast,
+    RayGradient,
     Visibility,
 )
 from lidardesign.scene import Scene

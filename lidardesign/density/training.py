@@ -1,8 +1,8 @@
-"""Training the flow on the target by reverse KL, with annealing, divergence handling and exact resume.
+"""Training the flow on the target: annealing, then balancing, with divergence handling and exact resume.
 
-The loss is the mean over flow samples of (1 + eta) log p(d) - log p*(d) (paper, eq. 7). Sigma falls geometrically
-from its start to its final value over the first share of the steps, so that modes are found while they are wide;
-eta falls to zero with it. A step whose loss or gradient is not finite is skipped; several in a row take the last good
+First the reverse KL along paths, while sigma falls geometrically from its start to its final value, so that surfaces
+are found while they are wide; eta falls to zero with it. The last steps balance the mass by values of p* (`losses`).
+A step whose loss or gradient is not finite is skipped; several in a row take the last good
 state back and halve the step size; when that does not help either, training stops with the last good checkpoint.
 """
 
@@ -20,7 +20,8 @@ import numpy as np
 import torch
 
 from lidardesign.density.flow import DesignFlow
-from lidardesign.density.objective import Coordinates, log_target
+from lidardesign.density.losses import Pool, balancing_loss, pathwise_loss
+from lidardesign.density.objective import Coordinates
 from lidardesign.density.settings import LearningSettings
 from lidardesign.density.target import Target
 from lidardesign.errors import DataError, DivergenceError
@@ -30,7 +31,9 @@ from lidardesign.run.manifest import record
 CHECKPOINT = "checkpoint.safetensors"
 PROGRESS = "progress.jsonl"
 SIGMA_START_RATIO = 10.0
-FINAL_RATE_SHARE = 0.01
+# The step size falls over each phase on a cosine between these shares of its initial value.
+PATHWISE_RATES = (1.0, 0.1)
+BALANCING_RATES = (0.3, 0.003)
 SKIPS_BEFORE_BACKING_OFF = 5
 HALVINGS_BEFORE_GIVING_UP = 6
 SNAPSHOT_STEPS = 50
@@ -68,6 +71,7 @@ class Trainer:
     settings: LearningSettings
     run: Path
     generator: torch.Generator
+    pool: Pool
     step: int = 0
     skipped: int = 0
     skipped_in_a_row: int = 0
@@ -84,16 +88,24 @@ class Trainer:
         """Time spent learning, over all resumed parts."""
         return self.seconds_before + time.perf_counter() - self._started
 
+    @property
+    def pathwise_steps(self) -> int:
+        """Steps before balancing begins."""
+        return round((1 - self.settings.balance) * self.settings.steps)
+
     def sigma_m(self, step: int) -> float:
         """The annealed sigma of a step [m]."""
         final = self.target.optics.sigma_m
         start = max(self.settings.sigma_start_m or SIGMA_START_RATIO * final, final)
-        fraction = min(step / max(self.settings.anneal * self.settings.steps, 1.0), 1.0)
+        fraction = min(step / max(self.settings.anneal * self.pathwise_steps, 1.0), 1.0)
         return start * (final / start) ** fraction
 
     def _rate(self) -> float:
-        share = self.step / self.settings.steps
-        decay = FINAL_RATE_SHARE + (1 - FINAL_RATE_SHARE) * (1 + math.cos(math.pi * share)) / 2
+        pathwise = self.step < self.pathwise_steps
+        first, last = PATHWISE_RATES if pathwise else BALANCING_RATES
+        begin, end = (0, self.pathwise_steps) if pathwise else (self.pathwise_steps, self.settings.steps)
+        share = (self.step - begin) / max(end - begin, 1)
+        decay = last + (first - last) * (1 + math.cos(math.pi * share)) / 2
         return self.settings.rate * decay / 2**self.halvings
 
     def train(self, progress: Callable[[LearnProgress], None] | None = None) -> None:
@@ -115,7 +127,7 @@ class Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = self._rate()
         self.optimiser.zero_grad(set_to_none=True)
-        loss, ess = self._loss()
+        loss, value, ess = self._loss()
         if torch.isfinite(loss):
             loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(self.flow.parameters(), self.settings.clip_norm)
@@ -125,19 +137,14 @@ class Trainer:
         else:
             self._skip()
         self.step += 1
-        return float(loss.detach()), ess
+        return value, ess
 
-    def _loss(self) -> tuple[torch.Tensor, float]:
-        base = self.flow.draw_base(self.settings.batch, self.generator)
-        conditions = draw_conditions(self.flow, self.settings.batch, self.generator)
-        learned, log_prob = self.flow(base, conditions)
-        unit = self.coordinates.join(learned, conditions)
-        sigma_m = self.sigma_m(self.step)
-        log_p_star = log_target(unit, self.target, self.coordinates, sigma_m)
-        eta = self.settings.entropy * max(0.0, 1 - self.step / (self.settings.anneal * self.settings.steps + 1))
-        weights = (log_p_star - log_prob).detach().double()
-        ess = torch.exp(2 * weights.logsumexp(0) - (2 * weights).logsumexp(0)) / len(weights)
-        return ((1 + eta) * log_prob - log_p_star).mean(), float(ess)
+    def _loss(self) -> tuple[torch.Tensor, float, float]:
+        parts = (self.flow, self.target, self.coordinates, self.settings.batch)
+        if self.step >= self.pathwise_steps:
+            return balancing_loss(*parts, self.pool, self.generator)
+        eta = self.settings.entropy * (1 - self.step / self.pathwise_steps)
+        return pathwise_loss(*parts, self.sigma_m(self.step), eta, self.generator)
 
     def _skip(self) -> None:
         self.skipped += 1
@@ -229,11 +236,3 @@ def _step_of(line: str) -> float:
         return json.loads(line)["step"]
     except (ValueError, KeyError, TypeError):
         return math.inf
-
-
-def draw_conditions(flow: DesignFlow, count: int, generator: torch.Generator) -> torch.Tensor | None:
-    """Uniform conditions in [-1, 1], shape (count, context), or None for a flow without any."""
-    if not flow.context:
-        return None
-    like = next(flow.parameters())
-    return (2 * torch.rand(count, flow.context, generator=generator, dtype=torch.float64) - 1).to(like)
