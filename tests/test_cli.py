@@ -96,6 +96,13 @@ BAD_YAML = {
     "notes.txt": "not a design at all",
 }
 
+CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+MESHES = {
+    "empty": "",
+    "nan": CORNERS.replace("v 1 0 0", "v nan 0 0") + "f 1 2 3\nf 1 2 4\n",
+    "open": CORNERS + "f 1 2 3\nf 1 2 4\n",
+}
+
 MISTAKES = [
     ("learn nothing", 2, "unknown task 'nothing'"),
     ("learn flatlnd", 2, "did you mean 'flatland'"),
@@ -118,6 +125,11 @@ MISTAKES = [
     ("learn face --set model=absent.h5", 3, "absent.h5"),
     ("learn face --set model=notes.txt", 3, "notes.txt"),
     ("learn meshes --set folder=absent", 3, "absent"),
+    ("learn meshes", 2, "--set folder=PATH"),
+    ("learn meshes --set folder=nothing", 3, "nothing"),
+    ("learn meshes --set folder=empty", 3, "empty.obj"),
+    ("learn meshes --set folder=nan", 3, "nan.obj"),
+    ("learn meshes --set folder=open --set sign=solid", 3, "open.obj"),
     ("fit absent", 3, "no such run"),
     ("fit taken", 3, "no run folder"),
     ("fit run --sensors 0", 2, "from 1, or auto"),
@@ -159,15 +171,17 @@ def mistakes(tmp_path, lidardesign):
     make_run(tmp_path / "run", count=1000)
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "letter.txt").write_text("keep me")
+    for name, text in MESHES.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / f"{name}.obj").write_text(text)
+    (tmp_path / "nothing").mkdir()
     for name, text in BAD_YAML.items():
         (tmp_path / name).write_text(text)
     return lidardesign
 
 
 @pytest.mark.parametrize(("arguments", "code", "words"), MISTAKES, ids=[entry[0] for entry in MISTAKES])
-def test_a_mistake_gets_one_message_its_exit_code_and_writes_nothing(
-    mistakes, tmp_path, arguments, code, words
-):
+def test_a_mistake_gets_one_message_its_exit_code_and_writes_nothing(mistakes, tmp_path, arguments, code, words):
     before = files_under(tmp_path)
     result = mistakes(*arguments.split(), "--json")
     assert result.code == code, result.err
@@ -191,9 +205,7 @@ def test_every_command_explains_itself_and_has_the_common_options(lidardesign, n
 
 
 def test_options_of_later_parts_are_absent(lidardesign):
-    text = "".join(
-        lidardesign(name, "--help").out for name in ("fit", "constrain", "evaluate", "export", "learn")
-    )
+    text = "".join(lidardesign(name, "--help").out for name in ("fit", "constrain", "evaluate", "export", "learn"))
     for option in ("--refine", "--at", "--effects", "--accuracy", "--workers", "--detector"):
         assert option not in text
 
@@ -349,9 +361,7 @@ def test_quiet_says_nothing_by_the_way(capsys):
 
 def program(*arguments, **options) -> subprocess.Popen:
     code = f"from lidardesign.cli.main import run; run({[str(a) for a in arguments]!r})"
-    return subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options
-    )
+    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
 
 
 def test_a_closed_pipe_ends_quietly(tmp_path):
@@ -367,18 +377,14 @@ def test_a_closed_pipe_ends_quietly(tmp_path):
 def test_a_full_disk_behind_stdout_is_one_message(tmp_path):
     with open("/dev/full", "w") as full:
         code = "from lidardesign.cli.main import run; run(['tasks', 'list'])"
-        result = subprocess.run(
-            [sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, check=False
-        )
+        result = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, check=False)
     assert result.returncode == 3
     assert result.stderr.splitlines() == [b"system error: No space left on device"]
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
 def test_any_output_encoding_works_and_no_colour_is_written_to_a_pipe(tmp_path, encoding):
-    process = program(
-        "tasks", "list", env={**os.environ, "PYTHONIOENCODING": encoding, "NO_COLOR": "1"}, cwd=tmp_path
-    )
+    process = program("tasks", "list", env={**os.environ, "PYTHONIOENCODING": encoding, "NO_COLOR": "1"}, cwd=tmp_path)
     out, err = process.communicate()
     assert process.returncode == 0, err
     assert b"flatland" in out
@@ -390,9 +396,7 @@ def test_any_output_encoding_works_and_no_colour_is_written_to_a_pipe(tmp_path, 
 def test_an_interruption_keeps_the_checkpoint_and_says_how_to_continue(tmp_path, sent, code):
     settings = ["learning.steps=100000", "learning.batch=64", "learning.checkpoint_seconds=0.2"]
     options = [word for setting in settings for word in ("--set", setting)]
-    process = program(
-        "learn", "flatland", "--preset", "draft", "--out", "run", *options, "--json", cwd=tmp_path
-    )
+    process = program("learn", "flatland", "--preset", "draft", "--out", "run", *options, "--json", cwd=tmp_path)
     deadline = time.monotonic() + 120
     while not list((tmp_path / "run").glob("checkpoint*")) and time.monotonic() < deadline:
         time.sleep(0.1)
