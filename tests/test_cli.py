@@ -299,7 +299,8 @@ def test_a_design_that_breaks_a_constraint_is_never_written(lidardesign, flat, m
     assert not (flat / "designs").exists()
 
 
-def test_a_run_that_is_being_written_is_left_alone(lidardesign, flat):
+def test_a_run_that_is_being_written_is_left_alone(lidardesign, flat, monkeypatch):
+    monkeypatch.setattr("lidardesign.cli.designs.WAIT_S", 0.1)
     (flat / ".lock").write_text(json.dumps({"pid": 1, "host": "elsewhere"}))
     result = lidardesign("fit", flat)
     assert result.code == 2

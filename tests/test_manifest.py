@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import stat
+import threading
 
 import pytest
 
@@ -165,3 +166,11 @@ def test_a_lock_of_unknown_origin_is_respected(tmp_path, content):
     (tmp_path / lock.FILE_NAME).write_text(content)
     with pytest.raises(ConfigError, match="is writing this run"), run_lock(tmp_path):
         pass
+
+
+def test_a_writer_waits_for_one_that_holds_the_run_for_an_instant(tmp_path):
+    holder = json.dumps({"pid": 1, "host": "elsewhere"})
+    (tmp_path / lock.FILE_NAME).write_text(holder)
+    threading.Timer(0.2, (tmp_path / lock.FILE_NAME).unlink).start()
+    with run_lock(tmp_path, wait_s=30):
+        assert (tmp_path / lock.FILE_NAME).read_text() != holder

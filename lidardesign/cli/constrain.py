@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 
 
 def constrain(
-    target: Annotated[
-        Path, typer.Argument(metavar="RUN|DESIGN", help="A run folder, or a design that came from one.")
-    ],
+    target: Annotated[Path, typer.Argument(metavar="RUN|DESIGN", help="A run folder, or a design that came from one.")],
     constraints: Annotated[
         Path | None,
         typer.Option("--constraints", metavar="FILE", help="YAML file of constraints.", show_default=False),

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from lidardesign.design.sensor import Design
 
 MAX_SHOWN = 20
+# Several designs may be fitted to one run at once; each holds the lock for an instant.
+WAIT_S = 10.0
 SPACE_MARK = ".space."
 
 
@@ -76,9 +78,7 @@ def show_constraints(checks: Sequence[ConstraintCheck], rich: RichConsole) -> No
         if SPACE_MARK in check.name and check.satisfied:
             continue
         holds = "yes" if check.satisfied else "[bold]no[/bold]"
-        table.add_row(
-            escape(check.name), escape(number(check.bound, 6)), escape(number(check.value, 6)), holds
-        )
+        table.add_row(escape(check.name), escape(number(check.bound, 6)), escape(number(check.value, 6)), holds)
     if table.row_count:
         rich.print(table)
 
@@ -102,6 +102,6 @@ def write_design(design: Design, run: Path, path: Path) -> None:
     from lidardesign.run.lock import run_lock
     from lidardesign.run.manifest import record
 
-    with run_lock(run):
+    with run_lock(run, wait_s=WAIT_S):
         save_design(design, path)
         record(run, [path.relative_to(run).as_posix()])

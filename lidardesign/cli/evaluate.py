@@ -44,15 +44,11 @@ def evaluate(
     ],
     rays: Annotated[
         list[int] | None,
-        typer.Option(
-            "--rays", metavar="N", min=1, help="Rays per frame; repeatable.", show_default="the task's"
-        ),
+        typer.Option("--rays", metavar="N", min=1, help="Rays per frame; repeatable.", show_default="the task's"),
     ] = None,
     baseline: Annotated[
         list[str] | None,
-        typer.Option(
-            "--baseline", metavar="NAME", help="A further baseline; repeatable.", show_default=False
-        ),
+        typer.Option("--baseline", metavar="NAME", help="A further baseline; repeatable.", show_default=False),
     ] = None,
     report: Annotated[
         Path | None,
@@ -66,9 +62,7 @@ def evaluate(
     ] = None,
     fail_above: Annotated[
         float | None,
-        typer.Option(
-            "--fail-above", metavar="VALUE", help="Exit 1 if a design scores above this.", show_default=False
-        ),
+        typer.Option("--fail-above", metavar="VALUE", help="Exit 1 if a design scores above this.", show_default=False),
     ] = None,
     seed: options.Seed = None,
     json: options.Json = False,
@@ -95,9 +89,7 @@ def _check_baselines(names: list[str]) -> None:
 
     unknown = [name for name in names if name not in BASELINES]
     if unknown:
-        raise ConfigError(
-            f"unknown baseline {unknown[0]!r}", where="--baseline", allowed=", ".join(BASELINES)
-        )
+        raise ConfigError(f"unknown baseline {unknown[0]!r}", where="--baseline", allowed=", ".join(BASELINES))
 
 
 def _collect(targets: list[Path]) -> tuple[list[_Entry], list[Run]]:
@@ -153,9 +145,7 @@ def _common_run(entries: list[_Entry], runs: list[Run]) -> Run:
                 hint="evaluate them one by one: scores of different scenes do not compare",
             )
     if not entries:
-        raise DataError(
-            "the run has no designs yet", where=str(first.folder), hint=f"lidardesign fit {first.folder}"
-        )
+        raise DataError("the run has no designs yet", where=str(first.folder), hint=f"lidardesign fit {first.folder}")
     return first
 
 
@@ -174,9 +164,7 @@ def _request(
     samples = {
         entry.design.name: load_samples(entry.run.folder)
         for entry in entries
-        if entry.run is not None
-        and _may_need_samples(entry.design)
-        and (entry.run.folder / FILE_NAME).exists()
+        if entry.run is not None and _may_need_samples(entry.design) and (entry.run.folder / FILE_NAME).exists()
     }
     return EvaluationRequest(
         task=task,

@@ -23,9 +23,7 @@ WITHOUT_RAYS = ("sensors-csv",)
 
 
 def export(
-    design: Annotated[
-        Path | None, typer.Argument(metavar="DESIGN", help="A design file.", show_default=False)
-    ] = None,
+    design: Annotated[Path | None, typer.Argument(metavar="DESIGN", help="A design file.", show_default=False)] = None,
     format_: Annotated[
         str | None,
         typer.Option("--format", metavar="NAME", help="Format; --list shows them.", show_default=False),
@@ -53,8 +51,7 @@ def _list(console: Console) -> None:
     from lidardesign.export.registry import EXPORTERS
 
     formats = [
-        {"name": name, "suffix": exporter.suffix, "summary": exporter.summary}
-        for name, exporter in EXPORTERS.items()
+        {"name": name, "suffix": exporter.suffix, "summary": exporter.summary} for name, exporter in EXPORTERS.items()
     ]
 
     def show(rich: RichConsole) -> None:
@@ -69,16 +66,12 @@ def _list(console: Console) -> None:
     console.result({"formats": formats}, show)
 
 
-def _export(
-    path: Path | None, name: str | None, out: Path | None, rays: int | None, console: Console
-) -> None:
+def _export(path: Path | None, name: str | None, out: Path | None, rays: int | None, console: Console) -> None:
     from lidardesign.design.files import load_design
     from lidardesign.export.registry import EXPORTERS
 
     if path is None:
-        raise ConfigError(
-            "no design was given", where="DESIGN", hint="lidardesign export --list shows the formats"
-        )
+        raise ConfigError("no design was given", where="DESIGN", hint="lidardesign export --list shows the formats")
     if name not in EXPORTERS:
         found = "no format was given" if name is None else f"unknown format {name!r}"
         raise ConfigError(found, where="--format", allowed=", ".join(EXPORTERS))
@@ -96,9 +89,7 @@ def _export(
         "bytes": target.stat().st_size if target.is_file() else None, "notes": notes,
     }  # fmt: skip
     content = f"{len(laid_out)} rays" if len(laid_out) else f"{len(design.sensors)} sensors"
-    console.result(
-        document, lambda rich: rich.print(f"wrote {target} ({content})", soft_wrap=True, markup=False)
-    )
+    console.result(document, lambda rich: rich.print(f"wrote {target} ({content})", soft_wrap=True, markup=False))
 
 
 def _rays(design: Design, path: Path, name: str, count: int | None, console: Console) -> Rays:
@@ -115,9 +106,7 @@ def _rays(design: Design, path: Path, name: str, count: int | None, console: Con
     if count is None and _is_open(design):
         run = run_of(design, path)
         if run is None:
-            raise ConfigError(
-                "the design leaves the number of rays open", where=str(path), hint="give --rays N"
-            )
+            raise ConfigError("the design leaves the number of rays open", where=str(path), hint="give --rays N")
         count = max(run.task.defaults.rays)
         console.note(f"note: the design leaves the number of rays open; {count} is the task's largest budget")
     if design.layout == "grid" or count is None or count == own_count(design):

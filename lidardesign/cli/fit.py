@@ -121,9 +121,7 @@ def _log_target(run: Run, points: np.ndarray) -> np.ndarray:
     return target.log_density(points)
 
 
-def check_written(
-    design: Design, constraints: Constraints | None, space: DesignSpace
-) -> list[ConstraintCheck]:
+def check_written(design: Design, constraints: Constraints | None, space: DesignSpace) -> list[ConstraintCheck]:
     """Check a design's own text against its constraints with code that the fit does not share.
 
     Raises:

@@ -28,9 +28,7 @@ CHECKPOINTS = "checkpoint*"
 
 
 def learn(
-    task: Annotated[
-        str, typer.Argument(metavar="TASK", help="Name of a task; `lidardesign tasks` lists them.")
-    ],
+    task: Annotated[str, typer.Argument(metavar="TASK", help="Name of a task; `lidardesign tasks` lists them.")],
     out: Annotated[
         Path | None,
         typer.Option("--out", metavar="RUN", help="Run folder to make.", show_default="runs/TASK"),
@@ -42,9 +40,7 @@ def learn(
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
     seed: options.Seed = None,
-    device: Annotated[
-        str, typer.Option("--device", metavar="auto|cpu|cuda", help="Where to compute.")
-    ] = "auto",
+    device: Annotated[str, typer.Option("--device", metavar="auto|cpu|cuda", help="Where to compute.")] = "auto",
     resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")] = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -79,9 +75,7 @@ def _check_can_start(run: Path) -> None:
         raise ConfigError("is a file", where=f"--out {run}", allowed="a folder that is new or empty")
     if run.is_dir() and any(run.iterdir()):
         hint = "continue it with --resume, or give another --out"
-        raise ConfigError(
-            "the folder is not empty", where=f"--out {run}", allowed="a new or empty folder", hint=hint
-        )
+        raise ConfigError("the folder is not empty", where=f"--out {run}", allowed="a new or empty folder", hint=hint)
 
 
 def _check_can_resume(run: Path) -> None:

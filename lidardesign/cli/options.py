@@ -15,28 +15,20 @@ Seed = Annotated[
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no notes.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
 
-Name = Annotated[
-    str, typer.Option("--name", metavar="NAME", help="Name of the design: RUN/designs/NAME.yaml.")
-]
+Name = Annotated[str, typer.Option("--name", metavar="NAME", help="Name of the design: RUN/designs/NAME.yaml.")]
 Layout = Annotated[
     str | None,
     typer.Option("--layout", metavar="grid|density|scan", help="How rays are laid out.", show_default=False),
 ]
-RayCount = Annotated[
-    int | None, typer.Option("--rays", metavar="N", min=1, help="Rays per frame.", show_default=False)
-]
-Gates = Annotated[
-    str, typer.Option("--gates", metavar="sensor|ray", help="One gate per sensor, or one per ray.")
-]
+RayCount = Annotated[int | None, typer.Option("--rays", metavar="N", min=1, help="Rays per frame.", show_default=False)]
+Gates = Annotated[str, typer.Option("--gates", metavar="sensor|ray", help="One gate per sensor, or one per ray.")]
 Sensors = Annotated[
     str | None,
     typer.Option("--sensors", metavar="N|auto", help="Number of sensors.", show_default="the task's"),
 ]
 Overrides = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set", metavar="KEY=VALUE", help="Set one value by its dotted key; repeatable.", show_default=False
-    ),
+    typer.Option("--set", metavar="KEY=VALUE", help="Set one value by its dotted key; repeatable.", show_default=False),
 ]
 ConfigFile = Annotated[
     Path | None,

@@ -21,9 +21,7 @@ def show_evaluation(document: dict[str, Any], written: Sequence[Path], rich: Ric
     metric = document["metric"]
     figure = f"{metric['name']} [{metric['unit']}], {metric['better']} is better"
     _show_rows(document["rows"], escape(f"{figure}, over {document['scenes']} held-out scenes"), rich)
-    designs = {row["design"] for row in document["rows"]} - {
-        row["design"] for row in document["equal_bandwidth"]
-    }
+    designs = {row["design"] for row in document["rows"]} - {row["design"] for row in document["equal_bandwidth"]}
     against = [pair for pair in document["paired"] if pair["b"] not in designs]
     unit = escape(metric["unit"])
     title = f"difference to each baseline \\[{unit}], scene by scene, with its 95 % interval"

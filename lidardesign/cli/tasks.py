@@ -135,14 +135,10 @@ def _show_task(document: dict[str, Any], rich: RichConsole) -> None:
         f"defaults: {document['defaults']['sensors']} sensors, rays {document['defaults']['rays']}",
         markup=False,
     )
-    table = Table(
-        "key", "type", "default", "what it is", title="configuration (--set KEY=VALUE)", title_justify="left"
-    )
+    table = Table("key", "type", "default", "what it is", title="configuration (--set KEY=VALUE)", title_justify="left")
     for entry in document["config"]:
         default = "required" if entry["required"] else str(entry["default"])
-        table.add_row(
-            *(escape(text) for text in (entry["key"], entry["type"], default, entry["description"]))
-        )
+        table.add_row(*(escape(text) for text in (entry["key"], entry["type"], default, entry["description"])))
     rich.print(table)
     if document["space"]:
         rich.print("design space (--set space.KEY=[LOW,HIGH])", markup=False)

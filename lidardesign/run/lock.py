@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import socket
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,13 +15,18 @@ from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.files import remove_stray_temporaries
 
 FILE_NAME = ".lock"
+RETRY_S = 0.05
 
 
 @contextlib.contextmanager
-def run_lock(run: Path) -> Iterator[None]:
+def run_lock(run: Path, *, wait_s: float = 0.0) -> Iterator[None]:
     """Hold a run folder's lock; a lock that a dead process left is taken over.
 
     Temporary files that a killed writer left in the folder are removed once the lock is held.
+
+    Arguments:
+        run: The run folder.
+        wait_s: How long to wait for another writer: commands that write one file hold the lock for an instant.
 
     Raises:
         ConfigError: Another living process writes this run.
@@ -29,7 +35,7 @@ def run_lock(run: Path) -> Iterator[None]:
     path = Path(run) / FILE_NAME
     owner = _owner()
     try:
-        _acquire(path, owner)
+        _acquire(path, owner, time.monotonic() + wait_s)
     except OSError as error:
         raise DataError(f"cannot be locked: {error.strerror or error}", where=str(path)) from error
     try:
@@ -41,17 +47,20 @@ def run_lock(run: Path) -> Iterator[None]:
                 path.unlink()
 
 
-def _acquire(path: Path, owner: dict[str, Any]) -> None:
-    for attempt in range(2):
+def _acquire(path: Path, owner: dict[str, Any], deadline: float) -> None:
+    while True:
         try:
             with path.open("x", encoding="utf-8") as file:
                 json.dump(owner, file)
             return
         except FileExistsError:
             holder = _read(path)
-            if attempt or not _is_stale(holder):
+            if _is_stale(holder):
+                path.unlink(missing_ok=True)
+            elif time.monotonic() < deadline:
+                time.sleep(RETRY_S)
+            else:
                 raise _locked(path, holder) from None
-            path.unlink(missing_ok=True)
 
 
 def _locked(path: Path, holder: dict[str, Any] | None) -> ConfigError:
