@@ -119,7 +119,10 @@ class Body:
     def __post_init__(self) -> None:
         poses = np.asarray(self.poses, dtype=np.float64)
         if poses.shape[-2:] != (4, 4) or poses.ndim not in (2, 3) or not np.isfinite(poses).all():
-            raise DataError(f"body {self.name!r}: poses must be finite with shape (4, 4) or (frames, 4, 4), found {poses.shape}")
+            raise DataError(
+                f"body {self.name!r}: poses have shape {poses.shape} or are not finite",
+                allowed="(4, 4) or (frames, 4, 4)",
+            )
         rotation = poses[..., :3, :3]
         if not np.allclose(rotation @ np.swapaxes(rotation, -1, -2), np.eye(3), atol=1e-6):
             raise DataError(f"body {self.name!r}: a pose is not rigid (its 3x3 part is no rotation)")

@@ -86,12 +86,16 @@ class DesignSpace:
         self._check_physical_ranges()
         unknown = sorted(set(self.condition) - set(DIMENSIONS))
         if unknown:
-            raise ConfigError(f"unknown dimension {unknown[0]!r}", where="space.condition", allowed=", ".join(DIMENSIONS))
+            raise ConfigError(
+                f"unknown dimension {unknown[0]!r}", where="space.condition", allowed=", ".join(DIMENSIONS)
+            )
 
     def _check_physical_ranges(self) -> None:
         rounding = 1e-9
         if self.high[AZIMUTH] - self.low[AZIMUTH] > FULL_TURN + rounding:
-            raise ConfigError("the azimuth spans more than a full turn", where="space.azimuth_rad", allowed="at most 2 pi")
+            raise ConfigError(
+                "the azimuth spans more than a full turn", where="space.azimuth_rad", allowed="at most 2 pi"
+            )
         if self.low[ELEVATION] < -math.pi / 2 - rounding or self.high[ELEVATION] > math.pi / 2 + rounding:
             raise ConfigError(
                 f"elevation {self.low[ELEVATION]} to {self.high[ELEVATION]} leaves the sphere",

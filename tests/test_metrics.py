@@ -17,7 +17,7 @@ from lidardesign.evaluate.metrics import (
     triangle_distance_m,
     visible_surface_points,
 )
-from lidardesign.evaluate.sampling import sample_body
+from lidardesign.surface import sample_body
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, angles
 

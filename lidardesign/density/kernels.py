@@ -1,4 +1,4 @@
-"""Compiled loops over grid tables and primitive bodies: distances, their contracted gradients, the visibility quadrature.
+"""Compiled loops over grid tables and primitive bodies: distances, contracted gradients, the visibility quadrature.
 
 A table holds the distances of all C columns (scenes, or frames of scenes) at every grid point in one row, so that the
 eight corners of a cell are eight contiguous reads. Gradients are never formed per column: a caller hands in one weight
@@ -154,7 +154,7 @@ def cell_minimum(table, counts, out):  # noqa: ANN001, ANN201
 def table_quadrature(
     table, clear, counts, low, inverse_step, shell, origins, directions, lengths, points_per_ray,  # noqa: ANN001
     attenuation, sharpness, cutoff, depth, slope,  # noqa: ANN001
-):  # fmt: skip
+) -> None:  # fmt: skip
     """Optical depths along rays by midpoints, and the slopes that their gradient needs.
 
     Cells whose every column is further than `cutoff` from a surface cannot attenuate and are never read.
@@ -201,7 +201,7 @@ def table_quadrature(
 def table_quadrature_gradient(
     table, clear, counts, low, inverse_step, origins, directions, lengths, cutoff, slope, weights,  # noqa: ANN001
     by_origin, by_direction, by_length,  # noqa: ANN001
-):  # fmt: skip
+) -> None:  # fmt: skip
     """Gradients of sum_c weights_nc * depth_nc by origin (N, 3), direction (N, 3) and length (N,), at fixed step.
 
     The caller adds the derivative by the step itself, which is depth / length.

@@ -26,7 +26,7 @@ from lidardesign.run.config import RunConfig
 from lidardesign.run.manifest import note, record
 from lidardesign.scene import Scene
 from lidardesign.space import AZIMUTH
-from lidardesign.task import Task, random_generator
+from lidardesign.task import Task, random_generator, scenes_of
 
 FLOW = "flow.safetensors"
 SAMPLE_CHUNK = 16384
@@ -93,7 +93,7 @@ def learn(
     """
     clock = _Clock()
     place = choose_device(device)
-    scenes = list(task.scenes(config.task, "train", config.seed))
+    scenes = list(scenes_of(task, config.task, "train", config.seed, config.space))
     if not scenes:
         raise DataError(f"the task {config.task_name!r} gave no training scenes", where="task")
     clock.lap("scenes")
@@ -153,7 +153,8 @@ def prepare_target(scenes: Sequence[Scene], config: RunConfig) -> tuple[Target, 
         target, refined = _refine_quadrature(target, scenes, config)
         notes.extend(refined)
     notes.extend(_resolution_notes(target, settings.sigma_m))
-    notes.extend(sorted({line for scene in scenes for body in scene.bodies for line in getattr(body.shape, "notes", ())}))
+    shapes = [body.shape for scene in scenes for body in scene.bodies]
+    notes.extend(sorted({line for shape in shapes for line in getattr(shape, "notes", ())}))
     return target, notes
 
 

@@ -37,7 +37,8 @@ class Coordinates:
     def blocks(self) -> list[list[int]]:
         """Learned dimensions by block of the flow's chain: origin, then direction, then range."""
         names = [self.space.free[n] for n in self.learned]
-        parts = [[k for k, i in enumerate(names) if i in group] for group in ((X, Y, Z), (AZIMUTH, ELEVATION), (RANGE,))]
+        groups = ((X, Y, Z), (AZIMUTH, ELEVATION), (RANGE,))
+        parts = [[k for k, i in enumerate(names) if i in group] for group in groups]
         return [part for part in parts if part]
 
     @cached_property

@@ -19,7 +19,9 @@ class DensitySettings(BaseModel):
     sigma_m: float = Field(0.005, gt=0, description="standard deviation of the surface proximity [m]")
     visibility: Visibility = Field("auto", description="how occlusion is computed; auto probes whether it is needed")
     attenuation_per_m: float | None = Field(None, gt=0, description="beta [1/m]; default max(1000, 5 / sigma)")
-    sharpness_per_m: float | None = Field(None, gt=0, description="k [1/m] of the quadrature; default max(1000, 5 / sigma)")
+    sharpness_per_m: float | None = Field(
+        None, gt=0, description="k [1/m] of the quadrature; default max(1000, 5 / sigma)"
+    )
     margin_m: float | None = Field(None, ge=0, description="m [m]: a surface does not occlude itself; default sigma")
     quadrature_points: int = Field(64, ge=4, le=4096, description="midpoints of the visibility quadrature")
     field_resolution: int = Field(64, ge=8, le=512, description="grid points along the longest side of mesh fields")

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidardesign.errors import DataError
-from lidardesign.evaluate.sampling import sample_body, sample_triangles
 from lidardesign.scene import Scene
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.space import RANGE, DesignSpace, aim
+from lidardesign.surface import sample_body, sample_triangles
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree

@@ -16,6 +16,7 @@ from lidardesign.errors import ConfigError
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, inverse_rigid
 
 FARTHEST_M = 1e30  # what Embree takes for an unlimited ray
+GROUP_CHUNK = 200_000  # ray-primitive pairs at a time: the temporaries stay below some 50 MB
 
 Only = Literal["all", "targets", "occluders"]
 
@@ -48,7 +49,11 @@ class SceneCaster:
         keep = {"all": lambda body: True, "targets": lambda body: body.is_target, "occluders": lambda b: b.is_occluder}
         chosen = [(i, body) for i, body in enumerate(scene.bodies) if keep[only](body)]
         self._meshes = _MeshCaster([(i, body) for i, body in chosen if isinstance(body.shape, Mesh)], frame)
-        self._primitives = [(i, body, body.pose(frame)) for i, body in chosen if not isinstance(body.shape, Mesh)]
+        kinds = {type(body.shape) for _, body in chosen} - {Mesh}
+        self._groups = [
+            _PrimitiveGroup([(i, body) for i, body in chosen if isinstance(body.shape, kind)], frame)
+            for kind in sorted(kinds, key=lambda kind: kind.__name__)
+        ]
 
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
         """The nearest hit of every ray, shapes (N, 3) and (N, 3); directions are normalised here.
@@ -60,10 +65,10 @@ class SceneCaster:
         return self.trace(origins, directions, np.full(len(origins), np.inf))
 
     def trace(self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Hits:
-        """`first_hit` of rays known to be finite, float64 and of unit length; from its limit (N,) on, a hit is a miss."""
+        """`first_hit` of finite float64 rays of unit length; from its limit (N,) on, a hit counts as a miss."""
         hits = self._meshes.trace(origins, directions, limit_m)
-        for index, body, pose in self._primitives:
-            _keep_nearer(hits, index, limit_m, *_primitive_hit(body, pose, origins, directions))
+        for group in self._groups:
+            group.keep_nearer(hits, origins, directions, limit_m)
         rows = np.flatnonzero(hits.body >= 0)
         facing = np.einsum("nk,nk->n", hits.normal[rows], directions[rows]) > 0
         hits.normal[rows[facing]] *= -1
@@ -75,13 +80,8 @@ def _checked_rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarr
     directions = np.asarray(directions, dtype=np.float64)
     lengths = np.linalg.norm(directions, axis=-1)
     if not (np.isfinite(origins).all() and np.isfinite(lengths).all()) or (len(lengths) and lengths.min() == 0):
-        raise ConfigError("a ray has an origin or direction that is not finite, or a direction of zero length", where="rays")
+        raise ConfigError("an origin or direction is not finite, or a direction has zero length", where="rays")
     return origins, directions / lengths[:, None]
-
-
-def _keep_nearer(hits: Hits, index: int, limit_m: np.ndarray, range_m: np.ndarray, normal: np.ndarray) -> None:
-    nearer = (range_m < hits.range_m) & (range_m < limit_m)
-    hits.range_m[nearer], hits.body[nearer], hits.normal[nearer] = range_m[nearer], index, normal[nearer]
 
 
 class _MeshCaster:
@@ -120,17 +120,52 @@ class _MeshCaster:
         return hits
 
 
-def _primitive_hit(
-    body: Body, pose: np.ndarray, origins: np.ndarray, directions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Range and world normal of the first hit with one primitive, by its closed form in the body's frame."""
-    to_body = inverse_rigid(pose)
-    local_origins = origins @ to_body[:3, :3].T + to_body[:3, 3]
-    local_directions = directions @ to_body[:3, :3].T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        range_m, normal = _CLOSED_FORMS[type(body.shape)](body.shape, local_origins, local_directions)
-    missed = ~(range_m >= 0)
-    return np.where(missed, np.inf, range_m), np.where(missed[:, None], 0.0, normal) @ pose[:3, :3].T
+class _PrimitiveGroup:
+    """All primitives of one kind in a frame, each hit in closed form in its own frame."""
+
+    def __init__(self, members: list[tuple[int, Body]], frame: int) -> None:
+        kind = type(members[0][1].shape)
+        self._closed_form = _CLOSED_FORMS[kind]
+        self._body = np.array([index for index, _ in members], dtype=np.int64)
+        self._sizes = np.array([_SIZES[kind](body.shape) for _, body in members])[:, None]
+        poses = np.stack([body.pose(frame) for _, body in members])
+        self._rotation = poses[:, :3, :3]
+        self._to_body = inverse_rigid(poses)
+
+    def keep_nearer(self, hits: Hits, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> None:
+        """Enter the hits that are nearer than what `hits` holds, in chunks that bound the memory."""
+        size = max(1, GROUP_CHUNK // len(self._body))
+        for start in range(0, len(origins), size):
+            rows = slice(start, start + size)
+            range_m, body, normal = self._nearest(origins[rows], directions[rows])
+            nearer = np.flatnonzero((range_m < hits.range_m[rows]) & (range_m < limit_m[rows]))
+            hits.range_m[rows][nearer] = range_m[nearer]
+            hits.body[rows][nearer] = body[nearer]
+            hits.normal[rows][nearer] = normal[nearer]
+
+    def _nearest(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Range, body and world normal of the nearest member per ray: (N,), (N,), (N, 3)."""
+        turn = np.swapaxes(self._to_body[:, :3, :3], -1, -2)
+        local_origins = origins @ turn + self._to_body[:, None, :3, 3]
+        local_directions = directions @ turn
+        with np.errstate(divide="ignore", invalid="ignore"):
+            range_m = self._closed_form(self._sizes, local_origins, local_directions)
+        range_m = np.where(range_m >= 0, range_m, np.inf)
+        chosen = np.argmin(range_m, axis=0)
+        rows = np.arange(len(origins))
+        nearest = range_m[chosen, rows]
+        reached = np.where(np.isfinite(nearest), nearest, 0.0)[:, None]
+        points = local_origins[chosen, rows] + reached * local_directions[chosen, rows]
+        normal = _NORMALS[self._closed_form](self._sizes[chosen, 0], points)
+        return nearest, self._body[chosen], np.einsum("nij,nj->ni", self._rotation[chosen], normal)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), np.finfo(float).tiny)
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.einsum("...k,...k->...", a, b)
 
 
 def _nearest_non_negative(near: np.ndarray, far: np.ndarray) -> np.ndarray:
@@ -138,86 +173,80 @@ def _nearest_non_negative(near: np.ndarray, far: np.ndarray) -> np.ndarray:
     return np.where(near >= 0, near, np.where(far >= 0, far, np.inf))
 
 
-def _ball(origins: np.ndarray, directions: np.ndarray, radius_m: float) -> np.ndarray:
-    along = np.einsum("nk,nk->n", origins, directions)
-    perpendicular = origins - along[:, None] * directions
-    # the distance of the line from the centre directly: b^2 - c cancels for far origins
-    half_chord = np.sqrt(radius_m**2 - np.einsum("nk,nk->n", perpendicular, perpendicular))
-    range_m = _nearest_non_negative(-along - half_chord, -along + half_chord)
-    return np.where(np.isnan(half_chord), np.inf, range_m)
+def _ball_roots(origins: np.ndarray, directions: np.ndarray, radius_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Both roots, NaN where the line passes by; the line's distance from the centre does not cancel as b^2 - c does."""
+    along = _dot(origins, directions)
+    perpendicular = origins - along[..., None] * directions
+    half_chord = np.sqrt(radius_m**2 - _dot(perpendicular, perpendicular))
+    return -along - half_chord, -along + half_chord
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(float).tiny)
+def _sphere(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    return _nearest_non_negative(*_ball_roots(origins, directions, sizes[..., 0]))
 
 
-def _points(origins: np.ndarray, directions: np.ndarray, range_m: np.ndarray) -> np.ndarray:
-    return origins + np.where(np.isfinite(range_m), range_m, 0.0)[:, None] * directions
+def _sphere_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return _unit(points)
 
 
-def _sphere(shape: Sphere, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    range_m = _ball(origins, directions, shape.radius_m)
-    return range_m, _unit(_points(origins, directions, range_m))
-
-
-def _box(shape: Box, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    half = np.asarray(shape.half_extents_m)
-    entry, leave = (-half - origins) / directions, (half - origins) / directions
+def _box(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    entry, leave = (-sizes - origins) / directions, (sizes - origins) / directions
     low, high = np.fmin(entry, leave), np.fmax(entry, leave)
     parallel = directions == 0
-    inside_slab = np.abs(origins) <= half
+    inside_slab = np.abs(origins) <= sizes
     low = np.where(parallel, np.where(inside_slab, -np.inf, np.inf), low)
     high = np.where(parallel, np.where(inside_slab, np.inf, -np.inf), high)
-    near, far = low.max(axis=1), high.min(axis=1)
-    range_m = np.where(near <= far, _nearest_non_negative(near, far), np.inf)
-    points = _points(origins, directions, range_m)
-    axis = np.argmax(np.abs(points) / half, axis=1)
+    near, far = low.max(axis=-1), high.min(axis=-1)
+    return np.where(near <= far, _nearest_non_negative(near, far), np.inf)
+
+
+def _box_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    axis = np.argmax(np.abs(points) / sizes, axis=1)
     normal = np.zeros_like(points)
     rows = np.arange(len(points))
     normal[rows, axis] = np.sign(points[rows, axis])
-    return range_m, normal
+    return normal
 
 
-def _capsule(shape: Capsule, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    radius, half_length = shape.radius_m, shape.half_length_m
-    across = np.einsum("nk,nk->n", directions[:, :2], directions[:, :2])
-    along = np.einsum("nk,nk->n", origins[:, :2], directions[:, :2]) / across
-    perpendicular = origins[:, :2] - along[:, None] * directions[:, :2]
-    half_chord = np.sqrt((radius**2 - np.einsum("nk,nk->n", perpendicular, perpendicular)) / across)
-    candidates = [-along - half_chord, -along + half_chord]
-    side = [
-        np.where((t >= 0) & (np.abs(origins[:, 2] + t * directions[:, 2]) <= half_length), t, np.inf) for t in candidates
-    ]
-    for end in (-half_length, half_length):
-        side += _cap(origins - np.array([0.0, 0.0, end]), directions, radius, np.sign(end) if end else 0.0)
-    range_m = np.fmin.reduce(side)
-    points = _points(origins, directions, range_m)
-    axis_point = np.zeros_like(points)
-    axis_point[:, 2] = np.clip(points[:, 2], -half_length, half_length)
-    return range_m, _unit(points - axis_point)
-
-
-def _cap(origins: np.ndarray, directions: np.ndarray, radius_m: float, outward: float) -> list[np.ndarray]:
-    """Hits with the half of an end ball that is not inside the capsule's cylinder."""
-    along = np.einsum("nk,nk->n", origins, directions)
-    perpendicular = origins - along[:, None] * directions
-    half_chord = np.sqrt(radius_m**2 - np.einsum("nk,nk->n", perpendicular, perpendicular))
-    hits = []
+def _capsule(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    radius, half_length = sizes[..., 0], sizes[..., 1]
+    across = _dot(directions[..., :2], directions[..., :2])
+    along = _dot(origins[..., :2], directions[..., :2]) / across
+    perpendicular = origins[..., :2] - along[..., None] * directions[..., :2]
+    half_chord = np.sqrt((radius**2 - _dot(perpendicular, perpendicular)) / across)
+    nearest = np.full(origins.shape[:-1], np.inf)
     for range_m in (-along - half_chord, -along + half_chord):
-        height = origins[:, 2] + range_m * directions[:, 2]
-        hits.append(np.where((range_m >= 0) & (height * outward >= 0), range_m, np.inf))
-    return hits
+        on_side = np.abs(origins[..., 2] + range_m * directions[..., 2]) <= half_length
+        nearest = np.where((range_m >= 0) & on_side, np.fmin(nearest, range_m), nearest)
+    for outward in (-1.0, 1.0):
+        centred = origins.copy()
+        centred[..., 2] -= outward * half_length
+        for range_m in _ball_roots(centred, directions, radius):
+            on_cap = (centred[..., 2] + range_m * directions[..., 2]) * outward >= 0
+            nearest = np.where((range_m >= 0) & on_cap, np.fmin(nearest, range_m), nearest)
+    return nearest
 
 
-def _plane(shape: Plane, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    range_m = -origins[:, 2] / directions[:, 2]
-    range_m = np.where(np.isfinite(range_m) & (range_m >= 0), range_m, np.inf)
-    return range_m, np.tile([0.0, 0.0, 1.0], (len(origins), 1))
+def _capsule_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    axis_point = np.zeros_like(points)
+    axis_point[:, 2] = np.clip(points[:, 2], -sizes[:, 1], sizes[:, 1])
+    return _unit(points - axis_point)
 
 
-_CLOSED_FORMS: dict[type, Callable[..., tuple[np.ndarray, np.ndarray]]] = {
-    Sphere: _sphere,
-    Box: _box,
-    Capsule: _capsule,
-    Plane: _plane,
+def _plane(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    range_m = -origins[..., 2] / directions[..., 2]
+    return np.where(np.isfinite(range_m) & (range_m >= 0), range_m, np.inf)
+
+
+def _plane_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    return np.tile([0.0, 0.0, 1.0], (len(points), 1))
+
+
+_CLOSED_FORMS: dict[type, Callable[..., np.ndarray]] = {Sphere: _sphere, Box: _box, Capsule: _capsule, Plane: _plane}
+_NORMALS = {_sphere: _sphere_normal, _box: _box_normal, _capsule: _capsule_normal, _plane: _plane_normal}
+_SIZES: dict[type, Callable[..., tuple[float, float, float]]] = {
+    Sphere: lambda shape: (shape.radius_m, 0.0, 0.0),
+    Box: lambda shape: shape.half_extents_m,
+    Capsule: lambda shape: (shape.radius_m, shape.half_length_m, 0.0),
+    Plane: lambda shape: (0.0, 0.0, 0.0),
 }

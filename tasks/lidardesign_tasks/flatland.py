@@ -55,9 +55,9 @@ class FlatlandTask:
         rays=(8, 16, 32, 64),
         density={"sigma_m": 0.02},
         learning={
-            "draft": {"steps": 250, "batch": 512, "layers": 4, "samples": 20_000},
-            "standard": {"steps": 600, "batch": 1024, "samples": 50_000},
-            "fine": {"steps": 2000, "batch": 2048, "samples": 100_000},
+            "draft": {"steps": 250, "batch": 512, "hidden": 48, "samples": 20_000},
+            "standard": {"samples": 50_000},
+            "fine": {"samples": 100_000},
         },
     )
 
