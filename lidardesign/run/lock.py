@@ -56,7 +56,8 @@ def _acquire(path: Path, owner: dict[str, Any], deadline: float) -> None:
         except FileExistsError:
             holder = _read(path)
             if _is_stale(holder):
-                path.unlink(missing_ok=True)
+                if _read(path) == holder:  # nobody else has taken it over meanwhile
+                    path.unlink(missing_ok=True)
             elif time.monotonic() < deadline:
                 time.sleep(RETRY_S)
             else:
