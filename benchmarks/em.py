@@ -62,7 +62,9 @@ def rival(points: np.ndarray, iterations: int) -> float:
     """Seconds per iteration of scikit-learn, as the difference of a long and a short run."""
     spent = []
     for steps in (2, 2 + iterations):
-        model = GaussianMixture(SENSORS, covariance_type="diag", tol=0, max_iter=steps, init_params="random_from_data", random_state=0)
+        model = GaussianMixture(
+            SENSORS, covariance_type="diag", tol=0, max_iter=steps, init_params="random_from_data", random_state=0
+        )
         start = time.perf_counter()
         model.fit(points)
         spent.append(time.perf_counter() - start)
@@ -96,10 +98,15 @@ def main() -> None:
     test = Features.of(held, np.ones(len(held)), axes, SPACE)
     bounds = constrained()
     with threadpool_limits(1):
-        pairs = [(ours(features, bounds, options.iterations), rival(points, options.iterations)) for _ in range(options.repeats)]
+        pairs = [
+            (ours(features, bounds, options.iterations), rival(points, options.iterations))
+            for _ in range(options.repeats)
+        ]
         mine, theirs = np.median(np.array(pairs), axis=0)
         print(f"one iteration, {len(points)} samples x 6, {SENSORS} components, 1 thread")
-        print(f"  lidardesign {1e3 * mine:7.1f} ms   scikit-learn diag {1e3 * theirs:7.1f} ms   ratio {mine / theirs:.2f} (at most 2)")
+        print(
+            f"  lidardesign {1e3 * mine:7.1f} ms   scikit-learn diag {1e3 * theirs:7.1f} ms   ratio {mine / theirs:.2f} (at most 2)"
+        )
         start = time.perf_counter()
         trace = fit_mixture(features, bounds, np.random.default_rng(0))
         mine = time.perf_counter() - start
@@ -108,8 +115,10 @@ def main() -> None:
         model.fit(points)
         theirs = time.perf_counter() - start
     jacobian = -np.log(np.cos(held[:, 4]))
-    print(f"held-out log-likelihood per solid angle: lidardesign {log_density(trace.mixture, test).mean():.5f} ({mine:.1f} s, {len(trace.history)} steps)   "
-          f"scikit-learn {np.mean(model.score_samples(held) + jacobian):.5f} ({theirs:.1f} s)")
+    print(
+        f"held-out log-likelihood per solid angle: lidardesign {log_density(trace.mixture, test).mean():.5f} ({mine:.1f} s, {len(trace.history)} steps)   "
+        f"scikit-learn {np.mean(model.score_samples(held) + jacobian):.5f} ({theirs:.1f} s)"
+    )
 
 
 if __name__ == "__main__":

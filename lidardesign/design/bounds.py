@@ -1,7 +1,7 @@
 """The bounds that every parameter of every component must keep, as arrays: what the M-step works with.
 
-Angles are internal ones (see `features`); gates and fields of view are bounds on reported intervals, which the
-factor z = `interval_factor(level)` ties to means and spreads.
+Angles are internal ones (see `features`); gates and fields of view are bounds on reported intervals, which
+the factor z = `interval_factor(level)` ties to means and spreads.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The independent checker: does a written design keep a written constraint file?
 
 It reads plain documents only and shares no code with the fit: intervals are recomputed from means and
-spreads, compared with the reported ones, and bounds are applied to both. Definitions are those of `constraints`.
+spreads, compared with the reported ones, and bounds are applied to both. `constraints` has the definitions.
 """
 
 from __future__ import annotations

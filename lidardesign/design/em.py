@@ -132,7 +132,7 @@ def from_labels(features: Features, labels: np.ndarray, bounds: Bounds) -> Mixtu
 
 
 def seed(features: Features, bounds: Bounds, generator: np.random.Generator) -> Mixture:
-    """k-means++ seeds, a few Lloyd steps, and components from the cells, matched to what each bound admits."""
+    """k-means++ seeds, a few Lloyd steps, and components from the cells, each where its bounds admit it."""
     chosen = generator.choice(len(features), min(SEED_SAMPLES, len(features)), replace=False)
     part = features.subset(np.sort(chosen)) if len(chosen) < len(features) else features
     embedding = np.ascontiguousarray(part.embedding)
@@ -211,7 +211,7 @@ def dead_components(mixture: Mixture, features: Features) -> np.ndarray:
 
 
 def _revived(trace: Trace, features: Features, bounds: Bounds, generator: np.random.Generator) -> Trace:
-    """Give dead components half of the heaviest one's samples and go on; keep it where the likelihood gains."""
+    """Give dead components half of the heaviest one's samples and go on, where the likelihood gains."""
     notes: list[str] = []
     for _ in range(MOST_REVIVALS):
         dead = np.flatnonzero(dead_components(trace.mixture, features))

@@ -117,7 +117,7 @@ def admitted(mixture: Mixture, features: Features, bounds: Bounds) -> Mixture:
 def sensors_of(
     ensemble: Ensemble, space: DesignSpace, level: float, *, by_weight: bool
 ) -> tuple[Sensor, ...]:
-    """The fitted components as sensors s0, s1, ...: heaviest first, or in the order of the constraint file."""
+    """The fitted components as sensors s0, s1, ...: heaviest first, or as in the constraint file."""
     rows = [
         _sensor(part, trace.mixture, row, space, level)
         for part, trace in zip(ensemble.parts, ensemble.traces, strict=True)

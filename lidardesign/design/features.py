@@ -1,11 +1,11 @@
 r"""Design points as the arrays that expectation maximisation runs on.
 
 Linear features hold the free origin axes y_1..y_m and the range y_r, centred and scaled:
-$\Phi = [1,\; y_i,\; y_r,\; y_i y_j (i \le j),\; y_r^2]$, so that every Gaussian exponent in them is one matrix
-product, and so are all their sufficient statistics. Directions are unit vectors.
+$\Phi = [1,\; y_i,\; y_r,\; y_i y_j (i \le j),\; y_r^2]$, so that every Gaussian exponent in them is one
+matrix product, and so are all their sufficient statistics. Directions are unit vectors.
 
 Axes that the space fixes are left out of the density, not given a tiny variance. Where only the azimuth is
-free, directions become unit vectors on the equator (a great circle, on which tangent coordinates are exact) and
+free, directions become unit vectors on the equator (a great circle, where tangent coordinates are exact) and
 angles scale by the cosine of the fixed elevation; where only the elevation is free, on the meridian.
 """
 
@@ -19,9 +19,9 @@ import numpy as np
 
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 
-# Below this cosine of a fixed elevation the azimuth turns the ray about itself: at the poles it is no freedom.
+# Below this cosine of a fixed elevation the azimuth turns the ray about itself: it is no freedom there.
 POLE_COSINE = 1e-9
-# A free axis on which the data do not vary is scaled by this share of its bounds, so that nothing divides by 0.
+# A free axis on which the data do not vary is scaled by this share of its bounds: nothing divides by 0.
 IDLE_AXIS_SHARE = 1e-3
 
 
@@ -142,7 +142,7 @@ class Features:
 
     @cached_property
     def embedding(self) -> np.ndarray:
-        """Scaled linear coordinates and directions, in which the Euclidean distance seeds components, (N, m + 3)."""
+        """Scaled linear coordinates and directions, whose Euclidean distance seeds components, (N, m + 3)."""
         return np.concatenate([self.linear, self.directions / self.angular_scale]).T
 
     def subset(self, keep: np.ndarray) -> Features:

@@ -109,8 +109,8 @@ def fit(
 
     Arguments:
         samples: Weighted samples of the learned density.
-        sensors: How many; `auto` chooses by held-out likelihood; None takes the constraints' or 4. A scan has one
-            component per ray instead.
+        sensors: How many; `auto` chooses by held-out likelihood; None takes the constraints' or 4. A scan has
+            one component per ray instead.
         layout: How rays are laid out.
         rays: Rays per frame; None takes the budget's.
         constraints: A checked constraint file.

@@ -2,8 +2,8 @@ r"""Mixtures of sensors on the sphere: density, responsibilities and sufficient 
 
 A component is $q(d) = N(x)\, N_2(u)\, \frac{t}{\sin t}\, N(r)$: origin with its full covariance, tangent
 coordinates u of the direction at the angle t = |u| from the boresight, range. With unit axes f, h, v of the
-boresight and $g(t) = t / \sin t$ the coordinates are $u = g\,(h \cdot d, v \cdot d)$, so one matrix product per
-block of samples gives all cosines, and g multiplies after the exponential: no logarithm of it is needed.
+boresight and $g(t) = t / \sin t$ the coordinates are $u = g\,(h \cdot d, v \cdot d)$, so one matrix product
+per block of samples gives all cosines, and g multiplies after the exponential: no logarithm of it is needed.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def _origin_coefficients(
 
 
 def angular_rows(mixture: Mixture, axes: Axes) -> np.ndarray:
-    """Rows forward, horizontal / (sigma_h sqrt 2), vertical / (sigma_v sqrt 2), shape (3, K, 3); 0 where fixed."""
+    """Rows forward, horizontal / (sqrt 2 sigma_h), vertical / (sqrt 2 sigma_v), (3, K, 3); 0 where fixed."""
     rows = np.ascontiguousarray(np.moveaxis(mixture.frames, 1, 0))
     for axis, used in enumerate((axes.horizontal, axes.vertical)):
         rows[axis + 1] *= (1.0 / (math.sqrt(2.0) * mixture.spread_rad[:, axis]))[:, None] if used else 0.0
@@ -282,7 +282,7 @@ def label_statistics(mixture: Mixture, features: Features, labels: np.ndarray) -
 
 
 def mean_directions(features: Features, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuth and elevation of the mean unit vector of each cell, through vectors only: shape (K,) each [rad]."""
+    """Azimuth and elevation of the mean unit vector of each cell, shape (K,) each [rad]."""
     sums = np.stack(
         [np.bincount(labels, features.weights * row, minlength=count) for row in features.directions]
     )

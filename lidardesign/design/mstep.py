@@ -1,9 +1,9 @@
 r"""The constrained M-step: each block of parameters at its best inside the bounds.
 
-Origin, range, and angular spreads with roll are exact maximisers of the expected log-likelihood Q inside their
-bounds. The boresight moves by the weighted mean of the tangent coordinates along the sphere (exponential map);
-that is exact in the flat limit, so `em` accepts it only where the log-likelihood does not fall and otherwise keeps
-the boresight, which makes the remaining step exact.
+Origin, range, and angular spreads with roll are exact maximisers of the expected log-likelihood Q inside
+their bounds. The boresight moves by the weighted mean of the tangent coordinates along the sphere (exponential
+map); that is exact in the flat limit, so `em` accepts it only where the log-likelihood does not fall and
+otherwise keeps the boresight, which makes the remaining step exact.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def _range(
 def fit_gate(
     mean: np.ndarray, variance: np.ndarray, bounds: Bounds, floor: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    r"""Mean and spread of a normal distribution whose interval m -+ z s keeps bounds, at the largest likelihood.
+    r"""Mean and spread of a normal distribution whose interval m -+ z s keeps bounds, at its best.
 
     For a spread s the best mean is the sample mean clipped to [max(start_low + z s, end_low - z s),
     min(start_high + z s, end_high - z s)]; with a clipped mean a + b s the likelihood is stationary where
@@ -130,7 +130,7 @@ def fit_gate(
     low = np.maximum(bounds.width_low, bounds.end_low - bounds.start_high) / (2 * z)
     high = np.minimum(bounds.width_high, bounds.end_high - bounds.start_low) / (2 * z)
     low = np.minimum(np.maximum(low, floor), high)
-    candidates = [np.sqrt(variance), low, high]
+    candidates = [np.sqrt(variance), low, np.where(np.isfinite(high), high, low)]
     for edge, slope in (
         (bounds.start_low, z),
         (bounds.end_low, -z),
@@ -142,9 +142,10 @@ def fit_gate(
         root = (-away * slope + np.sqrt(np.square(away * slope) + 4 * (variance + np.square(away)))) / 2
         candidates += [np.where(bound, root, low), np.where(bound, np.abs(away) / z, low)]
     for one, other in ((bounds.end_low, bounds.start_low), (bounds.end_high, bounds.start_high)):
-        candidates.append((one - other) / (2 * z))
+        both = np.isfinite(one) & np.isfinite(other)
+        candidates.append((np.where(both, one, 0.0) - np.where(both, other, 0.0)) / (2 * z))
     spreads = np.stack(candidates)
-    spreads = np.clip(np.where(np.isfinite(spreads), spreads, low), low, high)
+    spreads = np.clip(spreads, low, high)
     lower = np.maximum(bounds.start_low + z * spreads, bounds.end_low - z * spreads)
     upper = np.minimum(bounds.start_high + z * spreads, bounds.end_high - z * spreads)
     means = np.minimum(np.maximum(mean, lower), np.maximum(upper, lower))
@@ -183,7 +184,7 @@ def _moved(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Azimuth and elevation after a tangent step (K, 2) in rolled axes, projected into the boresight boxes.
 
-    The projection is in the metric of the component's spreads: along a face of the box the step is the best one.
+    The projection is in the metric of the component's spreads, so the step along a face of the box is the best.
     """
     sin_r, cos_r = np.sin(mixture.roll_rad), np.cos(mixture.roll_rad)
     rotation = np.stack([np.stack([cos_r, -sin_r], -1), np.stack([sin_r, cos_r], -1)], 1)
@@ -233,8 +234,8 @@ def exponential(level: np.ndarray, step: np.ndarray) -> np.ndarray:
 def _displacement(old: np.ndarray, new: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Tangent coordinates of new boresights in old frames, (K, 2), and the turn from transported to new axes.
 
-    Parallel transport along the geodesic is the rotation that takes one boresight to the other; `turn` (K, 2, 2)
-    expresses transported axes in the new frame's axes.
+    Parallel transport along the geodesic is the rotation that takes one boresight to the other; `turn`
+    (K, 2, 2) expresses transported axes in the new frame's axes.
     """
     local = np.einsum("kij,kj->ki", old, new[:, 0])
     sine = np.hypot(local[:, 1], local[:, 2])

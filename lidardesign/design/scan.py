@@ -1,7 +1,7 @@
 """Scans: every ray is a component of its own, with its own origin, direction and gate.
 
-Samples are quantised into as many cells as there are rays by Lloyd's iteration on origin, direction and range,
-each scaled by its spread; one constrained M-step per cell, all cells at once, makes the components.
+Samples are quantised into as many cells as there are rays by Lloyd's iteration on origin, direction and
+range, each scaled by its spread; one constrained M-step per cell, all cells at once, makes the components.
 """
 
 from __future__ import annotations

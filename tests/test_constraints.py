@@ -1,0 +1,225 @@
+"""Constraint files: what they may say, which contradict themselves, and that fits keep them exactly."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from lidardesign.design.check import check_design
+from lidardesign.design.constraints import Constraints, check_feasible
+from lidardesign.design.files import design_document, design_from_document
+from lidardesign.design.fit import fit
+from lidardesign.design.samples import Samples
+from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.space import DesignSpace
+
+FACE = DesignSpace((0.0, 0.0, 0.0, -0.5, -0.5, 0.05), (0.0, 0.0, 0.0, 0.5, 0.5, 1.05))
+ROOM = DesignSpace((-1.0, -1.0, 0.0, 0.0, -1.5, 0.1), (1.0, 1.0, 2.0, 2 * math.pi, 1.5, 4.0))
+
+CONTRADICTIONS = {
+    "fov": (
+        {"field_of_view": {"horizontal_deg": {"min": 20, "max": 10}}},
+        ["field_of_view.horizontal_deg.min", "field_of_view.horizontal_deg.max"],
+    ),
+    "gate start": ({"gate": {"start_m": {"min": 0.5, "max": 0.4}}}, ["gate.start_m.min", "gate.start_m.max"]),
+    "gate end": ({"gate": {"end_m": {"min": 0.5, "max": 0.4}}}, ["gate.end_m.min", "gate.end_m.max"]),
+    "gate width": ({"gate": {"width_m": {"min": 0.5, "max": 0.4}}}, ["gate.width_m.min", "gate.width_m.max"]),
+    "width above end": (
+        {"gate": {"width_m": {"min": 0.5}, "end_m": {"max": 0.4}}},
+        ["gate.width_m.min", "gate.end_m.max"],
+    ),
+    "start after end": (
+        {"gate": {"start_m": {"min": 0.5}, "end_m": {"max": 0.4}, "width_m": {"min": 0.01}}},
+        ["gate.start_m.min", "gate.end_m.max"],
+    ),
+    "three": (
+        {"gate": {"start_m": {"min": 0.5}, "end_m": {"max": 0.8}, "width_m": {"min": 0.4}}},
+        ["gate.start_m.min", "gate.width_m.min", "gate.end_m.max"],
+    ),
+    "too narrow": (
+        {"gate": {"start_m": {"max": 0.2}, "end_m": {"min": 0.8}, "width_m": {"max": 0.4}}},
+        ["gate.end_m.min", "gate.width_m.max", "gate.start_m.max"],
+    ),
+    "beyond the space": ({"gate": {"start_m": {"min": 2.0}}}, ["gate.start_m.min", "space.range_m"]),
+    "wider than the space": ({"gate": {"width_m": {"min": 2.0}}}, ["gate.width_m.min", "space.range_m"]),
+    "elevation": (
+        {"boresight": {"elevation_deg": {"min": 10, "max": 5}}},
+        ["boresight.elevation_deg.min", "boresight.elevation_deg.max"],
+    ),
+    "elevation outside": (
+        {"boresight": {"elevation_deg": {"min": 60}}},
+        ["boresight.elevation_deg.min", "space.elevation_rad"],
+    ),
+    "azimuth outside": (
+        {"boresight": {"azimuth_deg": {"min": 100, "max": 200}}},
+        ["boresight.azimuth_deg.min", "boresight.azimuth_deg.max", "space.azimuth_rad"],
+    ),
+    "origin outside": ({"origin": {"fixed_m": [0, 0, 1]}}, ["origin.fixed_m", "space.z_m"]),
+    "box": ({"origin": {"low_m": [1, 0, 0], "high_m": [0, 0, 0]}}, ["origin.low_m", "space.x_m"]),
+    "rays": ({"sensors": {"count": 4}, "budget": {"rays": 3}}, ["budget.rays", "sensors.count"]),
+    "sensors": ({"sensors": {"min": 4, "max": 3}}, ["sensors.min", "sensors.max"]),
+    "each": ({"sensors": {"count": 1}, "each": [{}, {}]}, ["each", "sensors.count"]),
+    "bandwidth": (
+        {"budget": {"rays": 576, "bandwidth_mbps": 0.1}},
+        ["budget.rays", "budget.bandwidth_mbps"],
+    ),
+    "bandwidth of wide gates": (
+        {"budget": {"rays": 100, "bandwidth_mbps": 0.1}, "gate": {"width_m": {"min": 0.5}}},
+        ["budget.rays", "budget.bandwidth_mbps", "gate.width_m.min"],
+    ),
+    "one sensor of each": (
+        {"gate": {"width_m": {"min": 0.2}}, "each": [{}, {"gate": {"width_m": {"max": 0.1}}}]},
+        ["gate.width_m.min", "each[1].gate.width_m.max"],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CONTRADICTIONS)
+def test_a_contradiction_names_the_smallest_conflicting_set(name):
+    values, conflicts = CONTRADICTIONS[name]
+    with pytest.raises(InfeasibleError) as caught:
+        check_feasible(Constraints.from_mapping(values), FACE)
+    assert sorted(caught.value.conflicts) == sorted(conflicts)
+    assert caught.value.exit_code == 4
+
+
+def test_a_fixed_angle_admits_no_field_of_view_along_it():
+    flat = DesignSpace((0.0, 0.0, 0.0, 0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0, 0.0, 2.0))
+    with pytest.raises(InfeasibleError) as caught:
+        check_feasible(Constraints.from_mapping({"field_of_view": {"vertical_deg": {"min": 5}}}), flat)
+    assert "space.elevation_rad" in caught.value.conflicts
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ({"gates": {}}, "unknown key 'gates'"),
+        ({"gate": {"width": {"max": 1}}}, "unknown key 'gate.width'"),
+        ({"origin": {"mounts_m": [[0, 0, 0]]}}, "unknown key"),
+        ({"gate": {"width_m": {"max": "wide"}}}, "gate.width_m.max"),
+        ({"gate": {"width_m": {"max": -1}}}, "greater than 0"),
+        ({"gate": {"width_m": {"max": math.nan}}}, "finite"),
+        ({"origin": {"low_m": [0, 0]}}, "origin.low_m"),
+        ({"sensors": {"count": 2, "max": 3}}, "either count"),
+        ({"budget": {"rays": 0}}, "budget.rays"),
+        ({"gate": 3}, "gate"),
+    ],
+)
+def test_what_a_file_may_not_say_is_a_config_error_with_its_key(values, text):
+    with pytest.raises(ConfigError, match=text) as caught:
+        Constraints.from_mapping(values)
+    assert caught.value.exit_code == 2
+
+
+def test_positions_of_errors_come_from_the_file():
+    def locate(path, *, key=False):
+        return f"c.yaml:{len(path)}:{int(key)}"
+
+    with pytest.raises(ConfigError, match=r"c\.yaml:2:1"):
+        Constraints.from_mapping({"gate": {"width": 1}}, locate=locate)
+
+
+def test_entries_of_each_lie_over_the_common_keys():
+    values = {
+        "gate": {"width_m": {"min": 0.1, "max": 0.5}},
+        "each": [{"gate": {"width_m": {"max": 0.2}}}, {}],
+    }
+    constraints = Constraints.from_mapping(values)
+    assert constraints.of_sensor(0).gate.width_m.max == 0.2
+    assert constraints.of_sensor(0).gate.width_m.min == 0.1
+    assert constraints.of_sensor(1).gate.width_m.max == 0.5
+    assert constraints.of_sensor(7).gate.width_m.max == 0.5
+    assert constraints.as_document() == values
+
+
+def test_empty_sections_say_nothing():
+    assert Constraints.from_mapping({"gate": None, "sensors": {"count": None}}).as_document() in (
+        {},
+        {"sensors": {}},
+    )
+    assert Constraints.from_mapping(None).as_document() == {}
+
+
+def room_samples(count=6000):
+    generator = np.random.default_rng(0)
+    points = ROOM.sample(count, generator)
+    return Samples(points, np.zeros(count), generator.normal(0, 0.5, count), ROOM)
+
+
+SAMPLES = room_samples()
+
+
+@st.composite
+def feasible(draw):
+    """Constraint files that some design satisfies, with bounds on everything."""
+    values = {}
+    if draw(st.booleans()):
+        low = [draw(st.floats(-1, 0.2)) for _ in range(2)] + [draw(st.floats(0, 1))]
+        values["origin"] = {"low_m": low, "high_m": [v + draw(st.floats(0.5, 0.8)) for v in low]}
+    if draw(st.booleans()):
+        values.setdefault("origin", {})["spread_m"] = {"max": draw(st.floats(0.01, 0.4))}
+    if draw(st.booleans()):
+        low = draw(st.floats(-200, 400))
+        values["boresight"] = {"azimuth_deg": {"min": low, "max": low + draw(st.floats(5, 200))}}
+    if draw(st.booleans()):
+        low = draw(st.floats(-80, 60))
+        values.setdefault("boresight", {})["elevation_deg"] = {"min": low, "max": low + draw(st.floats(0, 25))}
+    if draw(st.booleans()):
+        low = draw(st.floats(0, 20))
+        values["field_of_view"] = {
+            "horizontal_deg": {"min": low, "max": low + draw(st.floats(0, 60))},
+            "vertical_deg": {"max": draw(st.floats(1, 60))},
+        }
+    if draw(st.booleans()):
+        start = draw(st.floats(0.1, 1.5))
+        values["gate"] = {
+            "start_m": {"min": start},
+            "end_m": {"max": start + draw(st.floats(1.2, 2.3))},
+            "width_m": {"max": draw(st.floats(0.05, 1.0))},
+        }
+    values["budget"] = {"rays": draw(st.integers(9, 200))}
+    if draw(st.booleans()):
+        values["budget"]["bandwidth_mbps"] = values["budget"]["rays"] * 4e-4 * draw(st.floats(3, 200))
+    values["sensors"] = {"count": draw(st.integers(1, 3))}
+    return values
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(feasible())
+def test_every_feasible_set_holds_exactly_in_the_written_file(values):
+    constraints = Constraints.from_mapping(values)
+    try:
+        result = fit(SAMPLES, constraints=constraints, em_samples=3000, restarts=1)
+    except InfeasibleError as error:
+        # a random region may hold too little of the density; it must say how much
+        assert error.admissible_mass is not None
+        return
+    document = design_document(result.design)
+    for dumps, loads in ((json.dumps, json.loads), (yaml.safe_dump, yaml.safe_load)):
+        written = loads(dumps(document))
+        broken = [check for check in check_design(written, values, ROOM) if not check.satisfied]
+        assert broken == []
+    assert result.satisfied
+    again = design_document(design_from_document(document, "design"))
+    assert [c for c in check_design(again, values, ROOM) if not c.satisfied] == []
+    assert sum(sensor.rays for sensor in result.design.sensors) == values["budget"]["rays"]
+
+
+def test_exact_bounds_are_exact_without_any_tolerance():
+    values = {
+        "field_of_view": {"horizontal_deg": {"max": 20}, "vertical_deg": {"max": 20}},
+        "gate": {"width_m": {"max": 0.1}, "end_m": {"max": 3.0}},
+    }
+    result = fit(SAMPLES, sensors=3, constraints=Constraints.from_mapping(values), em_samples=3000)
+    for sensor in yaml.safe_load(yaml.safe_dump(design_document(result.design)))["sensors"]:
+        assert math.degrees(sensor["field_of_view_rad"]["horizontal"]) <= 20
+        assert math.degrees(sensor["field_of_view_rad"]["vertical"]) <= 20
+        assert sensor["gate_m"]["end"] - sensor["gate_m"]["start"] <= 0.1
+        assert sensor["gate_m"]["end"] <= 3.0
+        assert sensor["gate_m"]["start"] >= 0.1

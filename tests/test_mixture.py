@@ -1,0 +1,450 @@
+"""Laws of mixtures on the sphere and of the EM that fits them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from lidardesign.design.bounds import Bounds, Floors
+from lidardesign.design.em import climb, fit_mixture, from_labels, seed
+from lidardesign.design.features import Axes, Features
+from lidardesign.design.mixture import (
+    Mixture,
+    angle_ratio,
+    expect,
+    frames,
+    label_statistics,
+    log_density,
+    responsibilities,
+)
+from lidardesign.design.mstep import fit_field, fit_gate, maximise
+from lidardesign.design.sensor import boresight_frame, interval_factor, tangent_coordinates, tangent_directions
+from lidardesign.numerics import logsumexp, wrap_angle
+from lidardesign.space import DesignSpace, angles, direction
+
+Z = interval_factor(0.95)
+WHOLE = DesignSpace((-9.0, -9.0, -9.0, 0.0, -math.pi / 2, 0.0), (9.0, 9.0, 9.0, 2 * math.pi, math.pi / 2, 9.0))
+POINT = DesignSpace((0.0, 0.0, 0.0, 0.0, -math.pi / 2, 0.0), (0.0, 0.0, 0.0, 2 * math.pi, math.pi / 2, 9.0))
+
+
+def random_mixture(generator, count, width=0.3):
+    root = generator.standard_normal((count, 3, 3)) * 0.3
+    return Mixture(
+        weights=generator.dirichlet(np.full(count, 4.0)),
+        origin_m=generator.uniform(-1, 1, (count, 3)),
+        origin_covariance_m2=root @ np.swapaxes(root, 1, 2) + 0.01 * np.eye(3),
+        azimuth_rad=generator.uniform(0, 2 * np.pi, count),
+        elevation_rad=generator.uniform(-1.4, 1.4, count),
+        roll_rad=generator.uniform(-0.7, 0.7, count),
+        spread_rad=generator.uniform(0.2, 1.0, (count, 2)) * width,
+        range_m=generator.uniform(2, 5, count),
+        spread_range_m=generator.uniform(0.1, 0.6, count),
+    )
+
+
+def drawn(mixture, count, generator, space=WHOLE):
+    which = generator.choice(len(mixture), p=mixture.weights, size=count)
+    points = np.empty((count, 6))
+    for k in range(len(mixture)):
+        rows = which == k
+        n = int(rows.sum())
+        free = [i for i in range(3) if i in space.free]
+        points[rows, :3] = mixture.origin_m[k]
+        root = np.linalg.cholesky(mixture.origin_covariance_m2[k])
+        points[np.ix_(rows, free)] += (generator.standard_normal((n, 3)) @ root.T)[:, free]
+        tangent = mixture.spread_rad[k] * generator.standard_normal((n, 2))
+        azimuth, elevation = angles(tangent_directions(mixture.frames[k], tangent))
+        points[rows, 3], points[rows, 4] = azimuth, elevation
+        points[rows, 5] = mixture.range_m[k] + mixture.spread_range_m[k] * generator.standard_normal(n)
+    return points
+
+
+def features_of(points, space=WHOLE, weights=None):
+    return Features.of(points, np.ones(len(points)) if weights is None else weights, Axes.of(space), space)
+
+
+def naive_log_density(mixture, points, free_origin=True):
+    """Plain loops over samples and components with the sensor module's own tangent map."""
+    result = np.empty(len(points))
+    for n, point in enumerate(points):
+        terms = []
+        for k in range(len(mixture)):
+            total = math.log(mixture.weights[k])
+            if free_origin:
+                away = point[:3] - mixture.origin_m[k]
+                covariance = mixture.origin_covariance_m2[k]
+                total -= 0.5 * away @ np.linalg.solve(covariance, away)
+                total -= 0.5 * math.log((2 * math.pi) ** 3 * np.linalg.det(covariance))
+            frame = boresight_frame(mixture.azimuth_rad[k], mixture.elevation_rad[k], mixture.roll_rad[k])
+            ray = direction(point[3], point[4])
+            u = tangent_coordinates(frame, ray[None])[0]
+            angle = math.atan2(np.linalg.norm(np.cross(frame[0], ray)), frame[0] @ ray)
+            for axis in range(2):
+                spread = mixture.spread_rad[k, axis]
+                total -= 0.5 * (u[axis] / spread) ** 2 + math.log(spread * math.sqrt(2 * math.pi))
+            total += math.log(angle / math.sin(angle)) if angle > 0 else 0.0
+            z = (point[5] - mixture.range_m[k]) / mixture.spread_range_m[k]
+            total -= 0.5 * z * z + math.log(mixture.spread_range_m[k] * math.sqrt(2 * math.pi))
+            terms.append(total)
+        result[n] = logsumexp(terms)
+    return result
+
+
+def test_the_density_equals_plain_loops():
+    generator = np.random.default_rng(0)
+    mixture = random_mixture(generator, 5)
+    points = np.concatenate([drawn(mixture, 60, generator), WHOLE.sample(60, generator)])
+    fast = log_density(mixture, features_of(points))
+    np.testing.assert_allclose(fast, naive_log_density(mixture, points), rtol=1e-9, atol=1e-9)
+
+
+def test_blocks_do_not_change_the_density(monkeypatch):
+    generator = np.random.default_rng(1)
+    mixture = random_mixture(generator, 3)
+    features = features_of(drawn(mixture, 1000, generator))
+    whole = log_density(mixture, features)
+    monkeypatch.setattr("lidardesign.design.mixture.BLOCK", 37)
+    np.testing.assert_allclose(log_density(mixture, features), whole, rtol=1e-13)
+
+
+def test_a_component_integrates_to_one_over_sphere_and_range():
+    generator = np.random.default_rng(2)
+    count = 400_000
+    mixture = random_mixture(generator, 3, width=0.5)
+    axes_points = np.zeros((count, 6))
+    axes_points[:, 3] = generator.uniform(0, 2 * np.pi, count)
+    axes_points[:, 4] = np.arcsin(generator.uniform(-1, 1, count))
+    axes_points[:, 5] = generator.uniform(0, 9, count)
+    values = np.exp(log_density(mixture, features_of(axes_points, POINT))) * 4 * np.pi * 9
+    error = values.std() / math.sqrt(count)
+    assert abs(values.mean() - 1) < 5 * error
+    assert error < 0.05
+
+
+def test_the_density_does_not_change_when_the_world_turns_about_z():
+    generator = np.random.default_rng(3)
+    mixture = random_mixture(generator, 4)
+    points = drawn(mixture, 200, generator)
+    turn = 2.5
+    rotation = np.array([[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]])
+    turned_points = points.copy()
+    turned_points[:, :3] = points[:, :3] @ rotation.T
+    turned_points[:, 3] = (points[:, 3] + turn) % (2 * np.pi)
+    turned = Mixture(
+        mixture.weights,
+        mixture.origin_m @ rotation.T,
+        rotation @ mixture.origin_covariance_m2 @ rotation.T,
+        mixture.azimuth_rad + turn,
+        mixture.elevation_rad,
+        mixture.roll_rad,
+        mixture.spread_rad,
+        mixture.range_m,
+        mixture.spread_range_m,
+    )
+    one = log_density(mixture, features_of(points))
+    other = log_density(turned, features_of(turned_points))
+    np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("turn", [0.3, 1.7, 3.1, 5.9])
+def test_fits_turn_with_the_world_also_across_azimuth_zero(turn):
+    generator = np.random.default_rng(4)
+    tangent = np.array([0.2, 0.1]) * generator.standard_normal((3000, 2))
+    looking = tangent_directions(boresight_frame(0.0, 0.4, 0.2), tangent)
+    fits = []
+    for by in (0.0, turn):
+        azimuth, elevation = angles(looking)
+        points = np.zeros((3000, 6))
+        points[:, 3], points[:, 4] = np.mod(azimuth + by, 2 * np.pi), elevation
+        points[:, 5] = 3 + 0.1 * generator.standard_normal(3000) * 0 + 0.1 * tangent[:, 0]
+        fits.append(fit_mixture(features_of(points, POINT), Bounds.unbounded(1, Z), np.random.default_rng(0)))
+    one, other = fits
+    assert other.log_likelihood == pytest.approx(one.log_likelihood, abs=1e-6)
+    assert float(wrap_angle(other.mixture.azimuth_rad[0] - one.mixture.azimuth_rad[0] - turn)) == pytest.approx(
+        0, abs=1e-6
+    )
+    np.testing.assert_allclose(other.mixture.spread_rad, one.mixture.spread_rad, rtol=1e-6)
+
+
+def test_a_ceiling_sensor_is_fitted_straight_down():
+    generator = np.random.default_rng(5)
+    frame = boresight_frame(0.0, -math.pi / 2)
+    azimuth, elevation = angles(tangent_directions(frame, np.array([0.3, 0.1]) * generator.standard_normal((4000, 2))))
+    points = np.zeros((4000, 6))
+    points[:, 3], points[:, 4], points[:, 5] = azimuth, elevation, 2 + 0.1 * generator.standard_normal(4000)
+    trace = fit_mixture(features_of(points, POINT), Bounds.unbounded(1, Z), np.random.default_rng(0))
+    assert trace.mixture.elevation_rad[0] < -math.pi / 2 + 0.02
+    np.testing.assert_allclose(sorted(trace.mixture.spread_rad[0]), [0.1, 0.3], rtol=0.05)
+
+
+def test_frames_equal_the_sensors_own():
+    generator = np.random.default_rng(6)
+    values = generator.uniform(-1.5, 1.5, (3, 7))
+    many = frames(*values)
+    for k in range(7):
+        np.testing.assert_allclose(many[k], boresight_frame(*values[:, k]), atol=1e-15)
+
+
+def test_the_angle_ratio_is_accurate_from_zero_to_the_antipode():
+    angle = np.array([0.0, 1e-9, 1e-5, 1e-3, 0.1, 1.0, 2.0, 3.0, 3.14])
+    ratio = angle_ratio(np.cos(angle), np.empty(9), np.empty(9))
+    exact = np.array([1.0, *(angle[1:] / np.sin(angle[1:]))])
+    np.testing.assert_allclose(ratio, exact, rtol=1e-10)
+    assert np.isfinite(angle_ratio(np.array([-1.0, 1.0]), np.empty(2), np.empty(2))).all()
+
+
+def test_responsibilities_sum_to_one_sixty_sigma_away():
+    generator = np.random.default_rng(7)
+    mixture = random_mixture(generator, 4)
+    points = drawn(mixture, 50, generator)
+    points[:, 5] += 60 * mixture.spread_range_m.max()
+    shares = responsibilities(mixture, features_of(points))
+    assert np.isfinite(shares).all()
+    np.testing.assert_allclose(shares.sum(axis=1), 1.0, rtol=1e-12)
+
+
+def test_statistics_equal_their_definition():
+    generator = np.random.default_rng(8)
+    mixture = random_mixture(generator, 3)
+    points = drawn(mixture, 300, generator)
+    features = features_of(points, weights=generator.uniform(0.1, 1, 300))
+    found = expect(mixture, features)
+    shares = responsibilities(mixture, features) * features.weights[:, None]
+    np.testing.assert_allclose(found.mass, shares.sum(axis=0), rtol=1e-10)
+    np.testing.assert_allclose(found.phi, shares.T @ features.phi.T, rtol=1e-9, atol=1e-12)
+    for k in range(3):
+        u = tangent_coordinates(mixture.frames[k], features.directions.T)
+        np.testing.assert_allclose(found.tangent[k, :, 0], shares[:, k] @ u, rtol=1e-8, atol=1e-12)
+        moment = np.einsum("n,ni,nj->ij", shares[:, k], u, u)
+        np.testing.assert_allclose(found.tangent[k, :, 1:], moment, rtol=1e-8, atol=1e-12)
+    assert found.log_likelihood == pytest.approx(features.weights @ log_density(mixture, features), rel=1e-12)
+
+
+def test_hard_statistics_equal_soft_ones_of_a_single_component():
+    generator = np.random.default_rng(9)
+    mixture = random_mixture(generator, 1)
+    features = features_of(drawn(mixture, 200, generator))
+    soft, hard = expect(mixture, features), label_statistics(mixture, features, np.zeros(200, dtype=int))
+    np.testing.assert_allclose(hard.phi, soft.phi, rtol=1e-10, atol=1e-13)
+    np.testing.assert_allclose(hard.tangent, soft.tangent, rtol=1e-9, atol=1e-13)
+
+
+def test_a_planted_mixture_is_recovered():
+    generator = np.random.default_rng(10)
+    plan = Mixture(
+        weights=np.array([0.5, 0.3, 0.2]),
+        origin_m=np.array([[-1.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0]]),
+        origin_covariance_m2=np.tile(np.diag([0.01, 0.02, 0.03]), (3, 1, 1)),
+        azimuth_rad=np.array([0.0, 2.0, 4.0]),
+        elevation_rad=np.array([0.0, 0.5, -1.2]),
+        roll_rad=np.array([0.0, 0.3, -0.2]),
+        spread_rad=np.array([[0.3, 0.1], [0.2, 0.1], [0.1, 0.25]]),
+        range_m=np.array([2.0, 3.0, 4.0]),
+        spread_range_m=np.array([0.1, 0.2, 0.3]),
+    )
+    features = features_of(drawn(plan, 30_000, generator))
+    found = fit_mixture(features, Bounds.unbounded(3, Z), np.random.default_rng(0)).mixture
+    found = found.take(np.argsort(found.range_m))
+    np.testing.assert_allclose(found.weights, plan.weights, atol=0.02)
+    np.testing.assert_allclose(found.origin_m, plan.origin_m, atol=0.02)
+    np.testing.assert_allclose(wrap_angle(found.azimuth_rad - plan.azimuth_rad), 0, atol=0.02)
+    np.testing.assert_allclose(found.elevation_rad, plan.elevation_rad, atol=0.01)
+    np.testing.assert_allclose(found.spread_rad, plan.spread_rad, rtol=0.05)
+    np.testing.assert_allclose(found.roll_rad[:2], plan.roll_rad[:2], atol=0.05)
+    np.testing.assert_allclose(found.range_m, plan.range_m, atol=0.02)
+    np.testing.assert_allclose(found.spread_range_m, plan.spread_range_m, rtol=0.05)
+
+
+def test_one_narrow_component_equals_the_sample_moments_of_scikit_learn():
+    mixture_module = pytest.importorskip("sklearn.mixture")
+    generator = np.random.default_rng(11)
+    points = np.zeros((4000, 6))
+    points[:, 3:] = [1.0, 0.0, 3.0] + np.array([0.004, 0.003, 0.2]) * generator.standard_normal((4000, 3))
+    rival = mixture_module.GaussianMixture(
+        2, covariance_type="diag", random_state=0, tol=1e-9, max_iter=500, reg_covar=0
+    )
+    rival.fit(points[:, 3:])
+    start = rival.predict(points[:, 3:])
+    features = features_of(points, POINT)
+    ours = climb(
+        from_labels(features, start, Bounds.unbounded(2, Z)),
+        features,
+        Bounds.unbounded(2, Z),
+        tolerance_nats=1e-10,
+        iterations=2000,
+    )
+    theirs = rival.score(points[:, 3:])
+    # rolls are one parameter more each, so the fit may only be better
+    assert ours.log_likelihood > theirs - 1e-3
+    assert ours.log_likelihood == pytest.approx(theirs, abs=0.02)
+
+
+bound = st.floats(0.0, 1.0)
+
+
+@st.composite
+def random_bounds(draw, count):
+    base = Bounds.unbounded(count, Z)
+    values = {name: getattr(base, name) for name in base.__dataclass_fields__}
+    if draw(st.booleans()):
+        low = draw(bound) * 2 - 1.5
+        values["origin_low"] = np.full((count, 3), low)
+        values["origin_high"] = np.full((count, 3), low + draw(st.floats(0.05, 2.0)))
+    if draw(st.booleans()):
+        values["origin_spread"] = np.full(count, draw(st.floats(0.01, 0.5)))
+    if draw(st.booleans()):
+        values["azimuth_centre"] = np.full(count, 6 * draw(bound))
+        values["azimuth_half"] = np.full(count, draw(st.floats(0.05, 3.0)))
+    if draw(st.booleans()):
+        low = draw(st.floats(-1.5, 1.3))
+        values["elevation_low"] = np.full(count, low)
+        values["elevation_high"] = np.full(count, min(low + draw(st.floats(0.01, 1.0)), 1.57))
+    if draw(st.booleans()):
+        low = np.full((count, 2), [0.1 * draw(bound), 0.1 * draw(bound)])
+        values["spread_low"], values["spread_high"] = (
+            low,
+            low + [draw(st.floats(0.01, 0.3)), draw(st.floats(0.01, 0.3))],
+        )
+    if draw(st.booleans()):
+        start, width = 5 * draw(bound), draw(st.floats(0.1, 3.0))
+        values["start_low"] = np.full(count, start)
+        values["end_high"] = np.full(count, start + width)
+        if draw(st.booleans()):
+            values["width_high"] = np.full(count, width * draw(st.floats(0.1, 1.0)))
+        if draw(st.booleans()):
+            values["end_low"] = np.full(count, start + width * draw(st.floats(0.0, 0.9)))
+    return Bounds(**values)
+
+
+def assert_keeps(mixture, bounds):
+    tiny = 1e-9
+    assert (mixture.origin_m >= bounds.origin_low - tiny).all()
+    assert (mixture.origin_m <= bounds.origin_high + tiny).all()
+    largest = np.linalg.eigvalsh(mixture.origin_covariance_m2)[:, -1]
+    assert (np.sqrt(largest) <= bounds.origin_spread * (1 + tiny)).all()
+    assert (np.abs(wrap_angle(mixture.azimuth_rad - bounds.azimuth_centre)) <= bounds.azimuth_half + tiny).all()
+    assert (mixture.elevation_rad >= bounds.elevation_low - tiny).all()
+    assert (mixture.elevation_rad <= bounds.elevation_high + tiny).all()
+    assert (mixture.spread_rad >= bounds.spread_low - tiny).all()
+    assert (mixture.spread_rad <= bounds.spread_high + tiny).all()
+    start, end = mixture.range_m - Z * mixture.spread_range_m, mixture.range_m + Z * mixture.spread_range_m
+    assert (start >= bounds.start_low - tiny).all()
+    assert (start <= bounds.start_high + tiny).all()
+    assert (end >= bounds.end_low - tiny).all()
+    assert (end <= bounds.end_high + tiny).all()
+    assert (end - start <= bounds.width_high + tiny).all()
+    assert (end - start >= bounds.width_low - tiny).all()
+    assert (np.abs(mixture.roll_rad) <= math.pi / 4 + tiny).all()
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(data=st.data(), count=st.integers(1, 4), seed_number=st.integers(0, 10_000))
+def test_the_log_likelihood_never_decreases_and_every_bound_holds(data, count, seed_number):
+    generator = np.random.default_rng(seed_number)
+    bounds = data.draw(random_bounds(count))
+    features = features_of(drawn(random_mixture(generator, 3, width=0.8), 600, generator))
+    start = seed(features, bounds, generator)
+    assert_keeps(start, bounds)
+    trace = climb(start, features, bounds, iterations=25)
+    values = [expect(start, features).log_likelihood, *trace.history]
+    assert (np.diff(values) >= 0).all()
+    assert_keeps(trace.mixture, bounds)
+    final = expect(trace.mixture, features).log_likelihood
+    assert final == pytest.approx(trace.log_likelihood, rel=1e-9, abs=1e-9)
+
+
+@settings(max_examples=40, deadline=None)
+@given(data=st.data(), mean=st.floats(0, 8), spread=st.floats(0.01, 2))
+def test_the_gate_is_the_best_inside_its_bounds(data, mean, spread):
+    bounds = data.draw(random_bounds(1))
+    found_mean, found_spread = fit_gate(np.array([mean]), np.array([spread**2]), bounds, 1e-6)
+
+    def quality(m, s):
+        return -np.log(s) - (spread**2 + (mean - m) ** 2) / (2 * s * s)
+
+    m, s = np.meshgrid(np.linspace(0, 10, 300), np.geomspace(0.005, 3, 300))
+    inside = (m - Z * s >= bounds.start_low) & (m + Z * s <= bounds.end_high) & (m + Z * s >= bounds.end_low)
+    inside &= 2 * Z * s <= bounds.width_high
+    best = quality(m, s)[inside].max(initial=-np.inf)
+    assert quality(found_mean[0], found_spread[0]) >= best - 1e-9
+
+
+@settings(max_examples=40, deadline=None)
+@given(data=st.data(), a=st.floats(0.01, 1), b=st.floats(0.01, 1), turn=st.floats(-1.5, 1.5))
+def test_roll_and_spreads_are_the_best_inside_their_bounds(data, a, b, turn):
+    bounds = data.draw(random_bounds(1))
+    rotation = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    moment = rotation @ np.diag([a * a, b * b]) @ rotation.T
+    roll, spread = fit_field(moment[None], np.zeros(1), bounds, 1e-6, True)
+
+    def quality(angle, sigma):
+        axes = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+        variance = np.diag(axes @ moment @ axes.T)
+        return (-np.log(sigma) - variance / (2 * sigma**2)).sum()
+
+    found = quality(roll[0], spread[0])
+    for angle in np.linspace(-math.pi / 4, math.pi / 4, 61):
+        axes = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+        sigma = np.clip(np.sqrt(np.diag(axes @ moment @ axes.T)), bounds.spread_low[0], bounds.spread_high[0])
+        assert found >= quality(angle, sigma) - 1e-9
+
+
+@pytest.mark.parametrize("kind", ["one point", "three points", "collinear", "two samples"])
+def test_degenerate_data_give_finite_components(kind):
+    generator = np.random.default_rng(12)
+    points = WHOLE.sample(60, generator)
+    if kind == "one point":
+        points[:] = points[0]
+    elif kind == "three points":
+        points = points[generator.integers(3, size=60)]
+    elif kind == "collinear":
+        points = points[0] + np.linspace(0, 1, 60)[:, None] * 0.2 * np.array([1, 1, 1, 0.5, 0.1, 1])
+    else:
+        points = points[:2]
+    bounds = Bounds.unbounded(5, Z)
+    trace = fit_mixture(features_of(points), bounds, generator)
+    assert (np.diff(trace.history) >= 0).all()
+    for name in trace.mixture.__dataclass_fields__:
+        assert np.isfinite(getattr(trace.mixture, name)).all(), name
+    assert (np.linalg.eigvalsh(trace.mixture.origin_covariance_m2) > 0).all()
+
+
+def test_weights_equal_repeated_samples():
+    generator = np.random.default_rng(13)
+    mixture = random_mixture(generator, 2)
+    points = drawn(mixture, 400, generator)
+    times = generator.integers(1, 4, 400)
+    weighted = features_of(points, weights=times)
+    repeated = features_of(np.repeat(points, times, axis=0))
+    bounds = Bounds.unbounded(2, Z)
+    one = maximise(mixture, expect(mixture, weighted), weighted, bounds, Floors.of(weighted), 1.0)
+    other = maximise(mixture, expect(mixture, repeated), repeated, bounds, Floors.of(repeated), 1.0)
+    for name in one.__dataclass_fields__:
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-8, atol=1e-10)
+
+
+FIXED = {
+    "elevation fixed": ((-1.0, -1.0, 0.0, 0.0, 0.0, 0.1), (1.0, 1.0, 0.0, 2 * math.pi, 0.0, 5.0)),
+    "tilted": ((0.0, 0.0, 0.0, 0.0, -0.7, 0.1), (0.0, 0.0, 0.0, 2 * math.pi, -0.7, 5.0)),
+    "azimuth fixed": ((0.0, 0.0, 0.0, 1.0, -1.0, 0.1), (1.0, 0.0, 0.0, 1.0, 1.0, 5.0)),
+    "one direction": ((0.0, 0.0, 0.0, 1.0, 0.5, 0.1), (1.0, 0.0, 0.0, 1.0, 0.5, 5.0)),
+    "one range": ((0.0, 0.0, 0.0, 0.0, -1.0, 2.0), (1.0, 0.0, 0.0, 2 * math.pi, 1.0, 2.0)),
+    "only range": ((0.0, 0.0, 0.0, 1.0, 0.5, 0.1), (0.0, 0.0, 0.0, 1.0, 0.5, 5.0)),
+}
+
+
+@pytest.mark.parametrize("name", FIXED)
+def test_fixed_dimensions_leave_the_density(name):
+    space = DesignSpace(*FIXED[name])
+    generator = np.random.default_rng(14)
+    features = features_of(space.sample(800, generator), space)
+    trace = fit_mixture(features, Bounds.unbounded(3, Z), generator)
+    assert (np.diff(trace.history) >= 0).all()
+    # a uniform density over the free dimensions is known, and no fit can be far above it
+    free = [i for i in space.free]
+    volume = np.prod([space.chart_high[i] - space.chart_low[i] for i in free])
+    assert -math.log(volume) - 1.0 < trace.log_likelihood < -math.log(volume) + 0.6
