@@ -58,9 +58,7 @@ def circular_mean(angle_rad: Any, weights: Any | None = None) -> float:
     """Direction of the weighted mean of unit vectors, in [0, 2 pi) [rad]; 0 where they cancel."""
     angle = np.asarray(angle_rad, dtype=np.float64)
     share = np.ones_like(angle) if weights is None else np.asarray(weights, dtype=np.float64)
-    mean = math.atan2(float(np.sum(share * np.sin(angle))), float(np.sum(share * np.cos(angle)))) % (
-        2 * math.pi
-    )
+    mean = math.atan2(float(np.sum(share * np.sin(angle))), float(np.sum(share * np.cos(angle)))) % (2 * math.pi)
     return 0.0 if mean >= 2 * math.pi else mean
 
 

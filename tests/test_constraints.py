@@ -198,7 +198,8 @@ def test_every_feasible_set_holds_exactly_in_the_written_file(values):
         result = fit(SAMPLES, constraints=constraints, em_samples=3000, restarts=1)
     except InfeasibleError as error:
         # a random region may hold too little of the density; it must say how much
-        assert error.admissible_mass is not None
+        if error.admissible_mass is None:
+            raise
         return
     document = design_document(result.design)
     for dumps, loads in ((json.dumps, json.loads), (yaml.safe_dump, yaml.safe_load)):

@@ -305,10 +305,8 @@ def random_bounds(draw, count):
         values["elevation_high"] = np.full(count, min(low + draw(st.floats(0.01, 1.0)), 1.57))
     if draw(st.booleans()):
         low = np.full((count, 2), [0.1 * draw(bound), 0.1 * draw(bound)])
-        values["spread_low"], values["spread_high"] = (
-            low,
-            low + [draw(st.floats(0.01, 0.3)), draw(st.floats(0.01, 0.3))],
-        )
+        widths = [draw(st.floats(0.01, 0.3)), draw(st.floats(0.01, 0.3))]
+        values["spread_low"], values["spread_high"] = low, low + np.array(widths)
     if draw(st.booleans()):
         start, width = 5 * draw(bound), draw(st.floats(0.1, 3.0))
         values["start_low"] = np.full(count, start)

@@ -115,9 +115,7 @@ def _consistency(name: str, sensor: Mapping[str, Any], z: float) -> list[Constra
     spread = sensor["spread"]
     pairs = []
     for axis in ("horizontal", "vertical"):
-        pairs.append(
-            (f"field_of_view_rad.{axis}", sensor["field_of_view_rad"][axis], 2 * z * spread[f"{axis}_rad"])
-        )
+        pairs.append((f"field_of_view_rad.{axis}", sensor["field_of_view_rad"][axis], 2 * z * spread[f"{axis}_rad"]))
     start, end = sensor["gate_m"]["start"], sensor["gate_m"]["end"]
     mean = sensor.get("range_m")
     if mean is not None:
@@ -127,9 +125,7 @@ def _consistency(name: str, sensor: Mapping[str, Any], z: float) -> list[Constra
         pairs.append(("gate_m.width", end - start, 2 * z * spread["range_m"]))
     size = max(abs(value) for _, *values in pairs for value in values)
     checks = [
-        ConstraintCheck(
-            f"{name}.{key}", expected, found, bool(abs(found - expected) <= AGREEMENT * max(size, 1e-9))
-        )
+        ConstraintCheck(f"{name}.{key}", expected, found, bool(abs(found - expected) <= AGREEMENT * max(size, 1e-9)))
         for key, found, expected in pairs
     ]
     # agreement is no news; a contradiction is
@@ -172,9 +168,7 @@ def _largest_eigenvalue(matrix: Any) -> float:
     return q + 2 * p * math.cos(math.acos(min(max(half_determinant, -1.0), 1.0)) / 3)
 
 
-def _boresight(
-    name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], space: Any
-) -> list[ConstraintCheck]:
+def _boresight(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], space: Any) -> list[ConstraintCheck]:
     """Elevation, and azimuth on the circle; an end that is not given is the space's, or else 0 or 360 degrees."""
     elevation = math.degrees(sensor["boresight"]["elevation_rad"])
     checks = _between(f"{name}.boresight.elevation_deg", elevation, _get(rules, "boresight", "elevation_deg"))
@@ -192,9 +186,7 @@ def _boresight(
     return [*checks, ConstraintCheck(f"{name}.boresight.azimuth_deg", [low, high], azimuth, bool(kept))]
 
 
-def _intervals(
-    name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], z: float
-) -> list[ConstraintCheck]:
+def _intervals(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], z: float) -> list[ConstraintCheck]:
     """Gate and field of view: the worse of the reported and the recomputed interval is checked."""
     checks = []
     spread = sensor["spread"]
@@ -256,9 +248,7 @@ def _table(document: Mapping[str, Any], rules: Mapping[str, Any]) -> list[Constr
     for ray, (start, end, sensor) in enumerate(columns):
         own = _over(rules, each[sensor]) if sensor < len(each) else rules
         for key, value in (("start_m", start), ("end_m", end), ("width_m", end - start)):
-            failed += [
-                c for c in _between(f"ray{ray}.gate.{key}", value, _get(own, "gate", key)) if not c.satisfied
-            ]
+            failed += [c for c in _between(f"ray{ray}.gate.{key}", value, _get(own, "gate", key)) if not c.satisfied]
     return failed
 
 

@@ -124,9 +124,7 @@ def from_labels(features: Features, labels: np.ndarray, bounds: Bounds) -> Mixtu
     placed = blank
     for step in (1.0, 0.0) if axes.angular else (0.0,):
         statistics = label_statistics(placed, features, labels)
-        rows = Statistics(
-            statistics.log_likelihood, mass[source], statistics.phi[source], statistics.tangent[source]
-        )
+        rows = Statistics(statistics.log_likelihood, mass[source], statistics.phi[source], statistics.tangent[source])
         placed = maximise(placed, rows, features, bounds, floors, step)
     return placed
 
@@ -146,22 +144,16 @@ def _matched(features: Features, labels: np.ndarray, bounds: Bounds) -> np.ndarr
     cost = np.zeros((count, count))
     azimuth, elevation = mean_directions(features, labels, count)
     mass = np.maximum(np.bincount(labels, features.weights, minlength=count), SMALLEST_CELL)
-    means = np.stack(
-        [np.bincount(labels, features.weights * column, minlength=count) for column in features.points.T]
-    )
+    means = np.stack([np.bincount(labels, features.weights * column, minlength=count) for column in features.points.T])
     means = (means / mass).T
     for component in range(count):
         one = bounds.take(np.full(count, component))
         turned = wrap_angle(clip_azimuth(azimuth, one) - azimuth) / features.angular_scale
-        tilted = (
-            np.clip(elevation, one.elevation_low, one.elevation_high) - elevation
-        ) / features.angular_scale
+        tilted = (np.clip(elevation, one.elevation_low, one.elevation_high) - elevation) / features.angular_scale
         moved = np.clip(means[:, :3], one.origin_low, one.origin_high) - means[:, :3]
         reach = np.clip(means[:, 5], one.start_low, one.end_high) - means[:, 5]
         unit = features.scale.max() if len(features.scale) else 1.0
-        cost[component] = (
-            np.square(turned) + np.square(tilted) + (np.square(moved).sum(1) + np.square(reach)) / unit**2
-        )
+        cost[component] = np.square(turned) + np.square(tilted) + (np.square(moved).sum(1) + np.square(reach)) / unit**2
     if not cost.any() or (cost == cost[0]).all():
         return labels
     # loaded here because most designs have one set of bounds for all sensors
@@ -191,9 +183,7 @@ def fit_mixture(
         start: Admissible parameters to continue from instead of seeds.
     """
     if start is None:
-        starts = [
-            seed(features, bounds, generator) for _ in range(1 if len(bounds) == 1 else max(restarts, 1))
-        ]
+        starts = [seed(features, bounds, generator) for _ in range(1 if len(bounds) == 1 else max(restarts, 1))]
         if len(starts) > 1:
             runs = [climb(one, features, bounds, iterations=RESTART_ITERATIONS) for one in starts]
             start = max(runs, key=lambda run: run.log_likelihood).mixture
@@ -205,9 +195,7 @@ def fit_mixture(
 
 def dead_components(mixture: Mixture, features: Features) -> np.ndarray:
     """Which components explain less than two effective samples, shape (K,) bool."""
-    return mixture.weights * effective_count(features.weights) < min(
-        DEAD_SAMPLES, len(features) / len(mixture)
-    )
+    return mixture.weights * effective_count(features.weights) < min(DEAD_SAMPLES, len(features) / len(mixture))
 
 
 def _revived(trace: Trace, features: Features, bounds: Bounds, generator: np.random.Generator) -> Trace:

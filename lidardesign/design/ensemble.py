@@ -114,9 +114,7 @@ def admitted(mixture: Mixture, features: Features, bounds: Bounds) -> Mixture:
     return maximise(mixture, expect(mixture, features), features, bounds, Floors.of(features), 0.0)
 
 
-def sensors_of(
-    ensemble: Ensemble, space: DesignSpace, level: float, *, by_weight: bool
-) -> tuple[Sensor, ...]:
+def sensors_of(ensemble: Ensemble, space: DesignSpace, level: float, *, by_weight: bool) -> tuple[Sensor, ...]:
     """The fitted components as sensors s0, s1, ...: heaviest first, or as in the constraint file."""
     rows = [
         _sensor(part, trace.mixture, row, space, level)

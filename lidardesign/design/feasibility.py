@@ -50,9 +50,7 @@ def check_feasible(constraints: Constraints, space: DesignSpace, *, sensors: int
 
 def _refuse(message: str, conflicts: Sequence[str]) -> None:
     names = [name for name in dict.fromkeys(conflicts) if name]
-    raise InfeasibleError(
-        f"{message} ({', '.join(names)})", conflicts=names, hint="relax one of the constraints named"
-    )
+    raise InfeasibleError(f"{message} ({', '.join(names)})", conflicts=names, hint="relax one of the constraints named")
 
 
 def _check_count(constraints: Constraints, sensors: int | None) -> None:
@@ -92,9 +90,7 @@ def _check_origin(constraints: Constraints, one: SensorConstraints, index: int, 
                     )
 
 
-def _check_boresight(
-    constraints: Constraints, one: SensorConstraints, index: int, space: DesignSpace
-) -> None:
+def _check_boresight(constraints: Constraints, one: SensorConstraints, index: int, space: DesignSpace) -> None:
     elevation = one.boresight.elevation_deg
     name = constraints.name_of(index, "boresight.elevation_deg.min")
     other = constraints.name_of(index, "boresight.elevation_deg.max")
@@ -210,15 +206,11 @@ def _check_budget(constraints: Constraints, sensors: int | None) -> None:
         return
     widths = [constraints.of_sensor(i).gate.width_m.min or 0.0 for i in range(max(len(constraints.each), 1))]
     model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
-    rays, rays_name = (
-        (budget.rays, "budget.rays") if budget.rays is not None else (int(least.value), least.name)
-    )
+    rays, rays_name = (budget.rays, "budget.rays") if budget.rays is not None else (int(least.value), least.name)
     needed = model.mbps_of_widths([min(widths)], rays)
     if needed > budget.bandwidth_mbps:
         single = model.mbps_of_widths([0.0], rays)
         names = [rays_name, "budget.bandwidth_mbps"]
         if single <= budget.bandwidth_mbps:
             names.append(constraints.name_of(widths.index(min(widths)), "gate.width_m.min"))
-        _refuse(
-            f"{rays} rays need at least {needed:g} Mbit/s, more than {budget.bandwidth_mbps:g} Mbit/s", names
-        )
+        _refuse(f"{rays} rays need at least {needed:g} Mbit/s, more than {budget.bandwidth_mbps:g} Mbit/s", names)

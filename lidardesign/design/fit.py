@@ -134,16 +134,12 @@ def fit(
     if layout == "scan":
         supports = _supports(request, 1)
         points = _features(request, supports, 1)[0]
-        fitted, score = fit_scan(
-            points.features, samples.space, constraints, points.group, read_out, level, seed
-        )
+        fitted, score = fit_scan(points.features, samples.space, constraints, points.group, read_out, level, seed)
         total: int | None = len(fitted)
         notes: tuple[str, ...] = ()
     else:
         supports, ensemble = _fitted(request, sensors)
-        ensemble, total = within_budget(
-            ensemble, Ensemble.narrowed, lambda e: (e.widths_m, e.weights), read_out
-        )
+        ensemble, total = within_budget(ensemble, Ensemble.narrowed, lambda e: (e.widths_m, e.weights), read_out)
         fitted = sensors_of(ensemble, samples.space, level, by_weight=not constraints.each)
         score, notes = ensemble.log_likelihood, ensemble.notes
     design = _design(fitted, layout, total, request, name, gates)
@@ -209,9 +205,7 @@ def _fitted(request: _Request, sensors: int | str | None) -> tuple[list[Support]
     counts = _sensor_counts(request.constraints, sensors)
     supports = _supports(request, counts[-1])
     count = counts[0] if len(counts) == 1 else _chosen_count(request, supports, counts)
-    kept = (
-        supports if len(supports) == len(groups(request.constraints, request.samples.space, count)) else None
-    )
+    kept = supports if len(supports) == len(groups(request.constraints, request.samples.space, count)) else None
     supports = kept or _supports(request, count)
     return supports, fit_parts(_features(request, supports, count), request.seed, request.restarts)
 

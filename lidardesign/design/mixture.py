@@ -93,9 +93,7 @@ def frames(azimuth_rad: np.ndarray, elevation_rad: np.ndarray, roll_rad: np.ndar
     forward = np.stack([cos_e * cos_a, cos_e * sin_a, sin_e], axis=-1)
     horizontal = np.stack([-sin_a, cos_a, np.zeros_like(sin_a)], axis=-1)
     vertical = np.stack([-sin_e * cos_a, -sin_e * sin_a, cos_e], axis=-1)
-    return np.stack(
-        [forward, cos_r * horizontal + sin_r * vertical, cos_r * vertical - sin_r * horizontal], axis=1
-    )
+    return np.stack([forward, cos_r * horizontal + sin_r * vertical, cos_r * vertical - sin_r * horizontal], axis=1)
 
 
 def angle_ratio(cosine: np.ndarray, out: np.ndarray, work: np.ndarray) -> np.ndarray:
@@ -114,9 +112,7 @@ def angle_ratio(cosine: np.ndarray, out: np.ndarray, work: np.ndarray) -> np.nda
 def linear_coefficients(mixture: Mixture, features: Features) -> np.ndarray:
     """Rows that turn the features Phi into log weight + log N(x) + log N(r) + angular constants, (K, F)."""
     axes, count = features.axes, len(features.axes.origin)
-    constant = np.log(np.maximum(mixture.weights, SMALLEST_WEIGHT)) - 0.5 * LOG_TWO_PI * (
-        axes.linear + axes.angular
-    )
+    constant = np.log(np.maximum(mixture.weights, SMALLEST_WEIGHT)) - 0.5 * LOG_TWO_PI * (axes.linear + axes.angular)
     linear = np.zeros((len(mixture), axes.linear))
     quadratic = np.zeros((len(mixture), len(features.pairs)))
     if count:
@@ -132,9 +128,7 @@ def linear_coefficients(mixture: Mixture, features: Features) -> np.ndarray:
     return np.concatenate([constant[:, None], linear, quadratic], axis=1)
 
 
-def _origin_coefficients(
-    mixture: Mixture, features: Features, linear: np.ndarray, quadratic: np.ndarray
-) -> np.ndarray:
+def _origin_coefficients(mixture: Mixture, features: Features, linear: np.ndarray, quadratic: np.ndarray) -> np.ndarray:
     axes = list(features.axes.origin)
     count = len(axes)
     scale = features.scale[:count]
@@ -270,22 +264,15 @@ def label_statistics(mixture: Mixture, features: Features, labels: np.ndarray) -
     used = (features.axes.horizontal, features.axes.vertical)
     rows = [u[i] if used[i] else np.zeros(len(labels)) for i in range(2)]
     tangent = [
-        [
-            np.bincount(labels, features.weights * a * b, minlength=count)
-            for b in (np.ones(len(labels)), *rows)
-        ]
+        [np.bincount(labels, features.weights * a * b, minlength=count) for b in (np.ones(len(labels)), *rows)]
         for a in rows
     ]
-    return Statistics(
-        float("nan"), scattered[0], np.stack(scattered, 1), np.moveaxis(np.array(tangent), 2, 0)
-    )
+    return Statistics(float("nan"), scattered[0], np.stack(scattered, 1), np.moveaxis(np.array(tangent), 2, 0))
 
 
 def mean_directions(features: Features, labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Azimuth and elevation of the mean unit vector of each cell, shape (K,) each [rad]."""
-    sums = np.stack(
-        [np.bincount(labels, features.weights * row, minlength=count) for row in features.directions]
-    )
+    sums = np.stack([np.bincount(labels, features.weights * row, minlength=count) for row in features.directions])
     azimuth = np.arctan2(sums[1], sums[0]) if features.axes.horizontal else np.zeros(count)
     elevation = np.arctan2(sums[2], np.hypot(sums[0], sums[1])) if features.axes.vertical else np.zeros(count)
     return np.asarray(wrap_angle(azimuth)), elevation

@@ -48,9 +48,7 @@ def maximise(
         mixture, statistics.tangent / mass[:, None, None], features, bounds, floors, step
     )
     weights = np.maximum(statistics.mass, SMALLEST_WEIGHT)
-    fresh = Mixture(
-        weights / weights.sum(), origin, covariance, azimuth, elevation, roll, angular, mean, spread
-    )
+    fresh = Mixture(weights / weights.sum(), origin, covariance, azimuth, elevation, roll, angular, mean, spread)
     return fresh if alive.all() else _keep_dead(mixture, fresh, alive)
 
 
@@ -58,9 +56,7 @@ def _keep_dead(old: Mixture, fresh: Mixture, alive: np.ndarray) -> Mixture:
     rows = {}
     for name in fresh.__dataclass_fields__:
         new, kept = getattr(fresh, name), getattr(old, name)
-        rows[name] = (
-            new if name == "weights" else np.where(alive.reshape(-1, *[1] * (new.ndim - 1)), new, kept)
-        )
+        rows[name] = new if name == "weights" else np.where(alive.reshape(-1, *[1] * (new.ndim - 1)), new, kept)
     return Mixture(**rows)
 
 
@@ -108,9 +104,7 @@ def _range(
     return fit_gate(features.centre[-1] + scale * first, variance, bounds, floors.range_m)
 
 
-def fit_gate(
-    mean: np.ndarray, variance: np.ndarray, bounds: Bounds, floor: float
-) -> tuple[np.ndarray, np.ndarray]:
+def fit_gate(mean: np.ndarray, variance: np.ndarray, bounds: Bounds, floor: float) -> tuple[np.ndarray, np.ndarray]:
     r"""Mean and spread of a normal distribution whose interval m -+ z s keeps bounds, at its best.
 
     For a spread s the best mean is the sample mean clipped to [max(start_low + z s, end_low - z s),
@@ -213,11 +207,7 @@ def _moved(
     step = step * np.array(used, dtype=np.float64)
     forward = exponential(frames(mixture.azimuth_rad, mixture.elevation_rad, np.zeros(len(mixture))), step)
     azimuth = np.arctan2(forward[:, 1], forward[:, 0]) if used[0] else mixture.azimuth_rad
-    elevation = (
-        np.arctan2(forward[:, 2], np.hypot(forward[:, 0], forward[:, 1]))
-        if used[1]
-        else mixture.elevation_rad
-    )
+    elevation = np.arctan2(forward[:, 2], np.hypot(forward[:, 0], forward[:, 1])) if used[1] else mixture.elevation_rad
     still = (step == 0).all(axis=1)
     azimuth = clip_azimuth(np.where(still, mixture.azimuth_rad, azimuth), bounds)
     elevation = np.where(still, mixture.elevation_rad, elevation)

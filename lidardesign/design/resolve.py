@@ -75,9 +75,7 @@ def groups(constraints: Constraints, space: DesignSpace, count: int) -> list[Gro
     return [Group(pins, tuple(sensors)) for pins, sensors in members.items()]
 
 
-def bounds_of(
-    constraints: Constraints, space: DesignSpace, sensors: tuple[int, ...], interval: float
-) -> Bounds:
+def bounds_of(constraints: Constraints, space: DesignSpace, sensors: tuple[int, ...], interval: float) -> Bounds:
     """The bounds of some sensors' components, one row each.
 
     Arguments:
@@ -87,9 +85,7 @@ def bounds_of(
         interval: z, half an interval in standard deviations.
     """
     axes = Axes.of(space)
-    distinct = {
-        i: _row(constraints.of_sensor(i), space, axes, interval) for i in _distinct(constraints, sensors)
-    }
+    distinct = {i: _row(constraints.of_sensor(i), space, axes, interval) for i in _distinct(constraints, sensors)}
     last = len(constraints.each)
     rows = [distinct[min(i, last)] for i in sensors]
     arrays = {key: np.array([row[key] for row in rows]) for key in rows[0]}

@@ -76,9 +76,7 @@ def _in_sight(points: np.ndarray, one: object, space: DesignSpace) -> np.ndarray
     """Directions that a sensor with bounded boresight and bounded field of view can reach."""
     widest = one.field_of_view.horizontal_deg.max, one.field_of_view.vertical_deg.max
     aims = one.boresight
-    bounded = any(
-        v is not None for part in (aims.azimuth_deg, aims.elevation_deg) for v in (part.min, part.max)
-    )
+    bounded = any(v is not None for part in (aims.azimuth_deg, aims.elevation_deg) for v in (part.min, part.max))
     if None in widest or not bounded:
         return np.ones(len(points), dtype=bool)
     low, high = azimuth_interval(one, space)

@@ -1,0 +1,229 @@
+"""From samples to designs: budgets, counts, groups, pinned origins and scans."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from lidardesign.design.constraints import Constraints
+from lidardesign.design.files import design_document
+from lidardesign.design.fit import fit
+from lidardesign.design.resolve import Group
+from lidardesign.design.samples import Samples
+from lidardesign.design.support import pinned, restricted
+from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.space import DesignSpace, aim, observed_point
+
+FACE = DesignSpace((0.0, 0.0, 0.0, -0.6, -0.6, 0.05), (0.0, 0.0, 0.0, 0.6, 0.6, 1.05))
+FREE = DesignSpace((-0.05, -0.05, -0.05, -0.8, -0.8, 0.05), (0.05, 0.05, 0.05, 0.8, 0.8, 1.5))
+CENTRE, WIDTH = np.array([0.6, 0.0, 0.05]), 0.06
+
+
+def log_target(points):
+    """A Gaussian blob of scene points, per solid angle and range from anywhere."""
+    return -0.5 * np.square((observed_point(points) - CENTRE) / WIDTH).sum(axis=-1)
+
+
+def blob(space, count=8000, seed=0):
+    """Samples of p*(d) = blob(M(d)) through scene points: their density per design point is blob r^2."""
+    generator = np.random.default_rng(seed)
+    scene = CENTRE + WIDTH * generator.standard_normal((count, 3))
+    low, high = np.array(space.low[:3]), np.array(space.high[:3])
+    points = space.wrap(aim(low + (high - low) * generator.uniform(size=(count, 3)), scene))
+    points = points[space.contains(points)]
+    target = log_target(points)
+    return Samples(points, target + 2 * np.log(points[:, 5]), target, space)
+
+
+FIXED, MOVING = blob(FACE), blob(FREE)
+
+
+def constrained(**values):
+    return Constraints.from_mapping(values)
+
+
+def test_results_have_the_contract_keys_and_survive_json():
+    result = fit(FIXED, sensors=3, rays=50, em_samples=2000, restarts=2)
+    document = json.loads(json.dumps(result.as_dict()))
+    keys = {"design", "sensors", "log_likelihood", "admissible_mass", "ess", "satisfied", "constraints", "seconds"}
+    assert keys <= set(document)
+    assert document["satisfied"] is True
+    assert document["admissible_mass"] == pytest.approx(1.0)
+    assert 0 < document["ess"] <= 1
+    assert [s["name"] for s in document["sensors"]] == ["s0", "s1", "s2"]
+
+
+def test_the_same_seed_gives_the_same_design():
+    one, other = (fit(FIXED, sensors=3, em_samples=2000, seed=5) for _ in range(2))
+    assert design_document(one.design) == design_document(other.design)
+
+
+def test_a_fixed_origin_is_exact_and_has_no_spread():
+    for sensor in fit(FIXED, sensors=2, em_samples=2000).design.sensors:
+        np.testing.assert_array_equal(sensor.origin_m, 0.0)
+        np.testing.assert_array_equal(sensor.origin_covariance_m2, 0.0)
+
+
+@pytest.mark.parametrize("layout", ["grid", "density", "scan"])
+def test_rays_sum_to_the_budget_in_every_layout(layout):
+    result = fit(FIXED, sensors=3, layout=layout, rays=37, em_samples=2000, restarts=1)
+    design = result.design
+    assert design.rays == 37
+    assert sum(sensor.rays for sensor in design.sensors) == 37
+    assert result.satisfied
+    assert (layout == "density") == (design.ray_table is not None)
+
+
+def test_sensors_are_ordered_by_weight():
+    weights = [s.weight for s in fit(FIXED, sensors=4, em_samples=2000).design.sensors]
+    assert weights == sorted(weights, reverse=True)
+    assert sum(weights) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("layout", ["grid", "scan"])
+def test_a_bandwidth_budget_narrows_the_gates_until_it_holds(layout):
+    free = fit(FIXED, sensors=3, rays=100, layout=layout, em_samples=2000)
+    limit = 0.04 * 4
+    tight = fit(
+        FIXED,
+        sensors=None if layout == "scan" else 3,
+        rays=100,
+        layout=layout,
+        em_samples=2000,
+        constraints=constrained(budget={"bandwidth_mbps": limit}),
+    )
+    check = next(c for c in tight.constraints if c.name == "budget.bandwidth_mbps")
+    assert check.value <= limit
+    assert tight.satisfied
+    assert tight.log_likelihood <= free.log_likelihood + 1e-9
+    assert check.value > 0.5 * limit
+
+
+def test_without_a_ray_count_the_bandwidth_chooses_one():
+    result = fit(FIXED, sensors=2, em_samples=2000, constraints=constrained(budget={"bandwidth_mbps": 0.5}))
+    value = next(c for c in result.constraints if c.name == "budget.bandwidth_mbps").value
+    assert result.design.rays > 2
+    assert 0.45 < value <= 0.5
+
+
+def test_the_automatic_count_finds_separate_clusters():
+    generator = np.random.default_rng(1)
+    points = np.zeros((6000, 6))
+    which = generator.integers(3, size=6000)
+    points[:, 3] = np.array([-0.4, 0.0, 0.4])[which] + 0.02 * generator.standard_normal(6000)
+    points[:, 4] = 0.02 * generator.standard_normal(6000)
+    points[:, 5] = np.array([0.4, 0.6, 0.8])[which] + 0.02 * generator.standard_normal(6000)
+    samples = Samples(points, np.zeros(6000), np.zeros(6000), FACE)
+    assert len(fit(samples, sensors="auto", em_samples=3000).design.sensors) == 3
+    limited = fit(samples, sensors="auto", em_samples=3000, constraints=constrained(sensors={"max": 2}))
+    assert len(limited.design.sensors) == 2
+
+
+def test_each_entry_rules_its_own_sensor():
+    rules = constrained(each=[{"boresight": {"azimuth_deg": {"max": -2}}}, {"boresight": {"azimuth_deg": {"min": 2}}}])
+    result = fit(FIXED, em_samples=2000, constraints=rules)
+    assert result.satisfied
+    turned = [math.degrees(math.remainder(s.azimuth_rad, 2 * math.pi)) for s in result.design.sensors]
+    assert turned[0] <= -2
+    assert turned[1] >= 2
+
+
+def test_a_box_keeps_mean_origins_inside_and_reports_its_mass():
+    rules = constrained(origin={"low_m": [0.0, -0.05, -0.05], "high_m": [0.05, 0.05, 0.05], "spread_m": {"max": 0.01}})
+    result = fit(MOVING, sensors=2, em_samples=2000, constraints=rules)
+    assert result.satisfied
+    # nearer origins see the scene over more solid angle: the shares are as the squared inverse distances
+    near, far = 0.575**-2, 0.625**-2
+    assert result.admissible_mass == pytest.approx(near / (near + far), abs=0.03)
+    for sensor in result.design.sensors:
+        assert 0 <= sensor.origin_m[0] <= 0.05
+        assert np.linalg.eigvalsh(sensor.origin_covariance_m2)[-1] <= 0.01**2
+
+
+def test_a_set_that_holds_almost_nothing_is_refused_with_its_mass():
+    with pytest.raises(InfeasibleError) as caught:
+        fit(FIXED, sensors=2, constraints=constrained(gate={"end_m": {"max": 0.2}}))
+    assert caught.value.admissible_mass < 1e-3
+    assert caught.value.exit_code == 4
+
+
+def test_pinning_a_free_origin_needs_the_target():
+    with pytest.raises(ConfigError, match="target density"):
+        fit(MOVING, sensors=2, constraints=constrained(origin={"fixed_m": [0.02, 0.0, 0.0]}))
+
+
+def test_samples_of_a_pinned_origin_have_the_density_seen_from_there():
+    where = [0.04, -0.03, 0.02]
+    rules = constrained(origin={"fixed_m": where})
+    support = pinned(MOVING, rules, Group(tuple(where), (0,)), log_target, 8000, np.random.default_rng(0))
+    weights = support.weights / support.weights.sum()
+    fixed = DesignSpace((*where, *FREE.low[3:]), (*where, *FREE.high[3:]))
+    direct = blob(fixed, 40_000, seed=3)
+    # p* from the pinned origin: blob samples there, reweighted from their density blob r^2 to blob
+    for statistic in (lambda p: p[:, 3], lambda p: p[:, 4], lambda p: p[:, 5], lambda p: p[:, 5] ** 2):
+        expected = direct.weights @ statistic(direct.points)
+        assert weights @ statistic(support.points) == pytest.approx(expected, abs=0.004)
+
+
+def test_pinned_designs_sit_exactly_where_they_were_pinned():
+    where = [0.04, -0.03, 0.02]
+    result = fit(
+        MOVING, sensors=2, em_samples=3000, constraints=constrained(origin={"fixed_m": where}), retarget=log_target
+    )
+    assert result.satisfied
+    assert result.admissible_mass is None
+    for sensor in result.design.sensors:
+        np.testing.assert_array_equal(sensor.origin_m, where)
+        np.testing.assert_array_equal(sensor.origin_covariance_m2, 0.0)
+
+
+def test_sensors_may_be_pinned_to_different_origins():
+    places = [[0.04, 0.0, 0.0], [-0.04, 0.0, 0.0]]
+    rules = constrained(each=[{"origin": {"fixed_m": place}} for place in places])
+    result = fit(MOVING, em_samples=3000, constraints=rules, retarget=log_target)
+    assert result.satisfied
+    assert [list(s.origin_m) for s in result.design.sensors] == places
+    # nearer sensors see the same scene over more solid angle
+    assert result.design.sensors[0].weight > result.design.sensors[1].weight
+
+
+def test_a_thin_box_pins_one_coordinate():
+    rules = constrained(origin={"low_m": [-0.05, -0.05, 0.01], "high_m": [0.05, 0.05, 0.01]})
+    result = fit(MOVING, sensors=1, em_samples=3000, constraints=rules, retarget=log_target)
+    sensor = result.design.sensors[0]
+    assert result.satisfied
+    assert sensor.origin_m[2] == 0.01
+    assert sensor.origin_covariance_m2[0, 0] > 1e-5
+    np.testing.assert_array_equal(sensor.origin_covariance_m2[2], 0.0)
+
+
+def test_the_support_outside_the_gate_is_left_out():
+    rules = constrained(gate={"end_m": {"max": 0.6}})
+    support = restricted(FIXED, rules, Group((None, None, None), (0,)))
+    assert support.points[:, 5].max() <= 0.6
+    assert support.total == pytest.approx(FIXED.weights[FIXED.points[:, 5] <= 0.6].sum())
+
+
+def test_every_ray_of_a_scan_is_a_sensor_with_a_gate_of_its_own():
+    scan, grid = (fit(FIXED, sensors=2, layout=layout, rays=64, em_samples=4000) for layout in ("scan", "grid"))
+    assert len(scan.design.sensors) == 64
+    narrow = np.mean([np.diff(s.gate_m) for s in scan.design.sensors])
+    assert narrow < np.mean([np.diff(s.gate_m) for s in grid.design.sensors])
+    assert scan.log_likelihood > grid.log_likelihood - 0.5
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"sensors": 0}, {"sensors": "many"}, {"rays": 0}, {"layout": "scan"}],
+)
+def test_options_that_make_no_sense_are_config_errors(options):
+    with pytest.raises(ConfigError):
+        fit(FIXED, **options)
+
+
+def test_fewer_rays_than_sensors_is_infeasible():
+    with pytest.raises(InfeasibleError):
+        fit(FIXED, sensors=4, rays=3)
