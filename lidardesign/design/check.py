@@ -169,7 +169,10 @@ def _largest_eigenvalue(matrix: Any) -> float:
 
 
 def _boresight(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], space: Any) -> list[ConstraintCheck]:
-    """Elevation, and azimuth on the circle; an end that is not given is the space's, or else 0 or 360 degrees."""
+    """Elevation, and azimuth on the circle; an end that is not given is the space's.
+
+    Without a space a single bound says little: it is then read as the half circle beyond it.
+    """
     elevation = math.degrees(sensor["boresight"]["elevation_rad"])
     checks = _between(f"{name}.boresight.elevation_deg", elevation, _get(rules, "boresight", "elevation_deg"))
     given = _get(rules, "boresight", "azimuth_deg") or {}
@@ -177,9 +180,11 @@ def _boresight(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], s
     if low is None and high is None:
         return checks
     azimuth = math.degrees(sensor["boresight"]["azimuth_rad"])
-    turn = _get(space, "azimuth_rad") or [0.0, 2 * math.pi]
-    low = math.degrees(turn[0]) if low is None else low
-    high = math.degrees(turn[1]) if high is None else high
+    turn = _get(space, "azimuth_rad")
+    if low is None:
+        low = high - 180 if turn is None else math.degrees(turn[0])
+    if high is None:
+        high = low + 180 if turn is None else math.degrees(turn[1])
     width = high - low if high - low >= 360 else (high - low) % 360
     past = (azimuth - low) % 360
     kept = past <= width + _slack(360) or past >= 360 - _slack(360)
@@ -214,6 +219,7 @@ def _worse(name: str, values: list[float], rules: Any) -> list[ConstraintCheck]:
 
 
 def _inside_space(name: str, sensor: Mapping[str, Any], space: Mapping[str, Any]) -> list[ConstraintCheck]:
+    """Gates and mean origins inside the design space; origins are listed where they are not."""
     near, far = (float(v) for v in space["range_m"])
     start, end = float(sensor["gate_m"]["start"]), float(sensor["gate_m"]["end"])
     inside = start >= near - _slack(near) and end <= far + _slack(far)
@@ -221,7 +227,8 @@ def _inside_space(name: str, sensor: Mapping[str, Any], space: Mapping[str, Any]
     for value, key in zip(sensor["origin_m"]["mean"], ("x_m", "y_m", "z_m"), strict=True):
         low, high = (float(v) for v in space[key])
         kept = low - _slack(low) <= value <= high + _slack(high)
-        checks.append(ConstraintCheck(f"{name}.space.{key}", [low, high], value, bool(kept)))
+        if not kept:
+            checks.append(ConstraintCheck(f"{name}.space.{key}", [low, high], value, False))
     return checks
 
 

@@ -131,17 +131,7 @@ def fit(
     _check_options(constraints, samples, sensors, layout, rays)
     request = _Request(samples, constraints, seed, restarts, em_samples, level, retarget)
     read_out = ReadOut.of(constraints.budget, rays)
-    if layout == "scan":
-        supports = _supports(request, 1)
-        points = _features(request, supports, 1)[0]
-        fitted, score = fit_scan(points.features, samples.space, constraints, points.group, read_out, level, seed)
-        total: int | None = len(fitted)
-        notes: tuple[str, ...] = ()
-    else:
-        supports, ensemble = _fitted(request, sensors)
-        ensemble, total = within_budget(ensemble, Ensemble.narrowed, lambda e: (e.widths_m, e.weights), read_out)
-        fitted = sensors_of(ensemble, samples.space, level, by_weight=not constraints.each)
-        score, notes = ensemble.log_likelihood, ensemble.notes
+    supports, fitted, total, score, notes = _solved(request, read_out, sensors, layout)
     design = _design(fitted, layout, total, request, name, gates)
     checks = check_design(_document(design), constraints, samples.space)
     return FitResult(
@@ -154,6 +144,22 @@ def fit(
         seconds=time.perf_counter() - started,
         notes=notes,
     )
+
+
+def _solved(
+    request: _Request, read_out: ReadOut, sensors: int | str | None, layout: Layout
+) -> tuple[list[Support], tuple[Sensor, ...], int | None, float, tuple[str, ...]]:
+    """Samples, sensors, rays per frame, log-likelihood and notes of the fit that keeps its budget."""
+    constraints, space = request.constraints, request.samples.space
+    if layout == "scan":
+        supports = _supports(request, 1)
+        part = _features(request, supports, 1)[0]
+        beams, score = fit_scan(part.features, space, constraints, part.group, read_out, request.level, request.seed)
+        return supports, beams, len(beams), score, ()
+    supports, ensemble = _fitted(request, sensors)
+    ensemble, total = within_budget(ensemble, Ensemble.narrowed, lambda e: (e.widths_m, e.weights), read_out)
+    fitted = sensors_of(ensemble, space, request.level, by_weight=not constraints.each)
+    return supports, fitted, total, ensemble.log_likelihood, ensemble.notes
 
 
 def _check_options(
