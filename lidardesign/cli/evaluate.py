@@ -154,13 +154,9 @@ def _request(
 ) -> EvaluationRequest:
     from lidardesign.design.samples import FILE_NAME, load_samples
     from lidardesign.evaluate.score import EvaluationRequest
-    from lidardesign.registry import plugin_guard
 
     config, task = run.config, run.task
     seed = config.seed if seed is None else seed
-    with plugin_guard(task.name):
-        train = task.scenes(config.task, "train", seed)
-        test = task.scenes(config.task, "test", seed)
     samples = {
         entry.design.name: load_samples(entry.run.folder)
         for entry in entries
@@ -175,8 +171,8 @@ def _request(
         rays=sorted(set(rays or task.defaults.rays)),
         baselines=tuple(dict.fromkeys([*ALWAYS, *baselines])),
         samples=samples,
-        train=train,
-        test=test,
+        train=run.scenes("train", seed),
+        test=run.scenes("test", seed),
         lay_out=_lay_out,
     )
 

@@ -13,7 +13,8 @@ from lidardesign.errors import ConfigError, DataError
 if TYPE_CHECKING:
     from lidardesign.design.sensor import Design
     from lidardesign.run.config import RunConfig
-    from lidardesign.task import Task
+    from lidardesign.scene import Scene
+    from lidardesign.task import Split, Task
 
 DESIGN_FOLDER = "designs"
 NAME_PATTERN = re.compile(r"[^\W.][\w.+-]{0,99}")
@@ -30,6 +31,18 @@ class Run:
     def design_path(self, name: str) -> Path:
         """Where a design of this run is written."""
         return self.folder / DESIGN_FOLDER / f"{name}.yaml"
+
+    def scenes(self, split: Split, seed: int) -> list[Scene]:
+        """The scenes of a split, judged by the run's own design space.
+
+        Raises:
+            PluginError: The task's own code failed.
+        """
+        from lidardesign.registry import plugin_guard
+        from lidardesign.task import scenes_of
+
+        with plugin_guard(self.task.name):
+            return list(scenes_of(self.task, self.config.task, split, seed, self.config.space))
 
     def designs(self) -> list[Path]:
         """The designs of this run by name."""
