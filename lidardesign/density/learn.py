@@ -15,10 +15,10 @@ from lidardesign.density.diagnostics import coverage, quality
 from lidardesign.density.flow import DesignFlow
 from lidardesign.density.losses import Pool, draw_conditions
 from lidardesign.density.objective import Coordinates
-from lidardesign.density.proposals import occluded_share, propose
-from lidardesign.density.target import Target, build_target
+from lidardesign.density.prepare import prepare_target
+from lidardesign.density.proposals import propose
+from lidardesign.density.target import Target
 from lidardesign.density.training import PROGRESS, LearnProgress, Trainer
-from lidardesign.density.visibility import Optics
 from lidardesign.design.samples import Samples, save_samples
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.checkpoint import save_arrays
@@ -30,8 +30,6 @@ from lidardesign.task import Task, random_generator, scenes_of
 
 FLOW = "flow.safetensors"
 SAMPLE_CHUNK = 16384
-PROBES = 4096
-OCCLUDED_SHARE_TO_CARE = 1e-3
 CONDITION_GROUPS = 32
 
 
@@ -124,7 +122,7 @@ def learn(
         timings=clock.timings,
         **figures,
     )
-    note(run, learn=result.as_dict(), timings=clock.timings)
+    note(run, learn=result.as_dict(), timings=clock.timings, visibility=target.visibility.name)
     return result
 
 
@@ -139,51 +137,6 @@ def choose_device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise ConfigError("no CUDA device is available", where="--device", allowed="auto, cpu")
     return torch.device(name)
-
-
-def prepare_target(scenes: Sequence[Scene], config: RunConfig) -> tuple[Target, list[str]]:
-    """The target of training scenes with visibility `auto` decided, and notes on what was decided or is doubtful."""
-    settings, notes = config.density, []
-    visibility = settings.visibility
-    if visibility == "auto":
-        visibility, reason = _choose_visibility(scenes, config)
-        notes.append(reason)
-    target = build_target(scenes, config.space, settings, visibility)
-    if visibility == "quadrature":
-        target, refined = _refine_quadrature(target, scenes, config)
-        notes.extend(refined)
-    notes.extend(_resolution_notes(target, settings.sigma_m))
-    shapes = [body.shape for scene in scenes for body in scene.bodies]
-    notes.extend(sorted({line for shape in shapes for line in getattr(shape, "notes", ())}))
-    return target, notes
-
-
-def _choose_visibility(scenes: Sequence[Scene], config: RunConfig) -> tuple[str, str]:
-    generator = random_generator(config.seed, "visibility")
-    optics = Optics.of(config.density)
-    proposals = propose(scenes, config.space, PROBES, optics.sigma_m, generator)
-    share = occluded_share(scenes, proposals, optics.margin_m + 3 * optics.sigma_m)
-    if share < OCCLUDED_SHARE_TO_CARE:
-        return "off", f"visibility off: of {len(proposals.points)} probed rays {share:.2%} had anything in the way"
-    return "raycast", f"visibility by ray casting: {share:.1%} of {len(proposals.points)} probed rays were occluded"
-
-
-def _refine_quadrature(target: Target, scenes: Sequence[Scene], config: RunConfig) -> tuple[Target, list[str]]:
-    from lidardesign.density.refinement import refine_quadrature
-
-    generator = random_generator(config.seed, "quadrature")
-    proposals = propose(scenes, config.space, PROBES, config.density.sigma_m, generator)
-    return refine_quadrature(target, scenes, proposals.points)
-
-
-def _resolution_notes(target: Target, sigma_m: float) -> list[str]:
-    grid = getattr(target.field, "grid", None)
-    if grid is None or sigma_m >= grid.step / 2:
-        return []
-    return [
-        f"sigma {sigma_m:g} m is below half the field's grid step {grid.step:.3g} m: "
-        "surfaces are blurred more than sigma says; raise density.field_resolution"
-    ]
 
 
 def _trainer(

@@ -1,0 +1,67 @@
+"""The target of a run's training scenes: visibility decided, quadrature refined, doubts noted. Needs no torch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lidardesign.density.proposals import occluded_share, propose
+from lidardesign.density.refinement import refine_quadrature
+from lidardesign.density.target import Target, build_target
+from lidardesign.density.visibility import Optics
+from lidardesign.run.config import RunConfig
+from lidardesign.scene import Scene
+from lidardesign.task import random_generator
+
+PROBES = 4096
+OCCLUDED_SHARE_TO_CARE = 1e-3
+
+
+def prepare_target(
+    scenes: Sequence[Scene], config: RunConfig, *, visibility: str | None = None
+) -> tuple[Target, list[str]]:
+    """The target of training scenes, and notes on what was decided or is doubtful.
+
+    Arguments:
+        scenes: The training scenes.
+        config: The run's configuration; visibility `auto` is decided here by a probe.
+        visibility: What an earlier probe of the same run decided, to take instead.
+    """
+    settings, notes = config.density, []
+    visibility = visibility or settings.visibility
+    if visibility == "auto":
+        visibility, reason = _choose_visibility(scenes, config)
+        notes.append(reason)
+    target = build_target(scenes, config.space, settings, visibility)
+    if visibility == "quadrature":
+        target, refined = _refine_quadrature(target, scenes, config)
+        notes.extend(refined)
+    notes.extend(_resolution_notes(target, settings.sigma_m))
+    shapes = [body.shape for scene in scenes for body in scene.bodies]
+    notes.extend(sorted({line for shape in shapes for line in getattr(shape, "notes", ())}))
+    return target, notes
+
+
+def _choose_visibility(scenes: Sequence[Scene], config: RunConfig) -> tuple[str, str]:
+    generator = random_generator(config.seed, "visibility")
+    optics = Optics.of(config.density)
+    proposals = propose(scenes, config.space, PROBES, optics.sigma_m, generator)
+    share = occluded_share(scenes, proposals, optics.margin_m + 3 * optics.sigma_m)
+    if share < OCCLUDED_SHARE_TO_CARE:
+        return "off", f"visibility off: of {len(proposals.points)} probed rays {share:.2%} had anything in the way"
+    return "raycast", f"visibility by ray casting: {share:.1%} of {len(proposals.points)} probed rays were occluded"
+
+
+def _refine_quadrature(target: Target, scenes: Sequence[Scene], config: RunConfig) -> tuple[Target, list[str]]:
+    generator = random_generator(config.seed, "quadrature")
+    proposals = propose(scenes, config.space, PROBES, config.density.sigma_m, generator)
+    return refine_quadrature(target, scenes, proposals.points)
+
+
+def _resolution_notes(target: Target, sigma_m: float) -> list[str]:
+    grid = getattr(target.field, "grid", None)
+    if grid is None or sigma_m >= grid.step / 2:
+        return []
+    return [
+        f"sigma {sigma_m:g} m is below half the field's grid step {grid.step:.3g} m: "
+        "surfaces are blurred more than sigma says; raise density.field_resolution"
+    ]
