@@ -173,7 +173,7 @@ def feasible(draw):
     if draw(st.booleans()):
         low = draw(st.floats(0, 20))
         values["field_of_view"] = {
-            "horizontal_deg": {"min": low, "max": low + draw(st.floats(0, 60))},
+            "horizontal_deg": {"min": low, "max": low + draw(st.floats(0.1, 60))},
             "vertical_deg": {"max": draw(st.floats(1, 60))},
         }
     if draw(st.booleans()):

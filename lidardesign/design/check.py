@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Any
 
+import numpy as np
+
 # Rounding of the checker's own conversions between radians and degrees, as a share of the bound.
 ROUNDING = 1e-12
 # A reported interval may differ from its mean and spread by this share (decimal digits in a file).
@@ -146,26 +148,12 @@ def _origin(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any]) -> l
             kept = all(test(value, limit) for value, limit in zip(mean, bound, strict=True))
             checks.append(ConstraintCheck(f"{name}.origin.{key}", list(bound), list(mean), bool(kept)))
     largest = _get(rules, "origin", "spread_m", "max")
-    spread = math.sqrt(max(_largest_eigenvalue(covariance), 0.0))
+    spread = math.sqrt(max(float(np.linalg.eigvalsh(np.array(covariance, dtype=np.float64))[-1]), 0.0))
     if largest is not None:
         checks += _between(f"{name}.origin.spread_m", spread, {"max": largest})
     if _get(rules, "origin", "fixed_m") is not None:
         checks.append(ConstraintCheck(f"{name}.origin.fixed_m.spread", 0.0, spread, spread == 0.0))
     return checks
-
-
-def _largest_eigenvalue(matrix: Any) -> float:
-    """Of a symmetric 3x3 matrix, in closed form (O. K. Smith, Eigenvalues of a symmetric 3x3 matrix, 1961)."""
-    (a, d, f), (_, b, e), (_, _, c) = matrix
-    off = d * d + e * e + f * f
-    if off == 0:
-        return max(a, b, c)
-    q = (a + b + c) / 3
-    p = math.sqrt(((a - q) ** 2 + (b - q) ** 2 + (c - q) ** 2 + 2 * off) / 6)
-    x, y, w = (a - q) / p, (b - q) / p, (c - q) / p
-    u, v, t = d / p, e / p, f / p
-    half_determinant = (x * (y * w - v * v) - u * (u * w - v * t) + t * (u * v - y * t)) / 2
-    return q + 2 * p * math.cos(math.acos(min(max(half_determinant, -1.0), 1.0)) / 3)
 
 
 def _boresight(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], space: Any) -> list[ConstraintCheck]:

@@ -33,6 +33,8 @@ SEED_LLOYD_ITERATIONS = 4
 # A component that explains less than this many effective samples has died.
 DEAD_SAMPLES = 2.0
 MOST_REVIVALS = 3
+# Shorter boresight steps than this share are as good as none.
+SMALLEST_STEP = 0.02
 # Mass that stands for an empty cell, so that its mean is finite.
 SMALLEST_CELL = 1e-300
 
@@ -85,7 +87,8 @@ def climb(
             break
         mixture, statistics = proposal, outcome
         history.append(max(_finite(statistics), history[-1]))
-        if gain < tolerance_nats:
+        # a shortened boresight step may gain little and the next one more
+        if gain < tolerance_nats and (step >= 1.0 or step < SMALLEST_STEP):
             break
     return Trace(mixture, history[-1], tuple(history))
 
