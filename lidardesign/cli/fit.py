@@ -112,7 +112,7 @@ def fit_and_write(
 
 def _log_target(run: Run, points: np.ndarray) -> np.ndarray:
     """log p* of design points, (N, 6) to (N,): only a pinned origin needs it, and only then it is loaded."""
-    from lidardesign.density.learn import prepare_target
+    from lidardesign.density.prepare import prepare_target
 
     target, _ = prepare_target(run.scenes("train", run.config.seed), run.config)
     return target.log_density(points)
