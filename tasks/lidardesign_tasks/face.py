@@ -30,9 +30,7 @@ from lidardesign_tasks.surface import surface_score, with_visible_truth
 Vector = tuple[float, float, float]
 # columns: the world's x, y, z are the model's z (out of the face), x (to the head's left) and y (up)
 WORLD_AXES = [2, 0, 1]
-LARGEST_COEFFICIENT = (
-    3.0  # identities further from the mean than this in any mode are cut, as no faces are so
-)
+LARGEST_COEFFICIENT = 3.0  # identities further from the mean than this in any mode are cut: no faces are so
 
 
 class FaceConfig(TaskConfig):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -18,12 +20,45 @@ COVERED_M = 0.010
 STEEPEST_DEG = 85.0  # flatter triangles bridge depth steps: with dense rays they made up half of the error
 
 
+@dataclass(frozen=True, eq=False)
+class VisibleTruth(Mapping[str, SurfaceCloud]):
+    """The truth of a scene under the key `surface`, found when it is first asked for: learning never asks.
+
+    Arguments:
+        scene: The scene without a truth.
+        space: What the sensors may do.
+        points: Points of the cloud.
+        seed: Of their random places.
+    """
+
+    scene: Scene
+    space: DesignSpace
+    points: int
+    seed: int
+
+    @cached_property
+    def surface(self) -> SurfaceCloud:
+        """The part of the targets that some admissible ray sees; raises DataError where there is none."""
+        return visible_surface(self.scene, self.space, self.points, random_generator(self.seed, "truth"))
+
+    def __getitem__(self, key: str) -> SurfaceCloud:
+        if key != "surface":
+            raise KeyError(key)
+        return self.surface
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(("surface",))
+
+    def __len__(self) -> int:
+        return 1
+
+
 def with_visible_truth(
     scene: Scene, space: DesignSpace, points: int, generator: np.random.Generator
 ) -> Scene:
     """The scene with what some admissible ray can see as its truth: `surface`, a `SurfaceCloud`."""
-    cloud = visible_surface(scene, space, points, generator)
-    return Scene(scene.bodies, scene.name, {**scene.truth, "surface": cloud}, scene.frame_rate_hz)
+    truth = VisibleTruth(scene, space, points, int(generator.integers(2**62)))
+    return Scene(scene.bodies, scene.name, truth, scene.frame_rate_hz)
 
 
 def reconstruct(returns: Sequence[Returns]) -> SurfaceCloud | None:
