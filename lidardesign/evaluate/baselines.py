@@ -7,7 +7,8 @@ training scenes is taken at each number of rays.
 - `uniform`: rays even in azimuth and elevation over the whole design space (the paper's grid), with the whole
   range as their gate. Free origin axes join the layout: two free axes in all give a grid, more a
   low-discrepancy set.
-- `random`: rays uniform in the measure of the design space, with the whole range as their gate.
+- `random`: rays uniform in the measure of the design space, with the whole range as their gate, drawn anew for
+  every scene.
 - `bounding`: the even layout again, cropped per axis to the central 99 % of the training returns in angle and
   range. With free origins the better of two, on training scenes: parallel rays (vertical where the space
   allows it) from an even grid over the returns' box, and an even or low-discrepancy set in the central 99 %
@@ -200,10 +201,19 @@ def _uniform(source: Baselines) -> list[Candidate]:
 
 
 def _random(source: Baselines) -> list[Candidate]:
-    def place(count: int) -> np.ndarray:
-        return source.space.sample(count, random_generator(source.seed, "random baseline", count))
+    return [_random_draw(source.space, source.seed, 0)]
 
-    return [Candidate("random", place, _whole_range(source.space))]
+
+def _random_draw(space: DesignSpace, seed: int, scene: int) -> Candidate:
+    def place(count: int) -> np.ndarray:
+        return space.sample(count, random_generator(seed, "random baseline", count, scene))
+
+    return Candidate("random", place, _whole_range(space))
+
+
+def random_rays(space: DesignSpace, count: int, seed: int, scene: int) -> Rays:
+    """The baseline `random` drawn anew for a scene, so that no lucky draw stands for all scenes."""
+    return _random_draw(space, seed, scene).rays(count)
 
 
 def _bounding(source: Baselines) -> list[Candidate]:

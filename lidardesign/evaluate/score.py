@@ -21,7 +21,7 @@ from lidardesign.design.rays import lay_out
 from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import Design
 from lidardesign.errors import ConfigError, PluginError
-from lidardesign.evaluate.baselines import BASELINES, Baselines
+from lidardesign.evaluate.baselines import BASELINES, Baselines, random_rays
 from lidardesign.evaluate.results import Evaluation, Paired, Row, worse_than_threshold
 from lidardesign.evaluate.statistics import bootstrap_interval, paired_difference
 from lidardesign.registry import plugin_guard
@@ -257,7 +257,8 @@ def _score_all(
         casters = build_casters(scene)
         for key, rays in jobs.items():
             started = time.perf_counter()
-            score = score_scene(request.task, scene, rays, casters)
+            fired = random_rays(request.space, len(rays), request.seed, done) if key[0] == "random" else rays
+            score = score_scene(request.task, scene, fired, casters)
             tally = tallies[key]
             tally.seconds += time.perf_counter() - started
             tally.values.append(score.value)
