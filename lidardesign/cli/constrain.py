@@ -100,7 +100,7 @@ def _sensors(given: Any, constraints: Constraints, design: Design | None, usual:
     asked = constraints.sensors
     if given is not None or asked.count is not None:
         return given if given is not None else asked.count
-    usual = len(design.sensors) if design else usual
+    usual = max(len(design.sensors) if design else usual, len(constraints.each))
     return min(max(usual, asked.min or usual), asked.max or usual)
 
 

@@ -80,7 +80,7 @@ def _export(path: Path | None, name: str | None, out: Path | None, rays: int | N
     target = out if out is not None else path.with_suffix(exporter.suffix)
     if target.exists() and path.exists() and target.samefile(path):
         raise ConfigError("would overwrite the design itself", where=str(target), hint="give another --out")
-    laid_out = _rays(design, path, exporter.name, rays, console)
+    design, laid_out = _design_and_rays(design, path, exporter.name, rays, console)
     notes = list(exporter.write(design, laid_out, target))
     for note in notes:
         console.note(f"note: {note}")
@@ -92,27 +92,31 @@ def _export(path: Path | None, name: str | None, out: Path | None, rays: int | N
     console.result(document, lambda rich: rich.print(f"wrote {target} ({content})", soft_wrap=True, markup=False))
 
 
-def _rays(design: Design, path: Path, name: str, count: int | None, console: Console) -> Rays:
-    """The explicit rays of a design; another number than its own may need the samples of its run.
+def _design_and_rays(
+    design: Design, path: Path, name: str, count: int | None, console: Console
+) -> tuple[Design, Rays]:
+    """A design and its explicit rays; another number of rays than its own may need the samples of its run.
 
-    A design that leaves its number of rays open takes the largest budget of its task.
+    A scan of another number of rays has other sensors, so the design that is exported is that one. A design that
+    leaves its number of rays open takes the largest budget of its task.
     """
     from lidardesign.cli.runs import run_of
-    from lidardesign.design.rays import lay_out, own_count
+    from lidardesign.design.rays import lay_out, own_count, refitted
     from lidardesign.design.samples import load_samples
 
-    if name in WITHOUT_RAYS:
-        return lay_out(design, 0)
-    if count is None and _is_open(design):
+    if count is None and _is_open(design) and name not in WITHOUT_RAYS:
         run = run_of(design, path)
         if run is None:
             raise ConfigError("the design leaves the number of rays open", where=str(path), hint="give --rays N")
         count = max(run.task.defaults.rays)
         console.note(f"note: the design leaves the number of rays open; {count} is the task's largest budget")
-    if design.layout == "grid" or count is None or count == own_count(design):
-        return lay_out(design, count)
-    run = run_of(design, path)
-    return lay_out(design, count, load_samples(run.folder) if run else None)
+    samples = None
+    if count is not None and design.layout != "grid" and count != own_count(design):
+        run = run_of(design, path)
+        samples = load_samples(run.folder) if run else None
+        if design.layout == "scan":
+            design = refitted(design, count, samples)
+    return design, lay_out(design, 0 if name in WITHOUT_RAYS else count, samples)
 
 
 def _is_open(design: Design) -> bool:

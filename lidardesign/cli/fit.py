@@ -113,8 +113,10 @@ def fit_and_write(
 def _log_target(run: Run, points: np.ndarray) -> np.ndarray:
     """log p* of design points, (N, 6) to (N,): only a pinned origin needs it, and only then it is loaded."""
     from lidardesign.density.prepare import prepare_target
+    from lidardesign.run.manifest import read_manifest
 
-    target, _ = prepare_target(run.scenes("train", run.config.seed), run.config)
+    decided = read_manifest(run.folder).get("visibility")
+    target, _ = prepare_target(run.scenes("train", run.config.seed), run.config, visibility=decided)
     return target.log_density(points)
 
 

@@ -89,7 +89,7 @@ def lay_out(
     if design.ray_table is not None and len(design.ray_table.sensor) == total:
         return _table_rays(design.ray_table, rate_hz)
     if design.layout == "scan" and total not in (0, own_count(design)):
-        return lay_out(_refitted(design, total, samples, seed), total, gates="sensor", rate_hz=rate_hz)
+        return lay_out(refitted(design, total, samples, seed), total, gates="sensor", rate_hz=rate_hz)
     shares = _shares(design, total)
     seen = None
     if total and (gates == "ray" or design.layout == "density"):
@@ -154,10 +154,13 @@ def _shares(design: Design, total: int) -> np.ndarray:
     return split_budget(design.weights, total)
 
 
-def _refitted(design: Design, total: int, samples: Samples | None, seed: int) -> Design:
+def refitted(design: Design, total: int, samples: Samples | None, seed: int = 0) -> Design:
     """A scan of another number of rays: every ray is a component, so the components are others.
 
     Keeps the design's constraints, but for the number of rays itself.
+
+    Raises:
+        ConfigError: There are no samples to fit to.
     """
     if samples is None:
         raise _needs_samples(design, total, "sensor")
