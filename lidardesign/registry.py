@@ -62,9 +62,7 @@ def load_task(name: str) -> Task:
     if name not in offers:
         close = difflib.get_close_matches(name, offers, n=1)
         hint = f"did you mean {close[0]!r}?" if close else LIST_HINT
-        raise ConfigError(
-            f"unknown task {name!r}", where="TASK", allowed=", ".join(sorted(offers)), hint=hint
-        )
+        raise ConfigError(f"unknown task {name!r}", where="TASK", allowed=", ".join(sorted(offers)), hint=hint)
     return _load(name, offers[name])
 
 
@@ -123,9 +121,7 @@ def _time_limit(name: str) -> Iterator[None]:
         return
 
     def interrupt(*_: Any) -> None:
-        raise PluginError(
-            f"was not imported within {IMPORT_SECONDS:g} s", where=f"task {name}", hint="tell its author"
-        )
+        raise PluginError(f"was not imported within {IMPORT_SECONDS:g} s", where=f"task {name}", hint="tell its author")
 
     previous = signal.signal(signal.SIGALRM, interrupt)
     signal.setitimer(signal.ITIMER_REAL, IMPORT_SECONDS)
@@ -152,13 +148,9 @@ def _check(name: str, task: Any) -> None:
         )
     for member, kind in (("name", str), ("summary", str), ("metric", Metric), ("defaults", Defaults)):
         if not isinstance(getattr(task, member, None), kind):
-            raise PluginError(
-                f"its {member} is no {kind.__name__}", where=f"task {name}", hint="tell its author"
-            )
+            raise PluginError(f"its {member} is no {kind.__name__}", where=f"task {name}", hint="tell its author")
     if not (isinstance(getattr(task, "Config", None), type) and issubclass(task.Config, TaskConfig)):
-        raise PluginError(
-            "its Config is no subclass of TaskConfig", where=f"task {name}", hint="tell its author"
-        )
+        raise PluginError("its Config is no subclass of TaskConfig", where=f"task {name}", hint="tell its author")
     for member in ("space", "scenes", "score"):
         if not callable(getattr(task, member, None)):
             raise PluginError(f"it has no method {member}()", where=f"task {name}", hint="tell its author")

@@ -124,7 +124,17 @@ def command(*, json: bool, quiet: bool, debug: bool) -> Iterator[Console]:
         forget_stdout()
         raise typer.Exit(EXIT_BROKEN_PIPE) from None
     except (Exception, KeyboardInterrupt) as error:
-        raise typer.Exit(report_error(error, console)) from None
+        code = report_error(error, console)
+        _drop_unwritable(console.output)
+        raise typer.Exit(code) from None
+
+
+def _drop_unwritable(output: TextIO) -> None:
+    """Forget what a full disk did not take: it was reported, and the last flush would fail once more."""
+    try:
+        output.flush()
+    except OSError:
+        forget_stdout()
 
 
 def forget_stdout() -> None:

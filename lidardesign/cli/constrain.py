@@ -22,7 +22,9 @@ def constrain(
     target: Annotated[Path, typer.Argument(metavar="RUN|DESIGN", help="A run folder, or a design that came from one.")],
     constraints: Annotated[
         Path | None,
-        typer.Option("--constraints", metavar="FILE", help="YAML file of constraints.", show_default=False),
+        typer.Option(
+            "--constraints", metavar="FILE", help="YAML file of constraints (keys: README).", show_default=False
+        ),
     ] = None,
     overrides: Annotated[
         list[str] | None,
@@ -43,7 +45,7 @@ def constrain(
     quiet: options.Quiet = False,
     debug: options.Debug = False,
 ) -> None:
-    """Fit sensors again under constraints: no learning, seconds."""
+    """Fit sensors again under constraints: seconds, nothing is learned again."""
     with command(json=json, quiet=quiet, debug=debug) as console:
         check_name(name)
         check_choice(gates, "--gates", GATES)

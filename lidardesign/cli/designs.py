@@ -45,7 +45,7 @@ def show_design(design: Design, rich: RichConsole) -> None:
         "field of view [deg]",
         "gate [m]",
     ):
-        table.add_column(heading, justify="left" if heading == "sensor" else "right", overflow="fold")
+        table.add_column(escape(heading), justify="left" if heading == "sensor" else "right", overflow="fold")
     for sensor in design.sensors[:MAX_SHOWN]:
         horizontal, vertical = sensor.field_of_view_rad
         start, end = sensor.gate_m

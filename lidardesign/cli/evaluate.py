@@ -40,7 +40,7 @@ class _Entry:
 
 def evaluate(
     targets: Annotated[
-        list[Path], typer.Argument(metavar="RUN|DESIGN...", help="Runs (all their designs) or design files.")
+        list[Path], typer.Argument(metavar="RUN|DESIGN", help="Run folders (all their designs) and design files.")
     ],
     rays: Annotated[
         list[int] | None,
@@ -48,21 +48,34 @@ def evaluate(
     ] = None,
     baseline: Annotated[
         list[str] | None,
-        typer.Option("--baseline", metavar="NAME", help="A further baseline; repeatable.", show_default=False),
+        typer.Option(
+            "--baseline",
+            metavar="NAME",
+            help="A further baseline beside uniform, random and bounding.",
+            show_default=False,
+        ),
     ] = None,
     report: Annotated[
         Path | None,
-        typer.Option("--report", metavar="FILE.html", help="Write one HTML page.", show_default=False),
+        typer.Option(
+            "--report", metavar="FILE.html", help="Write one HTML page: tables, curves, 3D view.", show_default=False
+        ),
     ] = None,
     plots: Annotated[
-        Path | None, typer.Option("--plots", metavar="DIR", help="Write PNG curves.", show_default=False)
+        Path | None,
+        typer.Option("--plots", metavar="DIR", help="Write PNG curves into this folder.", show_default=False),
     ] = None,
     csv: Annotated[
         Path | None, typer.Option("--csv", metavar="FILE", help="Write the rows as CSV.", show_default=False)
     ] = None,
     fail_above: Annotated[
         float | None,
-        typer.Option("--fail-above", metavar="VALUE", help="Exit 1 if a design scores above this.", show_default=False),
+        typer.Option(
+            "--fail-above",
+            metavar="VALUE",
+            help="Exit 1 if a design scores worse, in the metric's unit.",
+            show_default=False,
+        ),
     ] = None,
     seed: options.Seed = None,
     json: options.Json = False,

@@ -92,9 +92,7 @@ def _export(path: Path | None, name: str | None, out: Path | None, rays: int | N
     console.result(document, lambda rich: rich.print(f"wrote {target} ({content})", soft_wrap=True, markup=False))
 
 
-def _design_and_rays(
-    design: Design, path: Path, name: str, count: int | None, console: Console
-) -> tuple[Design, Rays]:
+def _design_and_rays(design: Design, path: Path, name: str, count: int | None, console: Console) -> tuple[Design, Rays]:
     """A design and its explicit rays; another number of rays than its own may need the samples of its run.
 
     A scan of another number of rays has other sensors, so the design that is exported is that one. A design that

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
 DEVICES = ("auto", "cpu", "cuda")
 STARTED_FILES = {"config.yaml", "manifest.json", "progress.jsonl", ".lock"}
 CHECKPOINTS = "checkpoint*"
+# Below these a density is too rough for figures that are meant seriously.
+LOW_ESS = 0.2
+LOW_COVERAGE = 0.9
 
 
 def learn(
@@ -35,18 +39,30 @@ def learn(
     ] = None,
     preset: Annotated[
         str | None,
-        typer.Option("--preset", metavar="draft|standard|fine", help="Effort.", show_default="standard"),
+        typer.Option(
+            "--preset",
+            metavar="draft|standard|fine",
+            help="Effort: about half a minute, minutes, or tens of minutes.",
+            show_default="standard",
+        ),
     ] = None,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
     seed: options.Seed = None,
-    device: Annotated[str, typer.Option("--device", metavar="auto|cpu|cuda", help="Where to compute.")] = "auto",
-    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")] = False,
+    device: Annotated[
+        str,
+        typer.Option(
+            "--device", metavar="auto|cpu|cuda", help="Where the flow is trained; auto takes a GPU when there is one."
+        ),
+    ] = "auto",
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue an interrupted run from its last checkpoint.")
+    ] = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
     debug: options.Debug = False,
 ) -> None:
-    """Learn where rays are worth firing: TASK to a run folder."""
+    """Learn where rays are worth firing for TASK, into a run folder."""
     with command(json=json, quiet=quiet, debug=debug) as console:
         check_choice(device, "--device", DEVICES)
         from lidardesign.registry import load_task
@@ -66,6 +82,7 @@ def learn(
             _check_can_start(run)
             settings = resolve(plugin, **choices)
         result = _learn_in_folder(plugin, settings, run, resume, device, console)
+        result = replace(result, notes=(*result.notes, *_advice(result)))
         console.result(_document(result), lambda rich: _show(result, rich))
 
 
@@ -187,6 +204,18 @@ def _progress(console: Console) -> Iterator[Callable[[LearnProgress], None]]:
             phase = now.phase
 
         yield show
+
+
+def _advice(result: LearnResult) -> list[str]:
+    """What to do about a density that was learned badly."""
+    advice = []
+    if result.ess < LOW_ESS:
+        advice.append(f"ESS below {LOW_ESS:g}: the density is rough; --preset standard or fine learns longer")
+    if result.coverage < LOW_COVERAGE:
+        advice.append(
+            f"coverage below {LOW_COVERAGE:g}: a part of the scenes was missed; learn longer or another --seed"
+        )
+    return advice
 
 
 def _document(result: LearnResult) -> dict[str, Any]:

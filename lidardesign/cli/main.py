@@ -32,12 +32,32 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(tasks_app, name="tasks")
-app.command(context_settings=SETTINGS)(learn)
-app.command(context_settings=SETTINGS)(fit)
-app.command(context_settings=SETTINGS)(constrain)
-app.command(context_settings=SETTINGS)(evaluate)
-app.command(context_settings=SETTINGS)(export)
-app.command(context_settings=SETTINGS)(show)
+EXAMPLES = {
+    learn: (
+        "lidardesign learn face --preset draft --out runs/face",
+        "lidardesign learn meshes --set folder=scans --set scale=0.001 --out runs/scans",
+        "lidardesign learn face --out runs/face --resume",
+    ),
+    fit: (
+        "lidardesign fit runs/face --sensors 4 --name free",
+        "lidardesign fit runs/face --layout scan --rays 576 --name beams",
+    ),
+    constrain: (
+        "lidardesign constrain runs/face --set gate.width_m.max=0.1 --set sensors.count=6 --name tight",
+        "lidardesign constrain runs/face --constraints buyable.yaml --name buyable",
+    ),
+    evaluate: (
+        "lidardesign evaluate runs/face --report report.html",
+        "lidardesign evaluate runs/face/designs/free.yaml --rays 100 --rays 576 --fail-above 8",
+    ),
+    export: (
+        "lidardesign export runs/face/designs/free.yaml --format csv --rays 576 --out rays.csv",
+        "lidardesign export --list",
+    ),
+    show: ("lidardesign show runs/face/designs/free.yaml",),
+}
+for subcommand, examples in EXAMPLES.items():
+    app.command(context_settings=SETTINGS, epilog="\n\n".join(("Examples:", *examples)))(subcommand)
 
 
 def _print_version(wanted: bool) -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from collections.abc import Mapping
+from pathlib import Path
+from types import UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
 
 import typer
 
@@ -10,10 +13,14 @@ from lidardesign.cli import options
 from lidardesign.cli.console import command
 
 if TYPE_CHECKING:
+    from pydantic import BaseModel
+    from pydantic.fields import FieldInfo
     from rich.console import Console as RichConsole
 
     from lidardesign.registry import TaskListing
     from lidardesign.task import Task
+
+KINDS = {int: "whole number", float: "number", str: "text", bool: "true or false", type(None): "null"}
 
 tasks_app = typer.Typer(help="List the installed tasks, or show one.", invoke_without_command=True)
 
@@ -85,29 +92,56 @@ def show(
 
 
 def _describe(task: Task) -> dict[str, Any]:
+    from lidardesign.density.settings import DensitySettings, LearningSettings
+
     metric, defaults = task.metric, task.defaults
     return {
         "name": task.name,
         "summary": task.summary,
         "metric": {"name": metric.name, "unit": metric.unit, "better": metric.better, "worst": metric.worst},
-        "config": [_describe_field(name, info) for name, info in task.Config.model_fields.items()],
+        "config": _describe_fields(task.Config, {}),
+        "density": _describe_fields(DensitySettings, defaults.density),
+        "learning": _describe_fields(LearningSettings, defaults.learning.get("standard", {})),
         "space": _default_space(task),
         "defaults": {"sensors": defaults.sensors, "rays": list(defaults.rays)},
     }
 
 
-def _describe_field(name: str, info: Any) -> dict[str, Any]:
-    kind = getattr(info.annotation, "__name__", None) if not hasattr(info.annotation, "__args__") else None
+def _describe_fields(model: type[BaseModel], suggested: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The keys of a section; what a task suggests stands before the section's own defaults."""
+    entries = [_describe_field(name, info) for name, info in model.model_fields.items()]
+    return [{**entry, "default": suggested.get(entry["key"], entry["default"])} for entry in entries]
+
+
+def _describe_field(name: str, info: FieldInfo) -> dict[str, Any]:
     default = None if info.is_required() else info.get_default(call_default_factory=True)
     if hasattr(default, "model_dump"):
         default = default.model_dump(mode="json")
     return {
         "key": name,
-        "type": kind or str(info.annotation).replace("typing.", "").replace("pathlib.", ""),
+        "type": kind_of_value(info.annotation),
         "required": info.is_required(),
         "default": default,
         "description": info.description or "",
     }
+
+
+def kind_of_value(annotation: Any) -> str:
+    """What a key takes, in words: `number`, `3 numbers`, `auto or mm or m`, `path or null`."""
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return kind_of_value(parts[0])
+    if origin is Literal:
+        return " or ".join(str(part) for part in parts)
+    if origin in (Union, UnionType):
+        return " or ".join(kind_of_value(part) for part in parts)
+    if origin is tuple and len(set(parts)) == 1:
+        return f"{len(parts)} {kind_of_value(parts[0])}s"
+    if origin in (list, tuple, set) and parts:
+        return f"list of {kind_of_value(parts[0])}s"
+    if isinstance(annotation, type) and issubclass(annotation, Path):
+        return "path"
+    return KINDS.get(annotation) or getattr(annotation, "__name__", str(annotation))
 
 
 def _default_space(task: Task) -> dict[str, Any] | None:
@@ -135,15 +169,35 @@ def _show_task(document: dict[str, Any], rich: RichConsole) -> None:
         f"defaults: {document['defaults']['sensors']} sensors, rays {document['defaults']['rays']}",
         markup=False,
     )
-    table = Table("key", "type", "default", "what it is", title="configuration (--set KEY=VALUE)", title_justify="left")
-    for entry in document["config"]:
-        default = "required" if entry["required"] else str(entry["default"])
-        table.add_row(*(escape(text) for text in (entry["key"], entry["type"], default, entry["description"])))
-    rich.print(table)
+    _show_keys(document["config"], "configuration (--set KEY=VALUE)", rich)
     if document["space"]:
-        rich.print("design space (--set space.KEY=[LOW,HIGH])", markup=False)
-        space = Table("dimension", "from", "to")
+        title = escape("design space (--set space.KEY=[LOW,HIGH])")
+        space = Table("dimension", "from", "to", title=title, title_justify="left")
         for name, bounds in document["space"].items():
             if isinstance(bounds, list) and len(bounds) == 2 and name.endswith(("_m", "_rad")):
                 space.add_row(name, f"{bounds[0]:.4g}", f"{bounds[1]:.4g}")
         rich.print(space)
+    else:
+        rich.print("design space: follows from the configuration (--set space.KEY=[LOW,HIGH])", markup=False)
+    _show_keys(document["density"], "target density (--set density.KEY=VALUE)", rich)
+    _show_keys(document["learning"], "learning, preset standard (--set learning.KEY=VALUE)", rich)
+
+
+def _show_keys(entries: list[dict[str, Any]], title: str, rich: RichConsole) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table("key", "takes", "default", "what it is", title=title, title_justify="left")
+    for entry in entries:
+        default = "required" if entry["required"] else _shown_default(entry["default"])
+        table.add_row(*(escape(text) for text in (entry["key"], entry["type"], default, entry["description"])))
+    rich.print(table)
+
+
+def _shown_default(value: Any) -> str:
+    """A default as one would write it in YAML; a dash where it is left empty."""
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "[" + ", ".join(map(str, value)) + "]" if isinstance(value, list | tuple) else str(value)

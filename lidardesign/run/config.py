@@ -105,9 +105,7 @@ class _Layers:
 
     def forget(self, path: KeyPath) -> None:
         """Drop the origins of a path, of all it holds, and of what holds it, before it is replaced."""
-        touching = [
-            known for known in self.origins if known[: len(path)] == path or path[: len(known)] == known
-        ]
+        touching = [known for known in self.origins if known[: len(path)] == path or path[: len(known)] == known]
         for known in touching:
             del self.origins[known]
             self.keys.pop(known, None)
@@ -148,9 +146,7 @@ def resolve(
     layers = _Layers({section: {} for section in SECTIONS})
     layers.merge("learning", PRESET_LEARNING[header["preset"]], f"preset {header['preset']}")
     layers.merge("density", task.defaults.density, f"defaults of task {task.name}")
-    layers.merge(
-        "learning", task.defaults.learning.get(header["preset"], {}), f"defaults of task {task.name}"
-    )
+    layers.merge("learning", task.defaults.learning.get(header["preset"], {}), f"defaults of task {task.name}")
     _lay_file(layers, task, document)
     for text in overrides:
         _lay_override(layers, task, parse_override(text))
@@ -244,9 +240,7 @@ def _lay_file(layers: _Layers, task: Task, document: Document) -> None:
 
 
 def _lay_override(layers: _Layers, task: Task, override: Override) -> None:
-    path = (
-        override.path if override.path[0] in SECTIONS and len(override.path) > 1 else ("task", *override.path)
-    )
+    path = override.path if override.path[0] in SECTIONS and len(override.path) > 1 else ("task", *override.path)
     layers.forget(path)
     path = apply_override(layers.values, replace(override, path=path))
     layers.origins[path] = override.where

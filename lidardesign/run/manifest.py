@@ -61,9 +61,7 @@ def read_manifest(run: Path) -> dict[str, Any]:
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise DataError(
-            f"the manifest cannot be read: {error}", where=str(path), hint="learn the run again"
-        ) from None
+        raise DataError(f"the manifest cannot be read: {error}", where=str(path), hint="learn the run again") from None
     if not isinstance(manifest, dict) or not isinstance(manifest.get("files"), dict):
         raise DataError("the manifest lists no files", where=str(path), hint="learn the run again")
     found = manifest.get("schema_version")
@@ -113,9 +111,7 @@ def verify(run: Path, name: str) -> None:
         hint = "learning was not finished: continue with --resume"
         raise DataError(f"the run holds no {name} yet", where=str(run), hint=hint)
     if not path.is_file():
-        raise DataError(
-            "the manifest lists this file, but it is missing", where=str(path), hint="learn the run again"
-        )
+        raise DataError("the manifest lists this file, but it is missing", where=str(path), hint="learn the run again")
     size = path.stat().st_size
     if size < entry["bytes"]:
         raise DataError(

@@ -36,9 +36,7 @@ def parse_override(text: str) -> Override:
     where = f"--set {text}"
     parts = key.strip().split(".")
     if not equals or not all(parts):
-        raise ConfigError(
-            "is not of the form KEY=VALUE", where=where, allowed="a dotted key, as density.sigma_m=0.005"
-        )
+        raise ConfigError("is not of the form KEY=VALUE", where=where, allowed="a dotted key, as density.sigma_m=0.005")
     return Override(tuple(parts), _value(value.strip(), where), where)
 
 

@@ -26,9 +26,7 @@ class Locate(typing.Protocol):
         ...
 
 
-def check_model(
-    model: type[Model], values: Any, locate: typing.Callable[[KeyPath], str], section: str = ""
-) -> Model:
+def check_model(model: type[Model], values: Any, locate: typing.Callable[[KeyPath], str], section: str = "") -> Model:
     """Validate values with a pydantic model; the first error becomes a ConfigError at its position.
 
     Arguments:
@@ -104,19 +102,13 @@ def _explain(
         message, hint = f"unknown key {name!r}", suggest(str(path[-1]), allowed)
         return ConfigError(message, where=where, allowed=", ".join(allowed), hint=hint)
     if detail["type"] == "missing":
-        return ConfigError(
-            f"{name} is missing", where=where, hint=f"--set {name.removeprefix('task.')}=VALUE"
-        )
+        return ConfigError(f"{name} is missing", where=where, hint=f"--set {name.removeprefix('task.')}=VALUE")
     text = detail["msg"].removeprefix("Value error, ")
     found = "" if detail["type"] == "value_error" and not path else f": found {_short(detail['input'])}"
-    more = (
-        f" (and {len(details) - 1} more)" if len(details) > 1 and not _is_union(detail["loc"], path) else ""
-    )
+    more = f" (and {len(details) - 1} more)" if len(details) > 1 and not _is_union(detail["loc"], path) else ""
     if detail["type"] in ("value_error", "assertion_error"):
         return ConfigError(f"{name}: {text}{found if path else ''}{more}", where=where)
-    return ConfigError(
-        f"{name}{found}{more}", where=where, allowed=_lower(text.removeprefix("Input should be "))
-    )
+    return ConfigError(f"{name}{found}{more}", where=where, allowed=_lower(text.removeprefix("Input should be ")))
 
 
 def _real_path(location: tuple[Any, ...], values: Any) -> KeyPath:

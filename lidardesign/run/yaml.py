@@ -278,15 +278,11 @@ class _Builder:
     def _count(self, event: yaml.Event, nodes: int) -> None:
         self._nodes += nodes
         if self._nodes > MAX_NODES:
-            raise self._error(
-                event, "expands to too many values", f"at most {MAX_NODES}, aliases counted each time"
-            )
+            raise self._error(event, "expands to too many values", f"at most {MAX_NODES}, aliases counted each time")
 
     def _check_tag(self, event: Any) -> None:
         if event.tag is not None:
-            raise self._error(
-                event, f"the tag {event.tag!r} is not supported", hint="remove it; quotes make text"
-            )
+            raise self._error(event, f"the tag {event.tag!r} is not supported", hint="remove it; quotes make text")
 
     def _error(
         self, event: yaml.Event, message: str, allowed: str | None = None, hint: str | None = None
@@ -307,12 +303,8 @@ class _Dumper(_BaseDumper):  # type: ignore[misc, valid-type]
         return True
 
 
-_Dumper.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(f"^(?:{_FLOAT.pattern})$"), list("-+.0123456789")
-)
-_Dumper.add_implicit_resolver(
-    "tag:yaml.org,2002:int", re.compile(f"^(?:{_INTEGER.pattern})$"), list("-+0123456789")
-)
+_Dumper.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(f"^(?:{_FLOAT.pattern})$"), list("-+.0123456789"))
+_Dumper.add_implicit_resolver("tag:yaml.org,2002:int", re.compile(f"^(?:{_INTEGER.pattern})$"), list("-+0123456789"))
 
 
 def dump_yaml(value: Any) -> str:
