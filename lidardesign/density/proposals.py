@@ -3,7 +3,10 @@
 They find modes that the flow dropped (`coverage`), and show whether anything can be in the way of a ray at all
 (visibility `auto`). Where both angles are free they aim at points that are uniform in area from random admissible
 origins; where an angle is fixed hardly any surface point can be aimed at, so random admissible rays are traced
-through all surfaces and one of these is chosen. A normal range error is added in both cases.
+through all surfaces within reach and one of these is chosen. A normal range error is added in both cases.
+
+The density that they are drawn from sums over all surfaces of all scenes along a ray, each with its own range error;
+surfaces more than `WINDOW_SPREADS` of these away add less than 1e-13 of their share and are not looked for.
 """
 
 from __future__ import annotations
@@ -15,13 +18,15 @@ import numpy as np
 
 from lidardesign.density.fields import scene_columns
 from lidardesign.scene import Scene
-from lidardesign.simulate.raycast import SceneCaster
+from lidardesign.simulate.raycast import Crossings, shared_caster
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, aim, direction
 from lidardesign.surface import sample_body, surface_area_m2
 
-# Rays pass a surface by this share of the space's range before the next hit is looked for.
-STEP_SHARE = 1e-6
-MAXIMUM_LAYERS = 16
+WINDOW_SPREADS = 8.0
+# A proposal whose own surface ray casting does not find again within this many range errors (a ray through an edge
+# or a vertex, by rounding) is dropped: its density would be far too small and its weight without bounds.
+FOUND_SPREADS = 0.5
+# Surfaces seen more flatly than this have an unbounded density per solid angle; area sampling hardly meets them.
 MINIMUM_COSINE = 1e-3
 MAXIMUM_COLUMNS = 128
 
@@ -51,28 +56,12 @@ def propose(
     """Proposals from at most `count` draws; those that leave the space are dropped."""
     columns = _chosen_columns(scenes, generator)
     angles_free = AZIMUTH in space.free and ELEVATION in space.free
-    rays, column = (
-        _aimed_rays(scenes, columns, space, count, generator)
-        if angles_free
-        else (space.sample(count, generator), generator.integers(len(columns), size=count))
-    )
-    layers = [_layers(scenes[index], frame, rays, space) for index, frame in columns]
-    if not angles_free:
-        rays, column, layers = _with_surface(rays, column, layers, generator)
-    surface_range = rays[:, RANGE].copy()
-    points = rays.copy()
-    points[:, RANGE] += generator.normal(scale=spread_m, size=len(points))
-    density = np.zeros(len(points))
-    for (index, _), found in zip(columns, layers, strict=True):
-        z = (points[found.row, RANGE] - found.range_m) / spread_m
-        area = _target_area(scenes[index], space)
-        share = found.range_m**2 / (area * found.cosine) if angles_free else 1.0 / found.per_row(len(points))
-        np.add.at(density, found.row, share * np.exp(-(z**2) / 2))
-    log_density = np.log(np.maximum(density, np.finfo(float).tiny))
+    draw = _from_aimed_rays if angles_free else _from_random_rays
+    points, surface_range, column, density = draw(scenes, columns, space, count, spread_m, generator)
     if angles_free and space.measure == "angles":
-        log_density += np.log(np.maximum(np.cos(points[:, ELEVATION]), np.finfo(float).tiny))
-    inside = space.contains(points)
-    return Proposals(points[inside], log_density[inside], surface_range[inside], column[inside], columns)
+        density *= np.cos(points[:, ELEVATION])
+    kept = np.flatnonzero(space.contains(points) & (density > 0))
+    return Proposals(points[kept], np.log(density[kept]), surface_range[kept], column[kept], columns)
 
 
 def occluded_share(scenes: Sequence[Scene], proposals: Proposals, margin_m: float) -> float:
@@ -82,7 +71,7 @@ def occluded_share(scenes: Sequence[Scene], proposals: Proposals, margin_m: floa
     for number, (index, frame) in enumerate(proposals.columns):
         rows = proposals.column == number
         if rows.any():
-            caster = SceneCaster(scenes[index], frame, only="occluders")
+            caster = shared_caster(scenes[index], frame, only="occluders")
             hits = caster.first_hit(proposals.points[rows, :3], directions[rows])
             blocked += int((hits.range_m < proposals.surface_range_m[rows] - margin_m).sum())
     return blocked / max(len(directions), 1)
@@ -99,6 +88,86 @@ def _target_area(scene: Scene, space: DesignSpace) -> float:
     return sum(surface_area_m2(body, space) for body in scene.bodies if body.is_target)
 
 
+_Drawn = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def _from_aimed_rays(
+    scenes: Sequence[Scene],
+    columns: list[tuple[int, int]],
+    space: DesignSpace,
+    count: int,
+    spread_m: float,
+    generator: np.random.Generator,
+) -> _Drawn:
+    """Points, the ranges of their surfaces, their columns and their densities per volume and solid angle.
+
+    A point of an area A at range s and incidence theta has the density s^2 / (A cos theta) per solid angle.
+    """
+    rays, column = _aimed_rays(scenes, columns, space, count, generator)
+    points, surface_range = _with_range_error(rays, spread_m, generator)
+    directions = direction(points[:, AZIMUTH], points[:, ELEVATION])
+    start = np.maximum(points[:, RANGE] - WINDOW_SPREADS * spread_m, 0.0)
+    end = points[:, RANGE] + WINDOW_SPREADS * spread_m
+    density, found = np.zeros(len(points)), np.zeros(len(points), dtype=bool)
+    for number, (index, frame) in enumerate(columns):
+        caster = shared_caster(scenes[index], frame, only="targets")
+        crossed = caster.crossings(points[:, :3], directions, start, end)
+        share = crossed.range_m**2 / (
+            _target_area(scenes[index], space) * np.maximum(crossed.cosine, MINIMUM_COSINE)
+        )
+        _add_shares(density, crossed, share, points, spread_m)
+        own = np.abs(crossed.range_m - surface_range[crossed.row]) < FOUND_SPREADS * spread_m
+        found[crossed.row[own & (column[crossed.row] == number)]] = True
+    return points, surface_range, column, np.where(found, density, 0.0)
+
+
+def _from_random_rays(
+    scenes: Sequence[Scene],
+    columns: list[tuple[int, int]],
+    space: DesignSpace,
+    count: int,
+    spread_m: float,
+    generator: np.random.Generator,
+) -> _Drawn:
+    """The same along uniform rays that meet a surface of their column within reach, at one of these each."""
+    rays, column = space.sample(count, generator), generator.integers(len(columns), size=count)
+    directions = direction(rays[:, AZIMUTH], rays[:, ELEVATION])
+    start, end = np.zeros(count), np.full(count, space.high[RANGE] + WINDOW_SPREADS * spread_m)
+    crossed = [
+        shared_caster(scenes[index], frame, only="targets").crossings(rays[:, :3], directions, start, end)
+        for index, frame in columns
+    ]
+    chosen = np.full(count, np.nan)
+    for number, found in enumerate(crossed):
+        order = generator.permutation(np.flatnonzero(column[found.row] == number))
+        # of several writes to one row the last one stays, and their order is random
+        chosen[found.row[order]] = found.range_m[order]
+    rays[:, RANGE] = chosen
+    points, surface_range = _with_range_error(rays, spread_m, generator)
+    density = np.zeros(count)
+    for found in crossed:
+        share = 1.0 / np.bincount(found.row, minlength=count)[found.row]
+        _add_shares(density, found, share, points, spread_m)
+    kept = np.isfinite(chosen)
+    return points[kept], surface_range[kept], column[kept], density[kept]
+
+
+def _with_range_error(
+    rays: np.ndarray, spread_m: float, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    points = rays.copy()
+    points[:, RANGE] += generator.normal(scale=spread_m, size=len(points))
+    return points, rays[:, RANGE].copy()
+
+
+def _add_shares(
+    density: np.ndarray, crossed: Crossings, share: np.ndarray, points: np.ndarray, spread_m: float
+) -> None:
+    """Add every surface's share with its range error, up to the normal's constant."""
+    z = (points[crossed.row, RANGE] - crossed.range_m) / spread_m
+    np.add.at(density, crossed.row, share * np.exp(-np.square(z) / 2))
+
+
 def _aimed_rays(
     scenes: Sequence[Scene],
     columns: list[tuple[int, int]],
@@ -106,7 +175,7 @@ def _aimed_rays(
     count: int,
     generator: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rays from uniform origins to area-uniform target points, with the points' ranges."""
+    """Rays from uniform origins to area-uniform target points, with the points' ranges, and their columns."""
     column = np.sort(generator.integers(len(columns), size=count))
     surface = np.empty((count, 3))
     for number, (index, frame) in enumerate(columns):
@@ -116,62 +185,7 @@ def _aimed_rays(
             drawn = sample_body(targets, space, len(rows), generator, frame).points
             surface[rows] = generator.permutation(drawn)
     rays = space.wrap(aim(space.sample(count, generator)[:, :3], surface))
-    admissible = space.contains(np.concatenate([rays[:, :RANGE], np.full((count, 1), space.low[RANGE])], axis=1))
+    angles_only = rays.copy()
+    angles_only[:, RANGE] = space.low[RANGE]
+    admissible = space.contains(angles_only)
     return rays[admissible], column[admissible]
-
-
-@dataclass(frozen=True, eq=False)
-class _Layers:
-    """All surfaces that rays meet in one column, as flat lists."""
-
-    row: np.ndarray
-    range_m: np.ndarray
-    cosine: np.ndarray
-
-    def per_row(self, count: int) -> np.ndarray:
-        """How many surfaces the ray of each entry meets."""
-        return np.bincount(self.row, minlength=count)[self.row]
-
-    def of(self, kept: np.ndarray, new_row: np.ndarray) -> _Layers:
-        """The entries of kept rays, renumbered."""
-        keep = kept[self.row]
-        return _Layers(new_row[self.row[keep]], self.range_m[keep], self.cosine[keep])
-
-
-def _layers(scene: Scene, frame: int, rays: np.ndarray, space: DesignSpace) -> _Layers:
-    caster = SceneCaster(scene, frame, only="targets")
-    directions = direction(rays[:, AZIMUTH], rays[:, ELEVATION])
-    alive, start = np.arange(len(rays)), np.zeros(len(rays))
-    rows, ranges, cosines = [], [], []
-    for _ in range(MAXIMUM_LAYERS):
-        if not len(alive):
-            break
-        hits = caster.first_hit(rays[alive, :3] + start[alive, None] * directions[alive], directions[alive])
-        hit = np.isfinite(hits.range_m)
-        alive, normal = alive[hit], hits.normal[hit]
-        reached = start[alive] + hits.range_m[hit]
-        cosine = np.abs(np.einsum("nk,nk->n", normal, directions[alive]))
-        rows.append(alive)
-        ranges.append(reached)
-        cosines.append(np.maximum(cosine, MINIMUM_COSINE))
-        start[alive] = reached + STEP_SHARE * max(space.high[RANGE], 1.0)
-    return _Layers(
-        np.concatenate([np.empty(0, int), *rows]), np.concatenate([[], *ranges]), np.concatenate([[], *cosines])
-    )
-
-
-def _with_surface(
-    rays: np.ndarray, column: np.ndarray, layers: list[_Layers], generator: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, list[_Layers]]:
-    """The rays that meet a surface in their column, each at a random one of these."""
-    chosen = np.full(len(rays), np.nan)
-    for number, found in enumerate(layers):
-        order = generator.permutation(len(found.row))
-        own = order[column[found.row[order]] == number]
-        # of several writes to one row the last one stays, and their order is random
-        chosen[found.row[own]] = found.range_m[own]
-    kept = np.isfinite(chosen)
-    new_row = np.cumsum(kept) - 1
-    rays = rays[kept]
-    rays[:, RANGE] = chosen[kept]
-    return rays, column[kept], [found.of(kept, new_row) for found in layers]

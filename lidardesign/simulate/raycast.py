@@ -1,14 +1,17 @@
-"""First hits of rays in a scene: Embree for meshes, closed forms for primitives, nearest of both.
+"""First hits and all crossings of rays with a scene: Embree for meshes, closed forms for primitives.
 
-Meshes are recentred in float64 before they become Embree's float32, which keeps sub-micrometre accuracy far from
-the origin; Embree runs in its robust mode, without which a quarter of the rays aimed at vertices slip through.
+Meshes are recentred in float64 before they become Embree's float32, and rays that start far away are advanced to their
+neighbourhood first, which keeps sub-micrometre accuracy far from the origin; Embree runs in its robust mode, without
+which a quarter of the rays aimed at vertices slip through.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -17,6 +20,13 @@ from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, in
 
 FARTHEST_M = 1e30  # what Embree takes for an unlimited ray
 GROUP_CHUNK = 200_000  # ray-primitive pairs at a time: the temporaries stay below some 50 MB
+# Rays that start further than this many radii from the meshes' ball are advanced to it in float64.
+FAR_RADII = 4.0
+# Relative rounding of squared distances, doubled many times over: bounding balls are never missed.
+BALL_SLACK = 1e-12
+# After a triangle the next one is looked for this share of the scene's reach further on.
+STEP_SHARE = 1e-6
+MAXIMUM_LAYERS = 16
 
 Only = Literal["all", "targets", "occluders"]
 
@@ -36,6 +46,14 @@ class Hits:
     normal: np.ndarray
 
 
+class Crossings(NamedTuple):
+    """All surfaces that rays pass, as flat lists: ray (K,), range (K,) [m], |cosine| with the normal (K,)."""
+
+    row: np.ndarray
+    range_m: np.ndarray
+    cosine: np.ndarray
+
+
 class SceneCaster:
     """Casts rays into one frame of a scene.
 
@@ -46,8 +64,7 @@ class SceneCaster:
     """
 
     def __init__(self, scene: Scene, frame: int = 0, *, only: Only = "all") -> None:
-        keep = {"all": lambda body: True, "targets": lambda body: body.is_target, "occluders": lambda b: b.is_occluder}
-        chosen = [(i, body) for i, body in enumerate(scene.bodies) if keep[only](body)]
+        chosen = _chosen(scene, only)
         self._meshes = _MeshCaster([(i, body) for i, body in chosen if isinstance(body.shape, Mesh)], frame)
         kinds = {type(body.shape) for _, body in chosen} - {Mesh}
         self._groups = [
@@ -57,6 +74,8 @@ class SceneCaster:
 
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
         """The nearest hit of every ray, shapes (N, 3) and (N, 3); directions are normalised here.
+
+        A ray that starts inside a solid hits its way out.
 
         Raises:
             ConfigError: An origin or direction that is not finite, or a direction of zero length.
@@ -74,10 +93,40 @@ class SceneCaster:
         hits.normal[rows[facing]] *= -1
         return hits
 
+    def crossings(
+        self, origins: np.ndarray, directions: np.ndarray, start_m: np.ndarray, limit_m: np.ndarray
+    ) -> Crossings:
+        """Every surface that rays as in `trace` pass from a start (N,) up to a limit (N,), hidden ones too.
+
+        Up to `MAXIMUM_LAYERS` triangles per ray are found; triangles closer than the step between them count once.
+        """
+        parts = [self._meshes.crossings(origins, directions, start_m, limit_m)]
+        parts += [group.crossings(origins, directions, start_m, limit_m) for group in self._groups]
+        return Crossings(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _chosen(scene: Scene, only: Only) -> list[tuple[int, Body]]:
+    keep = {"all": lambda body: True, "targets": lambda body: body.is_target, "occluders": lambda b: b.is_occluder}
+    return [(i, body) for i, body in enumerate(scene.bodies) if keep[only](body)]
+
+
+_casters: WeakKeyDictionary[Scene, dict[tuple[int, ...], SceneCaster]] = WeakKeyDictionary()
+
+
+def shared_caster(scene: Scene, frame: int = 0, *, only: Only = "all") -> SceneCaster:
+    """The one caster of a scene's frame and bodies, built at first use and kept as long as the scene."""
+    known = _casters.setdefault(scene, {})
+    key = (frame, *(i for i, _ in _chosen(scene, only)))
+    if key not in known:
+        known[key] = SceneCaster(scene, frame, only=only)
+    return known[key]
+
 
 def _checked_rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    origins = np.ascontiguousarray(np.broadcast_to(origins, np.shape(directions)), dtype=np.float64)
     directions = np.asarray(directions, dtype=np.float64)
+    if directions.ndim != 2 or directions.shape[1] != 3:
+        raise ConfigError(f"directions have shape {directions.shape}", where="rays", allowed="(N, 3)")
+    origins = np.ascontiguousarray(np.broadcast_to(origins, directions.shape), dtype=np.float64)
     lengths = np.linalg.norm(directions, axis=-1)
     if not (np.isfinite(origins).all() and np.isfinite(lengths).all()) or (len(lengths) and lengths.min() == 0):
         raise ConfigError("an origin or direction is not finite, or a direction has zero length", where="rays")
@@ -97,6 +146,7 @@ class _MeshCaster:
         world = [body.shape.transformed(body.pose(frame)) for _, body in bodies]
         corners = np.concatenate([mesh.bounds_m for mesh in world])
         self._centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
+        self._radius_m = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0))) / 2
         self._scene = EmbreeScene()
         self._geometries = [
             TriangleMesh(self._scene, (mesh.vertices - self._centre).astype(np.float32), mesh.faces) for mesh in world
@@ -107,57 +157,143 @@ class _MeshCaster:
         hits = Hits(np.full(count, np.inf), np.full(count, -1, dtype=np.int64), np.zeros((count, 3)))
         if not len(self._body_of_geometry) or not count:
             return hits
+        local, advance_m = self._advanced(origins - self._centre, directions)
         found = self._scene.run(
-            (origins - self._centre).astype(np.float32),
+            local.astype(np.float32),
             directions.astype(np.float32),
-            dists=np.clip(limit_m, 0.0, FARTHEST_M).astype(np.float32),
+            dists=np.clip(limit_m - advance_m, 0.0, FARTHEST_M).astype(np.float32),
             output=True,
         )
-        rows = np.flatnonzero((found["primID"] >= 0) & (found["tfar"] < limit_m))
-        hits.range_m[rows] = found["tfar"][rows]
+        range_m = found["tfar"] + advance_m
+        rows = np.flatnonzero((found["primID"] >= 0) & (range_m < limit_m))
+        hits.range_m[rows] = range_m[rows]
         hits.body[rows] = self._body_of_geometry[found["geomID"][rows]]
         hits.normal[rows] = _unit(found["Ng"][rows].astype(np.float64))
         return hits
 
+    def _advanced(self, local: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Starts moved towards the meshes where float32 could not tell them apart, and by how much (N,)."""
+        far = np.einsum("nk,nk->n", local, local) > (FAR_RADII * self._radius_m) ** 2
+        if not far.any():
+            return local, np.zeros(len(local))
+        closest = -np.einsum("nk,nk->n", local, directions)
+        advance_m = np.where(far, np.maximum(closest - 2 * self._radius_m, 0.0), 0.0)
+        return local + advance_m[:, None] * directions, advance_m
+
+    def crossings(
+        self, origins: np.ndarray, directions: np.ndarray, start_m: np.ndarray, limit_m: np.ndarray
+    ) -> Crossings:
+        parts = [Crossings(np.empty(0, int), np.empty(0), np.empty(0))]
+        if len(self._body_of_geometry):
+            alive, start, step_m = np.arange(len(origins)), start_m.copy(), self._step_m(limit_m)
+            for _ in range(MAXIMUM_LAYERS):
+                ahead, toward = start[alive], directions[alive]
+                hits = self.trace(origins[alive] + ahead[:, None] * toward, toward, limit_m[alive] - ahead)
+                hit = hits.body >= 0
+                alive = alive[hit]
+                if not len(alive):
+                    break
+                reached = ahead[hit] + hits.range_m[hit]
+                cosine = np.abs(np.einsum("nk,nk->n", hits.normal[hit], toward[hit]))
+                parts.append(Crossings(alive, reached, cosine))
+                start[alive] = reached + step_m
+        return Crossings(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    def _step_m(self, limit_m: np.ndarray) -> float:
+        reach = limit_m[np.isfinite(limit_m)].max(initial=0.0)
+        return STEP_SHARE * max(float(reach), self._radius_m)
+
+
+class _Pairs(NamedTuple):
+    """Rays of a chunk with a primitive whose bounding ball they pass, as flat lists of K pairs.
+
+    Arguments:
+        rows: The chunk of rays.
+        ray, member: The ray's number in the chunk and the primitive's in its group.
+        origins, directions: The rays in the primitive's frame, shape (K, 3).
+        near, far: Ranges where they enter and leave it, NaN where they do not [m].
+    """
+
+    rows: slice
+    ray: np.ndarray
+    member: np.ndarray
+    origins: np.ndarray
+    directions: np.ndarray
+    near: np.ndarray
+    far: np.ndarray
+
 
 class _PrimitiveGroup:
-    """All primitives of one kind in a frame, each hit in closed form in its own frame."""
+    """All primitives of one kind in a frame, each crossed in closed form in its own frame."""
 
     def __init__(self, members: list[tuple[int, Body]], frame: int) -> None:
         kind = type(members[0][1].shape)
-        self._closed_form = _CLOSED_FORMS[kind]
+        self._crossed, self._normal = _CROSSED[kind], _NORMALS[kind]
         self._body = np.array([index for index, _ in members], dtype=np.int64)
-        self._sizes = np.array([_SIZES[kind](body.shape) for _, body in members])[:, None]
+        self._sizes = np.array([_SIZES[kind](body.shape) for _, body in members])
+        self._radii_m = np.array([_RADII[kind](body.shape) for _, body in members])
         poses = np.stack([body.pose(frame) for _, body in members])
-        self._rotation = poses[:, :3, :3]
+        self._centres, self._rotation = poses[:, :3, 3], poses[:, :3, :3]
         self._to_body = inverse_rigid(poses)
 
     def keep_nearer(self, hits: Hits, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> None:
-        """Enter the hits that are nearer than what `hits` holds, in chunks that bound the memory."""
+        """Enter the hits that are nearer than what `hits` holds."""
+        for pairs in self._pairs(origins, directions, limit_m):
+            rows = pairs.rows
+            range_m = np.where(pairs.near >= 0, pairs.near, np.where(pairs.far >= 0, pairs.far, np.inf))
+            bound = np.minimum(hits.range_m[rows], limit_m[rows])
+            nearest = bound.copy()
+            np.minimum.at(nearest, pairs.ray, range_m)
+            won = np.flatnonzero((range_m == nearest[pairs.ray]) & (range_m < bound[pairs.ray]))
+            ray = pairs.ray[won]
+            hits.range_m[rows][ray] = range_m[won]
+            hits.body[rows][ray] = self._body[pairs.member[won]]
+            hits.normal[rows][ray] = self._normals(pairs, won, range_m[won])
+
+    def _normals(self, pairs: _Pairs, chosen: np.ndarray, range_m: np.ndarray) -> np.ndarray:
+        """World normals where the chosen pairs cross at a range, outward."""
+        points = pairs.origins[chosen] + range_m[:, None] * pairs.directions[chosen]
+        member = pairs.member[chosen]
+        return np.einsum("nij,nj->ni", self._rotation[member], self._normal(self._sizes[member], points))
+
+    def crossings(
+        self, origins: np.ndarray, directions: np.ndarray, start_m: np.ndarray, limit_m: np.ndarray
+    ) -> Crossings:
+        """See `SceneCaster.crossings`."""
+        parts = [Crossings(np.empty(0, int), np.empty(0), np.empty(0))]
+        for pairs in self._pairs(origins, directions, limit_m):
+            start, limit = start_m[pairs.rows][pairs.ray], limit_m[pairs.rows][pairs.ray]
+            for range_m in (pairs.near, pairs.far):
+                kept = np.flatnonzero((range_m >= start) & (range_m < limit))
+                row = pairs.ray[kept] + pairs.rows.start
+                cosine = np.abs(_dot(self._normals(pairs, kept, range_m[kept]), directions[row]))
+                parts.append(Crossings(row, range_m[kept], cosine))
+        return Crossings(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    def _pairs(self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Iterator[_Pairs]:
+        """The pairs of all rays, in chunks that bound the memory."""
         size = max(1, GROUP_CHUNK // len(self._body))
         for start in range(0, len(origins), size):
-            rows = slice(start, start + size)
-            range_m, body, normal = self._nearest(origins[rows], directions[rows])
-            nearer = np.flatnonzero((range_m < hits.range_m[rows]) & (range_m < limit_m[rows]))
-            hits.range_m[rows][nearer] = range_m[nearer]
-            hits.body[rows][nearer] = body[nearer]
-            hits.normal[rows][nearer] = normal[nearer]
+            rows = slice(start, min(start + size, len(origins)))
+            ray, member = self._near_pairs(origins[rows], directions[rows], limit_m[rows])
+            pose = self._to_body[member]
+            local_origins = np.einsum("nij,nj->ni", pose[:, :3, :3], origins[rows][ray]) + pose[:, :3, 3]
+            local_directions = np.einsum("nij,nj->ni", pose[:, :3, :3], directions[rows][ray])
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                near, far = self._crossed(self._sizes[member], local_origins, local_directions)
+            yield _Pairs(rows, ray, member, local_origins, local_directions, near, far)
 
-    def _nearest(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Range, body and world normal of the nearest member per ray: (N,), (N,), (N, 3)."""
-        turn = np.swapaxes(self._to_body[:, :3, :3], -1, -2)
-        local_origins = origins @ turn + self._to_body[:, None, :3, 3]
-        local_directions = directions @ turn
-        with np.errstate(divide="ignore", invalid="ignore"):
-            range_m = self._closed_form(self._sizes, local_origins, local_directions)
-        range_m = np.where(range_m >= 0, range_m, np.inf)
-        chosen = np.argmin(range_m, axis=0)
-        rows = np.arange(len(origins))
-        nearest = range_m[chosen, rows]
-        reached = np.where(np.isfinite(nearest), nearest, 0.0)[:, None]
-        points = local_origins[chosen, rows] + reached * local_directions[chosen, rows]
-        normal = _NORMALS[self._closed_form](self._sizes[chosen, 0], points)
-        return nearest, self._body[chosen], np.einsum("nij,nj->ni", self._rotation[chosen], normal)
+    def _near_pairs(
+        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Rays and members whose bounding balls they pass within their limits."""
+        offset = self._centres - origins[:, None]
+        along = np.einsum("nbk,nk->nb", offset, directions)
+        squared = _dot(offset, offset)
+        slack = BALL_SLACK * squared
+        passes = squared - np.square(along) <= np.square(self._radii_m) + slack
+        reach = self._radii_m + np.sqrt(slack)
+        return np.nonzero(passes & (along >= -reach) & (along - reach <= limit_m[:, None]))
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
@@ -168,36 +304,32 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("...k,...k->...", a, b)
 
 
-def _nearest_non_negative(near: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """The smaller root that lies ahead; from inside a body that is the way out."""
-    return np.where(near >= 0, near, np.where(far >= 0, far, np.inf))
-
-
-def _ball_roots(origins: np.ndarray, directions: np.ndarray, radius_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _ball(origins: np.ndarray, directions: np.ndarray, radius_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Both roots, NaN where the line passes by; the line's distance from the centre does not cancel as b^2 - c does."""
     along = _dot(origins, directions)
-    perpendicular = origins - along[..., None] * directions
+    perpendicular = origins - along[:, None] * directions
     half_chord = np.sqrt(radius_m**2 - _dot(perpendicular, perpendicular))
     return -along - half_chord, -along + half_chord
 
 
-def _sphere(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    return _nearest_non_negative(*_ball_roots(origins, directions, sizes[..., 0]))
+def _sphere(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return _ball(origins, directions, sizes[:, 0])
 
 
 def _sphere_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
     return _unit(points)
 
 
-def _box(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def _box(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     entry, leave = (-sizes - origins) / directions, (sizes - origins) / directions
     low, high = np.fmin(entry, leave), np.fmax(entry, leave)
     parallel = directions == 0
     inside_slab = np.abs(origins) <= sizes
     low = np.where(parallel, np.where(inside_slab, -np.inf, np.inf), low)
     high = np.where(parallel, np.where(inside_slab, np.inf, -np.inf), high)
-    near, far = low.max(axis=-1), high.min(axis=-1)
-    return np.where(near <= far, _nearest_non_negative(near, far), np.inf)
+    near, far = low.max(axis=1), high.min(axis=1)
+    hit = near <= far
+    return np.where(hit, near, np.nan), np.where(hit, far, np.nan)
 
 
 def _box_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -208,23 +340,27 @@ def _box_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
     return normal
 
 
-def _capsule(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    radius, half_length = sizes[..., 0], sizes[..., 1]
-    across = _dot(directions[..., :2], directions[..., :2])
-    along = _dot(origins[..., :2], directions[..., :2]) / across
-    perpendicular = origins[..., :2] - along[..., None] * directions[..., :2]
-    half_chord = np.sqrt((radius**2 - _dot(perpendicular, perpendicular)) / across)
-    nearest = np.full(origins.shape[:-1], np.inf)
-    for range_m in (-along - half_chord, -along + half_chord):
-        on_side = np.abs(origins[..., 2] + range_m * directions[..., 2]) <= half_length
-        nearest = np.where((range_m >= 0) & on_side, np.fmin(nearest, range_m), nearest)
-    for outward in (-1.0, 1.0):
+def _capsule(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A line enters the capsule through its side, or through the cap on whose side it enters the endless cylinder.
+
+    Choosing the cap that way leaves no seam between side and cap for a ray to slip through.
+    """
+    radius_m, half_length_m = sizes[:, 0], sizes[:, 1]
+    across = _dot(directions[:, :2], directions[:, :2])
+    along = _dot(origins[:, :2], directions[:, :2]) / across
+    perpendicular = origins[:, :2] - along[:, None] * directions[:, :2]
+    half_chord = np.sqrt((radius_m**2 - _dot(perpendicular, perpendicular)) / across)
+    roots = []
+    for end, number in ((-1.0, 0), (1.0, 1)):
+        side = -along + end * half_chord
+        height = origins[:, 2] + side * directions[:, 2]
+        # a ray along the axis never meets the side: it comes and goes through the caps
+        height = np.where(across == 0, end * directions[:, 2] * np.inf, height)
         centred = origins.copy()
-        centred[..., 2] -= outward * half_length
-        for range_m in _ball_roots(centred, directions, radius):
-            on_cap = (centred[..., 2] + range_m * directions[..., 2]) * outward >= 0
-            nearest = np.where((range_m >= 0) & on_cap, np.fmin(nearest, range_m), nearest)
-    return nearest
+        centred[:, 2] -= np.sign(height) * half_length_m
+        cap = _ball(centred, directions, radius_m)[number]
+        roots.append(np.where(np.abs(height) <= half_length_m, side, cap))
+    return roots[0], roots[1]
 
 
 def _capsule_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -233,20 +369,38 @@ def _capsule_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
     return _unit(points - axis_point)
 
 
-def _plane(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    range_m = -origins[..., 2] / directions[..., 2]
-    return np.where(np.isfinite(range_m) & (range_m >= 0), range_m, np.inf)
+def _plane(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One crossing, and no second one."""
+    range_m = -origins[:, 2] / directions[:, 2]
+    return np.where(np.isfinite(range_m), range_m, np.nan), np.full(len(range_m), np.nan)
 
 
 def _plane_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.tile([0.0, 0.0, 1.0], (len(points), 1))
 
 
-_CLOSED_FORMS: dict[type, Callable[..., np.ndarray]] = {Sphere: _sphere, Box: _box, Capsule: _capsule, Plane: _plane}
-_NORMALS = {_sphere: _sphere_normal, _box: _box_normal, _capsule: _capsule_normal, _plane: _plane_normal}
+# Where a line enters and leaves each kind: NaN where it passes by.
+_CROSSED: dict[type, Callable[..., tuple[np.ndarray, np.ndarray]]] = {
+    Sphere: _sphere,
+    Box: _box,
+    Capsule: _capsule,
+    Plane: _plane,
+}
+_NORMALS: dict[type, Callable[..., np.ndarray]] = {
+    Sphere: _sphere_normal,
+    Box: _box_normal,
+    Capsule: _capsule_normal,
+    Plane: _plane_normal,
+}
 _SIZES: dict[type, Callable[..., tuple[float, float, float]]] = {
     Sphere: lambda shape: (shape.radius_m, 0.0, 0.0),
     Box: lambda shape: shape.half_extents_m,
     Capsule: lambda shape: (shape.radius_m, shape.half_length_m, 0.0),
     Plane: lambda shape: (0.0, 0.0, 0.0),
+}
+_RADII: dict[type, Callable[..., float]] = {
+    Sphere: lambda shape: shape.radius_m,
+    Box: lambda shape: math.hypot(*shape.half_extents_m),
+    Capsule: lambda shape: shape.radius_m + shape.half_length_m,
+    Plane: lambda shape: math.inf,
 }
