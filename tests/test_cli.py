@@ -12,62 +12,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import caller, files_under, make_run, program
 
 from lidardesign import __version__
 from lidardesign.cli import console as console_module
 from lidardesign.cli.console import Console, command, plain_json
-from lidardesign.cli.main import run as run_program
-from lidardesign.design.samples import Samples, save_samples
 from lidardesign.errors import InfeasibleError
-from lidardesign.registry import load_task
-from lidardesign.run.config import resolve, save_run_config
-from lidardesign.run.manifest import start_manifest
 from lidardesign.run.yaml import load_yaml
 
 COMMANDS = ["learn", "fit", "constrain", "evaluate", "export", "show", "tasks", "tasks list", "tasks show"]
 
 
-class Result:
-    """What a command did."""
-
-    def __init__(self, code, captured):
-        self.code, self.out, self.err = code, captured.out, captured.err
-
-    @property
-    def json(self):
-        return json.loads(self.out)
-
-
 @pytest.fixture
 def lidardesign(capsys, tmp_path, monkeypatch):
     """Run the program in this process, in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "200")
-
-    def call(*arguments):
-        with pytest.raises(SystemExit) as ended:
-            run_program([str(argument) for argument in arguments])
-        return Result(ended.value.code or 0, capsys.readouterr())
-
-    return call
-
-
-def make_run(folder: Path, count: int = 4000) -> Path:
-    """A run as `learn` leaves it, with samples around two spots of flatland instead of a learned density."""
-    task = load_task("flatland")
-    config = resolve(task, preset="draft", seed=3)
-    generator = np.random.default_rng(0)
-    points = config.space.sample(count, generator)
-    low, high = np.array(config.space.low), np.array(config.space.high)
-    scaled = (points - low) / np.where(high > low, high - low, 1.0)
-    spots = np.array([[0.3, 0, 0, 0.4, 0, 0.6], [0.7, 0, 0, 0.6, 0, 0.5]])
-    distance = ((scaled[:, None] - spots) ** 2).sum(-1)
-    log_target = np.logaddexp(*(-distance.T / (2 * 0.1**2)))
-    start_manifest(folder, command=["lidardesign", "learn"], seed=3)
-    save_run_config(config, folder)
-    log_prob = np.full(count, -config.space.log_volume)
-    save_samples(Samples(points, log_prob, log_target, config.space), folder)
-    return folder
+    return caller(capsys, tmp_path, monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -78,10 +37,6 @@ def finished_run(tmp_path_factory):
 @pytest.fixture
 def flat(tmp_path):
     return make_run(tmp_path / "run")
-
-
-def files_under(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 BAD_YAML = {
@@ -358,11 +313,6 @@ def test_quiet_says_nothing_by_the_way(capsys):
     Console(quiet=True).note("something")
     Console().note("something else")
     assert capsys.readouterr().err == "something else\n"
-
-
-def program(*arguments, **options) -> subprocess.Popen:
-    code = f"from lidardesign.cli.main import run; run({[str(a) for a in arguments]!r})"
-    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
 
 
 def test_a_closed_pipe_ends_quietly(tmp_path):

@@ -9,13 +9,15 @@ import os
 import stat
 import threading
 
+import numpy as np
 import pytest
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.run import files, lock
+from lidardesign.run import checkpoint, files, lock
+from lidardesign.run.checkpoint import load_arrays, save_arrays
 from lidardesign.run.files import remove_stray_temporaries, sha256_file, write_atomic
 from lidardesign.run.lock import run_lock
-from lidardesign.run.manifest import note, read_manifest, record, start_manifest, verify, write_manifest
+from lidardesign.run.manifest import announce, note, read_manifest, record, start_manifest, verify, write_manifest
 
 
 @pytest.fixture
@@ -125,7 +127,7 @@ MESSAGES = {
     "truncated": "truncated: 5 of 10",
     "changed": "changed since",
     "appended": "changed since",
-    "unrecorded": "no data.bin yet",
+    "unrecorded": "is not listed",
     "no manifest": "no run folder",
     "garbage manifest": "cannot be read",
     "newer": "schema version 2",
@@ -174,3 +176,50 @@ def test_a_writer_waits_for_one_that_holds_the_run_for_an_instant(tmp_path):
     threading.Timer(0.2, (tmp_path / lock.FILE_NAME).unlink).start()
     with run_lock(tmp_path, wait_s=30):
         assert (tmp_path / lock.FILE_NAME).read_text() != holder
+
+
+def test_a_file_verifies_before_and_after_the_write_that_was_announced(run):
+    announce(run, "data.bin", b"new content")
+    verify(run, "data.bin")
+    announce(run, "data.bin", b"newer content")
+    verify(run, "data.bin")
+    write_atomic(run / "data.bin", b"newer content")
+    verify(run, "data.bin")
+    record(run, ["data.bin"])
+    assert set(read_manifest(run)["files"]["data.bin"]) == {"sha256", "bytes"}
+    write_atomic(run / "data.bin", b"0123456789")
+    with pytest.raises(DataError, match="truncated"):
+        verify(run, "data.bin")
+
+
+def test_a_file_that_was_announced_but_never_written_is_missing(run):
+    announce(run, "first.bin", b"content")
+    with pytest.raises(DataError, match="missing"):
+        verify(run, "first.bin")
+
+
+def test_a_file_that_nobody_recorded_is_told_from_one_that_is_not_there_yet(run):
+    (run / "foreign.bin").write_bytes(b"?")
+    with pytest.raises(DataError, match="not listed"):
+        verify(run, "foreign.bin")
+    with pytest.raises(DataError, match=r"holds no absent\.bin yet"):
+        verify(run, "absent.bin")
+
+
+@pytest.mark.parametrize("stopped_at", ["announce", "write_atomic", "record"])
+def test_a_kill_at_any_moment_leaves_a_checkpoint_that_loads(run, monkeypatch, stopped_at):
+    save_arrays(run, "state.safetensors", {"step": np.arange(3)}, {"step": 1})
+    names = ("announce", "write_atomic", "record")
+    with monkeypatch.context() as patched:
+
+        def killed(*_):
+            raise KeyboardInterrupt
+
+        for name in names[names.index(stopped_at) :]:
+            patched.setattr(checkpoint, name, killed)
+        with pytest.raises(KeyboardInterrupt):
+            save_arrays(run, "state.safetensors", {"step": np.arange(4)}, {"step": 2})
+    arrays, state = load_arrays(run, "state.safetensors")
+    assert len(arrays["step"]) == state["step"] + 2
+    save_arrays(run, "state.safetensors", {"step": np.arange(5)}, {"step": 3})
+    assert load_arrays(run, "state.safetensors")[1] == {"step": 3}

@@ -15,19 +15,20 @@ import numpy as np
 
 from lidardesign.errors import DataError
 from lidardesign.run.files import write_atomic
-from lidardesign.run.manifest import record, verify
+from lidardesign.run.manifest import announce, record, verify
 
 FORMAT = "lidardesign-1"
 
 
 def save_arrays(run: Path, name: str, arrays: Mapping[str, np.ndarray], state: Mapping[str, Any]) -> None:
-    """Write arrays and plain state atomically and enter their hash in the manifest."""
+    """Write arrays and plain state atomically, with their hash in the manifest at every moment."""
     from safetensors.numpy import save
 
-    metadata = {"format": FORMAT, "state": json.dumps(dict(state))}
-    write_atomic(
-        run / name, save({key: np.ascontiguousarray(value) for key, value in arrays.items()}, metadata)
-    )
+    # one entry only: safetensors writes several in an order that changes from process to process
+    metadata = {FORMAT: json.dumps(dict(state))}
+    content = save({key: np.ascontiguousarray(value) for key, value in arrays.items()}, metadata)
+    announce(run, name, content)
+    write_atomic(run / name, content)
     record(run, [name])
 
 
@@ -47,14 +48,10 @@ def load_arrays(run: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, 
             arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a mapping
     except (SafetensorError, OSError) as error:
         raise DataError(f"cannot be read: {error}", where=str(path), hint="learn the run again") from None
-    if metadata.get("format") != FORMAT:
-        found = metadata.get("format", "none")
-        raise DataError(
-            f"has the format {found!r}", where=str(path), allowed=FORMAT, hint="learn the run again"
-        )
+    if FORMAT not in metadata:
+        found = ", ".join(sorted(metadata)) or "none"
+        raise DataError(f"has the format {found!r}", where=str(path), allowed=FORMAT, hint="learn the run again")
     for key, value in arrays.items():
         if value.dtype.kind == "f" and not np.isfinite(value).all():
-            raise DataError(
-                f"{key} holds values that are not finite", where=str(path), hint="learn the run again"
-            )
-    return arrays, json.loads(metadata["state"])
+            raise DataError(f"{key} holds values that are not finite", where=str(path), hint="learn the run again")
+    return arrays, json.loads(metadata[FORMAT])

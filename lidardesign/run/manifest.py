@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import platform
 from collections.abc import Iterable
@@ -88,6 +89,28 @@ def record(run: Path, names: Iterable[str]) -> None:
     write_manifest(run, manifest)
 
 
+def announce(run: Path, name: str, content: bytes) -> None:
+    """Enter the hash of a file's next content before it is written; its present content stays valid as well.
+
+    A process that is killed between the two writes then leaves a file that still verifies.
+    """
+    run = Path(run)
+    manifest = read_manifest(run) if (run / FILE_NAME).exists() else start_manifest(run, command=[], seed=0)
+    path, key = run / name, Path(name).as_posix()
+    entry: dict[str, Any] = {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
+    if key in manifest["files"] and path.is_file():
+        present = {"sha256": sha256_file(path), "bytes": path.stat().st_size}
+        if present["sha256"] in _hashes(manifest["files"][key]):
+            entry["replaces"] = present
+    manifest["files"][key] = entry
+    write_manifest(run, manifest)
+
+
+def _hashes(entry: dict[str, Any]) -> list[str]:
+    """The SHA-256 of every content that a file may have: its own, and what it replaces while it is being written."""
+    return [version["sha256"] for version in (entry, entry.get("replaces")) if version]
+
+
 def note(run: Path, **fields: Any) -> None:
     """Merge fields into the manifest; a mapping merges into a mapping of the same name."""
     run = Path(run)
@@ -107,11 +130,20 @@ def verify(run: Path, name: str) -> None:
     run = Path(run)
     path = run / name
     entry = read_manifest(run)["files"].get(Path(name).as_posix())
+    if entry is None and path.exists():
+        hint = "continue learning with --resume; if that does not help, remove the file"
+        raise DataError("is not listed in the run's manifest", where=str(path), hint=hint)
     if entry is None:
         hint = "learning was not finished: continue with --resume"
         raise DataError(f"the run holds no {name} yet", where=str(run), hint=hint)
     if not path.is_file():
-        raise DataError("the manifest lists this file, but it is missing", where=str(path), hint="learn the run again")
+        raise DataError(
+            "the manifest lists this file, but it is missing",
+            where=str(path),
+            hint="restore it, or learn again: --resume continues from the last checkpoint",
+        )
+    if sha256_file(path) in _hashes(entry):
+        return
     size = path.stat().st_size
     if size < entry["bytes"]:
         raise DataError(
@@ -119,9 +151,8 @@ def verify(run: Path, name: str) -> None:
             where=str(path),
             hint="restore it or learn the run again",
         )
-    if sha256_file(path) != entry["sha256"]:
-        raise DataError(
-            "was changed since it was written (its SHA-256 is not the manifest's)",
-            where=str(path),
-            hint="restore it or learn the run again",
-        )
+    raise DataError(
+        "was changed since it was written (its SHA-256 is not the manifest's)",
+        where=str(path),
+        hint="restore it or learn the run again",
+    )

@@ -1,0 +1,70 @@
+"""Running the program in tests: results, runs as `learn` leaves them, and a process of its own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidardesign.cli.main import run as run_program
+from lidardesign.design.samples import Samples, save_samples
+from lidardesign.registry import load_task
+from lidardesign.run.config import resolve, save_run_config
+from lidardesign.run.manifest import start_manifest
+
+
+class Result:
+    """What a command did."""
+
+    def __init__(self, code, captured):
+        self.code, self.out, self.err = code, captured.out, captured.err
+
+    @property
+    def json(self):
+        return json.loads(self.out)
+
+
+def caller(capsys, tmp_path, monkeypatch):
+    """A function that runs the program in this process, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def call(*arguments):
+        with pytest.raises(SystemExit) as ended:
+            run_program([str(argument) for argument in arguments])
+        return Result(ended.value.code or 0, capsys.readouterr())
+
+    return call
+
+
+def make_run(folder: Path, count: int = 4000) -> Path:
+    """A run as `learn` leaves it, with samples around two spots of flatland instead of a learned density."""
+    task = load_task("flatland")
+    config = resolve(task, preset="draft", seed=3)
+    generator = np.random.default_rng(0)
+    points = config.space.sample(count, generator)
+    low, high = np.array(config.space.low), np.array(config.space.high)
+    scaled = (points - low) / np.where(high > low, high - low, 1.0)
+    spots = np.array([[0.3, 0, 0, 0.4, 0, 0.6], [0.7, 0, 0, 0.6, 0, 0.5]])
+    distance = ((scaled[:, None] - spots) ** 2).sum(-1)
+    log_target = np.logaddexp(*(-distance.T / (2 * 0.1**2)))
+    start_manifest(folder, command=["lidardesign", "learn"], seed=3)
+    save_run_config(config, folder)
+    log_prob = np.full(count, -config.space.log_volume)
+    save_samples(Samples(points, log_prob, log_target, config.space), folder)
+    return folder
+
+
+def files_under(folder: Path) -> dict[str, bytes]:
+    """The content of every file in a folder, by its path."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def program(*arguments, before="", **options) -> subprocess.Popen:
+    """The program in a process of its own; `before` is Python that runs first."""
+    code = f"{before}\nfrom lidardesign.cli.main import run\nrun({[str(a) for a in arguments]!r})"
+    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
