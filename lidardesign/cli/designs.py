@@ -11,12 +11,16 @@ if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
     from lidardesign.design.check import ConstraintCheck
-    from lidardesign.design.sensor import Design
+    from lidardesign.design.sensor import Design, Sensor
 
 MAX_SHOWN = 20
 # Several designs may be fitted to one run at once; each holds the lock for an instant.
 WAIT_S = 10.0
 SPACE_MARK = ".space."
+ORIGIN = "origin [m]"
+SENSOR_COLUMNS = (
+    "sensor", "weight", "rays", ORIGIN, "azimuth\n[deg]", "elevation\n[deg]", "field of view\n[deg]", "gate [m]",
+)  # fmt: skip
 
 
 def number(value: Any, digits: int = 4) -> str:
@@ -29,38 +33,49 @@ def number(value: Any, digits: int = 4) -> str:
 
 
 def show_design(design: Design, rich: RichConsole) -> None:
-    """Print a design's sensors as a table, with angles in degrees."""
+    """Print a design's sensors as a table, with angles in degrees; a place that all share stands above it."""
     from rich.markup import escape
     from rich.table import Table
 
     rays = f"{design.rays} rays per frame" if design.rays else "rays per frame left open"
     title = f"{escape(design.name)}: {len(design.sensors)} sensors, layout {design.layout}, {rays}"
+    places = [_place(sensor) for sensor in design.sensors]
+    together = len(set(places)) == 1
+    if together:
+        title += f"\nall at {places[0]} m"
     table = Table(title=title, title_justify="left")
-    for heading in (
-        "sensor",
-        "weight",
-        "rays",
-        "origin [m]",
-        "azimuth, elevation [deg]",
-        "field of view [deg]",
-        "gate [m]",
-    ):
-        table.add_column(escape(heading), justify="left" if heading == "sensor" else "right", overflow="fold")
-    for sensor in design.sensors[:MAX_SHOWN]:
-        horizontal, vertical = sensor.field_of_view_rad
-        start, end = sensor.gate_m
-        table.add_row(
-            escape(sensor.name),
-            f"{sensor.weight:.3f}",
-            number(sensor.rays),
-            " ".join(f"{value:.3f}" for value in sensor.origin_m),
-            f"{math.degrees(sensor.azimuth_rad):.2f}, {math.degrees(sensor.elevation_rad):.2f}",
-            f"{math.degrees(horizontal):.2f} x {math.degrees(vertical):.2f}",
-            f"{start:.4f} - {end:.4f}",
-        )
+    for heading in SENSOR_COLUMNS:
+        if heading != ORIGIN or not together:
+            justify = "left" if heading == SENSOR_COLUMNS[0] else "right"
+            table.add_column(escape(heading), justify=justify, overflow="fold")
+    for sensor, place in list(zip(design.sensors, places, strict=True))[:MAX_SHOWN]:
+        cells = _cells(sensor)
+        table.add_row(*(cells if together else [*cells[:3], place, *cells[3:]]))
     rich.print(table)
     if len(design.sensors) > MAX_SHOWN:
         rich.print(f"... and {len(design.sensors) - MAX_SHOWN} more sensors; --json lists all")
+
+
+def _place(sensor: Sensor) -> str:
+    # -0.0 is the same place as 0.0
+    return " ".join(f"{round(value, 3) + 0.0:.3f}" for value in sensor.origin_m)
+
+
+def _cells(sensor: Sensor) -> list[str]:
+    """What a sensor's row shows, but for its place."""
+    from rich.markup import escape
+
+    horizontal, vertical = sensor.field_of_view_rad
+    start, end = sensor.gate_m
+    return [
+        escape(sensor.name),
+        f"{sensor.weight:.3f}",
+        number(sensor.rays),
+        f"{math.degrees(sensor.azimuth_rad):.2f}",
+        f"{math.degrees(sensor.elevation_rad):.2f}",
+        f"{math.degrees(horizontal):.2f} x {math.degrees(vertical):.2f}",
+        f"{start:.4f} - {end:.4f}",
+    ]
 
 
 def show_constraints(checks: Sequence[ConstraintCheck], rich: RichConsole) -> None:

@@ -147,7 +147,7 @@ def _load_file(
     vertices = mesh.vertices[:, WORLD_AXES[up]]
     if centre:
         vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    return Mesh(vertices, mesh.faces, mesh.sign, mesh.notes)
+    return Mesh(vertices, mesh.faces, mesh.sign, tuple(f"{path.name}: {note}" for note in mesh.notes))
 
 
 def split_meshes(
