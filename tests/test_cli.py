@@ -358,3 +358,47 @@ def test_an_interruption_keeps_the_checkpoint_and_says_how_to_continue(tmp_path,
     assert (tmp_path / "run" / "config.yaml").is_file()
     assert not (tmp_path / "run" / ".lock").exists()
     assert not list((tmp_path / "run").glob(".*.tmp"))
+
+
+def test_a_design_fits_a_terminal_of_80_columns(lidardesign, flat, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    design = Path(__file__).parents[1] / "examples" / "hand_written_design.yaml"
+    lines = lidardesign("show", design).out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert any("nose" in line and "0.250 - 0.400" in line for line in lines)
+    assert "all at 0.400 0.000 0.000 m" in "".join(lines)
+
+
+def test_a_task_lists_the_keys_of_every_section_in_words(lidardesign):
+    document = lidardesign("tasks", "show", "meshes", "--json").json
+    takes = {entry["key"]: entry["type"] for entry in document["config"]}
+    assert takes["folder"] == "path or null"
+    assert takes["origin_m"] == "3 numbers or null"
+    assert takes["up"] == "x or y or z"
+    assert {"sigma_m"} <= {entry["key"] for entry in document["density"]}
+    assert {"steps"} <= {entry["key"] for entry in document["learning"]}
+    text = lidardesign("tasks", "show", "meshes").out
+    assert "folder" in text
+    assert "sigma_m" in text
+
+
+def test_every_pinned_place_gets_a_sensor(lidardesign, flat):
+    each = "each=[{}, {}, {}, {}, {gate: {width_m: {max: 0.3}}}]"
+    made = lidardesign("constrain", flat, "--set", each, "--json").json
+    assert len(made["sensors"]) == 5
+
+
+def test_a_scan_exported_at_another_count_has_its_own_sensors(lidardesign, flat, tmp_path):
+    assert lidardesign("fit", flat, "--layout", "scan", "--rays", 12, "--name", "beams").code == 0
+    design = flat / "designs" / "beams.yaml"
+    lidardesign("export", design, "--format", "sensors-csv", "--rays", 20, "--out", "sensors.csv")
+    assert len((tmp_path / "sensors.csv").read_text().splitlines()) == 21
+    lidardesign("export", design, "--format", "npz", "--rays", 20, "--out", "rays.npz")
+    with np.load(tmp_path / "rays.npz") as arrays:
+        assert len(arrays["sensor_names"]) == 20
+        assert arrays["sensor"].max() == 19
+
+
+def test_help_gives_an_example_of_every_command(lidardesign):
+    for name in ("learn", "fit", "constrain", "evaluate", "export", "show"):
+        assert f"lidardesign {name} " in lidardesign(name, "--help").out.split("Examples:")[1]

@@ -74,7 +74,7 @@ def _cells(sensor: Sensor) -> list[str]:
         f"{math.degrees(sensor.azimuth_rad):.2f}",
         f"{math.degrees(sensor.elevation_rad):.2f}",
         f"{math.degrees(horizontal):.2f} x {math.degrees(vertical):.2f}",
-        f"{start:.4f} - {end:.4f}",
+        f"{start:.3f} - {end:.3f}",
     ]
 
 
