@@ -1,5 +1,6 @@
-# make demo  sets everything up in .venv and runs the whole chain on the built-in face task
-# make test  sets up and runs the tests
+# make demo   sets everything up in .venv and runs the whole chain on the built-in face task, about three minutes
+# make test   sets up, lints and runs the tests, a few minutes
+# make clean  takes all of it away again
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -11,10 +12,12 @@ export OMP_WAIT_POLICY ?= PASSIVE
 .PHONY: demo test lint clean
 
 $(BIN)/.ready: pyproject.toml constraints.txt
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
-	touch $@
+	@echo "Setting up $(VENV): once, a minute or more"
+	@$(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --upgrade pip
+	@# setuptools announces every editable install with a warning
+	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $@
 
 demo: $(BIN)/.ready
 	$(BIN)/python examples/demo.py
