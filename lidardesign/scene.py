@@ -7,6 +7,7 @@ Shapes are in their body's own frame; a pose is a 4x4 rigid transform from body 
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,6 +19,15 @@ from lidardesign.errors import DataError
 
 Role = Literal["target", "occluder", "both"]
 Sign = Literal["auto", "solid", "winding", "unsigned"]
+ROLES = ("target", "occluder", "both")
+# How far a pose's rotation may be from orthogonal: poses are often written with seven digits.
+RIGID_TOLERANCE = 1e-6
+
+
+def _check_lengths(shape: object, *lengths_m: float, low: float = 0.0, strict: bool = True) -> None:
+    for length in lengths_m:
+        if not math.isfinite(length) or length < low or (strict and length == low):
+            raise DataError(f"{shape} has the length {length} m", allowed="finite lengths above 0 m")
 
 
 @dataclass(frozen=True)
@@ -26,12 +36,18 @@ class Sphere:
 
     radius_m: float
 
+    def __post_init__(self) -> None:
+        _check_lengths(self, self.radius_m)
+
 
 @dataclass(frozen=True)
 class Box:
     """A box centred on the body's origin, by its half extents along x, y, z."""
 
     half_extents_m: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        _check_lengths(self, *self.half_extents_m)
 
 
 @dataclass(frozen=True)
@@ -40,6 +56,10 @@ class Capsule:
 
     radius_m: float
     half_length_m: float
+
+    def __post_init__(self) -> None:
+        _check_lengths(self, self.radius_m)
+        _check_lengths(self, self.half_length_m, strict=False)
 
 
 @dataclass(frozen=True)
@@ -66,15 +86,16 @@ class Mesh:
 
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
-        faces = np.ascontiguousarray(self.faces, dtype=np.int32)
+        faces = np.asarray(self.faces)
         if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
             raise DataError(f"a mesh needs (V, 3) vertices and (F, 3) faces, found {vertices.shape} and {faces.shape}")
         if not np.isfinite(vertices).all():
             raise DataError("a mesh has vertices that are NaN or infinite")
         if faces.min() < 0 or faces.max() >= len(vertices):
-            raise DataError(f"a mesh of {len(vertices)} vertices has faces that name vertex {int(faces.max())}")
+            worst = faces.min() if faces.min() < 0 else faces.max()
+            raise DataError(f"a mesh of {len(vertices)} vertices has faces that name vertex {int(worst)}")
         object.__setattr__(self, "vertices", vertices)
-        object.__setattr__(self, "faces", faces)
+        object.__setattr__(self, "faces", np.ascontiguousarray(faces, dtype=np.int32))
 
     @cached_property
     def content_hash(self) -> str:
@@ -118,14 +139,20 @@ class Body:
 
     def __post_init__(self) -> None:
         poses = np.asarray(self.poses, dtype=np.float64)
-        if poses.shape[-2:] != (4, 4) or poses.ndim not in (2, 3) or not np.isfinite(poses).all():
+        if poses.shape[-2:] != (4, 4) or poses.ndim not in (2, 3) or not poses.size or not np.isfinite(poses).all():
             raise DataError(
                 f"body {self.name!r}: poses have shape {poses.shape} or are not finite",
                 allowed="(4, 4) or (frames, 4, 4)",
             )
         rotation = poses[..., :3, :3]
-        if not np.allclose(rotation @ np.swapaxes(rotation, -1, -2), np.eye(3), atol=1e-6):
-            raise DataError(f"body {self.name!r}: a pose is not rigid (its 3x3 part is no rotation)")
+        orthogonal = np.allclose(rotation @ np.swapaxes(rotation, -1, -2), np.eye(3), atol=RIGID_TOLERANCE)
+        if not orthogonal or (np.linalg.det(rotation) < 0).any() or (poses[..., 3, :] != (0, 0, 0, 1)).any():
+            raise DataError(
+                f"body {self.name!r}: a pose is not rigid",
+                allowed="a rotation without scale or reflection, a translation, and 0 0 0 1 below",
+            )
+        if self.role not in ROLES:
+            raise DataError(f"body {self.name!r}: unknown role {self.role!r}", allowed=", ".join(ROLES))
         object.__setattr__(self, "poses", poses)
 
     @property

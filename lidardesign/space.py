@@ -24,6 +24,9 @@ X, Y, Z, AZIMUTH, ELEVATION, RANGE = range(6)
 FULL_TURN = 2 * math.pi
 
 Measure = Literal["solid_angle", "angles"]
+MEASURES = ("solid_angle", "angles")
+# Bounds such as 2 pi are written with some ten digits.
+ROUNDING_RAD = 1e-9
 
 
 def direction(azimuth_rad: Any, elevation_rad: Any) -> np.ndarray:
@@ -89,14 +92,15 @@ class DesignSpace:
             raise ConfigError(
                 f"unknown dimension {unknown[0]!r}", where="space.condition", allowed=", ".join(DIMENSIONS)
             )
+        if self.measure not in MEASURES:
+            raise ConfigError(f"unknown measure {self.measure!r}", where="space.measure", allowed=", ".join(MEASURES))
 
     def _check_physical_ranges(self) -> None:
-        rounding = 1e-9
-        if self.high[AZIMUTH] - self.low[AZIMUTH] > FULL_TURN + rounding:
+        if self.high[AZIMUTH] - self.low[AZIMUTH] > FULL_TURN + ROUNDING_RAD:
             raise ConfigError(
                 "the azimuth spans more than a full turn", where="space.azimuth_rad", allowed="at most 2 pi"
             )
-        if self.low[ELEVATION] < -math.pi / 2 - rounding or self.high[ELEVATION] > math.pi / 2 + rounding:
+        if max(-self.low[ELEVATION], self.high[ELEVATION]) > math.pi / 2 + ROUNDING_RAD:
             raise ConfigError(
                 f"elevation {self.low[ELEVATION]} to {self.high[ELEVATION]} leaves the sphere",
                 where="space.elevation_rad",
@@ -118,7 +122,7 @@ class DesignSpace:
     @cached_property
     def full_azimuth(self) -> bool:
         """Whether the azimuth covers the full turn, so that it is periodic."""
-        return self.high[AZIMUTH] - self.low[AZIMUTH] >= FULL_TURN - 1e-9
+        return self.high[AZIMUTH] - self.low[AZIMUTH] >= FULL_TURN - ROUNDING_RAD
 
     @cached_property
     def chart_low(self) -> np.ndarray:
@@ -174,12 +178,13 @@ class DesignSpace:
         return np.clip(points, self.low, self.high)
 
     def wrap(self, points: np.ndarray) -> np.ndarray:
-        """A copy with the azimuth moved by whole turns to lie at or above its lower bound."""
+        """A copy with an azimuth outside the bounds moved by whole turns to where it is nearest to them."""
         points = np.array(points, dtype=np.float64)
+        azimuth = points[..., AZIMUTH]
         low, high = self.low[AZIMUTH], self.high[AZIMUTH]
-        outside = (points[..., AZIMUTH] < low) | (points[..., AZIMUTH] > high)
-        wrapped = low + np.mod(points[..., AZIMUTH] - low, FULL_TURN)
-        points[..., AZIMUTH] = np.where(outside, wrapped, points[..., AZIMUTH])
+        lowest = (low + high) / 2 - math.pi
+        wrapped = lowest + np.mod(azimuth - lowest, FULL_TURN)
+        points[..., AZIMUTH] = np.where((azimuth < low) | (azimuth > high), wrapped, azimuth)
         return points
 
     def contains(self, points: np.ndarray, tolerance: float = 1e-9) -> np.ndarray:

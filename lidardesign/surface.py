@@ -41,6 +41,8 @@ def sample_body(
     bodies: Sequence[Body], space: DesignSpace, count: int, generator: np.random.Generator, frame: int = 0
 ) -> Sampled:
     """Area-uniform points on bodies; an infinite plane counts as far as the space reaches."""
+    if len(bodies) == 1:
+        return _on_body(bodies[0], space, count, generator, frame)
     area = np.array([surface_area_m2(body, space) for body in bodies])
     numbers = generator.multinomial(count, area / area.sum())
     parts = [_on_body(body, space, n, generator, frame) for body, n in zip(bodies, numbers, strict=True) if n]

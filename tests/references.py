@@ -46,3 +46,42 @@ def numerical_gradient(function, points, step):
         offset[k] = step
         columns.append((function(points + offset) - function(points - offset)) / (2 * step))
     return np.stack(columns, axis=1)
+
+# a few roundings of numbers near 1
+ROUNDING = 1e-15
+# |estimate - truth| of a fixed seed is below four standard errors but for one draw in 16,000
+STANDARD_ERRORS = 4.0
+# Embree's float32, recentred: 6e-8 relative per operation, a few of them, for scenes of about a metre
+EMBREE_M = 2e-6
+
+
+def shape_distance(shape):
+    """The signed distance of a shape at rest as a function of (N, 3) points; of a mesh, of its one triangle's plane."""
+    name = type(shape).__name__
+    if name == "Sphere":
+        return lambda q: np.linalg.norm(q, axis=1) - shape.radius_m
+    if name == "Plane":
+        return lambda q: q[:, 2]
+    if name == "Capsule":
+        half = shape.half_length_m
+        return lambda q: (
+            np.linalg.norm(q - np.c_[0 * q[:, :2], np.clip(q[:, 2], -half, half)], axis=1) - shape.radius_m
+        )
+    if name == "Box":
+        half = np.array(shape.half_extents_m)
+        return lambda q: (
+            np.linalg.norm(np.maximum(np.abs(q) - half, 0), axis=1)
+            + np.minimum((np.abs(q) - half).max(axis=1), 0)
+        )
+    a, b, c = shape.vertices[shape.faces[0]]
+    normal = np.cross(b - a, c - a)
+    return lambda q: (q - a) @ (normal / np.linalg.norm(normal))
+
+
+def marched_hit(distance, origins, directions, reach, steps=400):
+    """First hits by sphere marching of an exact distance, from outside; inf where the reach is passed first."""
+    travelled = np.zeros(len(origins))
+    for _ in range(steps):
+        travelled += np.maximum(distance(origins + travelled[:, None] * directions), 0.0)
+        travelled = np.minimum(travelled, 2 * reach)
+    return np.where(travelled < reach, travelled, np.inf)
