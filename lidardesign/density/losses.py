@@ -5,7 +5,8 @@ annealed. It cannot tell how much mass belongs on either side of a silhouette, b
 after another is hidden and its gradient has no term for the jump: on faces it stays at a KL of 0.25 nats with the neck
 starved by a factor of three. Balancing needs the values of p* only. For flow samples it follows the gradient of
 the reverse KL in its log-variance form, and for samples of p* from independent proposals that of the forward KL, which
-brings back what the flow dropped.
+brings back what the flow dropped. Few samples leak to where log p* is -100 and below, yet they would make up most of
+the KL; these are led back along paths, with a cost that grows like their distance in sigmas.
 
 References:
     VarGrad, Richter et al. 2020.
@@ -23,10 +24,10 @@ from lidardesign.density.flow import DesignFlow
 from lidardesign.density.objective import Coordinates, log_target
 from lidardesign.density.target import Target
 
-# A log weight further than this from the mean pulls no harder: leaked samples have log p* of -1000 and below.
-CLIPPED_NATS = 5.0
+# Log weights further than this from the mean pull no harder.
+LARGEST_PULL_NATS = 5.0
 # The share of the forward KL on proposals beside the reverse KL on the flow's own samples.
-FORWARD_SHARE = 0.3
+FORWARD_SHARE = 0.5
 
 
 def draw_conditions(flow: DesignFlow, count: int, generator: torch.Generator) -> Tensor | None:
@@ -90,18 +91,32 @@ def balancing_loss(
 ) -> tuple[Tensor, float, float]:
     """A loss whose gradient balances mass by values of p*; also the reverse KL loss and the batch's ESS."""
     conditions = draw_conditions(flow, count, generator)
+    base = flow.draw_base(count, generator)
     with torch.no_grad():
-        learned, log_prob = flow(flow.draw_base(count, generator), conditions)
+        learned, log_prob = flow(base, conditions)
     unit = coordinates.join(learned, conditions)
     points = coordinates.space.from_unit(unit.cpu().double().numpy())
     log_p_star = torch.as_tensor(target.log_density(points)).to(log_prob)
     log_weights = log_p_star - log_prob
     centred = log_weights - (log_weights.logsumexp(0) - np.log(count))
-    pull = centred.clamp(-CLIPPED_NATS, CLIPPED_NATS)
-    pull = (pull - pull.mean()).clamp(-CLIPPED_NATS, CLIPPED_NATS)
+    pull = centred.clamp(-LARGEST_PULL_NATS, LARGEST_PULL_NATS)
+    pull = pull - pull.mean()
     proposed = pool.draw(count, generator, learned)
     foreign = proposed[:, coordinates.learned]
     contexts = None if conditions is None else torch.cat([conditions, proposed[:, coordinates.conditions]])
     both = flow.log_prob(torch.cat([learned, foreign]), contexts)
     loss = -(pull * both[:count]).mean() - FORWARD_SHARE * both[count:].mean()
+    leaked = centred < -LARGEST_PULL_NATS
+    if leaked.any():
+        cost = _leak_cost(flow, target, coordinates, base[leaked], None if conditions is None else conditions[leaked])
+        loss = loss + cost / count
     return loss, float(-log_weights.mean()), effective_share(log_weights)
+
+
+def _leak_cost(
+    flow: DesignFlow, target: Target, coordinates: Coordinates, base: Tensor, conditions: Tensor | None
+) -> Tensor:
+    """The summed distances of leaked samples from the target, in sigmas: sqrt(-2 log p*), differentiable."""
+    learned, _ = flow(base, conditions)
+    log_p_star = log_target(coordinates.join(learned, conditions), target, coordinates, target.optics.sigma_m)
+    return torch.sqrt((-2 * log_p_star).clamp(min=1.0)).sum()

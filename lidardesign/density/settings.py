@@ -35,7 +35,7 @@ class LearningSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    steps: int = Field(700, ge=1, description="optimiser steps")
+    steps: int = Field(1000, ge=1, description="optimiser steps")
     batch: int = Field(1024, ge=2, description="design points per step")
     rate: float = Field(1e-2, gt=0, description="initial Adam step size")
     layers: int = Field(3, ge=1, le=32, description="autoregressive spline layers per block of the chain")
@@ -45,9 +45,9 @@ class LearningSettings(BaseModel):
         "float32", description="arithmetic of training steps; samples and densities are always float64"
     )
     entropy: float = Field(0.0, ge=0, description="eta of the paper; annealed to 0")
-    sigma_start_m: float | None = Field(None, gt=0, description="where sigma's annealing starts; default 10 sigma")
+    sigma_start_m: float | None = Field(None, gt=0, description="where sigma's annealing starts; default 6 sigma")
     anneal: float = Field(0.7, ge=0, le=1, description="share of the path-wise steps over which sigma falls")
-    balance: float = Field(0.4, ge=0, le=1, description="share of the steps, the last ones, that balance by values")
+    balance: float = Field(0.5, ge=0, le=1, description="share of the steps, the last ones, that balance by values")
     balance_proposals: int = Field(16384, ge=256, description="independent proposals that balancing draws from")
     clip_norm: float = Field(5.0, gt=0, description="gradient norm that steps are clipped to")
     checkpoint_seconds: float = Field(20.0, gt=0, description="time between checkpoints [s]")
@@ -57,8 +57,7 @@ class LearningSettings(BaseModel):
 
 PRESET_LEARNING: dict[str, dict[str, Any]] = {
     "draft": {
-        "steps": 250,
-        "layers": 2,
+        "steps": 340,
         "hidden": 64,
         "samples": 40_000,
         "balance_proposals": 8192,

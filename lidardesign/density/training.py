@@ -2,8 +2,11 @@
 
 First the reverse KL along paths, while sigma falls geometrically from its start to its final value, so that surfaces
 are found while they are wide; eta falls to zero with it. The last steps balance the mass by values of p* (`losses`).
-A step whose loss or gradient is not finite is skipped; several in a row take the last good
-state back and halve the step size; when that does not help either, training stops with the last good checkpoint.
+A step whose loss or gradient is not finite is skipped; several in a row take the last good weights back and halve the
+step size; when that does not help either, training stops with the last good checkpoint.
+
+Every `SNAPSHOT_STEPS` steps the whole state is copied. Checkpoints are these snapshots, also after an interruption: a
+resumed run falls back on the same weights as an uninterrupted one would, so both stay the same bit for bit.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +27,16 @@ from lidardesign.density.losses import Pool, balancing_loss, pathwise_loss
 from lidardesign.density.objective import Coordinates
 from lidardesign.density.settings import LearningSettings
 from lidardesign.density.target import Target
-from lidardesign.errors import DataError, DivergenceError
+from lidardesign.errors import DataError, DivergenceError, NumericalError
 from lidardesign.run.checkpoint import load_arrays, save_arrays
 from lidardesign.run.manifest import record
 
 CHECKPOINT = "checkpoint.safetensors"
 PROGRESS = "progress.jsonl"
-SIGMA_START_RATIO = 10.0
+SIGMA_START_RATIO = 6.0
 # The step size falls over each phase on a cosine between these shares of its initial value.
 PATHWISE_RATES = (1.0, 0.1)
-BALANCING_RATES = (0.3, 0.003)
+BALANCING_RATES = (0.6, 0.006)
 SKIPS_BEFORE_BACKING_OFF = 5
 HALVINGS_BEFORE_GIVING_UP = 6
 SNAPSHOT_STEPS = 50
@@ -61,6 +64,14 @@ class LearnProgress:
     phase: str = "learning"
 
 
+@dataclass(frozen=True, eq=False)
+class _Snapshot:
+    """The arrays of a state, copied, and its counters."""
+
+    arrays: dict[str, np.ndarray]
+    state: dict[str, Any]
+
+
 @dataclass
 class Trainer:
     """The state of training: flow, optimiser, random stream and counters."""
@@ -77,7 +88,7 @@ class Trainer:
     skipped_in_a_row: int = 0
     halvings: int = 0
     seconds_before: float = 0.0
-    _snapshot: dict[str, Any] = field(default_factory=dict)
+    _snapshot: _Snapshot | None = None
 
     def __post_init__(self) -> None:
         self.optimiser = torch.optim.Adam(self.flow.parameters(), lr=self.settings.rate, betas=(0.9, 0.99))
@@ -109,19 +120,26 @@ class Trainer:
         return self.settings.rate * decay / 2**self.halvings
 
     def train(self, progress: Callable[[LearnProgress], None] | None = None) -> None:
-        """Run the remaining steps, with checkpoints; raises DivergenceError."""
+        """Run the remaining steps, with checkpoints, one of them when it is interrupted; raises DivergenceError."""
+        try:
+            self._run_steps(progress)
+        except KeyboardInterrupt:
+            if self._snapshot is not None:
+                self._save(self._snapshot)
+            raise
+        self._save(self._taken())
+
+    def _run_steps(self, progress: Callable[[LearnProgress], None] | None) -> None:
         checkpointed = time.perf_counter()
         while self.step < self.settings.steps:
-            if self.step % SNAPSHOT_STEPS == 0:
-                self._snapshot = self._state_arrays()
+            if self.step % SNAPSHOT_STEPS == 0 or self._snapshot is None:
+                self._snapshot = self._taken()
+                if time.perf_counter() - checkpointed > self.settings.checkpoint_seconds:
+                    self._save(self._snapshot)
+                    checkpointed = time.perf_counter()
             loss, ess = self._advance()
-            done = self.step == self.settings.steps
-            if self.step % PROGRESS_STEPS == 0 or done:
+            if self.step % PROGRESS_STEPS == 0 or self.step == self.settings.steps:
                 self._report(loss, ess, progress)
-            if time.perf_counter() - checkpointed > self.settings.checkpoint_seconds:
-                self.save()
-                checkpointed = time.perf_counter()
-        self.save()
 
     def _advance(self) -> tuple[float, float]:
         for group in self.optimiser.param_groups:
@@ -141,10 +159,13 @@ class Trainer:
 
     def _loss(self) -> tuple[torch.Tensor, float, float]:
         parts = (self.flow, self.target, self.coordinates, self.settings.batch)
-        if self.step >= self.pathwise_steps:
-            return balancing_loss(*parts, self.pool, self.generator)
-        eta = self.settings.entropy * (1 - self.step / self.pathwise_steps)
-        return pathwise_loss(*parts, self.sigma_m(self.step), eta, self.generator)
+        try:
+            if self.step >= self.pathwise_steps:
+                return balancing_loss(*parts, self.pool, self.generator)
+            eta = self.settings.entropy * (1 - self.step / self.pathwise_steps)
+            return pathwise_loss(*parts, self.sigma_m(self.step), eta, self.generator)
+        except NumericalError:  # the flow left the numbers: a step to skip like any other
+            return torch.tensor(math.nan), math.nan, math.nan
 
     def _skip(self) -> None:
         self.skipped += 1
@@ -154,14 +175,13 @@ class Trainer:
         self.halvings += 1
         self.skipped_in_a_row = 0
         if self.halvings > HALVINGS_BEFORE_GIVING_UP:
-            self._restore_arrays(self._snapshot)
-            self.save()
+            self._save(self._snapshot)
             raise DivergenceError(
                 f"learning diverged at step {self.step}: loss or gradient stayed non-finite after "
                 f"{self.halvings - 1} halvings of the step size; the last good state is {self.run / CHECKPOINT}",
                 hint="a smaller learning.rate, a larger density.sigma_m, or learning.dtype=float64",
             )
-        self._restore_arrays(self._snapshot)
+        self._restore_arrays(self._snapshot.arrays)
 
     def _report(self, loss: float, ess: float, progress: Callable[[LearnProgress], None] | None) -> None:
         seconds = self.seconds
@@ -208,12 +228,13 @@ class Trainer:
         if with_generator:
             self.generator.set_state(torch.as_tensor(arrays["generator"]))
 
-    def save(self) -> None:
-        """Write the checkpoint."""
-        state = {
-            name: getattr(self, name) for name in ("step", "skipped", "skipped_in_a_row", "halvings")
-        } | {"seconds": self.seconds}
-        save_arrays(self.run, CHECKPOINT, self._state_arrays(), state)
+    def _taken(self) -> _Snapshot:
+        """A copy of the present state."""
+        counters = {name: getattr(self, name) for name in ("step", "skipped", "skipped_in_a_row", "halvings")}
+        return _Snapshot(self._state_arrays(), {**counters, "seconds": self.seconds})
+
+    def _save(self, snapshot: _Snapshot) -> None:
+        save_arrays(self.run, CHECKPOINT, snapshot.arrays, snapshot.state)
         if (self.run / PROGRESS).exists():
             record(self.run, [PROGRESS])
 
@@ -223,7 +244,7 @@ class Trainer:
         self._restore_arrays(arrays, with_generator=True)
         self.step, self.skipped = state["step"], state["skipped"]
         self.skipped_in_a_row, self.halvings = state["skipped_in_a_row"], state["halvings"]
-        self.seconds_before = state["seconds"]
+        self.seconds_before, self._started = state["seconds"], time.perf_counter()
         path = self.run / PROGRESS
         if path.exists():
             kept = [line for line in path.read_text(encoding="utf-8").splitlines() if _step_of(line) <= self.step]
