@@ -402,3 +402,20 @@ def test_a_scan_exported_at_another_count_has_its_own_sensors(lidardesign, flat,
 def test_help_gives_an_example_of_every_command(lidardesign):
     for name in ("learn", "fit", "constrain", "evaluate", "export", "show"):
         assert f"lidardesign {name} " in lidardesign(name, "--help").out.split("Examples:")[1]
+
+
+def test_a_design_that_was_copied_away_from_its_run_says_what_it_lacks(lidardesign, flat, tmp_path):
+    lidardesign("fit", flat, "--layout", "density", "--rays", 12, "--name", "beams")
+    copied = tmp_path / "elsewhere" / "deep" / "beams.yaml"
+    copied.parent.mkdir(parents=True)
+    copied.write_bytes((flat / "designs" / "beams.yaml").read_bytes())
+    assert lidardesign("export", copied, "--format", "csv").code == 0
+    for arguments, words in (
+        (("export", copied, "--format", "csv", "--rays", 20), "need samples of the learned density"),
+        (("evaluate", copied), "give the run folder too"),
+        (("constrain", copied), "the run of this design is not there"),
+    ):
+        result = lidardesign(*arguments)
+        assert result.code in (2, 3)
+        assert words in result.err
+    assert lidardesign("evaluate", flat, copied, "--rays", 12).code == 0

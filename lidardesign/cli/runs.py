@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from lidardesign.task import Split, Task
 
 DESIGN_FOLDER = "designs"
+MANIFEST = "manifest.json"
 NAME_PATTERN = re.compile(r"[^\W.][\w.+-]{0,99}")
 
 
@@ -86,7 +87,8 @@ def run_of(design: Design, path: Path) -> Run | None:
     if not isinstance(named, str):
         return None
     folder = Path(os.path.normpath(path.parent / named))
-    return open_run(folder) if folder.is_dir() else None
+    # a design that was copied elsewhere names a folder that is none of its run's
+    return open_run(folder) if (folder / MANIFEST).is_file() else None
 
 
 def need_run(run: Run | None, path: Path) -> Run:
