@@ -85,3 +85,5 @@ def marched_hit(distance, origins, directions, reach, steps=400):
         travelled += np.maximum(distance(origins + travelled[:, None] * directions), 0.0)
         travelled = np.minimum(travelled, 2 * reach)
     return np.where(travelled < reach, travelled, np.inf)
+# a spline of slope 1e4 multiplies float64's 1e-16 by its slope and its curvature, over a few layers
+FLOW_ROUND_TRIP_NATS = 1e-6

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
+from lidardesign.errors import NumericalError
+
 # A point counts as covered where p >= COVERED_RATIO * p* / Z.
 COVERED_RATIO = 0.1
 
@@ -33,11 +35,26 @@ class Quality:
 
 
 def quality(log_prob: np.ndarray, log_target: np.ndarray, groups: np.ndarray | None = None) -> Quality:
-    """ESS, KL and log Z of samples of p, shapes (N,); with `groups` (one per condition value) each is averaged."""
+    """ESS, KL and log Z of samples of p, shapes (N,); with `groups` (one per condition value) each is averaged.
+
+    Raises:
+        NumericalError: A log density is NaN or infinite.
+    """
+    log_weights = log_target - log_prob
+    if not len(log_weights) or not np.isfinite(log_weights).all():
+        raise NumericalError(
+            f"{int((~np.isfinite(log_weights)).sum())} of {len(log_weights)} samples of the flow have no finite weight",
+            hint="a smaller learning.rate, or learning.dtype=float64",
+        )
     if groups is None:
-        return _quality(log_target - log_prob)
-    parts = [_quality((log_target - log_prob)[groups == group]) for group in np.unique(groups)]
+        return _quality(log_weights)
+    parts = list(quality_by_group(log_weights, groups).values())
     return Quality(*(float(np.mean([getattr(part, name) for part in parts])) for name in ("ess", "kl_nats", "log_z")))
+
+
+def quality_by_group(log_weights: np.ndarray, groups: np.ndarray) -> dict[int, Quality]:
+    """The figures of every condition group by its number, from log p* - log p and groups, shapes (N,)."""
+    return {int(group): _quality(log_weights[groups == group]) for group in np.unique(groups)}
 
 
 def _quality(log_weights: np.ndarray) -> Quality:
@@ -49,9 +66,14 @@ def _quality(log_weights: np.ndarray) -> Quality:
 
 
 def coverage(
-    log_prob: np.ndarray, log_target: np.ndarray, log_proposal: np.ndarray, log_z: float
+    log_prob: np.ndarray, log_target: np.ndarray, log_proposal: np.ndarray, log_z: np.ndarray | float
 ) -> float:
-    """The covered share of the target's mass, from proposals with their three log densities, shapes (N,)."""
+    """The covered share of the target's mass, from proposals with their three log densities, shapes (N,).
+
+    With conditions `log_z` has the value of each proposal's condition group, shape (N,). No proposals cover nothing.
+    """
+    if not len(log_target):
+        return 0.0
     log_mass = log_target - log_proposal
     mass = np.exp(log_mass - log_mass.max())
     covered = log_prob >= log_target - log_z + math.log(COVERED_RATIO)

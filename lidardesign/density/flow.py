@@ -9,7 +9,7 @@ and costs one pass per layer and dimension of its block. Coordinates are the fre
 
 Splines are zuko's, with two differences: all knot slopes are learned, the outer ones too, and for an azimuth that spans
 the full turn the outer slopes are tied and the spline starts half a turn away, so that the density is continuous
-across 0 / 2 pi; later blocks see such an azimuth as its sine and cosine.
+across 0 / 2 pi; such an azimuth is a block of its own, and later blocks see its sine and cosine.
 
 References:
     Neural Spline Flows, Durkan et al. 2019. Normalizing Flows on Tori and Spheres, Rezende et al. 2020.
@@ -65,15 +65,22 @@ class BoundedSpline(MonotonicRQSTransform):
         return torch.where(self.periodic, torch.where(values >= 0, values - BOUND, values + BOUND), values)
 
     def call_and_ladj(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """The spline's values and log slopes at x, with shape (*, D)."""
-        return super().call_and_ladj(self._turned(x).clamp(-BOUND + EDGE, BOUND - EDGE))
+        """The spline's values and log slopes at x, with shape (*, D); rounding never leaves [-1, 1]."""
+        y, log_slope = super().call_and_ladj(self._turned(x).clamp(-BOUND + EDGE, BOUND - EDGE))
+        return y.clamp(-BOUND, BOUND), log_slope
 
     def _call(self, x: Tensor) -> Tensor:
-        return super()._call(self._turned(x).clamp(-BOUND + EDGE, BOUND - EDGE))
+        return super()._call(self._turned(x).clamp(-BOUND + EDGE, BOUND - EDGE)).clamp(-BOUND, BOUND)
 
     def _inverse(self, y: Tensor) -> Tensor:
-        x = super()._inverse(y.clamp(-BOUND + EDGE, BOUND - EDGE))
-        return self._turned(x)
+        """The root inside the bin; its discriminant is positive, but rounding may say otherwise."""
+        y = y.clamp(-BOUND + EDGE, BOUND - EDGE)
+        _, x0, x1, y0, y1, d0, d1, s = self.bin(self.searchsorted(self.vertical, y) - 1)
+        bend = (y - y0) * (d0 + d1 - 2 * s)
+        a, b, c = (y1 - y0) * (s - d0) + bend, (y1 - y0) * d0 - bend, -s * (y - y0)
+        discriminant = (b**2 - 4 * a * c).clamp(min=torch.finfo(y.dtype).tiny)
+        share = (2 * c / (-b - discriminant.sqrt())).clamp(0.0, 1.0)
+        return self._turned(x0 + share * (x1 - x0))
 
 
 class _Block(nn.Module):
@@ -160,11 +167,13 @@ class DesignFlow(nn.Module):
         self._periodic = list(periodic) or [False] * self.features
         self.blocks = nn.ModuleList()
         seen: list[int] = []
-        for dimensions in blocks:
-            width = context + len(seen) + sum(self._periodic[i] for i in seen)
-            circular = [self._periodic[i] for i in dimensions]
-            self.blocks.append(_Block(dimensions, width, layers, hidden, bins, circular))
-            seen += dimensions
+        # torch draws initial weights from its global stream; they are replaced by the generator's below
+        with torch.random.fork_rng(devices=[]):
+            for dimensions in blocks:
+                width = context + len(seen) + sum(self._periodic[i] for i in seen)
+                circular = [self._periodic[i] for i in dimensions]
+                self.blocks.append(_Block(dimensions, width, layers, hidden, bins, circular))
+                seen += dimensions
         self._initialise(generator)
 
     def _initialise(self, generator: torch.Generator) -> None:
@@ -205,9 +214,9 @@ class DesignFlow(nn.Module):
         return torch.cat(ordered, dim=-1), log_prob
 
     def log_prob(self, values: Tensor, context: Tensor | None = None) -> Tensor:
-        """The log density of any points in [-1, 1]^D, (N, D) to (N,); -inf outside."""
-        outside = (values.abs() > BOUND).any(dim=-1)
-        values = values.clamp(-BOUND, BOUND)
+        """The log density of any points in [-1, 1]^D, (N, D) to (N,); -inf outside, also for NaN."""
+        outside = ~(values.abs() <= BOUND).all(dim=-1)
+        values = torch.where(outside[:, None], 0.0, values)
         log_prob = torch.full_like(values[:, 0], self.log_base)
         finished: list[tuple[int, Tensor]] = []
         for block in self.blocks:

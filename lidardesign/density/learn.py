@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lidardesign.density.diagnostics import coverage, quality
+from lidardesign.density.diagnostics import coverage, quality, quality_by_group
 from lidardesign.density.flow import DesignFlow
 from lidardesign.density.losses import Pool, draw_conditions
 from lidardesign.density.objective import Coordinates
@@ -21,16 +21,18 @@ from lidardesign.density.target import Target
 from lidardesign.density.training import PROGRESS, LearnProgress, Trainer
 from lidardesign.design.samples import Samples, save_samples
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.registry import plugin_guard
 from lidardesign.run.checkpoint import save_arrays
 from lidardesign.run.config import RunConfig
 from lidardesign.run.manifest import note, record
 from lidardesign.scene import Scene
-from lidardesign.space import AZIMUTH
+from lidardesign.space import AZIMUTH, DesignSpace
 from lidardesign.task import Task, random_generator, scenes_of
 
 FLOW = "flow.safetensors"
 SAMPLE_CHUNK = 16384
 CONDITION_GROUPS = 32
+DEVICES = ("auto", "cpu", "cuda")
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,8 @@ def learn(
     """
     clock = _Clock()
     place = choose_device(device)
-    scenes = list(scenes_of(task, config.task, "train", config.seed, config.space))
+    with plugin_guard(config.task_name):
+        scenes = list(scenes_of(task, config.task, "train", config.seed, config.space))
     if not scenes:
         raise DataError(f"the task {config.task_name!r} gave no training scenes", where="task")
     clock.lap("scenes")
@@ -130,8 +133,10 @@ def choose_device(name: str) -> torch.device:
     """The device of a name; auto takes CUDA when it is there.
 
     Raises:
-        ConfigError: CUDA was asked for and is not there.
+        ConfigError: The name is none of auto, cpu and cuda, or CUDA was asked for and is not there.
     """
+    if name not in DEVICES:
+        raise ConfigError(f"unknown device {name!r}", where="--device", allowed=", ".join(DEVICES))
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if name == "cuda" and not torch.cuda.is_available():
@@ -193,10 +198,11 @@ def draw_samples(trainer: Trainer, count: int) -> Samples:
 
 
 def log_density_of(trainer: Trainer, points: np.ndarray) -> np.ndarray:
-    """The flow's log density per chart volume at any design points, (N, 6) to (N,)."""
+    """The flow's log density per chart volume at any design points, (N, 6) to (N,); -inf outside the space."""
     coordinates = trainer.coordinates
     like = next(trainer.flow.parameters())
-    unit = torch.as_tensor(coordinates.space.to_unit(points)).to(like)
+    # points on the space's faces may leave it by rounding
+    unit = torch.as_tensor(coordinates.space.to_unit(points).clip(-1.0, 1.0)).to(like)
     conditions = unit[:, coordinates.conditions] if coordinates.conditions else None
     with torch.no_grad():
         parts = [
@@ -206,12 +212,14 @@ def log_density_of(trainer: Trainer, points: np.ndarray) -> np.ndarray:
             for rows in torch.arange(len(unit)).split(SAMPLE_CHUNK)
         ]
     log_prob = torch.cat(parts).cpu().double().numpy()
+    log_prob = np.where(coordinates.space.contains(points), log_prob, -np.inf)
     return log_prob + coordinates.log_condition_density - coordinates.log_unit_volume
 
 
 def _measure(trainer: Trainer, scenes: Sequence[Scene], config: RunConfig) -> tuple[Samples, dict[str, float]]:
     samples = draw_samples(trainer, config.learning.samples)
-    found = quality(samples.log_prob, samples.log_target, _condition_groups(samples))
+    groups = _condition_groups(config.space, samples.points)
+    found = quality(samples.log_prob, samples.log_target, groups)
     generator = random_generator(config.seed, "coverage")
     proposals = propose(
         scenes, config.space, config.learning.coverage_proposals, trainer.target.optics.sigma_m, generator
@@ -220,18 +228,28 @@ def _measure(trainer: Trainer, scenes: Sequence[Scene], config: RunConfig) -> tu
         log_density_of(trainer, proposals.points),
         trainer.target.log_density(proposals.points),
         proposals.log_density,
-        found.log_z,
+        _log_z_at(proposals.points, samples, groups, found.log_z),
     )
     return samples, {"ess": found.ess, "kl_nats": found.kl_nats, "log_z": found.log_z, "coverage": covered}
 
 
-def _condition_groups(samples: Samples) -> np.ndarray | None:
-    conditioned = samples.space.conditioned
-    if not conditioned:
+def _condition_groups(space: DesignSpace, points: np.ndarray) -> np.ndarray | None:
+    """Which part of the first conditioning dimension's bounds points (N, 6) lie in, shape (N,)."""
+    if not space.conditioned:
         return None
-    low, high = np.array(samples.space.low), np.array(samples.space.high)
-    share = (samples.points[:, conditioned[0]] - low[conditioned[0]]) / (high - low)[conditioned[0]]
-    return np.minimum((share * CONDITION_GROUPS).astype(int), CONDITION_GROUPS - 1)
+    first = space.conditioned[0]
+    share = (points[:, first] - space.low[first]) / (space.high[first] - space.low[first])
+    return np.clip((share * CONDITION_GROUPS).astype(int), 0, CONDITION_GROUPS - 1)
+
+
+def _log_z_at(points: np.ndarray, samples: Samples, groups: np.ndarray | None, mean_log_z: float) -> np.ndarray | float:
+    """log Z of the condition group of each point; the mean where there are no conditions or no samples."""
+    if groups is None:
+        return mean_log_z
+    by_group = np.full(CONDITION_GROUPS, mean_log_z)
+    for group, part in quality_by_group(samples.log_weights, groups).items():
+        by_group[group] = part.log_z
+    return by_group[_condition_groups(samples.space, points)]
 
 
 def _store(trainer: Trainer, samples: Samples, config: RunConfig, run: Path) -> None:

@@ -35,9 +35,14 @@ class Coordinates:
 
     @property
     def blocks(self) -> list[list[int]]:
-        """Learned dimensions by block of the flow's chain: origin, then direction, then range."""
+        """Learned dimensions by block of the flow's chain: origin, then direction, then range.
+
+        An azimuth on a circle stands alone, so that everything after it sees its sine and cosine: inside a block the
+        elevation would see where the circle was cut open.
+        """
         names = [self.space.free[n] for n in self.learned]
-        groups = ((X, Y, Z), (AZIMUTH, ELEVATION), (RANGE,))
+        angles = ((AZIMUTH,), (ELEVATION,)) if self.space.full_azimuth else ((AZIMUTH, ELEVATION),)
+        groups = ((X, Y, Z), *angles, (RANGE,))
         parts = [[k for k, i in enumerate(names) if i in group] for group in groups]
         return [part for part in parts if part]
 

@@ -22,7 +22,7 @@ def refine_quadrature(target: Target, scenes: Sequence[Scene], probes: np.ndarra
     """The target with enough midpoints that probes (N, 6) hidden by an occluder are hidden, and notes about it."""
     rays = RayBatch(probes[:, :3], direction(probes[:, AZIMUTH], probes[:, ELEVATION]), probes[:, RANGE])
     active = np.ones((len(probes), target.field.columns), dtype=bool)
-    exact = Raycast(scenes).transmittance(rays, active, target.optics).log_values
+    exact = Raycast(scenes).transmittance(rays, active, target.optics, differentiable=False).log_values
     hidden = exact < np.log(OPAQUE)
     visibility, reach = target.visibility, float(probes[:, RANGE].max(initial=0.0))
     if not hidden.any():
@@ -45,7 +45,7 @@ def refine_quadrature(target: Target, scenes: Sequence[Scene], probes: np.ndarra
 
 
 def _missed_share(visibility: Quadrature, rays: RayBatch, hidden: np.ndarray, target: Target) -> float:
-    log_values = visibility.transmittance(rays, hidden, target.optics).log_values
+    log_values = visibility.transmittance(rays, hidden, target.optics, differentiable=False).log_values
     return float((log_values[hidden] > np.log(TRANSPARENT)).mean())
 
 

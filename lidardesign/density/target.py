@@ -24,11 +24,11 @@ from lidardesign.density.visibility import (
     RayGradient,
     Visibility,
 )
+from lidardesign.errors import NumericalError
 from lidardesign.scene import Scene
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 
 PADDING_SIGMAS = 4.0
-EVALUATION_CHUNK = 8192
 # d direction / d sin(elevation) grows without bound at the poles; it is capped at this cosine of the elevation.
 MINIMUM_POLE_COSINE = 1e-4
 
@@ -67,10 +67,13 @@ class Target:
         self, points: np.ndarray, sigma_m: float | None, gradient: bool
     ) -> tuple[np.ndarray, np.ndarray]:
         points = np.asarray(points, dtype=np.float64)
+        if not np.isfinite(points).all():
+            raise NumericalError("design points are not finite", where="target density")
         optics = self.optics if sigma_m is None else self.optics.widened(sigma_m)
         values, gradients = np.empty(len(points)), np.empty((len(points) if gradient else 0, 6))
-        for start in range(0, len(points), EVALUATION_CHUNK):
-            rows = slice(start, start + EVALUATION_CHUNK)
+        size = self.visibility.rows_at_once
+        for start in range(0, len(points), size):
+            rows = slice(start, start + size)
             values[rows], by_chart = self._evaluate(points[rows], optics, gradient)
             if gradient:
                 gradients[rows] = by_chart
@@ -86,7 +89,7 @@ class Target:
         distances = self.field.distances(observed).astype(np.float64)
         surface = self.log_column_weights - np.square(distances / optics.sigma_m) / 2
         active = surface >= surface.max(axis=1, keepdims=True) - self.surface_tolerance_nats
-        passed = self.visibility.transmittance(rays, active, optics)
+        passed = self.visibility.transmittance(rays, active, optics, differentiable=gradient)
         terms = np.where(active, surface + passed.log_values, -np.inf)
         peak = terms.max(axis=1, keepdims=True)
         shares = np.exp(terms - peak)

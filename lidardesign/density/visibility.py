@@ -8,7 +8,7 @@ differentiated through the plane of the hit triangle, so without the term for si
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -18,13 +18,14 @@ from lidardesign.density import kernels
 from lidardesign.density.fields import Field, TableField, scene_columns
 from lidardesign.density.settings import DensitySettings
 from lidardesign.scene import Scene
-from lidardesign.simulate.raycast import SceneCaster
+from lidardesign.simulate.raycast import shared_caster
 
 # A grazing hit moves without bound when its ray turns; its derivative is capped at this cosine.
 MINIMUM_COSINE = 0.05
 # Beyond this many sharpness lengths from every surface, sigmoid(-k d) is below 1e-13 and is not evaluated.
 CUTOFF_LENGTHS = 30.0
 CHUNK_BYTES = 64 * 2**20
+ROWS_AT_ONCE = 8192
 
 
 @dataclass(frozen=True)
@@ -104,12 +105,15 @@ class Transmittance(Protocol):
 
 
 class Visibility(Protocol):
-    """A way to compute visibility."""
+    """A way to compute visibility; `rows_at_once` is how many rays keep its memory bounded with gradients."""
 
     name: str
+    rows_at_once: int
 
-    def transmittance(self, rays: RayBatch, active: np.ndarray, optics: Optics) -> Transmittance:
-        """log T where `active` (N, columns), 0 elsewhere."""
+    def transmittance(
+        self, rays: RayBatch, active: np.ndarray, optics: Optics, *, differentiable: bool = True
+    ) -> Transmittance:
+        """log T where `active` (N, columns), 0 elsewhere; its gradient may only be asked for if `differentiable`."""
         ...
 
 
@@ -126,8 +130,11 @@ class NoVisibility:
     """Every ray reaches its point: T = 1."""
 
     name = "off"
+    rows_at_once = ROWS_AT_ONCE
 
-    def transmittance(self, rays: RayBatch, active: np.ndarray, optics: Optics) -> Transmittance:
+    def transmittance(
+        self, rays: RayBatch, active: np.ndarray, optics: Optics, *, differentiable: bool = True
+    ) -> Transmittance:
         """See `Visibility`."""
         return _Clear(np.zeros(active.shape), len(rays.ranges))
 
@@ -156,13 +163,16 @@ class Raycast:
     """Exact first hits: exact also for plates that are thinner than any quadrature step."""
 
     name = "raycast"
+    rows_at_once = ROWS_AT_ONCE
 
     def __init__(self, scenes: Sequence[Scene]) -> None:
         self._casters = [
-            SceneCaster(scenes[index], frame, only="occluders") for index, frame in scene_columns(scenes)
+            shared_caster(scenes[index], frame, only="occluders") for index, frame in scene_columns(scenes)
         ]
 
-    def transmittance(self, rays: RayBatch, active: np.ndarray, optics: Optics) -> Transmittance:
+    def transmittance(
+        self, rays: RayBatch, active: np.ndarray, optics: Optics, *, differentiable: bool = True
+    ) -> Transmittance:
         """See `Visibility`."""
         log_values = np.zeros(active.shape)
         found = [self._blocked(column, rays, active, optics) for column in range(active.shape[1])]
@@ -190,23 +200,26 @@ class _Depth:
 
     log_values: np.ndarray
     lengths: np.ndarray
-    by_point: list[tuple[slice, np.ndarray]]
-    contract: object
+    slopes: list[tuple[slice, np.ndarray]]
+    contract: Callable[[slice, np.ndarray, np.ndarray, RayGradient], None]
 
     def gradient(self, weights: np.ndarray) -> RayGradient:
         out = RayGradient.zeros(len(self.lengths))
-        for rows, slope in self.by_point:
+        for rows, slope in self.slopes:
             self.contract(rows, slope, -weights[rows], out)
         # the step grows with the length: d depth / d length at fixed integrand is depth / length
         ahead = self.lengths > 0
-        depth_share = np.einsum("nc,nc->n", weights, self.log_values)
-        out.ranges[ahead] += depth_share[ahead] / self.lengths[ahead]
+        by_step = np.einsum("nc,nc->n", weights, self.log_values)
+        out.ranges[ahead] += by_step[ahead] / self.lengths[ahead]
         out.ranges[~ahead] = 0.0
         return out
 
 
 class Quadrature:
     """The transmittance integral over the occluders' distances by midpoints.
+
+    A surface without an inside occludes as a shell of its `shell_m` to either side. The margin grows by the thickest
+    shell, so that such a surface does not hide itself either.
 
     Arguments:
         field: Distances of the occluders.
@@ -217,30 +230,35 @@ class Quadrature:
 
     def __init__(self, field: Field, points: int) -> None:
         self.field, self.points = field, points
+        self._shell_m = float(field.shell_m.max(initial=0.0))
         if isinstance(field, TableField):
             self._clear = np.empty(len(field.table), dtype=np.float32)
             kernels.cell_minimum(field.table, field.grid.counts, self._clear)
-            self._clear -= np.float32(field.shell_m.max())
+            self._clear -= np.float32(self._shell_m)
 
-    def transmittance(self, rays: RayBatch, active: np.ndarray, optics: Optics) -> Transmittance:
+    @property
+    def rows_at_once(self) -> int:
+        """Rays whose slopes at all midpoints and columns fill a chunk."""
+        return min(max(1, CHUNK_BYTES // (4 * self.points * self.field.columns)), ROWS_AT_ONCE)
+
+    def transmittance(
+        self, rays: RayBatch, active: np.ndarray, optics: Optics, *, differentiable: bool = True
+    ) -> Transmittance:
         """See `Visibility`; the field's contiguous rows make all columns cheap, so `active` only masks."""
-        lengths = np.maximum(rays.ranges - optics.margin_m, 0.0)
-        depth = np.zeros(active.shape)
-        slopes = []
-        for rows in self._chunks(len(lengths)):
-            slopes.append((rows, self._integrate(rays, lengths, rows, optics, depth)))
-        contract = self._contract(rays, lengths, optics)
-        return _Depth(np.where(active, -depth, 0.0), lengths, slopes, contract)
-
-    def _chunks(self, count: int) -> list[slice]:
-        size = max(1, CHUNK_BYTES // (4 * self.points * self.field.columns))
-        return [slice(start, min(start + size, count)) for start in range(0, count, size)]
+        lengths = np.maximum(rays.ranges - optics.margin_m - self._shell_m, 0.0)
+        depth, slopes = np.zeros(active.shape), []
+        for start in range(0, len(lengths), self.rows_at_once):
+            rows = slice(start, min(start + self.rows_at_once, len(lengths)))
+            slope = self._integrate(rays, lengths, rows, optics, depth, differentiable)
+            if differentiable:
+                slopes.append((rows, slope))
+        return _Depth(np.where(active, -depth, 0.0), lengths, slopes, self._contract(rays, lengths, optics))
 
     def _integrate(
-        self, rays: RayBatch, lengths: np.ndarray, rows: slice, optics: Optics, depth: np.ndarray
+        self, rays: RayBatch, lengths: np.ndarray, rows: slice, optics: Optics, depth: np.ndarray, differentiable: bool
     ) -> np.ndarray:
-        count = rows.stop - rows.start
-        slope = np.empty((count, self.points, self.field.columns), dtype=np.float32)
+        shape = (rows.stop - rows.start, self.points, self.field.columns)
+        slope = np.empty(shape if differentiable else (0, 0, 0), dtype=np.float32)
         if isinstance(self.field, TableField):
             kernels.table_quadrature(
                 self.field.table, self._clear, *self.field.geometry, self.field.shell_m,
@@ -250,12 +268,13 @@ class Quadrature:
             )  # fmt: skip
             return slope
         places, steps = self._places(rays, lengths, rows)
-        distances = self.field.distances(places.reshape(-1, 3)).reshape(slope.shape) - self.field.shell_m
+        distances = self.field.distances(places.reshape(-1, 3)).reshape(shape) - self.field.shell_m
         exponent = np.clip(optics.sharpness_per_m * distances, -60.0, 60.0)
         inside = 1.0 / (1.0 + np.exp(exponent))
         rate = optics.attenuation_per_m * steps[:, None, None]
         depth[rows] = (rate * inside).sum(axis=1)
-        slope[:] = -rate * optics.sharpness_per_m * inside * (1.0 - inside)
+        if differentiable:
+            slope[:] = -rate * optics.sharpness_per_m * inside * (1.0 - inside)
         return slope
 
     def _places(self, rays: RayBatch, lengths: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
@@ -263,7 +282,9 @@ class Quadrature:
         places = rays.origins[rows, None] + along[..., None] * rays.directions[rows, None]
         return places, lengths[rows] / self.points
 
-    def _contract(self, rays: RayBatch, lengths: np.ndarray, optics: Optics) -> object:
+    def _contract(
+        self, rays: RayBatch, lengths: np.ndarray, optics: Optics
+    ) -> Callable[[slice, np.ndarray, np.ndarray, RayGradient], None]:
         def table(rows: slice, slope: np.ndarray, weights: np.ndarray, out: RayGradient) -> None:
             kernels.table_quadrature_gradient(
                 self.field.table, self._clear, *self.field.geometry,
