@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from lidardesign_tasks.face import FaceTask
 from lidardesign_tasks.flatland import FlatlandTask
 from lidardesign_tasks.meshes import MeshesTask
@@ -285,3 +286,12 @@ def test_jitter_is_rigid_about_its_centre_and_bounded():
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
         angle = np.rad2deg(np.arccos((np.trace(pose[:3, :3]) - 1) / 2))
         assert angle <= 4.0 * 2.5 * np.sqrt(3) + 1e-9
+
+
+def test_a_mesh_in_millimetres_without_a_scale_is_noted_by_its_file(tmp_path):
+    trimesh.creation.box((120, 90, 70)).export(tmp_path / "box.obj")
+    for scale, noted in ((1.0, True), (0.001, False)):
+        task = MeshesTask()
+        scene = task.scenes(task.Config(folder=tmp_path, scale=scale), "train", 0)[0]
+        notes = " ".join(scene.bodies[0].shape.notes)
+        assert ("box.obj: is 120 m long" in notes) == noted

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -29,6 +30,7 @@ EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
 EXIT_TERMINATED = 143
 PLAIN_WIDTH = 120
+DISK_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 
 
 def plain_json(value: Any) -> Any:
@@ -167,9 +169,7 @@ def describe_error(error: BaseException, console: Console) -> tuple[dict[str, An
         text = "the computer has no memory left; a smaller batch, field_resolution or preset needs less"
         return {"kind": "memory", "message": text}, EXIT_INTERNAL, f"memory error: {text}"
     if isinstance(error, OSError):
-        name = f"{error.filename}: " if error.filename else ""
-        text = f"{name}{error.strerror or error}"
-        return {"kind": "system", "message": text}, EXIT_SYSTEM, f"system error: {text}"
+        return _describe_system_error(error)
     text = f"{type(error).__name__}: {' '.join(str(error).split())}"
     hint = "this is a fault of lidardesign; --debug shows where, please report it"
     return (
@@ -177,3 +177,13 @@ def describe_error(error: BaseException, console: Console) -> tuple[dict[str, An
         EXIT_INTERNAL,
         f"internal error: {text}\n  {hint}",
     )
+
+
+def _describe_system_error(error: OSError) -> tuple[dict[str, Any], int, str]:
+    name = f"{error.filename}: " if error.filename else ""
+    document = {"kind": "system", "message": f"{name}{error.strerror or error}"}
+    text = f"system error: {document['message']}"
+    if error.errno in DISK_FULL and not error.filename:
+        document["hint"] = "make room where the output, the temporary files or numba's cache (NUMBA_CACHE_DIR) go"
+        text += f"\n  try: {document['hint']}"
+    return document, EXIT_SYSTEM, text

@@ -33,6 +33,7 @@ Axis = Literal["x", "y", "z"]
 WORLD_AXES = {"x": [1, 2, 0], "y": [2, 0, 1], "z": [0, 1, 2]}
 RELATIVE_JITTER = 0.02  # of the largest extent, where no shift is given
 SENSOR_DISTANCE = 2.0  # extents
+DOUBTFUL_EXTENT_M = 20.0  # an object that large is more likely in another unit
 ROOM = 1.1  # around the bounding sphere, for the pose jitter
 
 
@@ -147,7 +148,16 @@ def _load_file(
     vertices = mesh.vertices[:, WORLD_AXES[up]]
     if centre:
         vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    return Mesh(vertices, mesh.faces, mesh.sign, tuple(f"{path.name}: {note}" for note in mesh.notes))
+    notes = [*mesh.notes, *_doubts_about_unit(vertices, scale)]
+    return Mesh(vertices, mesh.faces, mesh.sign, tuple(f"{path.name}: {note}" for note in notes))
+
+
+def _doubts_about_unit(vertices: np.ndarray, scale: float) -> list[str]:
+    """A note on a mesh that is larger than a building while no unit was given."""
+    extent = float(np.ptp(vertices, axis=0).max())
+    if scale != 1.0 or extent < DOUBTFUL_EXTENT_M:
+        return []
+    return [f"is {extent:.4g} m long; if the file is in millimetres, set scale=0.001"]
 
 
 def split_meshes(
