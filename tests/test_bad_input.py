@@ -388,8 +388,9 @@ def test_a_disk_that_fills_during_learning_is_one_message_and_a_folder_that_says
 def test_an_interrupted_run_is_resumed_to_the_bytes_of_a_straight_one(tmp_path):
     settings = settings_of(*SMALL, *FREQUENT)
     arguments = ["learn", "flatland", "--preset", "draft", *settings]
-    code, _, err = finish(program(*arguments, "--out", "straight", "--json", cwd=tmp_path))
+    code, out, err = finish(program(*arguments, "--out", "straight", "--json", cwd=tmp_path))
     assert code == 0, err
+    assert {"run", "task", "seconds", "steps", "ess", "kl_nats", "log_z", "coverage"} <= set(json.loads(out))
     interrupted = program(*arguments, "--out", "stopped", "--json", cwd=tmp_path)
     deadline = time.monotonic() + 120
     while not (tmp_path / "stopped" / "checkpoint.safetensors").exists() and time.monotonic() < deadline:

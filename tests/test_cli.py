@@ -420,3 +420,35 @@ def test_a_design_that_was_copied_away_from_its_run_says_what_it_lacks(lidardesi
         assert result.code in (2, 3)
         assert words in result.err
     assert lidardesign("evaluate", flat, copied, "--rays", 12).code == 0
+
+
+@pytest.mark.parametrize("decided", ["raycast", "off", None])
+def test_a_pinned_origin_is_weighted_with_the_visibility_that_the_run_decided_on(flat, monkeypatch, decided):
+    from lidardesign.cli import fit as fit_module
+    from lidardesign.cli.runs import open_run
+    from lidardesign.run.manifest import note
+
+    asked = []
+
+    class Flat:
+        def log_density(self, points):
+            return np.zeros(len(points))
+
+    def prepare(scenes, config, *, visibility=None):
+        asked.append((len(scenes), visibility))
+        return Flat(), []
+
+    monkeypatch.setattr("lidardesign.density.prepare.prepare_target", prepare)
+    if decided is not None:
+        note(flat, visibility=decided)
+    assert fit_module._log_target(open_run(flat), np.zeros((3, 6))).shape == (3,)
+    assert asked == [(20, decided)]
+
+
+def test_a_density_that_was_learned_badly_comes_with_advice():
+    from types import SimpleNamespace
+
+    from lidardesign.cli.learn import _advice
+
+    assert _advice(SimpleNamespace(ess=0.6, coverage=0.98)) == []
+    assert len(_advice(SimpleNamespace(ess=0.01, coverage=0.1))) == 2
