@@ -42,31 +42,27 @@ def score_rows(found: dict[str, Any]) -> list[list[object]]:
     ]  # fmt: skip
 
 
-def paired_rows(found: dict[str, Any]) -> list[list[object]]:
-    """Designs against baselines, scene by scene: negative differences are better for a distance."""
-    rows = []
+def paired_rows(found: dict[str, Any], key: str) -> list[list[object]]:
+    """Designs against baselines, scene by scene."""
     sign = 1.0 if found["metric"]["better"] == "lower" else -1.0
-    for pair in found["paired"]:
-        first, second, flip = pair["a"], pair["b"], 1.0
-        if first in BASELINES and second not in BASELINES:
-            first, second, flip = second, first, -1.0
-        if first in BASELINES or second not in BASELINES:
+    rows = []
+    for pair in found[key]:
+        if pair["a"] in BASELINES or pair["b"] not in BASELINES:
             continue
-        low, high = sorted((flip * pair["ci_low"], flip * pair["ci_high"]))
-        standing = (
-            "better"
-            if sign * high < 0 and sign * low < 0
-            else "worse"
-            if sign * low > 0 and sign * high > 0
-            else "no difference"
-        )
-        rows.append([first, second, pair["rays"], flip * pair["difference"], f"{low:.2f} to {high:.2f}", standing])
+        low, high = pair["ci_low"], pair["ci_high"]
+        decided = "better" if sign * low + sign * high < 0 else "worse"
+        standing = decided if low * high > 0 else "not told apart"
+        interval = f"{low:.2f} to {high:.2f}"
+        rows.append([pair["a"], pair["b"], pair["rays"], pair["difference"], interval, standing])
     return rows
 
 
 def equal_bandwidth_rows(found: dict[str, Any]) -> list[list[object]]:
     """Rows at the bandwidth of another design."""
-    return [[row["design"], row["rays"], row["value"], row["bandwidth_mbps"]] for row in found["equal_bandwidth"]]
+    return [
+        [row["design"], row["rays"], row["value"], row["bandwidth_mbps"], f"{row['matched_to']}, {row['matched_rays']}"]
+        for row in found["equal_bandwidth"]
+    ]
 
 
 def bandwidth_lines(found: dict[str, Any]) -> list[str]:
@@ -112,12 +108,14 @@ def main() -> None:
         ),
         "Paired differences at equal rays": (
             ["design", "baseline", "rays", f"difference {unit}", "95 % interval", "design is"],
-            paired_rows(found),
+            paired_rows(found, "paired"),
         ),
     }
     if found["equal_bandwidth"]:
-        columns = ["design", "rays", f"{found['metric']['name']} {unit}", "Mbit/s"]
+        columns = ["design", "rays", f"{found['metric']['name']} {unit}", "Mbit/s", "of"]
         tables["At equal bandwidth"] = (columns, equal_bandwidth_rows(found))
+        columns = ["design", "baseline", "design's rays", f"difference {unit}", "95 % interval", "design is"]
+        tables["Paired differences at equal bandwidth"] = (columns, paired_rows(found, "paired_equal_bandwidth"))
     report("lidardesign evaluate: faces", tables, bandwidth_lines(found), options.json)
 
 

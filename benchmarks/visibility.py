@@ -19,19 +19,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from common import face_scenes, interleaved, model_option, parser, report
-from scipy.special import softmax
+from scipy.special import logsumexp, softmax
 
 from lidardesign.density.fields import build_field, scene_columns
 from lidardesign.density.proposals import Proposals, propose
 from lidardesign.density.settings import DensitySettings
 from lidardesign.density.target import PADDING_SIGMAS, Target, build_target
-from lidardesign.density.visibility import NoVisibility, Quadrature, RayBatch, Raycast
+from lidardesign.density.visibility import NoVisibility, Quadrature, RayBatch, Raycast, Visibility
 from lidardesign.scene import Body, Box, Scene, rigid
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 
 POINTS = (16, 32, 64, 128, 256, 512)
 PLATE_M = 0.005
+LOG_OPAQUE = -1e4  # log T of hidden points: far below anything that counts, and finite
 
 
 def plate_scenes(count: int) -> tuple[list[Scene], DesignSpace]:
@@ -55,6 +56,7 @@ class Case:
     target: Target
     proposals: Proposals
     rays: RayBatch
+    surface: np.ndarray
     active: np.ndarray
     reference: np.ndarray
 
@@ -69,40 +71,18 @@ class Case:
         surface = -np.square(target.field.distances(rays.origins + rays.ranges[:, None] * rays.directions))
         surface /= 2 * target.optics.sigma_m**2
         active = surface >= surface.max(axis=1, keepdims=True) - target.surface_tolerance_nats
-        return cls(name, target, proposals, rays, active, _opaque(scenes, rays, target.optics.margin_m))
+        return cls(name, target, proposals, rays, surface, active, _opaque(scenes, rays, target.optics.margin_m))
 
-    def errors(self, target: Target) -> tuple[float, float]:
+    def errors(self, visibility: Visibility) -> tuple[float, float]:
         """Error of T and of the weights."""
-        values = np.exp(target.visibility.transmittance(self.rays, self.active, target.optics).log_values)
-        exact = replace(self.target, visibility=_Given(self.reference))
-        weights = [
-            softmax(one.log_density(self.proposals.points) - self.proposals.log_density) for one in (target, exact)
-        ]
-        return (
-            float(np.abs(values - self.reference)[self.active].mean()),
-            float(np.abs(weights[0] - weights[1]).sum() / 2),
-        )
+        log_values = visibility.transmittance(self.rays, self.active, self.target.optics).log_values
+        error = np.abs(np.exp(log_values) - self.reference)[self.active].mean()
+        exact = np.where(self.reference > 0, 0.0, LOG_OPAQUE)
+        return float(error), float(np.abs(self._weights(log_values) - self._weights(exact)).sum() / 2)
 
-
-@dataclass(frozen=True, eq=False)
-class _Known:
-    log_values: np.ndarray
-
-
-class _Given:
-    """A visibility that was computed before, for all proposals at once."""
-
-    name = "given"
-    FLOOR = 1e-30  # log T of hidden points: far below anything that counts, and finite
-
-    def __init__(self, values: np.ndarray) -> None:
-        self.values, self.row = np.log(np.maximum(values, self.FLOOR)), 0
-
-    def transmittance(self, rays: RayBatch, active: np.ndarray, optics: object, **_: object) -> _Known:
-        """The next rows, in the order in which the target asks for its chunks."""
-        rows = slice(self.row, self.row + len(active))
-        self.row = rows.stop
-        return _Known(np.where(active, self.values[rows], 0.0))
+    def _weights(self, log_transmittance: np.ndarray) -> np.ndarray:
+        log_target = logsumexp(np.where(self.active, self.surface + log_transmittance, -np.inf), axis=1)
+        return softmax(log_target - self.proposals.log_density)
 
 
 def _opaque(scenes: list[Scene], rays: RayBatch, margin_m: float) -> np.ndarray:
@@ -131,8 +111,8 @@ def measure(case: Case, scenes: list[Scene], points: tuple[int, ...], rounds: in
     }
     timings = interleaved(runs, rounds)
     rows = []
-    for name, target in targets.items():
-        transmittance, weights = case.errors(target)
+    for name, way in ways.items():
+        transmittance, weights = case.errors(way)
         seconds = timings[name].wall_median
         rows.append([case.name, name, transmittance, weights, 1e3 * seconds, 1 / (max(transmittance, 1e-9) * seconds)])
     return rows
