@@ -15,10 +15,10 @@ from lidardesign.design.constraints import Constraints
 from lidardesign.design.ensemble import Ensemble, Part, fit_parts, sensors_of
 from lidardesign.design.feasibility import check_feasible, least_sensors
 from lidardesign.design.features import Axes, Features
-from lidardesign.design.rays import make_ray_table, split_budget
+from lidardesign.design.rays import SAMPLES_PER_RAY, make_ray_table, split_budget
 from lidardesign.design.resolve import bounds_of, groups
 from lidardesign.design.samples import Samples
-from lidardesign.design.scan import fit_scan
+from lidardesign.design.scan import fit_scan, rays_of
 from lidardesign.design.sensor import DEFAULT_LEVEL, Design, Layout, Sensor, interval_factor
 from lidardesign.design.support import Retarget, Support, check_support, pinned, restricted
 from lidardesign.errors import ConfigError, InfeasibleError
@@ -152,6 +152,7 @@ def _solved(
     """Samples, sensors, rays per frame, log-likelihood and notes of the fit that keeps its budget."""
     constraints, space = request.constraints, request.samples.space
     if layout == "scan":
+        request = replace(request, em_samples=max(request.em_samples, SAMPLES_PER_RAY * rays_of(read_out)))
         supports = _supports(request, 1)
         part = _features(request, supports, 1)[0]
         beams, score = fit_scan(part.features, space, constraints, part.group, read_out, request.level, request.seed)

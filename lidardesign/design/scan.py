@@ -1,7 +1,18 @@
 """Scans: every ray is a component of its own, with its own origin, direction and gate.
 
-Samples are quantised into as many cells as there are rays by Lloyd's iteration on origin, direction and
-range, each scaled by its spread; one constrained M-step per cell, all cells at once, makes the components.
+Samples are quantised into as many cells as there are rays, and each cell's mean ray is fired. What is
+quantised is where rays look, never how far: with the range among the features, one ray's samples fall apart
+into cells of different ranges, and its gate no longer covers how much the scenes differ there.
+
+- Where origins are given, cells divide the directions.
+- Where origins are free, many rays observe the same place, so cells divide what is observed: the point of each
+  sample's ray at the mean range of the samples with like rays, which is the mean surface of the scenes.
+
+The gate is the central level of the scene points of a cell, projected onto the ray. Measured on training
+scenes as Chamfer distance, against the grid cropped to the training returns: faces at 196 rays 22.5 mm with the
+range as a feature, 11.5 mm with directions (grid 12.0 mm, at twice the bandwidth); flatland at 30 rays 22.9 mm
+with the range, 7.6 mm with origins and directions, 3.8 mm with the mean surface (grid 3.3 mm); faces with
+origins free in a 10 cm box at 196 rays 25 mm with origins and directions, 11.3 mm with the mean surface.
 """
 
 from __future__ import annotations
@@ -9,6 +20,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from lidardesign.design.bounds import Bounds
 from lidardesign.design.budget import ReadOut, within_budget
@@ -16,16 +28,20 @@ from lidardesign.design.constraints import Constraints
 from lidardesign.design.em import Trace, from_labels
 from lidardesign.design.ensemble import Ensemble, Part, sensors_of
 from lidardesign.design.features import Features
-from lidardesign.design.mixture import log_density
+from lidardesign.design.gates import admissible_gates, central_intervals
+from lidardesign.design.mixture import Mixture, log_density
 from lidardesign.design.quantise import lloyd
 from lidardesign.design.resolve import Group, bounds_of
 from lidardesign.design.sensor import Sensor, interval_factor
 from lidardesign.errors import ConfigError
-from lidardesign.space import DesignSpace
+from lidardesign.space import RANGE, DesignSpace, direction, observed_point
 from lidardesign.task import random_generator
 
 # More moves of the cells change their mean squared error by less than a percent.
 LLOYD_ITERATIONS = 15
+# The mean range of like rays is over so many of so many samples: one in three hundred of the density.
+NEIGHBOURS = 16
+NEIGHBOUR_POOL = 5000
 
 
 def fit_scan(
@@ -51,18 +67,16 @@ def fit_scan(
     Raises:
         ConfigError: No number of rays is known.
     """
-    if read_out.rays is None:
-        raise ConfigError("a scan needs its number of rays", where="--layout scan", hint="give --rays N")
-    count = read_out.rays
+    count = rays_of(read_out)
     everyone = Group(group.pins, tuple(range(count)))
     bounds = bounds_of(constraints, space, everyone.sensors, interval_factor(level))
     generator = random_generator(seed, "scan")
-    embedding = np.ascontiguousarray(features.embedding)
-    _, labels = lloyd(embedding, features.weights, count, generator, iterations=LLOYD_ITERATIONS)
+    _, labels = lloyd(looks(features), features.weights, count, generator, iterations=LLOYD_ITERATIONS)
     part = Part(everyone, 1.0, features, bounds)
 
     def scan(limits: Bounds) -> Ensemble:
         mixture = from_labels(features, labels, limits).with_weights(np.full(count, 1.0 / count))
+        mixture = _with_gates(mixture, features, labels, limits, level)
         score = float(features.weights @ log_density(mixture, features))
         return Ensemble((part,), (Trace(mixture, score, (score,)),))
 
@@ -76,3 +90,45 @@ def fit_scan(
     order = sorted(sensors, key=lambda s: (round(s.elevation_rad, 9), s.azimuth_rad, s.range_m))
     named = tuple(replace(sensor, name=f"s{index}") for index, sensor in enumerate(order))
     return named, fitted.log_likelihood
+
+
+def rays_of(read_out: ReadOut) -> int:
+    """The number of rays of a scan, which nothing else can tell.
+
+    Raises:
+        ConfigError: It is not known.
+    """
+    if read_out.rays is None:
+        raise ConfigError("a scan needs its number of rays", where="--layout scan", hint="give --rays N")
+    return read_out.rays
+
+
+def looks(features: Features) -> np.ndarray:
+    """What the cells of a scan divide: directions, or points of the mean surface, shape (N, F)."""
+    aiming = features.embedding
+    if features.axes.range:
+        aiming = np.delete(aiming, len(features.axes.origin), axis=1)
+    if not features.axes.origin:
+        return np.ascontiguousarray(aiming)
+    pool = slice(0, NEIGHBOUR_POOL)
+    near = cKDTree(aiming[pool]).query(aiming, k=min(NEIGHBOURS, len(aiming)))[1].reshape(len(aiming), -1)
+    share = features.weights[near]
+    points = features.points.copy()
+    points[:, RANGE] = (share * points[near, RANGE]).sum(axis=1) / share.sum(axis=1)
+    return observed_point(points)
+
+
+def _with_gates(mixture: Mixture, features: Features, labels: np.ndarray, bounds: Bounds, level: float) -> Mixture:
+    """The components with gates that hold the level of what their cells observe, along their own rays."""
+    axes, count = features.axes, len(mixture)
+    if not axes.range:
+        return mixture
+    azimuth = mixture.azimuth_rad if axes.horizontal else np.full(count, axes.azimuth_rad)
+    elevation = mixture.elevation_rad if axes.vertical else np.full(count, axes.elevation_rad)
+    away = observed_point(features.points) - mixture.origin_m[labels]
+    along = (away * direction(azimuth, elevation)[labels]).sum(axis=1)
+    wanted, effective = central_intervals(along, features.weights, labels, count, level)
+    # a cell without samples repeats the heaviest one, as its other parameters do
+    wanted[effective == 0] = wanted[np.bincount(labels, features.weights, minlength=count).argmax()]
+    centre, spread = admissible_gates(wanted, bounds)
+    return replace(mixture, range_m=centre, spread_range_m=spread)
