@@ -452,3 +452,31 @@ def test_a_density_that_was_learned_badly_comes_with_advice():
 
     assert _advice(SimpleNamespace(ess=0.6, coverage=0.98)) == []
     assert len(_advice(SimpleNamespace(ess=0.01, coverage=0.1))) == 2
+
+
+def test_compiled_code_has_a_folder_where_nothing_else_can_be_written(monkeypatch):
+    from lidardesign.cli import environment
+
+    removed = []
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setattr(environment.atexit, "register", lambda call, folder, **_: removed.append(folder))
+    environment.set_cache_default()
+    assert not removed
+    assert "NUMBA_CACHE_DIR" not in os.environ
+    monkeypatch.setattr(environment, "_can_be_written", lambda folder: False)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "chosen")
+    environment.set_cache_default()
+    assert os.environ["NUMBA_CACHE_DIR"] == "chosen"
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    environment.set_cache_default()
+    assert [os.environ["NUMBA_CACHE_DIR"]] == removed
+    assert os.listdir(removed[0]) == []
+    os.rmdir(removed[0])
+
+
+def test_a_folder_that_cannot_be_made_cannot_be_written(tmp_path):
+    from lidardesign.cli.environment import _can_be_written
+
+    (tmp_path / "file").write_text("")
+    assert _can_be_written(tmp_path / "new" / "deep")
+    assert not _can_be_written(tmp_path / "file" / "below")

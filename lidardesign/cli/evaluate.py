@@ -115,6 +115,8 @@ def _collect(targets: list[Path]) -> tuple[list[_Entry], list[Run]]:
         if target.is_dir():
             runs.append(open_run(target))
             entries += [_Entry(load_design(path), path, runs[-1]) for path in runs[-1].designs()]
+        elif not target.exists():
+            raise DataError("no such run or design", where=str(target), hint="give run folders or design files")
         else:
             design = load_design(target)
             entries.append(_Entry(design, target, run_of(design, target)))

@@ -27,7 +27,7 @@ DEVICES = ("auto", "cpu", "cuda")
 STARTED_FILES = {"config.yaml", "manifest.json", "progress.jsonl", ".lock"}
 CHECKPOINTS = "checkpoint*"
 # Below these a density is too rough for figures that are meant seriously.
-LOW_ESS = 0.2
+LOW_ESS = 0.1
 LOW_COVERAGE = 0.9
 
 

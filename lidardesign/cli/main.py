@@ -10,7 +10,7 @@ import typer
 from lidardesign import __version__
 from lidardesign.cli.console import EXIT_BROKEN_PIPE, Console, forget_stdout, print_json, report_error
 from lidardesign.cli.constrain import constrain
-from lidardesign.cli.environment import make_streams_tolerant, set_thread_defaults, terminate_cleanly
+from lidardesign.cli.environment import make_streams_tolerant, set_cache_default, set_thread_defaults, terminate_cleanly
 from lidardesign.cli.evaluate import evaluate
 from lidardesign.cli.export import export
 from lidardesign.cli.fit import fit
@@ -78,6 +78,7 @@ def program(
 def run(arguments: list[str] | None = None) -> None:
     """Run the program on command line arguments and exit."""
     set_thread_defaults()
+    set_cache_default()
     make_streams_tolerant()
     terminate_cleanly()
     arguments = sys.argv[1:] if arguments is None else arguments
