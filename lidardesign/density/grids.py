@@ -18,7 +18,7 @@ import numpy as np
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.scene import Mesh
 
-ALGORITHM = "narrow band 3 cells, igl winding sign, filled by distance transform, float32"
+ALGORITHM = "narrow band 3 cells, igl winding sign, filled by distance transform, recentred, float32"
 BAND_CELLS = 3.0
 MAXIMUM_CELLS = 40_000_000
 
@@ -66,13 +66,14 @@ def grid_around(bounds_m: np.ndarray, resolution: int, padding_m: float) -> Grid
 
 def distance_grid(mesh: Mesh, grid: Grid) -> np.ndarray:
     """Distances at all grid points, negative inside unless the mesh has no inside: shape (size,) float32 [m]."""
-    points = grid.points()
+    # relative to the grid's corner: squares of coordinates far from the origin would lose every digit
+    points, vertices = Grid(np.zeros(3), grid.step, grid.counts).points(), mesh.vertices - grid.low
     faces = mesh.faces.astype(np.int64)
-    distance = _filled(*_narrow_band(points, mesh.vertices, faces, grid), points, grid)
+    distance = _filled(*_narrow_band(points, vertices, faces, grid), points, grid)
     if mesh.sign != "unsigned":
         import igl
 
-        inside = igl.fast_winding_number(mesh.vertices, faces, points) > 0.5
+        inside = igl.fast_winding_number(vertices, faces, points) > 0.5
         distance = np.where(inside, -distance, distance)
     return distance.astype(np.float32)
 

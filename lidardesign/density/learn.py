@@ -17,6 +17,7 @@ from lidardesign.density.losses import Pool, draw_conditions
 from lidardesign.density.objective import Coordinates
 from lidardesign.density.prepare import prepare_target
 from lidardesign.density.proposals import propose
+from lidardesign.density.shell import shell_proposals, uses_shell
 from lidardesign.density.target import Target
 from lidardesign.density.training import PROGRESS, LearnProgress, Trainer
 from lidardesign.design.samples import Samples, save_samples
@@ -167,16 +168,26 @@ def _trainer(
 
 def _pool(target: Target, scenes: Sequence[Scene], config: RunConfig) -> Pool:
     """Proposals for balancing, independent of those that coverage is measured on."""
-    generator = random_generator(config.seed, "balancing")
-    proposals = propose(scenes, config.space, config.learning.balance_proposals, target.optics.sigma_m, generator)
-    if not len(proposals.points):
+    count = config.learning.balance_proposals
+    points, log_density = _independent_points(target, scenes, config, count, "balancing")
+    if not len(points):
         raise DataError(
             "no ray of the design space reaches a target surface in any training scene",
             where="space",
             hint="widen the angles or the range, or move the origin",
         )
-    log_weights = target.log_density(proposals.points) - proposals.log_density
-    return Pool.of(config.space.to_unit(proposals.points), log_weights)
+    return Pool.of(config.space.to_unit(points), target.log_density(points) - log_density)
+
+
+def _independent_points(
+    target: Target, scenes: Sequence[Scene], config: RunConfig, count: int, purpose: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points that know nothing of the flow (N, 6), and the log density that they were drawn from (N,)."""
+    generator, sigma_m = random_generator(config.seed, purpose), target.optics.sigma_m
+    if uses_shell(config.space):
+        return shell_proposals(target.field, scenes, config.space, count, sigma_m, generator)
+    proposals = propose(scenes, config.space, count, sigma_m, generator)
+    return proposals.points, proposals.log_density
 
 
 def draw_samples(trainer: Trainer, count: int) -> Samples:
@@ -220,15 +231,13 @@ def _measure(trainer: Trainer, scenes: Sequence[Scene], config: RunConfig) -> tu
     samples = draw_samples(trainer, config.learning.samples)
     groups = _condition_groups(config.space, samples.points)
     found = quality(samples.log_prob, samples.log_target, groups)
-    generator = random_generator(config.seed, "coverage")
-    proposals = propose(
-        scenes, config.space, config.learning.coverage_proposals, trainer.target.optics.sigma_m, generator
-    )
+    count = config.learning.coverage_proposals
+    points, log_density = _independent_points(trainer.target, scenes, config, count, "coverage")
     covered = coverage(
-        log_density_of(trainer, proposals.points),
-        trainer.target.log_density(proposals.points),
-        proposals.log_density,
-        _log_z_at(proposals.points, samples, groups, found.log_z),
+        log_density_of(trainer, points),
+        trainer.target.log_density(points),
+        log_density,
+        _log_z_at(points, samples, groups, found.log_z),
     )
     return samples, {"ess": found.ess, "kl_nats": found.kl_nats, "log_z": found.log_z, "coverage": covered}
 

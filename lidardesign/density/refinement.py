@@ -13,9 +13,9 @@ from lidardesign.scene import Scene
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction
 
 MAXIMUM_POINTS = 1024
-# Shares of probed rays that quadrature may see through although ray casting finds them opaque.
+# The share of probed rays that quadrature may see through although ray casting finds them opaque.
 MISSED_SHARE_TO_CARE = 0.005
-OPAQUE, TRANSPARENT = 0.01, 0.5
+OPAQUE, TRANSPARENT = 0.01, 0.1
 
 
 def refine_quadrature(target: Target, scenes: Sequence[Scene], probes: np.ndarray) -> tuple[Target, list[str]]:
@@ -27,16 +27,22 @@ def refine_quadrature(target: Target, scenes: Sequence[Scene], probes: np.ndarra
     visibility, reach = target.visibility, float(probes[:, RANGE].max(initial=0.0))
     if not hidden.any():
         return target, []
-    first = visibility.points
-    missed = _missed_share(visibility, rays, hidden, target)
-    while missed > MISSED_SHARE_TO_CARE and visibility.points < MAXIMUM_POINTS:
-        visibility = Quadrature(visibility.field, 2 * visibility.points)
-        missed = _missed_share(visibility, rays, hidden, target)
+    first, passed = visibility.points, _passed(visibility, rays, hidden, target)
+    while visibility.points < MAXIMUM_POINTS:
+        finer = Quadrature(visibility.field, 2 * visibility.points)
+        passed_finer = _passed(finer, rays, hidden, target)
+        # seen through, or not opaque only because midpoints are too few
+        coarse = (passed > TRANSPARENT) | ((passed > OPAQUE) & (passed_finer <= OPAQUE))
+        if coarse.mean() <= MISSED_SHARE_TO_CARE:
+            break
+        visibility, passed = finer, passed_finer
+    missed = float((passed > TRANSPARENT).mean())
     notes = []
     if visibility.points != first:
         notes.append(f"visibility quadrature refined from {first} to {visibility.points} points")
     if missed > MISSED_SHARE_TO_CARE:
-        thickness_m = max(reach / visibility.points, _field_step(visibility))
+        opaque_m = -np.log(OPAQUE) / target.optics.attenuation_per_m
+        thickness_m = max(reach / visibility.points, _field_step(visibility), opaque_m)
         notes.append(
             f"visibility quadrature still sees through {missed:.1%} of the hidden rays: it resolves occluders "
             f"thicker than {thickness_m:.2g} m; use density.visibility=raycast"
@@ -44,9 +50,9 @@ def refine_quadrature(target: Target, scenes: Sequence[Scene], probes: np.ndarra
     return replace(target, visibility=visibility), notes
 
 
-def _missed_share(visibility: Quadrature, rays: RayBatch, hidden: np.ndarray, target: Target) -> float:
-    log_values = visibility.transmittance(rays, hidden, target.optics, differentiable=False).log_values
-    return float((log_values[hidden] > np.log(TRANSPARENT)).mean())
+def _passed(visibility: Quadrature, rays: RayBatch, hidden: np.ndarray, target: Target) -> np.ndarray:
+    """T of the hidden ray-column pairs."""
+    return np.exp(visibility.transmittance(rays, hidden, target.optics, differentiable=False).log_values[hidden])
 
 
 def _field_step(visibility: Quadrature) -> float:

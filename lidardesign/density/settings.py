@@ -48,7 +48,7 @@ class LearningSettings(BaseModel):
     sigma_start_m: float | None = Field(None, gt=0, description="where sigma's annealing starts; default 6 sigma")
     anneal: float = Field(0.7, ge=0, le=1, description="share of the path-wise steps over which sigma falls")
     balance: float = Field(0.5, ge=0, le=1, description="share of the steps, the last ones, that balance by values")
-    balance_proposals: int = Field(16384, ge=256, description="independent proposals that balancing draws from")
+    balance_proposals: int = Field(65536, ge=256, description="independent proposals that balancing draws from")
     clip_norm: float = Field(5.0, gt=0, description="gradient norm that steps are clipped to")
     checkpoint_seconds: float = Field(20.0, gt=0, description="time between checkpoints [s]")
     samples: int = Field(100_000, ge=1000, description="fresh samples for ESS, KL, log Z, fit and constrain")
@@ -60,7 +60,7 @@ PRESET_LEARNING: dict[str, dict[str, Any]] = {
         "steps": 340,
         "hidden": 64,
         "samples": 40_000,
-        "balance_proposals": 8192,
+        "balance_proposals": 32768,
         "coverage_proposals": 4096,
     },
     "standard": {},
