@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -121,7 +122,7 @@ def test_the_density_is_continuous_around_the_circle(name):
     np.testing.assert_allclose(at(1 - near), at(near - 1), atol=1e-2)
     # nowhere else is it cut open either: where it changes most it changes smoothly
     grid = np.linspace(-0.99, 0.99, 100)
-    jumps = [np.abs(at(float(b)) - at(float(a))).max() for a, b in zip(grid[:-1], grid[1:], strict=True)]
+    jumps = [np.abs(at(float(b)) - at(float(a))).max() for a, b in pairwise(grid)]
     fine = [np.abs(at(float(a + near)) - at(float(a - near))).max() for a in grid[np.argsort(jumps)[-5:]]]
     assert max(fine) < 1e-2
 

@@ -15,7 +15,12 @@ from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 
 SPREAD_M = 0.05
 BALL = Scene((Body(Sphere(0.5), poses=rigid(translation_m=(2.0, 0, 0))),))
-TWO = Scene((Body(Sphere(0.3), poses=rigid(translation_m=(1.5, 0.4, 0))), Body(Box((0.2, 0.4, 0.3)), poses=rigid(translation_m=(2.0, -0.3, 0.1)))))
+TWO = Scene(
+    (
+        Body(Sphere(0.3), poses=rigid(translation_m=(1.5, 0.4, 0))),
+        Body(Box((0.2, 0.4, 0.3)), poses=rigid(translation_m=(2.0, -0.3, 0.1))),
+    )
+)
 FIXED_ORIGIN = DesignSpace((0, 0, 0, -0.5, -0.5, 0.5), (0, 0, 0, 0.5, 0.5, 3.5))
 FLATLAND = DesignSpace((-0.5, 0, 0, -0.6, 0, 0.2), (0.5, 0, 0, 0.6, 0, 3.0))
 FREE_ORIGIN = DesignSpace((-0.2, -0.2, 0, -0.6, -0.6, 0.5), (0.2, 0.2, 0, 0.6, 0.6, 3.5))
@@ -137,7 +142,7 @@ def test_proposals_lie_in_the_space_within_eight_range_errors_of_their_surface(s
 
 def test_no_mesh_proposal_has_an_unbounded_weight():
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
-    mesh = Scene((Body(Mesh(np.asarray(ball.vertices) + [2.0, 0, 0], np.asarray(ball.faces))),))
+    mesh = Scene((Body(Mesh(ball.vertices + np.array([2.0, 0, 0]), np.asarray(ball.faces))),))
     exact, meshed = drawn([BALL], FIXED_ORIGIN, 5000), drawn([mesh], FIXED_ORIGIN, 5000)
     assert len(meshed.points) > 0.99 * len(exact.points)
     assert meshed.log_density.min() > exact.log_density.min() - 2.0

@@ -97,7 +97,7 @@ def test_primitives_and_their_tessellations_are_hit_at_the_same_range(name):
 @pytest.mark.parametrize("name", SOLIDS)
 def test_a_ray_that_starts_inside_hits_its_way_out(name):
     caster = SceneCaster(Scene((Body(SOLIDS[name], poses=POSE),)))
-    origins, directions = rays_towards(200, 4)
+    _, directions = rays_towards(200, 4)
     hits = caster.first_hit(np.tile(POSE[:3, 3], (200, 1)), directions)
     places = POSE[:3, 3] + hits.range_m[:, None] * directions
     local = (places - POSE[:3, 3]) @ POSE[:3, :3]
@@ -179,9 +179,8 @@ def test_the_nearest_body_wins_whatever_its_kind():
     scene = mixed_scene()
     origins, directions = rays_towards(2000, 8, spread=0.7)
     together = SceneCaster(scene).first_hit(origins, directions)
-    alone = np.stack(
-        [SceneCaster(Scene((Body(b.shape, poses=b.poses),))).first_hit(origins, directions).range_m for b in scene.bodies]
-    )
+    casters = [SceneCaster(Scene((Body(body.shape, poses=body.poses),))) for body in scene.bodies]
+    alone = np.stack([caster.first_hit(origins, directions).range_m for caster in casters])
     np.testing.assert_array_equal(together.range_m, alone.min(axis=0))
     hit = together.body >= 0
     np.testing.assert_array_equal(together.body[hit], alone.argmin(axis=0)[hit])
@@ -213,7 +212,8 @@ def test_chunks_of_rays_do_not_change_the_bits():
     caster = SceneCaster(mixed_scene())
     origins, directions = rays_towards(1001, 11)
     whole = caster.first_hit(origins, directions)
-    parts = [caster.first_hit(origins[rows], directions[rows]) for rows in (slice(0, 7), slice(7, 500), slice(500, None))]
+    chunks = (slice(0, 7), slice(7, 500), slice(500, None))
+    parts = [caster.first_hit(origins[rows], directions[rows]) for rows in chunks]
     for name in ("range_m", "body", "normal"):
         assert getattr(whole, name).tobytes() == np.concatenate([getattr(part, name) for part in parts]).tobytes()
 
@@ -277,9 +277,8 @@ def test_crossings_keep_to_their_window():
     window = caster.crossings(origins, directions, np.full(500, 2.4), np.full(500, 2.9))
     inside = (everything.range_m >= 2.4) & (everything.range_m < 2.9)
     assert inside.sum() > 50
-    np.testing.assert_allclose(
-        np.sort(window.range_m + 10 * window.row), np.sort((everything.range_m + 10 * everything.row)[inside]), atol=1e-5
-    )
+    expected = np.sort((everything.range_m + 10 * everything.row)[inside])
+    np.testing.assert_allclose(np.sort(window.range_m + 10 * window.row), expected, atol=1e-5)
     assert (window.cosine >= 0).all()
     assert (window.cosine <= 1 + 1e-6).all()
 
