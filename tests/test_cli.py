@@ -17,6 +17,7 @@ from command_line import caller, files_under, make_run, program
 from lidardesign import __version__
 from lidardesign.cli import console as console_module
 from lidardesign.cli.console import Console, command, plain_json
+from lidardesign.design.samples import Samples, load_samples, save_samples
 from lidardesign.errors import InfeasibleError
 from lidardesign.run.yaml import load_yaml
 
@@ -480,3 +481,13 @@ def test_a_folder_that_cannot_be_made_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     assert _can_be_written(tmp_path / "new" / "deep")
     assert not _can_be_written(tmp_path / "file" / "below")
+
+
+def test_a_density_that_is_too_rough_is_no_fault_of_constraints(lidardesign, flat):
+    samples = load_samples(flat)
+    log_target = np.where(np.arange(len(samples)) < 3, 0.0, -1e3)
+    save_samples(Samples(samples.points, samples.log_prob, log_target, samples.space), flat)
+    result = lidardesign("fit", flat)
+    assert result.code == 3
+    assert "samples are worth 3" in result.err
+    assert "learn longer" in result.err

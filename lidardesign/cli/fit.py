@@ -10,6 +10,7 @@ import typer
 from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
 from lidardesign.cli.runs import check_choice, check_name, open_run, provenance, sensor_count
+from lidardesign.errors import DataError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from lidardesign.design.check import ConstraintCheck
     from lidardesign.design.constraints import Constraints
     from lidardesign.design.fit import FitResult
+    from lidardesign.design.samples import Samples
     from lidardesign.design.sensor import Design
     from lidardesign.space import DesignSpace
 
@@ -87,8 +89,10 @@ def fit_and_write(
     from lidardesign.design.samples import load_samples
 
     path = run.design_path(name)
+    samples = load_samples(run.folder)
+    _check_worth(samples, run)
     result: FitResult = fit_design(
-        load_samples(run.folder),
+        samples,
         constraints=constraints,
         seed=seed,
         name=name,
@@ -108,6 +112,24 @@ def fit_and_write(
     }
     document["satisfied"] = all(check.satisfied for check in checks)
     console.result(document, lambda rich: show_fit(document, design, checks, rich))
+
+
+def _check_worth(samples: Samples, run: Run) -> None:
+    """Refuse a density that was learned too badly to fit anything to, whatever the constraints.
+
+    Raises:
+        DataError: Its samples are worth fewer than a fit needs.
+    """
+    from lidardesign.design.support import LEAST_SAMPLES
+
+    worth = samples.effective_sample_size * len(samples)
+    if worth < LEAST_SAMPLES:
+        raise DataError(
+            f"the density is too rough: its {len(samples)} samples are worth {worth:.0f}",
+            where=str(run.folder),
+            allowed=f"at least {LEAST_SAMPLES}",
+            hint="learn longer (--preset standard or fine), or with a larger density.sigma_m",
+        )
 
 
 def _log_target(run: Run, points: np.ndarray) -> np.ndarray:
