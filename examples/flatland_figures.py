@@ -134,7 +134,9 @@ def single_point_figure(config: RunConfig) -> Figure:
 def segments(points: np.ndarray, keep: np.ndarray, colour: str, width: float) -> Line3DCollection:
     """Pieces of a curve in design space."""
     line = np.stack(place(points), axis=1)
-    return Line3DCollection(np.stack([line[:-1], line[1:]], axis=1)[keep], colors=colour, linewidths=width)
+    return Line3DCollection(
+        np.stack([line[:-1], line[1:]], axis=1)[keep], colors=colour, linewidths=width, capstyle="round"
+    )
 
 
 def density_figure(config: RunConfig, samples: Samples, scenes: list[Scene], target: Target) -> Figure:

@@ -37,7 +37,8 @@ from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.space import AZIMUTH, ELEVATION, angles, direction
 
 SIZE_INCHES, DOTS_PER_INCH = (16.0, 7.0), 100
-PIXELS = 420  # of the head's picture, along each side
+PIXELS = 1000  # of the head's picture, along each side
+BINS = 210  # of the density, along each side
 INK, QUIET, PAPER = "#1f2933", "#7b8794", "#ffffff"
 SERIES = {
     "10 sensors, density": ("#0072B2", "o", "-"),
@@ -102,7 +103,7 @@ class HeadView:
         grey = np.where(np.isfinite(self.shade), brightness * self.shade, 1.0)
         extent = (-self.half_deg, self.half_deg) * 2
         axes.imshow(grey, extent=extent, origin="lower", cmap="gray", vmin=0, vmax=1, interpolation="bilinear")
-        axes.set(xlim=(-14.5, 14.5), ylim=(-19.5, 15.0))
+        axes.set(xlim=(-15.9, 15.9), ylim=(-18.3, 20.1))
         axes.set_axis_off()
 
 
@@ -111,7 +112,7 @@ def draw_density(axes: Axes, view: HeadView, samples: Samples) -> None:
     view.draw(axes, 0.92)
     right = np.degrees(view.middle - samples.points[:, AZIMUTH])
     up = np.degrees(samples.points[:, ELEVATION])
-    edges = np.linspace(-view.half_deg, view.half_deg, PIXELS // 2 + 1)
+    edges = np.linspace(-view.half_deg, view.half_deg, BINS + 1)
     density, _, _ = np.histogram2d(up, right, bins=(edges, edges), weights=samples.weights)
     density = gaussian_filter(density, 2.2)
     share = np.clip(density / np.quantile(density[density > 0.02 * density.max()], 0.98), 0.0, 1.0)
@@ -192,7 +193,7 @@ def draw_scores(axes: Axes, evaluation: dict[str, Any]) -> None:
     axes.grid(True, color="#e4e7eb", linewidth=0.9)
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color(QUIET)
-    axes.set_ylim(3.0, 150.0)
+    axes.set_ylim(2.6, 150.0)
     lines = axes.get_lines()
     look = {"frameon": False, "fontsize": 12, "labelcolor": INK, "handlelength": 2.6}
     axes.add_artist(axes.legend(handles=lines[:2], loc="lower left", **look))
@@ -211,20 +212,21 @@ def overview(config: RunConfig, head: Any, samples: Samples, design: Design, eva
     FigureCanvasAgg(figure)
     view = HeadView(config, head)
     draw_density(figure.add_axes((0.015, 0.02, 0.30, 0.83)), view, samples)
-    draw_sensors(figure.add_axes((0.325, 0.02, 0.30, 0.83)), figure.add_axes((0.617, 0.10, 0.055, 0.66)), view, design)
-    draw_scores(figure.add_axes((0.732, 0.115, 0.255, 0.70)), evaluation)
+    draw_sensors(figure.add_axes((0.318, 0.02, 0.30, 0.83)), figure.add_axes((0.636, 0.10, 0.046, 0.66)), view, design)
+    draw_scores(figure.add_axes((0.746, 0.115, 0.242, 0.70)), evaluation)
     caption(figure, 0.022, "learn", "where rays are worth firing, from simulated heads")
     caption(figure, 0.345, "fit", "10 sensors: fields of view, and a time gate for each")
-    caption(figure, 0.700, "evaluate", f"on {evaluation['scenes']} held-out heads; lower is better")
+    caption(figure, 0.712, "evaluate", f"on {evaluation['scenes']} held-out heads; lower is better")
     return figure
 
 
 def save(figure: Figure, path: Path) -> None:
-    """As a PNG of 256 colours, which keeps the repository small."""
+    """As a PNG of 256 dithered colours: the picture lives in the repository."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
-    picture = Image.open(buffer).convert("RGB").quantize(256, dither=Image.Dither.NONE)
-    picture.save(path, optimize=True)
+    picture = Image.open(buffer).convert("RGB")
+    palette = picture.quantize(256)
+    picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG).save(path, optimize=True)
 
 
 def main() -> None:
