@@ -33,6 +33,16 @@ def test_the_constraint_file_is_accepted():
     assert constraints.budget.rays == 576
 
 
+def test_every_constraint_key_that_is_shown_is_accepted_and_none_is_left_out():
+    text = next(block for block in blocks("yaml") if "each:" in block)
+    shown = parse_yaml(text, where="README").value
+    Constraints.from_mapping(shown)
+    for section, model in Constraints.model_fields.items():
+        assert section in shown
+        keys = getattr(model.annotation, "model_fields", {})
+        assert all(key in text for key in keys)
+
+
 def test_the_configuration_file_is_accepted(tmp_path):
     text = next(block for block in blocks("yaml") if "scans.yaml" in block)
     path = tmp_path / "scans.yaml"
