@@ -183,17 +183,19 @@ def test_progress_rows_are_valid_and_complete(finished):
 
 
 def test_an_analytic_scene_is_learned_well(tmp_path):
-    settings = {"steps": 300, "batch": 256, "layers": 2, "hidden": 32, "samples": 10_000, "checkpoint_seconds": 100.0}
-    result = learn(BallTask(), config_of(**settings), tmp_path)
-    assert result.ess > 0.35  # seconds of training: the point is that it converges, not how far
-    assert result.kl_nats < 0.4
-    assert result.coverage > 0.95
-    # log Z by plain Monte Carlo over the box; the flow may lack the rays that just miss the ball, a tenth of the mass,
-    # which no proposal meets
-    points = SPACE.sample(100_000, np.random.default_rng(0))
-    target, _ = learning.prepare_target(BallTask().scenes(None, "train", 0), config_of())
-    plain = math.log(np.exp(target.log_density(points)).mean()) + SPACE.log_volume
-    assert result.log_z == pytest.approx(plain, abs=0.2)
+    settings = {"steps": 250, "batch": 256, "layers": 2, "hidden": 32, "samples": 10_000, "checkpoint_seconds": 100.0}
+    # the ball fills the space: with an angle fixed, no proposal meets the rim of a silhouette
+    space = replace(SPACE, low=(0, 0, 0, -0.25, 0, 0.2), high=(0, 0, 0, 0.25, 0, 2.5))
+    config = config_of(space, **settings)
+    result = learn(BallTask(), config, tmp_path)
+    assert result.ess > 0.4
+    assert result.kl_nats < 1.0  # leaked samples of so short a training make most of it
+    assert result.coverage > 0.9
+    # log Z by plain Monte Carlo over the box
+    points = space.sample(100_000, np.random.default_rng(0))
+    target, _ = learning.prepare_target(BallTask().scenes(None, "train", 0), config)
+    plain = math.log(np.exp(target.log_density(points)).mean()) + space.log_volume
+    assert result.log_z == pytest.approx(plain, abs=0.1)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
