@@ -26,6 +26,9 @@ from lidardesign.numerics import effective_count, wrap_angle
 CONVERGENCE_NATS = 1e-5
 MOST_ITERATIONS = 200
 RESTART_ITERATIONS = 12
+# Seeds are first compared on so many samples, and the best few of them on all.
+SCREEN_SAMPLES = 5000
+FINALISTS = 3
 # Falls below this are rounding of a sum over the samples [nats].
 ROUNDING_NATS = 1e-12
 SEED_SAMPLES = 2000
@@ -173,7 +176,7 @@ def fit_mixture(
     bounds: Bounds,
     generator: np.random.Generator,
     *,
-    restarts: int = 4,
+    restarts: int = 12,
     start: Mixture | None = None,
 ) -> Trace:
     """The best of several short runs, continued until it converges.
@@ -186,14 +189,23 @@ def fit_mixture(
         start: Admissible parameters to continue from instead of seeds.
     """
     if start is None:
-        starts = [seed(features, bounds, generator) for _ in range(1 if len(bounds) == 1 else max(restarts, 1))]
-        if len(starts) > 1:
-            runs = [climb(one, features, bounds, iterations=RESTART_ITERATIONS) for one in starts]
-            start = max(runs, key=lambda run: run.log_likelihood).mixture
-        else:
-            start = starts[0]
+        start = _best_seed(features, bounds, generator, 1 if len(bounds) == 1 else max(restarts, 1))
     trace = climb(start, features, bounds)
     return _revived(trace, features, bounds, generator)
+
+
+def _best_seed(features: Features, bounds: Bounds, generator: np.random.Generator, restarts: int) -> Mixture:
+    """The most promising of several seeds: short runs on a part of the samples, then of a few on all."""
+    seeds = [seed(features, bounds, generator) for _ in range(restarts)]
+    if restarts == 1:
+        return seeds[0]
+    part = features
+    if len(features) > SCREEN_SAMPLES:
+        part = features.subset(np.sort(generator.choice(len(features), SCREEN_SAMPLES, replace=False)))
+    runs = [climb(one, part, bounds, iterations=RESTART_ITERATIONS) for one in seeds]
+    runs.sort(key=lambda run: -run.log_likelihood)
+    best = [climb(run.mixture, features, bounds, iterations=RESTART_ITERATIONS) for run in runs[:FINALISTS]]
+    return max(best, key=lambda run: run.log_likelihood).mixture
 
 
 def dead_components(mixture: Mixture, features: Features) -> np.ndarray:

@@ -26,7 +26,8 @@ from lidardesign.task import random_generator
 
 DEFAULT_SENSORS = 4
 EM_SAMPLES = 20_000
-RESTARTS = 4
+# Of 7 fits of 10 sensors the worst is then 0.005 nats below the best on held-out samples, with 4 seeds 0.03.
+RESTARTS = 12
 # `auto` tries up to this many sensors.
 MOST_SENSORS = 12
 # It stops after this many counts in a row that gain less than one standard error.

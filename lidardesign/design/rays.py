@@ -12,14 +12,18 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
+from lidardesign.design.bounds import Bounds
+from lidardesign.design.constraints import Constraints
+from lidardesign.design.gates import SMALLEST_CELL, admissible_gates, central_intervals
 from lidardesign.design.grid import field_on_sphere, grid_tangent
 from lidardesign.design.membership import Members, members
 from lidardesign.design.quantise import lloyd
+from lidardesign.design.resolve import bounds_of, groups
 from lidardesign.design.samples import Samples
-from lidardesign.design.sensor import Design, RayTable, Sensor, tangent_directions
+from lidardesign.design.sensor import Design, RayTable, Sensor, interval_factor, tangent_directions
 from lidardesign.errors import ConfigError
 from lidardesign.simulate.returns import Rays
-from lidardesign.space import angles, direction
+from lidardesign.space import DesignSpace, angles, direction
 from lidardesign.task import random_generator
 
 Gates = Literal["sensor", "ray"]
@@ -29,8 +33,6 @@ REMAINDER_DECIMALS = 9
 # Lloyd's cells need no more samples than this: the centre of a cell is then known to a tenth of its width.
 SAMPLES_PER_RAY = 64
 SMALLEST_SAMPLE = 2000
-# A 95 % interval of ranges means nothing from fewer (effective) samples: one in forty lies beyond each end.
-SMALLEST_CELL = 20.0
 
 
 def split_budget(weights: np.ndarray, count: int) -> np.ndarray:
@@ -102,8 +104,8 @@ def lay_out(
     ]
     sensor = np.repeat(np.arange(len(shares)), shares)
     gate = np.array([s.gate_m for s in design.sensors])[sensor]
-    if gates == "ray" and seen is not None:
-        gate = _ray_gates(design, tangents, seen)
+    if gates == "ray" and seen is not None and samples is not None:
+        gate = _ray_gates(design, tangents, seen, samples.space)
     looking = [tangent_directions(s.frame, t) for s, t in zip(design.sensors, tangents, strict=True)]
     origin = np.array([s.origin_m for s in design.sensors], dtype=np.float64)[sensor]
     return Rays(origin, np.concatenate(looking), gate, sensor, fire_times(int(total), rate_hz))
@@ -165,13 +167,19 @@ def refitted(design: Design, total: int, samples: Samples | None, seed: int = 0)
     if samples is None:
         raise _needs_samples(design, total, "sensor")
     # fit lays out what it fits, so it stands above this module
-    from lidardesign.design.constraints import Constraints
     from lidardesign.design.fit import fit
 
     document = {**design.constraints}
     if "budget" in document:
         document["budget"] = {key: value for key, value in document["budget"].items() if key != "rays"}
     constraints = Constraints.from_mapping(document, where=f"constraints of {design.name}")
+    if any(pin is not None for group in groups(constraints, samples.space, 1) for pin in group.pins):
+        raise ConfigError(
+            f"a scan from a pinned origin cannot be fitted anew to {total} rays without its target density",
+            where=design.name,
+            allowed=f"{own_count(design)} rays",
+            hint=f"lidardesign constrain RUN --layout scan --rays {total} with the same constraints",
+        )
     fitted = fit(
         samples,
         layout="scan",
@@ -237,27 +245,35 @@ def _thinned(
     return tangent[chosen], np.ones(count)
 
 
-def _ray_gates(design: Design, tangents: list[np.ndarray], seen: list[Members]) -> np.ndarray:
-    """The gate of each ray, from the ranges of the samples that are nearest to it, shape (N, 2) [m]."""
+def _ray_gates(design: Design, tangents: list[np.ndarray], seen: list[Members], space: DesignSpace) -> np.ndarray:
+    """The gate of each ray, from the ranges of the samples that are nearest to it, shape (N, 2) [m].
+
+    Inside its sensor's gate, and moved no further than the design's constraints ask: they bound every ray.
+    """
+    constraints = Constraints.from_mapping(design.constraints, where=f"constraints of {design.name}")
     gates = []
-    for sensor, tangent, inside in zip(design.sensors, tangents, seen, strict=True):
+    for index, (sensor, tangent, inside) in enumerate(zip(design.sensors, tangents, seen, strict=True)):
         own = np.tile(sensor.gate_m, (len(tangent), 1))
         if len(tangent) and len(inside):
             cell = cKDTree(tangent).query(inside.tangent)[1]
-            for ray in range(len(tangent)):
-                _narrow(own[ray], inside.range_m[cell == ray], inside.weights[cell == ray], design.level)
+            wanted, effective = central_intervals(inside.range_m, inside.weights, cell, len(tangent), design.level)
+            known = np.flatnonzero((effective >= SMALLEST_CELL) & (np.diff(wanted, axis=1)[:, 0] > 0))
+            wanted = np.clip(wanted[known], *sensor.gate_m)
+            bounds = bounds_of(constraints, space, (index,), interval_factor(design.level))
+            own[known] = _kept(wanted, sensor, bounds.take(np.zeros(len(known), dtype=np.int64)))
         gates.append(own)
     return np.concatenate(gates)
 
 
-def _narrow(gate: np.ndarray, range_m: np.ndarray, weights: np.ndarray, level: float) -> None:
-    """Narrow a gate in place to the central `level` of weighted ranges, where they are enough to say."""
-    if not len(range_m) or weights.sum() ** 2 < SMALLEST_CELL * np.square(weights).sum():
-        return
-    order = np.argsort(range_m, kind="stable")
-    cumulative = np.cumsum(weights[order])
-    share = (cumulative - weights[order] / 2) / cumulative[-1]
-    ends = np.interp([(1 - level) / 2, (1 + level) / 2], share, range_m[order])
-    start, end = max(ends[0], gate[0]), min(ends[1], gate[1])
-    if end > start:
-        gate[:] = start, end
+def _kept(wanted: np.ndarray, sensor: Sensor, bounds: Bounds) -> np.ndarray:
+    """Wanted gates (K, 2), those that break a bound replaced by the best gate that keeps all of them [m]."""
+    start, end = sensor.gate_m
+    width = np.diff(wanted, axis=1)[:, 0]
+    broken = (wanted[:, 0] > bounds.start_high) | (wanted[:, 1] < bounds.end_low) | (width < bounds.width_low)
+    if not broken.any():
+        return wanted
+    inner = replace(bounds, start_low=np.full(len(wanted), start), end_high=np.full(len(wanted), end))
+    centre, spread = admissible_gates(wanted, inner)
+    half = bounds.interval * spread
+    moved = np.clip(np.stack([centre - half, centre + half], axis=1), start, end)
+    return np.where(broken[:, None], moved, wanted)
