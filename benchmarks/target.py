@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import common  # noqa: F401 (before numpy: it limits the thread pools)
 import numpy as np
 import torch
 from common import face_scenes, interleaved, median_ratio, model_option, parser, report

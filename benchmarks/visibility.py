@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import common  # noqa: F401 (before numpy: it limits the thread pools)
 import numpy as np
 from common import face_scenes, interleaved, model_option, parser, report
 from scipy.special import logsumexp, softmax
