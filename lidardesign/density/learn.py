@@ -176,7 +176,7 @@ def _pool(target: Target, scenes: Sequence[Scene], config: RunConfig) -> Pool:
             where="space",
             hint="widen the angles or the range, or move the origin",
         )
-    return Pool.of(config.space.to_unit(points), target.log_density(points) - log_density)
+    return Pool.of(config.space.to_unit(points), target.log_density(points), log_density)
 
 
 def _independent_points(

@@ -4,12 +4,13 @@ The path-wise loss (paper, eq. 7) moves samples along the gradient of log p* and
 annealed. It cannot tell how much mass belongs on either side of a silhouette, because there p* jumps as one scene
 after another is hidden and its gradient has no term for the jump: on faces it stays at a KL of 0.25 nats with the neck
 starved by a factor of three. Balancing needs the values of p* only. For flow samples it follows the gradient of
-the reverse KL in its log-variance form, and for samples of p* from independent proposals that of the forward KL, which
-brings back what the flow dropped. Few samples leak to where log p* is -100 and below, yet they would make up most of
-the KL; these are led back along paths, with a cost that grows like their distance in sigmas.
+the reverse KL in its log-variance form. For samples of p* from independent proposals it follows that of the mean
+squared weight, the inverse of the ESS, which brings back what the flow dropped. Few samples leak to where log p* is
+-100 and below, yet they would make up most of the KL: these are led back along paths, with a cost that grows like
+their distance in sigmas.
 
 References:
-    VarGrad, Richter et al. 2020.
+    VarGrad, Richter et al. 2020. Flow annealed importance sampling bootstrap, Midgley et al. 2023.
 """
 
 from __future__ import annotations
@@ -26,7 +27,10 @@ from lidardesign.density.target import Target
 
 # Log weights further than this from the mean pull no harder.
 LARGEST_PULL_NATS = 5.0
-# The share of the forward KL on proposals beside the reverse KL on the flow's own samples.
+# Where the density is starved, a proposal counts by its weight p* / p, up to this factor: the gradient of E[w^2].
+LARGEST_EMPHASIS = 30.0
+# The share of the proposals' term beside the reverse KL on the flow's own samples, and that of the leaked ones.
+LEAK_WEIGHT = 3.0
 FORWARD_SHARE = 0.5
 
 
@@ -67,23 +71,27 @@ class Pool:
 
     Arguments:
         unit: Unit points of all free dimensions, shape (M, free).
+        log_target: log p* at them, shape (M,).
         cumulated: Cumulated normalised weights, shape (M,).
     """
 
     unit: Tensor
+    log_target: Tensor
     cumulated: Tensor
 
     @classmethod
-    def of(cls, unit: np.ndarray, log_weights: np.ndarray) -> Pool:
-        """The pool of proposals with log p* - log q."""
+    def of(cls, unit: np.ndarray, log_target: np.ndarray, log_proposal: np.ndarray) -> Pool:
+        """The pool of proposals with log p* and log q."""
+        log_weights = log_target - log_proposal
         weights = np.exp(log_weights - log_weights.max())
-        return cls(torch.as_tensor(unit), torch.as_tensor(np.cumsum(weights / weights.sum())))
+        cumulated = np.cumsum(weights / weights.sum())
+        return cls(torch.as_tensor(unit), torch.as_tensor(log_target), torch.as_tensor(cumulated))
 
-    def draw(self, count: int, generator: torch.Generator, like: Tensor) -> Tensor:
-        """Unit points distributed as p*, shape (count, free)."""
+    def draw(self, count: int, generator: torch.Generator, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Unit points distributed as p*, shape (count, free), and log p* at them, shape (count,)."""
         places = torch.rand(count, generator=generator, dtype=torch.float64)
         chosen = torch.searchsorted(self.cumulated, places).clamp(max=len(self.unit) - 1)
-        return self.unit[chosen].to(like)
+        return self.unit[chosen].to(like), self.log_target[chosen].to(like)
 
 
 def balancing_loss(
@@ -98,18 +106,20 @@ def balancing_loss(
     points = coordinates.space.from_unit(unit.cpu().double().numpy())
     log_p_star = torch.as_tensor(target.log_density(points)).to(log_prob)
     log_weights = log_p_star - log_prob
-    centred = log_weights - (log_weights.logsumexp(0) - np.log(count))
+    log_z = log_weights.logsumexp(0) - np.log(count)
+    centred = log_weights - log_z
     pull = centred.clamp(-LARGEST_PULL_NATS, LARGEST_PULL_NATS)
     pull = pull - pull.mean()
-    proposed = pool.draw(count, generator, learned)
+    proposed, proposed_target = pool.draw(count, generator, learned)
     foreign = proposed[:, coordinates.learned]
     contexts = None if conditions is None else torch.cat([conditions, proposed[:, coordinates.conditions]])
     both = flow.log_prob(torch.cat([learned, foreign]), contexts)
-    loss = -(pull * both[:count]).mean() - FORWARD_SHARE * both[count:].mean()
+    starved = (proposed_target - both[count:].detach() - log_z).clamp(max=np.log(LARGEST_EMPHASIS)).exp()
+    loss = -(pull * both[:count]).mean() - FORWARD_SHARE * (starved * both[count:]).mean()
     leaked = centred < -LARGEST_PULL_NATS
     if leaked.any():
         cost = _leak_cost(flow, target, coordinates, base[leaked], None if conditions is None else conditions[leaked])
-        loss = loss + cost / count
+        loss = loss + LEAK_WEIGHT * cost / count
     return loss, float(-log_weights.mean()), effective_share(log_weights)
 
 
