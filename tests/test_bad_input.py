@@ -352,7 +352,7 @@ def test_evaluate_says_when_a_file_cannot_be_written(lidardesign, tmp_path):
     assert (tmp_path / "taken").read_text() == "a file"
 
 
-SMALL = ["learning.steps=60", "learning.batch=64", "learning.samples=1000", "learning.coverage_proposals=256"]
+SMALL = ["learning.steps=200", "learning.batch=64", "learning.samples=1000", "learning.coverage_proposals=256"]
 FREQUENT = ["learning.balance_proposals=256", "learning.checkpoint_seconds=0.05", "train=3"]
 RESULTS = ("flow.safetensors", "samples.npz")
 # a process whose files may not grow beyond a size behaves like one on a disk that becomes full
