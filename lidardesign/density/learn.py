@@ -17,7 +17,7 @@ from lidardesign.density.losses import Pool, draw_conditions
 from lidardesign.density.objective import Coordinates
 from lidardesign.density.prepare import prepare_target
 from lidardesign.density.proposals import propose
-from lidardesign.density.shell import shell_proposals, uses_shell
+from lidardesign.density.shell import can_be_aimed, resampled_proposals, shell_proposals
 from lidardesign.density.target import Target
 from lidardesign.density.training import PROGRESS, LearnProgress, Trainer
 from lidardesign.design.samples import Samples, save_samples
@@ -33,6 +33,8 @@ from lidardesign.task import Task, random_generator, scenes_of
 FLOW = "flow.safetensors"
 SAMPLE_CHUNK = 16384
 CONDITION_GROUPS = 32
+# Up to so many free dimensions, uniform candidates meet the surfaces often enough to be resampled.
+RESAMPLED_DIMENSIONS = 3
 DEVICES = ("auto", "cpu", "cuda")
 
 
@@ -184,8 +186,10 @@ def _independent_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points that know nothing of the flow (N, 6), and the log density that they were drawn from (N,)."""
     generator, sigma_m = random_generator(config.seed, purpose), target.optics.sigma_m
-    if uses_shell(config.space):
+    if can_be_aimed(config.space):
         return shell_proposals(target.field, scenes, config.space, count, sigma_m, generator)
+    if len(config.space.free) <= RESAMPLED_DIMENSIONS:
+        return resampled_proposals(target.field, config.space, count, sigma_m, generator)
     proposals = propose(scenes, config.space, count, sigma_m, generator)
     return proposals.points, proposals.log_density
 

@@ -55,7 +55,7 @@ class FlatlandTask:
         rays=(8, 16, 32, 64),
         density={"sigma_m": 0.02},
         learning={
-            "draft": {"steps": 250, "batch": 512, "hidden": 48, "samples": 20_000},
+            "draft": {"steps": 300, "batch": 512, "samples": 20_000},
             "standard": {"samples": 50_000},
             "fine": {"samples": 100_000},
         },
