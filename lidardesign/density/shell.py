@@ -3,9 +3,10 @@
 Where both angles are free, a point is drawn uniform in area on a random scene's targets, moved along the normal by a
 normal offset of the target's own sigma, and observed from a random admissible origin. Its density per volume is then
 q(s) = sum_i N(SDF_i(s); sigma) / A_i over the scenes, and r^2 q(s) per solid angle and range: exact for flat surfaces
-and to first order in sigma times the curvature for others (on a ball of 15 sigma the rim weighs 14 % too little, which
-a pool for balancing and a coverage can bear). Weights p* / q are bounded by A / r^2, and unlike range errors along rays these
-proposals also reach the rim of silhouettes, where a ray passes a surface within sigma without meeting it.
+and off in first order of sigma times the curvature for others (on a ball of 15 sigma the rim weighs 14 % too little,
+which a pool for balancing and a coverage can bear). Weights p* / q are bounded by A / r^2, and unlike range errors
+along rays these proposals also reach the rim of silhouettes, where a ray passes a surface within sigma without
+meeting it.
 
 Where an angle is fixed hardly any surface point can be aimed at, but few dimensions are free: uniform points of the
 space are resampled by the surface proximity, which is then their density.
