@@ -108,7 +108,9 @@ class Mesh:
     @cached_property
     def bounds_m(self) -> np.ndarray:
         """Axis-aligned bounds of the used vertices, shape (2, 3)."""
-        used = self.vertices[np.unique(self.faces)]
+        mask = np.zeros(len(self.vertices), dtype=bool)
+        mask[self.faces] = True
+        used = self.vertices[mask]
         return np.stack([used.min(axis=0), used.max(axis=0)])
 
     def transformed(self, pose: np.ndarray) -> Mesh:

@@ -57,7 +57,7 @@ class LearningSettings(BaseModel):
 
 PRESET_LEARNING: dict[str, dict[str, Any]] = {
     "draft": {
-        "steps": 340,
+        "steps": 290,
         "hidden": 64,
         "samples": 40_000,
         "balance_proposals": 32768,
