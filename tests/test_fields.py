@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import references
@@ -185,3 +187,11 @@ def test_chunks_do_not_change_the_bits():
     whole = field.distances(points)
     parts = np.concatenate([field.distances(points[:100]), field.distances(points[100:])])
     assert whole.tobytes() == parts.tobytes()
+
+
+def test_plain_and_compiled_interpolation_agree_inside_and_outside():
+    scenes = [Scene((Body(icosphere(0.5 - 0.02 * i, (0.03 * i, 0, 0))),)) for i in range(5)]
+    compiled = field_of(*scenes)
+    points = np.random.default_rng(10).uniform(-1.0, 1.0, (5000, 3))
+    plain = replace(compiled, compiled=False)
+    np.testing.assert_allclose(plain.distances(points), compiled.distances(points), rtol=1e-5, atol=1e-6)

@@ -138,7 +138,8 @@ def _log_target(run: Run, points: np.ndarray) -> np.ndarray:
     from lidardesign.run.manifest import read_manifest
 
     decided = read_manifest(run.folder).get("visibility")
-    target, _ = prepare_target(run.scenes("train", run.config.seed), run.config, visibility=decided)
+    scenes = run.scenes("train", run.config.seed)
+    target, _ = prepare_target(scenes, run.config, visibility=decided, compiled=False)
     return target.log_density(points)
 
 

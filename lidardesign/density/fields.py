@@ -12,7 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
-from lidardesign.density import kernels
+from lidardesign.density import interpolation
 from lidardesign.density.grids import Grid, cached_distance_grids, grid_around
 from lidardesign.errors import ConfigError
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, inverse_rigid
@@ -47,11 +47,13 @@ class TableField:
         table: Shape (grid points, columns) float32 [m].
         grid: Where the rows are.
         shell_m: See `Field`.
+        compiled: Whether distances come from the compiled kernels, which take 0.8 s to load.
     """
 
     table: np.ndarray
     grid: Grid
     shell_m: np.ndarray
+    compiled: bool = True
 
     @property
     def columns(self) -> int:
@@ -66,6 +68,10 @@ class TableField:
     def distances(self, points: np.ndarray) -> np.ndarray:
         """See `Field`."""
         points = np.ascontiguousarray(points, dtype=np.float64)
+        if not self.compiled:
+            return interpolation.table_distances(self.table, *self.geometry, points)
+        from lidardesign.density import kernels
+
         out = np.empty((len(points), self.columns), dtype=np.float32)
         kernels.table_distances(self.table, *self.geometry, points, out)
         return out
@@ -73,6 +79,8 @@ class TableField:
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """See `Field`."""
         points = np.ascontiguousarray(points, dtype=np.float64)
+        from lidardesign.density import kernels
+
         out = np.empty_like(points)
         kernels.table_gradient(self.table, *self.geometry, points, np.ascontiguousarray(weights, np.float64), out)
         return out
@@ -128,6 +136,8 @@ class BodyField:
 
     def _evaluate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         points = np.ascontiguousarray(points, dtype=np.float64)
+        from lidardesign.density import kernels
+
         shape = (len(points), self.columns)
         distances, nearest = np.empty(shape), np.empty(shape, dtype=np.int64)
         kernels.body_distances(
@@ -145,6 +155,8 @@ class BodyField:
         out = np.empty_like(points)
         weights = np.ascontiguousarray(weights, dtype=np.float64)
         nearest = self._evaluate(points)[1]
+        from lidardesign.density import kernels
+
         kernels.body_gradient(
             self._kinds, self._sizes, self._to_body, *self._geometry, points, nearest, weights, out
         )
@@ -152,11 +164,11 @@ class BodyField:
 
 
 _KINDS = {
-    Sphere: kernels.SPHERE,
-    Box: kernels.BOX,
-    Capsule: kernels.CAPSULE,
-    Plane: kernels.PLANE,
-    Mesh: kernels.GRID,
+    Sphere: interpolation.SPHERE,
+    Box: interpolation.BOX,
+    Capsule: interpolation.CAPSULE,
+    Plane: interpolation.PLANE,
+    Mesh: interpolation.GRID,
 }
 
 

@@ -15,10 +15,11 @@ import math
 import numpy as np
 from numba import njit
 
+from lidardesign.density.interpolation import BOX, CAPSULE, PLANE, SPHERE
+
 # Reassociation vectorises the sums; NaN and infinity keep their meaning (no `nnan`, no `ninf`).
 FAST = {"reassoc", "contract", "nsz", "arcp"}
 
-SPHERE, BOX, CAPSULE, PLANE, GRID = range(5)
 
 
 @njit(cache=True, nogil=True, inline="always")

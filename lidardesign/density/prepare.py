@@ -17,7 +17,7 @@ OCCLUDED_SHARE_TO_CARE = 1e-3
 
 
 def prepare_target(
-    scenes: Sequence[Scene], config: RunConfig, *, visibility: str | None = None
+    scenes: Sequence[Scene], config: RunConfig, *, visibility: str | None = None, compiled: bool = True
 ) -> tuple[Target, list[str]]:
     """The target of training scenes, and notes on what was decided or is doubtful.
 
@@ -25,13 +25,14 @@ def prepare_target(
         scenes: The training scenes.
         config: The run's configuration; visibility `auto` is decided here by a probe.
         visibility: What an earlier probe of the same run decided, to take instead.
+        compiled: See `build_target`.
     """
     settings, notes = config.density, []
     visibility = visibility or settings.visibility
     if visibility == "auto":
         visibility, reason = _choose_visibility(scenes, config)
         notes.append(reason)
-    target = build_target(scenes, config.space, settings, visibility)
+    target = build_target(scenes, config.space, settings, visibility, compiled=compiled)
     if visibility == "quadrature":
         target, refined = _refine_quadrature(target, scenes, config)
         notes.extend(refined)

@@ -9,11 +9,11 @@ changes p* by less than columns * exp(-t) of the largest surface proximity there
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidardesign.density.fields import Field, build_field, scene_columns
+from lidardesign.density.fields import Field, TableField, build_field, scene_columns
 from lidardesign.density.settings import DensitySettings
 from lidardesign.density.visibility import (
     NoVisibility,
@@ -121,12 +121,22 @@ class Target:
 
 
 def build_target(
-    scenes: Sequence[Scene], space: DesignSpace, settings: DensitySettings, visibility: str
+    scenes: Sequence[Scene], space: DesignSpace, settings: DensitySettings, visibility: str, *, compiled: bool = True
 ) -> Target:
-    """The target of scenes; `visibility` is one of raycast, quadrature, off (see `choose_visibility` for auto)."""
+    """The target of scenes.
+
+    Arguments:
+        scenes: One term per scene and frame.
+        space: The design space.
+        settings: Its numbers.
+        visibility: raycast, quadrature or off; `prepare_target` decides auto.
+        compiled: False for a few evaluations without gradient, which are not worth loading the kernels.
+    """
     optics = Optics.of(settings)
     fields = {"resolution": settings.field_resolution, "padding_m": PADDING_SIGMAS * settings.sigma_m}
     field = build_field(scenes, lambda body: body.is_target, **fields)
+    if isinstance(field, TableField):
+        field = replace(field, compiled=compiled)
     frames = [scenes[index].frames for index, _ in scene_columns(scenes)]
     return Target(
         field=field,

@@ -14,7 +14,6 @@ from typing import Protocol
 
 import numpy as np
 
-from lidardesign.density import kernels
 from lidardesign.density.fields import Field, TableField, scene_columns
 from lidardesign.density.settings import DensitySettings
 from lidardesign.scene import Scene
@@ -232,6 +231,8 @@ class Quadrature:
         self.field, self.points = field, points
         self._shell_m = float(field.shell_m.max(initial=0.0))
         if isinstance(field, TableField):
+            from lidardesign.density import kernels
+
             self._clear = np.empty(len(field.table), dtype=np.float32)
             kernels.cell_minimum(field.table, field.grid.counts, self._clear)
             self._clear -= np.float32(self._shell_m)
@@ -260,6 +261,8 @@ class Quadrature:
         shape = (rows.stop - rows.start, self.points, self.field.columns)
         slope = np.empty(shape if differentiable else (0, 0, 0), dtype=np.float32)
         if isinstance(self.field, TableField):
+            from lidardesign.density import kernels
+
             kernels.table_quadrature(
                 self.field.table, self._clear, *self.field.geometry, self.field.shell_m,
                 rays.origins[rows], rays.directions[rows], lengths[rows], self.points,
@@ -286,6 +289,8 @@ class Quadrature:
         self, rays: RayBatch, lengths: np.ndarray, optics: Optics
     ) -> Callable[[slice, np.ndarray, np.ndarray, RayGradient], None]:
         def table(rows: slice, slope: np.ndarray, weights: np.ndarray, out: RayGradient) -> None:
+            from lidardesign.density import kernels
+
             kernels.table_quadrature_gradient(
                 self.field.table, self._clear, *self.field.geometry,
                 rays.origins[rows], rays.directions[rows], lengths[rows],
