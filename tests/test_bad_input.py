@@ -356,7 +356,11 @@ SMALL = ["learning.steps=200", "learning.batch=64", "learning.samples=1000", "le
 FREQUENT = ["learning.balance_proposals=256", "learning.checkpoint_seconds=0.05", "train=3"]
 RESULTS = ("flow.safetensors", "samples.npz")
 # a process whose files may not grow beyond a size behaves like one on a disk that becomes full
-SMALL_DISK = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))"
+# Python writes byte code in part without noticing where the disk is full, and would leave it broken for all others
+SMALL_DISK = (
+    "import resource, sys; sys.dont_write_bytecode = True; "
+    "resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))"
+)
 
 
 def settings_of(*settings):

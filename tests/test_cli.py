@@ -435,7 +435,8 @@ def test_a_pinned_origin_is_weighted_with_the_visibility_that_the_run_decided_on
         def log_density(self, points):
             return np.zeros(len(points))
 
-    def prepare(scenes, config, *, visibility=None):
+    def prepare(scenes, config, *, visibility=None, compiled=True):
+        assert not compiled
         asked.append((len(scenes), visibility))
         return Flat(), []
 
