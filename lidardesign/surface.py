@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Sphere
+from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere
 from lidardesign.space import RANGE, DesignSpace
 
 
@@ -63,6 +63,11 @@ def surface_area_m2(body: Body, space: DesignSpace) -> float:
         return (2 * _reach_m(space)) ** 2
     a, b, c = np.moveaxis(shape.vertices[shape.faces], 1, 0)
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+
+def target_area_m2(scene: Scene, space: DesignSpace) -> float:
+    """The area of all targets of a scene [m^2]."""
+    return sum(surface_area_m2(body, space) for body in scene.bodies if body.is_target)
 
 
 def _reach_m(space: DesignSpace) -> float:

@@ -70,6 +70,7 @@ def test_a_folder_is_not_a_file(tmp_path):
 
 def test_a_device_is_written_straight():
     write_atomic("/dev/null", b"gone")
+    assert stat.S_ISCHR(os.stat("/dev/null").st_mode), "a rename over it would have left a file"
 
 
 def test_stray_temporaries_of_killed_writers_are_removed(tmp_path):

@@ -20,7 +20,7 @@ from lidardesign.density.fields import scene_columns
 from lidardesign.scene import Scene
 from lidardesign.simulate.raycast import Crossings, shared_caster
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, aim, direction
-from lidardesign.surface import sample_body, surface_area_m2
+from lidardesign.surface import sample_body, target_area_m2
 
 WINDOW_SPREADS = 8.0
 # A proposal whose own surface ray casting does not find again within this many range errors (a ray through an edge
@@ -84,10 +84,6 @@ def _chosen_columns(scenes: Sequence[Scene], generator: np.random.Generator) -> 
     return [columns[i] for i in sorted(generator.choice(len(columns), MAXIMUM_COLUMNS, replace=False))]
 
 
-def _target_area(scene: Scene, space: DesignSpace) -> float:
-    return sum(surface_area_m2(body, space) for body in scene.bodies if body.is_target)
-
-
 _Drawn = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -113,7 +109,7 @@ def _from_aimed_rays(
         caster = shared_caster(scenes[index], frame, only="targets")
         crossed = caster.crossings(points[:, :3], directions, start, end)
         share = crossed.range_m**2 / (
-            _target_area(scenes[index], space) * np.maximum(crossed.cosine, MINIMUM_COSINE)
+            target_area_m2(scenes[index], space) * np.maximum(crossed.cosine, MINIMUM_COSINE)
         )
         _add_shares(density, crossed, share, points, spread_m)
         own = np.abs(crossed.range_m - surface_range[crossed.row]) < FOUND_SPREADS * spread_m

@@ -19,9 +19,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from lidardesign.density.fields import Field, scene_columns
+from lidardesign.numerics import logsumexp, normalised_weights
 from lidardesign.scene import Scene
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, aim, observed_point
-from lidardesign.surface import sample_body, surface_area_m2
+from lidardesign.surface import sample_body, target_area_m2
 
 CANDIDATES = 131_072
 FARTHEST_SIGMAS = 6.0
@@ -79,15 +80,14 @@ def resampled_proposals(
     candidates, log_proximity = candidates[near], log_proximity[near]
     if not len(candidates):
         return candidates, log_proximity
-    weights = np.exp(log_proximity - log_proximity.max())
-    chosen = generator.choice(len(candidates), size=count, p=weights / weights.sum())
+    chosen = generator.choice(len(candidates), size=count, p=normalised_weights(log_proximity))
     return candidates[chosen], log_proximity[chosen]
 
 
-def _log_proximity(field: Field, points: np.ndarray, sigma_m: float) -> np.ndarray:
-    terms = -np.square(field.distances(observed_point(points)).astype(np.float64) / sigma_m) / 2
-    peak = terms.max(axis=1, keepdims=True)
-    return (peak + np.log(np.exp(terms - peak).sum(axis=1, keepdims=True)))[:, 0]
+def _log_proximity(field: Field, points: np.ndarray, sigma_m: float, weights: np.ndarray | None = None) -> np.ndarray:
+    """log of the sum over columns of weight * exp(-d^2 / (2 sigma^2)) at the observed points, shape (N,)."""
+    distances = field.distances(observed_point(points)).astype(np.float64)
+    return logsumexp(-np.square(distances / sigma_m) / 2, axis=1, weights=weights)
 
 
 def _normals(field: Field, points: np.ndarray, triangles: np.ndarray, column: int) -> np.ndarray:
@@ -111,16 +111,8 @@ def _log_density(
     points: np.ndarray,
     sigma_m: float,
 ) -> np.ndarray:
-    area = {
-        index: sum(surface_area_m2(body, space) for body in scene.bodies if body.is_target)
-        for index, scene in enumerate(scenes)
-    }
-    log_area = np.log([area[index] for index, _ in columns])
-    distances = field.distances(observed_point(points)).astype(np.float64)
-    terms = -np.square(distances / sigma_m) / 2 - log_area
-    peak = terms.max(axis=1, keepdims=True)
-    log_density = (peak + np.log(np.exp(terms - peak).sum(axis=1, keepdims=True)))[:, 0]
-    log_density += 2 * np.log(points[:, RANGE])
+    area_m2 = np.array([target_area_m2(scene, space) for scene in scenes])[[index for index, _ in columns]]
+    log_density = _log_proximity(field, points, sigma_m, 1.0 / area_m2) + 2 * np.log(points[:, RANGE])
     if space.measure == "angles":
         log_density += np.log(np.maximum(np.cos(points[:, ELEVATION]), np.finfo(float).tiny))
     return log_density

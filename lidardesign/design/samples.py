@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from lidardesign.errors import DataError
+from lidardesign.numerics import normalised_weights
 from lidardesign.run.files import write_atomic
 from lidardesign.run.manifest import record, verify
 from lidardesign.space import DesignSpace
@@ -45,12 +46,10 @@ class Samples:
     @cached_property
     def weights(self) -> np.ndarray:
         """Importance weights that sum to 1, shape (N,)."""
-        log_weights = self.log_weights
-        peak = log_weights.max()
-        if not np.isfinite(peak):
-            raise DataError("no sample of the run has a finite weight", hint="learn the run again")
-        weights = np.exp(log_weights - peak)
-        return weights / weights.sum()
+        try:
+            return normalised_weights(self.log_weights)
+        except ValueError:
+            raise DataError("no sample of the run has a finite weight", hint="learn the run again") from None
 
     @property
     def effective_sample_size(self) -> float:
