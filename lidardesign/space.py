@@ -11,7 +11,8 @@ itself, the paper's chart.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -192,6 +193,24 @@ class DesignSpace:
         wrapped = self.wrap(points)
         inside = (wrapped >= np.array(self.low) - tolerance) & (wrapped <= np.array(self.high) + tolerance)
         return inside.all(axis=-1)
+
+    def at(self, condition: Mapping[str, float]) -> DesignSpace:
+        """The space with conditioning dimensions fixed at values, as {"x_m": 0.37}.
+
+        Raises:
+            ConfigError: A name that is no conditioning dimension, or a value outside its bounds.
+        """
+        low, high = list(self.low), list(self.high)
+        for name, value in condition.items():
+            if name not in self.condition:
+                allowed = ", ".join(self.condition) or "none: the density has no conditions"
+                raise ConfigError(f"{name!r} is no condition of the density", where="--at", allowed=allowed)
+            index = DIMENSIONS.index(name)
+            if not self.low[index] <= value <= self.high[index]:
+                bounds = f"{self.low[index]:g} to {self.high[index]:g}"
+                raise ConfigError(f"{name}={value:g} is outside the design space", where="--at", allowed=bounds)
+            low[index] = high[index] = float(value)
+        return replace(self, low=tuple(low), high=tuple(high))
 
     def sample(self, count: int, generator: np.random.Generator) -> np.ndarray:
         """Design points uniform in the chart measure, shape (count, 6)."""

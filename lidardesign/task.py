@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict
 
 from lidardesign.scene import Scene
 from lidardesign.simulate.returns import Returns
-from lidardesign.space import DesignSpace
+from lidardesign.space import DIMENSIONS, DesignSpace
 
 API_VERSION = 1
 Split = Literal["train", "test"]
@@ -68,13 +68,15 @@ class Defaults:
 
     Arguments:
         sensors: The number of sensors to fit.
-        rays: Ray budgets per frame to evaluate at.
+        rays: Ray budgets per frame to evaluate at; where the density has conditions, per condition value.
+        layout: How `fit` lays rays out.
         density: Overrides of the `density` configuration section (for example {"sigma_m": 0.005}).
         learning: Overrides of the `learning` section, by preset name.
     """
 
     sensors: int = 4
     rays: tuple[int, ...] = (36, 100, 196, 361, 576)
+    layout: str = "grid"
     density: Mapping[str, Any] = field(default_factory=dict)
     learning: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
@@ -85,6 +87,10 @@ class Task(Protocol):
 
     `scenes` is deterministic in (config, split, seed), and the splits are disjoint. `score` may use
     `scene.truth` for judging only; the estimate is built from the returns alone.
+
+    A task whose space has conditions may also give `conditions(config)`, the condition values that designs are
+    evaluated at, as [{"x_m": 0.0}, {"x_m": 1.2}]. `score` then gets one `Returns` per condition value (and, within
+    each, per time frame), in this order.
     """
 
     name: ClassVar[str]
@@ -122,3 +128,25 @@ def scenes_of(task: Task, config: Any, split: Split, seed: int, space: DesignSpa
     if "space" in inspect.signature(task.scenes).parameters:
         return task.scenes(config, split, seed, space=space)
     return task.scenes(config, split, seed)
+
+
+# Conditions that a task does not name are evaluated at so many even places.
+EVEN_CONDITIONS = 9
+
+
+def conditions_of(task: Task, config: Any, space: DesignSpace) -> list[dict[str, float]]:
+    """The condition values that designs are evaluated at; one empty mapping where the density has no conditions.
+
+    Raises:
+        ConfigError: The task names a value outside the design space.
+    """
+    if not space.conditioned:
+        return [{}]
+    if hasattr(task, "conditions"):
+        named = [{name: float(value) for name, value in one.items()} for one in task.conditions(config)]
+        for one in named:
+            space.at(one)
+        return named
+    shares = (np.arange(EVEN_CONDITIONS) + 0.5) / EVEN_CONDITIONS
+    low, high = np.array(space.low), np.array(space.high)
+    return [{DIMENSIONS[i]: float(low[i] + share * (high - low)[i]) for i in space.conditioned} for share in shares]

@@ -10,6 +10,7 @@ the sphere instead of in azimuth and elevation.)
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
@@ -20,7 +21,7 @@ from scipy.special import ndtri
 from lidardesign.space import direction
 
 DEFAULT_LEVEL = 0.95
-Layout = Literal["grid", "density", "scan"]
+Layout = Literal["grid", "density", "scan", "distributed"]
 
 
 def interval_factor(level: float) -> float:
@@ -66,6 +67,28 @@ def angle_over_sine(angle: np.ndarray, sine: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
+class Coupling:
+    """How a ray follows from where it starts inside its sensor: conditional means are linear, spreads constant.
+
+    With x the origin and u = (horizontal, vertical) the tangent angles of a ray, both relative to the sensor's means:
+    E[u | x] = direction_per_m @ x, and E[range | x, u] = mean + range_per_m @ x + range_per_rad @ u.
+
+    Arguments:
+        direction_per_m: Shape (2, 3) [rad / m].
+        range_per_m: Shape (3,).
+        range_per_rad: Shape (2,) [m / rad].
+        spread_rad: Standard deviations of the tangent angles that the origin leaves, shape (2,).
+        spread_m: Standard deviation of the range that origin and direction leave.
+    """
+
+    direction_per_m: np.ndarray
+    range_per_m: np.ndarray
+    range_per_rad: np.ndarray
+    spread_rad: np.ndarray
+    spread_m: float
+
+
+@dataclass(frozen=True, eq=False)
 class Sensor:
     """One mixture component, read as a physical sensor.
 
@@ -79,6 +102,7 @@ class Sensor:
         range_m, spread_range_m: Mean and standard deviation of the range.
         level: The share of each marginal that its reported interval holds.
         rays: Rays per frame, where the design fixes them.
+        coupling: How direction and range follow from the origin; None where they are independent.
     """
 
     name: str
@@ -94,6 +118,7 @@ class Sensor:
     spread_range_m: float
     level: float = DEFAULT_LEVEL
     rays: int | None = None
+    coupling: Coupling | None = None
 
     @cached_property
     def frame(self) -> np.ndarray:
@@ -163,18 +188,42 @@ class RayTable:
 
 
 @dataclass(frozen=True, eq=False)
+class Track:
+    """Rays that vary smoothly along one condition, as a robot's position: given at knots, linear in between.
+
+    Ray n is the same ray at all knots. Its origin is its sensor's mean origin, with `dimension` at the condition.
+
+    Arguments:
+        dimension: The condition's name, as "x_m".
+        knots: Ascending condition values, shape (P,).
+        azimuth_rad, elevation_rad: Shape (P, N); azimuths are unrolled along the knots.
+        gate_m: Shape (P, N, 2).
+        sensor: Index of the sensor of each ray, shape (N,).
+    """
+
+    dimension: str
+    knots: np.ndarray
+    azimuth_rad: np.ndarray
+    elevation_rad: np.ndarray
+    gate_m: np.ndarray
+    sensor: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class Design:
     """A LiDAR system: sensors, how its rays are laid out, and where it came from.
 
     Arguments:
         name: The file's stem, the row's name in tables.
         sensors: At least one.
-        layout: `grid`, `density` or `scan`.
+        layout: `grid`, `density`, `scan` or `distributed`.
         rays: Rays per frame that it was made for; None leaves the budget to `evaluate`.
-        ray_table: The explicit rays of a `density` or `scan` layout.
+        ray_table: The explicit rays of every layout but `grid`.
         constraints: The constraint document that it satisfies (plain values).
         provenance: Command, seed, run and versions, for people.
         level: The share of each marginal that intervals hold.
+        track: The rays along a condition, where the design is for all its values.
+        at: The condition values that the design is for, where it is for one, as {"x_m": 0.37}.
     """
 
     name: str
@@ -185,6 +234,8 @@ class Design:
     constraints: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
     level: float = DEFAULT_LEVEL
+    track: Track | None = None
+    at: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def weights(self) -> np.ndarray:
