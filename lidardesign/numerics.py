@@ -94,14 +94,16 @@ def effective_sample_size(log_weights: Any) -> float:
     return effective_count(np.exp(log_weights - log_weights.max())) / len(log_weights)
 
 
-def clipped_eigenvalues(matrices: np.ndarray, low: Any, high: Any = np.inf) -> np.ndarray:
+def clipped_eigenvalues(matrices: np.ndarray, low: Any, high: Any = np.inf, smallest: Any = np.inf) -> np.ndarray:
     """Symmetric matrices (..., n, n) with their eigenvalues moved into [low, high], each (...).
 
-    It is the maximiser of the Gaussian log-likelihood under these bounds, not a mere repair.
+    The least eigenvalue is lowered to at most `smallest` (...) besides. It is the maximiser of the Gaussian
+    log-likelihood under these bounds, not a mere repair: lowering the least eigenvalue costs least.
     """
     symmetric = (matrices + np.swapaxes(matrices, -1, -2)) / 2
     values, vectors = np.linalg.eigh(symmetric)
     values = np.clip(values, np.asarray(low)[..., None], np.asarray(high)[..., None])
+    values[..., 0] = np.minimum(values[..., 0], smallest)
     rebuilt = (vectors * values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     return (rebuilt + np.swapaxes(rebuilt, -1, -2)) / 2
 

@@ -101,7 +101,9 @@ def test_a_fixed_angle_admits_no_field_of_view_along_it():
     [
         ({"gates": {}}, "unknown key 'gates'"),
         ({"gate": {"width": {"max": 1}}}, "unknown key 'gate.width'"),
-        ({"origin": {"mounts_m": [[0, 0, 0]]}}, "unknown key"),
+        ({"origin": {"mounts_m": []}}, "origin.mounts_m"),
+        ({"origin": {"mounts_m": [[0, 0, 0], [0, 0, 0]]}}, "the mounts must differ"),
+        ({"origin": {"thickness_m": {"max": 0}}}, "origin.thickness_m.max"),
         ({"gate": {"width_m": {"max": "wide"}}}, "gate.width_m.max"),
         ({"gate": {"width_m": {"max": -1}}}, "greater than 0"),
         ({"gate": {"width_m": {"max": math.nan}}}, "finite"),

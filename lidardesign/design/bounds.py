@@ -29,6 +29,7 @@ class Bounds:
         interval: z, the standard deviations on each side of a mean that an interval spans.
         origin_low, origin_high: Box of the mean origin [m], shape (K, 3).
         origin_spread: Largest standard deviation of the origin along any direction [m].
+        origin_thickness: Largest standard deviation of the origin along its thinnest direction [m].
         azimuth_centre, azimuth_half: Interval of the boresight's azimuth on the circle [rad].
         elevation_low, elevation_high: Of the boresight [rad].
         spread_low, spread_high: Angular standard deviations, horizontal and vertical, shape (K, 2) [rad].
@@ -39,6 +40,7 @@ class Bounds:
     origin_low: np.ndarray
     origin_high: np.ndarray
     origin_spread: np.ndarray
+    origin_thickness: np.ndarray
     azimuth_centre: np.ndarray
     azimuth_half: np.ndarray
     elevation_low: np.ndarray
@@ -74,6 +76,7 @@ class Bounds:
             origin_low=np.full((count, 3), -math.inf),
             origin_high=np.full((count, 3), math.inf),
             origin_spread=high,
+            origin_thickness=high,
             azimuth_centre=np.zeros(count),
             azimuth_half=np.full(count, math.pi),
             elevation_low=np.full(count, -math.pi / 2),

@@ -148,9 +148,11 @@ def _origin(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any]) -> l
             kept = all(test(value, limit) for value, limit in zip(mean, bound, strict=True))
             checks.append(ConstraintCheck(f"{name}.origin.{key}", list(bound), list(mean), bool(kept)))
     largest = _get(rules, "origin", "spread_m", "max")
-    spread = math.sqrt(max(float(np.linalg.eigvalsh(np.array(covariance, dtype=np.float64))[-1]), 0.0))
+    principal = np.sqrt(np.maximum(np.linalg.eigvalsh(np.array(covariance, dtype=np.float64)), 0.0))
+    thickness, spread = float(principal[0]), float(principal[-1])
     if largest is not None:
         checks += _between(f"{name}.origin.spread_m", spread, {"max": largest})
+    checks += _between(f"{name}.origin.thickness_m", thickness, _get(rules, "origin", "thickness_m"))
     if _get(rules, "origin", "fixed_m") is not None:
         checks.append(ConstraintCheck(f"{name}.origin.fixed_m.spread", 0.0, spread, spread == 0.0))
     return checks

@@ -4,7 +4,9 @@ What the bounds mean, here and in `check`, which verifies them on the finished f
 
 - `gate` and `field_of_view` bound the reported intervals, mean -+ z spread;
 - `origin.low_m`, `high_m` bound the sensor's mean origin; samples are taken from inside the box too;
-- `origin.spread_m.max` bounds the standard deviation of the origin along every direction;
+- `origin.spread_m.max` bounds the standard deviation of the origin along every direction, `thickness_m.max` that
+  along its thinnest principal direction, so that sensors spread over lines or sheets of any tilt;
+- `origin.mounts_m` lists the points where sensors can be fixed, one sensor at each at most (see `mounts`);
 - `boresight.azimuth_deg` is an interval on the circle: with `min` above `max` it passes through 0;
 - every gate stays inside the range bounds of the design space, whatever the file says.
 
@@ -75,7 +77,7 @@ class FieldRange(_Keys):
 
 
 class SpreadLimit(_Keys):
-    """The largest standard deviation of the origin along any direction [m]."""
+    """The largest standard deviation of the origin, along any or along its thinnest direction [m]."""
 
     max: Positive | None = None
 
@@ -87,6 +89,15 @@ class Origin(_Keys):
     high_m: Vector | None = None
     fixed_m: Vector | None = None
     spread_m: SpreadLimit = SpreadLimit()
+    thickness_m: SpreadLimit = SpreadLimit()
+    mounts_m: Annotated[list[Vector], Field(min_length=1)] | None = None
+
+    @model_validator(mode="after")
+    def _distinct_mounts(self) -> Origin:
+        mounts = [tuple(mount) for mount in self.mounts_m or []]
+        if len(set(mounts)) < len(mounts):
+            raise ValueError("the mounts must differ")
+        return self
 
 
 class Boresight(_Keys):

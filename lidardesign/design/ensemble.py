@@ -114,8 +114,8 @@ def admitted(mixture: Mixture, features: Features, bounds: Bounds) -> Mixture:
     return maximise(mixture, expect(mixture, features), features, bounds, Floors.of(features), 0.0)
 
 
-def sensors_of(ensemble: Ensemble, space: DesignSpace, level: float, *, by_weight: bool) -> tuple[Sensor, ...]:
-    """The fitted components as sensors s0, s1, ...: heaviest first, or as in the constraint file."""
+def sensors_of(ensemble: Ensemble, space: DesignSpace, level: float) -> tuple[Sensor, ...]:
+    """The fitted components as sensors s0, s1, ... in the order of the constraint file."""
     rows = [
         _sensor(part, trace.mixture, row, space, level)
         for part, trace in zip(ensemble.parts, ensemble.traces, strict=True)
@@ -123,9 +123,16 @@ def sensors_of(ensemble: Ensemble, space: DesignSpace, level: float, *, by_weigh
     ]
     placed = [rows[i] for i in np.argsort(ensemble.order, kind="stable")]
     placed = [replace(s, weight=float(w)) for s, w in zip(placed, ensemble.weights, strict=True)]
-    if by_weight:
-        placed.sort(key=lambda s: (-round(s.weight, 9), s.azimuth_rad, s.elevation_rad, s.range_m))
-    return tuple(replace(sensor, name=f"s{index}") for index, sensor in enumerate(placed))
+    return _named(placed)
+
+
+def heaviest_first(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
+    """Sensors by weight, named s0, s1, ... in that order."""
+    return _named(sorted(sensors, key=lambda s: (-round(s.weight, 9), s.azimuth_rad, s.elevation_rad, s.range_m)))
+
+
+def _named(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
+    return tuple(replace(sensor, name=f"s{index}") for index, sensor in enumerate(sensors))
 
 
 def _sensor(part: Part, mixture: Mixture, row: int, space: DesignSpace, level: float) -> Sensor:

@@ -19,6 +19,7 @@ import numpy as np
 from lidardesign.design.document import Locate, Node
 from lidardesign.design.sensor import (
     DEFAULT_LEVEL,
+    Coupling,
     Design,
     RayTable,
     Sensor,
@@ -31,7 +32,7 @@ from lidardesign.run.yaml import Document, dump_yaml, load_yaml
 
 SCHEMA_VERSION = 1
 SCHEMA_FILE = Path(__file__).with_name("design.schema.json")
-LAYOUTS = ("grid", "density", "scan")
+LAYOUTS = ("grid", "density", "scan", "distributed")
 # A file of a hundred thousand explicit rays; the YAML reader's own limit is for settings.
 MAX_BYTES = 64_000_000
 # Eight numbers a ray stay below the number of values that the YAML reader accepts in one file.
@@ -48,7 +49,8 @@ COVARIANCE_ROUNDING = 1e-9
 REQUIRED = ("schema_version", "sensors")
 OPTIONAL = ("name", "layout", "level", "rays", "ray_table", "constraints", "provenance")
 SENSOR_REQUIRED = ("origin_m", "boresight")
-SENSOR_OPTIONAL = ("name", "weight", "field_of_view_rad", "gate_m", "range_m", "spread", "rays")
+SENSOR_OPTIONAL = ("name", "weight", "field_of_view_rad", "gate_m", "range_m", "spread", "travel_m", "coupling", "rays")
+COUPLING_KEYS = ("direction_rad_per_m", "range_m_per_m", "range_m_per_rad", "spread_rad", "spread_m")
 TABLE_KEYS = (
     "origin_x_m",
     "origin_y_m",
@@ -82,8 +84,12 @@ def design_document(design: Design) -> dict[str, Any]:
 def _sensor_document(sensor: Sensor) -> dict[str, Any]:
     values = sensor.as_dict()
     rays = _count(values.pop("rays"))
+    coupling = values.pop("coupling")
+    if values["travel_m"]["length"] == 0:
+        del values["travel_m"]
     # the gate's start is cut at 0, so the mean range cannot be told from the gate alone
-    return {**values, "range_m": float(sensor.range_m), "rays": rays}
+    document = {**values, "range_m": float(sensor.range_m)}
+    return {**document, "rays": rays} if coupling is None else {**document, "coupling": coupling, "rays": rays}
 
 
 def _count(rays: int | None) -> int | None:
@@ -224,7 +230,7 @@ def _sensor(node: Node, index: int, level: float) -> Sensor:
     boresight = keys["boresight"].mapping(("azimuth_rad", "elevation_rad"), ("roll_rad",))
     horizontal, vertical = _angular_spreads(node, keys, level)
     range_m, spread_range = _range(node, keys, level)
-    return Sensor(
+    sensor = Sensor(
         name=keys["name"].text() if "name" in keys else f"sensor_{index + 1}",
         weight=keys["weight"].number(0) if "weight" in keys else 0.0,
         origin_m=mean,
@@ -238,7 +244,39 @@ def _sensor(node: Node, index: int, level: float) -> Sensor:
         spread_range_m=spread_range,
         level=level,
         rays=keys["rays"].integer(0) if "rays" in keys else None,
+        coupling=_coupling(keys["coupling"]) if "coupling" in keys else None,
     )
+    if "travel_m" in keys:
+        _check_travel(keys["travel_m"], sensor)
+    return sensor
+
+
+def _coupling(node: Node) -> Coupling:
+    keys = node.mapping(COUPLING_KEYS)
+    rows = keys["direction_rad_per_m"].items()
+    if len(rows) != 2:
+        allowed = "2 rows (horizontal, vertical) of 3 numbers [rad / m]"
+        raise keys["direction_rad_per_m"].error(f"has {len(rows)} rows", allowed=allowed)
+    return Coupling(
+        direction_per_m=np.stack([row.numbers(3) for row in rows]),
+        range_per_m=keys["range_m_per_m"].numbers(3),
+        range_per_rad=keys["range_m_per_rad"].numbers(2),
+        spread_rad=keys["spread_rad"].numbers(2, 0),
+        spread_m=keys["spread_m"].number(0),
+    )
+
+
+def _check_travel(node: Node, sensor: Sensor) -> None:
+    """The travel follows from the origin's covariance; another one would mean a different sensor."""
+    keys = node.mapping(("length",), ("direction",))
+    found, (expected, _) = keys["length"].number(0), sensor.travel_m
+    if abs(found - expected) > AGREEMENT * max(found, expected):
+        raise keys["length"].error(
+            f"is {found!r} m, but the origin's covariance gives {expected:.9g} at level {sensor.level:g}",
+            hint="remove travel_m; it follows from the covariance",
+        )
+    if "direction" in keys:
+        keys["direction"].numbers(3)
 
 
 def _origin(node: Node) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,8 @@ import numpy as np
 from lidardesign.design.budget import ReadOut, within_budget
 from lidardesign.design.check import ConstraintCheck, check_design
 from lidardesign.design.constraints import Constraints
-from lidardesign.design.ensemble import Ensemble, Part, fit_parts, sensors_of
+from lidardesign.design.coupling import couplings
+from lidardesign.design.ensemble import Ensemble, Part, fit_parts, heaviest_first, sensors_of
 from lidardesign.design.feasibility import check_feasible, least_sensors
 from lidardesign.design.features import Axes, Features
 from lidardesign.design.rays import SAMPLES_PER_RAY, make_ray_table, split_budget
@@ -160,7 +161,9 @@ def _solved(
         return supports, beams, len(beams), score, ()
     supports, ensemble = _fitted(request, sensors)
     ensemble, total = within_budget(ensemble, Ensemble.narrowed, lambda e: (e.widths_m, e.weights), read_out)
-    fitted = sensors_of(ensemble, space, request.level, by_weight=not constraints.each)
+    fitted = couplings(ensemble, sensors_of(ensemble, space, request.level))
+    if not constraints.each:
+        fitted = heaviest_first(fitted)
     return supports, fitted, total, ensemble.log_likelihood, ensemble.notes
 
 

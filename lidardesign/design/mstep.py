@@ -80,14 +80,16 @@ def _origin(
     high = np.square(bounds.origin_spread)
     low = np.minimum(floors.origin_m**2, high)
     box = bounds.origin_low[:, axes], bounds.origin_high[:, axes]
-    best = clipped_eigenvalues(scatter, low, high)
+    # fewer free axes leave the origin no thickness at all
+    thinnest = np.square(bounds.origin_thickness) if count == 3 else np.inf
+    best = clipped_eigenvalues(scatter, low, high, thinnest)
     point = np.clip(mean, *box)
     for _ in range(ORIGIN_ALTERNATIONS):
         if np.array_equal(point, mean):
             break
         point = box_quadratic_minimum(np.linalg.inv(best), mean, *box)
         away = mean - point
-        best = clipped_eigenvalues(scatter + away[:, :, None] * away[:, None, :], low, high)
+        best = clipped_eigenvalues(scatter + away[:, :, None] * away[:, None, :], low, high, thinnest)
     origin[:, axes] = point
     covariance[np.ix_(range(len(mixture)), axes, axes)] = best
     return origin, covariance

@@ -99,11 +99,12 @@ def _distinct(constraints: Constraints, sensors: tuple[int, ...]) -> set[int]:
 
 def _row(one: SensorConstraints, space: DesignSpace, axes: Axes, interval: float) -> dict[str, object]:
     low, high = origin_box(one, space)
-    spread = one.origin.spread_m.max
+    spread, thickness = one.origin.spread_m.max, one.origin.thickness_m.max
     row: dict[str, object] = {
         "origin_low": low,
         "origin_high": high,
         "origin_spread": math.inf if spread is None else (1 - INWARD) * spread,
+        "origin_thickness": math.inf if thickness is None else (1 - INWARD) * thickness,
     }
     row |= _boresight_row(one, space, axes)
     row |= _field_row(one, axes, interval)

@@ -86,7 +86,7 @@ def fit_scan(
         lambda e: (e.widths_m, e.weights),
         read_out,
     )
-    sensors = sensors_of(fitted, space, level, by_weight=False)
+    sensors = sensors_of(fitted, space, level)
     order = sorted(sensors, key=lambda s: (round(s.elevation_rad, 9), s.azimuth_rad, s.range_m))
     named = tuple(replace(sensor, name=f"s{index}") for index, sensor in enumerate(order))
     return named, fitted.log_likelihood

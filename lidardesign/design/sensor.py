@@ -87,6 +87,16 @@ class Coupling:
     spread_rad: np.ndarray
     spread_m: float
 
+    def as_dict(self) -> dict[str, Any]:
+        """The plain values of the design file."""
+        return {
+            "direction_rad_per_m": [[float(v) for v in row] for row in self.direction_per_m],
+            "range_m_per_m": [float(v) for v in self.range_per_m],
+            "range_m_per_rad": [float(v) for v in self.range_per_rad],
+            "spread_rad": [float(v) for v in self.spread_rad],
+            "spread_m": float(self.spread_m),
+        }
+
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
@@ -138,6 +148,19 @@ class Sensor:
         return max(self.range_m - half, 0.0), self.range_m + half
 
     @property
+    def travel_m(self) -> tuple[float, np.ndarray]:
+        """How far it moves to reach its origins: the interval of `level` along their longest principal axis.
+
+        Length [m] and unit vector, shape (3,), whose largest entry is positive; zeros for a fixed origin. A
+        sensor whose origin is longer than it is thick is one that moves: a scanner on a rail or a gantry.
+        """
+        values, axes = np.linalg.eigh(np.asarray(self.origin_covariance_m2, dtype=np.float64))
+        if values[-1] <= 0:
+            return 0.0, np.zeros(3)
+        axis = axes[:, -1] * np.copysign(1.0, axes[np.abs(axes[:, -1]).argmax(), -1])
+        return 2 * interval_factor(self.level) * math.sqrt(values[-1]), axis
+
+    @property
     def boresight(self) -> np.ndarray:
         """The unit vector that it points along, shape (3,)."""
         return direction(self.azimuth_rad, self.elevation_rad)
@@ -146,6 +169,7 @@ class Sensor:
         """The contract's JSON and YAML form of a sensor."""
         horizontal, vertical = self.field_of_view_rad
         start, end = self.gate_m
+        length, along = self.travel_m
         return {
             "name": self.name,
             "weight": float(self.weight),
@@ -153,6 +177,7 @@ class Sensor:
                 "mean": [float(v) for v in self.origin_m],
                 "covariance": [[float(v) for v in row] for row in self.origin_covariance_m2],
             },
+            "travel_m": {"length": float(length), "direction": [float(v) for v in along]},
             "boresight": {
                 "azimuth_rad": float(self.azimuth_rad),
                 "elevation_rad": float(self.elevation_rad),
@@ -165,6 +190,7 @@ class Sensor:
                 "vertical_rad": float(self.spread_vertical_rad),
                 "range_m": float(self.spread_range_m),
             },
+            "coupling": None if self.coupling is None else self.coupling.as_dict(),
             "rays": self.rays,
         }
 

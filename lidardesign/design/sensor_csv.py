@@ -201,6 +201,8 @@ def _losses(design: Design) -> list[str]:
         notes.append("the explicit rays of the layout are not held")
     if any(sensor.roll_rad for sensor in design.sensors):
         notes.append("roll is not held: spreads are those along azimuth and elevation")
+    if any(sensor.coupling is not None for sensor in design.sensors):
+        notes.append("couplings are not held: direction and range are read back as independent of the origin")
     for sensor in design.sensors:
         if _unrolled(sensor)[0] >= math.cos(sensor.elevation_rad) * FULL_TURN and _unrolled(sensor)[0] > 0:
             notes.append(f"{sensor.name} points at a pole: its azimuth spread was cut at a full turn")
