@@ -1,0 +1,155 @@
+"""Scanning shelves from a robot that drives past them: which elevations are worth a ray, and where along the aisle.
+
+World frame: the robot drives along x with its sensor at y = z = 0 and looks towards -y, up to straight up. The
+shelf stands along the aisle with four levels of boxes; see `warehouse_shelf` for its shape. A design gives the
+rays for any robot position x; it is judged by the boxes that it misses there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from lidardesign.errors import ConfigError
+from lidardesign.scene import Scene
+from lidardesign.simulate.returns import Returns
+from lidardesign.space import DIMENSIONS, DesignSpace
+from lidardesign.task import Defaults, Metric, Score, Split, TaskConfig, random_generator
+from lidardesign_tasks.warehouse_shelf import Interval, ShelfPlan, build_shelf
+from lidardesign_tasks.warehouse_truth import BoxTruth, miss_score
+
+AISLE_M = (-0.5, 4.0)
+PAPER_POSITIONS_M = (0.0, 1.2, 2.4, 3.6)
+# The density is conditioned on x; rays in one vertical plane need the others fixed.
+FIXED_DIMENSIONS = ("y_m", "z_m", "azimuth_rad")
+MAXIMUM_DRAWS = 100  # a shelf whose boxes are all hidden at all positions is drawn anew so often
+
+Size = Literal["full", "small"]
+SIZES: dict[str, dict[str, int]] = {
+    "full": {"train": 100, "test": 40, "positions": 20, "bays": 4},
+    "small": {"train": 6, "test": 4, "positions": 4, "bays": 2},
+}
+
+
+class WarehouseConfig(TaskConfig):
+    """How many shelves, how they differ, and where they are looked at from."""
+
+    size: Size = Field("full", description="small: 6 training and 4 held-out shelves of 2 bays, for quick checks")
+    train: int | None = Field(None, ge=1, le=10_000, description="training shelves; default 100, small 6")
+    test: int | None = Field(None, ge=1, le=10_000, description="held-out shelves; default 40, small 4")
+    positions: int | None = Field(
+        None, ge=0, le=1000, description="robot positions besides 0, 1.2, 2.4, 3.6 m; default 20, small 4"
+    )
+    bays: int | None = Field(None, ge=1, le=20, description="bays along the aisle; default 4, small 2")
+    front_m: Interval = Field(
+        (0.9, 1.1), description="mean distance to the shelf where the aisle starts and where it ends [m]"
+    )
+    front_jitter_m: float = Field(0.04, ge=0, le=0.2, description="half width of both distances' spread [m]")
+    first_level_m: Interval = Field((0.04, 0.14), description="height of the lowest level above the sensor [m]")
+    level_spacing_m: Interval = Field((0.43, 0.55), description="height from one level to the next [m]")
+    box_width_m: Interval = Field((0.2, 0.6), description="shortest and longest box along the aisle [m]")
+    box_height_m: Interval = Field((0.05, 0.38), description="lowest and highest box [m]")
+    box_setback_m: Interval = Field((0.0, 0.05), description="from the shelf's edge to the boxes' fronts [m]")
+    empty_share: float = Field(0.15, ge=0, le=0.9, description="share of boxes with an empty place beside them")
+    second_row_share: float = Field(0.15, ge=0, le=1, description="share of boxes with another one behind them")
+
+    @model_validator(mode="after")
+    def _check_the_plan(self) -> WarehouseConfig:
+        self.plan.check()
+        return self
+
+    def count(self, name: Literal["train", "test", "positions", "bays"]) -> int:
+        """A number of things: what was set, else that of the size."""
+        value = getattr(self, name)
+        return SIZES[self.size][name] if value is None else value
+
+    @property
+    def plan(self) -> ShelfPlan:
+        """What shelves are drawn from."""
+        return ShelfPlan(
+            aisle_m=AISLE_M,
+            bays=self.count("bays"),
+            front_m=self.front_m,
+            front_jitter_m=self.front_jitter_m,
+            first_level_m=self.first_level_m,
+            level_spacing_m=self.level_spacing_m,
+            box_width_m=self.box_width_m,
+            box_height_m=self.box_height_m,
+            box_setback_m=self.box_setback_m,
+            empty_share=self.empty_share,
+            second_row_share=self.second_row_share,
+        )
+
+
+class WarehouseTask:
+    """See every box on the shelves that a robot drives past, with few rays per position."""
+
+    name: ClassVar[str] = "warehouse"
+    summary: ClassVar[str] = "a robot drives past shelves of boxes; rays for any position along the aisle"
+    api_version: ClassVar[int] = 1
+    Config: ClassVar[type[WarehouseConfig]] = WarehouseConfig
+    metric: ClassVar[Metric] = Metric("miss rate", "%", "lower", worst=100.0, tolerance=0.5)
+    defaults: ClassVar[Defaults] = Defaults(
+        sensors=12, rays=(6, 12, 18), layout="scan", density={"sigma_m": 0.02}
+    )
+
+    def space(self, config: WarehouseConfig) -> DesignSpace:
+        """Elevation and range in the vertical plane y < 0, conditioned on the robot's x."""
+        return DesignSpace(
+            low=(AISLE_M[0], 0.0, 0.0, -math.pi / 2, 0.0, 0.1),
+            high=(AISLE_M[1], 0.0, 0.0, -math.pi / 2, math.pi / 2, 5.0),
+            condition=("x_m",),
+        )
+
+    def conditions(self, config: WarehouseConfig) -> list[dict[str, float]]:
+        """The paper's four robot positions, then `positions` more, even over the aisle."""
+        count = config.count("positions")
+        more = AISLE_M[0] + (np.arange(count) + 0.5) / max(count, 1) * (AISLE_M[1] - AISLE_M[0])
+        return [{"x_m": float(x)} for x in (*PAPER_POSITIONS_M, *more)]
+
+    def scenes(
+        self, config: WarehouseConfig, split: Split, seed: int, space: DesignSpace | None = None
+    ) -> Sequence[Scene]:
+        """Random shelves; each has a generator of its own, so counts do not change them.
+
+        Raises:
+            ConfigError: The space does not fix y, z and the azimuth, or no box can be seen in it.
+        """
+        space = space or self.space(config)
+        for name in FIXED_DIMENSIONS:
+            if DIMENSIONS.index(name) in space.free:
+                raise ConfigError(
+                    f"{name} is free, but the warehouse judges rays in one vertical plane per robot position",
+                    where=f"space.{name}",
+                    hint="fix it to one number",
+                )
+        origins = [space.at(one).low[:3] for one in self.conditions(config)]
+        return [
+            _visible_shelf(config.plan, space, np.array(origins), split, seed, index)
+            for index in range(config.count(split))
+        ]
+
+    def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
+        """The share [%] of boxes in the sensor's plane that no ray returned on; one `Returns` per position."""
+        return miss_score(self.metric, scene, returns)
+
+
+def _visible_shelf(
+    plan: ShelfPlan, space: DesignSpace, origins_m: np.ndarray, split: Split, seed: int, index: int
+) -> Scene:
+    """One shelf with its truth, drawn anew while no box can be seen from anywhere."""
+    for draw in range(MAXIMUM_DRAWS):
+        generator = random_generator(seed, "warehouse", split, index, draw)
+        scene = Scene(build_shelf(plan, generator), f"{split} shelf {index}")
+        truth = BoxTruth(scene, space, origins_m)
+        if truth.any_visible():
+            return Scene(scene.bodies, scene.name, truth)
+    raise ConfigError(
+        f"no box of {MAXIMUM_DRAWS} random shelves can be seen from any robot position",
+        where="task",
+        hint="bring the boxes' fronts to the shelf's edge or widen the design space",
+    )

@@ -1,0 +1,209 @@
+"""Which boxes a robot could see from a position, and which of them its returns lie on.
+
+All bodies are boxes with a vertical axis, so the sensor's vertical plane cuts each in a rectangle. Between
+neighbouring elevations of rectangles' corners a ray's first hit stays the same rectangle: one ray per such step finds
+everything that any ray could see, exactly.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from lidardesign.errors import ConfigError
+from lidardesign.scene import Body, Scene
+from lidardesign.simulate.returns import Returns
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace
+from lidardesign.task import Metric, Score
+
+PERCENT = 100.0
+# No step between neighbouring elevations is wider: the ends of the design space's range cut faces to this angle.
+LARGEST_STEP_RAD = math.radians(0.5)
+# Less of a box than this in all, 0.2 mm at 2 m, counts as hidden: rounding decides about slivers.
+SMALLEST_VISIBLE_RAD = 1e-4
+# A return lies on the nearest surface in its plane, unless even that is further away: several times the range
+# error of a single-photon detector (50 ps, 7.5 mm), less than half of the lowest box.
+ON_FACE_M = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneCut:
+    """What the sensor's vertical plane cuts out of a scene, in its coordinates (distance, height above the sensor).
+
+    Arguments:
+        body: Indices of the cut bodies, shape (B,).
+        low: Nearest distance and lowest height of each [m], shape (B, 2).
+        high: Furthest distance and largest height [m], shape (B, 2).
+        is_box: Which are boxes to be seen, shape (B,).
+    """
+
+    body: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    is_box: np.ndarray
+
+    def first_hits(self, elevation_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The nearest rectangle of rays from the sensor: its row (-1 on a miss) and range [m], both (N,)."""
+        if not len(self.body):
+            return np.full(len(elevation_rad), -1), np.full(len(elevation_rad), np.inf)
+        ray = np.stack([np.cos(elevation_rad), np.sin(elevation_rad)], axis=-1)[:, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            entry, leave = self.low / ray, self.high / ray
+        near = np.fmin(entry, leave).max(axis=-1)
+        far = np.fmax(entry, leave).min(axis=-1)
+        range_m = np.where((near <= far) & (far >= 0), np.where(near >= 0, near, far), np.inf)
+        row = range_m.argmin(axis=1)
+        nearest = range_m[np.arange(len(row)), row]
+        return np.where(np.isfinite(nearest), row, -1), nearest
+
+    def distance_m(self, points: np.ndarray) -> np.ndarray:
+        """Distance of points in the plane to every rectangle's outline, (N, 2) to (N, B)."""
+        outside = np.maximum(self.low - points[:, None], points[:, None] - self.high)
+        deepest = outside.max(axis=-1)
+        return np.where(deepest > 0, np.linalg.norm(np.maximum(outside, 0), axis=-1), -deepest)
+
+
+def cut_scene(scene: Scene, origin_m: np.ndarray, azimuth_rad: float) -> PlaneCut:
+    """What the half plane from an origin (3,) towards an azimuth cuts out of a scene of upright boxes."""
+    forward = np.array([math.cos(azimuth_rad), math.sin(azimuth_rad), 0.0])
+    rows, low, high = [], [], []
+    for index, body in enumerate(scene.bodies):
+        interval = _crossed(body, origin_m, forward)
+        if interval is not None:
+            middle, half = body.pose()[2, 3] - origin_m[2], body.shape.half_extents_m[2]
+            rows.append(index)
+            low.append((interval[0], middle - half))
+            high.append((interval[1], middle + half))
+    is_box = np.array([scene.bodies[index].is_target for index in rows], dtype=bool)
+    return PlaneCut(np.array(rows, dtype=int), np.reshape(low, (-1, 2)), np.reshape(high, (-1, 2)), is_box)
+
+
+def _crossed(body: Body, origin_m: np.ndarray, forward: np.ndarray) -> tuple[float, float] | None:
+    """Where a horizontal line from the origin enters and leaves a box's footprint [m]; None where it does not."""
+    pose, half = body.pose(), np.array(body.shape.half_extents_m[:2])
+    start = (pose[:3, :3].T @ (origin_m - pose[:3, 3]))[:2]
+    along = (pose[:3, :3].T @ forward)[:2]
+    near, far = 0.0, math.inf
+    for place, step, reach in zip(start.tolist(), along.tolist(), half.tolist(), strict=True):
+        if step == 0.0:
+            if abs(place) > reach:
+                return None
+            continue
+        ends = sorted(((-reach - place) / step, (reach - place) / step))
+        near, far = max(near, ends[0]), min(far, ends[1])
+    return (near, far) if near < far else None
+
+
+def visible_boxes(cut: PlaneCut, space: DesignSpace) -> np.ndarray:
+    """The bodies of the boxes that some admissible ray of the plane sees, ascending, shape (V,)."""
+    low, high = space.low[ELEVATION], space.high[ELEVATION]
+    corners = [np.arctan2(z, s) for s in (cut.low[:, 0], cut.high[:, 0]) for z in (cut.low[:, 1], cut.high[:, 1])]
+    even = np.linspace(low, high, math.ceil((high - low) / LARGEST_STEP_RAD) + 1)
+    edges = np.unique(np.clip(np.concatenate([*corners, even]), low, high))
+    row, range_m = cut.first_hits((edges[:-1] + edges[1:]) / 2)
+    admissible = (row >= 0) & (range_m >= space.low[RANGE]) & (range_m <= space.high[RANGE])
+    seen_rad = np.bincount(row[admissible], np.diff(edges)[admissible], minlength=len(cut.body))
+    return cut.body[cut.is_box & (seen_rad >= SMALLEST_VISIBLE_RAD)]
+
+
+@dataclass(frozen=True, eq=False)
+class BoxTruth(Mapping[str, list[np.ndarray]]):
+    """The boxes that could be seen (`visible`) and that stand in the plane at all (`standing`), per position.
+
+    Each is a list of body indices per robot position, found when first asked for: learning never asks.
+
+    Arguments:
+        scene: The scene without a truth.
+        space: What the sensor may do; its azimuth is fixed.
+        origins_m: Where the sensor is at the evaluated positions, shape (P, 3).
+    """
+
+    scene: Scene
+    space: DesignSpace
+    origins_m: np.ndarray
+
+    @cached_property
+    def cuts(self) -> list[PlaneCut]:
+        """The scene's cut at every position."""
+        return [self._cut(origin) for origin in self.origins_m]
+
+    @cached_property
+    def visible(self) -> list[np.ndarray]:
+        """The bodies of the boxes that an admissible ray sees, per position."""
+        return [visible_boxes(cut, self.space) for cut in self.cuts]
+
+    @cached_property
+    def standing(self) -> list[np.ndarray]:
+        """The bodies of all boxes in the plane, per position."""
+        return [cut.body[cut.is_box] for cut in self.cuts]
+
+    def any_visible(self) -> bool:
+        """Whether a box can be seen from anywhere; looks no further than the first one."""
+        return any(len(visible_boxes(self._cut(origin), self.space)) for origin in self.origins_m)
+
+    def _cut(self, origin_m: np.ndarray) -> PlaneCut:
+        return cut_scene(self.scene, origin_m, self.space.low[AZIMUTH])
+
+    def __getitem__(self, key: str) -> list[np.ndarray]:
+        if key not in ("visible", "standing"):
+            raise KeyError(key)
+        return getattr(self, key)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(("visible", "standing"))
+
+    def __len__(self) -> int:
+        return 2
+
+
+def seen_boxes(cut: PlaneCut, points_m: np.ndarray, origin_m: np.ndarray, azimuth_rad: float) -> np.ndarray:
+    """The bodies of the boxes that measured points (N, 3) [m] lie on, ascending.
+
+    A point belongs to the nearest outline in the plane, box or not, and to none beyond `ON_FACE_M`; one that is
+    further than that from the plane itself belongs to none.
+    """
+    if not len(cut.body) or not len(points_m):
+        return np.empty(0, dtype=int)
+    offset = points_m - origin_m
+    forward = np.array([math.cos(azimuth_rad), math.sin(azimuth_rad)])
+    aside = np.abs(offset[:, 0] * forward[1] - offset[:, 1] * forward[0])
+    distance = cut.distance_m(np.stack([offset[:, :2] @ forward, offset[:, 2]], axis=-1))
+    nearest = distance.argmin(axis=1)
+    on_face = np.maximum(distance.min(axis=1), aside) <= ON_FACE_M
+    rows = np.unique(nearest[on_face])
+    return cut.body[rows[cut.is_box[rows]]]
+
+
+def miss_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Score:
+    """The share [%] of (box, position) pairs without a return on the box, of those that some ray could have seen.
+
+    A design without a single return fails. Details: `returns`, `boxes` (pairs that could be seen), `boxes_seen`, and
+    `hidden_percent`, the share of boxes in the plane that no admissible ray could see.
+
+    Raises:
+        ConfigError: The number of returns is not the number of evaluated positions.
+    """
+    truth = scene.truth
+    if len(returns) != len(truth.origins_m):
+        raise ConfigError(
+            f"{len(returns)} lists of returns", where=f"scene {scene.name}", allowed=f"{len(truth.origins_m)} positions"
+        )
+    seen = 0
+    for one, cut, origin, visible in zip(returns, truth.cuts, truth.origins_m, truth.visible, strict=True):
+        found = seen_boxes(cut, one.points_m, origin, truth.space.low[AZIMUTH])
+        seen += len(np.intersect1d(found, visible))
+    boxes, standing = sum(map(len, truth.visible)), sum(map(len, truth.standing))
+    count = sum(int(one.returned.sum()) for one in returns)
+    details = {
+        "returns": float(count),
+        "boxes": float(boxes),
+        "boxes_seen": float(seen),
+        "hidden_percent": PERCENT * (1 - boxes / standing),
+    }
+    if not count:
+        return Score(metric.worst, failed=True, details=details)
+    return Score(PERCENT * (1 - seen / boxes), details=details)
