@@ -13,7 +13,7 @@ from lidardesign.density.settings import DensitySettings
 from lidardesign.density.target import build_target
 from lidardesign.errors import NumericalError
 from lidardesign.scene import Body, Box, Mesh, Plane, Scene, Sphere, rigid
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, observed_point
 
 FACING = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])  # turns a plane's +z to face the sensor along -x
 SPACE = DesignSpace((-0.1, -0.1, -0.1, -0.5, -0.5, 0.2), (0.1, 0.1, 0.1, 0.5, 0.5, 4.0))
@@ -111,13 +111,8 @@ def test_scenes_below_the_surface_tolerance_change_the_density_by_no_more_than_s
     exact = build_target(balls(), SPACE, SETTINGS.model_copy(update={"surface_tolerance_nats": 1e6}), "raycast")
     quick = build_target(balls(), SPACE, SETTINGS.model_copy(update={"surface_tolerance_nats": tolerance}), "raycast")
     points = points_near(count=500, spread=0.4)
-    proximity = build_target(balls(), SPACE, SETTINGS, "off").field.distances(
-        points[:, :3] + points[:, RANGE, None] * np.c_[
-            np.cos(points[:, ELEVATION]) * np.cos(points[:, AZIMUTH]),
-            np.cos(points[:, ELEVATION]) * np.sin(points[:, AZIMUTH]),
-            np.sin(points[:, ELEVATION]),
-        ]
-    )  # fmt: skip
+    observed = observed_point(points)
+    proximity = np.stack([np.linalg.norm(observed - centre, axis=1) - 0.5 for centre in CENTRES], axis=1)
     largest = np.exp(-np.square(proximity / SETTINGS.sigma_m).min(axis=1) / 2)
     error = np.abs(np.exp(exact.log_density(points)) - np.exp(quick.log_density(points)))
     assert (error <= 3 * math.exp(-tolerance) * largest + 1e-300).all()

@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 
 from lidardesign.density import interpolation
+from lidardesign.density.bodies import Bodies, own_grid, place_bodies
 from lidardesign.density.grids import Grid, cached_distance_grids, grid_around
 from lidardesign.errors import ConfigError
-from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, inverse_rigid
+from lidardesign.scene import Body, Mesh, Scene
 
 MAXIMUM_TABLE_BYTES = 6 * 2**30
 FAR_M = np.float32(1e9)  # the distance of a column without a mesh in the table
@@ -90,59 +92,24 @@ class BodyField:
     """Primitives and moving bodies, each evaluated in its own frame.
 
     Arguments:
-        entries: Column, body and frame of every body that counts.
-        columns: The number of columns.
-        build_grid: Gives the distance grid of a mesh in its own frame.
+        bodies: Every body that counts, by column.
     """
 
-    def __init__(
-        self,
-        entries: Sequence[tuple[int, Body, int]],
-        columns: int,
-        build_grid: Callable[[Mesh], tuple[Grid, np.ndarray]],
-    ) -> None:
-        self.columns = columns
-        self.shell_m = np.zeros(columns)
-        self._kinds = np.array([_KINDS[type(body.shape)] for _, body, _ in entries], dtype=np.int64)
-        self._sizes = np.array([_size(body) for _, body, _ in entries]).reshape(-1, 3)
-        poses = np.array([body.pose(frame) for _, body, frame in entries]).reshape(-1, 4, 4)
-        self._to_body = np.ascontiguousarray(inverse_rigid(poses)[:, :3])
-        self._columns = np.array([column for column, _, _ in entries], dtype=np.int64)
-        self._place_grids(entries, build_grid)
-
-    def _place_grids(self, entries: Sequence[tuple[int, Body, int]], build_grid: Callable) -> None:
-        count = len(entries)
-        self._starts, self._counts = np.zeros(count, np.int64), np.full((count, 3), 2, np.int64)
-        self._lows, self._inverse_steps = np.zeros((count, 3)), np.ones(count)
-        values: list[np.ndarray] = [np.zeros(8, np.float32)]
-        known: dict[str, tuple[int, Grid]] = {}
-        for row, (column, body, _) in enumerate(entries):
-            if not isinstance(body.shape, Mesh):
-                continue
-            key = body.shape.content_hash
-            if key not in known:
-                grid, distances = build_grid(body.shape)
-                known[key] = (sum(map(len, values)), grid)
-                values.append(distances)
-            self._starts[row], grid = known[key]
-            self._counts[row], self._lows[row], self._inverse_steps[row] = grid.counts, grid.low, 1.0 / grid.step
-            if body.shape.sign == "unsigned":
-                self.shell_m[column] = grid.step
-        self._grids = np.concatenate(values)
-
-    @property
-    def _geometry(self) -> tuple[np.ndarray, ...]:
-        return self._grids, self._starts, self._counts, self._lows, self._inverse_steps
+    def __init__(self, bodies: Bodies) -> None:
+        self.bodies = bodies
+        self.columns = bodies.columns
+        self.shell_m = np.zeros(bodies.columns)
+        steps = 1.0 / bodies.grids.inverse_steps
+        unsigned = np.array([False, *(mesh.sign == "unsigned" for mesh in bodies.grids.meshes)])
+        np.maximum.at(self.shell_m, bodies.column, np.where(unsigned, steps, 0.0)[bodies.grid])
 
     def _evaluate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         points = np.ascontiguousarray(points, dtype=np.float64)
-        from lidardesign.density import kernels
+        from lidardesign.density import body_kernels
 
         shape = (len(points), self.columns)
         distances, nearest = np.empty(shape), np.empty(shape, dtype=np.int64)
-        kernels.body_distances(
-            self._kinds, self._sizes, self._to_body, self._columns, *self._geometry, points, distances, nearest
-        )
+        body_kernels.all_distances(*self.bodies.shapes, self.bodies.starts, points, distances, nearest)
         return distances, nearest
 
     def distances(self, points: np.ndarray) -> np.ndarray:
@@ -152,36 +119,15 @@ class BodyField:
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """See `Field`."""
         points = np.ascontiguousarray(points, dtype=np.float64)
-        out = np.empty_like(points)
-        weights = np.ascontiguousarray(weights, dtype=np.float64)
         nearest = self._evaluate(points)[1]
-        from lidardesign.density import kernels
+        from lidardesign.density import body_kernels
 
-        kernels.body_gradient(
-            self._kinds, self._sizes, self._to_body, *self._geometry, points, nearest, weights, out
-        )
+        # a column without bodies has no nearest one, and no gradient
+        known = np.where(nearest >= 0, weights, 0.0).ravel()
+        rows = np.arange(len(points) + 1) * self.columns
+        out = np.empty_like(points)
+        body_kernels.add_gradients(*self.bodies.shapes, points, rows, nearest.ravel(), known, out)
         return out
-
-
-_KINDS = {
-    Sphere: interpolation.SPHERE,
-    Box: interpolation.BOX,
-    Capsule: interpolation.CAPSULE,
-    Plane: interpolation.PLANE,
-    Mesh: interpolation.GRID,
-}
-
-
-def _size(body: Body) -> tuple[float, float, float]:
-    match body.shape:
-        case Sphere(radius_m=radius):
-            return radius, 0.0, 0.0
-        case Capsule(radius_m=radius, half_length_m=half_length):
-            return radius, half_length, 0.0
-        case Box(half_extents_m=half):
-            return half[0], half[1], half[2]
-        case _:
-            return 0.0, 0.0, 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,13 +187,9 @@ def build_field(
     if at_rest:
         fields.append(_table_field(at_rest, len(columns), resolution, padding_m))
     if others or not at_rest:
-        fields.append(BodyField(others, len(columns), lambda mesh: _own_grid(mesh, resolution, padding_m)))
+        build = partial(own_grid, resolution=resolution, padding_m=padding_m)
+        fields.append(BodyField(place_bodies(others, len(columns), build)))
     return fields[0] if len(fields) == 1 else UnionField(*fields)
-
-
-def _own_grid(mesh: Mesh, resolution: int, padding_m: float) -> tuple[Grid, np.ndarray]:
-    grid = grid_around(mesh.bounds_m, resolution, padding_m)
-    return grid, cached_distance_grids([mesh], grid)[0]
 
 
 def _table_field(bodies: list[tuple[int, Body]], columns: int, resolution: int, padding_m: float) -> TableField:

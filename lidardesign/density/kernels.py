@@ -1,4 +1,4 @@
-"""Compiled loops over grid tables and primitive bodies: distances, contracted gradients, the visibility quadrature.
+"""Compiled loops over grid tables: distances, contracted gradients, the visibility quadrature.
 
 A table holds the distances of all C columns (scenes, or frames of scenes) at every grid point in one row, so that the
 eight corners of a cell are eight contiguous reads. Gradients are never formed per column: a caller hands in one weight
@@ -15,15 +15,13 @@ import math
 import numpy as np
 from numba import njit
 
-from lidardesign.density.interpolation import BOX, CAPSULE, PLANE, SPHERE
-
 # Reassociation vectorises the sums; NaN and infinity keep their meaning (no `nnan`, no `ninf`).
 FAST = {"reassoc", "contract", "nsz", "arcp"}
 
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _locate(counts, low, inverse_step, p, cell, fraction, excess):  # noqa: ANN001, ANN202
+def locate(counts, low, inverse_step, p, cell, fraction, excess):  # noqa: ANN001, ANN201
     """Cell, fraction in it and excess beyond the grid of one point; returns the squared excess."""
     squared = 0.0
     for k in range(3):
@@ -38,7 +36,7 @@ def _locate(counts, low, inverse_step, p, cell, fraction, excess):  # noqa: ANN0
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _corners(counts, cell, fraction, index, weight):  # noqa: ANN001, ANN202
+def corners(counts, cell, fraction, index, weight):  # noqa: ANN001, ANN201
     """Row indices and trilinear weights of a cell's eight corners."""
     for corner in range(8):
         i, j, k = corner & 1, (corner >> 1) & 1, (corner >> 2) & 1
@@ -93,8 +91,8 @@ def table_distances(table, counts, low, inverse_step, points, out):  # noqa: ANN
     cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
     index, weight = np.zeros(8, np.int64), np.zeros(8, table.dtype)
     for n in range(points.shape[0]):
-        squared = _locate(counts, low, inverse_step, points[n], cell, fraction, excess)
-        _corners(counts, cell, fraction, index, weight)
+        squared = locate(counts, low, inverse_step, points[n], cell, fraction, excess)
+        corners(counts, cell, fraction, index, weight)
         _blend(table, index, weight, out[n])
         if squared > 0.0:
             for c in range(table.shape[1]):
@@ -111,8 +109,8 @@ def table_gradient(table, counts, low, inverse_step, points, weights, out):  # n
     row, column_weight = np.zeros(columns, table.dtype), np.zeros(columns)
     gradient = np.zeros(3)
     for n in range(points.shape[0]):
-        squared = _locate(counts, low, inverse_step, points[n], cell, fraction, excess)
-        _corners(counts, cell, fraction, index, corner_weight)
+        squared = locate(counts, low, inverse_step, points[n], cell, fraction, excess)
+        corners(counts, cell, fraction, index, corner_weight)
         gradient[:] = 0.0
         outward = 0.0
         for c in range(columns):
@@ -180,11 +178,11 @@ def table_quadrature(
             along = (m + 0.5) * step
             for k in range(3):
                 p[k] = origins[n, k] + along * directions[n, k]
-            squared = _locate(counts, low, inverse_step, p, cell, fraction, excess)
+            squared = locate(counts, low, inverse_step, p, cell, fraction, excess)
             first = (cell[0] * counts[1] + cell[1]) * counts[2] + cell[2]
             if squared > cutoff * cutoff or clear[first] > cutoff:
                 continue
-            _corners(counts, cell, fraction, index, weight)
+            corners(counts, cell, fraction, index, weight)
             _blend(table, index, weight, row)
             for c in range(columns):
                 distance = row[c] - shell[c]
@@ -218,13 +216,13 @@ def table_quadrature_gradient(
             along = (m + 0.5) * step
             for k in range(3):
                 p[k] = origins[n, k] + along * directions[n, k]
-            squared = _locate(counts, low, inverse_step, p, cell, fraction, excess)
+            squared = locate(counts, low, inverse_step, p, cell, fraction, excess)
             first = (cell[0] * counts[1] + cell[1]) * counts[2] + cell[2]
             if squared > cutoff * cutoff or clear[first] > cutoff:
                 continue
             for c in range(columns):
                 column_weight[c] = weights[n, c] * slope[n, m, c]
-            _corners(counts, cell, fraction, index, corner_weight)
+            corners(counts, cell, fraction, index, corner_weight)
             outward = 0.0
             if squared > 0.0:
                 _blend(table, index, corner_weight, row)
@@ -240,119 +238,3 @@ def table_quadrature_gradient(
                 by_origin[n, k] += value
                 by_direction[n, k] += along * value
                 by_length[n] += (m + 0.5) / points_per_ray * value * directions[n, k]
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _body_distance(kind, size, grids, start, counts, low, inverse_step, q, gradient):  # noqa: ANN001, ANN202
-    """Signed distance of one body at a point in its own frame; its gradient goes to `gradient` (3,)."""
-    if kind == SPHERE:
-        length = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
-        for k in range(3):
-            gradient[k] = q[k] / length if length > 0.0 else 0.0
-        return length - size[0]
-    if kind == CAPSULE:
-        z = q[2] - min(max(q[2], -size[1]), size[1])
-        length = math.sqrt(q[0] * q[0] + q[1] * q[1] + z * z)
-        gradient[0] = q[0] / length if length > 0.0 else 0.0
-        gradient[1] = q[1] / length if length > 0.0 else 0.0
-        gradient[2] = z / length if length > 0.0 else 0.0
-        return length - size[0]
-    if kind == PLANE:
-        gradient[0], gradient[1], gradient[2] = 0.0, 0.0, 1.0
-        return q[2]
-    if kind == BOX:
-        return _box_distance(size, q, gradient)
-    return _grid_distance(grids, start, counts, low, inverse_step, q, gradient)
-
-
-@njit(cache=True, nogil=True)
-def _box_distance(size, q, gradient):  # noqa: ANN001, ANN202
-    squared, deepest, axis = 0.0, -np.inf, 0
-    for k in range(3):
-        beyond = abs(q[k]) - size[k]
-        if beyond > deepest:
-            deepest, axis = beyond, k
-        if beyond > 0.0:
-            squared += beyond * beyond
-        gradient[k] = 0.0
-    if squared == 0.0:
-        gradient[axis] = 1.0 if q[axis] >= 0.0 else -1.0
-        return deepest
-    distance = math.sqrt(squared)
-    for k in range(3):
-        beyond = abs(q[k]) - size[k]
-        if beyond > 0.0:
-            gradient[k] = beyond / distance * (1.0 if q[k] >= 0.0 else -1.0)
-    return distance
-
-
-@njit(cache=True, nogil=True)
-def _grid_distance(grids, start, counts, low, inverse_step, q, gradient):  # noqa: ANN001, ANN202
-    cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
-    index, weight = np.zeros(8, np.int64), np.zeros(8)
-    squared = _locate(counts, low, inverse_step, q, cell, fraction, excess)
-    _corners(counts, cell, fraction, index, weight)
-    value = 0.0
-    for corner in range(8):
-        value += weight[corner] * grids[start + index[corner]]
-    for axis in range(3):
-        total = 0.0
-        for corner in range(8):
-            upper = (corner >> axis) & 1
-            other = 1.0
-            for k in range(3):
-                if k != axis:
-                    other *= fraction[k] if (corner >> k) & 1 else 1.0 - fraction[k]
-            total += (1.0 if upper else -1.0) * other * grids[start + index[corner]]
-        gradient[axis] = total * inverse_step
-    if squared == 0.0:
-        return value
-    inner = max(value, 0.0)
-    distance = math.sqrt(squared + inner * inner)
-    for k in range(3):
-        gradient[k] = excess[k] / distance if excess[k] != 0.0 else gradient[k] * inner / distance
-    return distance
-
-
-@njit(cache=True, nogil=True)
-def body_distances(  # noqa: ANN201
-    kinds, sizes, to_body, columns, grids, starts, counts, lows, inverse_steps, points, out, nearest,  # noqa: ANN001
-):  # fmt: skip
-    """Distances of the nearest body of each column: out (N, C), and which body it was: nearest (N, C)."""
-    q, gradient = np.zeros(3), np.zeros(3)
-    out[:] = np.inf
-    nearest[:] = -1
-    for n in range(points.shape[0]):
-        for b in range(kinds.shape[0]):
-            _to_frame(to_body[b], points[n], q)
-            value = _body_distance(
-                kinds[b], sizes[b], grids, starts[b], counts[b], lows[b], inverse_steps[b], q, gradient
-            )
-            if value < out[n, columns[b]]:
-                out[n, columns[b]] = value
-                nearest[n, columns[b]] = b
-
-
-@njit(cache=True, nogil=True)
-def body_gradient(  # noqa: ANN201
-    kinds, sizes, to_body, grids, starts, counts, lows, inverse_steps, points, nearest, weights, out,  # noqa: ANN001
-):  # fmt: skip
-    """Gradients of sum_c weights_nc * d_c: out (N, 3)."""
-    q, gradient = np.zeros(3), np.zeros(3)
-    out[:] = 0.0
-    for n in range(points.shape[0]):
-        for c in range(weights.shape[1]):
-            b = nearest[n, c]
-            if b < 0 or weights[n, c] == 0.0:
-                continue
-            _to_frame(to_body[b], points[n], q)
-            _body_distance(kinds[b], sizes[b], grids, starts[b], counts[b], lows[b], inverse_steps[b], q, gradient)
-            for k in range(3):
-                for i in range(3):
-                    out[n, k] += weights[n, c] * to_body[b, i, k] * gradient[i]
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _to_frame(pose, p, q):  # noqa: ANN001, ANN202
-    for k in range(3):
-        q[k] = pose[k, 0] * p[0] + pose[k, 1] * p[1] + pose[k, 2] * p[2] + pose[k, 3]

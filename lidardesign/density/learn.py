@@ -13,11 +13,10 @@ import torch
 
 from lidardesign.density.diagnostics import coverage, quality, quality_by_group
 from lidardesign.density.flow import DesignFlow
+from lidardesign.density.independent import independent_points
 from lidardesign.density.losses import Pool, draw_conditions
 from lidardesign.density.objective import Coordinates
 from lidardesign.density.prepare import prepare_target
-from lidardesign.density.proposals import propose
-from lidardesign.density.shell import can_be_aimed, resampled_proposals, shell_proposals
 from lidardesign.density.target import Target
 from lidardesign.density.training import PROGRESS, LearnProgress, Trainer
 from lidardesign.design.samples import Samples, save_samples
@@ -33,8 +32,6 @@ from lidardesign.task import Task, random_generator, scenes_of
 FLOW = "flow.safetensors"
 SAMPLE_CHUNK = 16384
 CONDITION_GROUPS = 32
-# Up to so many free dimensions, uniform candidates meet the surfaces often enough to be resampled.
-RESAMPLED_DIMENSIONS = 3
 DEVICES = ("auto", "cpu", "cuda")
 
 
@@ -171,7 +168,8 @@ def _trainer(
 def _pool(target: Target, scenes: Sequence[Scene], config: RunConfig) -> Pool:
     """Proposals for balancing, independent of those that coverage is measured on."""
     count = config.learning.balance_proposals
-    points, log_density = _independent_points(target, scenes, config, count, "balancing")
+    generator = random_generator(config.seed, "balancing")
+    points, log_density = independent_points(target, scenes, count, generator)
     if not len(points):
         raise DataError(
             "no ray of the design space reaches a target surface in any training scene",
@@ -179,19 +177,6 @@ def _pool(target: Target, scenes: Sequence[Scene], config: RunConfig) -> Pool:
             hint="widen the angles or the range, or move the origin",
         )
     return Pool.of(config.space.to_unit(points), target.log_density(points), log_density)
-
-
-def _independent_points(
-    target: Target, scenes: Sequence[Scene], config: RunConfig, count: int, purpose: str
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points that know nothing of the flow (N, 6), and the log density that they were drawn from (N,)."""
-    generator, sigma_m = random_generator(config.seed, purpose), target.optics.sigma_m
-    if can_be_aimed(config.space):
-        return shell_proposals(target.field, scenes, config.space, count, sigma_m, generator)
-    if len(config.space.free) <= RESAMPLED_DIMENSIONS:
-        return resampled_proposals(target.field, config.space, count, sigma_m, generator)
-    proposals = propose(scenes, config.space, count, sigma_m, generator)
-    return proposals.points, proposals.log_density
 
 
 def draw_samples(trainer: Trainer, count: int) -> Samples:
@@ -236,7 +221,8 @@ def _measure(trainer: Trainer, scenes: Sequence[Scene], config: RunConfig) -> tu
     groups = _condition_groups(config.space, samples.points)
     found = quality(samples.log_prob, samples.log_target, groups)
     count = config.learning.coverage_proposals
-    points, log_density = _independent_points(trainer.target, scenes, config, count, "coverage")
+    generator = random_generator(config.seed, "coverage")
+    points, log_density = independent_points(trainer.target, scenes, count, generator)
     covered = coverage(
         log_density_of(trainer, points),
         trainer.target.log_density(points),

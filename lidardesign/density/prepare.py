@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from lidardesign.density.fields import TableField
 from lidardesign.density.proposals import occluded_share, propose
 from lidardesign.density.refinement import refine_quadrature
 from lidardesign.density.target import Target, build_target
@@ -37,6 +38,7 @@ def prepare_target(
         target, refined = _refine_quadrature(target, scenes, config)
         notes.extend(refined)
     notes.extend(_resolution_notes(target, settings.sigma_m))
+    notes.extend(dict.fromkeys(line for scene in scenes for line in scene.notes))
     shapes = [body.shape for scene in scenes for body in scene.bodies]
     notes.extend(sorted({line for shape in shapes for line in getattr(shape, "notes", ())}))
     return target, notes
@@ -59,9 +61,9 @@ def _refine_quadrature(target: Target, scenes: Sequence[Scene], config: RunConfi
 
 
 def _resolution_notes(target: Target, sigma_m: float) -> list[str]:
-    grid = getattr(target.field, "grid", None)
-    if grid is None or sigma_m >= grid.step / 2:
+    if not isinstance(target.field, TableField) or sigma_m >= target.field.grid.step / 2:
         return []
+    grid = target.field.grid
     return [
         f"sigma {sigma_m:g} m is below half the field's grid step {grid.step:.3g} m: "
         "surfaces are blurred more than sigma says; raise density.field_resolution"

@@ -7,9 +7,6 @@ and off in first order of sigma times the curvature for others (on a ball of 15 
 which a pool for balancing and a coverage can bear). Weights p* / q are bounded by A / r^2, and unlike range errors
 along rays these proposals also reach the rim of silhouettes, where a ray passes a surface within sigma without
 meeting it.
-
-Where an angle is fixed hardly any surface point can be aimed at, but few dimensions are free: uniform points of the
-space are resampled by the surface proximity, which is then their density.
 """
 
 from __future__ import annotations
@@ -19,13 +16,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from lidardesign.density.fields import Field, scene_columns
-from lidardesign.numerics import logsumexp, normalised_weights
+from lidardesign.numerics import logsumexp
 from lidardesign.scene import Scene
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, aim, observed_point
+from lidardesign.space import ELEVATION, RANGE, DesignSpace, aim, observed_point
 from lidardesign.surface import sample_body, target_area_m2
-
-CANDIDATES = 131_072
-FARTHEST_SIGMAS = 6.0
 
 
 def shell_proposals(
@@ -62,28 +56,6 @@ def shell_proposals(
     return points, _log_density(field, scenes, columns, space, points, sigma_m)
 
 
-def can_be_aimed(space: DesignSpace) -> bool:
-    """Whether surface points can be aimed at from everywhere in a space."""
-    return AZIMUTH in space.free and ELEVATION in space.free
-
-
-def resampled_proposals(
-    field: Field, space: DesignSpace, count: int, sigma_m: float, generator: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Uniform points resampled by surface proximity, (count, 6), and their log density up to a constant, (count,).
-
-    Empty where no candidate comes within `FARTHEST_SIGMAS` of any surface.
-    """
-    candidates = space.sample(CANDIDATES, generator)
-    log_proximity = np.concatenate([_log_proximity(field, part, sigma_m) for part in np.array_split(candidates, 16)])
-    near = log_proximity > -(FARTHEST_SIGMAS**2) / 2
-    candidates, log_proximity = candidates[near], log_proximity[near]
-    if not len(candidates):
-        return candidates, log_proximity
-    chosen = generator.choice(len(candidates), size=count, p=normalised_weights(log_proximity))
-    return candidates[chosen], log_proximity[chosen]
-
-
 def _log_proximity(field: Field, points: np.ndarray, sigma_m: float, weights: np.ndarray | None = None) -> np.ndarray:
     """log of the sum over columns of weight * exp(-d^2 / (2 sigma^2)) at the observed points, shape (N,)."""
     distances = field.distances(observed_point(points)).astype(np.float64)
@@ -113,6 +85,11 @@ def _log_density(
 ) -> np.ndarray:
     area_m2 = np.array([target_area_m2(scene, space) for scene in scenes])[[index for index, _ in columns]]
     log_density = _log_proximity(field, points, sigma_m, 1.0 / area_m2) + 2 * np.log(points[:, RANGE])
-    if space.measure == "angles":
-        log_density += np.log(np.maximum(np.cos(points[:, ELEVATION]), np.finfo(float).tiny))
-    return log_density
+    return log_density + log_chart_factor(space, points)
+
+
+def log_chart_factor(space: DesignSpace, points: np.ndarray) -> np.ndarray | float:
+    """log of solid angle per chart area at design points: 0 where the chart measures solid angle."""
+    if space.measure == "solid_angle":
+        return 0.0
+    return np.log(np.maximum(np.cos(points[:, ELEVATION]), np.finfo(float).tiny))

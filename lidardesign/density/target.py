@@ -16,6 +16,7 @@ import numpy as np
 from lidardesign.density.fields import Field, TableField, build_field, scene_columns
 from lidardesign.density.settings import DensitySettings
 from lidardesign.density.visibility import (
+    ROWS_AT_ONCE,
     NoVisibility,
     Optics,
     Quadrature,
@@ -25,8 +26,9 @@ from lidardesign.density.visibility import (
     Visibility,
 )
 from lidardesign.errors import NumericalError
-from lidardesign.scene import Scene
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
+from lidardesign.numerics import logsumexp
+from lidardesign.scene import Mesh, Scene
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction, observed_point
 
 PADDING_SIGMAS = 4.0
 # d direction / d sin(elevation) grows without bound at the poles; it is capped at this cosine of the elevation.
@@ -53,6 +55,25 @@ class Target:
     space: DesignSpace
     surface_tolerance_nats: float = 16.0
 
+    @property
+    def rows_at_once(self) -> int:
+        """How many points keep the memory bounded."""
+        return self.visibility.rows_at_once
+
+    def drawn(self, columns: np.ndarray) -> Target:
+        """A target in which some columns stand for all; tables hold scenes, which are not thinned: all of them stay."""
+        return self
+
+    def log_proximity(self, points: np.ndarray, sigma_m: float | None = None) -> np.ndarray:
+        """log of the sum of surface terms at the scene points that design points (N, 6) observe, shape (N,)."""
+        sigma_m = self.optics.sigma_m if sigma_m is None else sigma_m
+        values = np.empty(len(points))
+        for start in range(0, len(points), ROWS_AT_ONCE):
+            rows = slice(start, start + ROWS_AT_ONCE)
+            distances = self.field.distances(observed_point(points[rows])).astype(np.float64)
+            values[rows] = logsumexp(self.log_column_weights - np.square(distances / sigma_m) / 2, axis=1)
+        return values
+
     def log_density(self, points: np.ndarray, sigma_m: float | None = None) -> np.ndarray:
         """log p* of design points, (N, 6) to (N,), at the final sigma unless a wider one is given."""
         return self._in_chunks(points, sigma_m, gradient=False)[0]
@@ -71,7 +92,7 @@ class Target:
             raise NumericalError("design points are not finite", where="target density")
         optics = self.optics if sigma_m is None else self.optics.widened(sigma_m)
         values, gradients = np.empty(len(points)), np.empty((len(points) if gradient else 0, 6))
-        size = self.visibility.rows_at_once
+        size = self.rows_at_once
         for start in range(0, len(points), size):
             rows = slice(start, start + size)
             values[rows], by_chart = self._evaluate(points[rows], optics, gradient)
@@ -134,18 +155,29 @@ def build_target(
     """
     optics = Optics.of(settings)
     fields = {"resolution": settings.field_resolution, "padding_m": PADDING_SIGMAS * settings.sigma_m}
+    frames = [scenes[index].frames for index, _ in scene_columns(scenes)]
+    log_column_weights = -np.log(np.array(frames, dtype=np.float64))
+    if visibility != "quadrature" and not any(_has_mesh_at_rest(scene) for scene in scenes):
+        # frames builds on this module
+        from lidardesign.density.frames import build_frames_target
+
+        return build_frames_target(scenes, space, settings, visibility, log_column_weights, **fields)
     field = build_field(scenes, lambda body: body.is_target, **fields)
     if isinstance(field, TableField):
         field = replace(field, compiled=compiled)
-    frames = [scenes[index].frames for index, _ in scene_columns(scenes)]
     return Target(
         field=field,
         visibility=_build_visibility(scenes, settings, visibility, field, fields),
-        log_column_weights=-np.log(np.array(frames, dtype=np.float64)),
+        log_column_weights=log_column_weights,
         optics=optics,
         space=space,
         surface_tolerance_nats=settings.surface_tolerance_nats,
     )
+
+
+def _has_mesh_at_rest(scene: Scene) -> bool:
+    """Whether a target of a scene is best kept in the table that all scenes at rest share."""
+    return scene.frames == 1 and any(isinstance(body.shape, Mesh) for body in scene.bodies if body.is_target)
 
 
 def _build_visibility(

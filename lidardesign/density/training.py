@@ -158,14 +158,26 @@ class Trainer:
         return value, ess
 
     def _loss(self) -> tuple[torch.Tensor, float, float]:
-        parts = (self.flow, self.target, self.coordinates, self.settings.batch)
+        count = self.settings.batch
         try:
             if self.step >= self.pathwise_steps:
-                return balancing_loss(*parts, self.pool, self.generator)
+                return balancing_loss(self.flow, self.target, self.coordinates, count, self.pool, self.generator)
             eta = self.settings.entropy * (1 - self.step / self.pathwise_steps)
-            return pathwise_loss(*parts, self.sigma_m(self.step), eta, self.generator)
+            sigma_m, target = self.sigma_m(self.step), self._few_frames()
+            return pathwise_loss(self.flow, target, self.coordinates, count, sigma_m, eta, self.generator)
         except NumericalError:  # the flow left the numbers: a step to skip like any other
             return torch.tensor(math.nan), math.nan, math.nan
+
+    def _few_frames(self) -> Target:
+        """The target of a path-wise step. While sigma is wide thousands of frames would matter at every point.
+
+        Balancing needs the values of p* and sees all frames; at the final sigma few of them matter.
+        """
+        columns = len(self.target.log_column_weights)
+        if columns <= self.settings.frames:
+            return self.target
+        chosen = torch.randperm(columns, generator=self.generator)[: self.settings.frames]
+        return self.target.drawn(np.sort(chosen.numpy()))
 
     def _skip(self) -> None:
         self.skipped += 1

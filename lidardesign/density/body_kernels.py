@@ -1,0 +1,420 @@
+"""Compiled loops over bodies in their own frames: which columns matter at a point, distances, gradients, first hits.
+
+Every loop takes the arrays of `bodies.Bodies`: bodies sorted by column, `starts` telling where each column begins, and
+for each body its world bounding box, which decides whether it is looked at at all.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from lidardesign.density.interpolation import BOX, CAPSULE, GRID, PLANE, SPHERE
+from lidardesign.density.kernels import corners, locate
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _to_frame(pose, p, q):  # noqa: ANN001, ANN202
+    for k in range(3):
+        q[k] = pose[k, 0] * p[0] + pose[k, 1] * p[1] + pose[k, 2] * p[2] + pose[k, 3]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _turn(pose, v, out):  # noqa: ANN001, ANN202
+    for k in range(3):
+        out[k] = pose[k, 0] * v[0] + pose[k, 1] * v[1] + pose[k, 2] * v[2]
+
+
+@njit(cache=True, nogil=True)
+def _shape_distance(kind, size, values, start, counts, low, inverse_step, q, gradient):  # noqa: ANN001, ANN202
+    """Signed distance of one body at a point in its own frame; its gradient goes to `gradient` (3,)."""
+    if kind == SPHERE:
+        length = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+        for k in range(3):
+            gradient[k] = q[k] / length if length > 0.0 else 0.0
+        return length - size[0]
+    if kind == CAPSULE:
+        z = q[2] - min(max(q[2], -size[1]), size[1])
+        length = math.sqrt(q[0] * q[0] + q[1] * q[1] + z * z)
+        gradient[0] = q[0] / length if length > 0.0 else 0.0
+        gradient[1] = q[1] / length if length > 0.0 else 0.0
+        gradient[2] = z / length if length > 0.0 else 0.0
+        return length - size[0]
+    if kind == PLANE:
+        gradient[0], gradient[1], gradient[2] = 0.0, 0.0, 1.0
+        return q[2]
+    if kind == BOX:
+        return _box_distance(size, q, gradient)
+    return _grid_distance(values, start, counts, low, inverse_step, q, gradient)
+
+
+@njit(cache=True, nogil=True)
+def _box_distance(size, q, gradient):  # noqa: ANN001, ANN202
+    squared, deepest, axis = 0.0, -np.inf, 0
+    for k in range(3):
+        beyond = abs(q[k]) - size[k]
+        if beyond > deepest:
+            deepest, axis = beyond, k
+        if beyond > 0.0:
+            squared += beyond * beyond
+        gradient[k] = 0.0
+    if squared == 0.0:
+        gradient[axis] = 1.0 if q[axis] >= 0.0 else -1.0
+        return deepest
+    distance = math.sqrt(squared)
+    for k in range(3):
+        beyond = abs(q[k]) - size[k]
+        if beyond > 0.0:
+            gradient[k] = beyond / distance * (1.0 if q[k] >= 0.0 else -1.0)
+    return distance
+
+
+@njit(cache=True, nogil=True)
+def _grid_distance(values, start, counts, low, inverse_step, q, gradient):  # noqa: ANN001, ANN202
+    cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
+    index, weight = np.zeros(8, np.int64), np.zeros(8)
+    squared = locate(counts, low, inverse_step, q, cell, fraction, excess)
+    corners(counts, cell, fraction, index, weight)
+    value = 0.0
+    for corner in range(8):
+        value += weight[corner] * values[start + index[corner]]
+    for axis in range(3):
+        total = 0.0
+        for corner in range(8):
+            upper = (corner >> axis) & 1
+            other = 1.0
+            for k in range(3):
+                if k != axis:
+                    other *= fraction[k] if (corner >> k) & 1 else 1.0 - fraction[k]
+            total += (1.0 if upper else -1.0) * other * values[start + index[corner]]
+        gradient[axis] = total * inverse_step
+    if squared == 0.0:
+        return value
+    inner = max(value, 0.0)
+    distance = math.sqrt(squared + inner * inner)
+    for k in range(3):
+        gradient[k] = excess[k] / distance if excess[k] != 0.0 else gradient[k] * inner / distance
+    return distance
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _distance(kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, p, q, gradient):  # noqa: ANN001, ANN202
+    """Signed distance of body b at a world point, its gradient in the body's frame."""
+    g = grid[b]
+    _to_frame(to_body[b], p, q)
+    return _shape_distance(
+        kinds[b], sizes[b], values, grid_starts[g], counts[g], lows[g], steps[g], q, gradient
+    )
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _outside_squared(low, high, p):  # noqa: ANN001, ANN202
+    """Squared distance of a point to a box, 0 inside."""
+    total = 0.0
+    for k in range(3):
+        beyond = max(low[k] - p[k], p[k] - high[k], 0.0)
+        total += beyond * beyond
+    return total
+
+
+@njit(cache=True, nogil=True)
+def near_columns(  # noqa: ANN201
+    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps,  # noqa: ANN001
+    low, high, starts, points, log_weights, precision, tolerance,  # noqa: ANN001
+    row_starts, columns, distances, bodies,  # noqa: ANN001
+):  # fmt: skip
+    """The columns whose term log_weight - precision * d^2 / 2 is within a tolerance of the best one, for each point.
+
+    Bounding boxes bound the terms from above; only columns that could matter are evaluated, each by its nearest body.
+
+    Arguments:
+        points: Shape (N, 3).
+        log_weights: Per column, shape (columns,).
+        precision: 1 / sigma^2 [1/m^2].
+        tolerance: In nats.
+        row_starts: Out: where each point's pairs begin, shape (N + 1,).
+        columns, distances, bodies: Out: one entry per pair, as many as there is room for.
+
+    Returns:
+        The number of pairs; where it is above the room, the lists are cut off and the call has to be repeated.
+    """
+    count, room = starts.shape[0] - 1, columns.shape[0]
+    q, gradient = np.zeros(3), np.zeros(3)
+    hopes, found, nearest = np.empty(count), np.empty(count), np.empty(count, np.int64)
+    total = 0
+    for n in range(points.shape[0]):
+        row_starts[n] = total
+        p = points[n]
+        leader, highest = -1, -np.inf
+        for c in range(count):
+            squared = np.inf
+            for b in range(starts[c], starts[c + 1]):
+                squared = min(squared, _outside_squared(low[b], high[b], p))
+            hopes[c] = log_weights[c] - 0.5 * precision * squared
+            if hopes[c] > highest:
+                leader, highest = c, hopes[c]
+        best = -np.inf
+        for turn in range(-1, count):
+            c = leader if turn < 0 else turn
+            if c < 0 or (turn == leader and turn >= 0) or not hopes[c] >= best - tolerance:
+                if turn >= 0 and turn != leader:
+                    found[turn] = np.inf
+                continue
+            distance, body = np.inf, -1
+            for b in range(starts[c], starts[c + 1]):
+                squared = _outside_squared(low[b], high[b], p)
+                if squared > 0.0 and (distance <= 0.0 or squared >= distance * distance):
+                    continue
+                value = _distance(
+                    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, p, q, gradient
+                )
+                if value < distance:
+                    distance, body = value, b
+            found[c], nearest[c] = distance, body
+            best = max(best, log_weights[c] - 0.5 * precision * distance * distance)
+        for c in range(count):
+            if not np.isfinite(found[c]) or log_weights[c] - 0.5 * precision * found[c] * found[c] < best - tolerance:
+                continue
+            if total < room:
+                columns[total], distances[total], bodies[total] = c, found[c], nearest[c]
+            total += 1
+    row_starts[points.shape[0]] = total
+    return total
+
+
+@njit(cache=True, nogil=True)
+def add_gradients(  # noqa: ANN201
+    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps,  # noqa: ANN001
+    points, row_starts, bodies, weights, out,  # noqa: ANN001
+):  # fmt: skip
+    """Gradients of sum_pairs weight * d(body, point): pairs as `near_columns` lists them, out (N, 3)."""
+    q, gradient = np.zeros(3), np.zeros(3)
+    out[:] = 0.0
+    for n in range(points.shape[0]):
+        for pair in range(row_starts[n], row_starts[n + 1]):
+            b = bodies[pair]
+            if weights[pair] == 0.0:
+                continue
+            _distance(
+                kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, points[n], q, gradient
+            )
+            for k in range(3):
+                for i in range(3):
+                    out[n, k] += weights[pair] * to_body[b, i, k] * gradient[i]
+
+
+@njit(cache=True, nogil=True)
+def distances_of(  # noqa: ANN201
+    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, bodies, points, out  # noqa: ANN001
+):
+    """Distance of one body each at points: bodies (N,), points (N, 3), out (N,)."""
+    q, gradient = np.zeros(3), np.zeros(3)
+    for n in range(points.shape[0]):
+        out[n] = _distance(
+            kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, bodies[n], points[n], q, gradient
+        )
+
+
+@njit(cache=True, nogil=True)
+def all_distances(  # noqa: ANN201
+    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, starts, points, out, nearest  # noqa: ANN001
+):
+    """Distances of the nearest body of every column: out (N, C), and which body it was: nearest (N, C)."""
+    q, gradient = np.zeros(3), np.zeros(3)
+    out[:] = np.inf
+    nearest[:] = -1
+    for n in range(points.shape[0]):
+        for c in range(starts.shape[0] - 1):
+            for b in range(starts[c], starts[c + 1]):
+                value = _distance(
+                    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, points[n], q, gradient
+                )
+                if value < out[n, c]:
+                    out[n, c] = value
+                    nearest[n, c] = b
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _ball_roots(origin, direction, radius):  # noqa: ANN001, ANN202
+    """Both crossings of a line with a ball, NaN where it passes by; |direction| is 1."""
+    along = origin[0] * direction[0] + origin[1] * direction[1] + origin[2] * direction[2]
+    squared = 0.0
+    for k in range(3):
+        across = origin[k] - along * direction[k]
+        squared += across * across
+    room = radius * radius - squared
+    if room < 0.0:
+        return np.nan, np.nan
+    half = math.sqrt(room)
+    return -along - half, -along + half
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _box_roots(low, high, origin, direction):  # noqa: ANN001, ANN202
+    near, far = -np.inf, np.inf
+    for k in range(3):
+        if direction[k] == 0.0:
+            if origin[k] < low[k] or origin[k] > high[k]:
+                return np.nan, np.nan
+            continue
+        one, other = (low[k] - origin[k]) / direction[k], (high[k] - origin[k]) / direction[k]
+        near, far = max(near, min(one, other)), min(far, max(one, other))
+    if near > far:
+        return np.nan, np.nan
+    return near, far
+
+
+@njit(cache=True, nogil=True)
+def _capsule_roots(size, origin, direction, centred):  # noqa: ANN001, ANN202
+    """A line meets the side, or the cap on whose side it meets the endless cylinder (as in `simulate.raycast`)."""
+    radius, half_length = size[0], size[1]
+    across = direction[0] * direction[0] + direction[1] * direction[1]
+    roots = (np.nan, np.nan)
+    near, far = np.nan, np.nan
+    half = 0.0
+    along = 0.0
+    if across > 0.0:
+        along = (origin[0] * direction[0] + origin[1] * direction[1]) / across
+        x, y = origin[0] - along * direction[0], origin[1] - along * direction[1]
+        room = radius * radius - x * x - y * y
+        if room < 0.0:
+            return roots
+        half = math.sqrt(room / across)
+    for end in (-1.0, 1.0):
+        side = -along + end * half
+        height = origin[2] + side * direction[2] if across > 0.0 else end * direction[2] * np.inf
+        value = side
+        if not abs(height) <= half_length:
+            centred[0], centred[1] = origin[0], origin[1]
+            centred[2] = origin[2] - (half_length if height > 0.0 else -half_length)
+            first, second = _ball_roots(centred, direction, radius)
+            value = first if end < 0.0 else second
+        if end < 0.0:
+            near = value
+        else:
+            far = value
+    return near, far
+
+
+@njit(cache=True, nogil=True)
+def _primitive_roots(kind, size, origin, direction, work):  # noqa: ANN001, ANN202
+    if kind == SPHERE:
+        return _ball_roots(origin, direction, size[0])
+    if kind == BOX:
+        for k in range(3):
+            work[k] = -size[k]
+        return _box_roots(work, size, origin, direction)
+    if kind == CAPSULE:
+        return _capsule_roots(size, origin, direction, work)
+    if direction[2] == 0.0:
+        return np.nan, np.nan
+    return -origin[2] / direction[2], np.nan
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _normal(kind, size, point, out):  # noqa: ANN001, ANN202
+    """Outward normal of a primitive at a point on it, in its frame."""
+    out[0], out[1], out[2] = 0.0, 0.0, 0.0
+    if kind == PLANE:
+        out[2] = 1.0
+    elif kind == BOX:
+        axis, largest = 0, -1.0
+        for k in range(3):
+            share = abs(point[k]) / size[k]
+            if share > largest:
+                axis, largest = k, share
+        out[axis] = 1.0 if point[axis] >= 0.0 else -1.0
+    else:
+        z = point[2] - min(max(point[2], -size[1]), size[1]) if kind == CAPSULE else point[2]
+        length = math.sqrt(point[0] * point[0] + point[1] * point[1] + z * z)
+        if length > 0.0:
+            out[0], out[1], out[2] = point[0] / length, point[1] / length, z / length
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _segment_meets_box(low, high, origin, end):  # noqa: ANN001, ANN202
+    """Whether the bounding box of a segment meets a box."""
+    meets = True
+    for k in range(3):
+        meets = meets and min(origin[k], end[k]) <= high[k] and max(origin[k], end[k]) >= low[k]
+    return meets
+
+
+@njit(cache=True, nogil=True)
+def first_hits(  # noqa: ANN201
+    kinds, sizes, to_body, low, high, starts,  # noqa: ANN001
+    row_starts, columns, origins, directions, limits, hits, normals,  # noqa: ANN001
+):  # fmt: skip
+    """First hits of rays on the primitives of columns, before a limit.
+
+    Arguments:
+        row_starts, columns: Ray-column pairs as `near_columns` lists them.
+        origins, directions: Rays, shape (N, 3); directions of unit length.
+        limits: Where rays end, shape (N,) [m].
+        hits: Out: ranges, infinite without a hit, shape (P,) [m].
+        normals: Out: world normals that face the origin, shape (P, 3).
+    """
+    q, turned, work, point, local, end = (
+        np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3),
+    )  # fmt: skip
+    for n in range(origins.shape[0]):
+        for k in range(3):
+            end[k] = origins[n, k] + limits[n] * directions[n, k]
+        for pair in range(row_starts[n], row_starts[n + 1]):
+            best, body = limits[n], -1
+            for b in range(starts[columns[pair]], starts[columns[pair] + 1]):
+                if kinds[b] == GRID or not _segment_meets_box(low[b], high[b], origins[n], end):
+                    continue
+                _to_frame(to_body[b], origins[n], q)
+                _turn(to_body[b], directions[n], turned)
+                near, far = _primitive_roots(kinds[b], sizes[b], q, turned, work)
+                value = near if near >= 0.0 else far
+                if value >= 0.0 and value < best:
+                    best, body = value, b
+            hits[pair] = np.inf
+            if body < 0:
+                continue
+            hits[pair] = best
+            _to_frame(to_body[body], origins[n], q)
+            _turn(to_body[body], directions[n], turned)
+            for k in range(3):
+                point[k] = q[k] + best * turned[k]
+            _normal(kinds[body], sizes[body], point, local)
+            facing = local[0] * turned[0] + local[1] * turned[1] + local[2] * turned[2]
+            sign = -1.0 if facing > 0.0 else 1.0
+            for k in range(3):
+                normals[pair, k] = sign * (
+                    to_body[body, 0, k] * local[0] + to_body[body, 1, k] * local[1] + to_body[body, 2, k] * local[2]
+                )
+
+
+@njit(cache=True, nogil=True)
+def mesh_candidates(  # noqa: ANN201
+    kinds, to_body, grid, mesh_low, mesh_high, low, high, starts,  # noqa: ANN001
+    row_starts, columns, origins, directions, limits, rows, pairs, bodies,  # noqa: ANN001
+):  # fmt: skip
+    """Pairs and mesh bodies whose own bounding box the ray passes before its limit.
+
+    Returns:
+        Their number; where it is above the room in `rows`, `pairs` and `bodies`, the call has to be repeated.
+    """
+    q, turned, end = np.zeros(3), np.zeros(3), np.zeros(3)
+    total, room = 0, pairs.shape[0]
+    for n in range(origins.shape[0]):
+        for k in range(3):
+            end[k] = origins[n, k] + limits[n] * directions[n, k]
+        for pair in range(row_starts[n], row_starts[n + 1]):
+            for b in range(starts[columns[pair]], starts[columns[pair] + 1]):
+                if kinds[b] != GRID or not _segment_meets_box(low[b], high[b], origins[n], end):
+                    continue
+                _to_frame(to_body[b], origins[n], q)
+                _turn(to_body[b], directions[n], turned)
+                near, far = _box_roots(mesh_low[grid[b]], mesh_high[grid[b]], q, turned)
+                if not (far >= 0.0 and near < limits[n]):
+                    continue
+                if total < room:
+                    rows[total], pairs[total], bodies[total] = n, pair, b
+                total += 1
+    return total

@@ -1,0 +1,114 @@
+"""Points that know nothing of the flow, with the density that they were drawn from: for balancing and for coverage.
+
+- Targets of primitives or moving bodies, both angles free: scene points drawn exactly in proportion to the sum of the
+  bodies' surface terms, each observed from a uniform origin. Weights p* / q are then the visible share over r^2.
+- Meshes at rest, both angles free: the shell around the surfaces (`shell`).
+- An angle fixed: hardly any surface point can be aimed at from a given origin, but few dimensions are free, so uniform
+  points of the space are resampled by the surface proximity, which is then their density; with more free dimensions
+  uniform rays are traced (`proposals`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lidardesign.density.frames import FramesTarget, near_pairs, row_log_sums
+from lidardesign.density.proposals import propose
+from lidardesign.density.shell import log_chart_factor, shell_proposals
+from lidardesign.density.target import Target
+from lidardesign.numerics import normalised_weights
+from lidardesign.scene import Scene
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, aim
+
+# Up to so many free dimensions, uniform candidates meet the surfaces often enough to be resampled.
+RESAMPLED_DIMENSIONS = 3
+CANDIDATES = 131_072
+FARTHEST_SIGMAS = 6.0
+# Scene points are proposed this far around bounding boxes; the surface term is below e^-12 beyond.
+REACH_SIGMAS = 5.0
+DRAWS_AT_ONCE = 262_144
+# Bodies so thin beside their boxes that fewer draws than this share hit their surface are drawn in vain.
+MOST_ROUNDS = 400
+TERM_TOLERANCE_NATS = 16.0
+ROWS_AT_ONCE = 4096
+
+
+def independent_points(
+    target: Target, scenes: Sequence[Scene], count: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 6) inside the space, at most `count`, and their log density per chart volume up to a constant.
+
+    Empty where no ray of the space comes near a target.
+    """
+    space, sigma_m = target.space, target.optics.sigma_m
+    if AZIMUTH in space.free and ELEVATION in space.free:
+        if isinstance(target, FramesTarget) and np.isfinite(target.field.low).all():
+            return proximity_proposals(target, count, generator)
+        if not isinstance(target, FramesTarget):
+            return shell_proposals(target.field, scenes, space, count, sigma_m, generator)
+    elif len(space.free) <= RESAMPLED_DIMENSIONS:
+        return resampled_proposals(target, count, generator)
+    proposals = propose(scenes, space, count, sigma_m, generator)
+    return proposals.points, proposals.log_density
+
+
+def resampled_proposals(
+    target: Target, count: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Uniform points resampled by surface proximity, (count, 6), and their log density up to a constant, (count,).
+
+    Empty where no candidate comes within `FARTHEST_SIGMAS` of any surface.
+    """
+    candidates = target.space.sample(CANDIDATES, generator)
+    log_proximity = target.log_proximity(candidates)
+    near = log_proximity > target.log_column_weights.max() - FARTHEST_SIGMAS**2 / 2
+    candidates, log_proximity = candidates[near], log_proximity[near]
+    if not len(candidates):
+        return candidates, log_proximity
+    chosen = generator.choice(len(candidates), size=count, p=normalised_weights(log_proximity))
+    return candidates[chosen], log_proximity[chosen]
+
+
+def proximity_proposals(
+    target: FramesTarget, count: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Scene points in proportion to the surface terms of all bodies, seen from uniform origins."""
+    space, sigma_m = target.space, target.optics.sigma_m
+    surface = draw_near_surfaces(target, count, generator)
+    points = space.wrap(aim(space.sample(len(surface), generator)[:, :3], surface))
+    kept = space.contains(points) & (points[:, RANGE] > 0)
+    points, surface = points[kept], surface[kept]
+    bodies = target.field.apart()
+    weights = target.log_column_weights[target.field.column]
+    log_density = np.empty(len(points))
+    for start in range(0, len(points), ROWS_AT_ONCE):
+        rows = slice(start, min(start + ROWS_AT_ONCE, len(points)))
+        pairs = near_pairs(bodies, surface[rows], weights, sigma_m, TERM_TOLERANCE_NATS)
+        log_density[rows] = row_log_sums(weights[pairs.columns] - np.square(pairs.distances / sigma_m) / 2, pairs)[0]
+    return points, log_density + 2 * np.log(points[:, RANGE]) + log_chart_factor(space, points)
+
+
+def draw_near_surfaces(target: FramesTarget, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Scene points (at most count, 3) whose density is the sum over bodies of weight * exp(-d^2 / (2 sigma^2)).
+
+    Uniform points of the bodies' padded boxes, each box as often as its weight times its volume, are kept with the
+    probability of their own body's term: no body's integral is needed.
+    """
+    from lidardesign.density import body_kernels
+
+    bodies, sigma_m = target.field, target.optics.sigma_m
+    low, high = bodies.low - REACH_SIGMAS * sigma_m, bodies.high + REACH_SIGMAS * sigma_m
+    mass = np.exp(target.log_column_weights[bodies.column]) * (high - low).prod(axis=1)
+    cumulated = np.cumsum(mass / mass.sum())
+    found: list[np.ndarray] = []
+    for _ in range(MOST_ROUNDS):
+        body = np.searchsorted(cumulated, generator.random(DRAWS_AT_ONCE), side="right").clip(max=len(bodies) - 1)
+        points = generator.uniform(low[body], high[body])
+        distances = np.empty(len(points))
+        body_kernels.distances_of(*bodies.shapes, body, points, distances)
+        found.append(points[generator.random(len(points)) < np.exp(-np.square(distances / sigma_m) / 2)])
+        if sum(map(len, found)) >= count:
+            break
+    return np.concatenate(found)[:count]
