@@ -31,6 +31,8 @@ LAYERS = {
     "lidardesign.scene": 3,
     "lidardesign.meshio": 3,
     "lidardesign.simulate": 4,
+    "lidardesign.simulate.hits": 4,
+    "lidardesign.simulate.primitives": 4,
     "lidardesign.simulate.raycast": 4,
     "lidardesign.simulate.returns": 4,
     "lidardesign.surface": 4,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import math
+import weakref
 
 import numpy as np
 import pytest
@@ -12,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from lidardesign.errors import ConfigError
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
-from lidardesign.simulate.raycast import SceneCaster, shared_caster
+from lidardesign.simulate import raycast
+from lidardesign.simulate.raycast import SceneCaster, mesh_caster, shared_caster
 
 PRIMITIVES = {"sphere": Sphere(0.7), "box": Box((0.3, 0.5, 0.9)), "capsule": Capsule(0.3, 0.8), "plane": Plane()}
 SOLIDS = {name: shape for name, shape in PRIMITIVES.items() if name != "plane"}
@@ -297,3 +300,93 @@ def test_a_shared_caster_is_built_once_per_frame_and_set_of_bodies():
     mixed = mixed_scene()
     assert shared_caster(mixed, only="targets") is not shared_caster(mixed, only="occluders")
     assert shared_caster(mixed) is not shared_caster(mixed_scene())
+
+
+def posed_meshes(poses_of, seed=20, shift=(0.0, 0.0, 0.0)):
+    """A moving box, ball and screw of triangles, and one that rests."""
+    generator = np.random.default_rng(seed)
+    solids = [
+        trimesh.creation.box((0.5, 0.8, 0.3)),
+        trimesh.creation.icosphere(subdivisions=3, radius=0.4),
+        trimesh.creation.cylinder(0.2, 1.2, sections=40),
+        trimesh.creation.box((0.2, 0.2, 2.0)),
+    ]
+    bodies = []
+    for index, solid in enumerate(solids):
+        solid.apply_translation(generator.normal(size=3))  # the mesh is not centred in its own frame
+        rotations = Rotation.random(3, random_state=seed + index).as_matrix()
+        poses = np.stack([rigid(rotation, shift + generator.normal(size=3)) for rotation in rotations])
+        bodies.append((solid_mesh(solid), poses_of(poses, index)))
+    return bodies
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0, 0.0), (1e5, -2e5, 3e4)])
+def test_moving_meshes_are_hit_as_if_each_frame_were_a_scene_at_rest(shift):
+    shift = np.array(shift)
+    moving = posed_meshes(lambda poses, index: poses if index < 3 else poses[0], shift=shift)
+    scene = Scene(tuple(Body(mesh, poses=poses) for mesh, poses in moving))
+    origins, directions = rays_towards(4000, 21, spread=0.9)
+    origins = origins + shift
+    for frame in range(3):
+        resting = Scene(tuple(Body(body.shape, poses=body.pose(frame)) for body in scene.bodies))
+        found = SceneCaster(scene, frame).first_hit(origins, directions)
+        expected = SceneCaster(resting).first_hit(origins, directions)
+        # rays at edges may fall to either side
+        same = (found.body == expected.body) & (np.abs(np.einsum("nk,nk->n", expected.normal, directions)) > 0.1)
+        assert (found.body == expected.body).mean() > 0.999
+        assert set(found.body[same]) == {0, 1, 2, 3}
+        np.testing.assert_allclose(
+            found.range_m[same], expected.range_m[same], rtol=1e-5, atol=10 * references.EMBREE_M
+        )
+        aligned = np.einsum("nk,nk->n", found.normal[same], expected.normal[same])
+        assert np.mean(aligned > 1 - 1e-5) > 0.999
+        crossed, walked = (
+            caster.crossings(origins, directions, np.zeros(4000), unlimited(4000))
+            for caster in (SceneCaster(scene, frame), SceneCaster(resting))
+        )
+        assert abs(len(crossed.row) - len(walked.row)) <= 0.002 * len(walked.row)
+
+
+def test_a_limit_and_the_set_of_bodies_hold_for_moving_meshes():
+    moving = posed_meshes(lambda poses, index: poses)
+    roles = ("target", "occluder", "both", "occluder")
+    scene = Scene(tuple(Body(mesh, poses=poses, role=role) for (mesh, poses), role in zip(moving, roles, strict=True)))
+    origins, directions = rays_towards(2000, 22, spread=0.9)
+    free = SceneCaster(scene, 1).trace(origins, directions, unlimited(2000))
+    hit = free.body >= 0
+    before = SceneCaster(scene, 1).trace(origins[hit], directions[hit], free.range_m[hit] * (1 - 1e-5))
+    assert (before.body == -1).all()
+    beyond = SceneCaster(scene, 1).trace(origins[hit], directions[hit], free.range_m[hit] * (1 + 1e-5))
+    np.testing.assert_array_equal(beyond.body, free.body[hit])
+    targets = SceneCaster(scene, 1, only="targets").first_hit(origins, directions)
+    assert set(targets.body) == {-1, 0, 2}
+
+
+def test_a_mesh_is_built_once_for_all_frames_scenes_and_copies_of_it(monkeypatch):
+    built = []
+    make = raycast._Triangles.__init__
+
+    def counted(self, meshes):
+        built.append(len(meshes))
+        make(self, meshes)
+
+    monkeypatch.setattr(raycast._Triangles, "__init__", counted)
+    mesh = solid_mesh(trimesh.creation.icosphere(subdivisions=2, radius=0.123))
+    copy = Mesh(mesh.vertices, mesh.faces)
+    floor = solid_mesh(trimesh.creation.box((9.0, 9.0, 0.1)))
+    poses = np.stack([rigid(translation_m=(0.001 * i, 0, 1)) for i in range(1000)])
+    scenes = [Scene((Body(shape, poses=poses), Body(floor))) for shape in (mesh, mesh, copy)]
+    casters = [SceneCaster(scene, frame) for scene in scenes for frame in range(scene.frames)]
+    assert len(casters) == 3000
+    assert built == [1, 1, 1, 1]  # the moving mesh, and each scene's floor
+    hits = casters[500].first_hit([[0.5, 0, 3.0]], [[0.0, 0, -1]])
+    assert hits.range_m[0] == pytest.approx(3 - 1.123, abs=1e-6)
+
+
+def test_a_caster_lives_as_long_as_its_mesh():
+    mesh = solid_mesh(trimesh.creation.box((0.3, 0.3, 0.31)))
+    caster = weakref.ref(mesh_caster(mesh))
+    assert mesh_caster(mesh) is caster()
+    del mesh
+    gc.collect()
+    assert caster() is None

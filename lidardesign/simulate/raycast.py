@@ -2,28 +2,26 @@
 
 Meshes are recentred in float64 before they become Embree's float32, and rays that start far away are advanced to their
 neighbourhood first, which keeps sub-micrometre accuracy far from the origin; Embree runs in its robust mode, without
-which a quarter of the rays aimed at vertices slip through.
+which a quarter of the rays aimed at vertices slip through. Meshes at rest are one Embree scene; a mesh that moves has
+one in its own frame, built once, and rays are brought into that frame where they pass the mesh's ball.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
-from weakref import WeakKeyDictionary
+from collections.abc import Sequence
+from typing import Literal
+from weakref import WeakKeyDictionary, WeakValueDictionary
 
 import numpy as np
 
 from lidardesign.errors import ConfigError
-from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, inverse_rigid
+from lidardesign.scene import Body, Mesh, Scene
+from lidardesign.simulate.hits import Crossings, Hits
+from lidardesign.simulate.primitives import BALL_SLACK, PrimitiveGroup
 
 FARTHEST_M = 1e30  # what Embree takes for an unlimited ray
-GROUP_CHUNK = 200_000  # ray-primitive pairs at a time: the temporaries stay below some 50 MB
 # Rays that start further than this many radii from the meshes' ball are advanced to it in float64.
 FAR_RADII = 4.0
-# Relative rounding of squared distances, doubled many times over: bounding balls are never missed.
-BALL_SLACK = 1e-12
 # After a triangle the next one is looked for this share of the scene's reach further on.
 STEP_SHARE = 1e-6
 MAXIMUM_LAYERS = 16
@@ -31,44 +29,21 @@ MAXIMUM_LAYERS = 16
 Only = Literal["all", "targets", "occluders"]
 
 
-@dataclass(frozen=True, eq=False)
-class Hits:
-    """First hits of N rays.
-
-    Arguments:
-        range_m: Distance along the ray [m], infinite on a miss, shape (N,).
-        body: Index into the scene's bodies, -1 on a miss, shape (N,).
-        normal: Unit surface normal facing the ray's origin, zero on a miss, shape (N, 3).
-    """
-
-    range_m: np.ndarray
-    body: np.ndarray
-    normal: np.ndarray
-
-
-class Crossings(NamedTuple):
-    """All surfaces that rays pass, as flat lists: ray (K,), range (K,) [m], |cosine| with the normal (K,)."""
-
-    row: np.ndarray
-    range_m: np.ndarray
-    cosine: np.ndarray
-
-
 class SceneCaster:
     """Casts rays into one frame of a scene.
 
     Arguments:
-        scene: The scene; meshes are moved to their pose at `frame` once.
+        scene: The scene.
         frame: The time frame.
         only: Which bodies rays can hit.
     """
 
     def __init__(self, scene: Scene, frame: int = 0, *, only: Only = "all") -> None:
         chosen = _chosen(scene, only)
-        self._meshes = _MeshCaster([(i, body) for i, body in chosen if isinstance(body.shape, Mesh)], frame)
+        self._meshes = _Meshes(scene, [(i, body) for i, body in chosen if isinstance(body.shape, Mesh)], frame)
         kinds = {type(body.shape) for _, body in chosen} - {Mesh}
         self._groups = [
-            _PrimitiveGroup([(i, body) for i, body in chosen if isinstance(body.shape, kind)], frame)
+            PrimitiveGroup([(i, body) for i, body in chosen if isinstance(body.shape, kind)], frame)
             for kind in sorted(kinds, key=lambda kind: kind.__name__)
         ]
 
@@ -133,31 +108,26 @@ def _checked_rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarr
     return origins, directions / lengths[:, None]
 
 
-class _MeshCaster:
-    """All meshes of a frame in one Embree scene, recentred."""
+class _Triangles:
+    """Meshes in one Embree scene, recentred."""
 
-    def __init__(self, bodies: list[tuple[int, Body]], frame: int) -> None:
-        self._body_of_geometry = np.array([index for index, _ in bodies], dtype=np.int64)
-        if not bodies:
-            return
+    def __init__(self, meshes: Sequence[Mesh]) -> None:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
-        world = [body.shape.transformed(body.pose(frame)) for _, body in bodies]
-        corners = np.concatenate([mesh.bounds_m for mesh in world])
-        self._centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
-        self._radius_m = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0))) / 2
+        corners = np.concatenate([mesh.bounds_m for mesh in meshes])
+        self.centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
+        self.radius_m = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0))) / 2
         self._scene = EmbreeScene()
         self._geometries = [
-            TriangleMesh(self._scene, (mesh.vertices - self._centre).astype(np.float32), mesh.faces) for mesh in world
+            TriangleMesh(self._scene, (mesh.vertices - self.centre).astype(np.float32), mesh.faces) for mesh in meshes
         ]
 
-    def trace(self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Hits:
-        count = len(origins)
-        hits = Hits(np.full(count, np.inf), np.full(count, -1, dtype=np.int64), np.zeros((count, 3)))
-        if not len(self._body_of_geometry) or not count:
-            return hits
-        local, advance_m = self._advanced(origins - self._centre, directions)
+    def trace(
+        self, local: np.ndarray, directions: np.ndarray, limit_m: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """First hits of rays relative to the centre: rows (K,), their ranges (K,), meshes (K,) and normals (K, 3)."""
+        local, advance_m = self._advanced(local, directions)
         found = self._scene.run(
             local.astype(np.float32),
             directions.astype(np.float32),
@@ -166,25 +136,152 @@ class _MeshCaster:
         )
         range_m = found["tfar"] + advance_m
         rows = np.flatnonzero((found["primID"] >= 0) & (range_m < limit_m))
-        hits.range_m[rows] = range_m[rows]
-        hits.body[rows] = self._body_of_geometry[found["geomID"][rows]]
-        hits.normal[rows] = _unit(found["Ng"][rows].astype(np.float64))
-        return hits
+        return rows, range_m[rows], found["geomID"][rows], _unit(found["Ng"][rows].astype(np.float64))
 
     def _advanced(self, local: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Starts moved towards the meshes where float32 could not tell them apart, and by how much (N,)."""
-        far = np.einsum("nk,nk->n", local, local) > (FAR_RADII * self._radius_m) ** 2
+        far = np.einsum("nk,nk->n", local, local) > (FAR_RADII * self.radius_m) ** 2
         if not far.any():
             return local, np.zeros(len(local))
         closest = -np.einsum("nk,nk->n", local, directions)
-        advance_m = np.where(far, np.maximum(closest - 2 * self._radius_m, 0.0), 0.0)
+        advance_m = np.where(far, np.maximum(closest - 2 * self.radius_m, 0.0), 0.0)
         return local + advance_m[:, None] * directions, advance_m
+
+
+class MeshCaster:
+    """Casts rays at one mesh in its own frame; `mesh_caster` keeps one for every mesh."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self._triangles = _Triangles([mesh])
+
+    @property
+    def centre_m(self) -> np.ndarray:
+        """The centre of a ball around the mesh, shape (3,)."""
+        return self._triangles.centre
+
+    @property
+    def radius_m(self) -> float:
+        """The radius of that ball."""
+        return self._triangles.radius_m
+
+    def trace(
+        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """First hits of finite float64 rays of unit length in the mesh's frame, shapes (N, 3) and (N, 3).
+
+        From its limit (N,) on, a hit counts as a miss. Ranges (N,) [m] are infinite and unit normals (N, 3), wound as
+        the faces are, zero on a miss.
+        """
+        range_m, normal = np.full(len(origins), np.inf), np.zeros((len(origins), 3))
+        if len(origins):
+            rows, found_m, _, found_normal = self._triangles.trace(origins - self.centre_m, directions, limit_m)
+            range_m[rows], normal[rows] = found_m, found_normal
+        return range_m, normal
+
+
+_mesh_casters: WeakKeyDictionary[Mesh, MeshCaster] = WeakKeyDictionary()
+_casters_by_content: WeakValueDictionary[str, MeshCaster] = WeakValueDictionary()
+
+
+def mesh_caster(mesh: Mesh) -> MeshCaster:
+    """The one caster of a mesh in its own frame, kept as long as the mesh; meshes of equal content share it."""
+    if mesh not in _mesh_casters:
+        known = _casters_by_content.get(mesh.content_hash)
+        if known is None:
+            known = _casters_by_content[mesh.content_hash] = MeshCaster(mesh)
+        _mesh_casters[mesh] = known
+    return _mesh_casters[mesh]
+
+
+class _AtRest:
+    """All meshes of a scene that do not move, in one Embree scene."""
+
+    def __init__(self, bodies: Sequence[tuple[int, Body]]) -> None:
+        self._body_of_geometry = np.array([index for index, _ in bodies], dtype=np.int64)
+        self._triangles = _Triangles([body.shape.transformed(body.poses) for _, body in bodies])
+        self.radius_m = self._triangles.radius_m
+
+    def trace(self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Hits:
+        hits = _no_hits(len(origins))
+        if len(origins):
+            local = origins - self._triangles.centre
+            rows, range_m, geometry, normal = self._triangles.trace(local, directions, limit_m)
+            hits.range_m[rows], hits.body[rows], hits.normal[rows] = range_m, self._body_of_geometry[geometry], normal
+        return hits
+
+
+_at_rest: WeakKeyDictionary[Scene, dict[tuple[int, ...], _AtRest]] = WeakKeyDictionary()
+
+
+def _shared_at_rest(scene: Scene, bodies: Sequence[tuple[int, Body]]) -> _AtRest:
+    """What does not move is built once for all frames of a scene."""
+    known = _at_rest.setdefault(scene, {})
+    key = tuple(index for index, _ in bodies)
+    if key not in known:
+        known[key] = _AtRest(bodies)
+    return known[key]
+
+
+class _Moving:
+    """The meshes of a frame that move, each traced in its own frame."""
+
+    def __init__(self, bodies: Sequence[tuple[int, Body]], frame: int) -> None:
+        self._body = [index for index, _ in bodies]
+        self._casters = [mesh_caster(body.shape) for _, body in bodies]
+        poses = np.stack([body.pose(frame) for _, body in bodies])
+        self._rotation, self._translation = poses[:, :3, :3], poses[:, :3, 3]
+        centres = np.stack([caster.centre_m for caster in self._casters])
+        self._centres = np.einsum("bij,bj->bi", self._rotation, centres) + self._translation
+        self._radii_m = np.array([caster.radius_m for caster in self._casters])
+        self.radius_m = float(self._radii_m.max())
+
+    def keep_nearer(self, hits: Hits, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> None:
+        """Enter the hits that are nearer than what `hits` holds."""
+        for number, caster in enumerate(self._casters):
+            bound = np.minimum(hits.range_m, limit_m)
+            rows = np.flatnonzero(self._passes(number, origins, directions, bound))
+            if not len(rows):
+                continue
+            rotation = self._rotation[number]
+            range_m, normal = caster.trace(
+                (origins[rows] - self._translation[number]) @ rotation, directions[rows] @ rotation, bound[rows]
+            )
+            hit = np.isfinite(range_m)
+            won = rows[hit]
+            hits.range_m[won], hits.body[won] = range_m[hit], self._body[number]
+            hits.normal[won] = normal[hit] @ rotation.T
+
+    def _passes(self, number: int, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> np.ndarray:
+        """Which rays pass a mesh's ball before their limit, shape (N,)."""
+        offset = self._centres[number] - origins
+        along = np.einsum("nk,nk->n", offset, directions)
+        squared = np.einsum("nk,nk->n", offset, offset)
+        slack = BALL_SLACK * squared
+        radius_m = self._radii_m[number]
+        reach = radius_m + np.sqrt(slack)
+        return (squared - along**2 <= radius_m**2 + slack) & (along >= -reach) & (along - reach <= limit_m)
+
+
+class _Meshes:
+    """All meshes of a frame."""
+
+    def __init__(self, scene: Scene, bodies: list[tuple[int, Body]], frame: int) -> None:
+        resting = [(index, body) for index, body in bodies if body.poses.ndim == 2]
+        moving = [(index, body) for index, body in bodies if body.poses.ndim == 3]
+        self._resting = _shared_at_rest(scene, resting) if resting else None
+        self._moving = _Moving(moving, frame) if moving else None
+
+    def trace(self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Hits:
+        hits = self._resting.trace(origins, directions, limit_m) if self._resting else _no_hits(len(origins))
+        if self._moving:
+            self._moving.keep_nearer(hits, origins, directions, limit_m)
+        return hits
 
     def crossings(
         self, origins: np.ndarray, directions: np.ndarray, start_m: np.ndarray, limit_m: np.ndarray
     ) -> Crossings:
         parts = [Crossings(np.empty(0, int), np.empty(0), np.empty(0))]
-        if len(self._body_of_geometry):
+        if self._resting or self._moving:
             alive, start, step_m = np.arange(len(origins)), start_m.copy(), self._step_m(limit_m)
             for _ in range(MAXIMUM_LAYERS):
                 ahead, toward = start[alive], directions[alive]
@@ -201,206 +298,12 @@ class _MeshCaster:
 
     def _step_m(self, limit_m: np.ndarray) -> float:
         reach = limit_m[np.isfinite(limit_m)].max(initial=0.0)
-        return STEP_SHARE * max(float(reach), self._radius_m)
+        return STEP_SHARE * max(float(reach), *(part.radius_m for part in (self._resting, self._moving) if part))
 
 
-class _Pairs(NamedTuple):
-    """Rays of a chunk with a primitive whose bounding ball they pass, as flat lists of K pairs.
-
-    Arguments:
-        rows: The chunk of rays.
-        ray, member: The ray's number in the chunk and the primitive's in its group.
-        origins, directions: The rays in the primitive's frame, shape (K, 3).
-        near, far: Ranges where they enter and leave it, NaN where they do not [m].
-    """
-
-    rows: slice
-    ray: np.ndarray
-    member: np.ndarray
-    origins: np.ndarray
-    directions: np.ndarray
-    near: np.ndarray
-    far: np.ndarray
-
-
-class _PrimitiveGroup:
-    """All primitives of one kind in a frame, each crossed in closed form in its own frame."""
-
-    def __init__(self, members: list[tuple[int, Body]], frame: int) -> None:
-        kind = type(members[0][1].shape)
-        self._crossed, self._normal = _CROSSED[kind], _NORMALS[kind]
-        self._body = np.array([index for index, _ in members], dtype=np.int64)
-        self._sizes = np.array([_SIZES[kind](body.shape) for _, body in members])
-        self._radii_m = np.array([_RADII[kind](body.shape) for _, body in members])
-        poses = np.stack([body.pose(frame) for _, body in members])
-        self._centres, self._rotation = poses[:, :3, 3], poses[:, :3, :3]
-        self._to_body = inverse_rigid(poses)
-
-    def keep_nearer(self, hits: Hits, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> None:
-        """Enter the hits that are nearer than what `hits` holds."""
-        for pairs in self._pairs(origins, directions, limit_m):
-            rows = pairs.rows
-            range_m = np.where(pairs.near >= 0, pairs.near, np.where(pairs.far >= 0, pairs.far, np.inf))
-            bound = np.minimum(hits.range_m[rows], limit_m[rows])
-            nearest = bound.copy()
-            np.minimum.at(nearest, pairs.ray, range_m)
-            won = np.flatnonzero((range_m == nearest[pairs.ray]) & (range_m < bound[pairs.ray]))
-            ray = pairs.ray[won]
-            hits.range_m[rows][ray] = range_m[won]
-            hits.body[rows][ray] = self._body[pairs.member[won]]
-            hits.normal[rows][ray] = self._normals(pairs, won, range_m[won])
-
-    def _normals(self, pairs: _Pairs, chosen: np.ndarray, range_m: np.ndarray) -> np.ndarray:
-        """World normals where the chosen pairs cross at a range, outward."""
-        points = pairs.origins[chosen] + range_m[:, None] * pairs.directions[chosen]
-        member = pairs.member[chosen]
-        return np.einsum("nij,nj->ni", self._rotation[member], self._normal(self._sizes[member], points))
-
-    def crossings(
-        self, origins: np.ndarray, directions: np.ndarray, start_m: np.ndarray, limit_m: np.ndarray
-    ) -> Crossings:
-        """See `SceneCaster.crossings`."""
-        parts = [Crossings(np.empty(0, int), np.empty(0), np.empty(0))]
-        for pairs in self._pairs(origins, directions, limit_m):
-            start, limit = start_m[pairs.rows][pairs.ray], limit_m[pairs.rows][pairs.ray]
-            for range_m in (pairs.near, pairs.far):
-                kept = np.flatnonzero((range_m >= start) & (range_m < limit))
-                row = pairs.ray[kept] + pairs.rows.start
-                cosine = np.abs(_dot(self._normals(pairs, kept, range_m[kept]), directions[row]))
-                parts.append(Crossings(row, range_m[kept], cosine))
-        return Crossings(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-    def _pairs(self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Iterator[_Pairs]:
-        """The pairs of all rays, in chunks that bound the memory."""
-        size = max(1, GROUP_CHUNK // len(self._body))
-        for start in range(0, len(origins), size):
-            rows = slice(start, min(start + size, len(origins)))
-            ray, member = self._near_pairs(origins[rows], directions[rows], limit_m[rows])
-            pose = self._to_body[member]
-            local_origins = np.einsum("nij,nj->ni", pose[:, :3, :3], origins[rows][ray]) + pose[:, :3, 3]
-            local_directions = np.einsum("nij,nj->ni", pose[:, :3, :3], directions[rows][ray])
-            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-                near, far = self._crossed(self._sizes[member], local_origins, local_directions)
-            yield _Pairs(rows, ray, member, local_origins, local_directions, near, far)
-
-    def _near_pairs(
-        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Rays and members whose bounding balls they pass within their limits."""
-        offset = self._centres - origins[:, None]
-        along = np.einsum("nbk,nk->nb", offset, directions)
-        squared = _dot(offset, offset)
-        slack = BALL_SLACK * squared
-        passes = squared - np.square(along) <= np.square(self._radii_m) + slack
-        reach = self._radii_m + np.sqrt(slack)
-        return np.nonzero(passes & (along >= -reach) & (along - reach <= limit_m[:, None]))
+def _no_hits(count: int) -> Hits:
+    return Hits(np.full(count, np.inf), np.full(count, -1, dtype=np.int64), np.zeros((count, 3)))
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), np.finfo(float).tiny)
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.einsum("...k,...k->...", a, b)
-
-
-def _ball(origins: np.ndarray, directions: np.ndarray, radius_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both roots, NaN where the line passes by; the line's distance from the centre does not cancel as b^2 - c does."""
-    along = _dot(origins, directions)
-    perpendicular = origins - along[:, None] * directions
-    half_chord = np.sqrt(radius_m**2 - _dot(perpendicular, perpendicular))
-    return -along - half_chord, -along + half_chord
-
-
-def _sphere(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return _ball(origins, directions, sizes[:, 0])
-
-
-def _sphere_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return _unit(points)
-
-
-def _box(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    entry, leave = (-sizes - origins) / directions, (sizes - origins) / directions
-    low, high = np.fmin(entry, leave), np.fmax(entry, leave)
-    parallel = directions == 0
-    inside_slab = np.abs(origins) <= sizes
-    low = np.where(parallel, np.where(inside_slab, -np.inf, np.inf), low)
-    high = np.where(parallel, np.where(inside_slab, np.inf, -np.inf), high)
-    near, far = low.max(axis=1), high.min(axis=1)
-    hit = near <= far
-    return np.where(hit, near, np.nan), np.where(hit, far, np.nan)
-
-
-def _box_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    axis = np.argmax(np.abs(points) / sizes, axis=1)
-    normal = np.zeros_like(points)
-    rows = np.arange(len(points))
-    normal[rows, axis] = np.sign(points[rows, axis])
-    return normal
-
-
-def _capsule(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A line enters the capsule through its side, or through the cap on whose side it enters the endless cylinder.
-
-    Choosing the cap that way leaves no seam between side and cap for a ray to slip through.
-    """
-    radius_m, half_length_m = sizes[:, 0], sizes[:, 1]
-    across = _dot(directions[:, :2], directions[:, :2])
-    along = _dot(origins[:, :2], directions[:, :2]) / across
-    perpendicular = origins[:, :2] - along[:, None] * directions[:, :2]
-    half_chord = np.sqrt((radius_m**2 - _dot(perpendicular, perpendicular)) / across)
-    roots = []
-    for end, number in ((-1.0, 0), (1.0, 1)):
-        side = -along + end * half_chord
-        height = origins[:, 2] + side * directions[:, 2]
-        # a ray along the axis never meets the side: it comes and goes through the caps
-        height = np.where(across == 0, end * directions[:, 2] * np.inf, height)
-        centred = origins.copy()
-        centred[:, 2] -= np.sign(height) * half_length_m
-        cap = _ball(centred, directions, radius_m)[number]
-        roots.append(np.where(np.abs(height) <= half_length_m, side, cap))
-    return roots[0], roots[1]
-
-
-def _capsule_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    axis_point = np.zeros_like(points)
-    axis_point[:, 2] = np.clip(points[:, 2], -sizes[:, 1], sizes[:, 1])
-    return _unit(points - axis_point)
-
-
-def _plane(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One crossing, and no second one."""
-    range_m = -origins[:, 2] / directions[:, 2]
-    return np.where(np.isfinite(range_m), range_m, np.nan), np.full(len(range_m), np.nan)
-
-
-def _plane_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return np.tile([0.0, 0.0, 1.0], (len(points), 1))
-
-
-# Where a line enters and leaves each kind: NaN where it passes by.
-_CROSSED: dict[type, Callable[..., tuple[np.ndarray, np.ndarray]]] = {
-    Sphere: _sphere,
-    Box: _box,
-    Capsule: _capsule,
-    Plane: _plane,
-}
-_NORMALS: dict[type, Callable[..., np.ndarray]] = {
-    Sphere: _sphere_normal,
-    Box: _box_normal,
-    Capsule: _capsule_normal,
-    Plane: _plane_normal,
-}
-_SIZES: dict[type, Callable[..., tuple[float, float, float]]] = {
-    Sphere: lambda shape: (shape.radius_m, 0.0, 0.0),
-    Box: lambda shape: shape.half_extents_m,
-    Capsule: lambda shape: (shape.radius_m, shape.half_length_m, 0.0),
-    Plane: lambda shape: (0.0, 0.0, 0.0),
-}
-_RADII: dict[type, Callable[..., float]] = {
-    Sphere: lambda shape: shape.radius_m,
-    Box: lambda shape: math.hypot(*shape.half_extents_m),
-    Capsule: lambda shape: shape.radius_m + shape.half_length_m,
-    Plane: lambda shape: math.inf,
-}
