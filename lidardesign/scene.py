@@ -181,12 +181,14 @@ class Scene:
         name: For people and messages.
         truth: Arrays that the task's score needs (never read by designs, densities or estimates).
         frame_rate_hz: Frames per second where bodies move.
+        notes: What making the scene met that a user should know, one line each.
     """
 
     bodies: tuple[Body, ...]
     name: str = "scene"
     truth: Mapping[str, Any] = field(default_factory=dict)
     frame_rate_hz: float = 10.0
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not any(body.is_target for body in self.bodies):

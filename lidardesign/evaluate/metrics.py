@@ -40,6 +40,37 @@ def chamfer_m(first: np.ndarray, second: np.ndarray) -> float:
     return float(forth.mean() + back.mean())
 
 
+def discrete_frechet_m(first: np.ndarray, second: np.ndarray) -> float:
+    """The discrete Frechet distance of two paths [m]: the shortest leash with which both can be walked.
+
+    Eiter and Mannila, Computing discrete Frechet distance (1994), along anti-diagonals: all pairs of points whose
+    indices have the same sum follow from the two sums before it.
+
+    Arguments:
+        first: Points in the order of the path, shape (N, D).
+        second: Points, shape (M, D).
+
+    Raises:
+        ValueError: A path without points.
+    """
+    if not len(first) or not len(second):
+        raise ValueError("a path without points has no distance")
+    apart = np.sqrt(((first[:, None] - second[None]) ** 2).sum(axis=-1))
+    rows, columns = apart.shape
+    # leashes by row, one place to the right: a pair's three predecessors are at its place and the one before
+    before, last = np.full(rows + 1, np.inf), np.full(rows + 1, np.inf)
+    before[0] = -np.inf  # nothing has been walked before the first pair
+    flipped = apart[:, ::-1]
+    for total in range(rows + columns - 1):
+        low, high = max(0, total - columns + 1), min(rows, total + 1)
+        diagonal = np.diagonal(flipped, columns - 1 - total)
+        shortest = np.minimum(np.minimum(last[low + 1 : high + 1], last[low:high]), before[low:high])
+        now = np.full(rows + 1, np.inf)
+        now[low + 1 : high + 1] = np.maximum(diagonal, shortest)
+        before, last = last, now
+    return float(last[rows])
+
+
 @dataclass(frozen=True, eq=False)
 class SurfaceCloud:
     r"""A surface as points that each know the triangle they lie on.

@@ -1,0 +1,136 @@
+"""Tracking what a robot arm carries: sensors on the ceiling, pick-and-place below, the arm in the way.
+
+World frame: the arm stands at the origin on the floor z = 0 and works on its +x side; the ceiling is z = 1 m.
+The task of Behari et al. 2026, experiment B: a KUKA LBR iiwa 14 whose end effector is tracked.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from lidardesign.errors import ConfigError
+from lidardesign.evaluate.metrics import discrete_frechet_m
+from lidardesign.scene import Body, Scene, Sphere, rigid
+from lidardesign.simulate.returns import Returns
+from lidardesign.space import DesignSpace
+from lidardesign.task import Defaults, Metric, Score, Split, TaskConfig, random_generator
+from lidardesign_tasks.arm_motion import Arm, Motion
+from lidardesign_tasks.arm_robot import BALL_RADIUS_M, Robot, load_robot
+from lidardesign_tasks.arm_tracking import FEWEST_FRAMES, filled_path, tracked_places
+
+CEILING_M = 1.0
+SMALL = {"train": 4, "test": 4, "frames": 12}
+
+
+class ArmConfig(TaskConfig):
+    """The arm, how many trajectories of how many frames, how much they differ, and where sensors look."""
+
+    size: Literal["full", "small"] = Field(
+        "full", description="small: 4 trajectories of 12 frames in each split unless told otherwise, for trials"
+    )
+    robot: Path | None = Field(
+        None, description="MJCF file of an arm with 7 hinges; empty: the embedded arm of primitive links"
+    )
+    train: int = Field(40, ge=1, le=10_000, description="training trajectories")
+    test: int = Field(40, ge=1, le=10_000, description="held-out trajectories")
+    frames: int = Field(50, ge=4, le=1000, description="time frames of a trajectory")
+    duration_s: float = Field(8.0, ge=1, le=120, description="time of a trajectory [s]")
+    jitter_m: float = Field(
+        0.1, ge=0, le=0.3, description="pick and place points differ by up to this much along each axis [m]"
+    )
+    tool_m: float = Field(0.2, ge=0.05, le=0.3, description="from the flange to the ball's centre [m]")
+    elevation_max_deg: float = Field(
+        -60.0, gt=-90, le=0, description="the flattest elevation of a ray; -90 looks straight down [deg]"
+    )
+    range_m: tuple[float, float] = Field((0.1, 2.0), description="shortest and longest range [m]")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _small(cls, values: Any) -> Any:
+        if isinstance(values, dict) and values.get("size") == "small":
+            return {**SMALL, **values}
+        return values
+
+
+class ArmTask:
+    """Track the ball that an arm carries through a pick-and-place cycle."""
+
+    name: ClassVar[str] = "arm"
+    summary: ClassVar[str] = "tracking what a 7-axis robot arm carries, with sensors on the ceiling"
+    api_version: ClassVar[int] = 1
+    Config: ClassVar[type[ArmConfig]] = ArmConfig
+    metric: ClassVar[Metric] = Metric("Frechet distance", "m", "lower", worst=1.0, tolerance=0.002)
+    defaults: ClassVar[Defaults] = Defaults(
+        sensors=4, rays=(400, 1000, 1200), layout="distributed", density={"sigma_m": 0.025}
+    )
+
+    def space(self, config: ArmConfig) -> DesignSpace:
+        """Origins on the ceiling, the full turn, from straight down to the flattest elevation."""
+        return DesignSpace(
+            low=(-1.0, -1.0, CEILING_M, 0.0, -math.pi / 2, config.range_m[0]),
+            high=(1.0, 1.0, CEILING_M, 2 * math.pi, math.radians(config.elevation_max_deg), config.range_m[1]),
+        )
+
+    def scenes(self, config: ArmConfig, split: Split, seed: int) -> Sequence[Scene]:
+        """Random pick-and-place cycles; each has a generator of its own, so counts do not change them.
+
+        Raises:
+            DataError: The robot cannot be used, or cannot do what is drawn for it.
+            ConfigError: All cycles would be the same.
+        """
+        if config.jitter_m == 0:
+            raise ConfigError(
+                "without jitter all trajectories are nearly the same, and held-out ones would be known",
+                where="task.jitter_m",
+                hint="set jitter_m above 0",
+            )
+        robot = load_robot(config.robot, config.tool_m)
+        arm, rate_hz = Arm(robot, CEILING_M), config.frames / config.duration_s
+        motions = []
+        for index in range(config.train if split == "train" else config.test):
+            generator = random_generator(seed, "arm", split, index)
+            motions.append(arm.draw(config.jitter_m, config.frames, rate_hz, generator, f"{split} {index}"))
+        notes = (*robot.notes, *rejection_notes(motions, split))
+        return [_scene(robot, motion, f"{split} {i}", rate_hz, notes) for i, motion in enumerate(motions)]
+
+    def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
+        """Discrete Frechet distance [m] between the tracked path and the ball's; fails below two tracked frames."""
+        target = next(index for index, body in enumerate(scene.bodies) if body.is_target)
+        frames, places = tracked_places(returns, target, scene.bodies[target].shape.radius_m)
+        details = {"tracked_share": len(frames) / scene.frames}
+        if len(frames) < FEWEST_FRAMES:
+            return Score(self.metric.worst, failed=True, details=details)
+        path = filled_path(frames, places, scene.frames)
+        return Score(min(discrete_frechet_m(path, scene.truth["ball_m"]), self.metric.worst), details=details)
+
+
+def rejection_notes(motions: Sequence[Motion], split: str) -> tuple[str, ...]:
+    """One line on drawn motions that the arm cannot do, none where it can do all."""
+    rejected = sum((motion.rejected for motion in motions), Counter())
+    if not rejected:
+        return ()
+    reasons = ", ".join(f"{count} {reason}" for reason, count in rejected.most_common())
+    return (f"{split}: {rejected.total()} drawn motions were rejected and drawn again ({reasons})",)
+
+
+def _scene(robot: Robot, motion: Motion, name: str, rate_hz: float, notes: tuple[str, ...]) -> Scene:
+    ball = np.stack([rigid(translation_m=place) for place in motion.ball_m])
+    links = [
+        Body(link.shape, link.name, "occluder", _steady(poses))
+        for link, poses in zip(robot.links, motion.links, strict=True)
+    ]
+    truth = {"ball_m": motion.ball_m, "time_s": motion.time_s, "joints_rad": motion.joints_rad}
+    truth["rejected"] = dict(motion.rejected)
+    return Scene((Body(Sphere(BALL_RADIUS_M), "ball", "target", ball), *links), name, truth, rate_hz, notes)
+
+
+def _steady(poses: np.ndarray) -> np.ndarray:
+    """One pose (4, 4) where a body does not move, its poses (F, 4, 4) where it does."""
+    return poses[0] if (poses == poses[0]).all() else poses
