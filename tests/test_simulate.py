@@ -1,13 +1,18 @@
 """First hits, gates and outcomes against closed forms."""
 
+import itertools
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
 
 from lidardesign.errors import ConfigError
-from lidardesign.scene import Body, Box, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.returns import Outcome, Rays
-from lidardesign.simulate.simulate import build_casters, gate_outcomes, simulate
+from lidardesign.simulate.simulate import build_casters, gate_outcomes, simulate, simulate_many
 from lidardesign.space import direction
 
 
@@ -16,6 +21,10 @@ def make_rays(origins, directions, gate=(0.0, 10.0)):
     origins = np.broadcast_to(np.asarray(origins, float), directions.shape)
     count = len(directions)
     return Rays(origins, directions, np.broadcast_to(gate, (count, 2)), np.zeros(count), np.zeros(count))
+
+
+def unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def ball(radius=0.5, centre=(3.0, 0.0, 0.0), role="both"):
@@ -116,3 +125,59 @@ def test_no_rays_give_no_returns(with_mesh):
     (returns,) = simulate(scene, none)
     assert len(returns.outcome) == 0
     assert len(returns.points_m) == 0
+
+
+def moving_scene(generator, frames=4):
+    """Primitives and a mesh that move, one of each at rest."""
+    cube = trimesh.creation.box((0.5, 0.4, 0.3))
+    mesh = Mesh(np.asarray(cube.vertices), np.asarray(cube.faces))
+    shapes = [Sphere(0.2), Box((0.2, 0.1, 0.3)), Capsule(0.1, 0.3), mesh]
+
+    def poses():
+        return [rigid(turn, generator.normal(0, 0.4, 3)) for turn in Rotation.random(frames, generator).as_matrix()]
+
+    return Scene(
+        tuple(
+            Body(shape, role=role, poses=np.stack(poses())[slice(None) if moves else 0])
+            for shape in shapes
+            for moves, role in ((True, "both"), (False, "occluder"))
+        )
+    )
+
+
+def test_lists_of_rays_return_the_same_bits_together_as_alone():
+    generator = np.random.default_rng(11)
+    scene = moving_scene(generator)
+    origins = generator.normal(0, 2, (1200, 3))
+    ends = np.cumsum([0, 700, 1, 0, 499])
+    lists = [
+        make_rays(origins[a:b], -unit(origins[a:b] + generator.normal(0, 0.2, (b - a, 3))), (0.5, 2.0 + a / 1000))
+        for a, b in itertools.pairwise(ends)
+    ]
+    casters = build_casters(scene)
+    together = simulate_many(scene, lists, casters=casters)
+    assert sum(int(returns.returned.sum()) for frames in together for returns in frames) > 500
+    for rays, mine in zip(lists, together, strict=True):
+        alone = simulate(scene, rays)
+        assert [returns.frame for returns in mine] == [0, 1, 2, 3]
+        for a, b in zip(mine, alone, strict=True):
+            assert a.rays is rays
+            for name in ("outcome", "range_m", "body"):
+                assert getattr(a, name).tobytes() == getattr(b, name).tobytes()
+    assert simulate_many(scene, []) == []
+
+
+def test_turning_the_whole_world_changes_no_outcome():
+    generator = np.random.default_rng(12)
+    scene = moving_scene(generator)
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    turned = Scene(tuple(replace(body, poses=rigid(quarter) @ body.poses) for body in scene.bodies))
+    origins = generator.normal(0, 2, (2000, 3))
+    directions = -unit(origins + generator.normal(0, 0.2, origins.shape))
+    before = simulate(scene, make_rays(origins, directions))
+    after = simulate(turned, make_rays(origins @ quarter.T, directions @ quarter.T))
+    for a, b in zip(before, after, strict=True):
+        # a ray along an edge may fall to either side
+        same = a.body == b.body
+        assert same.mean() > 0.999
+        np.testing.assert_allclose(a.range_m[same], b.range_m[same], atol=1e-5)

@@ -243,13 +243,12 @@ class _Moving:
             if not len(rows):
                 continue
             rotation = self._rotation[number]
-            range_m, normal = caster.trace(
-                (origins[rows] - self._translation[number]) @ rotation, directions[rows] @ rotation, bound[rows]
-            )
+            local = _turned(origins[rows] - self._translation[number], rotation.T)
+            range_m, normal = caster.trace(local, _turned(directions[rows], rotation.T), bound[rows])
             hit = np.isfinite(range_m)
             won = rows[hit]
             hits.range_m[won], hits.body[won] = range_m[hit], self._body[number]
-            hits.normal[won] = normal[hit] @ rotation.T
+            hits.normal[won] = _turned(normal[hit], rotation)
 
     def _passes(self, number: int, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> np.ndarray:
         """Which rays pass a mesh's ball before their limit, shape (N,)."""
@@ -303,6 +302,12 @@ class _Meshes:
 
 def _no_hits(count: int) -> Hits:
     return Hits(np.full(count, np.inf), np.full(count, -1, dtype=np.int64), np.zeros((count, 3)))
+
+
+def _turned(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Rotated vectors (N, 3); unlike a matrix product, to the same bits in whatever batch."""
+    x, y, z = (vectors[:, [axis]] * rotation[:, axis] for axis in range(3))
+    return x + y + z
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -30,10 +30,47 @@ def simulate(scene: Scene, rays: Rays, *, casters: Sequence[SceneCaster] | None 
     Raises:
         ConfigError: The number of casters is not the scene's number of frames.
     """
+    return simulate_many(scene, [rays], casters=casters)[0]
+
+
+def simulate_many(
+    scene: Scene, lists: Sequence[Rays], *, casters: Sequence[SceneCaster] | None = None
+) -> list[list[Returns]]:
+    """The returns of several lists of rays in every time frame of a scene, each as `simulate` gives them.
+
+    All lists are traced together: over many frames, most of the time of short lists goes into the calls.
+
+    Arguments:
+        scene: What the rays meet; targets and occluders both stop them.
+        lists: Lists of rays, each fired anew in each frame.
+        casters: One caster per frame; None builds them here.
+
+    Returns:
+        For each list, one `Returns` per frame.
+
+    Raises:
+        ConfigError: The number of casters is not the scene's number of frames.
+    """
     casters = build_casters(scene) if casters is None else casters
     if len(casters) != scene.frames:
         raise ConfigError(f"{len(casters)} casters", where=f"scene {scene.name}", allowed=f"{scene.frames}")
-    return [_frame_returns(caster, rays, frame) for frame, caster in enumerate(casters)]
+    if not lists:
+        return []
+    ends = np.cumsum([len(rays) for rays in lists])
+    origins, directions, gate_m = (
+        np.concatenate([getattr(rays, name) for rays in lists]) for name in ("origin_m", "direction", "gate_m")
+    )
+    found: list[list[Returns]] = [[] for _ in lists]
+    for frame, caster in enumerate(casters):
+        hits = caster.first_hit(origins, directions)
+        outcome = gate_outcomes(hits.range_m, gate_m)
+        returned = outcome == Outcome.RETURN
+        columns = (outcome, np.where(returned, hits.range_m, np.nan), np.where(returned, hits.body, -1))
+        for mine, rays, end in zip(found, lists, ends, strict=True):
+            rows = slice(end - len(rays), end)
+            # copies: a view would keep all the lists' returns alive with it
+            mine.append(Returns(rays, *(column[rows].copy() for column in columns), frame=frame))
+    return found
 
 
 def build_casters(scene: Scene) -> list[SceneCaster]:
@@ -52,16 +89,3 @@ def gate_outcomes(range_m: np.ndarray, gate_m: np.ndarray) -> np.ndarray:
     outcome[range_m >= gate_m[:, 1]] = Outcome.AFTER_GATE
     outcome[np.isinf(range_m)] = Outcome.MISS
     return outcome
-
-
-def _frame_returns(caster: SceneCaster, rays: Rays, frame: int) -> Returns:
-    hits = caster.first_hit(rays.origin_m, rays.direction)
-    outcome = gate_outcomes(hits.range_m, rays.gate_m)
-    returned = outcome == Outcome.RETURN
-    return Returns(
-        rays=rays,
-        outcome=outcome,
-        range_m=np.where(returned, hits.range_m, np.nan),
-        body=np.where(returned, hits.body, -1),
-        frame=frame,
-    )
