@@ -45,7 +45,7 @@ class ArmConfig(TaskConfig):
     jitter_m: float = Field(
         0.1, ge=0, le=0.3, description="pick and place points differ by up to this much along each axis [m]"
     )
-    tool_m: float = Field(0.2, ge=0.05, le=0.3, description="from the flange to the ball's centre [m]")
+    tool_m: float = Field(0.15, ge=0.05, le=0.3, description="from the flange to the ball's centre [m]")
     elevation_max_deg: float = Field(
         -60.0, gt=-90, le=0, description="the flattest elevation of a ray; -90 looks straight down [deg]"
     )

@@ -11,7 +11,7 @@ import numpy as np
 
 from lidardesign.errors import DataError
 from lidardesign.scene import Box, Capsule, Mesh, Sphere
-from lidardesign_tasks.arm_robot import BALL, BALL_RADIUS_M, Robot, import_mujoco, mujoco_warnings
+from lidardesign_tasks.arm_robot import BALL, BALL_RADIUS_M, Robot, import_mink, import_mujoco, mujoco_warnings
 
 HOVER_M = np.array([0.5, 0.0, 0.35])
 PICK_M = np.array([0.45, -0.35, 0.15])
@@ -65,9 +65,7 @@ def minimum_jerk(share: np.ndarray) -> np.ndarray:
 
 def draw_waypoints(jitter_m: float, generator: np.random.Generator) -> np.ndarray:
     """Places of the ball between the phases approach, pick, retract, transit, descent and place, shape (7, 3) [m]."""
-    pick, place = (
-        point + generator.uniform(-jitter_m, jitter_m, 3) for point in (PICK_M, PLACE_M)
-    )
+    pick, place = (point + generator.uniform(-jitter_m, jitter_m, 3) for point in (PICK_M, PLACE_M))
     pick[2], place[2] = max(pick[2], LOWEST_M), max(place[2], LOWEST_M)
     lifts = generator.uniform(*LIFT_M, 2)
     up = np.array([0.0, 0.0, 1.0])
@@ -96,9 +94,8 @@ class Arm:
     """The arm that moves: a robot with the state that inverse kinematics needs."""
 
     def __init__(self, robot: Robot, ceiling_m: float) -> None:
-        import mink
-
-        self.robot, self.mink, self.mujoco = robot, mink, import_mujoco()
+        self.robot, self.mink, self.mujoco = robot, import_mink(), import_mujoco()
+        mink = self.mink
         self.highest_m = ceiling_m - CLEARANCE_M
         self.configuration = mink.Configuration(robot.model)
         self.reach = mink.FrameTask(BALL, "site", position_cost=1.0, orientation_cost=[1.0, 1.0, 0.0])

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib import import_module
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -103,20 +104,24 @@ def _read_once(path: str, states: tuple[tuple[str, int, int], ...], tool_m: floa
 
 
 def import_mujoco() -> Any:
-    """MuJoCo, which takes a while to import and only this task needs.
+    """MuJoCo, which takes a while to import and only this task needs; raises ConfigError where it is missing."""
+    return _imported("mujoco")
 
-    Raises:
-        ConfigError: It is not installed.
-    """
+
+def import_mink() -> Any:
+    """mink, which solves inverse kinematics for MuJoCo; raises ConfigError where it is missing."""
+    return _imported("mink")
+
+
+def _imported(name: str) -> Any:
     try:
-        import mujoco
+        return import_module(name)
     except ImportError as error:
         raise ConfigError(
-            f"the arm task needs MuJoCo, which cannot be imported ({error})",
+            f"the arm task needs {name}, which cannot be imported ({error})",
             where="task arm",
             hint="pip install mujoco mink",
         ) from error
-    return mujoco
 
 
 @contextmanager
