@@ -49,8 +49,8 @@ class WarehouseConfig(TaskConfig):
         (0.9, 1.1), description="mean distance to the shelf where the aisle starts and where it ends [m]"
     )
     front_jitter_m: float = Field(0.04, ge=0, le=0.2, description="half width of both distances' spread [m]")
-    first_level_m: Interval = Field((0.04, 0.14), description="height of the lowest level above the sensor [m]")
-    level_spacing_m: Interval = Field((0.43, 0.55), description="height from one level to the next [m]")
+    first_level_m: Interval = Field((0.05, 0.15), description="height of the lowest level above the sensor [m]")
+    level_spacing_m: Interval = Field((0.46, 0.56), description="height from one level to the next [m]")
     box_width_m: Interval = Field((0.2, 0.6), description="shortest and longest box along the aisle [m]")
     box_height_m: Interval = Field((0.05, 0.38), description="lowest and highest box [m]")
     box_setback_m: Interval = Field((0.0, 0.05), description="from the shelf's edge to the boxes' fronts [m]")
@@ -98,11 +98,16 @@ class WarehouseTask:
     )
 
     def space(self, config: WarehouseConfig) -> DesignSpace:
-        """Elevation and range in the vertical plane y < 0, conditioned on the robot's x."""
+        """Elevation and range in the vertical plane y < 0, conditioned on the robot's x.
+
+        Rays that stay in a plane are counted per plane angle: per solid angle, as for a sensor that also turns, a
+        degree of elevation would count for less the higher it looks, although no ray can leave the plane.
+        """
         return DesignSpace(
             low=(AISLE_M[0], 0.0, 0.0, -math.pi / 2, 0.0, 0.1),
             high=(AISLE_M[1], 0.0, 0.0, -math.pi / 2, math.pi / 2, 5.0),
             condition=("x_m",),
+            measure="angles",
         )
 
     def conditions(self, config: WarehouseConfig) -> list[dict[str, float]]:

@@ -18,7 +18,7 @@ from lidardesign.scene import Body, Box, Role, rigid
 Interval = tuple[float, float]
 
 LEVELS = 4
-BOARD_THICKNESS_M = 0.03
+BOARD_THICKNESS_M = 0.06  # the board with the beam that carries it
 SHELF_DEPTH_M = 0.6
 POLE_M = 0.05  # width and depth of an upright
 FLOOR_M = -0.2  # where the uprights stand: the robot carries its sensor 0.2 m above the floor
@@ -28,9 +28,13 @@ NARROW_GAP_M = (0.005, 0.03)
 EMPTY_PLACE_M = (0.1, 0.5)
 BEHIND_GAP_M = (0.01, 0.05)
 SHALLOWEST_M = 0.1  # a box of the second row is at least so deep
-# The shelf goes on beyond both ends of the aisle by more than its rotation takes away.
-BEYOND_AISLE_M = 0.3
+FURTHEST_BACK_M = 0.05  # with the deepest box, the widest gap and the shallowest box behind it the board is full
+WIDEST_BOX_M = 1.0
+NEAREST_FRONT_M, FURTHEST_FRONT_M = 0.3, 4.0
 STEEPEST_AISLE = 0.2  # metres of distance per metre of aisle
+# The shelf goes on beyond both ends of the aisle: a box that does not fit at its end is left away, and the places
+# that the robot looks at are as full there as elsewhere.
+BEYOND_AISLE_M = 0.65
 
 
 @dataclass(frozen=True)
@@ -60,26 +64,31 @@ class ShelfPlan:
             value = getattr(self, field.name)
             if isinstance(value, tuple) and field.name not in ("front_m", "aisle_m") and value[0] > value[1]:
                 raise ValueError(f"{field.name}: {value[0]} is above {value[1]}")
+        self._check_the_boxes()
+        self._check_the_front()
+
+    def _check_the_boxes(self) -> None:
         for name in ("box_width_m", "box_height_m"):
             if getattr(self, name)[0] <= 0:
                 raise ValueError(f"{name}: {getattr(self, name)[0]} m, allowed: above 0 m")
+        if self.box_width_m[1] > WIDEST_BOX_M:
+            raise ValueError(f"box_width_m: boxes of {self.box_width_m[1]} m, allowed: up to {WIDEST_BOX_M} m")
         clear = self.level_spacing_m[0] - BOARD_THICKNESS_M
         if self.box_height_m[1] >= clear:
             raise ValueError(
-                f"boxes of {self.box_height_m[1]} m do not fit between levels {self.level_spacing_m[0]} m apart, "
-                f"allowed: below {clear:.3f} m"
+                f"box_height_m: boxes of {self.box_height_m[1]} m do not fit between levels "
+                f"{self.level_spacing_m[0]} m apart, allowed: below {clear:.3f} m"
             )
-        deepest = SHELF_DEPTH_M - BOX_DEPTH_M[1] - BEHIND_GAP_M[1] - SHALLOWEST_M
-        if self.box_setback_m[0] < 0 or self.box_setback_m[1] > deepest + math.ulp(1.0):
-            raise ValueError(f"box_setback_m: {self.box_setback_m}, allowed: 0 to {deepest:.3f} m")
-        if self.box_width_m[1] > 1.0:
-            raise ValueError(f"box_width_m: boxes of {self.box_width_m[1]} m, allowed: up to 1 m")
-        self._check_the_front()
+        if self.box_setback_m[0] < 0 or self.box_setback_m[1] > FURTHEST_BACK_M:
+            raise ValueError(f"box_setback_m: {self.box_setback_m}, allowed: 0 to {FURTHEST_BACK_M} m")
 
     def _check_the_front(self) -> None:
         nearest = min(self.front_m) - self.front_jitter_m
-        if nearest < 2 * POLE_M or max(self.front_m) > 4:
-            raise ValueError(f"front_m: {self.front_m}, allowed: {2 * POLE_M} m above the jitter to 4 m")
+        if nearest < NEAREST_FRONT_M or max(self.front_m) > FURTHEST_FRONT_M:
+            raise ValueError(
+                f"front_m: {self.front_m} with a jitter of {self.front_jitter_m} m, "
+                f"allowed: {NEAREST_FRONT_M} to {FURTHEST_FRONT_M} m"
+            )
         length = self.aisle_m[1] - self.aisle_m[0]
         steepest = (abs(self.front_m[1] - self.front_m[0]) + 2 * self.front_jitter_m) / length
         if steepest > STEEPEST_AISLE:
