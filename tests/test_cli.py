@@ -162,7 +162,7 @@ def test_every_command_explains_itself_and_has_the_common_options(lidardesign, n
 
 def test_options_of_later_parts_are_absent(lidardesign):
     text = "".join(lidardesign(name, "--help").out for name in ("fit", "constrain", "evaluate", "export", "learn"))
-    for option in ("--refine", "--at", "--effects", "--accuracy", "--workers", "--detector"):
+    for option in ("--refine", "--effects", "--accuracy", "--workers", "--detector"):
         assert option not in text
 
 
@@ -443,7 +443,7 @@ def test_a_pinned_origin_is_weighted_with_the_visibility_that_the_run_decided_on
     monkeypatch.setattr("lidardesign.density.prepare.prepare_target", prepare)
     if decided is not None:
         note(flat, visibility=decided)
-    assert fit_module._log_target(open_run(flat), np.zeros((3, 6))).shape == (3,)
+    assert fit_module.log_target(open_run(flat), np.zeros((3, 6))).shape == (3,)
     assert asked == [(20, decided)]
 
 

@@ -10,7 +10,7 @@ import typer
 from lidardesign.cli import options
 from lidardesign.cli.console import command
 from lidardesign.cli.fit import GATES, LAYOUTS, fit_and_write
-from lidardesign.cli.runs import check_choice, check_name, need_run, open_target, sensor_count
+from lidardesign.cli.runs import check_choice, check_name, need_run, open_target, parse_at, sensor_count
 
 if TYPE_CHECKING:
     from lidardesign.design.constraints import Constraints
@@ -39,6 +39,7 @@ def constrain(
     layout: options.Layout = None,
     rays: options.RayCount = None,
     gates: options.Gates = "sensor",
+    at: options.At = None,
     name: options.Name = "constrained",
     seed: options.Seed = None,
     json: options.Json = False,
@@ -51,11 +52,11 @@ def constrain(
         check_choice(gates, "--gates", GATES)
         if layout is not None:
             check_choice(layout, "--layout", LAYOUTS)
-        count = sensor_count(sensors, None)
+        count, condition = sensor_count(sensors, None), parse_at(at)
         checked = load_constraints(constraints, overrides or [])
         opened, design = open_target(target)
         run = need_run(opened, target)
-        layout = layout or (design.layout if design else "grid")
+        layout = layout or (design.layout if design else run.task.defaults.layout)
         fit_and_write(
             run,
             console,
@@ -67,6 +68,7 @@ def constrain(
             layout=layout,
             rays=_rays(rays, checked, design, layout == "grid" and gates == "sensor", run.task.defaults.rays),
             gates=gates,
+            at={**(design.at if design else {}), **condition},
         )
 
 

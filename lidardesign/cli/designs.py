@@ -7,11 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
     from lidardesign.design.check import ConstraintCheck
-    from lidardesign.design.sensor import Design, Sensor
+    from lidardesign.design.sensor import Design, Sensor, Track
 
 MAX_SHOWN = 20
 # Several designs may be fitted to one run at once; each holds the lock for an instant.
@@ -21,6 +23,8 @@ ORIGIN = "origin [m]"
 SENSOR_COLUMNS = (
     "sensor", "weight", "rays", ORIGIN, "azimuth\n[deg]", "elevation\n[deg]", "field of view\n[deg]", "gate [m]",
 )  # fmt: skip
+
+TRACK_COLUMNS = ("ray", "azimuth\n[deg]", "elevation\n[deg]", "gate start\n[m]", "gate end\n[m]", "gate width\n[m]")
 
 
 def number(value: Any, digits: int = 4) -> str:
@@ -37,8 +41,13 @@ def show_design(design: Design, rich: RichConsole) -> None:
     from rich.markup import escape
     from rich.table import Table
 
+    if design.track is not None:
+        show_track(design, design.track, rich)
+        return
     rays = f"{design.rays} rays per frame" if design.rays else "rays per frame left open"
     title = f"{escape(design.name)}: {len(design.sensors)} sensors, layout {design.layout}, {rays}"
+    if design.at:
+        title += ", at " + escape(", ".join(f"{name}={value:g}" for name, value in design.at.items()))
     places = [_place(sensor) for sensor in design.sensors]
     together = len(set(places)) == 1
     if together:
@@ -54,6 +63,42 @@ def show_design(design: Design, rich: RichConsole) -> None:
     rich.print(table)
     if len(design.sensors) > MAX_SHOWN:
         rich.print(f"... and {len(design.sensors) - MAX_SHOWN} more sensors; --json lists all")
+
+
+def show_track(design: Design, track: Track, rich: RichConsole) -> None:
+    """Print the rays of a track as a table: from where to where each looks and listens over its travel."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    from lidardesign.design.track import travels
+
+    first, last = travels(track)
+    title = f"{escape(design.name)}: {len(track.sensor)} rays at every {track.dimension} from {first:g} to {last:g}"
+    title += f" (travel {last - first:g} m, {len(track.knots)} knots)\nsensors in the middle of their travel"
+    table = Table(title=title + f", at {_place(design.sensors[0])} m", title_justify="left")
+    for heading in TRACK_COLUMNS:
+        justify = "left" if heading == TRACK_COLUMNS[0] else "right"
+        table.add_column(escape(heading), justify=justify, overflow="fold")
+    for ray, sensor in list(enumerate(track.sensor))[:MAX_SHOWN]:
+        gate = track.gate_m[:, ray]
+        table.add_row(
+            escape(design.sensors[sensor].name),
+            _reach(np.degrees(track.azimuth_rad[:, ray]), 2),
+            _reach(np.degrees(track.elevation_rad[:, ray]), 2),
+            _reach(gate[:, 0], 3),
+            _reach(gate[:, 1], 3),
+            _reach(gate[:, 1] - gate[:, 0], 3),
+        )
+    rich.print(table)
+    if len(track.sensor) > MAX_SHOWN:
+        rich.print(f"... and {len(track.sensor) - MAX_SHOWN} more rays; --json lists all")
+    rich.print(f"--at {track.dimension}=VALUE shows the rays at one place")
+
+
+def _reach(values: np.ndarray, decimals: int) -> str:
+    """The smallest and the largest value; one where they look the same."""
+    low, high = (f"{round(float(v), decimals) + 0.0:.{decimals}f}" for v in (values.min(), values.max()))
+    return low if low == high else f"{low} .. {high}"
 
 
 def _place(sensor: Sensor) -> str:

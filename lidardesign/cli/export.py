@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,12 +10,17 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
+from lidardesign.cli.runs import parse_at
 from lidardesign.errors import ConfigError
 
 if TYPE_CHECKING:
+    import numpy as np
     from rich.console import Console as RichConsole
 
+    from lidardesign.cli.runs import Run
+    from lidardesign.design.samples import Samples
     from lidardesign.design.sensor import Design
+    from lidardesign.design.support import Retarget
     from lidardesign.simulate.returns import Rays
 
 
@@ -33,6 +39,7 @@ def export(
         typer.Option("--out", metavar="PATH", help="File to write.", show_default="beside the design"),
     ] = None,
     rays: options.RayCount = None,
+    at: options.At = None,
     list_formats: Annotated[bool, typer.Option("--list", help="List the formats.")] = False,
     seed: options.Seed = None,
     json: options.Json = False,
@@ -44,7 +51,7 @@ def export(
         if list_formats:
             _list(console)
         else:
-            _export(design, format_, out, rays, console)
+            _export(design, format_, out, rays, parse_at(at), console)
 
 
 def _list(console: Console) -> None:
@@ -66,7 +73,9 @@ def _list(console: Console) -> None:
     console.result({"formats": formats}, show)
 
 
-def _export(path: Path | None, name: str | None, out: Path | None, rays: int | None, console: Console) -> None:
+def _export(
+    path: Path | None, name: str | None, out: Path | None, rays: int | None, at: Mapping[str, float], console: Console
+) -> None:
     from lidardesign.design.files import load_design
     from lidardesign.export.registry import EXPORTERS
 
@@ -80,7 +89,7 @@ def _export(path: Path | None, name: str | None, out: Path | None, rays: int | N
     target = out if out is not None else path.with_suffix(exporter.suffix)
     if target.exists() and path.exists() and target.samefile(path):
         raise ConfigError("would overwrite the design itself", where=str(target), hint="give another --out")
-    design, laid_out = _design_and_rays(design, path, exporter.name, rays, console)
+    design, laid_out = _design_and_rays(design, path, exporter.name, rays, at, console)
     notes = list(exporter.write(design, laid_out, target))
     for note in notes:
         console.note(f"note: {note}")
@@ -92,29 +101,52 @@ def _export(path: Path | None, name: str | None, out: Path | None, rays: int | N
     console.result(document, lambda rich: rich.print(f"wrote {target} ({content})", soft_wrap=True, markup=False))
 
 
-def _design_and_rays(design: Design, path: Path, name: str, count: int | None, console: Console) -> tuple[Design, Rays]:
-    """A design and its explicit rays; another number of rays than its own may need the samples of its run.
+def _design_and_rays(
+    design: Design, path: Path, name: str, count: int | None, at: Mapping[str, float], console: Console
+) -> tuple[Design, Rays]:
+    """A design and its explicit rays at a condition; another number of rays may need the samples of its run.
 
     A scan of another number of rays has other sensors, so the design that is exported is that one. A design that
     leaves its number of rays open takes the largest budget of its task.
     """
     from lidardesign.cli.runs import run_of
     from lidardesign.design.rays import lay_out, own_count, refitted
-    from lidardesign.design.samples import load_samples
+    from lidardesign.design.track import placed
 
+    if at or design.track is not None:
+        # refuses a wrong place before anything is fitted
+        placed(design, at)
     if count is None and _is_open(design) and name not in WITHOUT_RAYS:
         run = run_of(design, path)
         if run is None:
             raise ConfigError("the design leaves the number of rays open", where=str(path), hint="give --rays N")
         count = max(run.task.defaults.rays)
         console.note(f"note: the design leaves the number of rays open; {count} is the task's largest budget")
-    samples = None
+    samples, retarget = None, None
     if count is not None and design.layout != "grid" and count != own_count(design):
         run = run_of(design, path)
-        samples = load_samples(run.folder) if run else None
+        if run is not None:
+            samples, retarget = _samples(run, design, at)
         if design.layout == "scan":
             design = refitted(design, count, samples)
-    return design, lay_out(design, 0 if name in WITHOUT_RAYS else count, samples)
+    laid_out = lay_out(design, 0 if name in WITHOUT_RAYS else count, samples, at=at, retarget=retarget)
+    return placed(design, at) if at or design.track is not None else design, laid_out
+
+
+def _samples(run: Run, design: Design, at: Mapping[str, float]) -> tuple[Samples, Retarget]:
+    """The samples that a design follows from: of all conditions for a track, else of the design's own."""
+    from lidardesign.cli.fit import log_target
+    from lidardesign.design.conditions import conditioned
+    from lidardesign.design.samples import load_samples
+
+    samples = load_samples(run.folder)
+
+    def retarget(points: np.ndarray) -> np.ndarray:
+        return log_target(run, points)
+
+    if design.track is None and samples.space.conditioned:
+        samples = conditioned(samples, {**at, **design.at}, retarget)
+    return samples, retarget
 
 
 def _is_open(design: Design) -> bool:

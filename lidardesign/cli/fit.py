@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,7 +10,7 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
-from lidardesign.cli.runs import check_choice, check_name, open_run, provenance, sensor_count
+from lidardesign.cli.runs import check_choice, check_name, open_run, parse_at, provenance, sensor_count
 from lidardesign.errors import DataError
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from lidardesign.design.sensor import Design
     from lidardesign.space import DesignSpace
 
-LAYOUTS = ("grid", "density", "scan")
+LAYOUTS = ("grid", "density", "scan", "distributed")
 GATES = ("sensor", "ray")
 
 
@@ -33,6 +34,7 @@ def fit(
     layout: options.Layout = None,
     rays: options.RayCount = None,
     gates: options.Gates = "sensor",
+    at: options.At = None,
     name: options.Name = "fit",
     seed: options.Seed = None,
     json: options.Json = False,
@@ -42,10 +44,12 @@ def fit(
     """Fit sensors to the density of RUN."""
     with command(json=json, quiet=quiet, debug=debug) as console:
         check_name(name)
-        layout = check_choice(layout or "grid", "--layout", LAYOUTS)
+        if layout is not None:
+            check_choice(layout, "--layout", LAYOUTS)
         check_choice(gates, "--gates", GATES)
-        count = sensor_count(sensors, None)
+        count, condition = sensor_count(sensors, None), parse_at(at)
         opened = open_run(run)
+        layout = layout or opened.task.defaults.layout
         open_budget = layout == "grid" and gates == "sensor"
         budget = rays if rays is not None or open_budget else max(opened.task.defaults.rays)
         fit_and_write(
@@ -58,6 +62,7 @@ def fit(
             layout=layout,
             rays=budget,
             gates=gates,
+            at=condition,
         )
 
 
@@ -69,6 +74,7 @@ def fit_and_write(
     name: str,
     seed: int,
     constraints: Any = None,
+    at: Mapping[str, float] | None = None,
     **choices: Any,
 ) -> None:
     """Fit a design to a run's samples, write it, and give the result.
@@ -80,23 +86,22 @@ def fit_and_write(
         name: The design's name and its file's.
         seed: Root of the random streams.
         constraints: Checked constraints, or None.
+        at: Condition values that the design is for; without any, one for all of them.
         choices: sensors, layout, rays and gates, as `lidardesign.design.fit.fit` takes them.
     """
     from dataclasses import replace
 
     from lidardesign.cli.designs import show_fit, write_design
     from lidardesign.design.fit import fit as fit_design
-    from lidardesign.design.samples import load_samples
 
     path = run.design_path(name)
-    samples = load_samples(run.folder)
-    _check_worth(samples, run)
+    samples = _samples_at(run, at or {}, seed, choices.get("rays"), console)
     result: FitResult = fit_design(
         samples,
         constraints=constraints,
         seed=seed,
         name=name,
-        retarget=lambda points: _log_target(run, points),
+        retarget=lambda points: log_target(run, points),
         **choices,
     )
     for note in result.notes:
@@ -112,6 +117,30 @@ def fit_and_write(
     }
     document["satisfied"] = all(check.satisfied for check in checks)
     console.result(document, lambda rich: show_fit(document, design, checks, rich))
+
+
+def _samples_at(run: Run, at: Mapping[str, float], seed: int, rays: int | None, console: Console) -> Samples:
+    """The samples of a run, given its conditions where they have values.
+
+    Raises:
+        ConfigError: A name that is no condition of the density, or a value outside its bounds.
+        DataError: The samples are worth too few.
+    """
+    from lidardesign.design.conditions import MOVED_SAMPLES, at_condition, shown
+    from lidardesign.design.rays import SAMPLES_PER_RAY
+    from lidardesign.design.samples import load_samples
+    from lidardesign.task import random_generator
+
+    run.config.space.at(at)
+    samples = load_samples(run.folder)
+    _check_worth(samples, run)
+    if not at:
+        return samples
+    count = max(MOVED_SAMPLES, SAMPLES_PER_RAY * (rays or 0))
+    generator = random_generator(seed, "condition")
+    moved = at_condition(samples, at, lambda points: log_target(run, points), count, generator)
+    console.note(f"note: at {shown(at)} {len(moved)} samples have ESS {moved.effective_sample_size:.2f}")
+    return moved
 
 
 def _check_worth(samples: Samples, run: Run) -> None:
@@ -132,8 +161,8 @@ def _check_worth(samples: Samples, run: Run) -> None:
         )
 
 
-def _log_target(run: Run, points: np.ndarray) -> np.ndarray:
-    """log p* of design points, (N, 6) to (N,): only a pinned origin needs it, and only then it is loaded."""
+def log_target(run: Run, points: np.ndarray) -> np.ndarray:
+    """log p* of design points, (N, 6) to (N,): only a pinned origin or a condition needs it, and then it is loaded."""
     from lidardesign.density.prepare import prepare_target
     from lidardesign.run.manifest import read_manifest
 

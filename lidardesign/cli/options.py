@@ -20,9 +20,18 @@ Layout = Annotated[
     str | None,
     typer.Option(
         "--layout",
-        metavar="grid|density|scan",
-        help="Rays even in the field of view, by density, or each its own sensor.",
-        show_default="grid",
+        metavar="grid|density|scan|distributed",
+        help="Rays even in the field of view, by density, each its own sensor, or starting across the origins.",
+        show_default="the design's or the task's",
+    ),
+]
+At = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--at",
+        metavar="NAME=VALUE",
+        help="A condition of the density, as x_m=0.37: exact, no window; repeatable.",
+        show_default=False,
     ),
 ]
 RayCount = Annotated[

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from dataclasses import dataclass
@@ -141,6 +142,27 @@ def check_choice(value: str, option: str, allowed: tuple[str, ...]) -> str:
     if value not in allowed:
         raise ConfigError(f"{value!r}", where=option, allowed=", ".join(allowed))
     return value
+
+
+def parse_at(texts: list[str] | None) -> dict[str, float]:
+    """The values of `--at`, as {"x_m": 0.37}; whether a density has them is for the design space to say.
+
+    Raises:
+        ConfigError: One is not NAME=VALUE with a finite number, or a name is given twice.
+    """
+    found: dict[str, float] = {}
+    for text in texts or []:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not (name and equals and math.isfinite(number)):
+            raise ConfigError(f"{text!r}", where="--at", allowed="NAME=VALUE with a finite number, as x_m=0.37")
+        if name in found:
+            raise ConfigError(f"{name} is given twice: {found[name]:g} and {number:g}", where="--at")
+        found[name] = number
+    return found
 
 
 def sensor_count(text: str | None, fallback: int | str | None) -> int | str | None:

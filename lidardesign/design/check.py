@@ -70,7 +70,10 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
         checks += _intervals(name, sensor, own, z)
         if bounds is not None:
             checks += _inside_space(name, sensor, bounds)
-    return checks + _table(document, rules) + _budget(document, rules)
+    checks += _table(document, rules)
+    if document.get("track"):
+        checks += _track(document["track"], document, rules, bounds)
+    return checks + _budget(document, rules)
 
 
 def _over(common: Mapping[str, Any], special: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -222,16 +225,37 @@ def _inside_space(name: str, sensor: Mapping[str, Any], space: Mapping[str, Any]
     return checks
 
 
-def _widths(document: Mapping[str, Any]) -> list[tuple[float, int]] | None:
-    """Gate widths and how many rays have them; None where the document fixes no rays."""
+def _widths(document: Mapping[str, Any], budget: Mapping[str, Any]) -> list[tuple[float, int]] | None:
+    """Gate widths and how many rays have them, of a track where they cost most; None without a number of rays."""
     table = document.get("ray_table")
     if table:
         pairs = zip(table["gate_start_m"], table["gate_end_m"], strict=True)
         return [(end - start, 1) for start, end in pairs]
+    if document.get("track"):
+        return _dearest(document["track"], budget)
     sensors = document["sensors"]
     if any(sensor.get("rays") is None for sensor in sensors):
         return None
     return [(s["gate_m"]["end"] - s["gate_m"]["start"], int(s["rays"])) for s in sensors]
+
+
+def _dearest(track: Mapping[str, Any], budget: Mapping[str, Any]) -> list[tuple[float, int]]:
+    """Gate widths where a track needs most bins: widths are linear between knots, so bins change only where one
+    crosses a whole number, and one place between each two of these tells all."""
+    bin_m = LIGHT_M_PER_S * budget.get("bin_ps", 100.0) * 1e-12 / 2
+    width = np.array(track["gate_end_m"], dtype=np.float64) - np.array(track["gate_start_m"], dtype=np.float64)
+    places = [width]
+    for left, right in zip(width[:-1] / bin_m, width[1:] / bin_m, strict=True):
+        crossings = [0.0, 1.0]
+        for one, other in zip(left, right, strict=True):
+            whole = np.arange(math.ceil(min(one, other)), math.floor(max(one, other)) + 1)
+            crossings += [] if one == other else list((whole - one) / (other - one))
+        shares = np.sort(crossings)
+        middle = (shares[1:] + shares[:-1])[:, None] / 2
+        places.append(bin_m * ((1 - middle) * left + middle * right))
+    every = np.concatenate(places)
+    bins = np.maximum(np.ceil(every / bin_m * (1 - BIN_ROUNDING)), 1).sum(axis=1)
+    return [(float(width), 1) for width in every[bins.argmax()]]
 
 
 def _table(document: Mapping[str, Any], rules: Mapping[str, Any]) -> list[ConstraintCheck]:
@@ -249,9 +273,57 @@ def _table(document: Mapping[str, Any], rules: Mapping[str, Any]) -> list[Constr
     return failed
 
 
+def _track(
+    track: Mapping[str, Any], document: Mapping[str, Any], rules: Mapping[str, Any], space: Any
+) -> list[ConstraintCheck]:
+    """Gates and boresights at every knot; in between they are linear, and these bounds are convex.
+
+    Only broken bounds are listed, but for the ends of the track, which must lie in the design space.
+    """
+    failed = []
+    for knot in range(len(track["knots_m"])):
+        rows = (track[key][knot] for key in ("gate_start_m", "gate_end_m", "azimuth_rad", "elevation_rad"))
+        for ray, (start, end, azimuth, elevation) in enumerate(zip(*rows, strict=True)):
+            name = f"ray{ray}.knot{knot}"
+            gate = {"start": start, "end": end}
+            aimed = {"azimuth_rad": azimuth, "elevation_rad": elevation}
+            origin = {"mean": [0.0, 0.0, 0.0]}
+            one = {"gate_m": gate, "boresight": aimed, "origin_m": origin}
+            found = _boresight(name, one, rules, space)
+            for key, value in (("start_m", start), ("end_m", end), ("width_m", end - start)):
+                found += _between(f"{name}.gate.{key}", value, _get(rules, "gate", key))
+            if space is not None:
+                found += _looks_inside(name, one, space)
+            failed += [check for check in found if not check.satisfied]
+    if space is None:
+        return failed
+    low, high = (float(value) for value in space[track["dimension"]])
+    first, last = track["knots_m"][0], track["knots_m"][-1]
+    inside = first >= low - _slack(low) and last <= high + _slack(high)
+    return [*failed, ConstraintCheck(f"track.space.{track['dimension']}", [low, high], [first, last], bool(inside))]
+
+
+def _looks_inside(name: str, ray: Mapping[str, Any], space: Mapping[str, Any]) -> list[ConstraintCheck]:
+    """The gate and the elevation of a ray inside the design space, and its azimuth on the circle."""
+    checks = []
+    near, far = (float(v) for v in space["range_m"])
+    start, end = ray["gate_m"]["start"], ray["gate_m"]["end"]
+    inside = start >= near - _slack(near) and end <= far + _slack(far)
+    checks.append(ConstraintCheck(f"{name}.space.range_m", [near, far], [start, end], bool(inside)))
+    low, high = (float(v) for v in space["elevation_rad"])
+    elevation = ray["boresight"]["elevation_rad"]
+    inside = low - _slack(low) <= elevation <= high + _slack(high)
+    checks.append(ConstraintCheck(f"{name}.space.elevation_rad", [low, high], elevation, bool(inside)))
+    low, high = (float(v) for v in space["azimuth_rad"])
+    past = (ray["boresight"]["azimuth_rad"] - low) % (2 * math.pi)
+    inside = past <= high - low + _slack(math.pi) or past >= 2 * math.pi - _slack(math.pi)
+    azimuth = ray["boresight"]["azimuth_rad"]
+    return [*checks, ConstraintCheck(f"{name}.space.azimuth_rad", [low, high], azimuth, bool(inside))]
+
+
 def _budget(document: Mapping[str, Any], rules: Mapping[str, Any]) -> list[ConstraintCheck]:
     budget = rules.get("budget") or {}
-    widths = _widths(document)
+    widths = _widths(document, budget)
     total = None if widths is None else sum(count for _, count in widths)
     checks = []
     declared = document.get("rays")

@@ -23,9 +23,11 @@ from lidardesign.design.sensor import (
     Design,
     RayTable,
     Sensor,
+    Track,
     interval_factor,
 )
 from lidardesign.design.sensor_csv import looks_like_sensor_csv, read_sensor_csv
+from lidardesign.design.track_document import MOST_TRACK_RAYS, read_at, read_track, track_document
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.files import write_atomic
 from lidardesign.run.yaml import Document, dump_yaml, load_yaml
@@ -47,7 +49,7 @@ WEIGHT_SUM_TOLERANCE = 1e-9
 COVARIANCE_ROUNDING = 1e-9
 
 REQUIRED = ("schema_version", "sensors")
-OPTIONAL = ("name", "layout", "level", "rays", "ray_table", "constraints", "provenance")
+OPTIONAL = ("name", "layout", "level", "rays", "at", "ray_table", "track", "constraints", "provenance")
 SENSOR_REQUIRED = ("origin_m", "boresight")
 SENSOR_OPTIONAL = ("name", "weight", "field_of_view_rad", "gate_m", "range_m", "spread", "travel_m", "coupling", "rays")
 COUPLING_KEYS = ("direction_rad_per_m", "range_m_per_m", "range_m_per_rad", "spread_rad", "spread_m")
@@ -76,6 +78,10 @@ def design_document(design: Design) -> dict[str, Any]:
     }
     if design.ray_table is not None:
         document["ray_table"] = _table_document(design.ray_table)
+    if design.track is not None:
+        document["track"] = track_document(design.track)
+    if design.at:
+        document["at"] = {name: float(value) for name, value in design.at.items()}
     document["constraints"] = design.constraints
     document["provenance"] = design.provenance
     return document
@@ -117,6 +123,13 @@ def save_design(design: Design, path: Path) -> None:
             where=str(path),
             allowed=f"at most {MOST_TABLE_RAYS}",
             hint="the layout grid needs no table",
+        )
+    if design.track is not None and design.track.azimuth_rad.size > MOST_TRACK_RAYS:
+        raise ConfigError(
+            f"{design.track.azimuth_rad.size} rays at knots of the track",
+            where=str(path),
+            allowed=f"at most {MOST_TRACK_RAYS}",
+            hint="fewer rays per position",
         )
     write_atomic(Path(path), dump_yaml(design_document(design)))
 
@@ -165,7 +178,8 @@ def design_from_document(
     sensors = _sensors(keys["sensors"], level)
     rays = keys["rays"].integer(0) if "rays" in keys else None
     table = _ray_table(keys["ray_table"], len(sensors)) if "ray_table" in keys else None
-    _check_rays(keys, sensors, rays, table)
+    track = read_track(keys["track"], len(sensors)) if "track" in keys else None
+    _check_rays(keys, sensors, rays, table, track)
     return Design(
         name=keys["name"].text() if "name" in keys else Path(where).stem,
         sensors=sensors,
@@ -175,6 +189,8 @@ def design_from_document(
         constraints=keys["constraints"].plain() if "constraints" in keys else {},
         provenance=keys["provenance"].plain() if "provenance" in keys else {},
         level=level,
+        track=track,
+        at=read_at(keys["at"]) if "at" in keys else {},
     )
 
 
@@ -377,9 +393,15 @@ def _ray_table(node: Node, sensors: int) -> RayTable:
 
 
 def _check_rays(
-    keys: dict[str, Node], sensors: tuple[Sensor, ...], rays: int | None, table: RayTable | None
+    keys: dict[str, Node],
+    sensors: tuple[Sensor, ...],
+    rays: int | None,
+    table: RayTable | None,
+    track: Track | None,
 ) -> None:
-    """The three places that may count rays must agree."""
+    """The places that may count rays must agree, and one of them says where rays go."""
+    if table is not None and track is not None:
+        raise keys["track"].error("is given beside ray_table", hint="remove either of the two")
     counts: dict[str, int] = {}
     if rays is not None:
         counts["rays"] = rays
@@ -387,6 +409,8 @@ def _check_rays(
         counts["the sum of sensors[].rays"] = sum(sensor.rays or 0 for sensor in sensors)
     if table is not None:
         counts["ray_table"] = len(table.sensor)
+    if track is not None:
+        counts["track"] = len(track.sensor)
     if len(set(counts.values())) > 1:
         node = keys.get("rays", keys["sensors"])
         found = ", ".join(f"{name} {count}" for name, count in counts.items())

@@ -11,6 +11,7 @@ import numpy as np
 
 from lidardesign.design.budget import ReadOut, within_budget
 from lidardesign.design.check import ConstraintCheck, check_design
+from lidardesign.design.conditions import fixed_conditions
 from lidardesign.design.constraints import Constraints
 from lidardesign.design.coupling import couplings
 from lidardesign.design.ensemble import Ensemble, Part, fit_parts, heaviest_first, sensors_of
@@ -22,7 +23,9 @@ from lidardesign.design.samples import Samples
 from lidardesign.design.scan import fit_scan, rays_of
 from lidardesign.design.sensor import DEFAULT_LEVEL, Design, Layout, Sensor, interval_factor
 from lidardesign.design.support import Retarget, Support, check_support, pinned, restricted
+from lidardesign.design.track_fit import fit_track
 from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.space import DIMENSIONS
 from lidardesign.task import random_generator
 
 DEFAULT_SENSORS = 4
@@ -131,6 +134,8 @@ def fit(
     started = time.perf_counter()
     constraints = Constraints() if constraints is None else constraints
     _check_options(constraints, samples, sensors, layout, rays)
+    if samples.space.conditioned:
+        return _along_condition(samples, constraints, rays, level, seed, name)
     request = _Request(samples, constraints, seed, restarts, em_samples, level, retarget)
     read_out = ReadOut.of(constraints.budget, rays)
     supports, fitted, total, score, notes = _solved(request, read_out, sensors, layout)
@@ -145,6 +150,24 @@ def fit(
         constraints=checks,
         seconds=time.perf_counter() - started,
         notes=notes,
+    )
+
+
+def _along_condition(
+    samples: Samples, constraints: Constraints, rays: int | None, level: float, seed: int, name: str
+) -> FitResult:
+    """A track: the rays of a scan for every value of the samples' condition."""
+    started = time.perf_counter()
+    fitted = fit_track(samples, rays=rays, constraints=constraints, level=level, seed=seed, name=name)
+    checks = check_design(_document(fitted.design), constraints, samples.space)
+    return FitResult(
+        design=fitted.design,
+        log_likelihood=fitted.log_likelihood,
+        admissible_mass=fitted.admissible_mass,
+        ess=fitted.ess,
+        satisfied=all(check.satisfied for check in checks),
+        constraints=checks,
+        seconds=time.perf_counter() - started,
     )
 
 
@@ -177,6 +200,13 @@ def _check_options(
         raise ConfigError(f"{sensors} sensors", where="--sensors", allowed="1 or more")
     if rays is not None and rays < 1:
         raise ConfigError(f"{rays} rays", where="--rays", allowed="1 or more")
+    if samples.space.conditioned and layout != "scan":
+        names = [DIMENSIONS[index] for index in samples.space.conditioned]
+        raise ConfigError(
+            f"the density has conditions ({', '.join(names)}), and only a scan has rays for all their values",
+            where=f"--layout {layout}",
+            hint=f"--layout scan, or {' '.join(f'--at {condition}=VALUE' for condition in names)}",
+        )
     budget = constraints.budget.rays
     if rays is not None and budget is not None and rays != budget:
         raise InfeasibleError(f"{rays} and {budget} rays asked for", conflicts=["--rays", "budget.rays"])
@@ -325,6 +355,7 @@ def _design(
         rays=total,
         constraints=request.constraints.as_document(),
         level=request.level,
+        at=fixed_conditions(request.samples.space),
     )
     if total is None or (layout == "grid" and gates == "sensor"):
         return design

@@ -6,21 +6,25 @@ explicit table keeps its own order), and fire evenly over the frame: ray i of n 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from lidardesign.design.bounds import Bounds
+from lidardesign.design.conditions import conditioned
 from lidardesign.design.constraints import Constraints
-from lidardesign.design.gates import SMALLEST_CELL, admissible_gates, central_intervals
+from lidardesign.design.gates import SMALLEST_CELL, central_intervals, kept_gates
 from lidardesign.design.grid import field_on_sphere, grid_tangent
 from lidardesign.design.membership import Members, members
 from lidardesign.design.quantise import lloyd
 from lidardesign.design.resolve import bounds_of, groups
 from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import Design, RayTable, Sensor, interval_factor, tangent_directions
+from lidardesign.design.support import Retarget
+from lidardesign.design.track import moved, placed
 from lidardesign.errors import ConfigError
 from lidardesign.simulate.returns import Rays
 from lidardesign.space import DesignSpace, angles, direction
@@ -33,6 +37,10 @@ REMAINDER_DECIMALS = 9
 # Lloyd's cells need no more samples than this: the centre of a cell is then known to a tenth of its width.
 SAMPLES_PER_RAY = 64
 SMALLEST_SAMPLE = 2000
+
+
+# A design is asked for at many places of a track; the samples and the design decide what a refit finds.
+_REFITS: WeakKeyDictionary[Samples, WeakKeyDictionary[Design, dict[tuple[int, int], Design]]] = WeakKeyDictionary()
 
 
 def split_budget(weights: np.ndarray, count: int) -> np.ndarray:
@@ -69,6 +77,8 @@ def lay_out(
     gates: Gates = "sensor",
     rate_hz: float = DEFAULT_RATE_HZ,
     seed: int = 0,
+    at: Mapping[str, float] | None = None,
+    retarget: Retarget | None = None,
 ) -> Rays:
     """The rays of a design.
 
@@ -83,15 +93,55 @@ def lay_out(
         gates: `sensor` gives each ray its sensor's gate; `ray` the interval of the ranges seen around it.
         rate_hz: Frames per second [Hz].
         seed: For the quantisation.
+        at: Condition values, as {"x_m": 0.37}: a track gives its rays there, and any other design moves there as
+            it is, see `track.placed`.
+        retarget: log p* of design points (N, 6), where the samples are of a density with conditions.
 
     Raises:
-        ConfigError: No number of rays is known, or the layout at this count needs samples.
+        ConfigError: No number of rays is known, the layout at this count needs samples, or a track's place is
+            not given.
     """
+    if design.track is not None:
+        return _on_track(design, count, samples, at or {}, rate_hz, seed)
+    # what moves was fitted where it was made: its rays are laid out there, then moved
+    home = {**(at or {}), **design.at}
+    here = placed(design, home) if home else design
+    if samples is not None and samples.space.conditioned and _asks_samples(here, count, gates):
+        samples = conditioned(samples, home, retarget)
+    rays = _laid_out(here, count, samples, gates, rate_hz, seed)
+    return moved(rays, design, at) if at else rays
+
+
+def _on_track(
+    design: Design, count: int | None, samples: Samples | None, at: Mapping[str, float], rate_hz: float, seed: int
+) -> Rays:
+    """The rays of a track at a position; another number of them is another track."""
+    total = own_count(design) if count is None else count
+    if total not in (0, own_count(design)):
+        design = refitted(design, total, samples, seed)
+    here = placed(design, at)
+    return _laid_out(here if total else replace(here, ray_table=None), total, None, "sensor", rate_hz, seed)
+
+
+def _asks_samples(design: Design, count: int | None, gates: Gates) -> bool:
+    """Whether the rays of a design at a count follow from samples of the density."""
+    total = own_count(design) if count is None else count
+    if total == 0 or (design.ray_table is not None and len(design.ray_table.sensor) == total):
+        return False
+    if design.layout == "scan":
+        return total != own_count(design) or gates == "ray"
+    return design.layout == "density" or gates == "ray"
+
+
+def _laid_out(
+    design: Design, count: int | None, samples: Samples | None, gates: Gates, rate_hz: float, seed: int
+) -> Rays:
+    """The rays of a design where it stands, see `lay_out`."""
     total = own_count(design) if count is None else count
     if design.ray_table is not None and len(design.ray_table.sensor) == total:
         return _table_rays(design.ray_table, rate_hz)
     if design.layout == "scan" and total not in (0, own_count(design)):
-        return lay_out(refitted(design, total, samples, seed), total, gates="sensor", rate_hz=rate_hz)
+        return _laid_out(refitted(design, total, samples, seed), total, None, "sensor", rate_hz, seed)
     shares = _shares(design, total)
     seen = None
     if total and (gates == "ray" or design.layout == "density"):
@@ -166,6 +216,13 @@ def refitted(design: Design, total: int, samples: Samples | None, seed: int = 0)
     """
     if samples is None:
         raise _needs_samples(design, total, "sensor")
+    known = _REFITS.setdefault(samples, WeakKeyDictionary()).setdefault(design, {})
+    if (total, seed) not in known:
+        known[total, seed] = _refit(design, total, samples, seed)
+    return known[total, seed]
+
+
+def _refit(design: Design, total: int, samples: Samples, seed: int) -> Design:
     # fit lays out what it fits, so it stands above this module
     from lidardesign.design.fit import fit
 
@@ -260,20 +317,6 @@ def _ray_gates(design: Design, tangents: list[np.ndarray], seen: list[Members], 
             known = np.flatnonzero((effective >= SMALLEST_CELL) & (np.diff(wanted, axis=1)[:, 0] > 0))
             wanted = np.clip(wanted[known], *sensor.gate_m)
             bounds = bounds_of(constraints, space, (index,), interval_factor(design.level))
-            own[known] = _kept(wanted, sensor, bounds.take(np.zeros(len(known), dtype=np.int64)))
+            own[known] = kept_gates(wanted, sensor, bounds.take(np.zeros(len(known), dtype=np.int64)))
         gates.append(own)
     return np.concatenate(gates)
-
-
-def _kept(wanted: np.ndarray, sensor: Sensor, bounds: Bounds) -> np.ndarray:
-    """Wanted gates (K, 2), those that break a bound replaced by the best gate that keeps all of them [m]."""
-    start, end = sensor.gate_m
-    width = np.diff(wanted, axis=1)[:, 0]
-    broken = (wanted[:, 0] > bounds.start_high) | (wanted[:, 1] < bounds.end_low) | (width < bounds.width_low)
-    if not broken.any():
-        return wanted
-    inner = replace(bounds, start_low=np.full(len(wanted), start), end_high=np.full(len(wanted), end))
-    centre, spread = admissible_gates(wanted, inner)
-    half = bounds.interval * spread
-    moved = np.clip(np.stack([centre - half, centre + half], axis=1), start, end)
-    return np.where(broken[:, None], moved, wanted)

@@ -1,0 +1,480 @@
+r"""Fitting a track: the rays of a scan for every value of one condition, as the position of a robot that drives by.
+
+Directions are Lloyd's cells along the condition. With hat functions h_p(x) over the knots, ray n looks at
+$c_n(x) = \sum_p h_p(x) c_{p,n}$, and what is minimised is
+
+$$\sum_i w_i \min_n |f_i - c_n(x_i)|^2 + \rho\, \bar m \sum_{p,n} |c_{p-1,n} - 2 c_{p,n} + c_{p+1,n}|^2,$$
+
+f_i a sample's unit vector, x_i its own condition value, w_i its importance weight, and m the mean mass of a ray at
+a knot: no sample is moved or cut off, rays stay themselves, and knots where a ray sees nothing are bridged
+straight. Cells and knots are updated in turn, each exactly, so the sum falls until it stays. It starts from Lloyd's
+cells at each knot, begun at the neighbouring knot's, outward from the knot with most samples.
+
+The kernel of knot p is its hat function, so the bandwidth is the distance of knots, and every sample counts once
+in all. Knots lie 0.1 m apart, over which scenes with the surfaces of the density's resolution hardly change, or
+further where fewer samples than `SAMPLES_PER_CELL` would be left for each ray of a knot.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from lidardesign.design.bounds import Bounds
+from lidardesign.design.budget import ReadOut, within_budget
+from lidardesign.design.conditions import fixed_conditions
+from lidardesign.design.constraints import Constraints
+from lidardesign.design.em import from_labels
+from lidardesign.design.features import Axes, Features
+from lidardesign.design.gates import admissible_gates, central_intervals
+from lidardesign.design.mixture import Mixture, log_density
+from lidardesign.design.quantise import lloyd
+from lidardesign.design.resolve import Group, bounds_of, origin_box
+from lidardesign.design.samples import Samples
+from lidardesign.design.sensor import DEFAULT_LEVEL, Design, Sensor, Track, interval_factor
+from lidardesign.design.support import check_support, restricted
+from lidardesign.design.track import TRAVELLED, interpolated
+from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.numerics import effective_count
+from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, DesignSpace, angles, direction, observed_point
+from lidardesign.task import random_generator
+
+KNOT_SPACING_M = 0.1
+# The ends of a 95 % interval are then each known from one sample in forty.
+SAMPLES_PER_CELL = 40
+# The gate at a knot is taken over so many knots on either side: its ends need more samples than a mean does.
+GATE_REACH = 2
+ROUGHNESS = 0.1
+LLOYD_ITERATIONS = 15
+SWEEPS = 15
+# Mean elevations closer than this are the same row [rad].
+ORDER_DECIMALS = 9
+# Distances of so many samples to all rays are held at once.
+BLOCK = 16384
+# Roughness relative to the mass of a knot that keeps the normal equations solvable where a ray sees nothing.
+SMALLEST_STIFFNESS = 1e-9
+
+
+class FittedTrack(NamedTuple):
+    """A design with a track, and how good it is.
+
+    Arguments:
+        design: One sensor per ray: the ray in the middle of its travel.
+        log_likelihood: Weighted mean log density of the samples, given their condition [nats].
+        admissible_mass: The share of the density inside the constraints.
+        ess: Effective share of the samples that were admitted, 0 to 1.
+    """
+
+    design: Design
+    log_likelihood: float
+    admissible_mass: float
+    ess: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Along:
+    """Weighted samples along a condition.
+
+    Arguments:
+        points: Design points, shape (M, 6).
+        weights: Summing to 1, shape (M,).
+        left: The knot on the left of each sample, shape (M,).
+        share: How far it is from there to the next knot, 0 to 1, shape (M,).
+        knots: Shape (P,).
+        dimension: Index of the condition.
+        space: The design space.
+    """
+
+    points: np.ndarray
+    weights: np.ndarray
+    left: np.ndarray
+    share: np.ndarray
+    knots: np.ndarray
+    dimension: int
+    space: DesignSpace
+
+    @classmethod
+    def of(
+        cls, points: np.ndarray, weights: np.ndarray, knots: np.ndarray, dimension: int, space: DesignSpace
+    ) -> _Along:
+        values = points[:, dimension]
+        left = np.clip(np.searchsorted(knots, values, side="right") - 1, 0, len(knots) - 2)
+        share = np.clip((values - knots[left]) / (knots[left + 1] - knots[left]), 0.0, 1.0)
+        return cls(points, weights / weights.sum(), left, share, knots, dimension, space)
+
+    def near(self, knot: int, reach: int = 1) -> tuple[np.ndarray, np.ndarray]:
+        """Samples within `reach` knots of one, and their hat function's weights times their own, shape (W,)."""
+        hat = 1 - np.abs(self.left + self.share - knot) / reach
+        chosen = np.flatnonzero(hat > 0)
+        return chosen, self.weights[chosen] * hat[chosen]
+
+    def between(self, values: np.ndarray, labels: np.ndarray) -> np.ndarray:
+        """Knot values (P, N, ...) of each sample's ray at its own condition, shape (M, ...)."""
+        share = self.share.reshape(-1, *[1] * (values.ndim - 2))
+        return (1 - share) * values[self.left, labels] + share * values[self.left + 1, labels]
+
+
+def fit_track(
+    samples: Samples,
+    *,
+    rays: int | None = None,
+    constraints: Constraints | None = None,
+    level: float = DEFAULT_LEVEL,
+    seed: int = 0,
+    name: str = "design",
+    knots: int | None = None,
+) -> FittedTrack:
+    """Rays for every value of the one condition that the samples leave free.
+
+    Arguments:
+        samples: Weighted samples of the density, its condition uniform over its bounds.
+        rays: Rays per position; None takes the budget's.
+        constraints: Bounds that every ray keeps at every position; a bandwidth is that of the worst position.
+        level: The share of what a ray sees that its gate holds.
+        seed: Root of the quantisation's stream.
+        name: The design's name.
+        knots: How many; None chooses from the samples.
+
+    Raises:
+        ConfigError: The space has not just one condition that a sensor can travel along, or no number of rays.
+        InfeasibleError: Constraints that hold too little of the density or that no track keeps.
+    """
+    constraints = Constraints() if constraints is None else constraints
+    dimension = _travelled(samples.space)
+    read_out = ReadOut.of(constraints.budget, rays)
+    if read_out.rays is None:
+        raise ConfigError("a track needs its number of rays per position", where="--layout scan", hint="give --rays N")
+    group = Group((None, None, None), tuple(range(read_out.rays)))
+    ends = _ends(samples.space, constraints, dimension, level)
+    support = restricted(samples, constraints, group)
+    check_support(support, group, mass=support.total, several=False)
+    places = _knots(*ends, support.effective, read_out.rays, knots)
+    along = _Along.of(support.points, support.weights, places, dimension, samples.space)
+    bounds = bounds_of(constraints, samples.space, group.sensors, interval_factor(level))
+    centres, labels = _rays(along, read_out.rays, random_generator(seed, "track"))
+    azimuth, elevation = _admitted(centres, along, bounds)
+    track = _with_gates(along, labels, azimuth, elevation, bounds, level, read_out)
+    sensors, score = _sensors(along, labels, track, bounds, level)
+    design = Design(
+        name=name, sensors=sensors, layout="scan", rays=read_out.rays, constraints=constraints.as_document(),
+        level=level, track=track, at=fixed_conditions(samples.space),
+    )  # fmt: skip
+    ess = support.effective / max(len(support.points), 1)
+    return FittedTrack(design, score, float(support.total), float(ess))
+
+
+def _travelled(space: DesignSpace) -> int:
+    """The one condition that is free, which must be a coordinate of the origin, the others fixed.
+
+    Raises:
+        ConfigError: It is not so.
+    """
+    names = [DIMENSIONS[index] for index in space.conditioned]
+    if len(names) != 1 or names[0] not in TRAVELLED:
+        raise ConfigError(
+            f"no track along {', '.join(names) or 'no condition'}: a track follows one coordinate of the origin",
+            where="--layout scan",
+            hint="give --at " + " --at ".join(f"{name}=VALUE" for name in names) if names else None,
+        )
+    free = [DIMENSIONS[index] for index in range(3) if index in space.free and DIMENSIONS[index] != names[0]]
+    if free:
+        raise ConfigError(
+            f"rays along {names[0]} start at one place beside it, but {', '.join(free)} is free",
+            where="--layout scan",
+            hint=f"learn with --set space.{free[0]}=VALUE, or give --at {names[0]}=VALUE",
+        )
+    return space.conditioned[0]
+
+
+def _travel_spread(length_m: float, level: float) -> float:
+    """The standard deviation of an origin whose interval is its travel [m]."""
+    return length_m / (2 * interval_factor(level))
+
+
+def _ends(space: DesignSpace, constraints: Constraints, dimension: int, level: float) -> tuple[float, float]:
+    """From where to where the rays travel [m].
+
+    Raises:
+        InfeasibleError: The constraints hold the origin still.
+    """
+    one = constraints.of_sensor(0)
+    low, high = (float(end[dimension]) for end in origin_box(one, space))
+    name = DIMENSIONS[dimension]
+    if not low < high:
+        raise InfeasibleError(
+            f"the origin is fixed at {name}={low:g}, but a track follows {name}",
+            conflicts=["origin", "--layout scan"],
+            hint=f"give --at {name}={low:g} instead",
+        )
+    limit = one.origin.spread_m.max
+    spread = _travel_spread(high - low, level)
+    if limit is not None and spread > limit:
+        raise InfeasibleError(
+            f"a track from {low:g} to {high:g} m has a spread of {spread:.3g} m along {name}",
+            conflicts=["origin.spread_m.max", f"space.{name}"],
+            allowed=f"at most {limit:g} m",
+            hint="a shorter origin box, or --at",
+        )
+    return low, high
+
+
+def _knots(low: float, high: float, effective: float, rays: int, wanted: int | None) -> np.ndarray:
+    """Even knots from end to end, shape (P,) [m]."""
+    if wanted is not None:
+        if wanted < 2:
+            raise ConfigError(f"{wanted} knots", where="track", allowed="2 or more")
+        return np.linspace(low, high, wanted)
+    usual = math.ceil((high - low) / KNOT_SPACING_M - SMALLEST_STIFFNESS)
+    affordable = int(effective / (rays * SAMPLES_PER_CELL))
+    return np.linspace(low, high, max(min(usual, affordable), 1) + 1)
+
+
+def _rays(along: _Along, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors of the rays at the knots (P, N, 3), and the ray of each sample (M,)."""
+    looks = direction(along.points[:, AZIMUTH], along.points[:, ELEVATION])
+    centres = _started(along, looks, count, generator)
+    labels = _nearest(along, looks, centres)
+    for _ in range(SWEEPS):
+        centres = _smoothed(along, looks, labels, centres)
+        fresh = _nearest(along, looks, centres)
+        if np.array_equal(fresh, labels):
+            break
+        labels = fresh
+    order = _upwards(centres)
+    return centres[:, order], np.argsort(order)[labels]
+
+
+def _upwards(centres: np.ndarray) -> np.ndarray:
+    """Rays by where they look on average: an order that does not depend on the seeding."""
+    azimuth, elevation = angles(centres.mean(axis=0))
+    return np.lexsort((azimuth, np.round(elevation, ORDER_DECIMALS)))
+
+
+def _started(along: _Along, looks: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Lloyd's cells at each knot, each begun at its neighbour's, from the best known knot outward: (P, N, 3)."""
+    windows = [along.near(knot) for knot in range(len(along.knots))]
+    worth = [effective_count(weights) for _, weights in windows]
+    first = int(np.argmax(worth))
+    chosen, weights = windows[first]
+    centres = np.empty((len(windows), count, 3))
+    centres[first], _ = lloyd(looks[chosen], weights, count, generator, iterations=LLOYD_ITERATIONS)
+    outward = [(knot - 1, knot) for knot in range(first + 1, len(windows))]
+    outward += [(knot + 1, knot) for knot in reversed(range(first))]
+    for before, knot in outward:
+        chosen, weights = windows[knot]
+        centres[knot] = centres[before]
+        if len(chosen) > count and weights.max(initial=0.0) > 0:
+            centres[knot], _ = lloyd(
+                looks[chosen], weights, count, generator, iterations=LLOYD_ITERATIONS, start=centres[before]
+            )
+    return centres
+
+
+def _nearest(along: _Along, looks: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """The ray that looks nearest to each sample at the sample's own condition, shape (M,)."""
+    labels = np.empty(len(looks), dtype=np.int64)
+    for start in range(0, len(looks), BLOCK):
+        part = slice(start, start + BLOCK)
+        left, share = along.left[part], along.share[part, None, None]
+        here = (1 - share) * centres[left] + share * centres[left + 1]
+        labels[part] = np.square(here - looks[part, None]).sum(axis=2).argmin(axis=1)
+    return labels
+
+
+def _smoothed(along: _Along, looks: np.ndarray, labels: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """The knots' best unit vectors for given cells: a least-squares problem per ray, shape (P, N, 3)."""
+    knots, count, _ = centres.shape
+    rows = labels * knots + along.left
+    weights, share = along.weights, along.share
+    matrix = np.zeros((count, knots, knots))
+    flat = matrix.reshape(count * knots, knots)
+
+    def add(row: np.ndarray, column: np.ndarray, values: np.ndarray) -> None:
+        sums = np.bincount(row * knots + column, values, count * knots * knots)
+        flat.reshape(-1)[:] += sums
+
+    add(rows, along.left, weights * (1 - share) ** 2)
+    add(rows, along.left + 1, weights * share * (1 - share))
+    add(rows + 1, along.left, weights * share * (1 - share))
+    add(rows + 1, along.left + 1, weights * share**2)
+    right = np.stack(
+        [
+            np.bincount(rows, weights * (1 - share) * column, count * knots)
+            + np.bincount(rows + 1, weights * share * column, count * knots)
+            for column in looks.T
+        ],
+        axis=-1,
+    ).reshape(count, knots, 3)
+    mass = 1.0 / (count * knots)
+    # a ray that sees nothing anywhere stays where it was
+    matrix += mass * (ROUGHNESS * _bending(knots) + SMALLEST_STIFFNESS * np.eye(knots))
+    right += mass * SMALLEST_STIFFNESS * centres.transpose(1, 0, 2)
+    solved = np.linalg.solve(matrix, right).transpose(1, 0, 2)
+    return solved
+
+
+def _bending(knots: int) -> np.ndarray:
+    """The quadratic form of summed squared second differences, shape (P, P)."""
+    second = np.diff(np.eye(knots), n=2, axis=0)
+    return second.T @ second
+
+
+def _admitted(centres: np.ndarray, along: _Along, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuths, unrolled along the knots, and elevations inside their bounds, shape (P, N) each [rad]."""
+    azimuth, elevation = angles(centres)
+    space = along.space
+    if ELEVATION in space.free:
+        elevation = np.clip(elevation, bounds.elevation_low, bounds.elevation_high)
+    else:
+        elevation = np.full_like(elevation, space.low[ELEVATION])
+    if AZIMUTH not in space.free:
+        return np.full_like(azimuth, space.low[AZIMUTH]), elevation
+    bound = bounds.azimuth_half < math.pi
+    offset = azimuth - bounds.azimuth_centre
+    offset -= 2 * math.pi * np.round(offset / (2 * math.pi))
+    clipped = bounds.azimuth_centre + np.clip(offset, -bounds.azimuth_half, bounds.azimuth_half)
+    return np.where(bound, clipped, np.unwrap(azimuth, axis=0)), elevation
+
+
+def _with_gates(
+    along: _Along,
+    labels: np.ndarray,
+    azimuth: np.ndarray,
+    elevation: np.ndarray,
+    bounds: Bounds,
+    level: float,
+    read_out: ReadOut,
+) -> Track:
+    """The track with gates that hold the level of what each ray sees, inside bounds and within the bandwidth.
+
+    Raises:
+        InfeasibleError: Even the narrowest admitted gates exceed the bandwidth somewhere.
+    """
+    wanted = _wanted_gates(along, labels, azimuth, elevation, level)
+    knots, count = azimuth.shape
+
+    def track(limits: Bounds) -> Track:
+        rows = limits.take(np.tile(np.arange(count), knots))
+        centre, spread = admissible_gates(wanted.reshape(-1, 2), rows)
+        half = limits.interval * spread
+        # half an ulp may take a gate that starts at 0 below it
+        gate = np.maximum(np.stack([centre - half, centre + half], axis=1), 0.0).reshape(knots, count, 2)
+        return Track(DIMENSIONS[along.dimension], along.knots, azimuth, elevation, gate, np.arange(count))
+
+    even = np.full(count, 1.0 / count)
+    fitted, _ = within_budget(
+        track(bounds),
+        lambda _, width_m: track(bounds.narrowed(width_m)),
+        lambda t: (_worst_widths(t, read_out), even),
+        read_out,
+    )
+    return fitted
+
+
+def _worst_widths(track: Track, read_out: ReadOut) -> np.ndarray:
+    """Gate widths that cost at least what any position does: the wider of two neighbouring knots, ray by ray."""
+    width = np.diff(track.gate_m, axis=2)[:, :, 0]
+    wider = np.maximum(width[:-1], width[1:])
+    return wider[read_out.model.bins(wider).sum(axis=1).argmax()]
+
+
+def _wanted_gates(
+    along: _Along, labels: np.ndarray, azimuth: np.ndarray, elevation: np.ndarray, level: float
+) -> np.ndarray:
+    """Central intervals of what rays observe, projected onto them, smooth along the knots: (P, N, 2) [m]."""
+    knots, count = azimuth.shape
+    ray = along.between(direction(azimuth, elevation), labels)
+    ahead = ((observed_point(along.points) - along.points[:, :3]) * ray).sum(axis=1)
+    wanted = np.full((knots, count, 2), np.nan)
+    for knot in range(knots):
+        chosen, weights = along.near(knot, GATE_REACH)
+        wanted[knot], _ = central_intervals(ahead[chosen], weights, labels[chosen], count, level)
+    return _bridged(wanted)
+
+
+def _bridged(gates: np.ndarray) -> np.ndarray:
+    """Gates of knots at which a ray sees nothing, from its other knots, or from all rays': (P, N, 2) [m]."""
+    knots, count, _ = gates.shape
+    places = np.arange(knots)
+    known = np.isfinite(gates[:, :, 0])
+    everything = np.nanmin(gates[:, :, 0]), np.nanmax(gates[:, :, 1])
+    filled = gates.copy()
+    for ray in range(count):
+        own = known[:, ray]
+        for end in range(2):
+            filled[:, ray, end] = np.interp(places, places[own], gates[own, ray, end]) if own.any() else everything[end]
+    return filled
+
+
+def _sensors(
+    along: _Along, labels: np.ndarray, track: Track, bounds: Bounds, level: float
+) -> tuple[tuple[Sensor, ...], float]:
+    """One sensor per ray, the ray in the middle of its travel; and the log-likelihood of the samples [nats]."""
+    middle = float(along.knots[0] + along.knots[-1]) / 2
+    central = int(np.abs(along.knots - middle).argmin())
+    spreads, score = None, 0.0
+    for knot in range(len(along.knots)):
+        chosen, weights = along.near(knot)
+        if not weights.sum() > 0:
+            continue
+        mixture, features = _components(along, chosen, weights, labels, track, knot, bounds)
+        score += float(weights.sum() * (features.weights @ log_density(mixture, features)))
+        if spreads is None or abs(knot - central) <= abs(spreads[0] - central):
+            spreads = knot, mixture, features.axes
+    assert spreads is not None
+    return _in_the_middle(track, middle, along, spreads[1], spreads[2], level), score
+
+
+def _components(
+    along: _Along,
+    chosen: np.ndarray,
+    weights: np.ndarray,
+    labels: np.ndarray,
+    track: Track,
+    knot: int,
+    bounds: Bounds,
+) -> tuple[Mixture, Features]:
+    """The rays at a knot as mixture components, and the samples near it."""
+    space = along.space.at({track.dimension: float(along.knots[knot])})
+    features = Features.of(along.points[chosen], weights, Axes.of(space), space)
+    count = len(track.sensor)
+    mixture = from_labels(features, labels[chosen], bounds).with_weights(np.full(count, 1.0 / count))
+    start, end = track.gate_m[knot].T
+    mixture = replace(mixture, range_m=(start + end) / 2, spread_range_m=(end - start) / (2 * bounds.interval))
+    if features.axes.horizontal:
+        mixture = replace(mixture, azimuth_rad=track.azimuth_rad[knot])
+    if features.axes.vertical:
+        mixture = replace(mixture, elevation_rad=track.elevation_rad[knot])
+    return mixture, features
+
+
+def _in_the_middle(
+    track: Track, middle: float, along: _Along, mixture: Mixture, axes: Axes, level: float
+) -> tuple[Sensor, ...]:
+    azimuth, elevation, gate = interpolated(track, middle)
+    origin = np.array(along.space.low[:3])
+    origin[along.dimension] = middle
+    covariance = np.zeros((3, 3))
+    covariance[along.dimension, along.dimension] = _travel_spread(along.knots[-1] - along.knots[0], level) ** 2
+    count = len(track.sensor)
+    return tuple(
+        Sensor(
+            name=f"s{ray}",
+            weight=1.0 / count,
+            origin_m=origin,
+            origin_covariance_m2=covariance,
+            azimuth_rad=float(azimuth[ray] % (2 * math.pi)),
+            elevation_rad=float(elevation[ray]),
+            roll_rad=float(mixture.roll_rad[ray]),
+            spread_horizontal_rad=float(mixture.spread_rad[ray, 0] * axes.angle_scale) if axes.horizontal else 0.0,
+            spread_vertical_rad=float(mixture.spread_rad[ray, 1]) if axes.vertical else 0.0,
+            range_m=float(gate[ray].mean()),
+            spread_range_m=float(gate[ray, 1] - gate[ray, 0]) / (2 * interval_factor(level)),
+            level=level,
+            rays=1,
+        )
+        for ray in range(count)
+    )
