@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -108,3 +109,15 @@ def naive_sphere_log_transmittance(centre, radius, point, optics):
     if not roots:
         return 0.0
     return -optics.attenuation_per_m * max(0.0, reach - optics.margin_m - min(roots))
+
+
+def recursive_frechet(first, second):
+    """The discrete Frechet distance by its recursive definition (Eiter and Mannila 1994)."""
+
+    @functools.cache
+    def leash(i, j):
+        apart = math.dist(first[i], second[j])
+        before = [leash(a, b) for a, b in ((i - 1, j), (i, j - 1), (i - 1, j - 1)) if a >= 0 and b >= 0]
+        return max(apart, min(before)) if before else apart
+
+    return leash(len(first) - 1, len(second) - 1)

@@ -187,7 +187,10 @@ class Arm:
         links = np.tile(np.eye(4), (len(self.bodies), len(joints), 1, 1))
         for frame, angles in enumerate(joints):
             data.qpos[:], data.qvel[:] = angles, velocity[frame]
+            mujoco.mj_checkPos(model, data)
+            mujoco.mj_checkVel(model, data)
             mujoco.mj_forward(model, data)
+            mujoco.mj_checkAcc(model, data)
             self._check_state(data)
             ball[frame] = data.site_xpos[self.site]
             links[:, frame, :3, :3] = data.xmat[self.bodies].reshape(-1, 3, 3)
