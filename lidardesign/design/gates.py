@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from lidardesign.design.bounds import Bounds
 from lidardesign.design.mstep import fit_gate
+from lidardesign.design.sensor import Sensor
 
 # A 95 % interval of ranges means nothing from fewer (effective) samples: one in forty lies beyond each end.
 SMALLEST_CELL = 20.0
@@ -56,3 +59,17 @@ def admissible_gates(wanted_m: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, 
     smallest = THINNEST_GATE_M / (2 * bounds.interval)
     spread = np.maximum(half / bounds.interval, smallest)
     return fit_gate(centre, np.square(spread), bounds, smallest)
+
+
+def kept_gates(wanted: np.ndarray, sensor: Sensor, bounds: Bounds) -> np.ndarray:
+    """Wanted gates (K, 2), those that break a bound replaced by the best gate that keeps all of them [m]."""
+    start, end = sensor.gate_m
+    width = np.diff(wanted, axis=1)[:, 0]
+    broken = (wanted[:, 0] > bounds.start_high) | (wanted[:, 1] < bounds.end_low) | (width < bounds.width_low)
+    if not broken.any():
+        return wanted
+    inner = replace(bounds, start_low=np.full(len(wanted), start), end_high=np.full(len(wanted), end))
+    centre, spread = admissible_gates(wanted, inner)
+    half = bounds.interval * spread
+    moved = np.clip(np.stack([centre - half, centre + half], axis=1), start, end)
+    return np.where(broken[:, None], moved, wanted)

@@ -1,4 +1,4 @@
-"""The even layout: a cell-centred grid of any number of rays in a sensor's own field of view."""
+"""Even layouts: a cell-centred grid of any number of rays in a field of view, and points that fill a cube evenly."""
 
 from __future__ import annotations
 
@@ -47,6 +47,18 @@ def grid_tangent(horizontal_rad: float, vertical_rad: float, count: int) -> np.n
     across = np.concatenate([(np.arange(n) + 0.5) / n - 0.5 for n in rows])
     up = np.repeat((np.arange(len(rows)) + 0.5) / len(rows) - 0.5, rows)
     return np.stack([horizontal_rad * across, vertical_rad * up], axis=1)
+
+
+def low_discrepancy(count: int, axes: int) -> np.ndarray:
+    """The additive recurrence R_k in the unit cube, shape (count, axes) (M. Roberts 2018).
+
+    Its generators are the powers of 1 / phi, with phi the root of phi^(k+1) = phi + 1 above 1.
+    """
+    phi = 1.5
+    for _ in range(64):  # a contraction by at least 3: 64 steps are far below rounding
+        phi = (1.0 + phi) ** (1.0 / (axes + 1))
+    generators = phi ** -np.arange(1.0, axes + 1)
+    return np.mod(0.5 + np.arange(1, count + 1)[:, None] * generators, 1.0)
 
 
 def field_on_sphere(sensor: Sensor) -> tuple[float, float]:

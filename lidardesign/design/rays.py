@@ -1,7 +1,8 @@
 """From a design to the explicit list of rays that it fires.
 
-Budgets are split by largest remainder. Rays start at their sensor's mean origin, are ordered by sensor (an
-explicit table keeps its own order), and fire evenly over the frame: ray i of n at i / (n * rate).
+Budgets are split by largest remainder. Rays start at their sensor's mean origin, in the layout `distributed`
+across its origins; they are ordered by sensor (an explicit table keeps its own order), and fire evenly over
+the frame: ray i of n at i / (n * rate).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from scipy.spatial import cKDTree
 
 from lidardesign.design.conditions import conditioned
 from lidardesign.design.constraints import Constraints
+from lidardesign.design.distributed import distributed_beams
 from lidardesign.design.gates import SMALLEST_CELL, central_intervals, kept_gates
 from lidardesign.design.grid import field_on_sphere, grid_tangent
 from lidardesign.design.membership import Members, members
@@ -84,7 +86,9 @@ def lay_out(
 
     At the number of rays of its explicit table, the design's table is the answer, gates included. Otherwise
     `grid` is even in each sensor's field of view; `density` quantises the samples inside each sensor; `scan`
-    fires along each sensor's boresight, and at another number of rays is fitted anew to the samples.
+    fires along each sensor's boresight, and at another number of rays is fitted anew to the samples;
+    `distributed` starts rays across each sensor's origins, by the samples inside it or by its own Gaussian, and
+    a ray's gate always is its own there.
 
     Arguments:
         design: The design.
@@ -143,6 +147,8 @@ def _laid_out(
     if design.layout == "scan" and total not in (0, own_count(design)):
         return _laid_out(refitted(design, total, samples, seed), total, None, "sensor", rate_hz, seed)
     shares = _shares(design, total)
+    if design.layout == "distributed":
+        return _distributed_rays(design, shares, samples, rate_hz, seed)
     seen = None
     if total and (gates == "ray" or design.layout == "density"):
         if samples is None:
@@ -159,6 +165,12 @@ def _laid_out(
     looking = [tangent_directions(s.frame, t) for s, t in zip(design.sensors, tangents, strict=True)]
     origin = np.array([s.origin_m for s in design.sensors], dtype=np.float64)[sensor]
     return Rays(origin, np.concatenate(looking), gate, sensor, fire_times(int(total), rate_hz))
+
+
+def _distributed_rays(design: Design, shares: np.ndarray, samples: Samples | None, rate_hz: float, seed: int) -> Rays:
+    beams = distributed_beams(design, shares, samples, seed)
+    columns = [np.concatenate([getattr(one, name) for one in beams]) for name in ("origin_m", "direction", "gate_m")]
+    return Rays(*columns, np.repeat(np.arange(len(shares)), shares), fire_times(int(shares.sum()), rate_hz))
 
 
 def make_ray_table(

@@ -20,7 +20,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from lidardesign.design.bounds import Bounds
 from lidardesign.design.budget import ReadOut, within_budget
@@ -29,19 +28,17 @@ from lidardesign.design.em import Trace, from_labels
 from lidardesign.design.ensemble import Ensemble, Part, sensors_of
 from lidardesign.design.features import Features
 from lidardesign.design.gates import admissible_gates, central_intervals
+from lidardesign.design.looks import looks
 from lidardesign.design.mixture import Mixture, log_density
 from lidardesign.design.quantise import lloyd
 from lidardesign.design.resolve import Group, bounds_of
 from lidardesign.design.sensor import Sensor, interval_factor
 from lidardesign.errors import ConfigError
-from lidardesign.space import RANGE, DesignSpace, direction, observed_point
+from lidardesign.space import DesignSpace, direction, observed_point
 from lidardesign.task import random_generator
 
 # More moves of the cells change their mean squared error by less than a percent.
 LLOYD_ITERATIONS = 15
-# The mean range of like rays is over so many of so many samples: one in three hundred of the density.
-NEIGHBOURS = 16
-NEIGHBOUR_POOL = 5000
 
 
 def fit_scan(
@@ -101,21 +98,6 @@ def rays_of(read_out: ReadOut) -> int:
     if read_out.rays is None:
         raise ConfigError("a scan needs its number of rays", where="--layout scan", hint="give --rays N")
     return read_out.rays
-
-
-def looks(features: Features) -> np.ndarray:
-    """What the cells of a scan divide: directions, or points of the mean surface, shape (N, F)."""
-    aiming = features.embedding
-    if features.axes.range:
-        aiming = np.delete(aiming, len(features.axes.origin), axis=1)
-    if not features.axes.origin:
-        return np.ascontiguousarray(aiming)
-    pool = slice(0, NEIGHBOUR_POOL)
-    near = cKDTree(aiming[pool]).query(aiming, k=min(NEIGHBOURS, len(aiming)))[1].reshape(len(aiming), -1)
-    share = features.weights[near]
-    points = features.points.copy()
-    points[:, RANGE] = (share * points[near, RANGE]).sum(axis=1) / share.sum(axis=1)
-    return observed_point(points)
 
 
 def _with_gates(mixture: Mixture, features: Features, labels: np.ndarray, bounds: Bounds, level: float) -> Mixture:

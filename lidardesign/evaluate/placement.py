@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidardesign.design.grid import grid_tangent
+from lidardesign.design.grid import grid_tangent, low_discrepancy
 from lidardesign.simulate.returns import Rays
 from lidardesign.space import AZIMUTH, ELEVATION, direction
 
@@ -25,18 +25,6 @@ def even_unit(count: int, extents: np.ndarray) -> np.ndarray:
     if len(extents) == 1:
         return (np.arange(count)[:, None] + 0.5) / count
     return low_discrepancy(count, len(extents))
-
-
-def low_discrepancy(count: int, axes: int) -> np.ndarray:
-    """The additive recurrence R_k in the unit cube, shape (count, axes) (M. Roberts 2018).
-
-    Its generators are the powers of 1 / phi, with phi the root of phi^(k+1) = phi + 1 above 1.
-    """
-    phi = 1.5
-    for _ in range(64):  # a contraction by at least 3: 64 steps are far below rounding
-        phi = (1.0 + phi) ** (1.0 / (axes + 1))
-    generators = phi ** -np.arange(1.0, axes + 1)
-    return np.mod(0.5 + np.arange(1, count + 1)[:, None] * generators, 1.0)
 
 
 def even_placement(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:

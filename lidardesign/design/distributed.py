@@ -1,0 +1,200 @@
+"""Rays that start across their sensor's origin: a ray's direction and gate follow from where it starts.
+
+With samples of the density, each sample belongs to one sensor, by its own origin, direction and range. What
+its ray looks at (see `looks`) is quantised by Lloyd's cells, so that rays fill the observed volume evenly in
+the density's measure, and one real sample's ray is fired per cell. Not the mean ray: where something hangs
+above the target the directions that see it form a ring, and the mean of visible rays points through the
+middle. Among the samples near a cell's centre the ray with the highest target density is taken.
+
+Without samples, low-discrepancy points fill each sensor's own Gaussian: the origin in the ellipsoid that holds
+the level, the direction given the origin, the gate given both. Independent draws would clump.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri, ndtri
+
+from lidardesign.design.bounds import Bounds
+from lidardesign.design.constraints import Constraints
+from lidardesign.design.coupling import conditional_means, conditional_spreads
+from lidardesign.design.features import Axes, Features
+from lidardesign.design.gates import SMALLEST_CELL, central_intervals, kept_gates
+from lidardesign.design.grid import field_on_sphere, low_discrepancy
+from lidardesign.design.looks import looks
+from lidardesign.design.quantise import lloyd
+from lidardesign.design.regions import owned, principal_axes
+from lidardesign.design.resolve import bounds_of, origin_box
+from lidardesign.design.samples import Samples
+from lidardesign.design.sensor import Design, Sensor, interval_factor, tangent_directions
+from lidardesign.space import AZIMUTH, ELEVATION, FULL_TURN, RANGE, DesignSpace, angles, direction, observed_point
+from lidardesign.task import random_generator
+
+# Cells need no more samples than this: their centres are then known to a tenth of their width.
+SAMPLES_PER_RAY = 64
+SMALLEST_SAMPLE = 2000
+LLOYD_ITERATIONS = 15
+# The share of a cell's samples, those nearest to its centre, among which the highest density is taken.
+NEAR_SHARE = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Beams:
+    """The rays of one sensor.
+
+    Arguments:
+        origin_m: Shape (N, 3).
+        direction: Unit vectors, shape (N, 3).
+        gate_m: Shape (N, 2).
+    """
+
+    origin_m: np.ndarray
+    direction: np.ndarray
+    gate_m: np.ndarray
+
+
+def distributed_beams(design: Design, shares: np.ndarray, samples: Samples | None, seed: int) -> list[Beams]:
+    """The rays of each sensor: by the samples inside it, by its Gaussian where there are fewer than rays.
+
+    Arguments:
+        design: G sensors.
+        shares: Rays of each sensor, shape (G,).
+        samples: Samples of the density that the sensors were fitted to; None lays out the Gaussians.
+        seed: For the quantisation.
+    """
+    constraints = Constraints.from_mapping(design.constraints, where=f"constraints of {design.name}")
+    space = _space_of(design) if samples is None else samples.space
+    members, fired = [np.zeros(0, dtype=np.int64)] * len(shares), [np.zeros((0, 6))] * len(shares)
+    if samples is not None:
+        members, fired = owned(design, samples.points, samples.weights, space, constraints)
+    beams = []
+    for index, (sensor, count) in enumerate(zip(design.sensors, shares, strict=True)):
+        bounds = bounds_of(constraints, space, (index,), interval_factor(design.level))
+        if samples is None or count == 0 or len(np.unique(fired[index][:, :RANGE], axis=0)) < count:
+            low, high = origin_box(constraints.of_sensor(index), space)
+            beams.append(_gaussian_beams(sensor, int(count), bounds, np.stack([low, high]), space))
+            continue
+        generator = random_generator(seed, "distributed layout", index)
+        beams.append(_sampled_beams(sensor, int(count), bounds, samples, members[index], fired[index], generator))
+    return beams
+
+
+def _space_of(design: Design) -> DesignSpace:
+    """The box in which a design may lay out rays when only its file is known: where its own rays start."""
+    table = design.ray_table
+    origins = np.stack([s.origin_m for s in design.sensors]) if table is None else table.origin_m
+    low, high = origins.min(axis=0), origins.max(axis=0)
+    if table is None:
+        reach = max(s.travel_m[0] for s in design.sensors)
+        low, high = low - reach, high + reach
+    farthest = max(sensor.gate_m[1] for sensor in design.sensors)
+    return DesignSpace((*low, 0.0, -math.pi / 2, 0.0), (*high, FULL_TURN, math.pi / 2, farthest))
+
+
+def _sampled_beams(
+    sensor: Sensor,
+    count: int,
+    bounds: Bounds,
+    samples: Samples,
+    members: np.ndarray,
+    fired: np.ndarray,
+    generator: np.random.Generator,
+) -> Beams:
+    """One real sample's ray per cell of what the samples inside a sensor look at."""
+    chosen, weights = _thinned(samples.weights[members], max(SAMPLES_PER_RAY * count, SMALLEST_SAMPLE), generator)
+    part = Features.of(fired[chosen], weights, Axes.of(samples.space), samples.space)
+    views = looks(part)
+    centres, labels = lloyd(views, part.weights, count, generator, iterations=LLOYD_ITERATIONS)
+    away = np.square(views - centres[labels]).sum(axis=1)
+    picked = _best_near(labels, away, samples.log_target[members[chosen]], count)
+    picked = picked[np.lexsort(part.points[picked, :RANGE].T)]
+    rays = part.points[picked]
+    looking = direction(rays[:, AZIMUTH], rays[:, ELEVATION])
+    gate = _gates(part, labels, picked, looking, sensor, bounds)
+    return Beams(rays[:, :3].copy(), looking, gate)
+
+
+def _thinned(weights: np.ndarray, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Indices and weights: all, or at most `count` of equal weight by systematic resampling."""
+    if len(weights) <= count:
+        return np.arange(len(weights)), weights
+    cumulative = np.cumsum(weights)
+    positions = (np.arange(count) + generator.uniform()) / count * cumulative[-1]
+    chosen = np.minimum(np.searchsorted(cumulative, positions, side="right"), len(weights) - 1)
+    return chosen, np.ones(count)
+
+
+def _best_near(labels: np.ndarray, away: np.ndarray, log_target: np.ndarray, count: int) -> np.ndarray:
+    """The sample of each cell with the highest target density among those nearest to its centre."""
+    order = np.lexsort((away, labels))
+    sizes = np.bincount(labels, minlength=count)
+    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    rank = np.empty(len(labels), dtype=np.int64)
+    rank[order] = np.arange(len(labels)) - starts[labels[order]]
+    near = rank < np.maximum(np.ceil(NEAR_SHARE * sizes[labels]), 1)
+    ranked = np.lexsort((away, np.where(near, -log_target, np.inf), labels))
+    return ranked[starts[sizes > 0]]
+
+
+def _gates(
+    part: Features, labels: np.ndarray, picked: np.ndarray, looking: np.ndarray, sensor: Sensor, bounds: Bounds
+) -> np.ndarray:
+    """The central level of what each cell's samples observe, along its own ray and inside bounds, (K, 2) [m]."""
+    cell = np.full(labels.max() + 1, -1)
+    cell[labels[picked]] = np.arange(len(picked))
+    ray = cell[labels]
+    along = ((observed_point(part.points) - part.points[picked[ray], :3]) * looking[ray]).sum(axis=1)
+    wanted, effective = central_intervals(along, part.weights, ray, len(picked), sensor.level)
+    gate = np.tile(sensor.gate_m, (len(picked), 1))
+    wanted = np.clip(wanted, *sensor.gate_m)
+    known = np.flatnonzero((effective >= SMALLEST_CELL) & (np.diff(wanted, axis=1)[:, 0] > 0))
+    gate[known] = kept_gates(wanted[known], sensor, bounds.take(np.zeros(len(known), dtype=np.int64)))
+    return gate
+
+
+def _gaussian_beams(sensor: Sensor, count: int, bounds: Bounds, box: np.ndarray, space: DesignSpace) -> Beams:
+    """Low-discrepancy points of a sensor's own Gaussian: origin, direction given origin, gate given both.
+
+    Arguments:
+        sensor: The component.
+        count: Number of rays.
+        bounds: Its gate bounds, one row.
+        box: Lowest and highest origins, shape (2, 3) [m].
+        space: Bounds of the directions.
+    """
+    spreads, axes = principal_axes(sensor)
+    unit = low_discrepancy(count, len(spreads) + 2)
+    origin = (normal_ball(unit[:, : len(spreads)], sensor.level) * spreads) @ axes.T
+    origin = np.clip(sensor.origin_m + origin, *box) - sensor.origin_m
+    mean_angle, _ = conditional_means(sensor, origin, np.zeros((count, 2)))
+    angular, depth = conditional_spreads(sensor)
+    half = np.array(field_on_sphere(sensor)) / 2
+    tangent = mean_angle + angular * ndtri((1 - sensor.level) / 2 + sensor.level * unit[:, len(spreads) :])
+    tangent = np.clip(tangent, -half, half)
+    azimuth, elevation = angles(tangent_directions(sensor.frame, tangent))
+    rays = np.column_stack([origin + sensor.origin_m, azimuth, elevation, np.full(count, sensor.range_m)])
+    rays = np.clip(space.wrap(rays), space.low, space.high)
+    _, middle = conditional_means(sensor, origin, tangent)
+    reach = interval_factor(sensor.level) * depth
+    gate = np.clip(np.stack([middle - reach, middle + reach], axis=1), *sensor.gate_m)
+    empty = gate[:, 1] <= gate[:, 0]
+    gate[empty] = sensor.gate_m
+    gate = kept_gates(gate, sensor, bounds.take(np.zeros(count, dtype=np.int64)))
+    return Beams(rays[:, :3], direction(rays[:, AZIMUTH], rays[:, ELEVATION]), gate)
+
+
+def normal_ball(unit: np.ndarray, level: float) -> np.ndarray:
+    """Points of the unit cube as a standard normal vector inside the ball of the level, (N, k) to (N, k), k <= 3."""
+    axes = unit.shape[1]
+    if axes <= 1:
+        return ndtri((1 - level) / 2 + level * unit)
+    radius = np.sqrt(chdtri(axes, 1 - level * unit[:, 0]))
+    turn = FULL_TURN * unit[:, 1]
+    if axes == 2:
+        return radius[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    height = 2 * unit[:, 2] - 1
+    ring = np.sqrt(1 - np.square(height))
+    return radius[:, None] * np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=1)
