@@ -23,6 +23,8 @@ KINDS: dict[type, int] = {
     Plane: interpolation.PLANE,
     Mesh: interpolation.GRID,
 }
+# Frames of one motion are close together: so many of them are looked at, or passed over, at once.
+GROUP_COLUMNS = 16
 BuildGrid = Callable[[Mesh], tuple[Grid, np.ndarray]]
 Entry = tuple[int, Body, int]
 
@@ -92,6 +94,19 @@ class Bodies:
         """Bounding boxes of the meshes in their own frames by grid row, shape (rows, 3) each [m]."""
         bounds = [np.zeros((2, 3)), *(mesh.bounds_m for mesh in self.grids.meshes)]
         return np.stack([b[0] for b in bounds]), np.stack([b[1] for b in bounds])
+
+    @cached_property
+    def groups(self) -> tuple[np.ndarray, np.ndarray]:
+        """Boxes around `GROUP_COLUMNS` neighbouring columns each, shape (groups, 3) [m]; empty groups are nowhere."""
+        first = np.arange(0, self.columns, GROUP_COLUMNS)
+        rows = self.starts[first]
+        low = np.full((len(first), 3), np.inf)
+        high = np.full((len(first), 3), -np.inf)
+        held = self.starts[np.minimum(first + GROUP_COLUMNS, self.columns)] > rows
+        if held.any():
+            low[held] = np.minimum.reduceat(self.low, rows[held])
+            high[held] = np.maximum.reduceat(self.high, rows[held])
+        return low, high
 
     def take(self, columns: np.ndarray) -> Bodies:
         """The bodies of some columns, which become columns 0, 1, ... in this order."""

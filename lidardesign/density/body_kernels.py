@@ -16,25 +16,28 @@ from lidardesign.density.kernels import corners, locate
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _to_frame(pose, p, q):  # noqa: ANN001, ANN202
+def _to_frame(to_body, b, points, n, q):  # noqa: ANN001, ANN202
+    """Point n in the frame of body b. Rows are indexed, not sliced: a slice costs as much as the arithmetic."""
     for k in range(3):
-        q[k] = pose[k, 0] * p[0] + pose[k, 1] * p[1] + pose[k, 2] * p[2] + pose[k, 3]
+        q[k] = (
+            to_body[b, k, 0] * points[n, 0]
+            + to_body[b, k, 1] * points[n, 1]
+            + to_body[b, k, 2] * points[n, 2]
+            + to_body[b, k, 3]
+        )
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _turn(pose, v, out):  # noqa: ANN001, ANN202
+def _turn(to_body, b, vectors, n, out):  # noqa: ANN001, ANN202
     for k in range(3):
-        out[k] = pose[k, 0] * v[0] + pose[k, 1] * v[1] + pose[k, 2] * v[2]
+        out[k] = (
+            to_body[b, k, 0] * vectors[n, 0] + to_body[b, k, 1] * vectors[n, 1] + to_body[b, k, 2] * vectors[n, 2]
+        )
 
 
 @njit(cache=True, nogil=True)
 def _shape_distance(kind, size, values, start, counts, low, inverse_step, q, gradient):  # noqa: ANN001, ANN202
-    """Signed distance of one body at a point in its own frame; its gradient goes to `gradient` (3,)."""
-    if kind == SPHERE:
-        length = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
-        for k in range(3):
-            gradient[k] = q[k] / length if length > 0.0 else 0.0
-        return length - size[0]
+    """Signed distance of a body other than a sphere at a point in its own frame, with its gradient (3,)."""
     if kind == CAPSULE:
         z = q[2] - min(max(q[2], -size[1]), size[1])
         length = math.sqrt(q[0] * q[0] + q[1] * q[1] + z * z)
@@ -100,38 +103,64 @@ def _grid_distance(values, start, counts, low, inverse_step, q, gradient):  # no
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _distance(kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, p, q, gradient):  # noqa: ANN001, ANN202
-    """Signed distance of body b at a world point, its gradient in the body's frame."""
+def _distance(kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, points, n, q, gradient):  # noqa: ANN001, ANN202
+    """Signed distance of body b at point n, its gradient in the body's frame."""
+    _to_frame(to_body, b, points, n, q)
+    if kinds[b] == SPHERE:
+        length = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+        scale = 1.0 / length if length > 0.0 else 0.0
+        gradient[0], gradient[1], gradient[2] = q[0] * scale, q[1] * scale, q[2] * scale
+        return length - sizes[b, 0]
     g = grid[b]
-    _to_frame(to_body[b], p, q)
     return _shape_distance(
         kinds[b], sizes[b], values, grid_starts[g], counts[g], lows[g], steps[g], q, gradient
     )
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _outside_squared(low, high, p):  # noqa: ANN001, ANN202
-    """Squared distance of a point to a box, 0 inside."""
-    total = 0.0
-    for k in range(3):
-        beyond = max(low[k] - p[k], p[k] - high[k], 0.0)
-        total += beyond * beyond
-    return total
+def _outside_squared(low, high, b, points, n):  # noqa: ANN001, ANN202
+    """Squared distance of point n to box b, 0 inside."""
+    x = max(low[b, 0] - points[n, 0], points[n, 0] - high[b, 0], 0.0)
+    y = max(low[b, 1] - points[n, 1], points[n, 1] - high[b, 1], 0.0)
+    z = max(low[b, 2] - points[n, 2], points[n, 2] - high[b, 2], 0.0)
+    return x * x + y * y + z * z
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _column_distance(  # noqa: ANN202
+    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps,  # noqa: ANN001
+    low, high, first, last, points, n, q, gradient,  # noqa: ANN001
+):  # fmt: skip
+    """Distance of the nearest of some bodies to point n, and which it is."""
+    distance, body = np.inf, -1
+    for b in range(first, last):
+        squared = _outside_squared(low, high, b, points, n)
+        if squared > 0.0 and (distance <= 0.0 or squared >= distance * distance):
+            continue
+        value = _distance(
+            kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, points, n, q, gradient
+        )
+        if value < distance:
+            distance, body = value, b
+    return distance, body
 
 
 @njit(cache=True, nogil=True)
 def near_columns(  # noqa: ANN201
     kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps,  # noqa: ANN001
-    low, high, starts, points, log_weights, precision, tolerance,  # noqa: ANN001
+    low, high, starts, group_low, group_high, group_columns,  # noqa: ANN001
+    points, log_weights, group_weights, precision, tolerance,  # noqa: ANN001
     row_starts, columns, distances, bodies,  # noqa: ANN001
 ):  # fmt: skip
     """The columns whose term log_weight - precision * d^2 / 2 is within a tolerance of the best one, for each point.
 
-    Bounding boxes bound the terms from above; only columns that could matter are evaluated, each by its nearest body.
+    Bounding boxes bound the terms from above, first of groups of neighbouring columns (frames of one motion are close
+    together), then of columns; only columns that could matter are evaluated, each by its nearest body.
 
     Arguments:
+        group_low, group_high: Boxes around `group_columns` columns each.
         points: Shape (N, 3).
-        log_weights: Per column, shape (columns,).
+        log_weights, group_weights: Per column, and the largest of each group.
         precision: 1 / sigma^2 [1/m^2].
         tolerance: In nats.
         row_starts: Out: where each point's pairs begin, shape (N + 1,).
@@ -140,45 +169,44 @@ def near_columns(  # noqa: ANN201
     Returns:
         The number of pairs; where it is above the room, the lists are cut off and the call has to be repeated.
     """
-    count, room = starts.shape[0] - 1, columns.shape[0]
+    count, groups, room = starts.shape[0] - 1, group_low.shape[0], columns.shape[0]
     q, gradient = np.zeros(3), np.zeros(3)
-    hopes, found, nearest = np.empty(count), np.empty(count), np.empty(count, np.int64)
+    hopes = np.empty(groups)
+    found, nearest, seen = np.empty(count), np.empty(count, np.int64), np.empty(count, np.int64)
     total = 0
     for n in range(points.shape[0]):
         row_starts[n] = total
-        p = points[n]
-        leader, highest = -1, -np.inf
-        for c in range(count):
-            squared = np.inf
-            for b in range(starts[c], starts[c + 1]):
-                squared = min(squared, _outside_squared(low[b], high[b], p))
-            hopes[c] = log_weights[c] - 0.5 * precision * squared
-            if hopes[c] > highest:
-                leader, highest = c, hopes[c]
-        best = -np.inf
-        for turn in range(-1, count):
-            c = leader if turn < 0 else turn
-            if c < 0 or (turn == leader and turn >= 0) or not hopes[c] >= best - tolerance:
-                if turn >= 0 and turn != leader:
-                    found[turn] = np.inf
+        leader, highest = 0, -np.inf
+        for g in range(groups):
+            hopes[g] = group_weights[g] - 0.5 * precision * _outside_squared(group_low, group_high, g, points, n)
+            if hopes[g] > highest:
+                leader, highest = g, hopes[g]
+        best, kept = -np.inf, 0
+        for turn in range(groups):
+            # the most promising group first: it tells how much the others may miss
+            g = leader if turn == 0 else (0 if turn == leader else turn)
+            if hopes[g] < best - tolerance:
                 continue
-            distance, body = np.inf, -1
-            for b in range(starts[c], starts[c + 1]):
-                squared = _outside_squared(low[b], high[b], p)
-                if squared > 0.0 and (distance <= 0.0 or squared >= distance * distance):
+            for c in range(g * group_columns, min((g + 1) * group_columns, count)):
+                if starts[c + 1] == starts[c] + 1:
+                    squared = _outside_squared(low, high, starts[c], points, n)
+                    if log_weights[c] - 0.5 * precision * squared < best - tolerance:
+                        continue
+                distance, body = _column_distance(
+                    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps,
+                    low, high, starts[c], starts[c + 1], points, n, q, gradient,
+                )  # fmt: skip
+                term = log_weights[c] - 0.5 * precision * distance * distance
+                if term < best - tolerance:
                     continue
-                value = _distance(
-                    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, p, q, gradient
-                )
-                if value < distance:
-                    distance, body = value, b
-            found[c], nearest[c] = distance, body
-            best = max(best, log_weights[c] - 0.5 * precision * distance * distance)
-        for c in range(count):
-            if not np.isfinite(found[c]) or log_weights[c] - 0.5 * precision * found[c] * found[c] < best - tolerance:
+                best = max(best, term)
+                seen[kept], found[kept], nearest[kept] = c, distance, body
+                kept += 1
+        for k in range(kept):
+            if log_weights[seen[k]] - 0.5 * precision * found[k] * found[k] < best - tolerance:
                 continue
             if total < room:
-                columns[total], distances[total], bodies[total] = c, found[c], nearest[c]
+                columns[total], distances[total], bodies[total] = seen[k], found[k], nearest[k]
             total += 1
     row_starts[points.shape[0]] = total
     return total
@@ -198,7 +226,7 @@ def add_gradients(  # noqa: ANN201
             if weights[pair] == 0.0:
                 continue
             _distance(
-                kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, points[n], q, gradient
+                kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, points, n, q, gradient
             )
             for k in range(3):
                 for i in range(3):
@@ -213,7 +241,7 @@ def distances_of(  # noqa: ANN201
     q, gradient = np.zeros(3), np.zeros(3)
     for n in range(points.shape[0]):
         out[n] = _distance(
-            kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, bodies[n], points[n], q, gradient
+            kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, bodies[n], points, n, q, gradient
         )
 
 
@@ -229,7 +257,7 @@ def all_distances(  # noqa: ANN201
         for c in range(starts.shape[0] - 1):
             for b in range(starts[c], starts[c + 1]):
                 value = _distance(
-                    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, points[n], q, gradient
+                    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, points, n, q, gradient
                 )
                 if value < out[n, c]:
                     out[n, c] = value
@@ -334,12 +362,20 @@ def _normal(kind, size, point, out):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _segment_meets_box(low, high, origin, end):  # noqa: ANN001, ANN202
-    """Whether the bounding box of a segment meets a box."""
-    meets = True
+def _boxes_meet(low, high, b, start, end):  # noqa: ANN001, ANN202
+    """Whether the box from `start` (3,) to `end` (3,) meets box b."""
+    for k in range(3):  # noqa: SIM110 - numba compiles the loop to half the time of one expression
+        if start[k] > high[b, k] or end[k] < low[b, k]:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _segment_box(origins, directions, limits, n, start, end):  # noqa: ANN001, ANN202
+    """The bounding box of ray n up to its limit."""
     for k in range(3):
-        meets = meets and min(origin[k], end[k]) <= high[k] and max(origin[k], end[k]) >= low[k]
-    return meets
+        tip = origins[n, k] + limits[n] * directions[n, k]
+        start[k], end[k] = min(origins[n, k], tip), max(origins[n, k], tip)
 
 
 @njit(cache=True, nogil=True)
@@ -356,19 +392,17 @@ def first_hits(  # noqa: ANN201
         hits: Out: ranges, infinite without a hit, shape (P,) [m].
         normals: Out: world normals that face the origin, shape (P, 3).
     """
-    q, turned, work, point, local, end = (
-        np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3),
-    )  # fmt: skip
+    q, turned, work, point = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    local, start, end = np.zeros(3), np.zeros(3), np.zeros(3)
     for n in range(origins.shape[0]):
-        for k in range(3):
-            end[k] = origins[n, k] + limits[n] * directions[n, k]
+        _segment_box(origins, directions, limits, n, start, end)
         for pair in range(row_starts[n], row_starts[n + 1]):
             best, body = limits[n], -1
             for b in range(starts[columns[pair]], starts[columns[pair] + 1]):
-                if kinds[b] == GRID or not _segment_meets_box(low[b], high[b], origins[n], end):
+                if kinds[b] == GRID or not _boxes_meet(low, high, b, start, end):
                     continue
-                _to_frame(to_body[b], origins[n], q)
-                _turn(to_body[b], directions[n], turned)
+                _to_frame(to_body, b, origins, n, q)
+                _turn(to_body, b, directions, n, turned)
                 near, far = _primitive_roots(kinds[b], sizes[b], q, turned, work)
                 value = near if near >= 0.0 else far
                 if value >= 0.0 and value < best:
@@ -377,8 +411,8 @@ def first_hits(  # noqa: ANN201
             if body < 0:
                 continue
             hits[pair] = best
-            _to_frame(to_body[body], origins[n], q)
-            _turn(to_body[body], directions[n], turned)
+            _to_frame(to_body, body, origins, n, q)
+            _turn(to_body, body, directions, n, turned)
             for k in range(3):
                 point[k] = q[k] + best * turned[k]
             _normal(kinds[body], sizes[body], point, local)
@@ -400,17 +434,16 @@ def mesh_candidates(  # noqa: ANN201
     Returns:
         Their number; where it is above the room in `rows`, `pairs` and `bodies`, the call has to be repeated.
     """
-    q, turned, end = np.zeros(3), np.zeros(3), np.zeros(3)
+    q, turned, start, end = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     total, room = 0, pairs.shape[0]
     for n in range(origins.shape[0]):
-        for k in range(3):
-            end[k] = origins[n, k] + limits[n] * directions[n, k]
+        _segment_box(origins, directions, limits, n, start, end)
         for pair in range(row_starts[n], row_starts[n + 1]):
             for b in range(starts[columns[pair]], starts[columns[pair] + 1]):
-                if kinds[b] != GRID or not _segment_meets_box(low[b], high[b], origins[n], end):
+                if kinds[b] != GRID or not _boxes_meet(low, high, b, start, end):
                     continue
-                _to_frame(to_body[b], origins[n], q)
-                _turn(to_body[b], directions[n], turned)
+                _to_frame(to_body, b, origins, n, q)
+                _turn(to_body, b, directions, n, turned)
                 near, far = _box_roots(mesh_low[grid[b]], mesh_high[grid[b]], q, turned)
                 if not (far >= 0.0 and near < limits[n]):
                     continue

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidardesign.density.bodies import Bodies, collect_bodies
+from lidardesign.density.bodies import GROUP_COLUMNS, Bodies, collect_bodies
 from lidardesign.density.occlusion import BodyRaycast, NoOcclusion, Pairs
 from lidardesign.density.settings import DensitySettings
 from lidardesign.density.target import Target
@@ -23,7 +23,8 @@ from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction,
 
 # Points at a time: their pairs, some hundred each, then stay within some 100 MB.
 ROWS_AT_ONCE = 2048
-PAIRS_PER_ROW = 64
+# Room for pairs is not touched before it is used; too little of it costs a second pass.
+PAIRS_PER_ROW = 1024
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,13 +127,15 @@ def near_pairs(
 
     points = np.ascontiguousarray(points, dtype=np.float64)
     row_starts = np.empty(len(points) + 1, dtype=np.int64)
-    room = max(PAIRS_PER_ROW * len(points), 1)
+    group_weights = np.maximum.reduceat(log_weights, np.arange(0, bodies.columns, GROUP_COLUMNS))
+    room = max(min(PAIRS_PER_ROW, bodies.columns) * len(points), 1)
     while True:
         columns, nearest = np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int64)
         distances = np.empty(room)
         count = body_kernels.near_columns(
-            *bodies.shapes, bodies.low, bodies.high, bodies.starts, points, log_weights, 1.0 / sigma_m**2,
-            tolerance_nats, row_starts, columns, distances, nearest,
+            *bodies.shapes, bodies.low, bodies.high, bodies.starts, *bodies.groups, GROUP_COLUMNS,
+            points, log_weights, group_weights, 1.0 / sigma_m**2, tolerance_nats,
+            row_starts, columns, distances, nearest,
         )  # fmt: skip
         if count <= room:
             return Pairs(row_starts, columns[:count], distances[:count], nearest[:count])

@@ -31,6 +31,9 @@ REACH_SIGMAS = 5.0
 DRAWS_AT_ONCE = 262_144
 # Bodies so thin beside their boxes that fewer draws than this share hit their surface are drawn in vain.
 MOST_ROUNDS = 400
+# Few origins of a wide ceiling may see a point under the space's angles: each point is tried from several.
+ORIGINS_PER_POINT = 4
+AIMING_ROUNDS = 8
 TERM_TOLERANCE_NATS = 16.0
 ROWS_AT_ONCE = 4096
 
@@ -75,19 +78,36 @@ def proximity_proposals(
     target: FramesTarget, count: int, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Scene points in proportion to the surface terms of all bodies, seen from uniform origins."""
-    space, sigma_m = target.space, target.optics.sigma_m
-    surface = draw_near_surfaces(target, count, generator)
+    parts, missing = [], count
+    for _ in range(AIMING_ROUNDS):
+        parts.append(_aimed(target, missing, generator))
+        missing -= len(parts[-1])
+        if missing <= 0:
+            break
+    points = np.concatenate(parts)[:count]
+    return points, _log_proposal_density(target, points)
+
+
+def _aimed(target: FramesTarget, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Admissible design points among `count` scene points seen from uniform origins each of them several times."""
+    space = target.space
+    surface = np.repeat(draw_near_surfaces(target, count, generator), ORIGINS_PER_POINT, axis=0)
     points = space.wrap(aim(space.sample(len(surface), generator)[:, :3], surface))
     kept = space.contains(points) & (points[:, RANGE] > 0)
-    points, surface = points[kept], surface[kept]
+    return points[kept]
+
+
+def _log_proposal_density(target: FramesTarget, points: np.ndarray) -> np.ndarray:
+    """log of the sum over bodies of weight * exp(-d^2 / (2 sigma^2)) per chart volume, up to a constant, (N,)."""
+    sigma_m, observed = target.optics.sigma_m, observed_point(points)
     bodies = target.field.apart()
     weights = target.log_column_weights[target.field.column]
     log_density = np.empty(len(points))
     for start in range(0, len(points), ROWS_AT_ONCE):
         rows = slice(start, min(start + ROWS_AT_ONCE, len(points)))
-        pairs = near_pairs(bodies, surface[rows], weights, sigma_m, TERM_TOLERANCE_NATS)
+        pairs = near_pairs(bodies, observed[rows], weights, sigma_m, TERM_TOLERANCE_NATS)
         log_density[rows] = row_log_sums(weights[pairs.columns] - np.square(pairs.distances / sigma_m) / 2, pairs)[0]
-    return points, log_density + 2 * np.log(points[:, RANGE]) + log_chart_factor(space, points)
+    return log_density + 2 * np.log(points[:, RANGE]) + log_chart_factor(target.space, points)
 
 
 def draw_near_surfaces(target: FramesTarget, count: int, generator: np.random.Generator) -> np.ndarray:

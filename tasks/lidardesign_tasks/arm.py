@@ -68,7 +68,7 @@ class ArmTask:
     Config: ClassVar[type[ArmConfig]] = ArmConfig
     metric: ClassVar[Metric] = Metric("Frechet distance", "m", "lower", worst=1.0, tolerance=0.002)
     defaults: ClassVar[Defaults] = Defaults(
-        sensors=4, rays=(400, 1000, 1200), layout="distributed", density={"sigma_m": 0.025}
+        sensors=4, rays=(400, 1000, 1200), layout="distributed", density={"sigma_m": 0.025, "surface_tolerance_nats": 10.0}
     )
 
     def space(self, config: ArmConfig) -> DesignSpace:
@@ -117,7 +117,7 @@ def rejection_notes(motions: Sequence[Motion], split: str) -> tuple[str, ...]:
     if not rejected:
         return ()
     reasons = ", ".join(f"{count} {reason}" for reason, count in rejected.most_common())
-    return (f"{split}: {rejected.total()} drawn motions were rejected and drawn again ({reasons})",)
+    return (f"{split}: motions that the arm cannot do were drawn again: {reasons}",)
 
 
 def _scene(robot: Robot, motion: Motion, name: str, rate_hz: float, notes: tuple[str, ...]) -> Scene:
