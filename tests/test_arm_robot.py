@@ -8,8 +8,10 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from lidardesign_tasks import arm_robot
-from lidardesign_tasks.arm_robot import BALL, import_mink, load_robot, mujoco_warnings
+from lidardesign_tasks import arm_engine
+from lidardesign_tasks.arm_engine import import_mink, mujoco_warnings
+from lidardesign_tasks.arm_links import BALL
+from lidardesign_tasks.arm_robot import load_robot
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.scene import Box, Capsule, Mesh, Sphere
@@ -109,7 +111,7 @@ def test_shapes_of_the_world_are_left_out_with_a_note_and_cylinders_become_close
     piece = PIECE.replace('"capsule"', '"cylinder"')
     robot = load_robot(written(tmp_path, mjcf(world=world, piece=piece)), TOOL_M)
     assert len(robot.links) == 8
-    assert any("1 shapes that stand in the world" in note for note in robot.notes)
+    assert any("not on the arm, are left out: 1" in note for note in robot.notes)
     for link in robot.links[:-1]:
         assert link.shape.sign == "solid"
         np.testing.assert_allclose(link.shape.bounds_m, [[-0.03, -0.03, 0.0], [0.03, 0.03, 0.18]], atol=1e-6)
@@ -202,7 +204,7 @@ def test_a_missing_package_is_named_with_what_to_install(monkeypatch):
     def missing(name):
         raise ModuleNotFoundError(f"No module named {name!r}")
 
-    monkeypatch.setattr(arm_robot, "import_module", missing)
+    monkeypatch.setattr(arm_engine, "import_module", missing)
     with pytest.raises(ConfigError, match="pip install mujoco mink"):
         import_mink()
 

@@ -11,7 +11,9 @@ import numpy as np
 
 from lidardesign.errors import DataError
 from lidardesign.scene import Box, Capsule, Mesh, Sphere
-from lidardesign_tasks.arm_robot import BALL, BALL_RADIUS_M, Robot, import_mink, import_mujoco, mujoco_warnings
+from lidardesign_tasks.arm_engine import import_mink, import_mujoco, mujoco_warnings
+from lidardesign_tasks.arm_links import BALL
+from lidardesign_tasks.arm_robot import BALL_RADIUS_M, Robot
 
 HOVER_M = np.array([0.5, 0.0, 0.35])
 PICK_M = np.array([0.45, -0.35, 0.15])
@@ -26,7 +28,7 @@ FIRST_STEPS = 60  # the first way-point is reached from the home posture
 POSITION_RESIDUAL_M = 1e-3
 TILT_RESIDUAL_RAD = math.radians(0.5)
 POSTURE_COST = 1e-2  # settles elbow and yaw, far below the costs of 1 per m and per rad of the ball's pose
-LARGEST_TURN_RAD_S = math.radians(200)  # faster joints mean that the arm flips between two postures
+LARGEST_TURN_RAD_S = math.radians(135)  # of the fastest joint in the arm's data sheet
 PENETRATION_M = 5e-3
 TRIES = 50
 
