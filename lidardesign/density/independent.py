@@ -20,7 +20,7 @@ from lidardesign.density.shell import log_chart_factor, shell_proposals
 from lidardesign.density.target import Target
 from lidardesign.numerics import normalised_weights
 from lidardesign.scene import Scene
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, aim
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, aim, observed_point
 
 # Up to so many free dimensions, uniform candidates meet the surfaces often enough to be resampled.
 RESAMPLED_DIMENSIONS = 3

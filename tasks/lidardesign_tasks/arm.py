@@ -68,7 +68,10 @@ class ArmTask:
     Config: ClassVar[type[ArmConfig]] = ArmConfig
     metric: ClassVar[Metric] = Metric("Frechet distance", "m", "lower", worst=1.0, tolerance=0.002)
     defaults: ClassVar[Defaults] = Defaults(
-        sensors=4, rays=(400, 1000, 1200), layout="distributed", density={"sigma_m": 0.025, "surface_tolerance_nats": 10.0}
+        sensors=4,
+        rays=(400, 1000, 1200),
+        layout="distributed",
+        density={"sigma_m": 0.025, "surface_tolerance_nats": 10.0},
     )
 
     def space(self, config: ArmConfig) -> DesignSpace:
