@@ -1,18 +1,26 @@
 r"""Fitting a track: the rays of a scan for every value of one condition, as the position of a robot that drives by.
 
-Directions are Lloyd's cells along the condition. With hat functions h_p(x) over the knots, ray n looks at
-$c_n(x) = \sum_p h_p(x) c_{p,n}$, and what is minimised is
+Rays divide what is observed: the mean surface of the scenes, seen from the sensor, in metres. With hat functions
+h_p(x) over the knots, ray n aims at $c_n(x) = \sum_p h_p(x) c_{p,n}$, and what is minimised is
 
-$$\sum_i w_i \min_n |f_i - c_n(x_i)|^2 + \rho\, \bar m \sum_{p,n} |c_{p-1,n} - 2 c_{p,n} + c_{p+1,n}|^2,$$
+$$\sum_i w_i \min_n |y_i - c_n(x_i)| + \frac{\kappa}{2} \sum_{p,n} |c_{p-1,n} - 2 c_{p,n} + c_{p+1,n}|^2,$$
 
-f_i a sample's unit vector, x_i its own condition value, w_i its importance weight, and m the mean mass of a ray at
-a knot: no sample is moved or cut off, rays stay themselves, and knots where a ray sees nothing are bridged
-straight. Cells and knots are updated in turn, each exactly, so the sum falls until it stays. It starts from Lloyd's
-cells at each knot, begun at the neighbouring knot's, outward from the knot with most samples.
+y_i the surface point of a sample relative to its own origin, x_i its own condition value, w_i its importance weight
+per area that faces the ray. No sample is moved or cut off, rays stay themselves, and knots where a ray sees nothing
+are bridged straight. Distances count once, not squared, so that more rays go to where surfaces often are (their
+density is as the root of the surface's, not the third root). Cells, then knots by their normal equations with
+weights w / |y - c|, are updated in turn (Weiszfeld 1937): the sum falls with every update. It starts from Lloyd's
+cells at each knot, begun at the neighbouring knot's, outward from the knot with most samples, where the best of
+several seedings is taken.
+
+Measured on warehouse shelves (40 held-out, 24 positions, rays' hits without gates), as miss rate in % with 6, 12,
+18 rays, each at its global optimum: directions and squares 19.5, 15.7, 10.6; surface points and squares 20.1, 13.0,
+7.7; surface points and distances, per facing area, 19.6, 11.3, 6.7; chosen greedily with the training scenes' own
+boxes in hand 18.8, 9.1, 5.2.
 
 The kernel of knot p is its hat function, so the bandwidth is the distance of knots, and every sample counts once
-in all. Knots lie 0.1 m apart, over which scenes with the surfaces of the density's resolution hardly change, or
-further where fewer samples than `SAMPLES_PER_CELL` would be left for each ray of a knot.
+in all. Knots lie 0.1 m apart, over which what is seen of a scene hardly changes, or further where fewer samples
+than `SAMPLES_PER_CELL` would be left for each ray of a knot.
 """
 
 from __future__ import annotations
@@ -30,6 +38,7 @@ from lidardesign.design.constraints import Constraints
 from lidardesign.design.em import from_labels
 from lidardesign.design.features import Axes, Features
 from lidardesign.design.gates import admissible_gates, central_intervals
+from lidardesign.design.looks import looks
 from lidardesign.design.mixture import Mixture, log_density
 from lidardesign.design.quantise import lloyd
 from lidardesign.design.resolve import Group, bounds_of, origin_box
@@ -47,9 +56,15 @@ KNOT_SPACING_M = 0.1
 SAMPLES_PER_CELL = 40
 # The gate at a knot is taken over so many knots on either side: its ends need more samples than a mean does.
 GATE_REACH = 2
+# The bending's weight kappa relative to the pull of one ray's samples at one knot.
 ROUGHNESS = 0.1
 LLOYD_ITERATIONS = 15
-SWEEPS = 15
+SWEEPS = 30
+STARTS = 12
+# Nearer samples than this share of the mean distance pull no harder.
+SMALLEST_DISTANCE = 0.01
+# Keeps divisions finite where every sample lies on its ray [m].
+TINY = 1e-12
 # Mean elevations closer than this are the same row [rad].
 ORDER_DECIMALS = 9
 # Distances of so many samples to all rays are held at once.
@@ -233,13 +248,20 @@ def _knots(low: float, high: float, effective: float, rays: int, wanted: int | N
 
 
 def _rays(along: _Along, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors of the rays at the knots (P, N, 3), and the ray of each sample (M,)."""
-    looks = direction(along.points[:, AZIMUTH], along.points[:, ELEVATION])
-    centres = _started(along, looks, count, generator)
-    labels = _nearest(along, looks, centres)
+    """What the rays aim at, relative to the sensor, at the knots (P, N, 3), and the ray of each sample (M,)."""
+    features = Features.of(along.points, along.weights, Axes.of(along.space), along.space)
+    surface = looks(features) - along.points[:, :3]
+    power = (AZIMUTH in along.space.free) + (ELEVATION in along.space.free)
+    mass = along.weights * np.linalg.norm(surface, axis=1) ** power
+    weighted = replace(along, weights=mass / mass.sum())
+    centres = _started(weighted, surface, count, generator)
+    labels, distance = _nearest(along, surface, centres)
+    nearest_m = SMALLEST_DISTANCE * float(weighted.weights @ distance)
+    stiffness = ROUGHNESS / max(float(weighted.weights @ distance), TINY) / (count * len(along.knots))
     for _ in range(SWEEPS):
-        centres = _smoothed(along, looks, labels, centres)
-        fresh = _nearest(along, looks, centres)
+        pulls = weighted.weights / np.maximum(distance, max(nearest_m, TINY))
+        centres = _smoothed(along, surface, pulls, labels, centres, stiffness)
+        fresh, distance = _nearest(along, surface, centres)
         if np.array_equal(fresh, labels):
             break
         labels = fresh
@@ -253,67 +275,81 @@ def _upwards(centres: np.ndarray) -> np.ndarray:
     return np.lexsort((azimuth, np.round(elevation, ORDER_DECIMALS)))
 
 
-def _started(along: _Along, looks: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
+def _started(along: _Along, surface: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
     """Lloyd's cells at each knot, each begun at its neighbour's, from the best known knot outward: (P, N, 3)."""
     windows = [along.near(knot) for knot in range(len(along.knots))]
-    worth = [effective_count(weights) for _, weights in windows]
-    first = int(np.argmax(worth))
-    chosen, weights = windows[first]
+    first = int(np.argmax([effective_count(weights) for _, weights in windows]))
     centres = np.empty((len(windows), count, 3))
-    centres[first], _ = lloyd(looks[chosen], weights, count, generator, iterations=LLOYD_ITERATIONS)
+    centres[first] = _best_start(*_window(surface, windows[first]), count, generator)
     outward = [(knot - 1, knot) for knot in range(first + 1, len(windows))]
     outward += [(knot + 1, knot) for knot in reversed(range(first))]
     for before, knot in outward:
-        chosen, weights = windows[knot]
+        points, weights = _window(surface, windows[knot])
         centres[knot] = centres[before]
-        if len(chosen) > count and weights.max(initial=0.0) > 0:
+        if len(points) > count and weights.max(initial=0.0) > 0:
             centres[knot], _ = lloyd(
-                looks[chosen], weights, count, generator, iterations=LLOYD_ITERATIONS, start=centres[before]
+                points, weights, count, generator, iterations=LLOYD_ITERATIONS, start=centres[before]
             )
     return centres
 
 
-def _nearest(along: _Along, looks: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """The ray that looks nearest to each sample at the sample's own condition, shape (M,)."""
-    labels = np.empty(len(looks), dtype=np.int64)
-    for start in range(0, len(looks), BLOCK):
+def _window(surface: np.ndarray, window: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    chosen, weights = window
+    return surface[chosen], weights
+
+
+def _best_start(
+    points: np.ndarray, weights: np.ndarray, count: int, generator: np.random.Generator
+) -> np.ndarray:
+    """Lloyd's cells with the smallest sum of distances among several seedings, shape (N, 3)."""
+    best, least = np.empty(0), math.inf
+    for _ in range(STARTS):
+        centres, labels = lloyd(points, weights, count, generator, iterations=LLOYD_ITERATIONS)
+        cost = float(weights @ np.linalg.norm(points - centres[labels], axis=1))
+        if cost < least:
+            best, least = centres, cost
+    return best
+
+
+def _nearest(along: _Along, surface: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The ray that aims nearest to each sample at the sample's own condition, and its distance, shape (M,)."""
+    labels, squared = np.empty(len(surface), dtype=np.int64), np.empty(len(surface))
+    for start in range(0, len(surface), BLOCK):
         part = slice(start, start + BLOCK)
         left, share = along.left[part], along.share[part, None, None]
         here = (1 - share) * centres[left] + share * centres[left + 1]
-        labels[part] = np.square(here - looks[part, None]).sum(axis=2).argmin(axis=1)
-    return labels
+        away = np.square(here - surface[part, None]).sum(axis=2)
+        labels[part], squared[part] = away.argmin(axis=1), away.min(axis=1)
+    return labels, np.sqrt(squared)
 
 
-def _smoothed(along: _Along, looks: np.ndarray, labels: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """The knots' best unit vectors for given cells: a least-squares problem per ray, shape (P, N, 3)."""
+def _smoothed(
+    along: _Along,
+    surface: np.ndarray,
+    pulls: np.ndarray,
+    labels: np.ndarray,
+    centres: np.ndarray,
+    stiffness: float,
+) -> np.ndarray:
+    """The knots' best aims for given cells and weights: a least-squares problem per ray, shape (P, N, 3)."""
     knots, count, _ = centres.shape
-    rows = labels * knots + along.left
-    weights, share = along.weights, along.share
-    matrix = np.zeros((count, knots, knots))
-    flat = matrix.reshape(count * knots, knots)
-
-    def add(row: np.ndarray, column: np.ndarray, values: np.ndarray) -> None:
-        sums = np.bincount(row * knots + column, values, count * knots * knots)
-        flat.reshape(-1)[:] += sums
-
-    add(rows, along.left, weights * (1 - share) ** 2)
-    add(rows, along.left + 1, weights * share * (1 - share))
-    add(rows + 1, along.left, weights * share * (1 - share))
-    add(rows + 1, along.left + 1, weights * share**2)
-    right = np.stack(
-        [
-            np.bincount(rows, weights * (1 - share) * column, count * knots)
-            + np.bincount(rows + 1, weights * share * column, count * knots)
-            for column in looks.T
-        ],
-        axis=-1,
-    ).reshape(count, knots, 3)
-    mass = 1.0 / (count * knots)
+    rows, share = labels * knots + along.left, along.share
+    matrix = np.zeros(count * knots * knots)
+    for down, down_share in ((0, 1 - share), (1, share)):
+        for across, across_share in ((0, 1 - share), (1, share)):
+            place = (rows + down) * knots + along.left + across
+            matrix += np.bincount(place, pulls * down_share * across_share, len(matrix))
+    size = count * knots
+    right = [
+        np.bincount(rows, pulls * (1 - share) * column, size) + np.bincount(rows + 1, pulls * share * column, size)
+        for column in surface.T
+    ]
+    normal = matrix.reshape(count, knots, knots)
     # a ray that sees nothing anywhere stays where it was
-    matrix += mass * (ROUGHNESS * _bending(knots) + SMALLEST_STIFFNESS * np.eye(knots))
-    right += mass * SMALLEST_STIFFNESS * centres.transpose(1, 0, 2)
-    solved = np.linalg.solve(matrix, right).transpose(1, 0, 2)
-    return solved
+    still = SMALLEST_STIFFNESS * stiffness
+    normal += stiffness * _bending(knots) + still * np.eye(knots)
+    wanted = np.stack(right, axis=-1).reshape(count, knots, 3) + still * centres.transpose(1, 0, 2)
+    return np.linalg.solve(normal, wanted).transpose(1, 0, 2)
 
 
 def _bending(knots: int) -> np.ndarray:
