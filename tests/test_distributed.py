@@ -179,7 +179,7 @@ def test_more_rays_leave_no_populated_region_empty():
         rays = lay_out(design, count, RING)
         away = views[:500, None] - rays.origin_m
         along = (away * rays.direction).sum(axis=2)
-        nearest = np.sqrt(np.square(away).sum(axis=2) - np.square(along)).min(axis=1)
+        nearest = np.linalg.norm(away - along[:, :, None] * rays.direction, axis=2).min(axis=1)
         reach.append((np.mean(nearest), np.quantile(nearest, 0.98)))
     assert (np.diff(reach, axis=0) < 0).all()
     assert reach[2][1] < 0.05

@@ -101,9 +101,14 @@ def load_constraints(file: Path | None, overrides: list[str]) -> Constraints:
 
 def _sensors(given: Any, constraints: Constraints, design: Design | None, usual: int) -> Any:
     """The number of sensors: the option's, then what the constraints ask for, the design's, the task's."""
+    from lidardesign.design.mounts import is_mounted
+
     asked = constraints.sensors
     if given is not None or asked.count is not None:
         return given if given is not None else asked.count
+    if is_mounted(constraints):
+        # the mounts say how many
+        return None
     usual = max(len(design.sensors) if design else usual, len(constraints.each))
     return min(max(usual, asked.min or usual), asked.max or usual)
 

@@ -73,7 +73,7 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
     checks += _table(document, rules)
     if document.get("track"):
         checks += _track(document["track"], document, rules, bounds)
-    return checks + _budget(document, rules)
+    return checks + _mounts(sensors, rules, each) + _budget(document, rules)
 
 
 def _over(common: Mapping[str, Any], special: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -158,6 +158,24 @@ def _origin(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any]) -> l
     checks += _between(f"{name}.origin.thickness_m", thickness, _get(rules, "origin", "thickness_m"))
     if _get(rules, "origin", "fixed_m") is not None:
         checks.append(ConstraintCheck(f"{name}.origin.fixed_m.spread", 0.0, spread, spread == 0.0))
+    return checks
+
+
+def _mounts(
+    sensors: list[Mapping[str, Any]], rules: Mapping[str, Any], each: list[Mapping[str, Any]]
+) -> list[ConstraintCheck]:
+    """Every mounted sensor is at one of its mounts without any spread, and no other one is there."""
+    checks, taken = [], []
+    for index, sensor in enumerate(sensors):
+        mounts = _get(_over(rules, each[index]) if index < len(each) else rules, "origin", "mounts_m")
+        if not mounts:
+            continue
+        mean, name = list(sensor["origin_m"]["mean"]), str(sensor.get("name", index))
+        still = not np.any(sensor["origin_m"]["covariance"])
+        there = [mount for mount in mounts if all(abs(a - b) <= _slack(b) for a, b in zip(mean, mount, strict=True))]
+        kept = bool(there) and there[0] not in taken and still
+        taken += there[:1]
+        checks.append(ConstraintCheck(f"{name}.origin.mounts_m", mounts, mean, kept))
     return checks
 
 

@@ -137,7 +137,7 @@ def _named(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
 
 def _sensor(part: Part, mixture: Mixture, row: int, space: DesignSpace, level: float) -> Sensor:
     axes: Axes = part.features.axes
-    origin = np.array(space.low[:3])
+    origin = np.array(space.low[:3], dtype=np.float64)
     for axis, pin in enumerate(part.group.pins):
         if pin is not None:
             origin[axis] = pin

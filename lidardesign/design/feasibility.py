@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints import Constraints, SensorConstraints
+from lidardesign.design.mounts import most_mounted
 from lidardesign.errors import InfeasibleError
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace
 
@@ -39,9 +40,11 @@ def check_feasible(constraints: Constraints, space: DesignSpace, *, sensors: int
         InfeasibleError: With the conflicting names.
     """
     _check_count(constraints, sensors)
+    _check_mount_count(constraints, sensors)
     for index in range(max(len(constraints.each), 1)):
         one = constraints.of_sensor(index)
         _check_origin(constraints, one, index, space)
+        _check_mounts(constraints, one, index, space)
         _check_boresight(constraints, one, index, space)
         _check_field(constraints, one, index, space)
         _check_gate(constraints, one, index, space)
@@ -88,6 +91,38 @@ def _check_origin(constraints: Constraints, one: SensorConstraints, index: int, 
                         f"{DIMENSIONS[axis]} of the origin is at least {low.value:g} and at most {high.value:g}",
                         [low.name, high.name],
                     )
+
+
+def _check_mounts(constraints: Constraints, one: SensorConstraints, index: int, space: DesignSpace) -> None:
+    """Mounts are alternatives to a fixed origin, inside the design space and the box."""
+    if one.origin.mounts_m is None:
+        return
+    name = constraints.name_of(index, "origin.mounts_m")
+    if one.origin.fixed_m is not None:
+        _refuse("an origin is fixed, or at one of several mounts", [constraints.name_of(index, "origin.fixed_m"), name])
+    for number, mount in enumerate(one.origin.mounts_m):
+        for axis, value in enumerate(mount):
+            bounds = [_Bound(space.low[axis], f"space.{DIMENSIONS[axis]}")]
+            bounds.append(_Bound(space.high[axis], f"space.{DIMENSIONS[axis]}"))
+            for key in ("low_m", "high_m"):
+                corner = getattr(one.origin, key)
+                own = value if corner is None else corner[axis]
+                bounds.append(_Bound(own, constraints.name_of(index, f"origin.{key}")))
+            for low, high in (bounds[:2], bounds[2:]):
+                beyond = low if value < low.value - AGREEMENT else high if value > high.value + AGREEMENT else None
+                if beyond is not None:
+                    text = f"{DIMENSIONS[axis]} of a mount is {value:g}, beyond {beyond.value:g}"
+                    _refuse(text, [f"{name}[{number}]", beyond.name])
+
+
+def _check_mount_count(constraints: Constraints, sensors: int | None) -> None:
+    """Every mounted sensor needs a mount of its own."""
+    least = least_sensors(constraints, sensors)
+    most = most_mounted(constraints)
+    if most is not None and most < least.value:
+        names = [constraints.name_of(i, "origin.mounts_m") for i in range(len(constraints.each) or 1)]
+        mounted = [name for i, name in enumerate(names) if constraints.of_sensor(i).origin.mounts_m]
+        _refuse(f"{least.value:g} sensors for {most} mounts", [least.name or "sensors", *mounted])
 
 
 def _check_boresight(constraints: Constraints, one: SensorConstraints, index: int, space: DesignSpace) -> None:

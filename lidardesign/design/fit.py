@@ -17,6 +17,8 @@ from lidardesign.design.coupling import couplings
 from lidardesign.design.ensemble import Ensemble, Part, fit_parts, heaviest_first, sensors_of
 from lidardesign.design.feasibility import check_feasible, least_sensors
 from lidardesign.design.features import Axes, Features
+from lidardesign.design.mount_choice import at_mounts
+from lidardesign.design.mounts import is_mounted, most_mounted
 from lidardesign.design.rays import SAMPLES_PER_RAY, make_ray_table, split_budget
 from lidardesign.design.resolve import bounds_of, groups
 from lidardesign.design.samples import Samples
@@ -211,6 +213,12 @@ def _check_options(
     if rays is not None and budget is not None and rays != budget:
         raise InfeasibleError(f"{rays} and {budget} rays asked for", conflicts=["--rays", "budget.rays"])
     if layout == "scan":
+        if is_mounted(constraints):
+            raise ConfigError(
+                "the rays of a scan have origins of their own",
+                where="--layout scan",
+                hint="remove origin.mounts_m, or choose the layout density",
+            )
         if constraints.each or any(v is not None for v in constraints.sensors.model_dump().values()):
             raise ConfigError(
                 "every ray of a scan is a component of its own",
@@ -233,17 +241,21 @@ def _sensor_counts(constraints: Constraints, sensors: int | str | None) -> list[
     if isinstance(sensors, int) or asked.count is not None:
         return [sensors if isinstance(sensors, int) else int(asked.count or 1)]
     low = max(asked.min or 1, len(constraints.each), 1)
-    high = MOST_SENSORS if asked.max is None else asked.max
-    if constraints.budget.rays is not None:
-        high = min(high, constraints.budget.rays)
+    mounted = most_mounted(constraints)
+    high = max(MOST_SENSORS, mounted or 0) if asked.max is None else asked.max
+    for limit in (mounted, constraints.budget.rays):
+        high = high if limit is None else min(high, limit)
     if sensors == "auto":
         return list(range(low, max(low, high) + 1))
-    usual = len(constraints.each) or DEFAULT_SENSORS
+    usual = mounted or len(constraints.each) or DEFAULT_SENSORS
     return [min(max(usual, low), max(low, high))]
 
 
 def _fitted(request: _Request, sensors: int | str | None) -> tuple[list[Support], Ensemble]:
     counts = _sensor_counts(request.constraints, sensors)
+    if is_mounted(request.constraints):
+        fixed, counts = at_mounts(request.constraints, request.samples, counts, request.retarget, request.seed)
+        request = replace(request, constraints=fixed)
     supports = _supports(request, counts[-1])
     count = counts[0] if len(counts) == 1 else _chosen_count(request, supports, counts)
     kept = supports if len(supports) == len(groups(request.constraints, request.samples.space, count)) else None

@@ -47,7 +47,7 @@ def inward(low: float, high: float) -> tuple[float, float]:
 
 def origin_box(one: SensorConstraints, space: DesignSpace) -> tuple[np.ndarray, np.ndarray]:
     """The box of a sensor's mean origin inside the design space, (3,) each [m]; a point where it is fixed."""
-    low, high = np.array(space.low[:3]), np.array(space.high[:3])
+    low, high = (np.array(bound[:3], dtype=np.float64) for bound in (space.low, space.high))
     if one.origin.low_m is not None:
         low = np.maximum(low, one.origin.low_m)
     if one.origin.high_m is not None:

@@ -118,38 +118,50 @@ def pinned(
     Raises:
         ConfigError: No way to evaluate the target density was given.
     """
+    aimed, weights = re_aimed(samples, drawn(samples, count, generator), constraints, group, retarget)
+    used = weights > 0
+    return Support(aimed[used], weights[used], float(weights.sum()) / count, effective_count(weights))
+
+
+def re_aimed(
+    samples: Samples, chosen: np.ndarray, constraints: Constraints, group: Group, retarget: Retarget | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Chosen samples aimed from the pins at what they observed, (N, 6), and their new weights, (N,); 0 where unseen.
+
+    Raises:
+        ConfigError: No way to evaluate the target density was given.
+        NumericalError: The target density is NaN at one of them.
+    """
     if retarget is None:
         raise ConfigError(
             "the origin is free in the learned density, and pinning it needs the target density",
             where="origin.fixed_m",
             hint="give the run folder instead of a design file",
         )
-    chosen = _drawn(samples, count, generator)
     points, space = samples.points[chosen], samples.space
-    aimed = _re_aimed(points, group.pins)
+    aimed = space.wrap(_from_pins(points, group.pins))
+    weights = np.zeros(len(aimed))
     log_old = _per_scene_volume(points, samples.log_target[chosen], space)
     keep = space.contains(aimed, TOLERANCE) & admissible(aimed, constraints, space, group)
     keep &= np.isfinite(log_old) & (aimed[:, RANGE] > 0)
-    aimed = space.wrap(aimed[keep])
-    if not len(aimed):
-        return Support(aimed, np.zeros(0), 0.0, 0.0)
-    log_target = np.asarray(retarget(aimed), dtype=np.float64)
-    if log_target.shape != (len(aimed),) or np.isnan(log_target).any():
+    if not keep.any():
+        return aimed, weights
+    log_target = np.asarray(retarget(aimed[keep]), dtype=np.float64)
+    if log_target.shape != (int(keep.sum()),) or np.isnan(log_target).any():
         raise NumericalError("the target density is NaN at re-aimed samples", where="origin.fixed_m")
     with np.errstate(invalid="ignore"):
-        weights = np.exp(_per_scene_volume(aimed, log_target, space) - log_old[keep])
-    used = weights > 0
-    return Support(aimed[used], weights[used], float(weights.sum()) / count, effective_count(weights))
+        weights[keep] = np.exp(_per_scene_volume(aimed[keep], log_target, space) - log_old[keep])
+    return aimed, weights
 
 
-def _drawn(samples: Samples, count: int, generator: np.random.Generator) -> np.ndarray:
-    """Indices of samples in proportion to their weights, by systematic resampling."""
+def drawn(samples: Samples, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Indices of `count` samples in proportion to their weights, by systematic resampling."""
     positions = (np.arange(count) + generator.uniform()) / count
     cumulative = np.cumsum(samples.weights)
     return np.minimum(np.searchsorted(cumulative, positions * cumulative[-1], side="right"), len(samples) - 1)
 
 
-def _re_aimed(points: np.ndarray, pins: Pins) -> np.ndarray:
+def _from_pins(points: np.ndarray, pins: Pins) -> np.ndarray:
     origins = points[:, :3].copy()
     for axis, value in enumerate(pins):
         if value is not None:
