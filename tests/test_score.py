@@ -182,7 +182,7 @@ def test_the_document_has_the_keys_of_the_contract_and_is_plain_json():
     assert json.loads(json.dumps(document, allow_nan=False)) == document
     keys = {"metric", "scenes", "rows", "paired", "equal_bandwidth", "effects", "accuracy"}
     assert keys <= set(document)
-    row = {"design", "rays", "value", "ci_low", "ci_high", "failures", "bandwidth_mbps", "seconds"}
+    row = {"design", "rays", "value", "ci_low", "ci_high", "failures", "bandwidth_mbps", "seconds", "details"}
     assert all(set(entry) == row for entry in document["rows"])
     assert all(set(entry) == {*row, "matched_to", "matched_rays"} for entry in document["equal_bandwidth"])
     pair = {"a", "b", "rays", "difference", "ci_low", "ci_high"}

@@ -20,10 +20,8 @@ from lidardesign.errors import ConfigError, DataError, ThresholdError
 
 if TYPE_CHECKING:
     from lidardesign.cli.runs import Run
-    from lidardesign.design.samples import Samples
-    from lidardesign.design.sensor import Design, RayTable
+    from lidardesign.design.sensor import Design
     from lidardesign.evaluate.score import Evaluation, EvaluationRequest
-    from lidardesign.simulate.returns import Rays
 
 
 ALWAYS = ("uniform", "random", "bounding")
@@ -44,14 +42,18 @@ def evaluate(
     ],
     rays: Annotated[
         list[int] | None,
-        typer.Option("--rays", metavar="N", min=1, help="Rays per frame; repeatable.", show_default="the task's"),
+        typer.Option(
+            "--rays", metavar="N", min=1, help="Rays per frame and position; repeatable.", show_default="the task's"
+        ),
     ] = None,
     baseline: Annotated[
         list[str] | None,
         typer.Option(
             "--baseline",
             metavar="NAME",
-            help="A further baseline beside uniform, random and bounding.",
+            help="A further baseline beside uniform, random and bounding: occupancy (rays towards cells that targets "
+            "occupy) or no-visibility (the first design fitted anew to the density without its occlusion term, from "
+            "samples drawn for it: some seconds). Repeatable.",
             show_default=False,
         ),
     ] = None,
@@ -167,6 +169,7 @@ def _common_run(entries: list[_Entry], runs: list[Run]) -> Run:
 def _request(
     run: Run, entries: list[_Entry], rays: list[int] | None, baselines: list[str], seed: int | None
 ) -> EvaluationRequest:
+    from lidardesign.cli.layouts import layouts_of, twin_without_visibility
     from lidardesign.design.samples import FILE_NAME, load_samples
     from lidardesign.evaluate.score import EvaluationRequest
 
@@ -177,6 +180,8 @@ def _request(
         for entry in entries
         if entry.run is not None and _may_need_samples(entry.design) and (entry.run.folder / FILE_NAME).exists()
     }
+    made = [(entry.design, entry.run) for entry in entries if entry.run is not None]
+    layouts = layouts_of([(design.name, origin) for design, origin in made])
     return EvaluationRequest(
         task=task,
         config=config.task,
@@ -188,29 +193,13 @@ def _request(
         samples=samples,
         train=run.scenes("train", seed),
         test=run.scenes("test", seed),
-        lay_out=_lay_out,
+        lay_out=layouts,
+        without_visibility=(lambda: twin_without_visibility(*made[0], layouts)) if made else None,
     )
 
 
 def _may_need_samples(design: Design) -> bool:
     return design.layout != "grid" or design.ray_table is not None
-
-
-def _lay_out(design: Design, count: int, samples: Samples | None) -> Rays:
-    """A design's rays at a number of rays, with a gate per ray where its own table has one per ray."""
-    from lidardesign.design.rays import lay_out
-
-    table = design.ray_table
-    gates = "ray" if table is not None and _has_gates_per_ray(table) else "sensor"
-    return lay_out(design, count, samples, gates=gates if samples is not None else "sensor")
-
-
-def _has_gates_per_ray(table: RayTable) -> bool:
-    """Whether rays of one sensor listen at different times."""
-    import numpy as np
-
-    _, first, sensor = np.unique(table.sensor, return_index=True, return_inverse=True)
-    return bool((table.gate_m != table.gate_m[first[sensor]]).any())
 
 
 def _evaluate(request: EvaluationRequest, console: Console) -> Evaluation:
@@ -250,11 +239,15 @@ def _write_files(
 
 
 def _write_report(evaluation: Evaluation, request: EvaluationRequest, path: Path) -> None:
+    from lidardesign.evaluate.entries import middle_condition
     from lidardesign.evaluate.report import write_report
     from lidardesign.run.manifest import versions
 
+    at = middle_condition(request)
     rays = {
-        design.name: _lay_out(design, design.rays or max(request.rays), request.samples.get(design.name))
+        design.name: request.lay_out(
+            design, design.rays or max(request.rays), request.samples.get(design.name), at=at
+        )
         for design in request.designs
     }
     reproduce = {"command": shlex.join(["lidardesign", *sys.argv[1:]]), "seed": request.seed, **versions()}

@@ -6,8 +6,8 @@ by scene, and their intervals are the ones that tell two designs apart.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,16 +21,17 @@ class Row:
 
     Arguments:
         design: Its name.
-        rays: Rays per frame.
+        rays: Rays per frame; with conditions, per condition value.
         value: Mean score over the held-out scenes, failures at the metric's worst value.
         ci_low, ci_high: Ends of the 95 % bootstrap interval of the mean.
         failures: Scenes with too few returns to score.
-        bandwidth_mbps: What its gates cost to read out [Mbit/s].
+        bandwidth_mbps: What its gates cost to read out, averaged over condition values [Mbit/s].
         seconds: Time to simulate and score all scenes [s]; measured once where rows share their rays.
         per_scene: The score in every held-out scene, shape (S,).
         baseline: Whether it is a baseline.
         matched_to, matched_rays: The design and its number of rays whose bandwidth this baseline was given;
             None outside the comparison at equal bandwidth.
+        details: The task's further figures by name, each a mean over the scenes that give it.
     """
 
     design: str
@@ -45,9 +46,10 @@ class Row:
     baseline: bool = False
     matched_to: str | None = None
     matched_rays: int | None = None
+    details: Mapping[str, float] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
-        """The contract's keys; a row at equal bandwidth also says which design it was matched to."""
+        """The contract's keys and `details`; a row at equal bandwidth also says which design it was matched to."""
         values: dict[str, Any] = {
             "design": self.design,
             "rays": self.rays,
@@ -57,6 +59,7 @@ class Row:
             "failures": self.failures,
             "bandwidth_mbps": self.bandwidth_mbps,
             "seconds": self.seconds,
+            "details": dict(self.details),
         }
         if self.matched_to is not None:
             values |= {"matched_to": self.matched_to, "matched_rays": self.matched_rays}

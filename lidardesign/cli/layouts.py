@@ -1,0 +1,104 @@
+"""How `evaluate` turns designs into rays: from their runs' samples, and asking their runs' target where needed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+from lidardesign.errors import DataError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from lidardesign.cli.runs import Run
+    from lidardesign.density.target import Target
+    from lidardesign.design.samples import Samples
+    from lidardesign.design.sensor import Design
+    from lidardesign.simulate.returns import Rays
+
+# As many samples as the standard preset of `learn` leaves.
+TWIN_SAMPLES = 100_000
+TWIN_NAME = "no-visibility"
+
+
+class RunTarget:
+    """log p* of a run, prepared when it is first asked for: most layouts never do.
+
+    Arguments:
+        run: The run.
+        visibility: The visibility to take instead of what the run decided.
+    """
+
+    def __init__(self, run: Run, visibility: str | None = None) -> None:
+        self._run, self._visibility = run, visibility
+
+    @cached_property
+    def _target(self) -> Target:
+        from lidardesign.density.prepare import prepare_target
+        from lidardesign.run.manifest import read_manifest
+
+        run = self._run
+        decided = self._visibility or read_manifest(run.folder).get("visibility")
+        scenes = run.scenes("train", run.config.seed)
+        return prepare_target(scenes, run.config, visibility=decided, compiled=False)[0]
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """Design points (N, 6) to (N,)."""
+        return self._target.log_density(points)
+
+
+@dataclass(frozen=True, eq=False)
+class Layouts:
+    """Lays designs out, each by its own run.
+
+    Arguments:
+        targets: The target of each design's run, by the design's name.
+    """
+
+    targets: Mapping[str, RunTarget]
+
+    def __call__(
+        self, design: Design, count: int, samples: Samples | None, *, at: Mapping[str, float] | None = None
+    ) -> Rays:
+        """A design's rays at a number of rays, with a gate per ray where its own table has one per ray."""
+        from lidardesign.design.rays import lay_out
+        from lidardesign.evaluate.ablation import has_gates_per_ray
+
+        table = design.ray_table
+        per_ray = table is not None and samples is not None and has_gates_per_ray(table)
+        gates = "ray" if per_ray else "sensor"
+        return lay_out(design, count, samples, gates=gates, at=at, retarget=self.targets.get(design.name))
+
+
+def twin_without_visibility(design: Design, run: Run, layouts: Layouts) -> tuple[Design, Samples]:
+    """A design's twin of the density without its occlusion term, and the samples that it was fitted to.
+
+    Raises:
+        DataError: No ray of the design space comes near a target.
+    """
+    from lidardesign.density.ablation import samples_without_visibility
+    from lidardesign.evaluate.ablation import fitted_twin
+    from lidardesign.task import random_generator
+
+    config = run.config
+    samples = samples_without_visibility(
+        run.scenes("train", config.seed),
+        config.space.at(design.at),
+        config.density,
+        TWIN_SAMPLES,
+        random_generator(config.seed, "no visibility"),
+    )
+    if not len(samples):
+        raise DataError("no ray of the design space comes near a target", where=f"--baseline {TWIN_NAME}")
+    target = layouts.targets[TWIN_NAME]
+    return fitted_twin(design, samples, name=TWIN_NAME, retarget=target), samples
+
+
+def layouts_of(runs: Sequence[tuple[str, Run]]) -> Layouts:
+    """The layouts of designs by name and run; the twin takes the first run's target without occlusion."""
+    targets = {name: RunTarget(run) for name, run in runs}
+    if runs:
+        targets[TWIN_NAME] = RunTarget(runs[0][1], visibility="off")
+    return Layouts(targets)

@@ -1,0 +1,101 @@
+"""What a baseline may take: layouts of any number of rays, with one ray list for every condition value.
+
+Most designs have one list of rays. Where a task's scenes are seen from several condition values (a robot's
+positions), a design has one list per value; all have the same number of rays.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.evaluate.placement import opened_gate, rays_at
+from lidardesign.simulate.returns import Rays
+from lidardesign.space import RANGE, DesignSpace
+
+CENTRAL_SHARE = 0.99
+
+Positions = tuple[Rays, ...]  # one list of rays per condition value, in the task's order
+
+
+class Spot(NamedTuple):
+    """Where and for which scene rays are laid out.
+
+    Arguments:
+        space: The design space at a condition value.
+        number: Which of the values it is.
+        scene: The held-out scene, for what is drawn anew in each.
+    """
+
+    space: DesignSpace
+    number: int = 0
+    scene: int = 0
+
+
+class Candidate(Protocol):
+    """One layout that a baseline may take; `drawn_anew` says whether it differs from scene to scene."""
+
+    name: str
+    drawn_anew: bool
+
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
+        """Exactly `count` rays in each of the spaces."""
+        ...
+
+    def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
+        """As many rays as fit in a bandwidth [Mbit/s], the same number in each space; none where not one fits."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """A layout whose rays all have one gate.
+
+    Arguments:
+        name: For messages.
+        place: Even or random points (x, y, z, azimuth, elevation) of any number, (count, spot) to (count, 5).
+        gate_m: The gate of all its rays, shape (2,).
+        drawn_anew: Whether the points differ from scene to scene.
+    """
+
+    name: str
+    place: Callable[[int, Spot], np.ndarray]
+    gate_m: np.ndarray
+    drawn_anew: bool = False
+
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
+        """See `Candidate`."""
+        spots = [Spot(space, number, scene) for number, space in enumerate(spaces)]
+        return tuple(rays_at(self.place(count, spot), self.gate_m) for spot in spots)
+
+    def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
+        """See `Candidate`."""
+        width_m = self.gate_m[1] - self.gate_m[0]
+        single = bandwidth.mbps_of_widths(np.array([width_m]))
+        # the ratio of two multiples of one bin may lie an ulp below a whole number
+        count = math.floor(limit_mbps / single * (1 + np.finfo(float).eps))
+        while count and bandwidth.mbps_of_widths(np.array([width_m]), count) > limit_mbps:
+            count -= 1
+        return self.positions(spaces, count)
+
+
+def mean_mbps(positions: Positions, bandwidth: Bandwidth) -> float:
+    """What reading rays out costs, averaged over condition values [Mbit/s]."""
+    return math.fsum(bandwidth.mbps(rays) for rays in positions) / len(positions)
+
+
+def whole_range(space: DesignSpace) -> np.ndarray:
+    """The gate that hears all of a space's range, shape (2,) [m]."""
+    return opened_gate(space.low[RANGE], space.high[RANGE])
+
+
+def central(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of the central 99 % of each column, (N, ...) to two of shape (...)."""
+    tail = (1 - CENTRAL_SHARE) / 2
+    low, high = np.quantile(values, [tail, 1 - tail], axis=0)
+    return low, np.maximum(low, high)

@@ -1,0 +1,161 @@
+"""The rows of an evaluation to be: who fires which rays, at how many and in whose bandwidth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.evaluate.ablation import TwinCandidate
+from lidardesign.evaluate.baselines import Baselines, Judge, Option
+from lidardesign.evaluate.candidates import Candidate, Positions, mean_mbps
+from lidardesign.evaluate.request import EvaluationRequest
+from lidardesign.evaluate.scoring import score_lists
+from lidardesign.simulate.simulate import build_casters
+from lidardesign.task import conditions_of
+
+# Candidates of a baseline are compared on this many training scenes: enough to tell a good layout from a bad one,
+# at a fraction of the held-out scenes' cost.
+JUDGED_SCENES = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """One row to be.
+
+    Arguments:
+        name: The design's or baseline's.
+        positions: The rays per condition value.
+        baseline: Whether it is a baseline.
+        redraw: Rays of a scene, for what is drawn anew in each.
+        matched_to, matched_rays: The design and its number of rays whose bandwidth this baseline was given.
+    """
+
+    name: str
+    positions: Positions
+    baseline: bool
+    redraw: Callable[[int], Positions] | None = None
+    matched_to: str | None = None
+    matched_rays: int | None = None
+
+    @property
+    def rays(self) -> int:
+        """Rays per condition value."""
+        return len(self.positions[0])
+
+    def mbps(self, bandwidth: Bandwidth) -> float:
+        """What its rays cost to read out, averaged over condition values [Mbit/s]."""
+        return mean_mbps(self.positions, bandwidth)
+
+    def drawn(self, scene: int) -> Positions:
+        """The rays that it fires in a held-out scene."""
+        return self.positions if self.redraw is None else self.redraw(scene)
+
+    @cached_property
+    def key(self) -> tuple[Any, ...]:
+        """Equal for entries that fire the same rays."""
+        if not self.baseline:
+            return ("design", self.name, self.rays)
+        arrays = (array for rays in self.positions for array in (rays.origin_m, rays.direction, rays.gate_m))
+        return (self.name, *(array.tobytes() for array in arrays))
+
+
+def entries_of(request: EvaluationRequest) -> list[Entry]:
+    """All rows to be: designs, baselines, then baselines at each design's bandwidth."""
+    baselines = _baselines(request)
+    counts = list(dict.fromkeys(request.rays))
+    designs = [
+        Entry(design.name, _laid_out(request, design, count), baseline=False)
+        for design in request.designs
+        for count in counts
+    ]
+    wanted = [
+        _Wanted(name, baselines.options(name, count), None) for name in request.baselines for count in counts
+    ]
+    if request.equal_bandwidth:
+        wanted += [
+            _Wanted(name, baselines.options_within(name, entry.mbps(request.bandwidth), request.bandwidth), entry)
+            for entry in designs
+            for name in request.baselines
+        ]
+    chosen = baselines.best([(one.name, one.options) for one in wanted])
+    return designs + [_entry(baselines, one, option) for one, option in zip(wanted, chosen, strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Wanted:
+    """A baseline that is asked for, maybe in the bandwidth of a design."""
+
+    name: str
+    options: list[Option]
+    matched: Entry | None
+
+
+def _entry(baselines: Baselines, wanted: _Wanted, option: Option) -> Entry:
+    candidate, count = option.candidate, len(option.positions[0])
+    redraw = None
+    if candidate.drawn_anew:
+
+        def redraw(scene: int) -> Positions:
+            return candidate.positions(baselines.spaces, count, scene)
+
+    matched = wanted.matched
+    if matched is None:
+        return Entry(wanted.name, option.positions, True, redraw)
+    return Entry(wanted.name, option.positions, True, redraw, matched.name, matched.rays)
+
+
+def _baselines(request: EvaluationRequest) -> Baselines:
+    return Baselines(
+        request.space,
+        request.train,
+        request.seed,
+        _judge(request),
+        conditions=_conditions(request),
+        without_visibility=_twin(request),
+    )
+
+
+def _conditions(request: EvaluationRequest) -> list[dict[str, float]]:
+    return conditions_of(request.task, request.config, request.space)
+
+
+def middle_condition(request: EvaluationRequest) -> dict[str, float]:
+    """The condition value in the middle of those that are evaluated at, for drawings; empty without conditions."""
+    ordered = sorted(_conditions(request), key=lambda condition: tuple(condition.values()))
+    return ordered[len(ordered) // 2]
+
+
+def _laid_out(request: EvaluationRequest, design: Any, count: int) -> Positions:
+    samples = request.samples.get(design.name)
+    return tuple(request.lay_out(design, count, samples, at=condition) for condition in _conditions(request))
+
+
+def _twin(request: EvaluationRequest) -> Callable[[], Candidate] | None:
+    make = request.without_visibility
+    if make is None:
+        return None
+
+    def candidate() -> Candidate:
+        design, samples = make()
+        return TwinCandidate(design, samples, _conditions(request), request.lay_out)
+
+    return candidate
+
+
+def _judge(request: EvaluationRequest) -> Judge:
+    """The mean score of sets of rays on a few training scenes, turned so that lower is better."""
+    sign = 1.0 if request.task.metric.better == "lower" else -1.0
+
+    def judge(lists: Sequence[Positions]) -> Sequence[float]:
+        values = [
+            [score.value for score, _ in score_lists(request.task, scene, lists, build_casters(scene))]
+            for scene in request.train[:JUDGED_SCENES]
+        ]
+        return [float(value) for value in sign * np.mean(values, axis=0)] if values else [0.0] * len(lists)
+
+    return judge

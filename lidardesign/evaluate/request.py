@@ -1,0 +1,79 @@
+"""What an evaluation is asked for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.rays import lay_out
+from lidardesign.design.samples import Samples
+from lidardesign.design.sensor import Design
+from lidardesign.errors import ConfigError, PluginError
+from lidardesign.evaluate.ablation import LayOut
+from lidardesign.evaluate.baselines import BASELINES
+from lidardesign.scene import Scene
+from lidardesign.space import DesignSpace
+from lidardesign.task import Task
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluationRequest:
+    """What to evaluate.
+
+    Arguments:
+        task: The task whose score is taken.
+        config: The task's configuration; its condition values are evaluated at.
+        space: The design space that baselines fill.
+        seed: Root of the drawn baselines and the bootstrap.
+        designs: The designs, by distinct names that are no baseline's.
+        rays: Numbers of rays per frame; with conditions, per condition value.
+        baselines: Names of baselines.
+        bandwidth: The read-out model.
+        samples: Samples of the learned density by design name, for layouts that need them.
+        equal_bandwidth: Whether baselines are also given each design's bandwidth.
+        train, test: Training scenes (for baselines) and held-out scenes.
+        lay_out: How a design becomes a ray list of a given length.
+        without_visibility: The design that stands for the baseline `no-visibility`, and the samples that it was
+            fitted to; called when that is asked for.
+    """
+
+    task: Task
+    config: Any
+    space: DesignSpace
+    seed: int
+    designs: Sequence[Design]
+    rays: Sequence[int]
+    baselines: Sequence[str] = ("uniform", "random", "bounding")
+    bandwidth: Bandwidth = field(default_factory=Bandwidth)
+    samples: Mapping[str, Samples] = field(default_factory=dict)
+    equal_bandwidth: bool = True
+    train: Sequence[Scene] = ()
+    test: Sequence[Scene] = ()
+    lay_out: LayOut = lay_out
+    without_visibility: Callable[[], tuple[Design, Samples]] | None = None
+
+    def check(self) -> None:
+        """Refuse what makes no sense.
+
+        Raises:
+            ConfigError: No scenes, designs of one name, an unknown baseline, or no rays.
+            PluginError: The metric's worst value is not finite.
+        """
+        where = f"task {self.task.name}"
+        if not self.test:
+            raise ConfigError("there are no held-out scenes", where=where, allowed="1 or more")
+        if not math.isfinite(self.task.metric.worst):
+            raise PluginError(f"the worst value is {self.task.metric.worst}", where=where, allowed="finite")
+        names = [design.name for design in self.designs]
+        for name in names:
+            if names.count(name) > 1 or name in BASELINES:
+                other = "a baseline" if name in BASELINES else "another design"
+                raise ConfigError(f"a design has the name of {other}: {name!r}", hint="rename its file")
+        unknown = [name for name in self.baselines if name not in BASELINES]
+        if unknown:
+            raise ConfigError(f"unknown baseline {unknown[0]!r}", where="--baseline", allowed=", ".join(BASELINES))
+        if any(count < 1 for count in self.rays):
+            raise ConfigError(f"{min(self.rays)} rays", where="--rays", allowed="1 or more")

@@ -1,0 +1,97 @@
+"""The checked score of lists of rays in a scene."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from lidardesign.errors import PluginError
+from lidardesign.evaluate.candidates import Positions
+from lidardesign.registry import plugin_guard
+from lidardesign.scene import Scene
+from lidardesign.simulate.raycast import SceneCaster
+from lidardesign.simulate.returns import Rays, Returns
+from lidardesign.simulate.simulate import simulate, simulate_many
+from lidardesign.task import Score, Task
+
+# Rays times frames that are traced together: their returns take 24 bytes each.
+MOST_RETURNS = 4_000_000
+
+
+def score_lists(
+    task: Task, scene: Scene, jobs: Sequence[Positions], casters: Sequence[SceneCaster]
+) -> Iterator[tuple[Score, float]]:
+    """Scores of many sets of rays in one scene, in their order, each with its share of the time [s].
+
+    As many are traced together as a bounded memory allows.
+    """
+    for group in _groups(jobs, scene.frames):
+        started = time.perf_counter()
+        found = iter(simulate_many(scene, [rays for positions in group for rays in positions], casters=casters))
+        rays = sum(_count(positions) for positions in group)
+        per_ray = (time.perf_counter() - started) / max(rays, 1)
+        for positions in group:
+            returns = [frame for _ in positions for frame in next(found)]
+            started = time.perf_counter()
+            score = checked_score(task, scene, returns)
+            yield score, time.perf_counter() - started + per_ray * _count(positions)
+
+
+def _count(positions: Positions) -> int:
+    return sum(len(rays) for rays in positions)
+
+
+def _groups(jobs: Sequence[Positions], frames: int) -> Iterator[list[Positions]]:
+    group: list[Positions] = []
+    size = 0
+    for positions in jobs:
+        returns = _count(positions) * frames
+        if group and size + returns > MOST_RETURNS:
+            yield group
+            group, size = [], 0
+        group.append(positions)
+        size += returns
+    if group:
+        yield group
+
+
+def score_scene(task: Task, scene: Scene, rays: Rays, casters: Sequence[SceneCaster]) -> Score:
+    """The checked score of one list of rays in one scene; see `checked_score`."""
+    return checked_score(task, scene, simulate(scene, rays, casters=casters))
+
+
+def checked_score(task: Task, scene: Scene, returns: Sequence[Returns]) -> Score:
+    """What a task makes of returns in a scene; a failure has the metric's worst value.
+
+    A value beyond the worst one counts as the worst, so that failing is never the better choice.
+
+    Raises:
+        PluginError: The task's score raised, or returned something that is no finite score.
+    """
+    where = f"task {task.name}, metric {task.metric.name}, scene {scene.name}"
+    try:
+        with plugin_guard(task.name):
+            score = task.score(scene, returns)
+    except PluginError as error:
+        raise PluginError(f"scoring failed: {error.message}", where=where, hint=error.hint) from error
+    if not isinstance(score, Score):
+        raise PluginError(
+            f"score returned {type(score).__name__}", where=where, allowed="lidardesign.task.Score"
+        )
+    if score.failed:
+        return Score(float(task.metric.worst), failed=True, details=score.details)
+    number = isinstance(score.value, int | float | np.integer | np.floating) and not isinstance(
+        score.value, bool
+    )
+    if not number or not math.isfinite(score.value):
+        raise PluginError(
+            f"score returned {score.value!r}",
+            where=where,
+            allowed="a finite number",
+            hint="where there are too few returns, return Score(metric.worst, failed=True)",
+        )
+    clip = min if task.metric.better == "lower" else max
+    return Score(clip(float(score.value), float(task.metric.worst)), details=score.details)
