@@ -94,11 +94,19 @@ def test_boxes_stand_on_boards_within_the_shelf_and_have_the_sizes_asked_for(she
                 assert 0.2 - ROUNDING_M <= high[0] - low[0] <= 0.6 + ROUNDING_M
 
 
-def test_no_two_bodies_overlap(shelves):
-    for scene in shelves:
-        corners = list(in_shelf_frame(scene.bodies).items())
-        low = np.array([one[0] for _, one in corners])
-        high = np.array([one[1] for _, one in corners])
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"second_row_share": 1.0, "box_setback_m": (0.05, 0.05), "empty_share": 0.0},
+        {"empty_share": 0.9, "front_m": (1.1, 0.4), "front_jitter_m": 0.05, "bays": 20},
+        {"box_width_m": (0.02, 1.0), "box_height_m": (0.399, 0.399), "level_spacing_m": (0.46, 0.46)},
+    ],
+)
+def test_no_two_bodies_overlap(values):
+    for scene in TASK.scenes(WarehouseConfig(size="small", test=3, **values), "test", 5):
+        corners = list(in_shelf_frame(scene.bodies).values())
+        low, high = np.array([one[0] for one in corners]), np.array([one[1] for one in corners])
         shared = np.minimum(high[:, None], high) - np.maximum(low[:, None], low)
         overlapping = (shared > ROUNDING_M).all(axis=-1)
         np.fill_diagonal(overlapping, False)
@@ -362,6 +370,25 @@ def test_a_space_without_a_fixed_plane_is_refused(name):
     values = {**SPACE.as_dict(), name: [-2.0, 0.5]}
     with pytest.raises(ConfigError, match="vertical plane"):
         TASK.scenes(SMALL, "train", 0, space=DesignSpace.from_dict(values))
+
+
+@pytest.mark.parametrize("bounds", [[0.0, 2.0], [-0.5, 6.0], 4.5])
+def test_a_space_beyond_or_short_of_the_aisle_is_refused_with_the_bounds(bounds):
+    with pytest.raises(ConfigError, match=r"-0\.5 to 4 m"):
+        TASK.scenes(SMALL, "train", 0, space=DesignSpace.from_dict({**SPACE.as_dict(), "x_m": bounds}))
+
+
+def test_a_robot_that_stands_still_is_judged_where_it_stands():
+    space = DesignSpace.from_dict({**SPACE.as_dict(), "x_m": 0.37})
+    scene = scenes_of(TASK, SMALL, "test", 0, space)[0]
+    assert conditions_of(TASK, SMALL, space) == [{}]
+    np.testing.assert_array_equal(scene.truth.origins_m, [[0.37, 0.0, 0.0]])
+    assert TASK.score(scene, returns_of(scene, np.linspace(0.0, math.pi / 2, SWEEP_RAYS))).value == 0.0
+
+
+def test_positions_that_are_no_condition_are_refused():
+    with pytest.raises(ConfigError, match="given robot positions"):
+        TASK.scenes(SMALL, "train", 0, space=DesignSpace.from_dict({**SPACE.as_dict(), "condition": []}))
 
 
 def test_a_space_from_which_no_box_can_be_seen_is_refused():

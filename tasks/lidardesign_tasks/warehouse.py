@@ -17,8 +17,8 @@ from pydantic import Field, model_validator
 from lidardesign.errors import ConfigError
 from lidardesign.scene import Scene
 from lidardesign.simulate.returns import Returns
-from lidardesign.space import DIMENSIONS, DesignSpace
-from lidardesign.task import Defaults, Metric, Score, Split, TaskConfig, random_generator
+from lidardesign.space import DIMENSIONS, DesignSpace, X
+from lidardesign.task import Defaults, Metric, Score, Split, TaskConfig, conditions_of, random_generator
 from lidardesign_tasks.warehouse_shelf import Interval, ShelfPlan, build_shelf
 from lidardesign_tasks.warehouse_truth import BoxTruth, miss_score
 
@@ -122,17 +122,11 @@ class WarehouseTask:
         """Random shelves; each has a generator of its own, so counts do not change them.
 
         Raises:
-            ConfigError: The space does not fix y, z and the azimuth, or no box can be seen in it.
+            ConfigError: The space is no vertical plane along the aisle, or no box can be seen in it.
         """
         space = space or self.space(config)
-        for name in FIXED_DIMENSIONS:
-            if DIMENSIONS.index(name) in space.free:
-                raise ConfigError(
-                    f"{name} is free, but the warehouse judges rays in one vertical plane per robot position",
-                    where=f"space.{name}",
-                    hint="fix it to one number",
-                )
-        origins = [space.at(one).low[:3] for one in self.conditions(config)]
+        _check_space(space)
+        origins = [space.at(one).low[:3] for one in conditions_of(self, config, space)]
         return [
             _visible_shelf(config.plan, space, np.array(origins), split, seed, index)
             for index in range(config.count(split))
@@ -141,6 +135,28 @@ class WarehouseTask:
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """The share [%] of boxes in the sensor's plane that no ray returned on; one `Returns` per position."""
         return miss_score(self.metric, scene, returns)
+
+
+def _check_space(space: DesignSpace) -> None:
+    """Refuse spaces in which nobody can say which boxes a position should see."""
+    for name in FIXED_DIMENSIONS:
+        if DIMENSIONS.index(name) in space.free:
+            raise ConfigError(
+                f"{name} is free, but the warehouse judges rays in one vertical plane per robot position",
+                where=f"space.{name}",
+                hint="fix it to one number",
+            )
+    if X in space.free and X not in space.conditioned:
+        raise ConfigError(
+            "x_m is free, but designs are judged at given robot positions", where="space.condition", allowed="x_m"
+        )
+    low, high = space.low[X], space.high[X]
+    if (low, high) != AISLE_M and not (X not in space.free and AISLE_M[0] <= low <= AISLE_M[1]):
+        raise ConfigError(
+            f"x from {low:g} to {high:g} m",
+            where="space.x_m",
+            allowed=f"{AISLE_M[0]:g} to {AISLE_M[1]:g} m, where designs are evaluated, or one number between them",
+        )
 
 
 def _visible_shelf(
