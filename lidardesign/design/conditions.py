@@ -2,8 +2,10 @@ r"""The density at one value of its conditions, as weighted samples: nothing is 
 
 Every sample d = (c, r) of the run is a draw of p(r | c) at its own condition c. Moved to the value v it is still a
 draw of that proposal, so with the weight $p^*(v, r) / p(r | c)$ its weighted mean is unbiased for the integral over
-$p^*(v, \cdot)$, however far c was: distance costs effective samples, never correctness. The samples nearest to the
-value are taken, because their proposals suit it best.
+$p^*(v, \cdot)$, however far c was: distance costs effective samples, never correctness. The nearest samples suit
+best; where the density moves quickly far ones get a few huge weights, so of the nearest `count`, half of them, a
+quarter, and so on, the part that is worth most equal weights is taken. (Learned shelves, 40,000 samples of ESS 0.2:
+worth 170 to 290 of the nearest 1000, 900 to 2400 of the nearest 20,000.)
 """
 
 from __future__ import annotations
@@ -58,18 +60,17 @@ def at_condition(
             where="--at",
             hint="give the run folder, or a design that lies in its run",
         )
-    chosen = _nearest(samples, condition, count, generator)
-    points = samples.points[chosen].copy()
+    order, nearest = _nearest(samples, condition, count, generator)
+    points = samples.points[order].copy()
     for name, value in condition.items():
         points[:, DIMENSIONS.index(name)] = value
     log_target = np.asarray(retarget(points), dtype=np.float64)
     if log_target.shape != (len(points),) or np.isnan(log_target).any():
         raise NumericalError(f"the target density is NaN at {shown(condition)}", where="--at")
     # samples were drawn with uniform conditions; given their values that density is no part of it
-    log_prob = samples.log_prob[chosen] + _log_extent(samples.space, condition)
+    log_prob = samples.log_prob[order] + _log_extent(samples.space, condition)
     moved = Samples(points, log_prob, log_target, space)
-    _check_worth(moved, condition)
-    return moved
+    return moved.subset(_worthiest(moved, nearest, condition))
 
 
 def conditioned(samples: Samples, condition: Mapping[str, float], retarget: Retarget | None) -> Samples:
@@ -109,8 +110,11 @@ def shown(condition: Mapping[str, float]) -> str:
 
 def _nearest(
     samples: Samples, condition: Mapping[str, float], count: int, generator: np.random.Generator
-) -> np.ndarray:
-    """Indices of the nearest samples in a random order; distances are shares of each condition's bounds."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the nearest samples in a random order, and the places in it from the nearest to the furthest.
+
+    Distances are shares of each condition's bounds.
+    """
     order = generator.permutation(len(samples))
     squared = np.zeros(len(samples))
     for name, value in condition.items():
@@ -118,27 +122,40 @@ def _nearest(
         extent = samples.space.high[index] - samples.space.low[index]
         if extent > 0:
             squared += np.square((samples.points[order, index] - value) / extent)
-    if count >= len(samples):
-        return order
-    nearest = np.argsort(squared, kind="stable")[:count]
-    # later steps take the first samples as a fair subset
-    return order[np.sort(nearest)]
+    kept = np.sort(np.argsort(squared, kind="stable")[:count])
+    return order[kept], np.argsort(squared[kept], kind="stable")
+
+
+def _worthiest(samples: Samples, nearest: np.ndarray, condition: Mapping[str, float]) -> np.ndarray:
+    """The places of the nearest samples that are worth most: all, half of them, a quarter, ..., in order.
+
+    Raises:
+        DataError: The best part is worth too few.
+    """
+    parts = [nearest]
+    while len(parts[-1]) >= 2 * LEAST_SAMPLES:
+        parts.append(parts[-1][: len(parts[-1]) // 2])
+    worth = [_worth(samples.log_weights[part]) for part in parts]
+    best = int(np.argmax(worth))
+    if worth[best] < LEAST_SAMPLES:
+        raise DataError(
+            f"at {shown(condition)} the {len(samples)} nearest samples are worth {worth[best]:.0f}",
+            where="--at",
+            allowed=f"at least {LEAST_SAMPLES}",
+            hint="another value, learn longer (--preset standard or fine), or with more learning.samples",
+        )
+    # later steps take the first samples as a fair subset, so the random order stays
+    return np.sort(parts[best])
+
+
+def _worth(log_weights: np.ndarray) -> float:
+    """The number of equal weights that are worth as much."""
+    if not np.isfinite(log_weights.max(initial=-np.inf)):
+        return 0.0
+    return effective_count(normalised_weights(log_weights))
 
 
 def _log_extent(space: DesignSpace, condition: Mapping[str, float]) -> float:
     """Logarithm of the chart volume of the conditions that get a value."""
     named = [index for index in space.conditioned if DIMENSIONS[index] in condition]
     return float(np.log(space.chart_high[named] - space.chart_low[named]).sum())
-
-
-def _check_worth(samples: Samples, condition: Mapping[str, float]) -> None:
-    found = 0.0
-    if np.isfinite(samples.log_weights.max(initial=-np.inf)):
-        found = effective_count(normalised_weights(samples.log_weights))
-    if found < LEAST_SAMPLES:
-        raise DataError(
-            f"at {shown(condition)} the {len(samples)} nearest samples are worth {found:.0f}",
-            where="--at",
-            allowed=f"at least {LEAST_SAMPLES}",
-            hint="another value, learn longer (--preset standard or fine), or with more learning.samples",
-        )

@@ -81,6 +81,12 @@ def interpolated(track: Track, at: float) -> tuple[np.ndarray, np.ndarray, np.nd
     return between(track.azimuth_rad), between(track.elevation_rad), between(track.gate_m)
 
 
+def boresight_azimuth(unrolled_rad: float) -> float:
+    """An azimuth as it is written: as it stands within a turn of 0, else in [0, 2 pi) [rad]."""
+    within = -2 * math.pi < unrolled_rad < 2 * math.pi
+    return float(unrolled_rad if within else mean_azimuth(np.float64(unrolled_rad)))
+
+
 def travels(track: Track) -> tuple[float, float]:
     """The ends of a track [m]."""
     return float(track.knots[0]), float(track.knots[-1])
@@ -124,7 +130,7 @@ def _turned(
     start, end = gate
     return replace(
         here,
-        azimuth_rad=float(mean_azimuth(azimuth)),
+        azimuth_rad=boresight_azimuth(azimuth),
         elevation_rad=float(elevation),
         range_m=float(start + end) / 2,
         spread_range_m=float(end - start) / (2 * interval_factor(sensor.level)),

@@ -1,22 +1,8 @@
-r"""Fitting a track: the rays of a scan for every value of one condition, as the position of a robot that drives by.
+"""Fitting a track: the rays of a scan for every value of one condition, as the position of a robot that drives by.
 
-Rays divide what is observed: the mean surface of the scenes, seen from the sensor, in metres. With hat functions
-h_p(x) over the knots, ray n aims at $c_n(x) = \sum_p h_p(x) c_{p,n}$, and what is minimised is
-
-$$\sum_i w_i \min_n |y_i - c_n(x_i)| + \frac{\kappa}{2} \sum_{p,n} |c_{p-1,n} - 2 c_{p,n} + c_{p+1,n}|^2,$$
-
-y_i the surface point of a sample relative to its own origin, x_i its own condition value, w_i its importance weight
-per area that faces the ray. No sample is moved or cut off, rays stay themselves, and knots where a ray sees nothing
-are bridged straight. Distances count once, not squared, so that more rays go to where surfaces often are (their
-density is as the root of the surface's, not the third root). Cells, then knots by their normal equations with
-weights w / |y - c|, are updated in turn (Weiszfeld 1937): the sum falls with every update. It starts from Lloyd's
-cells at each knot, begun at the neighbouring knot's, outward from the knot with most samples, where the best of
-several seedings is taken.
-
-Measured on warehouse shelves (40 held-out, 24 positions, rays' hits without gates), as miss rate in % with 6, 12,
-18 rays, each at its global optimum: directions and squares 19.5, 15.7, 10.6; surface points and squares 20.1, 13.0,
-7.7; surface points and distances, per facing area, 19.6, 11.3, 6.7; chosen greedily with the training scenes' own
-boxes in hand 18.8, 9.1, 5.2.
+Where rays aim is said in `along`: cells of what is observed, at every value of the condition. The gate of a ray is
+the central level of what its samples observe, projected onto it, over `GATE_REACH` knots on either side, inside the
+constraints at every knot and therefore in between.
 
 The kernel of knot p is its hat function, so the bandwidth is the distance of knots, and every sample counts once
 in all. Knots lie 0.1 m apart, over which what is seen of a scene hardly changes, or further where fewer samples
@@ -26,11 +12,12 @@ than `SAMPLES_PER_CELL` would be left for each ray of a knot.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from lidardesign.design.along import Along, aimed_rays
 from lidardesign.design.bounds import Bounds
 from lidardesign.design.budget import ReadOut, within_budget
 from lidardesign.design.conditions import fixed_conditions
@@ -38,39 +25,23 @@ from lidardesign.design.constraints import Constraints
 from lidardesign.design.em import from_labels
 from lidardesign.design.features import Axes, Features
 from lidardesign.design.gates import admissible_gates, central_intervals
-from lidardesign.design.looks import looks
 from lidardesign.design.mixture import Mixture, log_density
-from lidardesign.design.quantise import lloyd
 from lidardesign.design.resolve import Group, bounds_of, origin_box
 from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import DEFAULT_LEVEL, Design, Sensor, Track, interval_factor
 from lidardesign.design.support import check_support, restricted
-from lidardesign.design.track import TRAVELLED, interpolated
+from lidardesign.design.track import TRAVELLED, boresight_azimuth, interpolated
 from lidardesign.errors import ConfigError, InfeasibleError
-from lidardesign.numerics import effective_count
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, DesignSpace, angles, direction, observed_point
 from lidardesign.task import random_generator
 
 KNOT_SPACING_M = 0.1
+# A track of 4.5 m has 45 spacings, whatever the division rounds to.
+ROUNDING = 1e-9
 # The ends of a 95 % interval are then each known from one sample in forty.
 SAMPLES_PER_CELL = 40
 # The gate at a knot is taken over so many knots on either side: its ends need more samples than a mean does.
 GATE_REACH = 2
-# The bending's weight kappa relative to the pull of one ray's samples at one knot.
-ROUGHNESS = 0.1
-LLOYD_ITERATIONS = 15
-SWEEPS = 30
-STARTS = 12
-# Nearer samples than this share of the mean distance pull no harder.
-SMALLEST_DISTANCE = 0.01
-# Keeps divisions finite where every sample lies on its ray [m].
-TINY = 1e-12
-# Mean elevations closer than this are the same row [rad].
-ORDER_DECIMALS = 9
-# Distances of so many samples to all rays are held at once.
-BLOCK = 16384
-# Roughness relative to the mass of a knot that keeps the normal equations solvable where a ray sees nothing.
-SMALLEST_STIFFNESS = 1e-9
 
 
 class FittedTrack(NamedTuple):
@@ -87,49 +58,6 @@ class FittedTrack(NamedTuple):
     log_likelihood: float
     admissible_mass: float
     ess: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Along:
-    """Weighted samples along a condition.
-
-    Arguments:
-        points: Design points, shape (M, 6).
-        weights: Summing to 1, shape (M,).
-        left: The knot on the left of each sample, shape (M,).
-        share: How far it is from there to the next knot, 0 to 1, shape (M,).
-        knots: Shape (P,).
-        dimension: Index of the condition.
-        space: The design space.
-    """
-
-    points: np.ndarray
-    weights: np.ndarray
-    left: np.ndarray
-    share: np.ndarray
-    knots: np.ndarray
-    dimension: int
-    space: DesignSpace
-
-    @classmethod
-    def of(
-        cls, points: np.ndarray, weights: np.ndarray, knots: np.ndarray, dimension: int, space: DesignSpace
-    ) -> _Along:
-        values = points[:, dimension]
-        left = np.clip(np.searchsorted(knots, values, side="right") - 1, 0, len(knots) - 2)
-        share = np.clip((values - knots[left]) / (knots[left + 1] - knots[left]), 0.0, 1.0)
-        return cls(points, weights / weights.sum(), left, share, knots, dimension, space)
-
-    def near(self, knot: int, reach: int = 1) -> tuple[np.ndarray, np.ndarray]:
-        """Samples within `reach` knots of one, and their hat function's weights times their own, shape (W,)."""
-        hat = 1 - np.abs(self.left + self.share - knot) / reach
-        chosen = np.flatnonzero(hat > 0)
-        return chosen, self.weights[chosen] * hat[chosen]
-
-    def between(self, values: np.ndarray, labels: np.ndarray) -> np.ndarray:
-        """Knot values (P, N, ...) of each sample's ray at its own condition, shape (M, ...)."""
-        share = self.share.reshape(-1, *[1] * (values.ndim - 2))
-        return (1 - share) * values[self.left, labels] + share * values[self.left + 1, labels]
 
 
 def fit_track(
@@ -167,9 +95,9 @@ def fit_track(
     support = restricted(samples, constraints, group)
     check_support(support, group, mass=support.total, several=False)
     places = _knots(*ends, support.effective, read_out.rays, knots)
-    along = _Along.of(support.points, support.weights, places, dimension, samples.space)
+    along = Along.of(support.points, support.weights, places, dimension, samples.space)
     bounds = bounds_of(constraints, samples.space, group.sensors, interval_factor(level))
-    centres, labels = _rays(along, read_out.rays, random_generator(seed, "track"))
+    centres, labels = aimed_rays(along, read_out.rays, random_generator(seed, "track"))
     azimuth, elevation = _admitted(centres, along, bounds)
     track = _with_gates(along, labels, azimuth, elevation, bounds, level, read_out)
     sensors, score = _sensors(along, labels, track, bounds, level)
@@ -242,123 +170,12 @@ def _knots(low: float, high: float, effective: float, rays: int, wanted: int | N
         if wanted < 2:
             raise ConfigError(f"{wanted} knots", where="track", allowed="2 or more")
         return np.linspace(low, high, wanted)
-    usual = math.ceil((high - low) / KNOT_SPACING_M - SMALLEST_STIFFNESS)
+    usual = math.ceil((high - low) / KNOT_SPACING_M - ROUNDING)
     affordable = int(effective / (rays * SAMPLES_PER_CELL))
     return np.linspace(low, high, max(min(usual, affordable), 1) + 1)
 
 
-def _rays(along: _Along, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """What the rays aim at, relative to the sensor, at the knots (P, N, 3), and the ray of each sample (M,)."""
-    features = Features.of(along.points, along.weights, Axes.of(along.space), along.space)
-    surface = looks(features) - along.points[:, :3]
-    power = (AZIMUTH in along.space.free) + (ELEVATION in along.space.free)
-    mass = along.weights * np.linalg.norm(surface, axis=1) ** power
-    weighted = replace(along, weights=mass / mass.sum())
-    centres = _started(weighted, surface, count, generator)
-    labels, distance = _nearest(along, surface, centres)
-    nearest_m = SMALLEST_DISTANCE * float(weighted.weights @ distance)
-    stiffness = ROUGHNESS / max(float(weighted.weights @ distance), TINY) / (count * len(along.knots))
-    for _ in range(SWEEPS):
-        pulls = weighted.weights / np.maximum(distance, max(nearest_m, TINY))
-        centres = _smoothed(along, surface, pulls, labels, centres, stiffness)
-        fresh, distance = _nearest(along, surface, centres)
-        if np.array_equal(fresh, labels):
-            break
-        labels = fresh
-    order = _upwards(centres)
-    return centres[:, order], np.argsort(order)[labels]
-
-
-def _upwards(centres: np.ndarray) -> np.ndarray:
-    """Rays by where they look on average: an order that does not depend on the seeding."""
-    azimuth, elevation = angles(centres.mean(axis=0))
-    return np.lexsort((azimuth, np.round(elevation, ORDER_DECIMALS)))
-
-
-def _started(along: _Along, surface: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
-    """Lloyd's cells at each knot, each begun at its neighbour's, from the best known knot outward: (P, N, 3)."""
-    windows = [along.near(knot) for knot in range(len(along.knots))]
-    first = int(np.argmax([effective_count(weights) for _, weights in windows]))
-    centres = np.empty((len(windows), count, 3))
-    centres[first] = _best_start(*_window(surface, windows[first]), count, generator)
-    outward = [(knot - 1, knot) for knot in range(first + 1, len(windows))]
-    outward += [(knot + 1, knot) for knot in reversed(range(first))]
-    for before, knot in outward:
-        points, weights = _window(surface, windows[knot])
-        centres[knot] = centres[before]
-        if len(points) > count and weights.max(initial=0.0) > 0:
-            centres[knot], _ = lloyd(
-                points, weights, count, generator, iterations=LLOYD_ITERATIONS, start=centres[before]
-            )
-    return centres
-
-
-def _window(surface: np.ndarray, window: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    chosen, weights = window
-    return surface[chosen], weights
-
-
-def _best_start(
-    points: np.ndarray, weights: np.ndarray, count: int, generator: np.random.Generator
-) -> np.ndarray:
-    """Lloyd's cells with the smallest sum of distances among several seedings, shape (N, 3)."""
-    best, least = np.empty(0), math.inf
-    for _ in range(STARTS):
-        centres, labels = lloyd(points, weights, count, generator, iterations=LLOYD_ITERATIONS)
-        cost = float(weights @ np.linalg.norm(points - centres[labels], axis=1))
-        if cost < least:
-            best, least = centres, cost
-    return best
-
-
-def _nearest(along: _Along, surface: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The ray that aims nearest to each sample at the sample's own condition, and its distance, shape (M,)."""
-    labels, squared = np.empty(len(surface), dtype=np.int64), np.empty(len(surface))
-    for start in range(0, len(surface), BLOCK):
-        part = slice(start, start + BLOCK)
-        left, share = along.left[part], along.share[part, None, None]
-        here = (1 - share) * centres[left] + share * centres[left + 1]
-        away = np.square(here - surface[part, None]).sum(axis=2)
-        labels[part], squared[part] = away.argmin(axis=1), away.min(axis=1)
-    return labels, np.sqrt(squared)
-
-
-def _smoothed(
-    along: _Along,
-    surface: np.ndarray,
-    pulls: np.ndarray,
-    labels: np.ndarray,
-    centres: np.ndarray,
-    stiffness: float,
-) -> np.ndarray:
-    """The knots' best aims for given cells and weights: a least-squares problem per ray, shape (P, N, 3)."""
-    knots, count, _ = centres.shape
-    rows, share = labels * knots + along.left, along.share
-    matrix = np.zeros(count * knots * knots)
-    for down, down_share in ((0, 1 - share), (1, share)):
-        for across, across_share in ((0, 1 - share), (1, share)):
-            place = (rows + down) * knots + along.left + across
-            matrix += np.bincount(place, pulls * down_share * across_share, len(matrix))
-    size = count * knots
-    right = [
-        np.bincount(rows, pulls * (1 - share) * column, size) + np.bincount(rows + 1, pulls * share * column, size)
-        for column in surface.T
-    ]
-    normal = matrix.reshape(count, knots, knots)
-    # a ray that sees nothing anywhere stays where it was
-    still = SMALLEST_STIFFNESS * stiffness
-    normal += stiffness * _bending(knots) + still * np.eye(knots)
-    wanted = np.stack(right, axis=-1).reshape(count, knots, 3) + still * centres.transpose(1, 0, 2)
-    return np.linalg.solve(normal, wanted).transpose(1, 0, 2)
-
-
-def _bending(knots: int) -> np.ndarray:
-    """The quadratic form of summed squared second differences, shape (P, P)."""
-    second = np.diff(np.eye(knots), n=2, axis=0)
-    return second.T @ second
-
-
-def _admitted(centres: np.ndarray, along: _Along, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
+def _admitted(centres: np.ndarray, along: Along, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
     """Azimuths, unrolled along the knots, and elevations inside their bounds, shape (P, N) each [rad]."""
     azimuth, elevation = angles(centres)
     space = along.space
@@ -376,7 +193,7 @@ def _admitted(centres: np.ndarray, along: _Along, bounds: Bounds) -> tuple[np.nd
 
 
 def _with_gates(
-    along: _Along,
+    along: Along,
     labels: np.ndarray,
     azimuth: np.ndarray,
     elevation: np.ndarray,
@@ -418,7 +235,7 @@ def _worst_widths(track: Track, read_out: ReadOut) -> np.ndarray:
 
 
 def _wanted_gates(
-    along: _Along, labels: np.ndarray, azimuth: np.ndarray, elevation: np.ndarray, level: float
+    along: Along, labels: np.ndarray, azimuth: np.ndarray, elevation: np.ndarray, level: float
 ) -> np.ndarray:
     """Central intervals of what rays observe, projected onto them, smooth along the knots: (P, N, 2) [m]."""
     knots, count = azimuth.shape
@@ -446,34 +263,22 @@ def _bridged(gates: np.ndarray) -> np.ndarray:
 
 
 def _sensors(
-    along: _Along, labels: np.ndarray, track: Track, bounds: Bounds, level: float
+    along: Along, labels: np.ndarray, track: Track, bounds: Bounds, level: float
 ) -> tuple[tuple[Sensor, ...], float]:
     """One sensor per ray, the ray in the middle of its travel; and the log-likelihood of the samples [nats]."""
     middle = float(along.knots[0] + along.knots[-1]) / 2
-    central = int(np.abs(along.knots - middle).argmin())
-    spreads, score = None, 0.0
-    for knot in range(len(along.knots)):
-        chosen, weights = along.near(knot)
-        if not weights.sum() > 0:
-            continue
-        mixture, features = _components(along, chosen, weights, labels, track, knot, bounds)
-        score += float(weights.sum() * (features.weights @ log_density(mixture, features)))
-        if spreads is None or abs(knot - central) <= abs(spreads[0] - central):
-            spreads = knot, mixture, features.axes
-    assert spreads is not None
-    return _in_the_middle(track, middle, along, spreads[1], spreads[2], level), score
+    seen = [knot for knot in range(len(along.knots)) if along.near(knot)[1].sum() > 0]
+    found = {knot: _components(along, labels, track, knot, bounds) for knot in seen}
+    score = sum(share * float(near.weights @ log_density(rays, near)) for share, rays, near in found.values())
+    _, mixture, features = found[min(seen, key=lambda knot: abs(along.knots[knot] - middle))]
+    return _in_the_middle(track, middle, along, mixture, features.axes, level), score
 
 
 def _components(
-    along: _Along,
-    chosen: np.ndarray,
-    weights: np.ndarray,
-    labels: np.ndarray,
-    track: Track,
-    knot: int,
-    bounds: Bounds,
-) -> tuple[Mixture, Features]:
-    """The rays at a knot as mixture components, and the samples near it."""
+    along: Along, labels: np.ndarray, track: Track, knot: int, bounds: Bounds
+) -> tuple[float, Mixture, Features]:
+    """The share of the samples near a knot, the rays there as mixture components, and these samples."""
+    chosen, weights = along.near(knot)
     space = along.space.at({track.dimension: float(along.knots[knot])})
     features = Features.of(along.points[chosen], weights, Axes.of(space), space)
     count = len(track.sensor)
@@ -484,11 +289,11 @@ def _components(
         mixture = replace(mixture, azimuth_rad=track.azimuth_rad[knot])
     if features.axes.vertical:
         mixture = replace(mixture, elevation_rad=track.elevation_rad[knot])
-    return mixture, features
+    return float(weights.sum()), mixture, features
 
 
 def _in_the_middle(
-    track: Track, middle: float, along: _Along, mixture: Mixture, axes: Axes, level: float
+    track: Track, middle: float, along: Along, mixture: Mixture, axes: Axes, level: float
 ) -> tuple[Sensor, ...]:
     azimuth, elevation, gate = interpolated(track, middle)
     origin = np.array(along.space.low[:3])
@@ -502,7 +307,7 @@ def _in_the_middle(
             weight=1.0 / count,
             origin_m=origin,
             origin_covariance_m2=covariance,
-            azimuth_rad=float(azimuth[ray] % (2 * math.pi)),
+            azimuth_rad=boresight_azimuth(azimuth[ray]),
             elevation_rad=float(elevation[ray]),
             roll_rad=float(mixture.roll_rad[ray]),
             spread_horizontal_rad=float(mixture.spread_rad[ray, 0] * axes.angle_scale) if axes.horizontal else 0.0,

@@ -1,0 +1,235 @@
+"""Exact conditions: samples moved to a value of their condition, weighted, against closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lidardesign.design.conditions import at_condition, conditioned, fixed_conditions
+from lidardesign.design.samples import Samples
+from lidardesign.errors import ConfigError, DataError, NumericalError
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace
+
+AISLE = DesignSpace((0.0, 0.0, 0.0, -2.0, 0.0, 0.1), (4.0, 0.0, 0.0, 2.0, 0.0, 4.0), condition=("x_m",))
+LOG_MASS = 1.7
+# Bounds are five standard deviations away, so that cut tails weigh less than a millionth.
+TARGET, PROPOSAL = (0.15, 0.1), (0.2, 0.15)
+
+
+def means(x):
+    """Where the planted density lies at a condition: azimuth [rad] and range [m]."""
+    return 0.3 * (x - 2), 1.5 + 0.25 * x
+
+
+def log_normal(values, mean, spread):
+    return -0.5 * np.square((values - mean) / spread) - math.log(spread * math.sqrt(2 * math.pi))
+
+
+def log_target(points, condition=0):
+    azimuth, reach = means(points[:, condition])
+    planted = log_normal(points[:, AZIMUTH], azimuth, TARGET[0]) + log_normal(points[:, RANGE], reach, TARGET[1])
+    return LOG_MASS + planted
+
+
+def learned(count=40_000, seed=0):
+    """Samples of a density that is a little off and too wide, as flows are."""
+    generator = np.random.default_rng(seed)
+    x = generator.uniform(0.0, 4.0, count)
+    azimuth, reach = means(x)
+    points = np.zeros((count, 6))
+    points[:, 0] = x
+    points[:, AZIMUTH] = azimuth + 0.05 + PROPOSAL[0] * generator.standard_normal(count)
+    points[:, RANGE] = reach - 0.03 + PROPOSAL[1] * generator.standard_normal(count)
+    log_prob = log_normal(points[:, AZIMUTH], azimuth + 0.05, PROPOSAL[0])
+    log_prob += log_normal(points[:, RANGE], reach - 0.03, PROPOSAL[1])
+    return Samples(points, log_prob - math.log(4.0), log_target(points), AISLE)
+
+
+SAMPLES = learned()
+
+
+def estimate(samples, values):
+    """Weighted mean and its standard error."""
+    mean = samples.weights @ values
+    return mean, math.sqrt(np.square(samples.weights) @ np.square(values - mean))
+
+
+@pytest.mark.parametrize("value", [0.0, 0.37, 1.2, 3.91, 4.0])
+def test_moments_at_a_value_are_those_of_the_conditional_density(value):
+    found = at_condition(SAMPLES, {"x_m": value}, log_target, 20_000, np.random.default_rng(1))
+    for column, centre, spread in zip((AZIMUTH, RANGE), means(value), TARGET, strict=True):
+        mean, error = estimate(found, found.points[:, column])
+        assert abs(mean - centre) < 4 * error
+        square, error = estimate(found, np.square(found.points[:, column] - centre))
+        assert abs(square - spread**2) < 4 * error
+
+
+@pytest.mark.parametrize("value", [0.0, 2.0, 4.0])
+def test_a_window_of_the_same_samples_is_biased_where_exact_weights_are_not(value):
+    count = 20_000
+    exact = at_condition(SAMPLES, {"x_m": value}, log_target, count, np.random.default_rng(1))
+    nearest = np.argsort(np.abs(SAMPLES.points[:, 0] - value))[:count]
+    window = SAMPLES.subset(nearest)
+    # in the middle the window's bias is in the spread, at the ends in the mean
+    centre = means(value)[0]
+    for power, truth in ((1, 0.0), (2, TARGET[0] ** 2)):
+        mean, error = estimate(exact, (exact.points[:, AZIMUTH] - centre) ** power)
+        assert abs(mean - truth) < 4 * error
+    mean, error = estimate(window, np.square(window.points[:, AZIMUTH] - centre))
+    assert abs(mean - TARGET[0] ** 2) > 20 * error
+
+
+@pytest.mark.parametrize("value", [0.0, 0.37, 3.91])
+def test_the_mean_weight_is_the_mass_of_the_target_at_the_value(value):
+    found = at_condition(SAMPLES, {"x_m": value}, log_target, 20_000, np.random.default_rng(1))
+    weights = np.exp(found.log_weights)
+    error = weights.std() / math.sqrt(len(weights))
+    assert abs(weights.mean() - math.exp(LOG_MASS)) < 4 * error
+
+
+def test_samples_so_far_that_they_would_spoil_the_rest_are_left_away():
+    worth = []
+    for count in (1000, 4000, 16_000, 40_000):
+        found = at_condition(SAMPLES, {"x_m": 1.0}, log_target, count, np.random.default_rng(1))
+        worth.append(found.effective_sample_size * len(found))
+    assert worth[1] > 2 * worth[0]
+    assert min(worth[2:]) > 0.9 * worth[1]
+
+
+def test_every_sample_has_the_value_exactly_and_the_space_fixes_it():
+    found = at_condition(SAMPLES, {"x_m": 0.37}, log_target, 500, np.random.default_rng(1))
+    assert len(found) in (500, 250)
+    np.testing.assert_array_equal(found.points[:, 0], 0.37)
+    assert found.space == AISLE.at({"x_m": 0.37})
+    assert found.space.conditioned == ()
+    assert fixed_conditions(found.space) == {"x_m": 0.37}
+    assert fixed_conditions(AISLE) == {}
+    np.testing.assert_array_equal(SAMPLES.points[:3, 0], learned().points[:3, 0])
+
+
+@given(seed=st.integers(0, 2**31), value=st.floats(0.0, 4.0))
+def test_the_same_generator_gives_the_same_samples(seed, value):
+    one, other = (
+        at_condition(SAMPLES, {"x_m": value}, log_target, 200, np.random.default_rng(seed)) for _ in range(2)
+    )
+    np.testing.assert_array_equal(one.points, other.points)
+    np.testing.assert_array_equal(one.log_prob, other.log_prob)
+
+
+def test_the_first_samples_are_no_nearer_than_the_last():
+    # a density that shows from where a sample came: its azimuth is its own condition
+    points = np.zeros((8000, 6))
+    points[:, 0] = points[:, AZIMUTH] = np.random.default_rng(0).uniform(0.0, 2.0, 8000)
+    points[:, RANGE] = 1.0
+    space = DesignSpace((0.0, 0, 0, 0.0, 0, 0.1), (2.0, 0, 0, 2.0, 0, 4.0), condition=("x_m",))
+    flat = Samples(points, np.zeros(8000), np.zeros(8000), space)
+    found = at_condition(flat, {"x_m": 0.5}, lambda p: np.zeros(len(p)), 4000, np.random.default_rng(2))
+    away = np.abs(found.points[:, AZIMUTH] - 0.5)
+    half = len(away) // 2
+    assert abs(away[:half].mean() - away[half:].mean()) < 4 * away.std() / math.sqrt(half / 2)
+
+
+def test_a_condition_on_the_elevation_counts_in_its_chart():
+    # p(azimuth | elevation) uniform, conditions uniform in sin(elevation): every weight is the target's mass
+    space = DesignSpace((0, 0, 0, -1.0, 0.2, 1.0), (0, 0, 0, 1.0, 1.3, 1.0), condition=("elevation_rad",))
+    generator = np.random.default_rng(0)
+    points = space.sample(3000, generator)
+    log_prob = np.full(3000, -math.log(2.0) - math.log(math.sin(1.3) - math.sin(0.2)))
+    samples = Samples(points, log_prob, np.zeros(3000), space)
+    found = at_condition(samples, {"elevation_rad": 0.7}, lambda p: np.zeros(len(p)), 1000, generator)
+    np.testing.assert_allclose(np.exp(found.log_weights), 2.0, rtol=1e-12)
+    np.testing.assert_array_equal(found.points[:, ELEVATION], 0.7)
+
+
+def test_several_conditions_are_met_at_once_or_one_by_one():
+    space = DesignSpace((0.0, -1.0, 0, -2.0, 0, 1.0), (4.0, 1.0, 0, 2.0, 0, 1.0), condition=("x_m", "y_m"))
+    generator = np.random.default_rng(3)
+    count = 30_000
+    points = np.zeros((count, 6))
+    points[:, 0], points[:, 1], points[:, RANGE] = generator.uniform(0, 4, count), generator.uniform(-1, 1, count), 1.0
+
+    def centre(p):
+        return 0.2 * (p[:, 0] - 2) + 0.3 * p[:, 1]
+
+    def target(p):
+        return log_normal(p[:, AZIMUTH], centre(p), 0.2)
+
+    points[:, AZIMUTH] = centre(points) + 0.3 * generator.standard_normal(count)
+    log_prob = log_normal(points[:, AZIMUTH], centre(points), 0.3) - math.log(8.0)
+    samples = Samples(points, log_prob, target(points), space)
+    both = at_condition(samples, {"x_m": 3.0, "y_m": -0.5}, target, 10_000, generator)
+    mean, error = estimate(both, both.points[:, AZIMUTH])
+    assert abs(mean - (0.2 - 0.15)) < 4 * error
+    assert both.space.conditioned == ()
+    first = at_condition(samples, {"x_m": 3.0}, target, count, generator)
+    assert [both.space.free, first.space.conditioned] == [(AZIMUTH,), (1,)]
+    then = at_condition(first, {"y_m": -0.5}, target, 10_000, generator)
+    mean, error = estimate(then, then.points[:, AZIMUTH])
+    assert abs(mean - 0.05) < 4 * error
+    weights = np.exp(then.log_weights)
+    assert abs(weights.mean() - 1) < 4 * weights.std() / 100
+
+
+def test_without_a_condition_nothing_changes():
+    assert at_condition(SAMPLES, {}, None, 10, np.random.default_rng(0)) is SAMPLES
+
+
+@pytest.mark.parametrize(
+    ("condition", "words"),
+    [
+        ({"x_m": 4.2}, "0 to 4"),
+        ({"x_m": math.nan}, "0 to 4"),
+        ({"y_m": 0.0}, "x_m"),
+        ({"speed": 1.0}, "x_m"),
+    ],
+)
+def test_values_outside_and_unknown_names_are_refused_with_what_is_allowed(condition, words):
+    with pytest.raises(ConfigError, match=words):
+        at_condition(SAMPLES, condition, log_target, 100, np.random.default_rng(0))
+
+
+def test_a_density_without_conditions_says_so():
+    fixed = Samples(SAMPLES.points, SAMPLES.log_prob, SAMPLES.log_target, DesignSpace(AISLE.low, AISLE.high))
+    with pytest.raises(ConfigError, match="no conditions"):
+        at_condition(fixed, {"x_m": 1.0}, log_target, 100, np.random.default_rng(0))
+
+
+def test_without_a_target_density_the_run_is_asked_for():
+    with pytest.raises(ConfigError, match="give the run folder"):
+        at_condition(SAMPLES, {"x_m": 1.0}, None, 100, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(
+    "target",
+    [lambda p: np.full(len(p), -np.inf), lambda p: np.where(np.arange(len(p)) < 3, 0.0, -np.inf)],
+    ids=["nothing there", "three samples there"],
+)
+def test_a_value_where_samples_are_worth_too_few_is_refused_with_their_worth(target):
+    with pytest.raises(DataError, match=r"x_m=1 the 1000 nearest samples are worth [0-3]\n(.|\n)*at least 50"):
+        at_condition(SAMPLES, {"x_m": 1.0}, target, 1000, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("target", [lambda p: np.full(len(p), np.nan), lambda p: np.zeros(3)])
+def test_a_target_that_is_no_density_is_a_numerical_failure(target):
+    with pytest.raises(NumericalError, match="x_m=1"):
+        at_condition(SAMPLES, {"x_m": 1.0}, target, 1000, np.random.default_rng(0))
+
+
+def test_samples_at_a_condition_are_remembered_while_the_run_is():
+    calls = []
+
+    def counted(points):
+        calls.append(len(points))
+        return log_target(points)
+
+    samples = learned(2000, seed=9)
+    one, other = (conditioned(samples, {"x_m": 1.0}, counted) for _ in range(2))
+    assert one is other
+    assert len(calls) == 1
+    assert conditioned(samples, {"x_m": 2.0}, counted) is not one
+    with pytest.raises(ConfigError, match="give --at x_m=VALUE"):
+        conditioned(samples, {}, counted)
