@@ -129,13 +129,21 @@ def _outside_squared(low, high, b, points, n):  # noqa: ANN001, ANN202
 @njit(cache=True, nogil=True, inline="always")
 def _column_distance(  # noqa: ANN202
     kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps,  # noqa: ANN001
-    low, high, first, last, points, n, q, gradient,  # noqa: ANN001
+    low, high, first, last, points, n, reach, q, gradient,  # noqa: ANN001
 ):  # fmt: skip
-    """Distance of the nearest of some bodies to point n, and which it is."""
+    """Distance of the nearest of some bodies to point n, and which it is; `reach` (B,) is scratch.
+
+    The body whose box is nearest goes first; after it hardly any other has to be evaluated.
+    """
     distance, body = np.inf, -1
+    leader, least = first, np.inf
     for b in range(first, last):
-        squared = _outside_squared(low, high, b, points, n)
-        if squared > 0.0 and (distance <= 0.0 or squared >= distance * distance):
+        reach[b] = _outside_squared(low, high, b, points, n)
+        if reach[b] < least:
+            leader, least = b, reach[b]
+    for turn in range(first - 1, last):
+        b = leader if turn < first else turn
+        if turn == leader or (reach[b] > 0.0 and (distance <= 0.0 or reach[b] >= distance * distance)):
             continue
         value = _distance(
             kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, points, n, q, gradient
@@ -171,7 +179,7 @@ def near_columns(  # noqa: ANN201
     """
     count, groups, room = starts.shape[0] - 1, group_low.shape[0], columns.shape[0]
     q, gradient = np.zeros(3), np.zeros(3)
-    hopes = np.empty(groups)
+    hopes, reach = np.empty(groups), np.empty(kinds.shape[0])
     found, nearest, seen = np.empty(count), np.empty(count, np.int64), np.empty(count, np.int64)
     total = 0
     for n in range(points.shape[0]):
@@ -194,7 +202,7 @@ def near_columns(  # noqa: ANN201
                         continue
                 distance, body = _column_distance(
                     kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps,
-                    low, high, starts[c], starts[c + 1], points, n, q, gradient,
+                    low, high, starts[c], starts[c + 1], points, n, reach, q, gradient,
                 )  # fmt: skip
                 term = log_weights[c] - 0.5 * precision * distance * distance
                 if term < best - tolerance:
