@@ -133,10 +133,18 @@ def _started(along: Along, surface: np.ndarray, count: int, generator: np.random
         points, weights = _window(surface, windows[knot])
         centres[knot] = centres[before]
         if len(points) > count and weights.max(initial=0.0) > 0:
-            centres[knot], _ = lloyd(
-                points, weights, count, generator, iterations=LLOYD_ITERATIONS, start=centres[before]
-            )
+            fresh, _ = lloyd(points, weights, count, generator, iterations=LLOYD_ITERATIONS, start=centres[before])
+            centres[knot] = _matched(centres[before], fresh)
     return centres
+
+
+def _matched(before: np.ndarray, fresh: np.ndarray) -> np.ndarray:
+    """Centres (N, 3) in the order in which all of them together moved least: emptied cells may change places."""
+    # slow to import
+    from scipy.optimize import linear_sum_assignment
+
+    squared = np.square(before[:, None] - fresh[None]).sum(axis=2)
+    return fresh[linear_sum_assignment(squared)[1]]
 
 
 def _window(surface: np.ndarray, window: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -95,7 +95,8 @@ def fit_track(
     support = restricted(samples, constraints, group)
     check_support(support, group, mass=support.total, several=False)
     places = _knots(*ends, support.effective, read_out.rays, knots)
-    along = Along.of(support.points, support.weights, places, dimension, samples.space)
+    used = support.weights > 0
+    along = Along.of(support.points[used], support.weights[used], places, dimension, samples.space)
     bounds = bounds_of(constraints, samples.space, group.sensors, interval_factor(level))
     centres, labels = aimed_rays(along, read_out.rays, random_generator(seed, "track"))
     azimuth, elevation = _admitted(centres, along, bounds)
