@@ -175,10 +175,17 @@ def _request(
 
     config, task = run.config, run.task
     seed = config.seed if seed is None else seed
-    samples = {
-        entry.design.name: load_samples(entry.run.folder)
+    # designs of one run share its samples, and what is worked out from them
+    folders = {
+        entry.run.folder
         for entry in entries
         if entry.run is not None and _may_need_samples(entry.design) and (entry.run.folder / FILE_NAME).exists()
+    }
+    known = {folder: load_samples(folder) for folder in folders}
+    samples = {
+        entry.design.name: known[entry.run.folder]
+        for entry in entries
+        if entry.run is not None and entry.run.folder in known
     }
     made = [(entry.design, entry.run) for entry in entries if entry.run is not None]
     layouts = layouts_of([(design.name, origin) for design, origin in made])
@@ -239,6 +246,7 @@ def _write_files(
 
 
 def _write_report(evaluation: Evaluation, request: EvaluationRequest, path: Path) -> None:
+    from lidardesign.design.track import placed
     from lidardesign.evaluate.entries import middle_condition
     from lidardesign.evaluate.report import write_report
     from lidardesign.run.manifest import versions
@@ -250,8 +258,9 @@ def _write_report(evaluation: Evaluation, request: EvaluationRequest, path: Path
         )
         for design in request.designs
     }
+    shown = [placed(design, at) for design in request.designs]
     reproduce = {"command": shlex.join(["lidardesign", *sys.argv[1:]]), "seed": request.seed, **versions()}
-    write_report(evaluation, request.designs, rays, request.test[0], path, reproduce=reproduce)
+    write_report(evaluation, shown, rays, request.test[0], path, reproduce=reproduce, at=at)
 
 
 def _check_threshold(evaluation: Evaluation, limit: float | None) -> None:

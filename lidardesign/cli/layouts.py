@@ -98,7 +98,8 @@ def twin_without_visibility(design: Design, run: Run, layouts: Layouts) -> tuple
 
 def layouts_of(runs: Sequence[tuple[str, Run]]) -> Layouts:
     """The layouts of designs by name and run; the twin takes the first run's target without occlusion."""
-    targets = {name: RunTarget(run) for name, run in runs}
+    by_folder = {run.folder: RunTarget(run) for _, run in runs}
+    targets = {name: by_folder[run.folder] for name, run in runs}
     if runs:
         targets[TWIN_NAME] = RunTarget(runs[0][1], visibility="off")
     return Layouts(targets)

@@ -39,11 +39,14 @@ def _show_rows(rows: Sequence[Entry], title: str, rich: RichConsole) -> None:
     from rich.table import Table
 
     table = Table(title=title, title_justify="left")
-    for heading in ("design", "rays", "value", "95 % interval", "failures", "Mbit/s", "seconds"):
+    detail = next((name for row in rows for name in row["details"]), None)
+    further = [] if detail is None else [escape(detail.replace("_", " "))]
+    for heading in ("design", "rays", "value", "95 % interval", "failures", *further, "Mbit/s", "seconds"):
         table.add_column(heading, justify="left" if heading == "design" else "right")
     for row in rows:
         interval = f"{number(row['ci_low'])} - {number(row['ci_high'])}"
-        cells = (row["rays"], row["value"], interval, row["failures"], row["bandwidth_mbps"])
+        extra = [] if detail is None else [row["details"].get(detail)]
+        cells = (row["rays"], row["value"], interval, row["failures"], *extra, row["bandwidth_mbps"])
         table.add_row(escape(row["design"]), *(number(cell) for cell in cells), number(row["seconds"], 2))
     rich.print(table)
 

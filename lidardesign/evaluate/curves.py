@@ -12,9 +12,9 @@ Against = Literal["rays", "bandwidth"]
 
 # Okabe and Ito 2008, without yellow (too faint on white) and with black kept for text.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-GREYS = ("#555555", "#808080", "#222222", "#999999")
+GREYS = ("#555555", "#808080", "#222222", "#999999", "#6b6b6b")
 MARKERS = ("o", "s", "^", "D", "v", "P")
-BASELINE_MARKERS = ("x", "+", "*", "1")
+BASELINE_MARKERS = ("x", "+", "*", "1", "d")
 DASHES = ("solid", "dashed", "dashdot", "dotted")
 MANY_DECADES = 4.0  # a range of values wider than this factor is easier to read on a logarithmic axis
 

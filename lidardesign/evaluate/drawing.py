@@ -7,23 +7,35 @@ import math
 import numpy as np
 
 from lidardesign.design.grid import field_on_sphere
-from lidardesign.design.sensor import Sensor, tangent_directions
+from lidardesign.design.sensor import Sensor, interval_factor, tangent_directions
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.returns import Outcome, Rays
 from lidardesign.simulate.simulate import gate_outcomes
 
-MOST_FACES = 60_000  # per body; more would make the page slow to open
+MOST_FACES = 60_000  # of a scene; more would make the page large and slow to open
 STEPS = 24  # round a sphere or capsule
 SHELL_STEPS = 8  # along each side of a gate's shell
+SMALLEST_SPREAD_M = 1e-3  # of origins; less looks like one place
 PLANE_MARGIN = 0.1  # of the scene's extent, beyond which an infinite plane is not drawn
 
 
-def body_triangles(body: Body, frame: int, bounds_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """World vertices (V, 3) float32 [m] and faces (F, 3) int32 of a body; planes are cut at bounds (2, 3)."""
+def drawn_share(scene: Scene) -> float:
+    """The share of a scene's triangles that is drawn: all of them up to `MOST_FACES`."""
+    faces = sum(len(body.shape.faces) for body in scene.bodies if isinstance(body.shape, Mesh))
+    return min(1.0, MOST_FACES / max(faces, 1))
+
+
+def body_triangles(
+    body: Body, frame: int, bounds_m: np.ndarray, share: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """World vertices (V, 3) float32 [m] and faces (F, 3) int32 of a body; planes are cut at bounds (2, 3).
+
+    Of a mesh about a share of its triangles is drawn.
+    """
     shape, pose = body.shape, body.pose(frame)
     if isinstance(shape, Mesh):
-        vertices, faces = thinned(shape.vertices, shape.faces)
+        vertices, faces = thinned(shape.vertices, shape.faces, math.ceil(share * len(shape.faces)))
     elif isinstance(shape, Sphere):
         vertices, faces = _capsule(shape.radius_m, 0.0)
     elif isinstance(shape, Capsule):
@@ -36,9 +48,9 @@ def body_triangles(body: Body, frame: int, bounds_m: np.ndarray) -> tuple[np.nda
     return world.astype(np.float32), faces.astype(np.int32)
 
 
-def thinned(vertices: np.ndarray, faces: np.ndarray, most: int = MOST_FACES) -> tuple[np.ndarray, np.ndarray]:
+def thinned(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
     """At most about `most` faces, by merging the vertices of each cell of a grid into their mean."""
-    cells = math.sqrt(most)
+    cells = math.sqrt(max(most, 1))
     while len(faces) > most:
         low, extent = vertices.min(axis=0), np.ptp(vertices, axis=0).max()
         cell = np.floor((vertices - low) / max(extent, np.finfo(float).tiny) * cells).astype(np.int64)
@@ -81,6 +93,24 @@ def frustum_lines(sensor: Sensor) -> np.ndarray:
     outline = np.concatenate([edge.reshape(-1, 3) for edge in edges])
     pieces += [sensor.origin_m + radius * outline for radius in (start, end)]
     return separated(pieces)
+
+
+def origin_lines(sensor: Sensor, level: float) -> np.ndarray:
+    """Ellipses that hold `level` of a sensor's origins along their axes, NaN between them, (K, 3) float32 [m].
+
+    One in each plane of two principal axes; none where origins hardly spread.
+    """
+    variances, axes = np.linalg.eigh(sensor.origin_covariance_m2)
+    reach = interval_factor(level) * np.sqrt(np.clip(variances, 0.0, None))
+    if reach.max() < SMALLEST_SPREAD_M:
+        return np.zeros((0, 3), dtype=np.float32)
+    turn = np.linspace(0.0, 2 * np.pi, STEPS + 1)
+    spread = (axes * reach).T
+    # eigenvalues grow: the first plane is that of the two largest, others only where there is a thickness
+    planes = [(2, 1)] + [(2, 0), (1, 0)] * bool(reach[0] >= SMALLEST_SPREAD_M)
+    return separated(
+        [sensor.origin_m + np.outer(np.cos(turn), spread[a]) + np.outer(np.sin(turn), spread[b]) for a, b in planes]
+    )
 
 
 def gate_shell(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
@@ -136,8 +166,9 @@ def _capsule(radius_m: float, half_length_m: float) -> tuple[np.ndarray, np.ndar
 def _box(half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = [face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))]
-    return signs * half, np.array(faces)
+    # corners of their own for every side keep the light from rounding the edges
+    faces = [(k, k + 1, k + 2) for k in range(0, 24, 4)] + [(k, k + 2, k + 3) for k in range(0, 24, 4)]
+    return (signs * half)[np.ravel(quads)], np.array(faces)
 
 
 def _square(pose: np.ndarray, bounds_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

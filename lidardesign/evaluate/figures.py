@@ -16,8 +16,10 @@ from lidardesign.design.sensor import Design, Sensor
 from lidardesign.evaluate.curves import Against, Series, axis_titles, logarithmic, position, series
 from lidardesign.evaluate.drawing import (
     body_triangles,
+    drawn_share,
     frustum_lines,
     gate_shell,
+    origin_lines,
     ray_segments,
     scene_bounds,
 )
@@ -39,6 +41,7 @@ SYMBOLS = {
     "+": "cross-thin-open",
     "*": "asterisk-open",
     "1": "y-down-open",
+    "d": "diamond-tall-open",
 }
 DASH_NAMES = {"solid": "solid", "dashed": "dash", "dashdot": "dashdot", "dotted": "dot"}
 OUTCOME_COLOURS = {
@@ -162,6 +165,7 @@ def _body_traces(
     scene: Scene, frame: int, bounds_m: np.ndarray, eye: Mapping[str, float]
 ) -> list[dict[str, Any]]:
     """All targets in one trace and all mere occluders in another, lit from where the camera starts."""
+    share = drawn_share(scene)
     light = {axis: LIGHT_DISTANCE * value for axis, value in eye.items()}
     looks = {
         True: {"name": "scene", "color": "#c9b8a8"},
@@ -169,7 +173,8 @@ def _body_traces(
     }
     traces = []
     for target, look in looks.items():
-        pieces = [body_triangles(body, frame, bounds_m) for body in scene.bodies if body.is_target == target]
+        bodies = [body for body in scene.bodies if body.is_target == target]
+        pieces = [body_triangles(body, frame, bounds_m, share) for body in bodies]
         if pieces:
             offsets = np.cumsum([0, *(len(vertices) for vertices, _ in pieces)])
             vertices = np.concatenate([vertices for vertices, _ in pieces])
@@ -195,7 +200,8 @@ def _sensor_traces(design: Design) -> list[dict[str, Any]]:
     sensors: Sequence[Sensor] = design.sensors if len(design.sensors) <= MOST_SENSORS else ()
     if not sensors:
         return []
-    lines = np.concatenate([frustum_lines(sensor) for sensor in sensors])
+    pieces = [piece for sensor in sensors for piece in (frustum_lines(sensor), origin_lines(sensor, design.level))]
+    lines = np.concatenate(pieces)
     traces = [
         _line_trace(
             lines, name="fields of view", line={"color": SENSOR_COLOUR, "width": 3}, legendgroup="sensors"

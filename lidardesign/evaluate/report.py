@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from lidardesign.design.sensor import Design
+from lidardesign.evaluate.drawing import MOST_FACES, drawn_share
 from lidardesign.evaluate.figures import curve_figure, scene_figure
 from lidardesign.evaluate.page import page
 from lidardesign.evaluate.results import Evaluation
@@ -39,6 +40,7 @@ def write_report(
     *,
     title: str | None = None,
     reproduce: Mapping[str, Any] | None = None,
+    at: Mapping[str, float] | None = None,
 ) -> None:
     """Write the report, whole or not at all.
 
@@ -46,12 +48,13 @@ def write_report(
         evaluation: What was found.
         designs: The designs to list and draw.
         rays_by_design: The rays to draw for each design, by name.
-        scene: The scene to draw them in, at its first frame.
+        scene: The scene to draw them in, at the frame in the middle of its time.
         path: The HTML file.
         title: The page's title; the metric's name by default.
         reproduce: Command, seed, versions and the like, shown as they are at the end.
+        at: The condition values that designs and rays are drawn at.
     """
-    write_atomic(Path(path), report_html(evaluation, designs, rays_by_design, scene, title, reproduce))
+    write_atomic(Path(path), report_html(evaluation, designs, rays_by_design, scene, title, reproduce, at))
 
 
 def report_html(
@@ -61,11 +64,13 @@ def report_html(
     scene: Scene,
     title: str | None = None,
     reproduce: Mapping[str, Any] | None = None,
+    at: Mapping[str, float] | None = None,
 ) -> str:
     """The report as text; see `write_report`."""
     metric = evaluation.metric
     heading = title or f"{metric.name} on {evaluation.scenes} held-out scenes"
-    figure, masks = scene_figure(scene, designs, rays_by_design)
+    frame = scene.frames // 2
+    figure, masks = scene_figure(scene, designs, rays_by_design, frame)
     sections = [
         _section("Result", _paragraphs(summary_sentences(evaluation)) + _notes(evaluation.notes)),
         _section("Score against rays", _figure(curve_figure(evaluation, "rays"), RAYS_ID, 440)),
@@ -74,8 +79,8 @@ def report_html(
         ),
         _section(
             "Designs in a scene",
-            f"<p>Held-out scene {html.escape(scene.name)}. Lines run from each sensor to the first hit, or "
-            f"to the end of the gate; tinted shells are the gates.</p>"
+            f"<p>{html.escape(_drawn(scene, frame, at or {}))} Lines run from where each ray starts to its first hit, "
+            f"or to the end of its gate; tinted shells are the gates, ellipses where the rays of a sensor start.</p>"
             f"{_chooser(masks)}{_figure(figure, SCENE_ID, 560, tools=True)}",
         ),
         _section("All scores", rows_table(evaluation)),
@@ -85,6 +90,18 @@ def report_html(
         _section("How to reproduce", _definitions(reproduce)) if reproduce else "",
     ]
     return page(heading, "\n".join(section for section in sections if section), _plotly_source())
+
+
+def _drawn(scene: Scene, frame: int, at: Mapping[str, float]) -> str:
+    """Which scene is shown, and when and where it is seen."""
+    shown = f"Held-out scene {scene.name}"
+    if scene.frames > 1:
+        shown += f", frame {frame + 1} of {scene.frames}"
+    if at:
+        shown += ", seen from " + ", ".join(f"{name}={value:g}" for name, value in at.items())
+    if drawn_share(scene) < 1:
+        shown += f" (drawn coarser: {MOST_FACES} of its triangles)"
+    return f"{shown}."
 
 
 def _plotly_source() -> str:

@@ -140,6 +140,11 @@ class Evaluation:
         }
 
 
+def leading_detail(rows: Sequence[Row]) -> str | None:
+    """The first of the task's further figures, which tables show beside the score; None where it gives none."""
+    return next((name for row in rows for name in row.details), None)
+
+
 def worse_than_threshold(evaluation: Evaluation, limit: float) -> list[Row]:
     """Rows of designs whose mean misses a limit in the metric's unit; baselines never count.
 

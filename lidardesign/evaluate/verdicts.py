@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 
 from lidardesign.design.sensor import Design
-from lidardesign.evaluate.results import Evaluation, Paired, Row
+from lidardesign.evaluate.results import Evaluation, Paired, Row, leading_detail
 
 MOST_SENSORS = 60  # listed in a table
 
@@ -48,7 +48,9 @@ def rows_table(evaluation: Evaluation) -> str:
     """All rows at equal rays."""
     unit = evaluation.metric.unit
     headings = ["design", "rays", f"{evaluation.metric.name} [{unit}]", "95 % interval", "failures"]
-    return _table([*headings, "Mbit/s", "seconds"], _grouped(evaluation.rows), text_columns=1)
+    detail = leading_detail(evaluation.rows)
+    headings += [] if detail is None else [_words(detail)]
+    return _table([*headings, "Mbit/s", "seconds"], _grouped(evaluation.rows, detail), text_columns=1)
 
 
 def paired_table(evaluation: Evaluation) -> str:
@@ -128,10 +130,16 @@ def _interval(item: Row | Paired) -> str:
     return f"{figure(item.ci_low)} to {figure(item.ci_high)}"
 
 
-def _grouped(rows: Sequence[Row]) -> list[tuple[list[str], str, bool]]:
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _grouped(rows: Sequence[Row], detail: str | None) -> list[tuple[list[str], str, bool]]:
     lines = []
     for index, row in enumerate(rows):
         cells = [row.design, str(row.rays), figure(row.value), _interval(row), str(row.failures)]
+        if detail is not None:
+            cells.append(figure(row.details[detail]) if detail in row.details else "-")
         cells += [figure(row.bandwidth_mbps), f"{row.seconds:.2f}"]
         lines.append((cells, "", bool(index and row.design != rows[index - 1].design)))
     return lines
