@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 if TYPE_CHECKING:
+    import numpy as np
     from rich.console import Console as RichConsole
 
     from lidardesign.design.check import ConstraintCheck
@@ -67,6 +66,7 @@ def show_design(design: Design, rich: RichConsole) -> None:
 
 def show_track(design: Design, track: Track, rich: RichConsole) -> None:
     """Print the rays of a track as a table: from where to where each looks and listens over its travel."""
+    from numpy import degrees
     from rich.markup import escape
     from rich.table import Table
 
@@ -83,8 +83,8 @@ def show_track(design: Design, track: Track, rich: RichConsole) -> None:
         gate = track.gate_m[:, ray]
         table.add_row(
             escape(design.sensors[sensor].name),
-            _reach(np.degrees(track.azimuth_rad[:, ray]), 2),
-            _reach(np.degrees(track.elevation_rad[:, ray]), 2),
+            _reach(degrees(track.azimuth_rad[:, ray]), 2),
+            _reach(degrees(track.elevation_rad[:, ray]), 2),
             _reach(gate[:, 0], 3),
             _reach(gate[:, 1], 3),
             _reach(gate[:, 1] - gate[:, 0], 3),
