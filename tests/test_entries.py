@@ -1,0 +1,309 @@
+"""Rows at several condition values: who fires what where, in which order it is judged, and what it costs."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.rays import lay_out
+from lidardesign.design.samples import Samples
+from lidardesign.design.sensor import Coupling, Design, RayTable, Sensor
+from lidardesign.evaluate.entries import entries_of, middle_condition
+from lidardesign.evaluate.score import EvaluationRequest, evaluate
+from lidardesign.scene import Body, Box, Capsule, Scene, Sphere, rigid
+from lidardesign.simulate.simulate import simulate
+from lidardesign.space import DesignSpace, angles
+from lidardesign.task import Defaults, Metric, Score, TaskConfig
+
+AISLE = DesignSpace(
+    (-0.5, 0.0, 0.0, -math.pi / 2, 0.0, 0.1), (4.0, 0.0, 0.0, -math.pi / 2, math.pi / 2, 5.0), condition=("x_m",)
+)
+PLACES = (3.0, 0.25, 1.5)
+CEILING = DesignSpace((-1, -1, 1, 0, -math.pi / 2, 0.1), (1, 1, 1, 2 * math.pi, -0.2, 2.5))
+
+
+class SeenTask:
+    """Percent of rays that return; remembers the returns that it was given."""
+
+    name = "seen"
+    summary = "rays with a return"
+    api_version = 1
+    Config = TaskConfig
+    metric = Metric("seen", "%", "higher", worst=0.0, tolerance=1.0)
+    defaults = Defaults()
+
+    def __init__(self, places=None):
+        self.given = []
+        if places is not None:
+            self.conditions = lambda config: [{"x_m": place} for place in places]
+
+    def score(self, scene, returns):
+        self.given.append((scene, list(returns)))
+        hit = [int(one.returned.sum()) for one in returns]
+        return Score(100.0 * sum(hit) / max(sum(len(one.outcome) for one in returns), 1), details={"hit": sum(hit)})
+
+
+def shelves(count, seed):
+    """Boxes along the aisle at y = -1."""
+    generator = np.random.default_rng(seed)
+    return [
+        Scene(
+            tuple(
+                Body(
+                    Box((0.2, 0.1, 0.15)), f"box {i}", poses=rigid(translation_m=(x, -1.0, generator.uniform(0.2, 1.2)))
+                )
+                for i, x in enumerate(np.linspace(-0.4, 3.9, 9))
+            ),
+            f"shelf {index}",
+        )
+        for index in range(count)
+    ]
+
+
+def carried(count, frames, seed):
+    """A ball that moves below the ceiling, sometimes behind a capsule that moves with it."""
+    generator = np.random.default_rng(seed)
+    scenes = []
+    for index in range(count):
+        start, end = generator.uniform(-0.5, 0.5, (2, 3))
+        path = start + np.linspace(0, 1, frames)[:, None] * (end - start)
+        turns = Rotation.random(frames, generator).as_matrix()
+        ball = Body(Sphere(0.3), "ball", "target", np.stack([rigid(translation_m=p) for p in path]))
+        arm = np.stack([rigid(turn, p + np.array([0.1, 0.1, 0.4])) for turn, p in zip(turns, path, strict=True)])
+        scenes.append(Scene((ball, Body(Capsule(0.08, 0.3), "arm", "occluder", arm)), f"path {index}"))
+    return scenes
+
+
+def upward(name="up", elevation=0.6, weight=1.0, range_m=1.2):
+    origin = np.array([2.0, 0.0, 0.0])
+    return Sensor(name, weight, origin, np.zeros((3, 3)), -math.pi / 2, elevation, 0.0, 1e-3, 0.2, range_m, 0.1)
+
+
+def aisle_request(task, **changes):
+    values = {
+        "task": task,
+        "config": TaskConfig(),
+        "space": AISLE,
+        "seed": 3,
+        "designs": [Design("cart", (upward(),))],
+        "rays": (6, 10),
+        "baselines": ("uniform", "random", "bounding", "occupancy"),
+        "train": shelves(4, 1),
+        "test": shelves(3, 2),
+    }
+    return EvaluationRequest(**{**values, **changes})
+
+
+def test_returns_come_condition_by_condition_and_within_each_frame_by_frame():
+    task = SeenTask(PLACES)
+    moving = [
+        replace(
+            scene,
+            bodies=tuple(
+                replace(body, poses=np.stack([rigid(translation_m=(0, 0, dz)) @ body.poses for dz in (0.0, 0.1)]))
+                for body in scene.bodies
+            ),
+        )
+        for scene in shelves(2, 2)
+    ]
+    request = aisle_request(task, test=moving, rays=(6,), equal_bandwidth=False)
+    evaluate(request)
+    judged = [(scene, returns) for scene, returns in task.given if any(scene is other for other in moving)]
+    assert judged
+    for _, returns in judged:
+        assert [one.frame for one in returns] == [0, 1] * len(PLACES)
+        assert [one.rays.origin_m[0, 0] for one in returns] == [x for x in PLACES for _ in range(2)]
+
+
+def test_every_row_scores_what_its_rays_return_when_simulated_alone():
+    task = SeenTask(PLACES)
+    request = aisle_request(task)
+    entries = entries_of(request)
+    evaluation = evaluate(request)
+    rows = [*evaluation.rows, *evaluation.equal_bandwidth]
+    assert [(row.design, row.rays) for row in rows] == [(entry.name, entry.rays) for entry in entries]
+    for row, entry in zip(rows, entries, strict=True):
+        for index, scene in enumerate(request.test):
+            alone = [one for rays in entry.drawn(index) for one in simulate(scene, rays)]
+            assert row.per_scene[index] == task.score(scene, alone).value
+        assert row.details["hit"] == pytest.approx(row.per_scene.mean() * row.rays * len(PLACES) / 100)
+
+
+def test_rays_count_per_position_and_bandwidth_is_the_mean_over_positions():
+    request = aisle_request(SeenTask(PLACES))
+    evaluation = evaluate(request)
+    for row, entry in zip(evaluation.rows, entries_of(request), strict=False):
+        assert row.rays in (6, 10)
+        assert [len(rays) for rays in entry.positions] == [row.rays] * len(PLACES)
+        costs = [Bandwidth().mbps(rays) for rays in entry.positions]
+        assert row.bandwidth_mbps == pytest.approx(np.mean(costs), rel=1e-12)
+    own = {(row.design, row.rays): row for row in evaluation.rows}
+    for row in evaluation.equal_bandwidth:
+        assert row.bandwidth_mbps <= own[row.matched_to, row.matched_rays].bandwidth_mbps
+    assert any("per position" in note and "3 positions" in note for note in evaluation.notes)
+
+
+@pytest.mark.parametrize("place", range(len(PLACES)))
+def test_baselines_lie_in_what_the_condition_leaves_free(place):
+    request = aisle_request(SeenTask(PLACES))
+    inside = AISLE.at({"x_m": PLACES[place]})
+    for entry in entries_of(request):
+        for scene in range(2):
+            rays = entry.drawn(scene)[place]
+            azimuth, elevation = angles(rays.direction)
+            middle = np.clip(rays.gate_m.mean(axis=1), inside.low[5], inside.high[5])
+            points = np.column_stack([rays.origin_m, azimuth, elevation, middle])
+            if entry.baseline:
+                assert inside.contains(points, tolerance=1e-7).all()
+            else:
+                assert (rays.origin_m[:, 0] == PLACES[place]).all()
+
+
+def test_bounding_is_one_grid_over_the_whole_aisle():
+    request = aisle_request(SeenTask(PLACES))
+    entry = next(entry for entry in entries_of(request) if entry.name == "bounding")
+    first, *others = entry.positions
+    for other in others:
+        np.testing.assert_array_equal(other.direction, first.direction)
+        np.testing.assert_array_equal(other.gate_m, first.gate_m)
+    uniform = next(entry for entry in entries_of(request) if entry.name == "uniform")
+    assert np.ptp(first.direction[:, 2]) < np.ptp(uniform.positions[0].direction[:, 2])
+
+
+def test_drawn_baselines_differ_from_scene_to_scene_and_from_place_to_place():
+    request = aisle_request(SeenTask(PLACES))
+    for entry in entries_of(request):
+        drawn = [rays.direction for scene in range(2) for rays in entry.drawn(scene)]
+        if entry.name in ("random", "occupancy") and entry.rays:
+            assert len({one.tobytes() for one in drawn}) == len(drawn)
+        assert entry.drawn(1)[0].direction.tobytes() == entry.drawn(1)[0].direction.tobytes()
+
+
+def test_conditions_that_a_task_does_not_name_are_even_and_the_middle_one_is_drawn():
+    request = aisle_request(SeenTask())
+    places = {rays.origin_m[0, 0] for rays in entries_of(request)[0].positions}
+    assert len(places) == 9
+    assert middle_condition(request) == {"x_m": pytest.approx(1.75)}
+    assert middle_condition(aisle_request(SeenTask(PLACES))) == {"x_m": 1.5}
+    assert middle_condition(aisle_request(SeenTask(), space=CEILING, rays=(6,))) == {}
+
+
+QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+
+
+def ceiling_sensors():
+    """One that looks straight down, two about azimuth 0, one that is coupled to where its rays start."""
+    flat = np.diag([0.04, 0.02, 0.0])
+    coupling = Coupling(
+        np.array([[0.1, 0.3, 0.0], [-0.2, 0.1, 0.0]]),
+        np.array([0.1, -0.1, 0.0]),
+        np.array([0.1, 0.2]),
+        (0.1, 0.1),
+        0.05,
+    )
+    places = [(0.1, 0.2, 1.0), (-0.6, 0.0, 1.0), (-0.5, 0.1, 1.0), (0.3, -0.4, 1.0)]
+    looks = [(0.4, -math.pi / 2), (math.radians(359), -1.0), (math.radians(1), -1.1), (2.0, -1.2)]
+    return tuple(
+        Sensor(
+            f"s{i}", 0.25, np.array(place), flat, *look, 0.2, 0.15, 0.1, 0.9, 0.2, coupling=coupling if i == 3 else None
+        )
+        for i, (place, look) in enumerate(zip(places, looks, strict=True))
+    )
+
+
+def turned_sensor(sensor):
+    coupling = sensor.coupling
+    if coupling is not None:
+        coupling = replace(
+            coupling,
+            direction_per_m=coupling.direction_per_m @ QUARTER.T,
+            range_per_m=QUARTER @ coupling.range_per_m,
+        )
+    return replace(
+        sensor,
+        origin_m=QUARTER @ sensor.origin_m,
+        origin_covariance_m2=QUARTER @ sensor.origin_covariance_m2 @ QUARTER.T,
+        azimuth_rad=(sensor.azimuth_rad + math.pi / 2) % (2 * math.pi),
+        coupling=coupling,
+    )
+
+
+def turned_table(table):
+    return replace(table, origin_m=table.origin_m @ QUARTER.T, azimuth_rad=table.azimuth_rad + math.pi / 2)
+
+
+def explicit(design, count):
+    rays = lay_out(design, count)
+    azimuth, elevation = angles(rays.direction)
+    return replace(design, rays=count, ray_table=RayTable(rays.origin_m, azimuth, elevation, rays.gate_m, rays.sensor))
+
+
+def test_turning_sensors_and_world_by_a_quarter_changes_no_score():
+    plain = Design("plain", ceiling_sensors())
+    table = explicit(plain, 300)
+    turned = [replace(one, sensors=tuple(map(turned_sensor, one.sensors))) for one in (plain, table)]
+    turned[1] = replace(turned[1], ray_table=turned_table(table.ray_table))
+    scenes = carried(4, 5, 6)
+    world = [
+        replace(scene, bodies=tuple(replace(body, poses=rigid(QUARTER) @ body.poses) for body in scene.bodies))
+        for scene in scenes
+    ]
+    found = []
+    for designs, test in (((plain, replace(table, name="table")), scenes), (turned, world)):
+        designs = [replace(one, name=name) for one, name in zip(designs, ("plain", "table"), strict=True)]
+        request = EvaluationRequest(
+            task=SeenTask(), config=TaskConfig(), space=CEILING, seed=0, designs=designs, rays=(300,),
+            baselines=(), train=(), test=test,
+        )  # fmt: skip
+        found.append(evaluate(request).rows)
+    for before, after in zip(*found, strict=True):
+        assert 5 < before.value < 95
+        assert before.bandwidth_mbps == after.bandwidth_mbps
+        # one ray in 1500 may pass an edge on its other side
+        np.testing.assert_allclose(before.per_scene, after.per_scene, atol=0.1)
+
+
+def test_all_baselines_of_moving_scenes_have_free_origins_inside_the_space():
+    request = EvaluationRequest(
+        task=SeenTask(), config=TaskConfig(), space=CEILING, seed=0, designs=[Design("d", ceiling_sensors())],
+        rays=(50,), baselines=("uniform", "random", "bounding", "occupancy"), train=carried(3, 6, 1),
+        test=carried(2, 4, 2),
+    )  # fmt: skip
+    rows = {row.design: row for row in evaluate(request).rows}
+    assert rows["bounding"].value > rows["uniform"].value
+    assert rows["occupancy"].value > 2 * rows["uniform"].value
+    for entry in entries_of(request):
+        if entry.baseline:
+            (rays,) = entry.positions
+            low, high = np.array(CEILING.low[:3]), np.array(CEILING.high[:3])
+            assert ((rays.origin_m >= low) & (rays.origin_m <= high)).all()
+
+
+def test_a_twin_stands_for_no_visibility_with_as_many_rays():
+    made = []
+
+    def twin():
+        made.append(1)
+        points = np.tile([0.0, 0, 1, 0, -1.2, 1], (3, 1))
+        return Design("no-visibility", ceiling_sensors()[:2]), Samples(points, np.zeros(3), np.zeros(3), CEILING)
+
+    request = EvaluationRequest(
+        task=SeenTask(), config=TaskConfig(), space=CEILING, seed=0, designs=[Design("d", ceiling_sensors())],
+        rays=(40, 80), baselines=("no-visibility",), train=carried(1, 4, 1), test=carried(2, 4, 2),
+        without_visibility=twin,
+    )  # fmt: skip
+    evaluation = evaluate(request)
+    assert [(row.design, row.rays, row.baseline) for row in evaluation.rows] == [
+        ("d", 40, False), ("d", 80, False), ("no-visibility", 40, True), ("no-visibility", 80, True)
+    ]  # fmt: skip
+    assert len(made) == 1
+    own = {row.rays: row.bandwidth_mbps for row in evaluation.rows if row.design == "d"}
+    for row in evaluation.equal_bandwidth:
+        assert 0 < row.bandwidth_mbps <= own[row.matched_rays]
+        # the most that fit: one ray more costs about one share more
+        assert row.bandwidth_mbps * (row.rays + 2) / row.rays > own[row.matched_rays]
+    evaluate(replace(request, baselines=("uniform",)))
+    assert len(made) == 1
