@@ -110,8 +110,10 @@ def lay_out(
     # what moves was fitted where it was made: its rays are laid out there, then moved
     home = {**(at or {}), **design.at}
     here = placed(design, home) if home else design
-    if samples is not None and samples.space.conditioned and _asks_samples(here, count, gates):
-        samples = conditioned(samples, home, retarget)
+    if samples is not None and samples.space.conditioned:
+        # distributed rays can also be laid out by their sensors alone
+        asked = _asks_samples(here, count, gates) or (here.layout == "distributed" and retarget is not None)
+        samples = conditioned(samples, home, retarget) if asked else None
     rays = _laid_out(here, count, samples, gates, rate_hz, seed)
     return moved(rays, design, at) if at else rays
 
@@ -134,7 +136,7 @@ def _asks_samples(design: Design, count: int | None, gates: Gates) -> bool:
         return False
     if design.layout == "scan":
         return total != own_count(design) or gates == "ray"
-    return design.layout == "density" or gates == "ray"
+    return design.layout == "density" or (design.layout == "grid" and gates == "ray")
 
 
 def _laid_out(
