@@ -23,6 +23,7 @@ from lidardesign.space import DesignSpace
 
 # Bandwidth grows almost in proportion to the number of rays: a few steps find the largest number that fits.
 MOST_STEPS = 8
+CLOSE_ENOUGH = 0.98  # of the bandwidth: every further step may be another fit
 
 LogTarget = Callable[[np.ndarray], np.ndarray]
 
@@ -106,7 +107,7 @@ class TwinCandidate:
                 low = count
             else:
                 high = count
-            if high - low <= 1:
+            if high - low <= 1 or CLOSE_ENOUGH * limit_mbps <= cost <= limit_mbps:
                 break
             guess = math.floor(count * limit_mbps / cost) if cost > 0 else 2 * count
             count = int(min(max(guess, low + 1), high - 1))
