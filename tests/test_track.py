@@ -173,6 +173,49 @@ def test_azimuths_pass_through_north_without_a_jump():
     assert all(-2 * math.pi < sensor.azimuth_rad < 2 * math.pi for sensor in design.sensors)
 
 
+DOME = DesignSpace(
+    (0.0, 0, 0, 0.0, -0.5, 0.5), (3.0, 0, 0, 2 * math.pi, math.pi / 2, 1.6), condition=("x_m",)
+)  # fmt: skip
+
+
+def dome(count=9000):
+    """A patch of a room around the sensor that circles it through azimuth 0 while the robot drives."""
+    generator = np.random.default_rng(4)
+    points = np.zeros((count, 6))
+    points[:, 0] = generator.uniform(0, 3, count)
+    points[:, 3] = np.mod(0.6 * (points[:, 0] - 1.5) + generator.uniform(-0.5, 0.5, count), 2 * math.pi)
+    points[:, 4] = generator.uniform(0.2, 0.9, count)
+    points[:, 5] = 1 + 0.05 * generator.standard_normal(count)
+    return Samples(points, np.zeros(count), np.zeros(count), DOME)
+
+
+def test_rays_with_two_angles_cover_what_is_seen_there():
+    design = fit(dome(), layout="scan", rays=12).design
+    for x in (0.0, 0.7, 1.5, 3.0):
+        azimuth, elevation, gate = interpolated(design.track, x)
+        away = np.angle(np.exp(1j * (azimuth - 0.6 * (x - 1.5))))
+        assert np.abs(away).max() < 0.5
+        assert np.ptp(away) > 0.5
+        assert np.ptp(elevation) > 0.35
+        assert (np.abs(gate.mean(axis=1) - 1) < 0.1).all()
+
+
+@given(at=st.floats(0.0, 3.0))
+def test_azimuths_keep_an_interval_through_north_at_every_position(northern, at):
+    azimuth = np.angle(np.exp(1j * interpolated(northern.track, at)[0]))
+    assert np.degrees(np.abs(azimuth)).max() <= 20
+
+
+@pytest.fixture(scope="module")
+def northern():
+    result = fit(
+        dome(), layout="scan", rays=6, constraints=constrained(boresight={"azimuth_deg": {"min": 340, "max": 20}})
+    )
+    assert result.satisfied
+    assert np.ptp(result.design.track.azimuth_rad) > 0.5
+    return result.design
+
+
 def test_places_where_a_ray_sees_nothing_are_bridged():
     generator = np.random.default_rng(2)
     empty = (SAMPLES.points[:, 0] > 1.5) & (SAMPLES.points[:, 0] < 2.4)

@@ -43,8 +43,8 @@ SMALLEST_DISTANCE = 0.01
 TINY = 1e-12
 # Mean elevations closer than this are the same row [rad].
 ORDER_DECIMALS = 9
-# Distances of so many samples to all rays are held at once.
-BLOCK = 16384
+# So many distances of samples to rays are held at once.
+BLOCK = 500_000
 # Roughness relative to the mass of a knot that keeps the normal equations solvable where a ray sees nothing.
 SMALLEST_STIFFNESS = 1e-9
 
@@ -166,8 +166,9 @@ def _best_start(points: np.ndarray, weights: np.ndarray, count: int, generator: 
 def _nearest(along: Along, surface: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The ray that aims nearest to each sample at the sample's own condition, and its distance, shape (M,)."""
     labels, squared = np.empty(len(surface), dtype=np.int64), np.empty(len(surface))
-    for start in range(0, len(surface), BLOCK):
-        part = slice(start, start + BLOCK)
+    size = max(BLOCK // centres.shape[1], 1)
+    for start in range(0, len(surface), size):
+        part = slice(start, start + size)
         left, share = along.left[part], along.share[part, None, None]
         here = (1 - share) * centres[left] + share * centres[left + 1]
         away = np.square(here - surface[part, None]).sum(axis=2)
