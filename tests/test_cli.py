@@ -225,6 +225,27 @@ def test_evaluate_scores_designs_and_baselines_and_holds_a_threshold(lidardesign
     assert "held-out" in lidardesign("evaluate", flat, "--rays", 16).out
 
 
+def test_further_baselines_are_built_where_they_are_asked_for(lidardesign, flat):
+    lidardesign("fit", flat, "--sensors", 2)
+    asked = ("--baseline", "occupancy", "--baseline", "no-visibility")
+    result = lidardesign("evaluate", flat, "--rays", 12, *asked, "--report", "page.html", "--json").json
+    names = ["fit", "uniform", "random", "bounding", "occupancy", "no-visibility"]
+    assert [row["design"] for row in result["rows"]] == names
+    assert all(row["rays"] == 12 for row in result["rows"])
+    assert {row["design"] for row in result["equal_bandwidth"]} == {*names[1:]}
+    assert Path("page.html").is_file()
+
+
+def test_no_visibility_needs_a_design_whose_run_is_there(lidardesign, flat):
+    lidardesign("fit", flat, "--sensors", 2)
+    away = Path("away.yaml")
+    away.write_text((flat / "designs" / "fit.yaml").read_text())
+    (flat / "designs" / "fit.yaml").unlink()
+    result = lidardesign("evaluate", flat, away, "--rays", 12, "--baseline", "no-visibility")
+    assert result.code == 2
+    assert "no design to fit anew" in result.err
+
+
 def test_the_same_seed_writes_the_same_design(lidardesign, flat):
     texts = []
     for seed in (1, 1):

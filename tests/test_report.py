@@ -1,17 +1,27 @@
 """The report is one page that works offline, and no name in it can become markup or script."""
 
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 
 from lidardesign.design.sensor import Design, Sensor
-from lidardesign.evaluate.drawing import body_triangles, frustum_lines, gate_shell, ray_segments, thinned
+from lidardesign.evaluate.drawing import (
+    MOST_FACES,
+    body_triangles,
+    drawn_share,
+    frustum_lines,
+    gate_shell,
+    origin_lines,
+    ray_segments,
+    thinned,
+)
 from lidardesign.evaluate.figures import scene_figure
 from lidardesign.evaluate.report import report_html, write_report
-from lidardesign.evaluate.results import Evaluation, Paired, Row
-from lidardesign.evaluate.verdicts import figure, summary_sentences, verdict
+from lidardesign.evaluate.results import Evaluation, Paired, Row, leading_detail
+from lidardesign.evaluate.verdicts import figure, rows_table, summary_sentences, verdict
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.simulate.returns import Outcome, Rays
 from lidardesign.task import Metric
@@ -211,3 +221,56 @@ def test_a_scan_of_hundreds_of_sensors_is_drawn_by_its_rays_alone():
     design = Design("scan", tuple(make_sensor(f"s{i}") for i in range(300)), layout="scan")
     figure, _ = scene_figure(make_scene(), [design], {"scan": make_rays(300)})
     assert len(figure["data"]) < 12
+
+
+def test_the_share_of_a_scene_that_is_drawn_bounds_all_its_meshes_together():
+    side = np.linspace(0, 1, 150)
+    x, y = np.meshgrid(side, side)
+    vertices = np.stack([x.ravel(), y.ravel(), np.sin(7 * x.ravel())], axis=1)
+    first = (np.arange(149)[:, None] * 150 + np.arange(149)).ravel()
+    sheet = Mesh(vertices, np.stack([first, first + 1, first + 150], axis=1), "unsigned")
+    poses = np.stack([rigid(translation_m=(0, 0, frame)) for frame in range(3)])
+    scene = Scene(tuple(Body(sheet, f"sheet {i}", poses=poses) for i in range(5)), "sheets")
+    assert drawn_share(make_scene()) == 1.0
+    assert drawn_share(scene) == pytest.approx(MOST_FACES / (5 * len(sheet.faces)))
+    drawn = sum(len(body_triangles(body, 1, np.zeros((2, 3)), drawn_share(scene))[1]) for body in scene.bodies)
+    assert 0.1 * MOST_FACES < drawn <= MOST_FACES + 5
+    design = Design("a", (make_sensor(),))
+    text = report_html(make_evaluation("a"), [design], {"a": make_rays()}, scene, at={"x_m": 0.37})
+    assert "frame 2 of 3, seen from x_m=0.37 (drawn coarser" in text
+    assert len(text) < 8e6
+
+
+def test_a_moving_scene_is_drawn_at_the_frame_in_the_middle():
+    poses = np.stack([rigid(translation_m=(3, y, 0)) for y in (9.0, 0.0, 9.0)])
+    scene = Scene((Body(Sphere(0.4), "ball", "target", poses),), "moving")
+    text = report_html(make_evaluation("a"), [Design("a", (make_sensor(),))], {"a": make_rays(101)}, scene)
+    # the ball is only in front of the rays in the middle frame
+    hits = len(ray_segments(scene, make_rays(101), 1)[Outcome.RETURN]) // 3
+    assert hits > 20
+    assert f"return ({hits})" in text
+
+
+def test_where_rays_of_a_sensor_start_is_drawn_where_it_spreads():
+    sensor = make_sensor()
+    assert len(origin_lines(sensor, 0.95)) == 0
+    turn = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
+    spread = turn @ np.diag([0.04, 0.01, 0]) @ turn.T
+    flat = replace(sensor, origin_m=np.array([1.0, 2, 3]), origin_covariance_m2=spread)
+    lines = origin_lines(flat, 0.95)
+    local = (lines[~np.isnan(lines[:, 0])] - flat.origin_m) @ turn
+    np.testing.assert_allclose(local[:, 2], 0.0, atol=1e-6)
+    np.testing.assert_allclose(np.hypot(local[:, 0] / 0.2, local[:, 1] / 0.1), 1.959964, atol=1e-4)
+    thick = replace(flat, origin_covariance_m2=np.diag([0.04, 0.01, 0.02]))
+    assert np.isnan(origin_lines(thick, 0.95)[:, 0]).sum() == 3
+
+
+def test_the_tasks_first_further_figure_stands_beside_the_score():
+    evaluation = make_evaluation("a")
+    assert leading_detail(evaluation.rows) is None
+    tracked = [replace(row, details={"tracked_share": 0.8125, "other": 3.0}) for row in evaluation.rows]
+    text = rows_table(replace(evaluation, rows=tracked))
+    assert "tracked share" in text
+    assert "0.8125" in text
+    assert "other" not in text
+    assert "tracked" not in rows_table(evaluation)

@@ -246,6 +246,20 @@ def test_a_broken_score_is_a_plugin_error_naming_task_metric_and_scene(result):
         assert word in str(caught.value)
 
 
+def test_details_are_means_over_the_scenes_that_give_them():
+    class Detailed(MissTask):
+        def score(self, scene, returns):
+            index = int(scene.name.split()[-1])
+            some = {"even": float(index)} if index % 2 == 0 else {}
+            return Score(1.0, details={"hit": index, "broken": float("nan"), **some})
+
+    row = evaluate(make_request(task=Detailed())).rows[0]
+    assert row.details == {"hit": 2.5, "even": 2.0}
+    assert row.as_dict()["details"] == row.details
+    with pytest.raises(PluginError, match="detail 'hit'"):
+        evaluate(make_request(task=BrokenTask(Score(1.0, details={"hit": "many"}))))
+
+
 def test_errors_about_data_keep_their_kind():
     with pytest.raises(DataError):
         evaluate(make_request(task=BrokenTask(DataError("no such file"))))

@@ -81,12 +81,10 @@ def checked_score(task: Task, scene: Scene, returns: Sequence[Returns]) -> Score
         raise PluginError(
             f"score returned {type(score).__name__}", where=where, allowed="lidardesign.task.Score"
         )
+    _check_details(score, where)
     if score.failed:
         return Score(float(task.metric.worst), failed=True, details=score.details)
-    number = isinstance(score.value, int | float | np.integer | np.floating) and not isinstance(
-        score.value, bool
-    )
-    if not number or not math.isfinite(score.value):
+    if not _is_number(score.value) or not math.isfinite(score.value):
         raise PluginError(
             f"score returned {score.value!r}",
             where=where,
@@ -95,3 +93,15 @@ def checked_score(task: Task, scene: Scene, returns: Sequence[Returns]) -> Score
         )
     clip = min if task.metric.better == "lower" else max
     return Score(clip(float(score.value), float(task.metric.worst)), details=score.details)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+
+
+def _check_details(score: Score, where: str) -> None:
+    bad = [name for name, value in score.details.items() if not _is_number(value)]
+    if bad:
+        raise PluginError(
+            f"score returned the detail {bad[0]!r}: {score.details[bad[0]]!r}", where=where, allowed="a number"
+        )
