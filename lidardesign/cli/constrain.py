@@ -38,7 +38,7 @@ def constrain(
     sensors: options.Sensors = None,
     layout: options.Layout = None,
     rays: options.RayCount = None,
-    gates: options.Gates = "sensor",
+    gates: options.Gates = None,
     at: options.At = None,
     name: options.Name = "constrained",
     seed: options.Seed = None,
@@ -49,7 +49,8 @@ def constrain(
     """Fit sensors again under constraints: seconds, nothing is learned again."""
     with command(json=json, quiet=quiet, debug=debug) as console:
         check_name(name)
-        check_choice(gates, "--gates", GATES)
+        if gates is not None:
+            check_choice(gates, "--gates", GATES)
         if layout is not None:
             check_choice(layout, "--layout", LAYOUTS)
         count, condition = sensor_count(sensors, None), parse_at(at)
@@ -66,7 +67,7 @@ def constrain(
             constraints=checked,
             sensors=_sensors(count, checked, design, run.task.defaults.sensors),
             layout=layout,
-            rays=_rays(rays, checked, design, layout == "grid" and gates == "sensor", run.task.defaults.rays),
+            rays=_rays(rays, checked, design, layout == "grid" and gates != "ray", run.task.defaults.rays),
             gates=gates,
             at={**(design.at if design else {}), **condition},
         )

@@ -33,7 +33,7 @@ def fit(
     sensors: options.Sensors = None,
     layout: options.Layout = None,
     rays: options.RayCount = None,
-    gates: options.Gates = "sensor",
+    gates: options.Gates = None,
     at: options.At = None,
     name: options.Name = "fit",
     seed: options.Seed = None,
@@ -46,11 +46,12 @@ def fit(
         check_name(name)
         if layout is not None:
             check_choice(layout, "--layout", LAYOUTS)
-        check_choice(gates, "--gates", GATES)
+        if gates is not None:
+            check_choice(gates, "--gates", GATES)
         count, condition = sensor_count(sensors, None), parse_at(at)
         opened = open_run(run)
         layout = layout or opened.task.defaults.layout
-        open_budget = layout == "grid" and gates == "sensor"
+        open_budget = layout == "grid" and gates != "ray"
         budget = rays if rays is not None or open_budget else max(opened.task.defaults.rays)
         fit_and_write(
             opened,

@@ -67,8 +67,9 @@ class Layouts:
         from lidardesign.evaluate.ablation import has_gates_per_ray
 
         table = design.ray_table
-        per_ray = table is not None and samples is not None and has_gates_per_ray(table)
-        gates = "ray" if per_ray else "sensor"
+        # only rays that start across their sensor's origins have gates of their own without samples
+        known = samples is not None or design.layout == "distributed"
+        gates = "ray" if table is not None and known and has_gates_per_ray(table) else "sensor"
         return lay_out(design, count, samples, gates=gates, at=at, retarget=self.targets.get(design.name))
 
 

@@ -38,7 +38,15 @@ RayCount = Annotated[
     int | None,
     typer.Option("--rays", metavar="N", min=1, help="Rays per frame, over all sensors.", show_default="left open"),
 ]
-Gates = Annotated[str, typer.Option("--gates", metavar="sensor|ray", help="One gate per sensor, or one per ray.")]
+Gates = Annotated[
+    str | None,
+    typer.Option(
+        "--gates",
+        metavar="sensor|ray",
+        help="One gate per sensor, or one per ray; per ray where rays start across their sensor's origins.",
+        show_default=False,
+    ),
+]
 Sensors = Annotated[
     str | None,
     typer.Option(

@@ -4,10 +4,17 @@ With samples of the density, each sample belongs to one sensor, by its own origi
 its ray looks at (see `looks`) is quantised by Lloyd's cells, so that rays fill the observed volume evenly in
 the density's measure, and one real sample's ray is fired per cell. Not the mean ray: where something hangs
 above the target the directions that see it form a ring, and the mean of visible rays points through the
-middle. Among the samples near a cell's centre the ray with the highest target density is taken.
+middle. Then scene points go to the ray that passes nearest to them (see `lines`) and each cell takes the ray
+that is near most of its points, so that rays are even over the whole volume, not only at its middle. Of the
+best tenth of a cell's rays the one with the highest target density is taken: it is hidden least.
 
 Without samples, low-discrepancy points fill each sensor's own Gaussian: the origin in the ellipsoid that holds
 the level, the direction given the origin, the gate given both. Independent draws would clump.
+
+Measured on the arm task (40 other held-out paths, share of frames with a return at 400 and 1000 rays, 4 sensors,
+gates open): cells' medoids 81 and 97.6 %, the highest density among the nearest quarter 88 and 98.4 %, with
+cells of lines 88 and 98.9 %; random draws 83 and 96 %. Gates per ray then listen to 80 and 92 % of the frames
+at 2.7 and 6.6 Mbit/s, the sensors' gates to 84 and 96 % at 4.0 and 10.1 Mbit/s.
 """
 
 from __future__ import annotations
@@ -24,6 +31,7 @@ from lidardesign.design.coupling import conditional_means, conditional_spreads
 from lidardesign.design.features import Axes, Features
 from lidardesign.design.gates import SMALLEST_CELL, central_intervals, kept_gates
 from lidardesign.design.grid import field_on_sphere, low_discrepancy
+from lidardesign.design.lines import mean_squares, nearest_lines
 from lidardesign.design.looks import looks
 from lidardesign.design.quantise import lloyd
 from lidardesign.design.regions import owned, principal_axes
@@ -39,6 +47,10 @@ SMALLEST_SAMPLE = 2000
 LLOYD_ITERATIONS = 15
 # The share of a cell's samples, those nearest to its centre, among which the highest density is taken.
 NEAR_SHARE = 0.25
+# The same among the rays of a cell of lines, by their distance from its scene points.
+NEAR_LINE_SHARE = 0.1
+# More moves of the cells of lines gain nothing that can be measured.
+LINE_ITERATIONS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,50 +117,78 @@ def _sampled_beams(
 ) -> Beams:
     """One real sample's ray per cell of what the samples inside a sensor look at."""
     chosen, weights = _thinned(samples.weights[members], max(SAMPLES_PER_RAY * count, SMALLEST_SAMPLE), generator)
+    if len(np.unique(fired[chosen, :RANGE], axis=0)) < count:
+        chosen, weights = np.arange(len(members)), samples.weights[members]
     part = Features.of(fired[chosen], weights, Axes.of(samples.space), samples.space)
-    views = looks(part)
-    centres, labels = lloyd(views, part.weights, count, generator, iterations=LLOYD_ITERATIONS)
-    away = np.square(views - centres[labels]).sum(axis=1)
-    picked = _best_near(labels, away, samples.log_target[members[chosen]], count)
-    picked = picked[np.lexsort(part.points[picked, :RANGE].T)]
+    picked = _picked(part, samples.log_target[members[chosen]], count, generator)
     rays = part.points[picked]
     looking = direction(rays[:, AZIMUTH], rays[:, ELEVATION])
-    gate = _gates(part, labels, picked, looking, sensor, bounds)
-    return Beams(rays[:, :3].copy(), looking, gate)
+    return Beams(rays[:, :3].copy(), looking, _gates(part, rays[:, :3], looking, sensor, bounds))
 
 
 def _thinned(weights: np.ndarray, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Indices and weights: all, or at most `count` of equal weight by systematic resampling."""
+    """Indices and weights: all, or fewer by systematic resampling, how often each was drawn being its weight."""
     if len(weights) <= count:
         return np.arange(len(weights)), weights
     cumulative = np.cumsum(weights)
     positions = (np.arange(count) + generator.uniform()) / count * cumulative[-1]
-    chosen = np.minimum(np.searchsorted(cumulative, positions, side="right"), len(weights) - 1)
-    return chosen, np.ones(count)
+    drawn = np.minimum(np.searchsorted(cumulative, positions, side="right"), len(weights) - 1)
+    chosen, times = np.unique(drawn, return_counts=True)
+    return chosen, times.astype(np.float64)
 
 
-def _best_near(labels: np.ndarray, away: np.ndarray, log_target: np.ndarray, count: int) -> np.ndarray:
-    """The sample of each cell with the highest target density among those nearest to its centre."""
+def _picked(part: Features, log_target: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
+    """The samples whose rays are fired, `count` distinct ones ordered by direction and origin."""
+    views = looks(part)
+    centres, labels = lloyd(views, part.weights, count, generator, iterations=LLOYD_ITERATIONS)
+    away = np.square(views - centres[labels]).sum(axis=1)
+    picked = _best_near(labels, away, log_target, NEAR_SHARE)
+    scene, origins = observed_point(part.points), part.points[:, :3]
+    looking = direction(part.points[:, AZIMUTH], part.points[:, ELEVATION])
+    for _ in range(LINE_ITERATIONS):
+        cells, away = nearest_lines(scene, origins[picked], looking[picked])
+        picked = _with_missing(picked, away, part.points, count)
+        cells, _ = nearest_lines(scene, origins[picked], looking[picked])
+        order = np.argsort(cells, kind="stable")
+        cost = np.empty(len(cells))
+        for cell in np.split(order, np.searchsorted(cells[order], np.arange(1, count))):
+            if len(cell):
+                cost[cell] = mean_squares(scene[cell], part.weights[cell], origins[cell], looking[cell])
+        picked = _best_near(cells, cost, log_target, NEAR_LINE_SHARE)
+    _, away = nearest_lines(scene, origins[picked], looking[picked])
+    picked = _with_missing(picked, away, part.points, count)
+    return picked[np.lexsort(part.points[picked, :RANGE].T)]
+
+
+def _with_missing(picked: np.ndarray, away: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
+    """Picked samples, and as many others as are missing: distinct rays, those farthest from all rays first."""
+    if len(picked) == count:
+        return picked
+    farthest = np.argsort(-away, kind="stable")
+    everyone = np.concatenate([picked, farthest])
+    _, first = np.unique(points[everyone, :RANGE], axis=0, return_index=True)
+    return everyone[np.sort(first)[:count]]
+
+
+def _best_near(labels: np.ndarray, away: np.ndarray, log_target: np.ndarray, share: float) -> np.ndarray:
+    """The sample of each cell with the highest target density among the share nearest to its centre."""
     order = np.lexsort((away, labels))
-    sizes = np.bincount(labels, minlength=count)
+    sizes = np.bincount(labels)
     starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
     rank = np.empty(len(labels), dtype=np.int64)
     rank[order] = np.arange(len(labels)) - starts[labels[order]]
-    near = rank < np.maximum(np.ceil(NEAR_SHARE * sizes[labels]), 1)
+    near = rank < np.maximum(np.ceil(share * sizes[labels]), 1)
     ranked = np.lexsort((away, np.where(near, -log_target, np.inf), labels))
     return ranked[starts[sizes > 0]]
 
 
-def _gates(
-    part: Features, labels: np.ndarray, picked: np.ndarray, looking: np.ndarray, sensor: Sensor, bounds: Bounds
-) -> np.ndarray:
-    """The central level of what each cell's samples observe, along its own ray and inside bounds, (K, 2) [m]."""
-    cell = np.full(labels.max() + 1, -1)
-    cell[labels[picked]] = np.arange(len(picked))
-    ray = cell[labels]
-    along = ((observed_point(part.points) - part.points[picked[ray], :3]) * looking[ray]).sum(axis=1)
-    wanted, effective = central_intervals(along, part.weights, ray, len(picked), sensor.level)
-    gate = np.tile(sensor.gate_m, (len(picked), 1))
+def _gates(part: Features, origins: np.ndarray, looking: np.ndarray, sensor: Sensor, bounds: Bounds) -> np.ndarray:
+    """The central level of the scene points nearest to each ray, along it and inside bounds, (K, 2) [m]."""
+    scene = observed_point(part.points)
+    ray, _ = nearest_lines(scene, origins, looking)
+    along = ((scene - origins[ray]) * looking[ray]).sum(axis=1)
+    wanted, effective = central_intervals(along, part.weights, ray, len(origins), sensor.level)
+    gate = np.tile(sensor.gate_m, (len(origins), 1))
     wanted = np.clip(wanted, *sensor.gate_m)
     known = np.flatnonzero((effective >= SMALLEST_CELL) & (np.diff(wanted, axis=1)[:, 0] > 0))
     gate[known] = kept_gates(wanted[known], sensor, bounds.take(np.zeros(len(known), dtype=np.int64)))

@@ -19,7 +19,7 @@ from lidardesign.design.feasibility import check_feasible, least_sensors
 from lidardesign.design.features import Axes, Features
 from lidardesign.design.mount_choice import at_mounts
 from lidardesign.design.mounts import is_mounted, most_mounted
-from lidardesign.design.rays import SAMPLES_PER_RAY, make_ray_table, split_budget
+from lidardesign.design.rays import SAMPLES_PER_RAY, Gates, make_ray_table, own_gates, split_budget
 from lidardesign.design.resolve import bounds_of, groups
 from lidardesign.design.samples import Samples
 from lidardesign.design.scan import fit_scan, rays_of
@@ -109,7 +109,7 @@ def fit(
     em_samples: int = EM_SAMPLES,
     level: float = DEFAULT_LEVEL,
     name: str = "design",
-    gates: Literal["sensor", "ray"] = "sensor",
+    gates: Gates | None = None,
     retarget: Retarget | None = None,
 ) -> FitResult:
     """Fit sensors to samples of the density under constraints.
@@ -126,7 +126,7 @@ def fit(
         em_samples: Samples that the fit works on.
         level: The share of each marginal that intervals hold.
         name: The design's name.
-        gates: Whether explicit rays have their sensor's gate or their own.
+        gates: Whether explicit rays have their sensor's gate or their own; None is `own_gates` of the layout.
         retarget: log p* of design points (N, 6), needed where an origin is pinned that the density leaves free.
 
     Raises:
@@ -141,7 +141,7 @@ def fit(
     request = _Request(samples, constraints, seed, restarts, em_samples, level, retarget)
     read_out = ReadOut.of(constraints.budget, rays)
     supports, fitted, total, score, notes = _solved(request, read_out, sensors, layout)
-    design = _design(fitted, layout, total, request, name, gates)
+    design = _design(fitted, layout, total, request, name, gates or own_gates(layout))
     checks = check_design(_document(design), constraints, samples.space)
     return FitResult(
         design=design,
@@ -355,7 +355,7 @@ def _design(
     total: int | None,
     request: _Request,
     name: str,
-    gates: Literal["sensor", "ray"],
+    gates: Gates,
 ) -> Design:
     if total is not None:
         counts = split_budget(np.array([s.weight for s in sensors]), total)

@@ -95,13 +95,17 @@ def _started(start: np.ndarray, count: int, offset: np.ndarray) -> np.ndarray:
 
 
 def _distinct(features: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Distinct points, the distinct point of each point, and summed weights.
+    """Distinct points in order of first appearance, the distinct point of each point, and summed weights.
 
+    That order does not depend on the coordinates, so the quantisation turns and moves with its points.
     Points without weight are kept out; each of them belongs to its nearest point with weight.
     """
     positive = weights > 0
-    distinct, inner = np.unique(features[positive], axis=0, return_inverse=True)
-    inner = inner.reshape(-1)
+    distinct, first, inner = np.unique(features[positive], axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    distinct, inner = distinct[order], place[inner.reshape(-1)]
     inverse = np.zeros(len(features), dtype=np.int64)
     inverse[positive] = inner
     if not positive.all():

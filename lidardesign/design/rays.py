@@ -24,7 +24,7 @@ from lidardesign.design.membership import Members, members
 from lidardesign.design.quantise import lloyd
 from lidardesign.design.resolve import bounds_of, groups
 from lidardesign.design.samples import Samples
-from lidardesign.design.sensor import Design, RayTable, Sensor, interval_factor, tangent_directions
+from lidardesign.design.sensor import Design, Layout, RayTable, Sensor, interval_factor, tangent_directions
 from lidardesign.design.support import Retarget
 from lidardesign.design.track import moved, placed
 from lidardesign.errors import ConfigError
@@ -76,7 +76,7 @@ def lay_out(
     count: int | None = None,
     samples: Samples | None = None,
     *,
-    gates: Gates = "sensor",
+    gates: Gates | None = None,
     rate_hz: float = DEFAULT_RATE_HZ,
     seed: int = 0,
     at: Mapping[str, float] | None = None,
@@ -87,14 +87,14 @@ def lay_out(
     At the number of rays of its explicit table, the design's table is the answer, gates included. Otherwise
     `grid` is even in each sensor's field of view; `density` quantises the samples inside each sensor; `scan`
     fires along each sensor's boresight, and at another number of rays is fitted anew to the samples;
-    `distributed` starts rays across each sensor's origins, by the samples inside it or by its own Gaussian, and
-    a ray's gate always is its own there.
+    `distributed` starts rays across each sensor's origins, by the samples inside it or by its own Gaussian.
 
     Arguments:
         design: The design.
         count: Rays per frame; None takes the design's own number.
         samples: Samples of the density, for `density` and `scan` at a new count and for gates per ray.
-        gates: `sensor` gives each ray its sensor's gate; `ray` the interval of the ranges seen around it.
+        gates: `sensor` gives each ray its sensor's gate; `ray` the interval of the ranges seen around it; None is
+            `own_gates` of the layout.
         rate_hz: Frames per second [Hz].
         seed: For the quantisation.
         at: Condition values, as {"x_m": 0.37}: a track gives its rays there, and any other design moves there as
@@ -105,6 +105,7 @@ def lay_out(
         ConfigError: No number of rays is known, the layout at this count needs samples, or a track's place is
             not given.
     """
+    gates = gates or own_gates(design.layout)
     if design.track is not None:
         return _on_track(design, count, samples, at or {}, rate_hz, seed)
     # what moves was fitted where it was made: its rays are laid out there, then moved
@@ -150,7 +151,7 @@ def _laid_out(
         return _laid_out(refitted(design, total, samples, seed), total, None, "sensor", rate_hz, seed)
     shares = _shares(design, total)
     if design.layout == "distributed":
-        return _distributed_rays(design, shares, samples, rate_hz, seed)
+        return _distributed_rays(design, shares, samples, gates, rate_hz, seed)
     seen = None
     if total and (gates == "ray" or design.layout == "density"):
         if samples is None:
@@ -169,14 +170,26 @@ def _laid_out(
     return Rays(origin, np.concatenate(looking), gate, sensor, fire_times(int(total), rate_hz))
 
 
-def _distributed_rays(design: Design, shares: np.ndarray, samples: Samples | None, rate_hz: float, seed: int) -> Rays:
+def own_gates(layout: Layout) -> Gates:
+    """The gates that rays have where nothing is asked for: a ray that starts where no other does has its own."""
+    return "ray" if layout == "distributed" else "sensor"
+
+
+def _distributed_rays(
+    design: Design, shares: np.ndarray, samples: Samples | None, gates: Gates, rate_hz: float, seed: int
+) -> Rays:
     beams = distributed_beams(design, shares, samples, seed)
-    columns = [np.concatenate([getattr(one, name) for one in beams]) for name in ("origin_m", "direction", "gate_m")]
-    return Rays(*columns, np.repeat(np.arange(len(shares)), shares), fire_times(int(shares.sum()), rate_hz))
+    origin, looking, gate = (
+        np.concatenate([getattr(one, name) for one in beams]) for name in ("origin_m", "direction", "gate_m")
+    )
+    sensor = np.repeat(np.arange(len(shares)), shares)
+    if gates == "sensor":
+        gate = np.array([s.gate_m for s in design.sensors])[sensor]
+    return Rays(origin, looking, gate, sensor, fire_times(int(shares.sum()), rate_hz))
 
 
 def make_ray_table(
-    design: Design, count: int, samples: Samples | None = None, gates: Gates = "sensor", *, seed: int = 0
+    design: Design, count: int, samples: Samples | None = None, gates: Gates | None = None, *, seed: int = 0
 ) -> RayTable:
     """The explicit rays of a design's layout, laid out anew, as they are kept in its file."""
     rays = lay_out(replace(design, ray_table=None), count, samples, gates=gates, seed=seed)

@@ -1,8 +1,9 @@
 """The joint region of a sensor with an extended origin: which samples it fires itself, from where they start.
 
-The region holds the origins inside the ellipsoid of the level, the directions inside the field of view and
-the ranges inside the gate. Along pinned origin axes, where samples have measure zero, they are aimed anew at
-their scene points, as in `membership`.
+The region holds the origins inside the ellipsoid of the level and the directions inside the field of view. The
+gate is no part of it: a ray is fired at all ranges, and its gate is found from all that it could return. (With
+the gate, rays would get the central 95 % of a central 95 %.) Along pinned origin axes, where samples have
+measure zero, they are aimed anew at their scene points, as in `membership`.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from lidardesign.design.coupling import conditional_means, conditional_spreads, 
 from lidardesign.design.membership import FIELD_ROUNDING_RAD, SMALLEST_ANGLE_RAD, SMALLEST_LENGTH
 from lidardesign.design.resolve import origin_box
 from lidardesign.design.sensor import Design, Sensor, angle_over_sine
-from lidardesign.space import RANGE, DesignSpace, aim, observed_point
+from lidardesign.space import DesignSpace, aim, observed_point
 
 # Samples may lie outside a box or an ellipsoid by the rounding of their coordinates [m].
 ROUNDING_M = 1e-9
@@ -29,7 +30,7 @@ def owned(
     """The samples of each sensor: their indices and, as it fires them, their design points.
 
     A sample belongs to the sensor with the highest weighted density of its own origin, direction and range
-    among those whose region and origin box hold it, the first where they tie.
+    among those whose region and origin box hold its ray, the first where they tie.
 
     Arguments:
         design: G sensors.
@@ -69,9 +70,7 @@ def _fired_by(sensor: Sensor, points: np.ndarray, space: DesignSpace) -> np.ndar
 def in_region(sensor: Sensor, points: np.ndarray) -> np.ndarray:
     """Which design points (N, 6) lie in a sensor's joint region, shape (N,) bool."""
     origin, tangent, _ = relative(sensor, points)
-    start, end = sensor.gate_m
     inside = (np.abs(tangent) <= np.array(sensor.field_of_view_rad) / 2 + FIELD_ROUNDING_RAD).all(axis=1)
-    inside &= (points[:, RANGE] >= start) & (points[:, RANGE] <= end)
     spreads, axes = principal_axes(sensor)
     along = origin @ axes
     within = np.square(along / spreads).sum(axis=1) <= ellipsoid_radius(sensor.level, len(spreads)) ** 2
