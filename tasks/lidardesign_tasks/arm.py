@@ -72,6 +72,7 @@ class ArmTask:
         rays=(400, 1000, 1200),
         layout="distributed",
         density={"sigma_m": 0.025, "surface_tolerance_nats": 10.0},
+        learning={"standard": {"steps": 800, "hidden": 64}},
     )
 
     def space(self, config: ArmConfig) -> DesignSpace:
