@@ -25,6 +25,11 @@ if TYPE_CHECKING:
 
 
 ALWAYS = ("uniform", "random", "bounding")
+BASELINE_HELP = (
+    "A further baseline beside uniform, random and bounding: occupancy (rays towards cells that targets occupy) or "
+    "no-visibility (the first design fitted anew to the density without its occlusion term, from samples drawn for it: "
+    "some seconds). Repeatable."
+)
 
 
 @dataclass
@@ -51,9 +56,7 @@ def evaluate(
         typer.Option(
             "--baseline",
             metavar="NAME",
-            help="A further baseline beside uniform, random and bounding: occupancy (rays towards cells that targets "
-            "occupy) or no-visibility (the first design fitted anew to the density without its occlusion term, from "
-            "samples drawn for it: some seconds). Repeatable.",
+            help=BASELINE_HELP,
             show_default=False,
         ),
     ] = None,

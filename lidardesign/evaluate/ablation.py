@@ -47,8 +47,10 @@ def fitted_twin(design: Design, samples: Samples, *, name: str, retarget: LogTar
         name: Of the twin.
         retarget: log p* of the other density, where the fit needs it.
     """
-    per_ray = design.ray_table is not None and has_gates_per_ray(design.ray_table)
     one_per_ray = design.layout == "scan" or design.track is not None
+    gates = None
+    if design.ray_table is not None and not one_per_ray:
+        gates = "ray" if has_gates_per_ray(design.ray_table) else "sensor"
     seed = design.provenance.get("seed", 0)
     return fit(
         samples,
@@ -59,7 +61,7 @@ def fitted_twin(design: Design, samples: Samples, *, name: str, retarget: LogTar
         seed=seed if isinstance(seed, int) else 0,
         level=design.level,
         name=name,
-        gates="ray" if per_ray and not one_per_ray and design.layout != "distributed" else "sensor",
+        gates=gates,
         retarget=retarget,
     ).design
 
