@@ -305,7 +305,8 @@ def test_every_constraint_holds_at_every_position(tight, at):
 def test_the_bandwidth_budget_is_used(tight):
     check = next(check for check in tight.constraints if check.name == "budget.bandwidth_mbps")
     found = max(Bandwidth().mbps(lay_out(tight.design, at={"x_m": x})) for x in np.linspace(-0.5, 4.0, 4000))
-    assert found == pytest.approx(check.value)
+    # the dearest stretch may lie between the places that are tried: 0.0004 Mbit/s is one bin of one ray
+    assert check.value - 0.001 <= found <= check.value + 1e-12
     assert 0.02 < check.value <= 0.03
 
 
@@ -455,6 +456,20 @@ def test_constraints_that_no_track_keeps_are_infeasible(rules, conflicts):
         fit(SAMPLES, layout="scan", rays=8, constraints=constrained(**rules))
     if conflicts:
         assert list(caught.value.conflicts) == conflicts
+
+
+@pytest.mark.parametrize("index", [4, 5])
+def test_a_fixed_elevation_or_range_stays_fixed(index):
+    points, low, high = SAMPLES.points.copy(), list(AISLE.low), list(AISLE.high)
+    points[:, index] = low[index] = high[index] = 1.0
+    space = replace(AISLE, low=tuple(low), high=tuple(high))
+    track = fit(Samples(points, SAMPLES.log_prob, SAMPLES.log_target, space), layout="scan", rays=3).design.track
+    np.testing.assert_array_equal(track.elevation_rad if index == 4 else track.gate_m, 1.0)
+
+
+def test_more_rays_than_the_samples_are_worth_are_refused():
+    with pytest.raises(InfeasibleError, match="effective samples"):
+        fit(SAMPLES, layout="scan", rays=3000)
 
 
 def test_an_origin_box_shortens_the_travel():

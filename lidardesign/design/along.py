@@ -21,6 +21,7 @@ boxes in hand 18.8, 9.1, 5.2.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 
@@ -36,6 +37,8 @@ from lidardesign.space import AZIMUTH, ELEVATION, DesignSpace, angles
 ROUGHNESS = 1.0
 LLOYD_ITERATIONS = 15
 SWEEPS = 30
+# Sweeps end when one shortens the mean distance by less than this share.
+SMALLEST_GAIN = 1e-4
 STARTS = 12
 # Nearer samples than this share of the mean distance pull no harder.
 SMALLEST_DISTANCE = 0.01
@@ -107,10 +110,10 @@ def aimed_rays(along: Along, count: int, generator: np.random.Generator) -> tupl
     for _ in range(SWEEPS):
         pulls = weighted.weights / np.maximum(distance, max(nearest_m, TINY))
         centres = _smoothed(along, surface, pulls, labels, centres, stiffness)
-        fresh, distance = _nearest(along, surface, centres)
-        if np.array_equal(fresh, labels):
+        before = float(weighted.weights @ distance)
+        labels, distance = _nearest(along, surface, centres)
+        if before - float(weighted.weights @ distance) <= SMALLEST_GAIN * before:
             break
-        labels = fresh
     order = _upwards(centres)
     return centres[:, order], np.argsort(order)[labels]
 
@@ -165,15 +168,25 @@ def _best_start(points: np.ndarray, weights: np.ndarray, count: int, generator: 
 
 def _nearest(along: Along, surface: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The ray that aims nearest to each sample at the sample's own condition, and its distance, shape (M,)."""
-    labels, squared = np.empty(len(surface), dtype=np.int64), np.empty(len(surface))
+    labels = np.empty(len(surface), dtype=np.int64)
+    order = np.argsort(along.left, kind="stable")
+    starts = np.searchsorted(along.left[order], np.arange(len(along.knots)))
     size = max(BLOCK // centres.shape[1], 1)
-    for start in range(0, len(surface), size):
-        part = slice(start, start + size)
-        left, share = along.left[part], along.share[part, None, None]
-        here = (1 - share) * centres[left] + share * centres[left + 1]
-        away = np.square(here - surface[part, None]).sum(axis=2)
-        labels[part], squared[part] = away.argmin(axis=1), away.min(axis=1)
-    return labels, np.sqrt(squared)
+    for knot, (first, last) in enumerate(itertools.pairwise(starts)):
+        for start in range(first, last, size):
+            part = order[start : min(start + size, last)]
+            labels[part] = _nearest_between(surface[part], along.share[part, None], centres[knot], centres[knot + 1])
+    here = along.between(centres, labels)
+    return labels, np.linalg.norm(here - surface, axis=1)
+
+
+def _nearest_between(surface: np.ndarray, share: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The nearest ray of samples (W, 3) between two knots with aims (N, 3): |c|^2 - 2 y c decides, shape (W,)."""
+    squares = np.stack([(left * left).sum(axis=1), (left * right).sum(axis=1), (right * right).sum(axis=1)])
+    hats = np.concatenate([(1 - share) ** 2, 2 * share * (1 - share), share**2], axis=1)
+    # one matrix product: its factors are as long as a sample's hats and points, not as the rays are many
+    sides = np.concatenate([hats, -2 * (1 - share) * surface, -2 * share * surface], axis=1)
+    return (sides @ np.concatenate([squares, left.T, right.T])).argmin(axis=1)
 
 
 def _smoothed(

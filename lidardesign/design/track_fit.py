@@ -32,7 +32,7 @@ from lidardesign.design.sensor import DEFAULT_LEVEL, Design, Sensor, Track, inte
 from lidardesign.design.support import check_support, restricted
 from lidardesign.design.track import TRAVELLED, boresight_azimuth, interpolated
 from lidardesign.errors import ConfigError, InfeasibleError
-from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, DesignSpace, angles, direction, observed_point
+from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace, angles, direction, observed_point
 from lidardesign.task import random_generator
 
 KNOT_SPACING_M = 0.1
@@ -211,6 +211,9 @@ def _with_gates(
     knots, count = azimuth.shape
 
     def track(limits: Bounds) -> Track:
+        if RANGE not in along.space.free:
+            gate = np.full((knots, count, 2), along.space.low[RANGE])
+            return Track(DIMENSIONS[along.dimension], along.knots, azimuth, elevation, gate, np.arange(count))
         rows = limits.take(np.tile(np.arange(count), knots))
         centre, spread = admissible_gates(wanted.reshape(-1, 2), rows)
         half = limits.interval * spread
