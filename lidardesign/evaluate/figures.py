@@ -28,6 +28,7 @@ from lidardesign.scene import Scene
 from lidardesign.simulate.returns import Outcome, Rays
 
 MOST_RAYS = 2000  # drawn per design
+MANY_RAYS, FAINT = 300, 0.22  # more rays that hit nothing would hide everything else
 MOST_SENSORS = 40  # drawn as frusta; a scan has hundreds, and its rays say it all
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 14, "color": "#1f2933"}
 SYMBOLS = {
@@ -234,7 +235,8 @@ def _ray_traces(scene: Scene, rays: Rays, frame: int) -> list[dict[str, Any]]:
         colour, label = OUTCOME_COLOURS[outcome], outcome.name.lower().replace("_", " ")
         name = f"{label} ({len(lines) // 3})"
         look = {"color": colour, "width": 1.5}
-        traces.append(_line_trace(lines, name=name, line=look, opacity=0.55, legendgroup=label))
+        opacity = FAINT if outcome == Outcome.MISS and len(lines) // 3 > MANY_RAYS else 0.55
+        traces.append(_line_trace(lines, name=name, line=look, opacity=opacity, legendgroup=label))
         if outcome == Outcome.RETURN:
             ends = _line_trace(lines[1::3], name="returns", legendgroup=label, showlegend=False)
             traces.append({**ends, "mode": "markers", "marker": {"color": colour, "size": 3}})
