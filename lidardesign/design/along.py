@@ -37,7 +37,7 @@ from lidardesign.space import AZIMUTH, ELEVATION, DesignSpace, angles
 ROUGHNESS = 1.0
 LLOYD_ITERATIONS = 15
 SWEEPS = 30
-# Sweeps end when one shortens the mean distance by less than this share.
+# Sweeps end when one lowers the cost by less than this share.
 SMALLEST_GAIN = 1e-4
 STARTS = 12
 # Nearer samples than this share of the mean distance pull no harder.
@@ -107,15 +107,22 @@ def aimed_rays(along: Along, count: int, generator: np.random.Generator) -> tupl
     labels, distance = _nearest(along, surface, centres)
     nearest_m = SMALLEST_DISTANCE * float(weighted.weights @ distance)
     stiffness = ROUGHNESS / max(float(weighted.weights @ distance), TINY) / (count * len(along.knots))
+    cost = math.inf
     for _ in range(SWEEPS):
+        before, cost = cost, _cost(weighted, distance, centres, stiffness)
+        if before - cost <= SMALLEST_GAIN * cost:
+            break
         pulls = weighted.weights / np.maximum(distance, max(nearest_m, TINY))
         centres = _smoothed(along, surface, pulls, labels, centres, stiffness)
-        before = float(weighted.weights @ distance)
         labels, distance = _nearest(along, surface, centres)
-        if before - float(weighted.weights @ distance) <= SMALLEST_GAIN * before:
-            break
     order = _upwards(centres)
     return centres[:, order], np.argsort(order)[labels]
+
+
+def _cost(along: Along, distance: np.ndarray, centres: np.ndarray, stiffness: float) -> float:
+    """What every sweep lowers: the weighted mean distance and the cost of bends [m]."""
+    bends = np.square(np.diff(centres, n=2, axis=0)).sum()
+    return float(along.weights @ distance) + stiffness / 2 * float(bends)
 
 
 def _upwards(centres: np.ndarray) -> np.ndarray:
