@@ -97,6 +97,17 @@ def test_a_scan_is_the_layout_where_the_task_says_so(lidardesign, run, monkeypat
     assert design.rays == 5
 
 
+def test_a_layout_that_a_task_invented_is_refused(lidardesign, run, monkeypatch):
+    from dataclasses import replace
+
+    task = type(load_task("flatland"))
+    monkeypatch.setattr(task, "defaults", replace(task.defaults, layout="spiral"))
+    for command in ("fit", "constrain"):
+        result = lidardesign(command, run)
+        assert result.code == 2
+        assert "task flatland" in result.err
+
+
 def test_constraints_hold_along_a_track_and_at_a_value(lidardesign, run):
     lidardesign("fit", run, "--layout", "scan", "--rays", 4)
     path = run / "designs" / "fit.yaml"

@@ -50,7 +50,7 @@ def fit(
             check_choice(gates, "--gates", GATES)
         count, condition = sensor_count(sensors, None), parse_at(at)
         opened = open_run(run)
-        layout = layout or opened.task.defaults.layout
+        layout = layout or usual_layout(opened)
         open_budget = layout == "grid" and gates != "ray"
         budget = rays if rays is not None or open_budget else max(opened.task.defaults.rays)
         fit_and_write(
@@ -65,6 +65,15 @@ def fit(
             gates=gates,
             at=condition,
         )
+
+
+def usual_layout(run: Run) -> str:
+    """The layout that a run's task suggests.
+
+    Raises:
+        ConfigError: It is none.
+    """
+    return check_choice(run.task.defaults.layout, f"defaults.layout of task {run.task.name}", LAYOUTS)
 
 
 def fit_and_write(
