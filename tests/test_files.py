@@ -19,7 +19,7 @@ from lidardesign.design.files import (
     save_design,
 )
 from lidardesign.design.rays import lay_out
-from lidardesign.design.sensor import Design, RayTable, Sensor, interval_factor
+from lidardesign.design.sensor import Coupling, Design, RayTable, Sensor, interval_factor
 from lidardesign.errors import ConfigError, DataError, NumericalError
 from lidardesign.run.yaml import dump_yaml, parse_yaml
 
@@ -49,6 +49,16 @@ def sensors(draw, name, weight, level, rays):
         azimuth_rad=draw(st.floats(-10, 10)), elevation_rad=draw(st.floats(-math.pi / 2, math.pi / 2)),
         roll_rad=draw(st.floats(-4, 4)), spread_horizontal_rad=draw(st.floats(0, 4)),
         spread_vertical_rad=draw(st.floats(0, 4)), range_m=draw(length), spread_range_m=draw(length),
+        coupling=draw(st.none() | couplings()),
+    )  # fmt: skip
+
+
+@st.composite
+def couplings(draw):
+    numbers = lambda values, count: np.array(draw(st.lists(values, min_size=count, max_size=count)))  # noqa: E731
+    return Coupling(
+        direction_per_m=numbers(finite, 6).reshape(2, 3), range_per_m=numbers(finite, 3),
+        range_per_rad=numbers(finite, 2), spread_rad=numbers(length, 2), spread_m=draw(length),
     )  # fmt: skip
 
 
@@ -88,7 +98,7 @@ def designs(draw):
     )
     return Design(
         name=draw(words), sensors=chosen, rays=total, ray_table=table, level=level,
-        layout=draw(st.sampled_from(["grid", "density", "scan"])),
+        layout=draw(st.sampled_from(["grid", "density", "scan", "distributed"])),
         constraints={"gate": {"width_m": {"max": draw(length)}}},
         provenance={"command": draw(anything), "seed": 7},
     )  # fmt: skip

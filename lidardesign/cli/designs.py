@@ -103,7 +103,9 @@ def _reach(values: np.ndarray, decimals: int) -> str:
 
 def _place(sensor: Sensor) -> str:
     # -0.0 is the same place as 0.0
-    return " ".join(f"{round(value, 3) + 0.0:.3f}" for value in sensor.origin_m)
+    place = " ".join(f"{round(value, 3) + 0.0:.3f}" for value in sensor.origin_m)
+    travel, _ = sensor.travel_m
+    return f"{place}, travel {travel:.3f}" if travel > 0 else place
 
 
 def _cells(sensor: Sensor) -> list[str]:
