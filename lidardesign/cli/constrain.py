@@ -9,7 +9,7 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.console import command
-from lidardesign.cli.fit import GATES, LAYOUTS, fit_and_write, usual_layout
+from lidardesign.cli.fit import GATES, LAYOUTS, check_level, fit_and_write, usual_layout
 from lidardesign.cli.runs import check_choice, check_name, need_run, open_target, parse_at, sensor_count
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ def constrain(
     layout: options.Layout = None,
     rays: options.RayCount = None,
     gates: options.Gates = None,
+    level: options.Level = None,
     at: options.At = None,
     name: options.Name = "constrained",
     seed: options.Seed = None,
@@ -69,8 +70,16 @@ def constrain(
             layout=layout,
             rays=_rays(rays, checked, design, layout == "grid" and gates != "ray", run.task.defaults.rays),
             gates=gates,
+            level=check_level(_level(level, design, run.task.defaults.level)),
             at={**(design.at if design else {}), **condition},
         )
+
+
+def _level(given: float | None, design: Design | None, usual: float) -> float:
+    """The level of intervals: the option's, else the design's, else the task's."""
+    if given is not None:
+        return given
+    return design.level if design else usual
 
 
 def load_constraints(file: Path | None, overrides: list[str]) -> Constraints:

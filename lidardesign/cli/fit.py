@@ -11,7 +11,7 @@ import typer
 from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
 from lidardesign.cli.runs import check_choice, check_name, open_run, parse_at, provenance, sensor_count
-from lidardesign.errors import DataError
+from lidardesign.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -34,6 +34,7 @@ def fit(
     layout: options.Layout = None,
     rays: options.RayCount = None,
     gates: options.Gates = None,
+    level: options.Level = None,
     at: options.At = None,
     name: options.Name = "fit",
     seed: options.Seed = None,
@@ -63,8 +64,22 @@ def fit(
             layout=layout,
             rays=budget,
             gates=gates,
+            level=check_level(opened.task.defaults.level if level is None else level),
             at=condition,
         )
+
+
+def check_level(level: float) -> float:
+    """A share that intervals can hold.
+
+    Raises:
+        ConfigError: It is next to nothing, or next to everything.
+    """
+    from lidardesign.design.sensor import LEVELS
+
+    if not LEVELS[0] <= level <= LEVELS[1]:
+        raise ConfigError(f"{level:g}", where="--level", allowed=f"{LEVELS[0]:g} to {LEVELS[1]:g}")
+    return level
 
 
 def usual_layout(run: Run) -> str:
@@ -97,7 +112,7 @@ def fit_and_write(
         seed: Root of the random streams.
         constraints: Checked constraints, or None.
         at: Condition values that the design is for; without any, one for all of them.
-        choices: sensors, layout, rays and gates, as `lidardesign.design.fit.fit` takes them.
+        choices: sensors, layout, rays, gates and level, as `lidardesign.design.fit.fit` takes them.
     """
     from dataclasses import replace
 

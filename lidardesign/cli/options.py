@@ -38,6 +38,15 @@ RayCount = Annotated[
     int | None,
     typer.Option("--rays", metavar="N", min=1, help="Rays per frame, over all sensors.", show_default="left open"),
 ]
+Level = Annotated[
+    float | None,
+    typer.Option(
+        "--level",
+        metavar="SHARE",
+        help="Share of rays and returns that fields of view and gates hold, as 0.99.",
+        show_default="the design's or the task's",
+    ),
+]
 Gates = Annotated[
     str | None,
     typer.Option(

@@ -153,6 +153,17 @@ def _column_distance(  # noqa: ANN202
     return distance, body
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _most_promising(group_low, group_high, group_weights, precision, points, n, hopes):  # noqa: ANN001, ANN202
+    """What each group could come to at point n at best, into `hopes`; which group hopes for most."""
+    leader, highest = 0, -np.inf
+    for g in range(hopes.shape[0]):
+        hopes[g] = group_weights[g] - 0.5 * precision * _outside_squared(group_low, group_high, g, points, n)
+        if hopes[g] > highest:
+            leader, highest = g, hopes[g]
+    return leader
+
+
 @njit(cache=True, nogil=True)
 def near_columns(  # noqa: ANN201
     kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps,  # noqa: ANN001
@@ -184,11 +195,7 @@ def near_columns(  # noqa: ANN201
     total = 0
     for n in range(points.shape[0]):
         row_starts[n] = total
-        leader, highest = 0, -np.inf
-        for g in range(groups):
-            hopes[g] = group_weights[g] - 0.5 * precision * _outside_squared(group_low, group_high, g, points, n)
-            if hopes[g] > highest:
-                leader, highest = g, hopes[g]
+        leader = _most_promising(group_low, group_high, group_weights, precision, points, n, hopes)
         best, kept = -np.inf, 0
         for turn in range(groups):
             # the most promising group first: it tells how much the others may miss

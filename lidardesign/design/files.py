@@ -19,6 +19,7 @@ import numpy as np
 from lidardesign.design.document import Locate, Node
 from lidardesign.design.sensor import (
     DEFAULT_LEVEL,
+    LEVELS,
     Coupling,
     Design,
     RayTable,
@@ -41,8 +42,6 @@ MAX_BYTES = 64_000_000
 MOST_TABLE_RAYS = 60_000
 # How far a written interval may be from the one that the spread gives: digits that a person may have rounded.
 AGREEMENT = 1e-6
-# Beyond these an interval is next to nothing, or next to everything, of a normal distribution.
-LEVELS = (0.01, 0.999999)
 # Weights that sum to 1 within this are taken as they stand, so that loading changes no bit.
 WEIGHT_SUM_TOLERANCE = 1e-9
 # How much below zero rounding may push an eigenvalue of a covariance, relative to the largest.

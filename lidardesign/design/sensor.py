@@ -21,6 +21,8 @@ from scipy.special import ndtri
 from lidardesign.space import direction
 
 DEFAULT_LEVEL = 0.95
+# Beyond these an interval is next to nothing, or next to everything, of a normal distribution.
+LEVELS = (0.01, 0.999999)
 Layout = Literal["grid", "density", "scan", "distributed"]
 
 
