@@ -18,6 +18,7 @@ from lidardesign.density.occlusion import BodyRaycast, Pairs
 from lidardesign.density.settings import DensitySettings
 from lidardesign.density.target import build_target
 from lidardesign.density.visibility import RayBatch
+from lidardesign.errors import ConfigError
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.space import AZIMUTH, ELEVATION, DesignSpace, direction, observed_point
@@ -200,6 +201,11 @@ def test_independent_points_weighted_by_their_density_integrate_the_target():
         effective = values.sum() ** 2 / np.square(values).sum()
         spread = math.sqrt(np.average(np.square(uniform[:, axis] - naive), weights=values))
         assert abs(ours - naive) < 5 * spread / math.sqrt(effective)
+
+
+def test_a_quadrature_over_thousands_of_bodies_is_refused():
+    with pytest.raises(ConfigError, match="raycast"):
+        build_target(moving_scenes(frames=300), CEILING, SETTINGS, "quadrature")
 
 
 def test_a_frame_costs_a_pose_and_no_grid():

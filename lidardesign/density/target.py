@@ -25,12 +25,13 @@ from lidardesign.density.visibility import (
     RayGradient,
     Visibility,
 )
-from lidardesign.errors import NumericalError
+from lidardesign.errors import ConfigError, NumericalError
 from lidardesign.numerics import logsumexp
 from lidardesign.scene import Mesh, Scene
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction, observed_point
 
 PADDING_SIGMAS = 4.0
+MOST_QUADRATURE_BODIES = 2000
 # d direction / d sin(elevation) grows without bound at the poles; it is capped at this cosine of the elevation.
 MINIMUM_POLE_COSINE = 1e-4
 
@@ -162,6 +163,7 @@ def build_target(
         from lidardesign.density.frames import build_frames_target
 
         return build_frames_target(scenes, space, settings, visibility, log_column_weights, **fields)
+    _check_quadrature(scenes, visibility)
     field = build_field(scenes, lambda body: body.is_target, **fields)
     if isinstance(field, TableField):
         field = replace(field, compiled=compiled)
@@ -173,6 +175,18 @@ def build_target(
         space=space,
         surface_tolerance_nats=settings.surface_tolerance_nats,
     )
+
+
+def _check_quadrature(scenes: Sequence[Scene], visibility: str) -> None:
+    """Refuse a quadrature that would evaluate every body of thousands of frames at every midpoint."""
+    moving = sum(scene.frames * len(scene.bodies) for scene in scenes if scene.frames > 1)
+    if visibility == "quadrature" and moving > MOST_QUADRATURE_BODIES:
+        raise ConfigError(
+            f"a quadrature over {moving} bodies in all frames would take minutes a step",
+            where="density.visibility",
+            allowed=f"at most {MOST_QUADRATURE_BODIES}",
+            hint="density.visibility=raycast looks only at the frames that matter",
+        )
 
 
 def _has_mesh_at_rest(scene: Scene) -> bool:
