@@ -446,7 +446,7 @@ def test_a_design_that_was_copied_away_from_its_run_says_what_it_lacks(lidardesi
 
 @pytest.mark.parametrize("decided", ["raycast", "off", None])
 def test_a_pinned_origin_is_weighted_with_the_visibility_that_the_run_decided_on(flat, monkeypatch, decided):
-    from lidardesign.cli import fit as fit_module
+    from lidardesign.cli.layouts import RunTarget
     from lidardesign.cli.runs import open_run
     from lidardesign.run.manifest import note
 
@@ -464,7 +464,8 @@ def test_a_pinned_origin_is_weighted_with_the_visibility_that_the_run_decided_on
     monkeypatch.setattr("lidardesign.density.prepare.prepare_target", prepare)
     if decided is not None:
         note(flat, visibility=decided)
-    assert fit_module.log_target(open_run(flat), np.zeros((3, 6))).shape == (3,)
+    target = RunTarget(open_run(flat))
+    assert [target(np.zeros((3, 6))).shape for _ in range(2)] == [(3,), (3,)]
     assert asked == [(20, decided)]
 
 

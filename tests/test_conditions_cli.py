@@ -38,9 +38,7 @@ def make_conditioned_run(folder, count=6000, condition="[x_m]"):
 @pytest.fixture
 def lidardesign(capsys, tmp_path, monkeypatch):
     """Run the program in this process; the target density is the planted one."""
-    from lidardesign.cli import fit as fit_module
-
-    monkeypatch.setattr(fit_module, "log_target", lambda run, points: log_target(points))
+    monkeypatch.setattr("lidardesign.cli.layouts.RunTarget.__call__", lambda self, points: log_target(points))
     return caller(capsys, tmp_path, monkeypatch)
 
 
@@ -205,3 +203,72 @@ def test_several_conditions_are_given_at_once(lidardesign, tmp_path):
     assert sensor["boresight"]["azimuth_rad"] == pytest.approx(1.6)
     assert sensor["field_of_view_rad"]["horizontal"] == 0
     assert np.mean(list(sensor["gate_m"].values())) == pytest.approx(0.6, abs=0.02)
+
+
+OPEN = """
+schema_version: 1
+layout: {layout}
+sensors:
+- name: a
+  origin_m: {{mean: [0.5, 0, 0], covariance: [[0.04, 0, 0], [0, 0, 0], [0, 0, 0]]}}
+  boresight: {{azimuth_rad: 1.6, elevation_rad: 0.0}}
+  field_of_view_rad: {{horizontal: 0.3, vertical: 0.0}}
+  gate_m: {{start: 0.4, end: 1.0}}
+"""
+
+
+def test_a_design_by_hand_without_a_number_of_rays_is_exported_at_the_one_that_is_asked_for(lidardesign, tmp_path):
+    (tmp_path / "hand.yaml").write_text(OPEN.format(layout="distributed"))
+    result = lidardesign("export", "hand.yaml", "--format", "npz", "--rays", 20, "--out", "r.npz")
+    assert result.code == 0, result.err
+    with np.load(tmp_path / "r.npz") as arrays:
+        assert len(np.unique(arrays["origin_x_m"])) == 20
+    (tmp_path / "hand.yaml").write_text(OPEN.format(layout="density"))
+    refused = lidardesign("export", "hand.yaml", "--format", "npz", "--rays", 20, "--out", "r.npz")
+    assert refused.code == 2
+    assert "need samples of the learned density" in refused.err
+
+
+def test_a_design_is_exported_with_the_rays_that_it_is_evaluated_with(lidardesign, run, tmp_path):
+    from lidardesign.cli.layouts import Layouts
+    from lidardesign.design.samples import load_samples
+
+    for layout, gates in (("grid", "ray"), ("density", "ray"), ("distributed", "sensor"), ("distributed", "ray")):
+        name = f"{layout}-{gates}"
+        made = ("--at", "x_m=0.37", "--layout", layout, "--rays", 8, "--sensors", 2, "--gates", gates)
+        assert lidardesign("fit", run, *made, "--name", name).code == 0
+        path = run / "designs" / f"{name}.yaml"
+        assert lidardesign("export", path, "--format", "npz", "--rays", 12, "--out", "r.npz").code == 0
+        evaluated = Layouts({name: log_target})(load_design(path), 12, load_samples(run))
+        with np.load(tmp_path / "r.npz") as arrays:
+            np.testing.assert_array_equal(arrays["gate_start_m"], evaluated.gate_m[:, 0])
+            np.testing.assert_array_equal(arrays["gate_end_m"], evaluated.gate_m[:, 1])
+            np.testing.assert_array_equal(arrays["azimuth_rad"], np.arctan2(*evaluated.direction[:, 1::-1].T))
+        own = [np.ptp(evaluated.gate_m[evaluated.sensor == index, 1]) > 0 for index in (0, 1)]
+        assert any(own) == (gates == "ray")
+
+
+def test_a_scan_for_one_value_is_fitted_anew_once_for_all_places(lidardesign, run, monkeypatch):
+    from lidardesign.design import rays as rays_module
+    from lidardesign.design.samples import load_samples
+
+    assert lidardesign("fit", run, "--at", "x_m=0.37", "--layout", "scan", "--rays", 4, "--name", "here").code == 0
+    design, samples, fits = load_design(run / "designs" / "here.yaml"), load_samples(run), []
+    refit = rays_module._refit
+    monkeypatch.setattr(rays_module, "_refit", lambda *arguments: fits.append(1) or refit(*arguments))
+    first, *others = (lay_out(design, 7, samples, at={"x_m": x}, retarget=log_target) for x in (0.0, 0.37, 1.0))
+    assert len(fits) == 1
+    for other, x in zip(others, (0.37, 1.0), strict=True):
+        np.testing.assert_array_equal(other.direction, first.direction)
+        np.testing.assert_array_equal(other.origin_m[:, 0], x)
+
+
+def test_a_distributed_design_by_hand_is_evaluated_with_the_gates_of_its_layout(tmp_path):
+    from lidardesign.cli.layouts import Layouts
+
+    (tmp_path / "hand.yaml").write_text(OPEN.format(layout="distributed"))
+    design = load_design(tmp_path / "hand.yaml")
+    expected = lay_out(design, 20)
+    found = Layouts({})(design, 20, None)
+    np.testing.assert_array_equal(found.gate_m, expected.gate_m)
+    np.testing.assert_array_equal(found.origin_m, expected.origin_m)

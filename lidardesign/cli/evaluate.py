@@ -172,7 +172,7 @@ def _common_run(entries: list[_Entry], runs: list[Run]) -> Run:
 def _request(
     run: Run, entries: list[_Entry], rays: list[int] | None, baselines: list[str], seed: int | None
 ) -> EvaluationRequest:
-    from lidardesign.cli.layouts import layouts_of, twin_without_visibility
+    from lidardesign.cli.layouts import layouts_of, may_need_samples, twin_without_visibility
     from lidardesign.design.samples import FILE_NAME, load_samples
     from lidardesign.evaluate.score import EvaluationRequest
 
@@ -182,7 +182,7 @@ def _request(
     folders = {
         entry.run.folder
         for entry in entries
-        if entry.run is not None and _may_need_samples(entry.design) and (entry.run.folder / FILE_NAME).exists()
+        if entry.run is not None and may_need_samples(entry.design) and (entry.run.folder / FILE_NAME).exists()
     }
     known = {folder: load_samples(folder) for folder in folders}
     samples = {
@@ -206,10 +206,6 @@ def _request(
         lay_out=layouts,
         without_visibility=(lambda: twin_without_visibility(*made[0], layouts)) if made else None,
     )
-
-
-def _may_need_samples(design: Design) -> bool:
-    return design.layout != "grid" or design.ray_table is not None
 
 
 def _evaluate(request: EvaluationRequest, console: Console) -> Evaluation:

@@ -14,7 +14,6 @@ from lidardesign.cli.runs import parse_at
 from lidardesign.errors import ConfigError
 
 if TYPE_CHECKING:
-    import numpy as np
     from rich.console import Console as RichConsole
 
     from lidardesign.cli.runs import Run
@@ -109,8 +108,9 @@ def _design_and_rays(
     A scan of another number of rays has other sensors, so the design that is exported is that one. A design that
     leaves its number of rays open takes the largest budget of its task.
     """
+    from lidardesign.cli.layouts import may_need_samples
     from lidardesign.cli.runs import run_of
-    from lidardesign.design.rays import lay_out, own_count, refitted
+    from lidardesign.design.rays import gates_of, lay_out, own_count, refitted
     from lidardesign.design.track import placed
 
     if at or design.track is not None:
@@ -123,27 +123,25 @@ def _design_and_rays(
         count = max(run.task.defaults.rays)
         console.note(f"note: the design leaves the number of rays open; {count} is the task's largest budget")
     samples, retarget = None, None
-    if count is not None and design.layout != "grid" and count != own_count(design):
+    if count is not None and may_need_samples(design) and (_is_open(design) or count != own_count(design)):
         run = run_of(design, path)
         if run is not None:
             samples, retarget = _samples(run, design, at)
         if design.layout == "scan":
             design = refitted(design, count, samples)
-    laid_out = lay_out(design, 0 if name in WITHOUT_RAYS else count, samples, at=at, retarget=retarget)
+    count = 0 if name in WITHOUT_RAYS else count
+    gates = gates_of(design, samples)
+    laid_out = lay_out(design, count, samples, gates=gates, at=at, retarget=retarget)
     return placed(design, at) if at or design.track is not None else design, laid_out
 
 
 def _samples(run: Run, design: Design, at: Mapping[str, float]) -> tuple[Samples, Retarget]:
     """The samples that a design follows from: of all conditions for a track, else of the design's own."""
-    from lidardesign.cli.fit import log_target
+    from lidardesign.cli.layouts import RunTarget
     from lidardesign.design.conditions import conditioned
     from lidardesign.design.samples import load_samples
 
-    samples = load_samples(run.folder)
-
-    def retarget(points: np.ndarray) -> np.ndarray:
-        return log_target(run, points)
-
+    samples, retarget = load_samples(run.folder), RunTarget(run)
     if design.track is None and samples.space.conditioned:
         samples = conditioned(samples, {**at, **design.at}, retarget)
     return samples, retarget

@@ -14,8 +14,7 @@ from lidardesign.cli.runs import check_choice, check_name, open_run, parse_at, p
 from lidardesign.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
-    import numpy as np
-
+    from lidardesign.cli.layouts import RunTarget
     from lidardesign.cli.runs import Run
     from lidardesign.design.check import ConstraintCheck
     from lidardesign.design.constraints import Constraints
@@ -117,16 +116,17 @@ def fit_and_write(
     from dataclasses import replace
 
     from lidardesign.cli.designs import show_fit, write_design
+    from lidardesign.cli.layouts import RunTarget
     from lidardesign.design.fit import fit as fit_design
 
-    path = run.design_path(name)
-    samples = _samples_at(run, at or {}, seed, choices.get("rays"), console)
+    path, target = run.design_path(name), RunTarget(run)
+    samples = _samples_at(run, at or {}, seed, choices.get("rays"), target, console)
     result: FitResult = fit_design(
         samples,
         constraints=constraints,
         seed=seed,
         name=name,
-        retarget=lambda points: log_target(run, points),
+        retarget=target,
         **choices,
     )
     for note in result.notes:
@@ -144,7 +144,9 @@ def fit_and_write(
     console.result(document, lambda rich: show_fit(document, design, checks, rich))
 
 
-def _samples_at(run: Run, at: Mapping[str, float], seed: int, rays: int | None, console: Console) -> Samples:
+def _samples_at(
+    run: Run, at: Mapping[str, float], seed: int, rays: int | None, target: RunTarget, console: Console
+) -> Samples:
     """The samples of a run, given its conditions where they have values.
 
     Raises:
@@ -163,7 +165,7 @@ def _samples_at(run: Run, at: Mapping[str, float], seed: int, rays: int | None, 
         return samples
     count = max(MOVED_SAMPLES, SAMPLES_PER_RAY * (rays or 0))
     generator = random_generator(seed, "condition")
-    moved = at_condition(samples, at, lambda points: log_target(run, points), count, generator)
+    moved = at_condition(samples, at, target, count, generator)
     console.note(f"note: at {shown(at)} {len(moved)} samples have ESS {moved.effective_sample_size:.2f}")
     return moved
 
@@ -184,17 +186,6 @@ def _check_worth(samples: Samples, run: Run) -> None:
             allowed=f"at least {LEAST_SAMPLES}",
             hint="learn longer (--preset standard or fine), or with a larger density.sigma_m",
         )
-
-
-def log_target(run: Run, points: np.ndarray) -> np.ndarray:
-    """log p* of design points, (N, 6) to (N,): only a pinned origin or a condition needs it, and then it is loaded."""
-    from lidardesign.density.prepare import prepare_target
-    from lidardesign.run.manifest import read_manifest
-
-    decided = read_manifest(run.folder).get("visibility")
-    scenes = run.scenes("train", run.config.seed)
-    target, _ = prepare_target(scenes, run.config, visibility=decided, compiled=False)
-    return target.log_density(points)
 
 
 def check_written(design: Design, constraints: Constraints | None, space: DesignSpace) -> list[ConstraintCheck]:

@@ -1,4 +1,4 @@
-"""How `evaluate` turns designs into rays: from their runs' samples, and asking their runs' target where needed."""
+"""How commands turn designs into rays: from their runs' samples, and asking their runs' target where needed."""
 
 from __future__ import annotations
 
@@ -63,14 +63,15 @@ class Layouts:
         self, design: Design, count: int, samples: Samples | None, *, at: Mapping[str, float] | None = None
     ) -> Rays:
         """A design's rays at a number of rays, with a gate per ray where its own table has one per ray."""
-        from lidardesign.design.rays import lay_out
-        from lidardesign.evaluate.ablation import has_gates_per_ray
+        from lidardesign.design.rays import gates_of, lay_out
 
-        table = design.ray_table
-        # only rays that start across their sensor's origins have gates of their own without samples
-        known = samples is not None or design.layout == "distributed"
-        gates = "ray" if table is not None and known and has_gates_per_ray(table) else "sensor"
+        gates = gates_of(design, samples)
         return lay_out(design, count, samples, gates=gates, at=at, retarget=self.targets.get(design.name))
+
+
+def may_need_samples(design: Design) -> bool:
+    """Whether another number of rays of a design may follow from samples of its run."""
+    return design.layout != "grid" or design.ray_table is not None
 
 
 def twin_without_visibility(design: Design, run: Run, layouts: Layouts) -> tuple[Design, Samples]:

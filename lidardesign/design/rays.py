@@ -110,11 +110,14 @@ def lay_out(
         return _on_track(design, count, samples, at or {}, rate_hz, seed)
     # what moves was fitted where it was made: its rays are laid out there, then moved
     home = {**(at or {}), **design.at}
-    here = placed(design, home) if home else design
     if samples is not None and samples.space.conditioned:
         # distributed rays can also be laid out by their sensors alone
-        asked = _asks_samples(here, count, gates) or (here.layout == "distributed" and retarget is not None)
+        asked = _asks_samples(design, count, gates) or (design.layout == "distributed" and retarget is not None)
         samples = conditioned(samples, home, retarget) if asked else None
+    if design.layout == "scan" and count not in (None, 0) and count != own_count(design):
+        # before it is placed: one refit then serves all places
+        design, gates = refitted(design, count, samples, seed), "sensor"
+    here = placed(design, home) if home else design
     rays = _laid_out(here, count, samples, gates, rate_hz, seed)
     return moved(rays, design, at) if at else rays
 
@@ -147,8 +150,6 @@ def _laid_out(
     total = own_count(design) if count is None else count
     if design.ray_table is not None and len(design.ray_table.sensor) == total:
         return _table_rays(design.ray_table, rate_hz)
-    if design.layout == "scan" and total not in (0, own_count(design)):
-        return _laid_out(refitted(design, total, samples, seed), total, None, "sensor", rate_hz, seed)
     shares = _shares(design, total)
     if design.layout == "distributed":
         return _distributed_rays(design, shares, samples, gates, rate_hz, seed)
@@ -173,6 +174,21 @@ def _laid_out(
 def own_gates(layout: Layout) -> Gates:
     """The gates that rays have where nothing is asked for: a ray that starts where no other does has its own."""
     return "ray" if layout == "distributed" else "sensor"
+
+
+def gates_of(design: Design, samples: Samples | None) -> Gates | None:
+    """The gates that a design's rays keep at another number of rays; None where its own table tells nothing.
+
+    A table tells by two rays of one sensor. Rays that start where others do have gates of their own by samples only.
+    """
+    table = design.ray_table
+    if table is None:
+        return None
+    _, first, sensor = np.unique(table.sensor, return_index=True, return_inverse=True)
+    if len(first) == len(sensor):
+        return None
+    per_ray = bool((table.gate_m != table.gate_m[first[sensor]]).any())
+    return "ray" if per_ray and (samples is not None or design.layout == "distributed") else "sensor"
 
 
 def _distributed_rays(

@@ -243,7 +243,7 @@ def _wanted_gates(
 ) -> np.ndarray:
     """Central intervals of what rays observe, projected onto them, smooth along the knots: (P, N, 2) [m]."""
     knots, count = azimuth.shape
-    ray = along.between(direction(azimuth, elevation), labels)
+    ray = direction(along.between(azimuth, labels), along.between(elevation, labels))
     ahead = ((observed_point(along.points) - along.points[:, :3]) * ray).sum(axis=1)
     wanted = np.full((knots, count, 2), np.nan)
     for knot in range(knots):

@@ -15,8 +15,9 @@ import numpy as np
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints import Constraints
 from lidardesign.design.fit import fit
+from lidardesign.design.rays import gates_of
 from lidardesign.design.samples import Samples
-from lidardesign.design.sensor import Design, RayTable
+from lidardesign.design.sensor import Design
 from lidardesign.evaluate.candidates import Positions, mean_mbps
 from lidardesign.simulate.returns import Rays
 from lidardesign.space import DesignSpace
@@ -48,9 +49,6 @@ def fitted_twin(design: Design, samples: Samples, *, name: str, retarget: LogTar
         retarget: log p* of the other density, where the fit needs it.
     """
     one_per_ray = design.layout == "scan" or design.track is not None
-    gates = None
-    if design.ray_table is not None and not one_per_ray:
-        gates = "ray" if has_gates_per_ray(design.ray_table) else "sensor"
     seed = design.provenance.get("seed", 0)
     return fit(
         samples,
@@ -61,15 +59,9 @@ def fitted_twin(design: Design, samples: Samples, *, name: str, retarget: LogTar
         seed=seed if isinstance(seed, int) else 0,
         level=design.level,
         name=name,
-        gates=gates,
+        gates=None if one_per_ray else gates_of(design, samples),
         retarget=retarget,
     ).design
-
-
-def has_gates_per_ray(table: RayTable) -> bool:
-    """Whether rays of one sensor listen at different times."""
-    _, first, sensor = np.unique(table.sensor, return_index=True, return_inverse=True)
-    return bool((table.gate_m != table.gate_m[first[sensor]]).any())
 
 
 class TwinCandidate:
