@@ -28,6 +28,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 ROOT = Path(__file__).resolve().parents[1]
 FACE_MODEL = ROOT.parent / "shared" / "data" / "ict_face.h5"
+ARM_MODEL = ROOT.parent / "shared" / "data" / "iiwa14" / "iiwa14.xml"
 MEBIBYTE = 2**20
 
 
@@ -144,6 +145,49 @@ def face_scenes(model: str, count: int, seed: int = 0) -> list[Any]:
     return list(task.scenes(config, "train", seed))
 
 
+def robot_settings(robot: str) -> dict[str, Any]:
+    """Keys of the arm task for `--robot`: `embedded`, `iiwa14` (said and replaced where it is missing), or a path."""
+    if robot == "embedded":
+        return {}
+    path = ARM_MODEL if robot == "iiwa14" else Path(robot)
+    if not path.exists():
+        print(f"{path.name} is not here: the embedded arm is used instead", file=sys.stderr)
+        return {}
+    return {"robot": path}
+
+
+def learned(task: str, folder: Path, options: Any, settings: Mapping[str, Any]) -> Path:
+    """The run that `--run` names; without one a run of the task, learned into a folder.
+
+    Arguments:
+        task: Its name.
+        folder: Where the run is made.
+        options: Of `run_options`.
+        settings: Keys that the benchmark itself sets; `--set` comes after them.
+    """
+    if options.run is not None:
+        return options.run
+    words = ["learn", task, "--preset", options.preset, "--out", folder / "run", "--json"]
+    for setting in [*(f"{key}={value}" for key, value in settings.items()), *options.set]:
+        words += ["--set", setting]
+    run_process(lidardesign(*words)).document()
+    return folder / "run"
+
+
+def fitted(run: Path, name: str, *words: str) -> tuple[Path, dict[str, Any]]:
+    """The file of a design that is fitted to a run, and what `fit` printed."""
+    found = run_process(lidardesign("fit", run, "--name", name, "--json", *words)).document()
+    return run / "designs" / f"{name}.yaml", found
+
+
+def verdict(claim: str, cases: Mapping[str, bool]) -> str:
+    """Whether a claim holds in every case, and where it does not."""
+    broken = [name for name, holds in cases.items() if not holds]
+    word = "does not hold" if broken else "holds"
+    where = f"; not for {', '.join(broken)}" if broken else ""
+    return f"{word}: {claim} ({len(cases) - len(broken)} of {len(cases)}{where})"
+
+
 def machine() -> dict[str, Any]:
     """What was measured on."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
@@ -180,6 +224,18 @@ def parser(description: str | None, **defaults: int) -> argparse.ArgumentParser:
 def model_option(made: argparse.ArgumentParser) -> None:
     """Add `--model`."""
     made.add_argument("--model", default="ict", help="face model: ict, embedded, or a file (default %(default)s)")
+
+
+def run_options(made: argparse.ArgumentParser) -> None:
+    """Add `--run`, `--preset` and `--set`."""
+    made.add_argument("--run", type=Path, help="a run of this task, which gets the designs (default: learn one)")
+    made.add_argument("--preset", default="standard", help="what is learned (default %(default)s)")
+    made.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="passed to learn; repeatable")
+
+
+def robot_option(made: argparse.ArgumentParser) -> None:
+    """Add `--robot`."""
+    made.add_argument("--robot", default="embedded", help="arm: embedded, iiwa14, or a file (default %(default)s)")
 
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

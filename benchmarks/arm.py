@@ -1,0 +1,125 @@
+"""Tracking with the arm task: designs of 2, 4 and 8 sensors against every baseline, with the claims as verdicts.
+
+`learn`, `fit` and `evaluate` as whole processes. The claims: a lower Frechet distance than `uniform` and `random` with
+at most half their bandwidth at every number of rays; at the smallest one lower than `bounding` at no more bandwidth.
+
+    python benchmarks/arm.py [--robot iiwa14] [--run RUN]
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from common import (
+    fitted,
+    learned,
+    lidardesign,
+    parser,
+    report,
+    robot_option,
+    robot_settings,
+    run_options,
+    run_process,
+    verdict,
+)
+
+BASELINES = ("uniform", "random", "bounding", "occupancy", "no-visibility")
+FURTHER = ("occupancy", "no-visibility")  # that evaluate only scores when asked
+SPARSE = ("uniform", "random")
+MOST_OF_THEIR_BANDWIDTH = 0.5
+
+
+def score_rows(found: dict[str, Any]) -> list[list[object]]:
+    """One row per design or baseline and number of rays."""
+    spent = bandwidths(found)
+    return [
+        [
+            row["rays"],
+            row["design"],
+            row["value"],
+            f"{row['ci_low']:.3g} to {row['ci_high']:.3g}",
+            row["details"].get("tracked_share", float("nan")),
+            row["failures"],
+            row["bandwidth_mbps"],
+            row["bandwidth_mbps"] / spent["uniform", row["rays"]],
+        ]
+        for row in sorted(found["rows"], key=lambda row: row["rays"])
+    ]
+
+
+def bandwidths(found: dict[str, Any]) -> dict[tuple[str, int], float]:
+    """Mbit/s by design or baseline and number of rays."""
+    return {(row["design"], row["rays"]): row["bandwidth_mbps"] for row in found["rows"]}
+
+
+def verdicts(found: dict[str, Any]) -> list[str]:
+    """The claims, each over all designs and numbers of rays that it speaks of."""
+    value = {(row["design"], row["rays"]): row["value"] for row in found["rows"]}
+    spent = bandwidths(found)
+    designs = [key for key in value if key[0] not in BASELINES]
+    fewest = min(rays for _, rays in value)
+
+    def wins(name: str, rays: int, baseline: str, share: float) -> bool:
+        lower = value[name, rays] < value[baseline, rays]
+        return lower and spent[name, rays] <= share * spent[baseline, rays]
+
+    sparse = {
+        f"{name} with {rays} rays, {baseline}": wins(name, rays, baseline, MOST_OF_THEIR_BANDWIDTH)
+        for name, rays in designs
+        for baseline in SPARSE
+    }
+    bounded = {
+        f"{name} with {rays} rays": wins(name, rays, "bounding", 1.0) for name, rays in designs if rays == fewest
+    }
+    unaware = {f"{name} with {rays} rays": wins(name, rays, "no-visibility", 1.0) for name, rays in designs}
+    return [
+        verdict("lower than uniform and random with at most half the bandwidth", sparse),
+        verdict(f"lower than bounding with {fewest} rays at no more bandwidth", bounded),
+        verdict("lower than no-visibility at no more bandwidth (no claim, for information)", unaware),
+    ]
+
+
+def main() -> None:
+    """Measure and print."""
+    made = parser(__doc__, rounds=1)
+    robot_option(made)
+    run_options(made)
+    made.add_argument("--sensors", type=int, nargs="+", default=[2, 4, 8])
+    made.add_argument("--rays", type=int, nargs="+", default=[400, 1000, 1200])
+    options = made.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        run = learned("arm", Path(folder), options, robot_settings(options.robot))
+        designs, fits = [], []
+        for sensors in options.sensors:
+            words = ("--sensors", str(sensors), "--rays", str(max(options.rays)))
+            path, fit = fitted(run, f"benchmark-{sensors}", *words)
+            designs.append(path)
+            fits.append([sensors, fit["seconds"], fit["log_likelihood"], fit["ess"]])
+        words = ["evaluate", *designs, "--json"]
+        for name in FURTHER:
+            words += ["--baseline", name]
+        for rays in options.rays:
+            words += ["--rays", str(rays)]
+        results = [run_process(lidardesign(*words)) for _ in range(options.rounds)]
+        found = results[0].document()
+    metric = f"{found['metric']['name']} {found['metric']['unit']}"
+    columns = ["rays", "design", metric, "95 % interval", "tracked", "failures", "Mbit/s", "of uniform's"]
+    report(
+        "Tracking with the arm",
+        {
+            "Fits": (["sensors", "s", "log-likelihood", "ESS"], fits),
+            "evaluate as a whole process": (
+                ["wall s", "CPU s", "peak MiB"],
+                [[one.wall, one.cpu, one.peak_mib] for one in results],
+            ),
+            f"Scores on {found['scenes']} held-out trajectories": (columns, score_rows(found)),
+        },
+        verdicts(found),
+        options.json,
+    )
+
+
+if __name__ == "__main__":
+    main()
