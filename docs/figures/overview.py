@@ -10,22 +10,18 @@ from `lidardesign fit`, and the curves from `lidardesign evaluate`.
 from __future__ import annotations
 
 import argparse
-import io
-import json
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from drawing import INK, PAPER, QUIET, command, save
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from matplotlib.ticker import FixedLocator, FuncFormatter, MultipleLocator, NullLocator
-from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from lidardesign.design.files import load_design
@@ -38,9 +34,7 @@ from lidardesign.space import AZIMUTH, ELEVATION, angles, direction
 
 SIZE_INCHES, DOTS_PER_INCH = (16.0, 7.0), 100
 PIXELS = 1000  # of the head's picture, along each side
-COLOUR_STEP = 5  # of 255: divides it, so that white stays white
 BINS = 210  # of the density, along each side
-INK, QUIET, PAPER = "#1f2933", "#7b8794", "#ffffff"
 SERIES = {
     "10 sensors, density": ("#0072B2", "o", "-"),
     "10 sensors, grid": ("#56B4E9", "s", "-"),
@@ -50,20 +44,6 @@ SERIES = {
 }
 HEAT = LinearSegmentedColormap.from_list("heat", ["#1b2a6b", "#7b2a8b", "#d5483c", "#f6a02c", "#fdf3b4"])
 GATES = LinearSegmentedColormap.from_list("gates", ["#f0a202", "#d5483c", "#8a2f8f", "#2c4bb0"])
-
-
-def command(*words: str | Path) -> dict[str, Any]:
-    """The JSON document of a `lidardesign` command."""
-    program = "import sys; from lidardesign.cli.main import run; sys.exit(run())"
-    done = subprocess.run(
-        [sys.executable, "-c", program, *map(str, words), "--json", "--quiet"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
-        sys.exit(f"lidardesign {words[0]} failed: {done.stderr or done.stdout}")
-    return json.loads(done.stdout)
 
 
 def computed(run: Path, learn: bool) -> tuple[Design, dict[str, Any]]:
@@ -219,15 +199,6 @@ def overview(config: RunConfig, head: Any, samples: Samples, design: Design, eva
     caption(figure, 0.345, "fit", "10 sensors: fields of view, and a time gate for each")
     caption(figure, 0.712, "evaluate", f"on {evaluation['scenes']} held-out heads; lower is better")
     return figure
-
-
-def save(figure: Figure, path: Path) -> None:
-    """As an opaque PNG with colours rounded to a 51st, which halves it: the picture lives in the repository."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None})
-    colours = np.asarray(Image.open(buffer).convert("RGB"))
-    rounded = COLOUR_STEP * np.round(colours / COLOUR_STEP)
-    Image.fromarray(rounded.astype(np.uint8)).save(path, optimize=True)
 
 
 def main() -> None:
