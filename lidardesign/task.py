@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from lidardesign.errors import PluginError
 from lidardesign.scene import Scene
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DIMENSIONS, DesignSpace
@@ -141,14 +142,25 @@ def conditions_of(task: Task, config: Any, space: DesignSpace) -> list[dict[str,
 
     Raises:
         ConfigError: The task names a value outside the design space.
+        PluginError: The task names no value, or leaves one of the conditions open.
     """
     if not space.conditioned:
         return [{}]
     if hasattr(task, "conditions"):
         named = [{name: float(value) for name, value in one.items()} for one in task.conditions(config)]
-        for one in named:
-            space.at(one)
+        _check_conditions(task, named, space)
         return named
     shares = (np.arange(EVEN_CONDITIONS) + 0.5) / EVEN_CONDITIONS
     low, high = np.array(space.low), np.array(space.high)
     return [{DIMENSIONS[i]: float(low[i] + share * (high - low)[i]) for i in space.conditioned} for share in shares]
+
+
+def _check_conditions(task: Task, named: Sequence[Mapping[str, float]], space: DesignSpace) -> None:
+    where = f"task {task.name}, conditions"
+    if not named:
+        raise PluginError("no condition value is named", where=where, allowed="1 or more")
+    for one in named:
+        space.at(one)
+        missing = [DIMENSIONS[i] for i in space.conditioned if DIMENSIONS[i] not in one]
+        if missing:
+            raise PluginError(f"{dict(one)} leaves {missing[0]} open", where=where, allowed="every condition has one")

@@ -49,8 +49,9 @@ def run(tmp_path):
 
 @pytest.mark.parametrize("layout", ["grid", "density", "scan", "distributed"])
 def test_every_layout_can_be_fitted_at_a_value(lidardesign, run, layout):
+    sensors = () if layout == "scan" else ("--sensors", 2)
     result = lidardesign(
-        "fit", run, "--at", "x_m=0.37", "--layout", layout, "--rays", 6, "--sensors", 2, "--name", "here", "--json"
+        "fit", run, "--at", "x_m=0.37", "--layout", layout, "--rays", 6, *sensors, "--name", "here", "--json"
     )
     assert result.code == 0, result.err
     design = load_design(run / "designs" / "here.yaml")
@@ -168,6 +169,8 @@ MISTAKES = [
     ("fit run", 2, "--layout scan, or --at x_m=VALUE"),
     ("fit run --layout density --rays 4", 2, "--at x_m=VALUE"),
     ("fit run --layout distributed --rays 4", 2, "--at x_m=VALUE"),
+    ("fit run --layout scan --rays 4 --sensors 2", 2, "--sensors"),
+    ("constrain run --layout scan --rays 4 --sensors auto", 2, "--sensors"),
     ("constrain run", 2, "--at x_m=VALUE"),
     ("constrain run --at x_m=-0.1", 2, "0 to 1"),
     ("constrain run --layout scan --set origin.fixed_m=[0.5,0,0]", 4, "--at x_m=0.5"),

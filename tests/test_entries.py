@@ -11,6 +11,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.rays import lay_out
 from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import Coupling, Design, RayTable, Sensor
+from lidardesign.errors import ConfigError, PluginError
 from lidardesign.evaluate.entries import entries_of, middle_condition
 from lidardesign.evaluate.score import EvaluationRequest, evaluate
 from lidardesign.scene import Body, Box, Capsule, Scene, Sphere, rigid
@@ -307,3 +308,18 @@ def test_a_twin_stands_for_no_visibility_with_as_many_rays():
         assert row.bandwidth_mbps * (row.rays + 2) / row.rays > own[row.matched_rays]
     evaluate(replace(request, baselines=("uniform",)))
     assert len(made) == 1
+
+
+@pytest.mark.parametrize(
+    ("space", "named", "words"),
+    [
+        (AISLE, [], "no condition value"),
+        (AISLE, [{"x_m": 1.0}, {}], "leaves x_m open"),
+        (AISLE, [{"x_m": 1.0}, {"x_m": 4.1}], "outside the design space"),
+    ],
+)
+def test_conditions_that_a_task_cannot_mean_are_refused(space, named, words):
+    task = SeenTask()
+    task.conditions = lambda config: named
+    with pytest.raises((ConfigError, PluginError), match=words):
+        entries_of(aisle_request(task, space=space))

@@ -9,7 +9,7 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.console import command
-from lidardesign.cli.fit import GATES, LAYOUTS, check_level, fit_and_write, usual_layout
+from lidardesign.cli.fit import GATES, LAYOUTS, check_level, check_sensors, fit_and_write, usual_layout
 from lidardesign.cli.runs import check_choice, check_name, need_run, open_target, parse_at, sensor_count
 
 if TYPE_CHECKING:
@@ -59,6 +59,7 @@ def constrain(
         opened, design = open_target(target)
         run = need_run(opened, target)
         layout = layout or (design.layout if design else usual_layout(run))
+        check_sensors(count, layout)
         fit_and_write(
             run,
             console,

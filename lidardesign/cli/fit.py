@@ -51,6 +51,7 @@ def fit(
         count, condition = sensor_count(sensors, None), parse_at(at)
         opened = open_run(run)
         layout = layout or usual_layout(opened)
+        check_sensors(count, layout)
         open_budget = layout == "grid" and gates != "ray"
         budget = rays if rays is not None or open_budget else max(opened.task.defaults.rays)
         fit_and_write(
@@ -79,6 +80,20 @@ def check_level(level: float) -> float:
     if not LEVELS[0] <= level <= LEVELS[1]:
         raise ConfigError(f"{level:g}", where="--level", allowed=f"{LEVELS[0]:g} to {LEVELS[1]:g}")
     return level
+
+
+def check_sensors(count: int | str | None, layout: str) -> None:
+    """Refuse a number of sensors where the rays say how many there are.
+
+    Raises:
+        ConfigError: A scan was asked for with a number of sensors.
+    """
+    if count is not None and layout == "scan":
+        raise ConfigError(
+            f"{count} sensors of a scan, whose every ray is a sensor of its own",
+            where="--sensors",
+            hint="give --rays N alone, or another --layout",
+        )
 
 
 def usual_layout(run: Run) -> str:
