@@ -94,6 +94,16 @@ def effective_sample_size(log_weights: Any) -> float:
     return effective_count(np.exp(log_weights - log_weights.max())) / len(log_weights)
 
 
+def systematic_draw(weights: Any, count: int, generator: np.random.Generator) -> np.ndarray:
+    """Indices of `count` draws in proportion to weights (N,), ascending: one in each of equal shares of their sum.
+
+    Every index is drawn its expected number of times, rounded up or down (systematic resampling; Kitagawa 1996).
+    """
+    cumulated = np.cumsum(weights)
+    places = (np.arange(count) + generator.uniform()) / count * cumulated[-1]
+    return np.minimum(np.searchsorted(cumulated, places, side="right"), len(cumulated) - 1)
+
+
 def clipped_eigenvalues(matrices: np.ndarray, low: Any, high: Any = np.inf, smallest: Any = np.inf) -> np.ndarray:
     """Symmetric matrices (..., n, n) with their eigenvalues moved into [low, high], each (...).
 

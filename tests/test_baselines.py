@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.grid import low_discrepancy
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines import BASELINES, NO_VISIBILITY, Baselines, build_baseline
 from lidardesign.evaluate.observed import unrolled
-from lidardesign.evaluate.placement import even_placement, low_discrepancy, opened_gate
+from lidardesign.evaluate.placement import even_placement, opened_gate
 from lidardesign.scene import Body, Box, Scene, Sphere, rigid
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import DesignSpace, angles

@@ -20,6 +20,7 @@ from lidardesign.numerics import (
     nearest_positive_definite,
     normalised_weights,
     safe_divide,
+    systematic_draw,
     wrap_angle,
 )
 
@@ -128,3 +129,15 @@ def test_the_box_minimum_beats_every_other_point_of_the_box():
     for _ in range(300):
         other = np.clip(best + 0.2 * generator.standard_normal((30, 3)), -1, 1)
         assert (cost(best) <= cost(other) + 1e-9).all()
+
+
+@pytest.mark.parametrize("count", [1, 7, 1000])
+def test_a_systematic_draw_takes_every_index_as_often_as_its_weight_says_rounded(count):
+    generator = np.random.default_rng(count)
+    weights = generator.exponential(size=50) * (generator.random(50) < 0.7)
+    chosen = systematic_draw(weights, count, generator)
+    times, expected = np.bincount(chosen, minlength=50), count * weights / weights.sum()
+    assert len(chosen) == count
+    assert (np.abs(times - expected) < 1).all()
+    assert (times[weights == 0] == 0).all()
+    assert (np.diff(chosen) >= 0).all()

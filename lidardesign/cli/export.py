@@ -50,7 +50,7 @@ def export(
         if list_formats:
             _list(console)
         else:
-            _export(design, format_, out, rays, parse_at(at), console)
+            _export(design, format_, out, rays, parse_at(at), seed or 0, console)
 
 
 def _list(console: Console) -> None:
@@ -73,7 +73,13 @@ def _list(console: Console) -> None:
 
 
 def _export(
-    path: Path | None, name: str | None, out: Path | None, rays: int | None, at: Mapping[str, float], console: Console
+    path: Path | None,
+    name: str | None,
+    out: Path | None,
+    rays: int | None,
+    at: Mapping[str, float],
+    seed: int,
+    console: Console,
 ) -> None:
     from lidardesign.design.files import load_design
     from lidardesign.export.registry import EXPORTERS
@@ -88,7 +94,7 @@ def _export(
     target = out if out is not None else path.with_suffix(exporter.suffix)
     if target.exists() and path.exists() and target.samefile(path):
         raise ConfigError("would overwrite the design itself", where=str(target), hint="give another --out")
-    design, laid_out = _design_and_rays(design, path, exporter.name, rays, at, console)
+    design, laid_out = _design_and_rays(design, path, exporter.name, rays, at, seed, console)
     notes = list(exporter.write(design, laid_out, target))
     for note in notes:
         console.note(f"note: {note}")
@@ -101,7 +107,7 @@ def _export(
 
 
 def _design_and_rays(
-    design: Design, path: Path, name: str, count: int | None, at: Mapping[str, float], console: Console
+    design: Design, path: Path, name: str, count: int | None, at: Mapping[str, float], seed: int, console: Console
 ) -> tuple[Design, Rays]:
     """A design and its explicit rays at a condition; another number of rays may need the samples of its run.
 
@@ -128,10 +134,10 @@ def _design_and_rays(
         if run is not None:
             samples, retarget = _samples(run, design, at)
         if design.layout == "scan":
-            design = refitted(design, count, samples)
+            design = refitted(design, count, samples, seed)
     count = 0 if name in WITHOUT_RAYS else count
     gates = gates_of(design, samples)
-    laid_out = lay_out(design, count, samples, gates=gates, at=at, retarget=retarget)
+    laid_out = lay_out(design, count, samples, gates=gates, seed=seed, at=at, retarget=retarget)
     return placed(design, at) if at or design.track is not None else design, laid_out
 
 

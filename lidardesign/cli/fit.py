@@ -169,7 +169,7 @@ def _samples_at(
         DataError: The samples are worth too few.
     """
     from lidardesign.design.conditions import MOVED_SAMPLES, at_condition, shown
-    from lidardesign.design.rays import SAMPLES_PER_RAY
+    from lidardesign.design.quantise import SAMPLES_PER_RAY
     from lidardesign.design.samples import load_samples
     from lidardesign.task import random_generator
 

@@ -72,7 +72,7 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
             checks += _inside_space(name, sensor, bounds)
     checks += _table(document, rules)
     if document.get("track"):
-        checks += _track(document["track"], document, rules, bounds)
+        checks += _track(document["track"], rules, bounds)
     return checks + _mounts(sensors, rules, each) + _budget(document, rules)
 
 
@@ -291,9 +291,7 @@ def _table(document: Mapping[str, Any], rules: Mapping[str, Any]) -> list[Constr
     return failed
 
 
-def _track(
-    track: Mapping[str, Any], document: Mapping[str, Any], rules: Mapping[str, Any], space: Any
-) -> list[ConstraintCheck]:
+def _track(track: Mapping[str, Any], rules: Mapping[str, Any], space: Any) -> list[ConstraintCheck]:
     """Gates and boresights at every knot; in between they are linear, and these bounds are convex.
 
     Only broken bounds are listed, but for the ends of the track, which must lie in the design space.

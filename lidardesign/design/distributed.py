@@ -33,17 +33,15 @@ from lidardesign.design.gates import SMALLEST_CELL, central_intervals, kept_gate
 from lidardesign.design.grid import field_on_sphere, low_discrepancy
 from lidardesign.design.lines import mean_squares, nearest_lines
 from lidardesign.design.looks import looks
-from lidardesign.design.quantise import lloyd
+from lidardesign.design.quantise import lloyd, samples_for
 from lidardesign.design.regions import owned, principal_axes
 from lidardesign.design.resolve import bounds_of, origin_box
 from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import Design, Sensor, interval_factor, tangent_directions
+from lidardesign.numerics import systematic_draw
 from lidardesign.space import AZIMUTH, ELEVATION, FULL_TURN, RANGE, DesignSpace, angles, direction, observed_point
 from lidardesign.task import random_generator
 
-# Cells need no more samples than this: their centres are then known to a tenth of their width.
-SAMPLES_PER_RAY = 64
-SMALLEST_SAMPLE = 2000
 LLOYD_ITERATIONS = 15
 # The share of a cell's samples, those nearest to its centre, among which the highest density is taken.
 NEAR_SHARE = 0.25
@@ -116,7 +114,7 @@ def _sampled_beams(
     generator: np.random.Generator,
 ) -> Beams:
     """One real sample's ray per cell of what the samples inside a sensor look at."""
-    chosen, weights = _thinned(samples.weights[members], max(SAMPLES_PER_RAY * count, SMALLEST_SAMPLE), generator)
+    chosen, weights = _thinned(samples.weights[members], samples_for(count), generator)
     if len(np.unique(fired[chosen, :RANGE], axis=0)) < count:
         chosen, weights = np.arange(len(members)), samples.weights[members]
     part = Features.of(fired[chosen], weights, Axes.of(samples.space), samples.space)
@@ -130,10 +128,7 @@ def _thinned(weights: np.ndarray, count: int, generator: np.random.Generator) ->
     """Indices and weights: all, or fewer by systematic resampling, how often each was drawn being its weight."""
     if len(weights) <= count:
         return np.arange(len(weights)), weights
-    cumulative = np.cumsum(weights)
-    positions = (np.arange(count) + generator.uniform()) / count * cumulative[-1]
-    drawn = np.minimum(np.searchsorted(cumulative, positions, side="right"), len(weights) - 1)
-    chosen, times = np.unique(drawn, return_counts=True)
+    chosen, times = np.unique(systematic_draw(weights, count, generator), return_counts=True)
     return chosen, times.astype(np.float64)
 
 

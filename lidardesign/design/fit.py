@@ -19,7 +19,8 @@ from lidardesign.design.feasibility import check_feasible, least_sensors
 from lidardesign.design.features import Axes, Features
 from lidardesign.design.mount_choice import at_mounts
 from lidardesign.design.mounts import is_mounted, most_mounted
-from lidardesign.design.rays import SAMPLES_PER_RAY, Gates, make_ray_table, own_gates, split_budget
+from lidardesign.design.quantise import SAMPLES_PER_RAY
+from lidardesign.design.rays import Gates, make_ray_table, own_gates, split_budget
 from lidardesign.design.resolve import bounds_of, groups
 from lidardesign.design.samples import Samples
 from lidardesign.design.scan import fit_scan, rays_of
@@ -27,6 +28,7 @@ from lidardesign.design.sensor import DEFAULT_LEVEL, Design, Layout, Sensor, int
 from lidardesign.design.support import Retarget, Support, check_support, pinned, restricted
 from lidardesign.design.track_fit import fit_track
 from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.numerics import systematic_draw
 from lidardesign.space import DIMENSIONS
 from lidardesign.task import random_generator
 
@@ -314,9 +316,7 @@ def _thinned(support: Support, count: int, generator: np.random.Generator) -> tu
     """At most `count` samples: systematic resampling to equal weights where there are more."""
     if len(support.points) <= count:
         return support.points, support.weights
-    cumulative = np.cumsum(support.weights)
-    positions = (np.arange(count) + generator.uniform()) / count * cumulative[-1]
-    chosen = np.minimum(np.searchsorted(cumulative, positions, side="right"), len(cumulative) - 1)
+    chosen = systematic_draw(support.weights, count, generator)
     return support.points[generator.permutation(chosen)], np.ones(count)
 
 

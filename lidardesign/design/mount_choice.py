@@ -15,8 +15,9 @@ from lidardesign.design.constraints import Constraints
 from lidardesign.design.mounts import Mount, fixed_at, matched, mounts_of
 from lidardesign.design.resolve import Group, pins_of
 from lidardesign.design.samples import Samples
-from lidardesign.design.support import Retarget, drawn, re_aimed
+from lidardesign.design.support import Retarget, re_aimed
 from lidardesign.errors import InfeasibleError
+from lidardesign.numerics import systematic_draw
 from lidardesign.task import random_generator
 
 # So many samples tell apart mounts whose shares differ by a hundredth.
@@ -74,7 +75,7 @@ def _views(
     seed: int,
 ) -> dict[tuple[int, Mount], np.ndarray]:
     """What each sensor would see of each drawn sample's scene point from each of its mounts, (N,) each."""
-    chosen = drawn(samples, MOUNT_SAMPLES, random_generator(seed, "mounts"))
+    chosen = systematic_draw(samples.weights, MOUNT_SAMPLES, random_generator(seed, "mounts"))
     last = len(constraints.each)
     views: dict[tuple[int, Mount], np.ndarray] = {}
     for sensor, mounts in enumerate(options):

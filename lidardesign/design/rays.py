@@ -21,13 +21,14 @@ from lidardesign.design.distributed import distributed_beams
 from lidardesign.design.gates import SMALLEST_CELL, central_intervals, kept_gates
 from lidardesign.design.grid import field_on_sphere, grid_tangent
 from lidardesign.design.membership import Members, members
-from lidardesign.design.quantise import lloyd
+from lidardesign.design.quantise import lloyd, samples_for
 from lidardesign.design.resolve import bounds_of, groups
 from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import Design, Layout, RayTable, Sensor, interval_factor, tangent_directions
 from lidardesign.design.support import Retarget
 from lidardesign.design.track import moved, placed
 from lidardesign.errors import ConfigError
+from lidardesign.numerics import systematic_draw
 from lidardesign.simulate.returns import Rays
 from lidardesign.space import DesignSpace, angles, direction
 from lidardesign.task import random_generator
@@ -36,10 +37,6 @@ Gates = Literal["sensor", "ray"]
 DEFAULT_RATE_HZ = 10.0
 # Shares of a ray closer than this are the same share: weights that were normalised differ by a few ulp.
 REMAINDER_DECIMALS = 9
-# Lloyd's cells need no more samples than this: the centre of a cell is then known to a tenth of its width.
-SAMPLES_PER_RAY = 64
-SMALLEST_SAMPLE = 2000
-
 
 # A design is asked for at many places of a track; the samples and the design decide what a refit finds.
 _REFITS: WeakKeyDictionary[Samples, WeakKeyDictionary[Design, dict[tuple[int, int], Design]]] = WeakKeyDictionary()
@@ -325,24 +322,14 @@ def _density_tangent(sensor: Sensor, count: int, seen: Members, seed: int, even:
     """
     generator = random_generator(seed, "density layout")
     tangent, weights = seen.tangent, seen.weights
-    most = max(SAMPLES_PER_RAY * count, SMALLEST_SAMPLE)
+    most = samples_for(count)
     if len(seen) > most:
-        tangent, weights = _thinned(tangent, weights, most, generator)
+        tangent, weights = tangent[systematic_draw(weights, most, generator)], np.ones(most)
     if len(np.unique(tangent, axis=0)) < count:
         return even
     centres, _ = lloyd(tangent, weights, count, generator)
     # row by row upwards, as the grid is: an order that depends on where the rays are, not on the seeding
     return centres[np.lexsort((centres[:, 0], centres[:, 1]))]
-
-
-def _thinned(
-    tangent: np.ndarray, weights: np.ndarray, count: int, generator: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Systematic resampling to fewer points of equal weight."""
-    cumulative = np.cumsum(weights)
-    positions = (np.arange(count) + generator.uniform()) / count * cumulative[-1]
-    chosen = np.minimum(np.searchsorted(cumulative, positions), len(weights) - 1)
-    return tangent[chosen], np.ones(count)
 
 
 def _ray_gates(design: Design, tangents: list[np.ndarray], seen: list[Members], space: DesignSpace) -> np.ndarray:

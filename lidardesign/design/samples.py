@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from lidardesign.errors import DataError
-from lidardesign.numerics import normalised_weights
+from lidardesign.numerics import normalised_weights, systematic_draw
 from lidardesign.run.files import write_atomic
 from lidardesign.run.manifest import record, verify
 from lidardesign.space import DesignSpace
@@ -62,9 +62,7 @@ class Samples:
 
     def resample(self, count: int, generator: np.random.Generator) -> np.ndarray:
         """Design points drawn from p* by systematic importance resampling, shape (count, 6)."""
-        positions = (np.arange(count) + generator.uniform()) / count
-        chosen = np.searchsorted(np.cumsum(self.weights), positions)
-        return self.points[generator.permutation(np.minimum(chosen, len(self) - 1))]
+        return self.points[generator.permutation(systematic_draw(self.weights, count, generator))]
 
 
 def save_samples(samples: Samples, run: Path) -> None:

@@ -23,7 +23,7 @@ from lidardesign.design.feasibility import azimuth_interval
 from lidardesign.design.resolve import Group, Pins, origin_box
 from lidardesign.design.samples import Samples
 from lidardesign.errors import ConfigError, InfeasibleError, NumericalError
-from lidardesign.numerics import effective_count, wrap_angle
+from lidardesign.numerics import effective_count, systematic_draw, wrap_angle
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, aim, direction, observed_point
 
 Retarget = Callable[[np.ndarray], np.ndarray]
@@ -118,7 +118,8 @@ def pinned(
     Raises:
         ConfigError: No way to evaluate the target density was given.
     """
-    aimed, weights = re_aimed(samples, drawn(samples, count, generator), constraints, group, retarget)
+    chosen = systematic_draw(samples.weights, count, generator)
+    aimed, weights = re_aimed(samples, chosen, constraints, group, retarget)
     used = weights > 0
     return Support(aimed[used], weights[used], float(weights.sum()) / count, effective_count(weights))
 
@@ -152,13 +153,6 @@ def re_aimed(
     with np.errstate(invalid="ignore"):
         weights[keep] = np.exp(_per_scene_volume(aimed[keep], log_target, space) - log_old[keep])
     return aimed, weights
-
-
-def drawn(samples: Samples, count: int, generator: np.random.Generator) -> np.ndarray:
-    """Indices of `count` samples in proportion to their weights, by systematic resampling."""
-    positions = (np.arange(count) + generator.uniform()) / count
-    cumulative = np.cumsum(samples.weights)
-    return np.minimum(np.searchsorted(cumulative, positions * cumulative[-1], side="right"), len(samples) - 1)
 
 
 def _from_pins(points: np.ndarray, pins: Pins) -> np.ndarray:

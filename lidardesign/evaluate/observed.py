@@ -8,8 +8,9 @@ from functools import cached_property
 
 import numpy as np
 
+from lidardesign.design.grid import low_discrepancy
 from lidardesign.evaluate.candidates import Positions, whole_range
-from lidardesign.evaluate.placement import RAY_AXES, low_discrepancy
+from lidardesign.evaluate.placement import RAY_AXES
 from lidardesign.scene import Scene
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.space import AZIMUTH, ELEVATION, FULL_TURN, RANGE, DesignSpace, direction, observed_point

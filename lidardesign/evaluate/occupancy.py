@@ -61,8 +61,8 @@ class OccupancyGrid:
 
     def draw(self, count: int, generator: np.random.Generator) -> np.ndarray:
         """Points uniform in cells that are drawn by their probability, shape (count, 3)."""
-        cumulated = np.cumsum(self.probability)
-        chosen = np.searchsorted(cumulated, generator.random(count) * cumulated[-1], side="right")
+        share = self.probability.ravel() / self.probability.sum()
+        chosen = generator.choice(len(share), count, p=share)
         cell = np.stack(np.unravel_index(chosen, self.probability.shape), axis=1)
         return self.low_m + self.edge_m * (cell + generator.random((count, 3)))
 
