@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from lidardesign_tasks.arm import ArmTask
 from lidardesign_tasks.face import FaceTask
 from lidardesign_tasks.flatland import FlatlandTask
 from lidardesign_tasks.meshes import MeshesTask
 from lidardesign_tasks.pose import jittered_pose
+from lidardesign_tasks.warehouse import WarehouseTask
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.scene import Scene
 from lidardesign.simulate.returns import Outcome, Rays, Returns
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import aim, direction
-from lidardesign.task import Task, scenes_of
+from lidardesign.task import Task, conditions_of, scenes_of
 
 REAL_MODEL = Path(__file__).parents[2] / "shared" / "data" / "ict_face.h5"
 SMALL = {"train": 2, "test": 2, "truth_points": 800}
@@ -201,7 +204,66 @@ def test_a_score_reads_only_rays_and_ranges_not_what_was_hit(case):
     assert task.score(scene, [blind]).value == task.score(scene, [returns]).value
 
 
-@pytest.mark.parametrize("kind", [FaceTask, FlatlandTask, MeshesTask])
+UNIFORM_RAYS = 20_000
+# Tasks whose scenes move, or are seen from several places, have no single surface as their truth.
+SEEN_OFTEN = {
+    "arm": (ArmTask, {"train": 2, "test": 1, "frames": 6}),
+    "warehouse": (WarehouseTask, {"size": "small", "train": 2, "test": 1}),
+}
+
+
+@pytest.fixture(scope="module", params=SEEN_OFTEN)
+def often(request):
+    """Task, configuration, a list of uniform rays for each condition value, and scenes by split."""
+    kind, values = SEEN_OFTEN[request.param]
+    task, config = kind(), kind.Config(**values)
+    space, generator = task.space(config), np.random.default_rng(2)
+    lists = []
+    for condition in conditions_of(task, config, space):
+        points = space.at(condition).sample(UNIFORM_RAYS, generator)
+        gates = np.tile([space.low[5], space.high[5]], (len(points), 1))
+        looking = direction(points[:, 3], points[:, 4])
+        lists.append(Rays(points[:, :3], looking, gates, np.zeros(len(points)), np.zeros(len(points))))
+    return task, config, lists, {split: task.scenes(config, split, 0) for split in ("train", "test")}
+
+
+def score_often(task, scene, lists):
+    """The score of one list of rays per condition value, each in every frame."""
+    return task.score(scene, [one for rays in lists for one in simulate(scene, rays)])
+
+
+def test_a_task_that_is_seen_often_keeps_the_contract(often):
+    task, _, lists, scenes = often
+    assert isinstance(task, Task)
+    assert task.api_version == 1
+    assert max(scene.frames for scene in scenes["test"]) * len(lists) > 1
+    for scene in scenes["train"]:
+        found = score_often(task, scene, lists)
+        assert not found.failed
+        assert 0 <= found.value < task.metric.worst
+        assert all(np.isfinite(value) for value in found.details.values())
+
+
+def test_many_scenes_survive_the_way_to_a_worker_process_and_repeat(often):
+    task, config, lists, scenes = often
+    again = task.scenes(config, "train", 0)
+    for scene, other in zip(scenes["train"], again, strict=True):
+        value = score_often(task, scene, lists).value
+        assert score_often(task, pickle.loads(pickle.dumps(scene)), lists).value == value
+        assert score_often(task, other, lists).value == value
+
+
+def test_a_design_that_sees_nothing_anywhere_fails_with_the_worst_value(often):
+    task, _, lists, scenes = often
+    nothing = [rays.subset(np.zeros(0, dtype=int)) for rays in lists]
+    away = [replace(rays, origin_m=rays.origin_m + 50.0) for rays in lists]
+    for fired in (nothing, away):
+        found = score_often(task, scenes["test"][0], fired)
+        assert found.failed
+        assert found.value == task.metric.worst
+
+
+@pytest.mark.parametrize("kind", [ArmTask, FaceTask, FlatlandTask, MeshesTask, WarehouseTask])
 @pytest.mark.parametrize("values", [{"no_such_key": 1}, {"train": float("nan")}])
 def test_unknown_keys_and_values_that_are_no_numbers_are_refused(kind, values):
     with pytest.raises(ValueError, match="validation error"):
