@@ -9,6 +9,7 @@ at most half their bandwidth at every number of rays; at the smallest one lower 
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -73,12 +74,26 @@ def verdicts(found: dict[str, Any]) -> list[str]:
     bounded = {
         f"{name} with {rays} rays": wins(name, rays, "bounding", 1.0) for name, rays in designs if rays == fewest
     }
-    unaware = {f"{name} with {rays} rays": wins(name, rays, "no-visibility", 1.0) for name, rays in designs}
     return [
         verdict("lower than uniform and random with at most half the bandwidth", sparse),
         verdict(f"lower than bounding with {fewest} rays at no more bandwidth", bounded),
-        verdict("lower than no-visibility at no more bandwidth (no claim, for information)", unaware),
+        *(_beside(name, value, spent, designs) for name in FURTHER),
     ]
+
+
+def _beside(
+    baseline: str,
+    value: Mapping[tuple[str, int], float],
+    spent: Mapping[tuple[str, int], float],
+    designs: Sequence[tuple[str, int]],
+) -> str:
+    """What a baseline that nothing is claimed of comes to, in multiples of the designs at equal rays."""
+    worse = [value[baseline, rays] / value[name, rays] for name, rays in designs]
+    dearer = [spent[baseline, rays] / spent[name, rays] for name, rays in designs]
+    return (
+        f"{baseline}: {min(worse):.2f} to {max(worse):.2f} times the distance "
+        f"at {min(dearer):.2f} to {max(dearer):.2f} times the bandwidth"
+    )
 
 
 def main() -> None:

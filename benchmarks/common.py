@@ -164,10 +164,15 @@ def learned(task: str, folder: Path, options: Any, settings: Mapping[str, Any]) 
         folder: Where the run is made.
         options: Of `run_options`.
         settings: Keys that the benchmark itself sets; `--set` comes after them.
+
+    Raises:
+        SystemExit: Learning failed, or a run is given together with what only learning could heed.
     """
     if options.run is not None:
+        if options.preset or options.set or settings:
+            sys.exit("--run takes a run as it is: leave out what is said about learning and about the arm")
         return options.run
-    words = ["learn", task, "--preset", options.preset, "--out", folder / "run", "--json"]
+    words = ["learn", task, "--preset", options.preset or "standard", "--out", folder / "run", "--json"]
     for setting in [*(f"{key}={value}" for key, value in settings.items()), *options.set]:
         words += ["--set", setting]
     run_process(lidardesign(*words)).document()
@@ -178,6 +183,16 @@ def fitted(run: Path, name: str, *words: str) -> tuple[Path, dict[str, Any]]:
     """The file of a design that is fitted to a run, and what `fit` printed."""
     found = run_process(lidardesign("fit", run, "--name", name, "--json", *words)).document()
     return run / "designs" / f"{name}.yaml", found
+
+
+def without_traceback(main: Callable[[], None]) -> None:
+    """Run a benchmark; what the library refuses ends it with the library's message."""
+    from lidardesign.errors import LidardesignError
+
+    try:
+        main()
+    except LidardesignError as error:
+        sys.exit(f"{error.kind}: {error}")
 
 
 def verdict(claim: str, cases: Mapping[str, bool]) -> str:
@@ -229,7 +244,7 @@ def model_option(made: argparse.ArgumentParser) -> None:
 def run_options(made: argparse.ArgumentParser) -> None:
     """Add `--run`, `--preset` and `--set`."""
     made.add_argument("--run", type=Path, help="a run of this task, which gets the designs (default: learn one)")
-    made.add_argument("--preset", default="standard", help="what is learned (default %(default)s)")
+    made.add_argument("--preset", help="what is learned (default standard)")
     made.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="passed to learn; repeatable")
 
 

@@ -23,7 +23,7 @@ from typing import Any
 
 import common  # before numpy: it limits the thread pools
 import numpy as np
-from common import Timing, interleaved, median_ratio, parser, report, robot_settings, verdict
+from common import Timing, interleaved, median_ratio, parser, report, robot_settings, verdict, without_traceback
 
 from lidardesign.density.fields import build_field, scene_columns
 from lidardesign.density.frames import FramesTarget
@@ -248,4 +248,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    without_traceback(main)

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from common import learned, parser, report, robot_option, robot_settings, run_options
+from common import learned, parser, report, robot_option, robot_settings, run_options, without_traceback
 
 CLAIMED_FACTOR = 2.0
 HORIZON = {"elevation_max_deg": 0}
@@ -174,4 +174,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    without_traceback(main)

@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from common import fitted, learned, lidardesign, parser, report, run_options, run_process, verdict
+from common import fitted, learned, lidardesign, parser, report, run_options, run_process, verdict, without_traceback
 
 SPARSE = ("uniform", "random")
 BASELINES = (*SPARSE, "bounding")
@@ -79,6 +79,7 @@ def miss_rates(run_folder: Path, designs: list[Path], x_m: float, rays: int) -> 
     samples = load_samples(run.folder)
     space = config.space.at({"x_m": x_m})
     train, test = (scenes_of(run.task, config.task, split, config.seed, space) for split in ("train", "test"))
+    layouts = layouts_of([(design.name, run) for design in loaded])
     request = EvaluationRequest(
         task=run.task,
         config=config.task,
@@ -91,7 +92,8 @@ def miss_rates(run_folder: Path, designs: list[Path], x_m: float, rays: int) -> 
         equal_bandwidth=False,
         train=train,
         test=test,
-        lay_out=layouts_of([(design.name, run) for design in loaded]),
+        # a space with one position has no condition left to name, but a track has to know where
+        lay_out=lambda design, count, samples, *, at=None: layouts(design, count, samples, at={**at, "x_m": x_m}),
     )
     return {row.design: row.value for row in evaluate(request).rows}
 
@@ -167,4 +169,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    without_traceback(main)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
+import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -62,6 +65,166 @@ def test_contestants_take_turns_after_one_round_that_is_not_counted(common):
 
 def test_ratios_are_taken_round_by_round(common):
     assert common.median_ratio([1.0, 10.0, 100.0], [2.0, 20.0, 50.0]) == 0.5
+
+
+@pytest.fixture
+def script(monkeypatch):
+    """A benchmark script as a module, by its name."""
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    before = set(sys.modules)
+    yield lambda name: importlib.import_module(name)
+    for name in {"common", *(path.stem for path in SCRIPTS)} & (set(sys.modules) - before):
+        del sys.modules[name]
+
+
+def test_a_claim_is_said_to_hold_or_where_it_does_not(common):
+    assert common.verdict("lower", {"a": True, "b": True}) == "holds: lower (2 of 2)"
+    assert common.verdict("lower", {"a": True, "b": False}) == "does not hold: lower (1 of 2; not for b)"
+
+
+def test_a_run_is_taken_as_it_is(common, tmp_path):
+    options = common.parser(None)
+    common.run_options(options)
+    assert common.learned("arm", tmp_path, options.parse_args(["--run", "here"]), {}) == Path("here")
+    with pytest.raises(SystemExit, match="as it is"):
+        common.learned("arm", tmp_path, options.parse_args(["--run", "here", "--preset", "draft"]), {})
+    with pytest.raises(SystemExit, match="as it is"):
+        common.learned("arm", tmp_path, options.parse_args(["--run", "here"]), {"robot": "other.xml"})
+
+
+def test_a_benchmark_that_is_refused_says_why_without_a_traceback(common):
+    from lidardesign.errors import ConfigError
+
+    def refused():
+        raise ConfigError("5 m", where="--at", allowed="0 to 4 m")
+
+    with pytest.raises(SystemExit, match="--at: 5 m"):
+        common.without_traceback(refused)
+
+
+def test_the_rays_that_a_distance_takes_are_exact_on_a_power_law(script):
+    rays = (100, 200, 400, 1600)
+    distances = [3 * count**-0.7 for count in rays]
+    needed = script("occlusion").rays_needed
+    for wanted in (130.0, 200.0, 399.0, 1000.0):
+        found = needed(rays, distances, 3 * wanted**-0.7)
+        assert found.rays == pytest.approx(wanted)
+        assert not found.bound
+
+
+def test_the_rays_that_a_distance_takes_are_bounded_beyond_the_curve(script):
+    needed = script("occlusion").rays_needed
+    assert needed((100, 200), (0.4, 0.2), 0.5).text() == "<= 100"
+    assert needed((100, 200), (0.4, 0.2), 0.1).text() == "> 200"
+
+
+def test_a_curve_that_rises_again_counts_where_it_first_comes_down(script):
+    needed = script("occlusion").rays_needed
+    assert needed((100, 200, 400, 800), (0.4, 0.2, 0.3, 0.1), 0.2).rays == pytest.approx(200)
+
+
+def test_bounds_only_count_towards_a_factor_that_they_support(script):
+    occlusion = script("occlusion")
+    factors = [occlusion.Needed(3.0, "<="), occlusion.Needed(3.0, ">"), occlusion.Needed(1.9)]
+    assert occlusion.layout_line("density", (100, 200, 300), factors).endswith("at least 2 times at 200")
+
+
+def rows_of(**values):
+    """Rows of an evaluation from name = (value, bandwidth), at 10 rays."""
+    return {
+        "rows": [
+            {"design": name.replace("_", "-"), "rays": 10, "value": value, "bandwidth_mbps": spent}
+            for name, (value, spent) in values.items()
+        ]
+    }
+
+
+@pytest.mark.parametrize(("spent", "value", "holds"), [(1.0, 0.1, True), (1.01, 0.1, False), (0.5, 0.5, False)])
+def test_the_arm_must_be_better_at_half_the_bandwidth(script, spent, value, holds):
+    others = {"uniform": (0.5, 2.0), "random": (0.6, 2.0), "bounding": (0.4, 2.0)}
+    others |= {"occupancy": (0.4, 2.0), "no_visibility": (0.4, 2.0)}
+    first = script("arm").verdicts(rows_of(mine=(value, spent), **others))[0]
+    assert first.startswith("holds") == holds
+
+
+@pytest.mark.parametrize(
+    ("mine", "theirs", "holds"), [(9.0, 10.0, True), (10.0, 10.0, False), (2.0, 2.0, True), (2.1, 2.0, False)]
+)
+def test_the_warehouse_must_beat_bounding_where_that_misses_much(script, mine, theirs, holds):
+    others = {"uniform": (50.0, 8.0), "random": (50.0, 8.0), "bounding": (theirs, 2.0)}
+    sparse, bounded = script("warehouse").verdicts(rows_of(mine=(mine, 1.0), **others))
+    assert sparse.startswith("holds")
+    assert bounded.startswith("holds") == holds
+
+
+def test_a_warehouse_without_an_eighth_of_the_bandwidth_falls_short(script):
+    others = {"uniform": (50.0, 7.9), "random": (50.0, 8.0), "bounding": (10.0, 2.0)}
+    sparse = script("warehouse").verdicts(rows_of(mine=(9.0, 1.0), **others))[0]
+    assert sparse.startswith("does not hold")
+    assert "uniform" in sparse
+
+
+def test_positions_between_are_held_against_the_worst_of_the_papers(script):
+    paper = [[0.0, 1.0, 2.0, 0.5, 20.0], [1.2, 1.0, 3.0, 0.5, 10.0]]
+    said = script("warehouse").position_verdict
+    assert said([*paper, [0.37, 1.0, 2.0, 0.5, 20.0]]).startswith("holds")
+    assert said([*paper, [0.37, 1.0, 1.9, 0.5, 20.0]]).startswith("does not hold")
+    assert said([*paper, [0.37, 1.0, math.nan, 0.5, 20.0]]).startswith("does not hold")
+
+
+def run_script(name, tmp_path, *words):
+    """What a script writes as JSON."""
+    file = tmp_path / "found.json"
+    command = [sys.executable, ROOT / "benchmarks" / f"{name}.py", "--rounds", "1", "--json", file, *words]
+    done = subprocess.run([*map(str, command)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "| ---" in done.stdout
+    return json.loads(file.read_text(encoding="utf-8"))
+
+
+def settings(*pairs):
+    learning = ("steps=40", "samples=4000", "balance_proposals=2048", "coverage_proposals=512")
+    return [word for pair in (*(f"learning.{one}" for one in learning), *pairs) for word in ("--set", pair)]
+
+
+SMALL_ARM = settings("size=small", "train=2", "test=2", "density.sigma_m=0.05")
+SMALL_WAREHOUSE = settings("size=small", "train=3", "test=2", "positions=1", "density.sigma_m=0.15")
+
+
+@pytest.mark.slow
+def test_frames_are_measured_and_culling_keeps_its_bound(tmp_path):
+    words = ["--trajectories", "2", "--frames", "12", "--points", "64", "--casters", "6", "--growth", "24"]
+    found = run_script("frames", tmp_path, "--robot", "embedded", *words)
+    errors = next(rows for caption, rows in found["tables"].items() if caption.startswith("Culled"))
+    assert all(0 <= row["error, max"] <= row["bound"] for row in errors)
+    assert {row["way"] for row in found["tables"]["Time per evaluation"]} >= {"full sum", "caster per frame"}
+
+
+@pytest.mark.slow
+def test_the_arm_is_measured(tmp_path):
+    found = run_script("arm", tmp_path, "--preset", "draft", *SMALL_ARM, "--sensors", "2", "--rays", "40")
+    rows = next(rows for caption, rows in found["tables"].items() if caption.startswith("Scores"))
+    assert {row["design"] for row in rows} == {
+        "benchmark-2", "uniform", "random", "bounding", "occupancy", "no-visibility",
+    }  # fmt: skip
+    assert len(found["conclusions"]) == 4
+
+
+@pytest.mark.slow
+def test_the_worth_of_knowing_about_occlusion_is_measured(tmp_path):
+    words = ["--preset", "draft", "--rays", "40", "80", "--further-rays", "120", "--layout", "density"]
+    found = run_script("occlusion", tmp_path, *SMALL_ARM, *words)
+    (rows,) = found["tables"].values()
+    assert [row["rays"] for row in rows] == [40, 80]
+
+
+@pytest.mark.slow
+def test_the_warehouse_is_measured(tmp_path):
+    words = ["--preset", "draft", *SMALL_WAREHOUSE, "--rays", "4", "--fit-rays", "4", "--at", "0", "0.37"]
+    found = run_script("warehouse", tmp_path, *words)
+    rows = next(rows for caption, rows in found["tables"].items() if caption.startswith("Fits"))
+    assert [row["x m"] for row in rows] == [0.0, 0.37]
+    assert any("exit code 2" in line for line in found["conclusions"])
 
 
 @pytest.mark.slow
