@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 
 from lidardesign import registry
 from lidardesign.cli.main import app
@@ -18,19 +19,36 @@ from lidardesign.run.yaml import parse_yaml
 from lidardesign.scene import Scene
 from lidardesign.simulate.returns import Rays
 from lidardesign.simulate.simulate import simulate
-from lidardesign.task import Task
+from lidardesign.task import Task, conditions_of
 
-README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+WRITING_TASKS = (ROOT / "docs" / "writing-tasks.md").read_text(encoding="utf-8")
+# The README's pictures are downloaded by everyone who clones it.
+LARGEST_PICTURE_BYTES = 250_000
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+def blocks(language: str, text: str = README) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
 
 
 def test_the_constraint_file_is_accepted():
     text = next(block for block in blocks("yaml") if "buyable" in block)
     constraints = Constraints.from_mapping(parse_yaml(text, where="README").value)
     assert constraints.budget.rays == 576
+
+
+def test_the_mounts_of_the_ceiling_are_accepted():
+    text = next(block for block in blocks("yaml") if "ceiling.yaml" in block)
+    constraints = Constraints.from_mapping(parse_yaml(text, where="README").value)
+    assert len(constraints.origin.mounts_m or ()) == 4
+    assert constraints.sensors.count == 2
+
+
+def test_the_mounts_that_a_comment_shows_are_accepted():
+    (shown,) = re.findall(r"# (mounts_m: \[.*?\]\])", README)
+    origin = parse_yaml(shown, where="README").value
+    assert len(Constraints.from_mapping({"origin": origin}).origin.mounts_m or ()) == 2
 
 
 def test_every_constraint_key_that_is_shown_is_accepted_and_none_is_left_out():
@@ -84,3 +102,74 @@ def test_the_example_task_keeps_the_contract_and_scores_a_ray():
     away = Rays(origin, -rays.direction, rays.gate_m, rays.sensor, rays.time_s)
     assert task.score(scene, simulate(scene, away)).value == 100.0
     assert resolve(task).space == task.space(config)
+
+
+def moving_scene_of(name: str, block: int):
+    """A task of docs/writing-tasks.md, held to the contract, and its first held-out scene."""
+    namespace: dict[str, object] = {}
+    exec(blocks("python", WRITING_TASKS)[block], namespace)  # the page's own text
+    task = namespace[name]()
+    registry._check(task.name, task)
+    config = task.Config()
+    first, again = (task.scenes(config, "test", 0)[0] for _ in range(2))
+    for one, other in zip(first.bodies, again.bodies, strict=True):
+        assert np.array_equal(one.poses, other.poses)
+    return task, config, first
+
+
+def rays_at(points: np.ndarray, origin: np.ndarray) -> Rays:
+    """One ray from an origin (3,) to each point (N, 3), listening all the way."""
+    offset = points - origin
+    directions = offset / np.linalg.norm(offset, axis=1, keepdims=True)
+    count = len(points)
+    origins = np.broadcast_to(origin, points.shape)
+    return Rays(origins, directions, np.tile([0.1, 9.0], (count, 1)), np.zeros(count), np.zeros(count))
+
+
+def test_the_moving_ball_of_the_guide_is_scored_over_its_frames():
+    task, config, scene = moving_scene_of("PassingTask", 0)
+    assert resolve(task).space == task.space(config)
+    origin, ball = np.array([0.0, 0.0, 0.3]), scene.bodies[0]
+    assert scene.frames == config.frames
+    seen_at_the_ends = rays_at(ball.poses[[0, -1], :3, 3], origin)
+    assert 0.0 < task.score(scene, simulate(scene, seen_at_the_ends)).value < 100.0
+    everywhere = rays_at(ball.poses[:, :3, 3], origin)
+    assert task.score(scene, simulate(scene, everywhere)).value < task.score(
+        scene, simulate(scene, seen_at_the_ends)
+    ).value
+
+
+def test_the_drive_of_the_guide_is_scored_over_its_positions():
+    task, config, scene = moving_scene_of("DriveTask", 1)
+    space = resolve(task).space
+    assert space.condition == ("x_m",)
+    places = conditions_of(task, config, space)
+    assert len(places) == 4
+    sign = scene.bodies[0].pose()[:3, 3]
+    rays = [rays_at(sign[None], np.array([place["x_m"], 0.0, 0.0])) for place in places]
+    returns = [frame for one in rays for frame in simulate(scene, one)]
+    assert task.score(scene, returns).value == 0.0
+    away = Rays(rays[0].origin_m, -rays[0].direction, rays[0].gate_m, rays[0].sensor, rays[0].time_s)
+    assert task.score(scene, [*simulate(scene, away), *returns[1:]]).value == 25.0
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))], ids=lambda p: p.name)
+def test_links_lead_somewhere_and_pictures_are_small(page):
+    targets = re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8"))
+    for target in targets:
+        found = page.parent / target
+        assert found.exists(), target
+        assert found.suffix != ".png" or found.stat().st_size < LARGEST_PICTURE_BYTES
+
+
+def test_every_option_that_a_console_shows_exists():
+    known = {
+        name
+        for command in typer.main.get_command(app).commands.values()
+        for part in (command, *getattr(command, "commands", {}).values())
+        for parameter in part.params
+        for name in parameter.opts
+    }
+    consoles = "\n".join(blocks("console"))
+    shown = {word for line in consoles.splitlines() if "lidardesign" in line for word in re.findall(r"--[\w-]+", line)}
+    assert shown <= known

@@ -1,0 +1,48 @@
+"""The examples run from beginning to end."""
+
+from __future__ import annotations
+
+import csv
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+QUICK = ("learning.samples=20000", "learning.coverage_proposals=1024")
+SETTINGS = {
+    "arm": (*QUICK, "learning.steps=50"),
+    # a blurred shelf is learned at once
+    "warehouse": (*QUICK, "learning.steps=60", "density.sigma_m=0.1"),
+}
+
+
+def run_example(name: str, folder: Path) -> str:
+    """What an example prints that ends well."""
+    words = [word for setting in SETTINGS[name] for word in ("--set", setting)]
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / f"{name}.py", "--out", folder, *words],
+        capture_output=True, text=True, check=False, cwd=folder.parent,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert "Done in" in done.stdout
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_the_arm_is_designed_with_free_mounted_and_railed_sensors(tmp_path):
+    run_example("arm", tmp_path / "arm")
+    written = {path.stem for path in (tmp_path / "arm" / "run" / "designs").iterdir()}
+    assert written == {"free", "mounted", "rails"}
+    assert "no-visibility" in (tmp_path / "arm" / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_the_warehouse_is_designed_for_every_position(tmp_path):
+    run_example("warehouse", tmp_path / "aisle")
+    for x_m in ("0.37", "3.91"):
+        with open(tmp_path / "aisle" / f"rays_{x_m}.csv", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+        assert len(rows) == 12
+        assert {row["origin_x_m"] for row in rows} == {x_m}
