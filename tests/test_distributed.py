@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.special import chdtri
 
+from lidardesign.design import lines
 from lidardesign.design.coupling import coupling_of
 from lidardesign.design.distributed import normal_ball
 from lidardesign.design.files import design_document, design_from_document
@@ -183,3 +184,17 @@ def test_more_rays_leave_no_populated_region_empty():
         reach.append((np.mean(nearest), np.quantile(nearest, 0.98)))
     assert (np.diff(reach, axis=0) < 0).all()
     assert reach[2][1] < 0.05
+
+
+def test_distances_from_lines_agree_with_the_cross_product_in_whatever_blocks(monkeypatch):
+    generator = np.random.default_rng(8)
+    points, origins, looking = (generator.normal(size=(n, 3)) for n in (50, 7, 7))
+    looking /= np.linalg.norm(looking, axis=1)[:, None]
+    weights = generator.random(50)
+    apart = np.square(np.cross(points[:, None] - origins, looking)).sum(axis=2)
+    for block in (1, 60, 1_000_000):
+        monkeypatch.setattr(lines, "BLOCK", block)
+        nearest, away = lines.nearest_lines(points, origins, looking)
+        np.testing.assert_array_equal(nearest, apart.argmin(axis=1))
+        np.testing.assert_allclose(away, apart.min(axis=1), atol=1e-12)
+        np.testing.assert_allclose(lines.mean_squares(points, weights, origins, looking), weights @ apart, rtol=1e-10)

@@ -218,9 +218,9 @@ def often(request):
     kind, values = SEEN_OFTEN[request.param]
     task, config = kind(), kind.Config(**values)
     space, generator = task.space(config), np.random.default_rng(2)
-    lists = []
-    for condition in conditions_of(task, config, space):
-        points = space.at(condition).sample(UNIFORM_RAYS, generator)
+    lists, conditions = [], conditions_of(task, config, space)
+    for condition in conditions:
+        points = space.at(condition).sample(UNIFORM_RAYS // len(conditions), generator)
         gates = np.tile([space.low[5], space.high[5]], (len(points), 1))
         looking = direction(points[:, 3], points[:, 4])
         lists.append(Rays(points[:, :3], looking, gates, np.zeros(len(points)), np.zeros(len(points))))

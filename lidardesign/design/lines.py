@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-# Scene points per block: distances to a thousand rays then take 16 MB.
-BLOCK = 2048
+# Distances that are held at once: 16 MB of them.
+BLOCK = 2_097_152
 
 
 def squared_distances(points: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -26,8 +26,9 @@ def squared_distances(points: np.ndarray, origins: np.ndarray, directions: np.nd
 def nearest_lines(points: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The line nearest to each point, and its squared distance, shape (N,) each."""
     nearest, away = np.empty(len(points), dtype=np.int64), np.empty(len(points))
-    for start in range(0, len(points), BLOCK):
-        part = slice(start, start + BLOCK)
+    size = max(BLOCK // len(origins), 1)
+    for start in range(0, len(points), size):
+        part = slice(start, start + size)
         squares = squared_distances(points[part], origins, directions)
         nearest[part] = squares.argmin(axis=1)
         away[part] = np.take_along_axis(squares, nearest[part, None], axis=1)[:, 0]
@@ -36,4 +37,6 @@ def nearest_lines(points: np.ndarray, origins: np.ndarray, directions: np.ndarra
 
 def mean_squares(points: np.ndarray, weights: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Weighted sums of squared distances of a cell's points (M, 3) from each of its own rays' lines, shape (M,)."""
-    return weights @ squared_distances(points, origins, directions)
+    size = max(BLOCK // len(points), 1)
+    parts = [slice(start, start + size) for start in range(0, len(origins), size)]
+    return np.concatenate([weights @ squared_distances(points, origins[part], directions[part]) for part in parts])
