@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-QUICK = ("learning.samples=20000", "learning.coverage_proposals=1024")
+QUICK = ("learning.samples=10000", "learning.coverage_proposals=1024")
 SETTINGS = {
     "arm": (*QUICK, "learning.steps=50"),
     # a blurred shelf is learned at once
