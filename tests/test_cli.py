@@ -185,6 +185,18 @@ def test_a_task_shows_its_keys_and_its_space(lidardesign):
     assert "design space" in lidardesign("tasks", "show", "flatland").out
 
 
+def test_a_task_shows_what_is_designed_what_is_given_and_how_it_is_fitted(lidardesign):
+    arm = lidardesign("tasks", "show", "arm")
+    assert "4 sensors, layout distributed, level 0.99, evaluated at 400, 1000, 1200 rays" in arm.out
+    assert lidardesign("tasks", "show", "arm", "--json").json["defaults"]["layout"] == "distributed"
+    shelves = lidardesign("tasks", "show", "warehouse").out
+    kinds = {row.split()[1]: row for row in shelves.splitlines() if row.startswith("│")}
+    assert "a condition (--at)" in kinds["x_m"]
+    assert "fixed" in kinds["azimuth_rad"]
+    assert "designed" in kinds["elevation_rad"]
+    assert "layout scan, level" in shelves
+
+
 def test_the_chain_works_from_a_run_to_exported_rays(lidardesign, flat, tmp_path):
     fitted = lidardesign("fit", flat, "--sensors", 2, "--json").json
     assert {

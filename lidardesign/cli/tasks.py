@@ -103,7 +103,12 @@ def _describe(task: Task) -> dict[str, Any]:
         "density": _describe_fields(DensitySettings, defaults.density),
         "learning": _describe_fields(LearningSettings, defaults.learning.get("standard", {})),
         "space": _default_space(task),
-        "defaults": {"sensors": defaults.sensors, "rays": list(defaults.rays)},
+        "defaults": {
+            "sensors": defaults.sensors,
+            "layout": defaults.layout,
+            "level": defaults.level,
+            "rays": list(defaults.rays),
+        },
     }
 
 
@@ -160,27 +165,39 @@ def _default_space(task: Task) -> dict[str, Any] | None:
 
 def _show_task(document: dict[str, Any], rich: RichConsole) -> None:
     from rich.markup import escape
-    from rich.table import Table
 
     metric = document["metric"]
     rich.print(f"[bold]{escape(document['name'])}[/bold]: {escape(document['summary'])}")
     rich.print(f"metric: {escape(metric['name'])} \\[{escape(metric['unit'])}], {metric['better']} is better")
-    rich.print(
-        f"defaults: {document['defaults']['sensors']} sensors, rays {document['defaults']['rays']}",
-        markup=False,
-    )
+    rich.print(_shown_defaults(document["defaults"]), markup=False)
     _show_keys(document["config"], "configuration (--set KEY=VALUE)", rich)
     if document["space"]:
-        title = escape("design space (--set space.KEY=[LOW,HIGH])")
-        space = Table("dimension", "from", "to", title=title, title_justify="left")
-        for name, bounds in document["space"].items():
-            if isinstance(bounds, list) and len(bounds) == 2 and name.endswith(("_m", "_rad")):
-                space.add_row(name, f"{bounds[0]:.4g}", f"{bounds[1]:.4g}")
-        rich.print(space)
+        rich.print("design space (--set space.KEY=[LOW,HIGH])", style="italic", markup=False)
+        rich.print(_space_table(document["space"]))
     else:
         rich.print("design space: follows from the configuration (--set space.KEY=[LOW,HIGH])", markup=False)
     _show_keys(document["density"], "target density (--set density.KEY=VALUE)", rich)
     _show_keys(document["learning"], "learning, preset standard (--set learning.KEY=VALUE)", rich)
+
+
+def _shown_defaults(defaults: Mapping[str, Any]) -> str:
+    """What `fit` and `evaluate` do where nothing is said; a scan has as many sensors as rays."""
+    sensors = "" if defaults["layout"] == "scan" else f"{defaults['sensors']} sensors, "
+    rays = ", ".join(map(str, defaults["rays"]))
+    return f"defaults: {sensors}layout {defaults['layout']}, level {defaults['level']:g}, evaluated at {rays} rays"
+
+
+def _space_table(space: Mapping[str, Any]) -> Any:
+    """The bounds of every dimension, and whether it is designed, fixed or given."""
+    from rich.table import Table
+
+    table = Table("dimension", "from", "to", "")
+    for name, bounds in space.items():
+        if isinstance(bounds, list) and len(bounds) == 2 and name.endswith(("_m", "_rad")):
+            low, high = bounds
+            kind = "a condition (--at)" if name in space["condition"] else "fixed" if low == high else "designed"
+            table.add_row(name, f"{low:.4g}", f"{high:.4g}", kind)
+    return table
 
 
 def _show_keys(entries: list[dict[str, Any]], title: str, rich: RichConsole) -> None:
