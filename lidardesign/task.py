@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from lidardesign.errors import PluginError
+from lidardesign.errors import ConfigError, PluginError
 from lidardesign.scene import Scene
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DIMENSIONS, DesignSpace
@@ -127,10 +127,17 @@ def scenes_of(task: Task, config: Any, split: Split, seed: int, space: DesignSpa
 
     A task whose `scenes` takes a keyword `space` gets it; its truth then follows a space set in the run's
     configuration. Other tasks judge by the space of their configuration.
+
+    Raises:
+        PluginError: The task gave something else.
     """
-    if "space" in inspect.signature(task.scenes).parameters:
-        return task.scenes(config, split, seed, space=space)
-    return task.scenes(config, split, seed)
+    takes_space = "space" in inspect.signature(task.scenes).parameters
+    scenes = list(task.scenes(config, split, seed, **({"space": space} if takes_space else {})))
+    for scene in scenes:
+        if not isinstance(scene, Scene):
+            found = f"scenes gave one {type(scene).__name__}"
+            raise PluginError(found, where=f"task {task.name}", allowed="lidardesign.scene.Scene")
+    return scenes
 
 
 # Conditions that a task does not name are evaluated at so many even places.
@@ -160,7 +167,10 @@ def _check_conditions(task: Task, named: Sequence[Mapping[str, float]], space: D
     if not named:
         raise PluginError("no condition value is named", where=where, allowed="1 or more")
     for one in named:
-        space.at(one)
+        try:
+            space.at(one)
+        except ConfigError as error:
+            raise ConfigError(error.message, where=where, allowed=error.allowed) from None
         missing = [DIMENSIONS[i] for i in space.conditioned if DIMENSIONS[i] not in one]
         if missing:
             raise PluginError(f"{dict(one)} leaves {missing[0]} open", where=where, allowed="every condition has one")

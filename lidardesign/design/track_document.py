@@ -18,6 +18,8 @@ TRACK_KEYS = (
 )  # fmt: skip
 # Four numbers per ray and knot stay below the number of values that the YAML reader accepts in one file.
 MOST_TRACK_RAYS = 100_000
+# Beyond this double precision no longer tells places a millimetre apart.
+FURTHEST_M = 1e12
 
 
 def track_document(track: Track) -> dict[str, Any]:
@@ -37,9 +39,13 @@ def read_track(node: Node, sensors: int) -> Track:
     """
     keys = node.mapping(TRACK_KEYS)
     knots = keys["knots_m"].numbers()
-    if len(knots) < 2 or (np.diff(knots) <= 0).any():
+    if len(knots) < 2 or (knots[1:] <= knots[:-1]).any():
         raise keys["knots_m"].error("are no knots", allowed="at least two numbers, each above the one before")
+    if np.abs(knots).max() > FURTHEST_M:
+        raise keys["knots_m"].error(f"reach {np.abs(knots).max():g} m", allowed=f"within {FURTHEST_M:g} m of 0")
     index = np.array([item.integer(0, sensors - 1) for item in keys["sensor"].items()], dtype=np.int64)
+    if not len(index):
+        raise keys["sensor"].error("is empty", allowed="at least one ray")
 
     def rows(key: str, low: float = -math.inf, high: float = math.inf) -> np.ndarray:
         items = keys[key].items()

@@ -10,11 +10,14 @@ from typing import Any
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.track import travels
+from lidardesign.errors import ConfigError
 from lidardesign.evaluate.ablation import TwinCandidate
 from lidardesign.evaluate.baselines import Baselines, Judge, Option
 from lidardesign.evaluate.candidates import Candidate, Positions, mean_mbps
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.scoring import score_lists
+from lidardesign.registry import plugin_guard
 from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import conditions_of
 
@@ -66,6 +69,7 @@ class Entry:
 
 def entries_of(request: EvaluationRequest) -> list[Entry]:
     """All rows to be: designs, baselines, then baselines at each design's bandwidth."""
+    _check_tracks(request)
     baselines = _baselines(request)
     counts = list(dict.fromkeys(request.rays))
     designs = [
@@ -84,6 +88,21 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
         ]
     chosen = baselines.best([(one.name, one.options) for one in wanted])
     return designs + [_entry(baselines, one, option) for one, option in zip(wanted, chosen, strict=True)]
+
+
+def _check_tracks(request: EvaluationRequest) -> None:
+    """Refuse a track that ends before a place where designs are evaluated."""
+    for design in request.designs:
+        if design.track is None:
+            continue
+        name, (first, last) = design.track.dimension, travels(design.track)
+        beyond = [one[name] for one in _conditions(request) if name in one and not first <= one[name] <= last]
+        if beyond:
+            raise ConfigError(
+                f"its track goes from {name}={first:g} to {last:g}, but designs are evaluated at {beyond[0]:g} too",
+                where=f"design {design.name}",
+                hint="fit a track of the whole way: lidardesign fit RUN",
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +140,8 @@ def _baselines(request: EvaluationRequest) -> Baselines:
 
 
 def _conditions(request: EvaluationRequest) -> list[dict[str, float]]:
-    return conditions_of(request.task, request.config, request.space)
+    with plugin_guard(request.task.name):
+        return conditions_of(request.task, request.config, request.space)
 
 
 def middle_condition(request: EvaluationRequest) -> dict[str, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -100,6 +100,10 @@ def _is_number(value: object) -> bool:
 
 
 def _check_details(score: Score, where: str) -> None:
+    if not isinstance(score.details, Mapping) or not all(isinstance(name, str) for name in score.details):
+        raise PluginError(
+            f"score returned the details {score.details!r}", where=where, allowed="numbers by name, as {'seen': 3.0}"
+        )
     bad = [name for name, value in score.details.items() if not _is_number(value)]
     if bad:
         raise PluginError(

@@ -55,6 +55,8 @@ def _inside(folder: Path, directory: str, name: str, model: Path) -> Path:
 
 def _parse(path: Path) -> ElementTree.Element:
     try:
+        if path.exists() and not path.is_file():
+            raise DataError("is no regular file", where=str(path), allowed="an MJCF model")
         if path.stat().st_size > LARGEST_XML_BYTES:
             raise DataError(f"has {path.stat().st_size} bytes", where=str(path), allowed=f"{LARGEST_XML_BYTES}")
         return ElementTree.fromstring(path.read_bytes())
