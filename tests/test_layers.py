@@ -51,6 +51,8 @@ HOMES = {
     "torch": ("lidardesign.density.",),
     "zuko": ("lidardesign.density.",),
     "embreex": ("lidardesign.simulate.raycast",),
+    "mujoco": (),
+    "mink": (),
     "typer": ("lidardesign.cli.",),
     "rich": ("lidardesign.cli.",),
     "plotly": ("lidardesign.evaluate.report",),
@@ -163,6 +165,14 @@ def test_modules_of_fast_commands_import_nothing_slow_at_their_top(path):
     for imported, line in imports(top):
         slow = {imported, imported.split(".")[0], ".".join(imported.split(".")[:2])} & SLOW_AT_TOP
         assert not slow or module_name(path) in TORCH_SIDE_FILES, f"{path}:{line}: {imported}"
+
+
+@pytest.mark.parametrize("path", TASK_MODULES, ids=module_name)
+def test_tasks_import_the_robot_engine_only_when_an_arm_moves(path):
+    tree = parse(path)
+    top = ast.Module([node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)], [])
+    for imported, line in imports(top):
+        assert imported.split(".")[0] not in ("mujoco", "mink"), f"{path}:{line}: {imported}"
 
 
 @pytest.mark.parametrize("path", MODULES, ids=module_name)
