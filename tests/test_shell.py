@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from lidardesign.density.independent import independent_points, resampled_proposals
 from lidardesign.density.settings import DensitySettings
-from lidardesign.density.shell import can_be_aimed, resampled_proposals, shell_proposals
+from lidardesign.density.shell import shell_proposals
 from lidardesign.density.target import build_target
 from lidardesign.scene import Body, Mesh, Scene, Sphere, rigid
 from lidardesign.space import AZIMUTH, DesignSpace, direction
@@ -83,11 +84,11 @@ def test_weights_of_shell_proposals_are_bounded():
 
 def test_with_a_fixed_angle_points_are_resampled_by_proximity():
     space, scenes = flat_space(), [Scene((ball(),))]
-    assert not can_be_aimed(space)
-    assert can_be_aimed(open_space())
     target = build_target(scenes, space, DensitySettings(sigma_m=SIGMA), "raycast")
     generator = np.random.default_rng(3)
-    points, log_density = resampled_proposals(target.field, space, 20_000, SIGMA, generator)
+    points, log_density = independent_points(target, scenes, 20_000, generator)
+    alike = resampled_proposals(target, 20_000, np.random.default_rng(3))
+    np.testing.assert_array_equal(points, alike[0])
     found, error = weighted_means(points, target.log_density(points) - log_density, FUNCTIONS)
     brute = space.sample(200_000, generator)
     expected, brute_error = weighted_means(brute, target.log_density(brute), FUNCTIONS)
@@ -101,7 +102,8 @@ def test_a_space_that_reaches_no_surface_gives_no_proposals():
     points, _ = shell_proposals(target.field, [Scene((ball(),))], away, 500, SIGMA, np.random.default_rng(4))
     assert len(points) == 0
     flat = DesignSpace((0, 0, 0, math.pi - 0.1, 0.0, 0.1), (0, 0, 0, math.pi + 0.1, 0.0, 0.5))
-    assert len(resampled_proposals(target.field, flat, 500, SIGMA, np.random.default_rng(5))[0]) == 0
+    target = build_target([Scene((ball(),))], flat, DensitySettings(sigma_m=SIGMA), "off")
+    assert len(independent_points(target, [Scene((ball(),))], 500, np.random.default_rng(5))[0]) == 0
 
 
 def test_the_same_seed_gives_the_same_proposals():
