@@ -146,6 +146,8 @@ CASES = [
     ("constrain run --set gate.width_m.max=-1", 2, "--set gate.width_m.max=-1"),
     ("constrain run --set gate.width_m.max=nan", 2, "--set gate.width_m.max=nan"),
     ("constrain run --set gate.width.max=1", 2, "did you mean 'width_m'"),
+    ("constrain run --set rays=1", 2, "did you mean 'budget.rays'"),
+    ("constrain run --set mounts_m=[[0,0,1]]", 2, "did you mean 'origin.mounts_m'"),
     ("constrain run --set field_of_view.horizontal_deg=20", 2, "--set field_of_view.horizontal_deg=20"),
     ("constrain run --set gate.start_m.min=0.8 --set gate.end_m.max=0.5", 4, "gate.start_m.min"),
     ("constrain run --set sensors.count=3 --sensors 2", 4, "sensors.count"),

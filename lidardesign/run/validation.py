@@ -99,8 +99,8 @@ def _explain(
     where = locate((*prefix, *path), key=detail["type"] == "extra_forbidden")
     if detail["type"] == "extra_forbidden":
         allowed = _fields_at(model, path[:-1])
-        message, hint = f"unknown key {name!r}", suggest(str(path[-1]), allowed)
-        return ConfigError(message, where=where, allowed=", ".join(allowed), hint=hint)
+        hint = suggest(str(path[-1]), allowed) or _elsewhere(model, str(path[-1]))
+        return ConfigError(f"unknown key {name!r}", where=where, allowed=", ".join(allowed), hint=hint)
     if detail["type"] == "missing":
         return ConfigError(f"{name} is missing", where=where, hint=f"--set {name.removeprefix('task.')}=VALUE")
     text = detail["msg"].removeprefix("Value error, ")
@@ -142,6 +142,13 @@ def suggest(key: str, allowed: Iterable[str]) -> str | None:
     """A hint at the allowed name that an unknown one is most like, if any is."""
     close = difflib.get_close_matches(key, list(allowed), n=1)
     return f"did you mean {close[0]!r}?" if close else None
+
+
+def _elsewhere(model: type[BaseModel], key: str) -> str | None:
+    """A hint at the section of a model that has a key which was given outside of it, if one has."""
+    sections = {name: _nested_model(info.annotation) for name, info in model.model_fields.items()}
+    found = [f"{name}.{key}" for name, nested in sections.items() if nested and key in nested.model_fields]
+    return f"did you mean {found[0]!r}?" if found else None
 
 
 def _short(value: Any, limit: int = 60) -> str:
