@@ -13,7 +13,9 @@ from __future__ import annotations
 
 import math
 import statistics
+import sys
 import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -91,7 +93,10 @@ def curves(run_folder: Path, layout: str, sensors: int, rays: Sequence[int], see
         lay_out=layouts,
         without_visibility=lambda: twin_without_visibility(design, run, layouts),
     )
+    started = time.perf_counter()
     rows = evaluate(request).rows
+    seconds = time.perf_counter() - started
+    print(f"{layout}, fit with seed {seed}: evaluated in {seconds:.0f} s", file=sys.stderr)
     return _curve(rows, AWARE), _curve(rows, TWIN_NAME)
 
 

@@ -165,11 +165,11 @@ def test_a_warehouse_without_an_eighth_of_the_bandwidth_falls_short(script):
 
 
 def test_positions_between_are_held_against_the_worst_of_the_papers(script):
-    paper = [[0.0, 1.0, 2.0, 0.5, 20.0], [1.2, 1.0, 3.0, 0.5, 10.0]]
+    paper = [[0.0, 0.5, 2.0, 0.8, 20.0], [1.2, 0.5, 3.0, 0.7, 10.0]]
     said = script("warehouse").position_verdict
-    assert said([*paper, [0.37, 1.0, 2.0, 0.5, 20.0]]).startswith("holds")
-    assert said([*paper, [0.37, 1.0, 1.9, 0.5, 20.0]]).startswith("does not hold")
-    assert said([*paper, [0.37, 1.0, math.nan, 0.5, 20.0]]).startswith("does not hold")
+    assert said([*paper, [0.37, 0.5, 0.1, 0.8, 20.0]]).startswith("holds")
+    assert said([*paper, [0.37, 0.5, 2.0, 0.81, 20.0]]).startswith("does not hold")
+    assert said([*paper, [0.37, 0.5, 2.0, math.nan, 20.0]]).startswith("does not hold")
 
 
 def run_script(name, tmp_path, *words):
