@@ -41,6 +41,7 @@ EXAMPLES = {
     fit: (
         "lidardesign fit runs/face --sensors 4 --name free",
         "lidardesign fit runs/face --layout scan --rays 576 --name beams",
+        "lidardesign fit runs/warehouse --rays 12 --at x_m=0.37 --name here",
     ),
     constrain: (
         "lidardesign constrain runs/face --set gate.width_m.max=0.1 --set sensors.count=6 --name tight",
@@ -49,12 +50,16 @@ EXAMPLES = {
     evaluate: (
         "lidardesign evaluate runs/face --report report.html",
         "lidardesign evaluate runs/face/designs/free.yaml --rays 100 --rays 576 --fail-above 8",
+        "lidardesign evaluate runs/arm --baseline occupancy --baseline no-visibility",
     ),
     export: (
         "lidardesign export runs/face/designs/free.yaml --format csv --rays 576 --out rays.csv",
         "lidardesign export --list",
     ),
-    show: ("lidardesign show runs/face/designs/free.yaml",),
+    show: (
+        "lidardesign show runs/face/designs/free.yaml",
+        "lidardesign show runs/warehouse/designs/track.yaml --at x_m=3.91",
+    ),
 }
 for subcommand, examples in EXAMPLES.items():
     app.command(context_settings=SETTINGS, epilog="\n\n".join(("Examples:", *examples)))(subcommand)

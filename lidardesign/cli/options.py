@@ -30,13 +30,19 @@ At = Annotated[
     typer.Option(
         "--at",
         metavar="NAME=VALUE",
-        help="A condition of the density, as x_m=0.37: exact, no window; repeatable.",
+        help="Value of a condition, as the robot's position x_m=0.37; exact, no window. Repeatable.",
         show_default=False,
     ),
 ]
 RayCount = Annotated[
     int | None,
-    typer.Option("--rays", metavar="N", min=1, help="Rays per frame, over all sensors.", show_default="left open"),
+    typer.Option(
+        "--rays",
+        metavar="N",
+        min=1,
+        help="Rays per frame, over all sensors.",
+        show_default="left open, or the task's most",
+    ),
 ]
 Level = Annotated[
     float | None,
@@ -52,8 +58,8 @@ Gates = Annotated[
     typer.Option(
         "--gates",
         metavar="sensor|ray",
-        help="One gate per sensor, or one per ray; per ray where rays start across their sensor's origins.",
-        show_default=False,
+        help="One gate per sensor, or one per ray.",
+        show_default="sensor; ray in the layout distributed",
     ),
 ]
 Sensors = Annotated[
@@ -61,7 +67,7 @@ Sensors = Annotated[
     typer.Option(
         "--sensors",
         metavar="N|auto",
-        help="Number of sensors; auto: by held-out likelihood.",
+        help="Number of sensors (a scan has one per ray); auto: by held-out likelihood.",
         show_default="the task's",
     ),
 ]
