@@ -171,7 +171,7 @@ def main() -> None:
         "layout", "rays", "m", "twin m", "tracked", "twin tracked", "Mbit/s", "twin Mbit/s", "twin's rays", "factor",
     ]  # fmt: skip
     report(
-        f"Knowing about occlusion: medians over {options.rounds} fits",
+        f"Knowing about occlusion: medians, fits per layout: {options.rounds}",
         {"Frechet distance of designs and their twins without visibility": (columns, rows)},
         lines,
         options.json,
