@@ -1,4 +1,4 @@
-"""Proposals from the shell around surfaces: weighted to p* they agree with brute force, the rim included."""
+"""Proposals around surfaces, in and from their shell: weighted to p* they agree with brute force, rim included."""
 
 from __future__ import annotations
 
@@ -57,12 +57,12 @@ FUNCTIONS = (on_the_rim, lambda p: p[:, 5], lambda p: p[:, 4], lambda p: np.abs(
 @pytest.mark.parametrize("body", [ball, mesh_ball], ids=["primitive", "mesh"])
 @pytest.mark.parametrize("measure", ["solid_angle", "angles"])
 @pytest.mark.parametrize("visibility", ["off", "raycast"])
-def test_weighted_shell_proposals_have_the_moments_of_the_target(body, measure, visibility, tmp_path, monkeypatch):
+def test_weighted_proposals_have_the_moments_of_the_target(body, measure, visibility, tmp_path, monkeypatch):
     monkeypatch.setenv("LIDARDESIGN_CACHE", str(tmp_path))
     space, scenes = open_space(measure), [Scene((body(),))]
     target = build_target(scenes, space, DensitySettings(sigma_m=SIGMA), visibility)
     generator = np.random.default_rng(1)
-    points, log_density = shell_proposals(target.field, scenes, space, 20_000, SIGMA, generator)
+    points, log_density = independent_points(target, scenes, 20_000, generator)
     assert space.contains(points).all()
     found, error = weighted_means(points, target.log_density(points) - log_density, FUNCTIONS)
     brute = space.sample(200_000, generator)
@@ -74,7 +74,7 @@ def test_weighted_shell_proposals_have_the_moments_of_the_target(body, measure, 
 
 
 def test_weights_of_shell_proposals_are_bounded():
-    space, scenes = open_space(), [Scene((ball(),))]
+    space, scenes = open_space(), [Scene((mesh_ball(),))]
     target = build_target(scenes, space, DensitySettings(sigma_m=SIGMA), "off")
     points, log_density = shell_proposals(target.field, scenes, space, 5_000, SIGMA, np.random.default_rng(2))
     log_weights = target.log_density(points) - log_density
@@ -98,19 +98,18 @@ def test_with_a_fixed_angle_points_are_resampled_by_proximity():
 
 def test_a_space_that_reaches_no_surface_gives_no_proposals():
     away = DesignSpace((0, 0, 0, math.pi - 0.1, -0.1, 0.1), (0, 0, 0, math.pi + 0.1, 0.1, 0.5))
-    target = build_target([Scene((ball(),))], away, DensitySettings(sigma_m=SIGMA), "off")
-    points, _ = shell_proposals(target.field, [Scene((ball(),))], away, 500, SIGMA, np.random.default_rng(4))
-    assert len(points) == 0
+    for body in (ball(), mesh_ball()):
+        target = build_target([Scene((body,))], away, DensitySettings(sigma_m=SIGMA), "off")
+        assert len(independent_points(target, [Scene((body,))], 500, np.random.default_rng(4))[0]) == 0
     flat = DesignSpace((0, 0, 0, math.pi - 0.1, 0.0, 0.1), (0, 0, 0, math.pi + 0.1, 0.0, 0.5))
     target = build_target([Scene((ball(),))], flat, DensitySettings(sigma_m=SIGMA), "off")
     assert len(independent_points(target, [Scene((ball(),))], 500, np.random.default_rng(5))[0]) == 0
 
 
-def test_the_same_seed_gives_the_same_proposals():
-    space, scenes = open_space(), [Scene((ball(),))]
+@pytest.mark.parametrize("body", [ball, mesh_ball], ids=["primitive", "mesh"])
+def test_the_same_seed_gives_the_same_proposals(body):
+    space, scenes = open_space(), [Scene((body(),))]
     target = build_target(scenes, space, DensitySettings(sigma_m=SIGMA), "off")
-    first, second = (
-        shell_proposals(target.field, scenes, space, 100, SIGMA, np.random.default_rng(6))[0] for _ in range(2)
-    )
+    first, second = (independent_points(target, scenes, 100, np.random.default_rng(6))[0] for _ in range(2))
     assert first.tobytes() == second.tobytes()
     assert np.ptp(first[:, AZIMUTH]) > 0
