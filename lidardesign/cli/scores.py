@@ -38,7 +38,8 @@ def _show_rows(rows: Sequence[Entry], title: str, rich: RichConsole) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left")
+    rich.print(f"[italic]{title}[/italic]", soft_wrap=True)
+    table = Table()
     detail = next((name for row in rows for name in row["details"]), None)
     further = [] if detail is None else [escape(detail.replace("_", " "))]
     for heading in ("design", "rays", "value", "95 % interval", "failures", *further, "Mbit/s", "seconds"):
@@ -69,7 +70,9 @@ def _show_grid(
     lines: dict[tuple[Any, ...], dict[str, str]] = {}
     for entry in entries:
         lines.setdefault(tuple(entry[key] for key in keys), {})[entry[column]] = cell(entry)
-    table = Table("design", title=title, title_justify="left")
+    # a table's own title would wrap at the table's width
+    rich.print(f"[italic]{title}[/italic]", soft_wrap=True)
+    table = Table("design")
     for heading in ("rays", *columns):
         table.add_column(escape(heading), justify="right")
     for (name, rays), cells in lines.items():
