@@ -41,7 +41,8 @@ def central_intervals(
             continue
         share = (np.cumsum(weights[part]) - weights[part] / 2) / mass
         ends[cell] = np.interp([(1 - level) / 2, (1 + level) / 2], share, values[part])
-        effective[cell] = mass**2 / np.square(weights[part]).sum()
+        # shares first: squares of weights below 1e-160 are zero
+        effective[cell] = 1 / np.square(weights[part] / mass).sum()
     return ends, effective
 
 
