@@ -89,7 +89,7 @@ def main() -> None:
     made.add_argument("--preset", default="standard", help="what is learned (default %(default)s)")
     made.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="passed to learn; repeatable")
     made.add_argument("--sensors", type=int, nargs="+", default=[2, 4, 10])
-    made.add_argument("--layout", default="grid", choices=["grid", "density", "scan"])
+    made.add_argument("--layout", default="grid", choices=["grid", "density", "distributed"])
     made.add_argument("--rays", type=int, nargs="+", default=[36, 100, 196, 361, 576])
     options = made.parse_args()
     with tempfile.TemporaryDirectory() as folder:
