@@ -94,7 +94,7 @@ def distributed_beams(design: Design, shares: np.ndarray, samples: Samples | Non
 
 def _space_of(design: Design) -> DesignSpace:
     """The box in which a design may lay out rays when only its file is known: where its own rays start."""
-    table = design.ray_table
+    table = design.ray_table if design.ray_table is not None and len(design.ray_table.sensor) else None
     origins = np.stack([s.origin_m for s in design.sensors]) if table is None else table.origin_m
     low, high = origins.min(axis=0), origins.max(axis=0)
     if table is None:

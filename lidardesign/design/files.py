@@ -291,7 +291,14 @@ def _check_travel(node: Node, sensor: Sensor) -> None:
             hint="remove travel_m; it follows from the covariance",
         )
     if "direction" in keys:
-        keys["direction"].numbers(3)
+        along = keys["direction"].numbers(3)
+        length, variance = np.linalg.norm(along), np.linalg.eigvalsh(sensor.origin_covariance_m2)[-1]
+        reached = along @ sensor.origin_covariance_m2 @ along / length**2 if length > 0 else 0.0
+        if abs(reached - variance) > AGREEMENT * variance:
+            raise keys["direction"].error(
+                "is not the direction in which the origin's covariance is longest",
+                hint="remove travel_m; it follows from the covariance",
+            )
 
 
 def _origin(node: Node) -> tuple[np.ndarray, np.ndarray]:

@@ -69,6 +69,8 @@ def kept_gates(wanted: np.ndarray, sensor: Sensor, bounds: Bounds) -> np.ndarray
     broken = (wanted[:, 0] > bounds.start_high) | (wanted[:, 1] < bounds.end_low) | (width < bounds.width_low)
     if not broken.any():
         return wanted
+    if end <= start:
+        return np.tile([start, end], (len(wanted), 1))
     inner = replace(bounds, start_low=np.full(len(wanted), start), end_high=np.full(len(wanted), end))
     centre, spread = admissible_gates(wanted, inner)
     half = bounds.interval * spread
