@@ -1,8 +1,9 @@
 """What knowing about occlusion is worth: designs and their twins `no-visibility` over numbers of rays, on the arm.
 
 A twin is the same design fitted to the density without its occlusion term, exactly as `evaluate --baseline
-no-visibility` makes it. Two layouts: distributed, whose rays start across the ceiling, and density, whose rays start
-from a few points. The factor says how many times more rays the twin needs for the same Frechet distance, interpolated
+no-visibility` makes it. Three kinds of design: distributed, whose rays start across the ceiling; density, whose rays
+start from a few points, the means of its components' origins; and mounted, whose four sensors take the best of 25 even
+mounting points. The factor says how many times more rays the twin needs for the same Frechet distance, interpolated
 between its numbers of rays on logarithmic scales; where it starts below or never gets there, the factor is a bound.
 
     python benchmarks/occlusion.py                                 # the default set-up
@@ -25,7 +26,8 @@ from common import learned, parser, report, robot_option, robot_settings, run_op
 
 CLAIMED_FACTOR = 2.0
 HORIZON = {"elevation_max_deg": 0}
-SENSORS = {"distributed": 8, "density": 4}
+SENSORS = {"distributed": 8, "density": 4, "mounted": 4}
+MOUNTS_M = [[x, y, 1.0] for x in (-0.8, -0.4, 0.0, 0.4, 0.8) for y in (-0.8, -0.4, 0.0, 0.4, 0.8)]
 AWARE = "aware"
 
 
@@ -67,6 +69,7 @@ def curves(run_folder: Path, layout: str, sensors: int, rays: Sequence[int], see
     """Of a design fitted with a seed, and of its twin."""
     from lidardesign.cli.layouts import TWIN_NAME, layouts_of, twin_without_visibility
     from lidardesign.cli.runs import open_run
+    from lidardesign.design.constraints import Constraints
     from lidardesign.design.fit import fit
     from lidardesign.design.samples import load_samples
     from lidardesign.evaluate.score import EvaluationRequest, evaluate
@@ -75,9 +78,20 @@ def curves(run_folder: Path, layout: str, sensors: int, rays: Sequence[int], see
     config, samples = run.config, load_samples(run.folder)
     level = run.task.defaults.level
     most = max(rays)
-    design = fit(samples, sensors=sensors, layout=layout, rays=most, level=level, seed=seed, name=AWARE).design
-    design = replace(design, provenance={**design.provenance, "seed": seed})
     layouts = layouts_of([(AWARE, run)])
+    mounted = layout == "mounted"
+    design = fit(
+        samples,
+        sensors=sensors,
+        layout="density" if mounted else layout,
+        rays=most,
+        constraints=Constraints.from_mapping({"origin": {"mounts_m": MOUNTS_M}} if mounted else {}),
+        level=level,
+        seed=seed,
+        name=AWARE,
+        retarget=layouts.targets[AWARE],
+    ).design
+    design = replace(design, provenance={**design.provenance, "seed": seed})
     request = EvaluationRequest(
         task=run.task,
         config=config.task,
@@ -152,7 +166,7 @@ def main() -> None:
     robot_option(made)
     run_options(made)
     made.add_argument("--horizon", action="store_true", help="rays as flat as the horizon, not 60 degrees below")
-    made.add_argument("--layout", action="append", choices=list(SENSORS), help="repeatable (default both)")
+    made.add_argument("--layout", action="append", choices=list(SENSORS), help="repeatable (default all)")
     made.add_argument("--rays", type=int, nargs="+", default=[100, 200, 300, 400, 600, 800, 1200, 1600])
     made.add_argument("--further-rays", type=int, nargs="*", default=[2400, 3200], help="of the twin's curve alone")
     options = made.parse_args()

@@ -14,7 +14,7 @@ QUICK = ("learning.samples=10000", "learning.coverage_proposals=1024")
 SETTINGS = {
     "arm": (*QUICK, "learning.steps=50"),
     # a blurred shelf is learned at once
-    "warehouse": (*QUICK, "learning.steps=60", "density.sigma_m=0.1"),
+    "warehouse": (*QUICK, "learning.steps=150", "density.sigma_m=0.1"),
 }
 
 

@@ -21,8 +21,9 @@ from lidardesign.density.visibility import Optics, RayBatch, RayGradient
 from lidardesign.scene import Scene
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction, observed_point
 
-# Points at a time: their pairs, some hundred each, then stay within some 100 MB.
+# Points at a time, fewer where there are more columns: should all of these matter, their pairs still fit in 300 MB.
 ROWS_AT_ONCE = 2048
+PAIRS_AT_ONCE = 2**22
 # Room for pairs is not touched before it is used; too little of it costs a second pass.
 PAIRS_PER_ROW = 1024
 
@@ -42,7 +43,7 @@ class FramesTarget(Target):
     @property
     def rows_at_once(self) -> int:
         """See `Target`."""
-        return ROWS_AT_ONCE
+        return int(np.clip(PAIRS_AT_ONCE // self.field.columns, 64, ROWS_AT_ONCE))
 
     def drawn(self, columns: np.ndarray) -> FramesTarget:
         """See `Target`: an estimate of p* from some columns alone, weighted to stand for all of them."""
@@ -58,8 +59,8 @@ class FramesTarget(Target):
         """log of the sum of surface terms at the scene points that design points (N, 6) observe, shape (N,)."""
         sigma_m = self.optics.sigma_m if sigma_m is None else sigma_m
         observed, values = observed_point(points), np.empty(len(points))
-        for start in range(0, len(points), ROWS_AT_ONCE):
-            rows = slice(start, min(start + ROWS_AT_ONCE, len(points)))
+        for start in range(0, len(points), self.rows_at_once):
+            rows = slice(start, min(start + self.rows_at_once, len(points)))
             pairs = self._pairs(observed[rows], sigma_m)
             surface = self.log_column_weights[pairs.columns] - np.square(pairs.distances / sigma_m) / 2
             values[rows] = row_log_sums(surface, pairs)[0]

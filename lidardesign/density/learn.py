@@ -110,7 +110,7 @@ def learn(
     # float32 steps train as well and 2.4 times faster, but float32 splines give wrong densities: measure in float64
     trainer.flow.double()
     clock.lap("learning")
-    samples, figures = _measure(trainer, scenes, config)
+    samples, figures = _measure(trainer, scenes, config, notes)
     clock.lap("measuring")
     if trainer.skipped:
         notes.append(f"{trainer.skipped} steps were not finite and skipped")
@@ -216,19 +216,21 @@ def log_density_of(trainer: Trainer, points: np.ndarray) -> np.ndarray:
     return log_prob + coordinates.log_condition_density - coordinates.log_unit_volume
 
 
-def _measure(trainer: Trainer, scenes: Sequence[Scene], config: RunConfig) -> tuple[Samples, dict[str, float]]:
+def _measure(
+    trainer: Trainer, scenes: Sequence[Scene], config: RunConfig, notes: list[str]
+) -> tuple[Samples, dict[str, float]]:
     samples = draw_samples(trainer, config.learning.samples)
     groups = _condition_groups(config.space, samples.points)
     found = quality(samples.log_prob, samples.log_target, groups)
     count = config.learning.coverage_proposals
     generator = random_generator(config.seed, "coverage")
     points, log_density = independent_points(trainer.target, scenes, count, generator)
-    covered = coverage(
-        log_density_of(trainer, points),
-        trainer.target.log_density(points),
-        log_density,
-        _log_z_at(points, samples, groups, found.log_z),
-    )
+    covered = 0.0
+    if len(points):
+        log_z = _log_z_at(points, samples, groups, found.log_z)
+        covered = coverage(log_density_of(trainer, points), trainer.target.log_density(points), log_density, log_z)
+    else:
+        notes.append("coverage could not be measured and counts as 0: no independently drawn ray fits in the space")
     return samples, {"ess": found.ess, "kl_nats": found.kl_nats, "log_z": found.log_z, "coverage": covered}
 
 

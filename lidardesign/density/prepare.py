@@ -15,6 +15,7 @@ from lidardesign.task import random_generator
 
 PROBES = 4096
 OCCLUDED_SHARE_TO_CARE = 1e-3
+HIDDEN_SHARE_TO_WARN = 0.99
 
 
 def prepare_target(
@@ -51,7 +52,10 @@ def _choose_visibility(scenes: Sequence[Scene], config: RunConfig) -> tuple[str,
     share = occluded_share(scenes, proposals, optics.margin_m + 3 * optics.sigma_m)
     if share < OCCLUDED_SHARE_TO_CARE:
         return "off", f"visibility off: of {len(proposals.points)} probed rays {share:.2%} had anything in the way"
-    return "raycast", f"visibility by ray casting: {share:.1%} of {len(proposals.points)} probed rays were occluded"
+    reason = f"visibility by ray casting: {share:.1%} of {len(proposals.points)} probed rays were occluded"
+    if share > HIDDEN_SHARE_TO_WARN:
+        reason += "; hardly anything is ever visible: check the occluders' places and the bodies' roles"
+    return "raycast", reason
 
 
 def _refine_quadrature(target: Target, scenes: Sequence[Scene], config: RunConfig) -> tuple[Target, list[str]]:

@@ -39,6 +39,8 @@ from lidardesign.task import random_generator
 
 # More moves of the cells change their mean squared error by less than a percent.
 LLOYD_ITERATIONS = 15
+# A ray's cell of fewer samples has no shape; cells beyond that also cost more time than anybody waits.
+FEWEST_PER_RAY = 4
 
 
 def fit_scan(
@@ -62,9 +64,16 @@ def fit_scan(
         seed: Root of the quantisation's stream.
 
     Raises:
-        ConfigError: No number of rays is known.
+        ConfigError: No number of rays is known, or more are asked for than the samples can tell apart.
     """
     count = rays_of(read_out)
+    if count * FEWEST_PER_RAY > len(features):
+        raise ConfigError(
+            f"{count} rays from {len(features)} samples",
+            where="--layout scan",
+            allowed=f"at most {len(features) // FEWEST_PER_RAY} rays",
+            hint="learn with more samples (learning.samples)",
+        )
     everyone = Group(group.pins, tuple(range(count)))
     bounds = bounds_of(constraints, space, everyone.sensors, interval_factor(level))
     generator = random_generator(seed, "scan")

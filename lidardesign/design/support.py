@@ -182,6 +182,9 @@ def check_support(support: Support, group: Group, *, mass: float | None, several
     """
     needed = max(LEAST_SAMPLES, LEAST_SAMPLES_PER_SENSOR * len(group.sensors))
     which = f"sensors {', '.join(map(str, group.sensors))}" if several else "the sensors"
+    if any(pin is not None for pin in group.pins):
+        place = ", ".join("free" if pin is None else f"{pin:g}" for pin in group.pins)
+        which += f" at ({place}) m"
     if mass is not None and mass < LEAST_MASS:
         raise InfeasibleError(
             f"the constraints of {which} hold {mass:.3g} of the density",
