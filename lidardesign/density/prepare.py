@@ -49,6 +49,8 @@ def _choose_visibility(scenes: Sequence[Scene], config: RunConfig) -> tuple[str,
     generator = random_generator(config.seed, "visibility")
     optics = Optics.of(config.density)
     proposals = propose(scenes, config.space, PROBES, optics.sigma_m, generator)
+    if not len(proposals.points):
+        return "raycast", "visibility by ray casting, to be safe: no probed ray of the space meets a target"
     share = occluded_share(scenes, proposals, optics.margin_m + 3 * optics.sigma_m)
     if share < OCCLUDED_SHARE_TO_CARE:
         return "off", f"visibility off: of {len(proposals.points)} probed rays {share:.2%} had anything in the way"
