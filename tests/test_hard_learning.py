@@ -67,3 +67,24 @@ def test_one_frame_per_step_is_enough_to_learn_something_finite(lidardesign):
     result = learn(lidardesign, "one", "--set", "learning.frames=1", "--set", "learning.dtype=float64")
     assert result.code == 0, result.err
     assert 0 < result.json["ess"] <= 1
+
+
+def test_a_space_too_narrow_for_any_ray_is_refused_before_learning(lidardesign):
+    done = learn(lidardesign, "run", "--set", "elevation_max_deg=-89.9")
+    assert done.code == 3
+    assert "no ray of the design space" in done.json["error"]["message"]
+
+
+def test_coverage_that_cannot_be_measured_counts_as_none_and_is_said(lidardesign, monkeypatch):
+    draw, calls = density_learn.independent_points, []
+
+    def second_draw_is_empty(*arguments):
+        calls.append(1)
+        points, log_density = draw(*arguments)
+        return (points, log_density) if len(calls) == 1 else (points[:0], log_density[:0])
+
+    monkeypatch.setattr(density_learn, "independent_points", second_draw_is_empty)
+    done = learn(lidardesign, "run", "--set", "learning.steps=3")
+    assert done.code == 0
+    assert done.json["coverage"] == 0
+    assert any("coverage could not be measured" in note for note in done.json["notes"])
