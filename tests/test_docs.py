@@ -41,8 +41,8 @@ def test_the_constraint_file_is_accepted():
 def test_the_mounts_of_the_ceiling_are_accepted():
     text = next(block for block in blocks("yaml") if "ceiling.yaml" in block)
     constraints = Constraints.from_mapping(parse_yaml(text, where="README").value)
-    assert len(constraints.origin.mounts_m or ()) == 4
-    assert constraints.sensors.count == 2
+    assert len(constraints.origin.mounts_m or ()) == 9
+    assert constraints.sensors.count == 4
 
 
 def test_the_mounts_that_a_comment_shows_are_accepted():
