@@ -19,7 +19,7 @@ from lidardesign.density.settings import DensitySettings
 from lidardesign.density.target import Target
 from lidardesign.density.visibility import Optics, RayBatch, RayGradient
 from lidardesign.scene import Scene
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction, observed_point
+from lidardesign.space import DesignSpace, observed_point
 
 # Points at a time, fewer where there are more columns: should all of these matter, their pairs still fit in 300 MB.
 ROWS_AT_ONCE = 2048
@@ -70,12 +70,8 @@ class FramesTarget(Target):
         return near_pairs(self.field, observed, self.log_column_weights, sigma_m, self.surface_tolerance_nats)
 
     def _evaluate(self, points: np.ndarray, optics: Optics, gradient: bool) -> tuple[np.ndarray, np.ndarray | None]:
-        rays = RayBatch(
-            np.ascontiguousarray(points[:, :3]),
-            direction(points[:, AZIMUTH], points[:, ELEVATION]),
-            np.ascontiguousarray(points[:, RANGE]),
-        )
-        observed = rays.origins + rays.ranges[:, None] * rays.directions
+        rays = RayBatch.of(points)
+        observed = rays.observed
         pairs = self._pairs(observed, optics.sigma_m)
         surface = self.log_column_weights[pairs.columns] - np.square(pairs.distances / optics.sigma_m) / 2
         passed = self.visibility.blocked(rays, pairs, optics)
@@ -85,9 +81,7 @@ class FramesTarget(Target):
         by_point = self._surface_gradient(observed, pairs, -shares * pairs.distances / optics.sigma_m**2)
         by_ray = RayGradient.zeros(len(points))
         passed.add_gradient(shares, by_ray)
-        by_ray.origins += by_point
-        by_ray.directions += rays.ranges[:, None] * by_point
-        by_ray.ranges += np.einsum("nk,nk->n", by_point, rays.directions)
+        by_ray.add_by_point(by_point, rays)
         return values, self._by_chart(points, by_ray)
 
     def _surface_gradient(self, observed: np.ndarray, pairs: Pairs, weights: np.ndarray) -> np.ndarray:

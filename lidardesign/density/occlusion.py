@@ -108,11 +108,11 @@ class BodyRaycast:
 
     def first_hits(self, rays: RayBatch, pairs: Pairs, limit_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Ranges of first hits before a limit, infinite without one (P,), and normals facing the origin (P, 3)."""
-        from lidardesign.density import body_kernels
+        from lidardesign.density import hit_kernels
 
         bodies, count = self.bodies, len(pairs.columns)
         hits, normals = np.empty(count), np.zeros((count, 3))
-        body_kernels.first_hits(
+        hit_kernels.first_hits(
             bodies.kinds, bodies.sizes, bodies.to_body, bodies.low, bodies.high, bodies.starts,
             pairs.row_starts, pairs.columns, rays.origins, rays.directions, limit_m, hits, normals,
         )  # fmt: skip
@@ -144,12 +144,12 @@ class BodyRaycast:
     def _candidates(
         self, rays: RayBatch, pairs: Pairs, limit_m: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        from lidardesign.density import body_kernels
+        from lidardesign.density import hit_kernels
 
         bodies, room = self.bodies, max(len(pairs.columns), 1)
         while True:
             rows, chosen, body = (np.empty(room, dtype=np.int64) for _ in range(3))
-            count = body_kernels.mesh_candidates(
+            count = hit_kernels.mesh_candidates(
                 bodies.kinds, bodies.to_body, bodies.grid, *bodies.mesh_bounds, bodies.low, bodies.high, bodies.starts,
                 pairs.row_starts, pairs.columns, rays.origins, rays.directions, limit_m, rows, chosen, body,
             )  # fmt: skip

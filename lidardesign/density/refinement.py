@@ -10,7 +10,7 @@ import numpy as np
 from lidardesign.density.target import Target
 from lidardesign.density.visibility import Quadrature, RayBatch, Raycast
 from lidardesign.scene import Scene
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction
+from lidardesign.space import RANGE
 
 MAXIMUM_POINTS = 1024
 # The share of probed rays that quadrature may see through although ray casting finds them opaque.
@@ -20,7 +20,7 @@ OPAQUE, TRANSPARENT = 0.01, 0.1
 
 def refine_quadrature(target: Target, scenes: Sequence[Scene], probes: np.ndarray) -> tuple[Target, list[str]]:
     """The target with enough midpoints that probes (N, 6) hidden by an occluder are hidden, and notes about it."""
-    rays = RayBatch(probes[:, :3], direction(probes[:, AZIMUTH], probes[:, ELEVATION]), probes[:, RANGE])
+    rays = RayBatch.of(probes)
     active = np.ones((len(probes), target.field.columns), dtype=bool)
     exact = Raycast(scenes).transmittance(rays, active, target.optics, differentiable=False).log_values
     hidden = exact < np.log(OPAQUE)

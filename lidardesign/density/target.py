@@ -28,7 +28,7 @@ from lidardesign.density.visibility import (
 from lidardesign.errors import ConfigError, NumericalError
 from lidardesign.numerics import logsumexp
 from lidardesign.scene import Mesh, Scene
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction, observed_point
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, observed_point
 
 PADDING_SIGMAS = 4.0
 MOST_QUADRATURE_BODIES = 2000
@@ -102,12 +102,8 @@ class Target:
         return values, gradients
 
     def _evaluate(self, points: np.ndarray, optics: Optics, gradient: bool) -> tuple[np.ndarray, np.ndarray | None]:
-        rays = RayBatch(
-            np.ascontiguousarray(points[:, :3]),
-            direction(points[:, AZIMUTH], points[:, ELEVATION]),
-            np.ascontiguousarray(points[:, RANGE]),
-        )
-        observed = rays.origins + rays.ranges[:, None] * rays.directions
+        rays = RayBatch.of(points)
+        observed = rays.observed
         distances = self.field.distances(observed).astype(np.float64)
         surface = self.log_column_weights - np.square(distances / optics.sigma_m) / 2
         active = surface >= surface.max(axis=1, keepdims=True) - self.surface_tolerance_nats
@@ -122,9 +118,7 @@ class Target:
         shares /= total
         by_point = self.field.gradient(observed, -shares * distances / optics.sigma_m**2)
         by_ray = passed.gradient(shares)
-        by_ray.origins += by_point
-        by_ray.directions += rays.ranges[:, None] * by_point
-        by_ray.ranges += np.einsum("nk,nk->n", by_point, rays.directions)
+        by_ray.add_by_point(by_point, rays)
         return values, self._by_chart(points, by_ray)
 
     def _by_chart(self, points: np.ndarray, by_ray: RayGradient) -> np.ndarray:

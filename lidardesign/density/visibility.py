@@ -18,6 +18,7 @@ from lidardesign.density.fields import Field, TableField, scene_columns
 from lidardesign.density.settings import DensitySettings
 from lidardesign.scene import Scene
 from lidardesign.simulate.raycast import shared_caster
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction
 
 # A grazing hit moves without bound when its ray turns; its derivative is capped at this cosine.
 MINIMUM_COSINE = 0.05
@@ -78,6 +79,17 @@ class RayBatch:
     directions: np.ndarray
     ranges: np.ndarray
 
+    @classmethod
+    def of(cls, points: np.ndarray) -> RayBatch:
+        """The rays of design points, (N, 6)."""
+        directions = direction(points[:, AZIMUTH], points[:, ELEVATION])
+        return cls(np.ascontiguousarray(points[:, :3]), directions, np.ascontiguousarray(points[:, RANGE]))
+
+    @property
+    def observed(self) -> np.ndarray:
+        """The scene points that they listen at, shape (N, 3)."""
+        return self.origins + self.ranges[:, None] * self.directions
+
 
 @dataclass(eq=False)
 class RayGradient:
@@ -91,6 +103,12 @@ class RayGradient:
     def zeros(cls, count: int) -> RayGradient:
         """All zero, for `count` rays."""
         return cls(np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count))
+
+    def add_by_point(self, by_point: np.ndarray, rays: RayBatch) -> None:
+        """Add the derivatives by the observed scene points, shape (N, 3)."""
+        self.origins += by_point
+        self.directions += rays.ranges[:, None] * by_point
+        self.ranges += np.einsum("nk,nk->n", by_point, rays.directions)
 
 
 class Transmittance(Protocol):
