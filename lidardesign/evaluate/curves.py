@@ -59,7 +59,7 @@ def _styled(name: str, rows: tuple[Row, ...], index: int) -> Series:
 
 
 def position(row: Row, against: Against) -> float:
-    """Where a row stands on the horizontal axis: rays per frame, or Mbit/s."""
+    """Where a row stands on the horizontal axis: rays per frame or position, or Mbit/s."""
     return float(row.rays) if against == "rays" else row.bandwidth_mbps
 
 
@@ -72,5 +72,5 @@ def logarithmic(values: Sequence[float]) -> bool:
 def axis_titles(evaluation: Evaluation, against: Against) -> tuple[str, str]:
     """Titles of the horizontal and the vertical axis, with their units."""
     metric = evaluation.metric
-    across = "rays per frame" if against == "rays" else "bandwidth [Mbit/s]"
+    across = "rays" if against == "rays" else "bandwidth [Mbit/s]"
     return across, f"{metric.name} [{metric.unit}], {metric.better} is better"
