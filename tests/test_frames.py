@@ -208,10 +208,9 @@ def test_a_quadrature_over_thousands_of_bodies_is_refused():
         build_target(moving_scenes(frames=300), CEILING, SETTINGS, "quadrature")
 
 
-def test_a_frame_costs_a_pose_and_no_grid():
+def test_a_frame_costs_a_pose_and_no_grid_even_where_scenes_have_copies_of_a_mesh():
     generator = np.random.default_rng(0)
-    mesh = cube(generator)
-    scene = Scene((Body(mesh, "part", "target", tracks(generator, 500)),))
-    bodies = collect_bodies([scene], lambda body: True, resolution=16, padding_m=0.05)
+    scenes = [Scene((Body(cube(generator), "part", "target", tracks(generator, 250)),)) for _ in range(2)]
+    bodies = collect_bodies(scenes, lambda body: True, resolution=16, padding_m=0.05)
     assert bodies.columns == 500
     assert len(bodies.grids.meshes) == 1

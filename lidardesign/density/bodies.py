@@ -199,18 +199,18 @@ def size_of(body: Body) -> tuple[float, float, float]:
 
 def _grids(entries: Sequence[Entry], build_grid: BuildGrid) -> tuple[Grids, np.ndarray]:
     """One grid per distinct mesh, and the grid row of every entry."""
-    known: dict[int, int] = {}
+    known: dict[str, int] = {}
     meshes: list[Mesh] = []
     built: list[tuple[Grid, np.ndarray]] = []
     row = np.zeros(len(entries), dtype=np.int64)
     for index, (_, body, _) in enumerate(entries):
         mesh = body.shape
         if isinstance(mesh, Mesh):
-            if id(mesh) not in known:
-                known[id(mesh)] = len(meshes) + 1
+            if mesh.content_hash not in known:
+                known[mesh.content_hash] = len(meshes) + 1
                 meshes.append(mesh)
                 built.append(build_grid(mesh))
-            row[index] = known[id(mesh)]
+            row[index] = known[mesh.content_hash]
     # row 0 is a grid of one empty cell, so that the kernels always have something to index
     values = [np.zeros(8, np.float32), *(distances for _, distances in built)]
     lengths = [len(part) for part in values]
