@@ -7,6 +7,9 @@ import math
 
 import numpy as np
 
+from lidardesign.design.samples import Samples
+from lidardesign.space import DesignSpace
+
 # trilinear interpolation of a smooth distance is off by about h^2 / 4 (measured: 6.3e-4 at h = 1/64 of a unit sphere)
 GRID_ERROR_PER_STEP_SQUARED = 0.5
 # float32 tables carry 1.2e-7 relative rounding, central differences over 1e-4 m turn it into about 1e-3
@@ -121,3 +124,14 @@ def recursive_frechet(first, second):
         return max(apart, min(before)) if before else apart
 
     return leash(len(first) - 1, len(second) - 1)
+
+
+def quarter_turned(samples):
+    """The same world seen from a frame turned by 90 degrees about the vertical."""
+    points = samples.points.copy()
+    points[:, 0], points[:, 1] = -samples.points[:, 1], samples.points[:, 0]
+    points[:, 3] += math.pi / 2
+    low, high = list(samples.space.low), list(samples.space.high)
+    low[0], high[0], low[1], high[1] = -high[1], -low[1], low[0], high[0]
+    low[3], high[3] = low[3] + math.pi / 2, high[3] + math.pi / 2
+    return Samples(points, samples.log_prob, samples.log_target, DesignSpace(tuple(low), tuple(high)))

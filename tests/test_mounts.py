@@ -161,3 +161,10 @@ def test_the_number_of_sensors_is_limited_only_where_all_of_them_are_mounted():
     assert most_mounted(Constraints.from_mapping({"origin": {"mounts_m": MOUNTS}})) == 4
     shared = {"origin": {"mounts_m": MOUNTS}, "each": [{"origin": {"mounts_m": [MOUNTS[0]]}}]}
     assert most_mounted(Constraints.from_mapping(shared)) == 4
+
+
+def test_a_sensor_with_one_mount_keeps_it_though_another_would_see_more_from_there():
+    best, other = MOUNTS[0], MOUNTS[2]
+    each = [{"origin": {"mounts_m": [best, other]}}, {"origin": {"mounts_m": [best]}}]
+    result = fitted(sensors={"count": 2}, each=each)
+    assert [tuple(sensor.origin_m) for sensor in result.design.sensors] == [tuple(other), tuple(best)]

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import references
 
 from lidardesign.design.bounds import Bounds
 from lidardesign.design.check import check_design
@@ -39,24 +40,13 @@ def from_the_ceiling(count=6000, seed=0):
     return Samples(points, np.zeros(len(points)), log_weights, CEILING)
 
 
-def turned(samples):
-    """The same world seen from a frame turned by 90 degrees about the vertical."""
-    points = samples.points.copy()
-    points[:, 0], points[:, 1] = -samples.points[:, 1], samples.points[:, 0]
-    points[:, 3] += math.pi / 2
-    low, high = list(samples.space.low), list(samples.space.high)
-    low[0], high[0], low[1], high[1] = -high[1], -low[1], low[0], high[0]
-    low[3], high[3] = low[3] + math.pi / 2, high[3] + math.pi / 2
-    return Samples(points, samples.log_prob, samples.log_target, DesignSpace(tuple(low), tuple(high)))
-
-
 @pytest.mark.parametrize("layout", ["grid", "density", "distributed", "scan"])
 def test_a_design_turns_with_its_world(layout):
     samples = from_the_ceiling()
     sensors = None if layout == "scan" else 3
     straight, around = (
         fit(one, sensors=sensors, layout=layout, rays=40, em_samples=3000, restarts=2).design
-        for one in (samples, turned(samples))
+        for one in (samples, references.quarter_turned(samples))
     )
     if layout != "scan":
         for one, other in zip(straight.sensors, around.sensors, strict=True):
@@ -83,7 +73,7 @@ def test_what_a_turned_design_returns_in_a_turned_scene_is_the_same():
     samples = from_the_ceiling()
     centre = np.array([0.1, 0.05, 0.3])
     outcomes = []
-    for one, turn in ((samples, np.eye(3)), (turned(samples), QUARTER)):
+    for one, turn in ((samples, np.eye(3)), (references.quarter_turned(samples), QUARTER)):
         design = fit(one, sensors=2, layout="distributed", rays=60, em_samples=2000, restarts=1).design
         scene = Scene((Body(Sphere(0.12), "ball", "target", rigid(translation_m=turn @ centre)),), "ball")
         returns = simulate(scene, lay_out(design))[0]

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import references
 from command_line import caller
 
 from lidardesign.design.constraints import Constraints
@@ -123,16 +124,6 @@ def test_a_moving_mesh_scores_as_the_ball_that_it_is_almost():
     assert rows[1][design.name].value > 3 * rows[1]["uniform"].value
 
 
-def turned_samples(samples):
-    points = samples.points.copy()
-    points[:, 0], points[:, 1] = -samples.points[:, 1], samples.points[:, 0]
-    points[:, 3] += math.pi / 2
-    low, high = list(samples.space.low), list(samples.space.high)
-    low[0], high[0], low[1], high[1] = -high[1], -low[1], low[0], high[0]
-    low[3], high[3] = low[3] + math.pi / 2, high[3] + math.pi / 2
-    return Samples(points, samples.log_prob, samples.log_target, DesignSpace(tuple(low), tuple(high)))
-
-
 def turned_scene(scene):
     return replace(scene, bodies=tuple(replace(body, poses=rigid(QUARTER) @ body.poses) for body in scene.bodies))
 
@@ -140,7 +131,8 @@ def turned_scene(scene):
 @pytest.mark.parametrize("layout", ["grid", "density", "distributed", "scan"])
 def test_rows_of_a_fitted_design_stay_when_the_world_turns_by_a_quarter(layout):
     straight, scenes, rows = from_the_ceiling(), carried(Sphere(RADIUS_M)), []
-    for samples, test in ((straight, scenes), (turned_samples(straight), [turned_scene(scene) for scene in scenes])):
+    turned = references.quarter_turned(straight), [turned_scene(scene) for scene in scenes]
+    for samples, test in ((straight, scenes), turned):
         sensors = None if layout == "scan" else 3
         design = fit(samples, sensors=sensors, layout=layout, rays=40, em_samples=3000, restarts=2).design
         asked = request([design], test, samples.space, rays=(40, 64), samples={design.name: samples})

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from lidardesign.design.constraints import Constraints
 
 Mount = tuple[float, float, float]
@@ -28,25 +30,22 @@ def most_mounted(constraints: Constraints) -> int | None:
     common = mounts_of(constraints, len(constraints.each))
     count = len(constraints.each) + len(common)
     options = [mounts_of(constraints, sensor) for sensor in range(count)]
-    while not matched(options[:count]):
+    while not matched([mounts for mounts in options[:count] if mounts]):
         count -= 1
     return None if not common and count == len(constraints.each) else count
 
 
 def matched(options: Sequence[Sequence[Mount]]) -> bool:
-    """Whether every mounted sensor can have a mount of its own (augmenting paths; H. Kuhn 1955)."""
-    taken: dict[Mount, int] = {}
+    """Whether each of some mounted sensors can have a mount of its own; one without any left cannot."""
+    if not options or not all(options):
+        return not options
+    # loaded here because few constraint files have mounts
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import maximum_bipartite_matching
 
-    def place(sensor: int, tried: set[Mount]) -> bool:
-        for mount in options[sensor]:
-            if mount not in tried:
-                tried.add(mount)
-                if mount not in taken or place(taken[mount], tried):
-                    taken[mount] = sensor
-                    return True
-        return False
-
-    return all(place(sensor, set()) for sensor, mounts in enumerate(options) if mounts)
+    places = sorted({mount for mounts in options for mount in mounts})
+    admitted = np.array([[mount in mounts for mount in places] for mounts in options], dtype=np.int8)
+    return bool((maximum_bipartite_matching(csr_array(admitted), perm_type="column") >= 0).all())
 
 
 def fixed_at(constraints: Constraints, places: Sequence[Mount | None]) -> Constraints:
