@@ -22,6 +22,8 @@ Sign = Literal["auto", "solid", "winding", "unsigned"]
 ROLES = ("target", "occluder", "both")
 # How far a pose's rotation may be from orthogonal: poses are often written with seven digits.
 RIGID_TOLERANCE = 1e-6
+# Shares of light that were meant to add up to 1 may exceed it by rounding.
+SHARE_ROUNDING = 1e-9
 
 
 def _check_lengths(shape: object, *lengths_m: float, low: float = 0.0, strict: bool = True) -> None:
@@ -119,6 +121,83 @@ class Mesh:
 
 
 Shape = Sphere | Box | Capsule | Plane | Mesh
+Vector = tuple[float, float, float]
+
+
+def _check_shares(what: str, **shares: float) -> None:
+    for name, value in shares.items():
+        if not math.isfinite(value) or not 0 <= value <= 1:
+            raise DataError(f"{what}: {name} is {value}", allowed="0 to 1")
+    if sum(shares.values()) > 1 + SHARE_ROUNDING:
+        named = " + ".join(shares)
+        raise DataError(f"{what}: {named} is {sum(shares.values()):g}", allowed="at most 1: no light is made")
+
+
+@dataclass(frozen=True)
+class Medium:
+    """What fills the air: haze, fog, dust.
+
+    Arguments:
+        extinction_per_m: How fast light fades, exp(-extinction * length) [1/m].
+        backscatter_per_m_sr: How much of it comes straight back per length and solid angle [1/(m sr)].
+    """
+
+    extinction_per_m: float
+    backscatter_per_m_sr: float
+
+    def __post_init__(self) -> None:
+        for name in ("extinction_per_m", "backscatter_per_m_sr"):
+            value = getattr(self, name)
+            if not math.isfinite(value) or value < 0:
+                raise DataError(f"medium: {name} is {value}", allowed="finite, 0 or more")
+
+
+@dataclass(frozen=True)
+class Ambient:
+    """Light that the emitter did not send.
+
+    Arguments:
+        illuminance_lux: On the surfaces [lux]; full sunlight has about 100,000, a lit room 300.
+        source: Its spectrum: `sun`, or `indoor` (white LEDs, which hardly shine in the infrared).
+    """
+
+    illuminance_lux: float
+    source: Literal["sun", "indoor"] = "sun"
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.illuminance_lux) or self.illuminance_lux < 0:
+            raise DataError(f"ambient light of {self.illuminance_lux} lux", allowed="finite, 0 or more")
+        if self.source not in ("sun", "indoor"):
+            raise DataError(f"ambient light from {self.source!r}", allowed="sun, indoor")
+
+
+@dataclass(frozen=True)
+class Receiver:
+    """A fixed detector that listens for light from elsewhere; without one, every ray listens from its own origin.
+
+    Arguments:
+        origin_m: Where it is [m].
+        azimuth_rad, elevation_rad: Where it looks.
+        horizontal_rad, vertical_rad: Its whole field of view, angles about its upright and its lateral axis.
+        range_m: The interval of distances from it that it can hear in [m].
+    """
+
+    origin_m: Vector
+    azimuth_rad: float
+    elevation_rad: float
+    horizontal_rad: float
+    vertical_rad: float
+    range_m: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        numbers = (*self.origin_m, self.azimuth_rad, self.elevation_rad, *self.range_m)
+        if len(self.origin_m) != 3 or not all(math.isfinite(value) for value in numbers):
+            raise DataError(f"receiver: {self} has numbers that are not finite", allowed="finite numbers")
+        for name in ("horizontal_rad", "vertical_rad"):
+            if not 0 < getattr(self, name) < math.pi:
+                raise DataError(f"receiver: {name} is {getattr(self, name)}", allowed="above 0 and below pi")
+        if not 0 <= self.range_m[0] < self.range_m[1]:
+            raise DataError(f"receiver: hears from {self.range_m[0]} to {self.range_m[1]} m", allowed="0 <= low < high")
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +210,10 @@ class Body:
         role: `target` counts as surface worth observing, `occluder` blocks rays, `both` does both.
         poses: Body to world, shape (4, 4) for a body at rest or (frames, 4, 4).
         reflectance: Lambertian albedo, 0 to 1.
+        specular: Share of the light that it mirrors, 0 to 1.
+        transmission: Share of the light that each of its surfaces lets through, straight on, 0 to 1.
+        velocity_m_s: How a body at rest in all frames moves within one [m/s]; bodies with a pose per frame move
+            from each to the next.
     """
 
     shape: Shape
@@ -138,6 +221,9 @@ class Body:
     role: Role = "both"
     poses: np.ndarray = field(default_factory=lambda: np.eye(4))
     reflectance: float = 0.5
+    specular: float = 0.0
+    transmission: float = 0.0
+    velocity_m_s: Vector = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         poses = np.asarray(self.poses, dtype=np.float64)
@@ -155,7 +241,21 @@ class Body:
             )
         if self.role not in ROLES:
             raise DataError(f"body {self.name!r}: unknown role {self.role!r}", allowed=", ".join(ROLES))
+        _check_shares(
+            f"body {self.name!r}",
+            reflectance=self.reflectance,
+            specular=self.specular,
+            transmission=self.transmission,
+        )
+        velocity = tuple(float(value) for value in self.velocity_m_s)
+        if len(velocity) != 3 or not all(math.isfinite(value) for value in velocity):
+            raise DataError(f"body {self.name!r}: velocity_m_s is {self.velocity_m_s}", allowed="three finite numbers")
+        if any(velocity) and poses.ndim == 3:
+            raise DataError(
+                f"body {self.name!r} has a velocity and poses per frame", allowed="one of them: poses are its motion"
+            )
         object.__setattr__(self, "poses", poses)
+        object.__setattr__(self, "velocity_m_s", velocity)
 
     @property
     def is_target(self) -> bool:
@@ -182,6 +282,9 @@ class Scene:
         truth: Arrays that the task's score needs (never read by designs, densities or estimates).
         frame_rate_hz: Frames per second where bodies move.
         notes: What making the scene met that a user should know, one line each.
+        medium: What fills the air; None: nothing.
+        ambient: Light that the emitter did not send; None: darkness.
+        receiver: A fixed detector that all rays' light is heard by; None: every ray is heard at its own origin.
     """
 
     bodies: tuple[Body, ...]
@@ -189,6 +292,9 @@ class Scene:
     truth: Mapping[str, Any] = field(default_factory=dict)
     frame_rate_hz: float = 10.0
     notes: tuple[str, ...] = ()
+    medium: Medium | None = None
+    ambient: Ambient | None = None
+    receiver: Receiver | None = None
 
     def __post_init__(self) -> None:
         if not any(body.is_target for body in self.bodies):

@@ -78,7 +78,8 @@ class Returns:
         rays: The rays that were fired.
         outcome: Values of `Outcome`, shape (N,).
         range_m: The measured one-way range [m], NaN without a return, shape (N,).
-        body: Index of the body that was hit inside the gate, -1 without a return, shape (N,). For scoring only.
+        body: Index of the body that was hit inside the gate, shape (N,); -1 without a return, and where a detector took
+            noise for one. For scoring only.
         frame: The scene's time frame that they were measured in.
     """
 

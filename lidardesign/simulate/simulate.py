@@ -1,4 +1,4 @@
-"""What a list of rays returns in a scene, with the detector `ideal`: exact first hits, no bins, no noise.
+"""What a list of rays returns in a scene: exact first hits, or what a detector makes of them where effects are on.
 
 Rays are traced from the sensor, not from the start of the gate, so whatever stands between the sensor and the
 gate hides what is behind it.
@@ -7,6 +7,7 @@ gate hides what is behind it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,14 +16,20 @@ from lidardesign.scene import Scene
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.returns import Outcome, Rays, Returns
 
+if TYPE_CHECKING:
+    from lidardesign.simulate.physics import Physics
 
-def simulate(scene: Scene, rays: Rays, *, casters: Sequence[SceneCaster] | None = None) -> list[Returns]:
+
+def simulate(
+    scene: Scene, rays: Rays, *, casters: Sequence[SceneCaster] | None = None, physics: Physics | None = None
+) -> list[Returns]:
     """The returns of rays in every time frame of a scene.
 
     Arguments:
         scene: What the rays meet; targets and occluders both stop them.
         rays: The rays, fired anew in each frame, N of them.
         casters: One caster per frame, as `build_casters` makes them; None builds them here.
+        physics: A detector and the effects that are on; None, or none on: geometry alone.
 
     Returns:
         One `Returns` per frame, each with N outcomes.
@@ -30,11 +37,15 @@ def simulate(scene: Scene, rays: Rays, *, casters: Sequence[SceneCaster] | None 
     Raises:
         ConfigError: The number of casters is not the scene's number of frames.
     """
-    return simulate_many(scene, [rays], casters=casters)[0]
+    return simulate_many(scene, [rays], casters=casters, physics=physics)[0]
 
 
 def simulate_many(
-    scene: Scene, lists: Sequence[Rays], *, casters: Sequence[SceneCaster] | None = None
+    scene: Scene,
+    lists: Sequence[Rays],
+    *,
+    casters: Sequence[SceneCaster] | None = None,
+    physics: Physics | None = None,
 ) -> list[list[Returns]]:
     """The returns of several lists of rays in every time frame of a scene, each as `simulate` gives them.
 
@@ -44,6 +55,7 @@ def simulate_many(
         scene: What the rays meet; targets and occluders both stop them.
         lists: Lists of rays, each fired anew in each frame.
         casters: One caster per frame; None builds them here.
+        physics: A detector and the effects that are on; each list shares the emitter's energy among its own rays.
 
     Returns:
         For each list, one `Returns` per frame.
@@ -56,6 +68,12 @@ def simulate_many(
         raise ConfigError(f"{len(casters)} casters", where=f"scene {scene.name}", allowed=f"{scene.frames}")
     if not lists:
         return []
+    if physics is not None and physics.effects:
+        from lidardesign.simulate.physics import measure
+
+        return [
+            [measure(scene, frame, rays, caster, physics) for frame, caster in enumerate(casters)] for rays in lists
+        ]
     ends = np.cumsum([len(rays) for rays in lists])
     origins, directions, gate_m = (
         np.concatenate([getattr(rays, name) for rays in lists]) for name in ("origin_m", "direction", "gate_m")
