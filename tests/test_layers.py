@@ -34,6 +34,7 @@ LAYERS = {
     "lidardesign.simulate.hits": 4,
     "lidardesign.simulate.primitives": 4,
     "lidardesign.simulate.raycast": 4,
+    "lidardesign.simulate.receiver_view": 4,
     "lidardesign.simulate.returns": 4,
     "lidardesign.surface": 4,
     "lidardesign.density": 4,
