@@ -18,7 +18,7 @@ import numpy as np
 
 from lidardesign.density.fields import scene_columns
 from lidardesign.scene import Scene
-from lidardesign.simulate.raycast import Crossings, shared_caster
+from lidardesign.simulate.raycast import Crossings, SceneCaster, shared_caster
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, aim, direction
 from lidardesign.surface import sample_body, target_area_m2
 
@@ -65,16 +65,31 @@ def propose(
 
 
 def occluded_share(scenes: Sequence[Scene], proposals: Proposals, margin_m: float) -> float:
-    """The share of proposals whose surface has an occluder more than the margin in front of it."""
-    directions = direction(proposals.points[:, AZIMUTH], proposals.points[:, ELEVATION])
-    blocked = 0
+    """The share of proposals whose surface has an occluder more than the margin in front of it, on any of its ways."""
+    origins = proposals.points[:, :3]
+    surface = proposals.surface_range_m[:, None]
+    points = origins + surface * direction(proposals.points[:, AZIMUTH], proposals.points[:, ELEVATION])
+    blocked = np.zeros(len(points), dtype=bool)
     for number, (index, frame) in enumerate(proposals.columns):
-        rows = proposals.column == number
-        if rows.any():
-            caster = shared_caster(scenes[index], frame, only="occluders")
-            hits = caster.first_hit(proposals.points[rows, :3], directions[rows])
-            blocked += int((hits.range_m < proposals.surface_range_m[rows] - margin_m).sum())
-    return blocked / max(len(directions), 1)
+        rows = np.flatnonzero(proposals.column == number)
+        if not len(rows):
+            continue
+        caster, receiver = shared_caster(scenes[index], frame, only="occluders"), scenes[index].receiver
+        blocked[rows] = _is_hidden(caster, origins[rows], points[rows], margin_m)
+        if receiver is not None:
+            blocked[rows] |= _is_hidden(caster, np.asarray(receiver.origin_m), points[rows], margin_m)
+    return float(blocked.mean()) if len(blocked) else 0.0
+
+
+def _is_hidden(caster: SceneCaster, places: np.ndarray, points: np.ndarray, margin_m: float) -> np.ndarray:
+    """Which points (N, 3) have something more than the margin in front of them, seen from places (3,) or (N, 3)."""
+    offset = points - places
+    reach_m = np.linalg.norm(offset, axis=1)
+    seen = np.flatnonzero(reach_m > 0)
+    hidden = np.zeros(len(points), dtype=bool)
+    starts = np.broadcast_to(places, points.shape)[seen]
+    hidden[seen] = caster.first_hit(starts, offset[seen]).range_m < reach_m[seen] - margin_m
+    return hidden
 
 
 def _chosen_columns(scenes: Sequence[Scene], generator: np.random.Generator) -> list[tuple[int, int]]:

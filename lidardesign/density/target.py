@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidardesign.density.fields import Field, TableField, build_field, scene_columns
+from lidardesign.density.receiver import HeardVisibility, common_receiver
 from lidardesign.density.settings import DensitySettings
 from lidardesign.density.visibility import (
     ROWS_AT_ONCE,
@@ -142,17 +143,21 @@ def build_target(
     """The target of scenes.
 
     Arguments:
-        scenes: One term per scene and frame.
+        scenes: One term per scene and frame; where they have a fixed receiver, it must see the points too.
         space: The design space.
         settings: Its numbers.
         visibility: raycast, quadrature or off; `prepare_target` decides auto.
         compiled: False for a few evaluations without gradient, which are not worth loading the kernels.
+
+    Raises:
+        ConfigError: A quadrature over too many moving bodies, or scenes with different receivers.
     """
     optics = Optics.of(settings)
     fields = {"resolution": settings.field_resolution, "padding_m": PADDING_SIGMAS * settings.sigma_m}
     frames = [scenes[index].frames for index, _ in scene_columns(scenes)]
     log_column_weights = -np.log(np.array(frames, dtype=np.float64))
-    if visibility != "quadrature" and not any(_has_mesh_at_rest(scene) for scene in scenes):
+    receiver = common_receiver(scenes)
+    if receiver is None and visibility != "quadrature" and not any(_has_mesh_at_rest(scene) for scene in scenes):
         # frames builds on this module
         from lidardesign.density.frames import build_frames_target
 
@@ -161,9 +166,10 @@ def build_target(
     field = build_field(scenes, lambda body: body.is_target, **fields)
     if isinstance(field, TableField):
         field = replace(field, compiled=compiled)
+    way = _build_visibility(scenes, settings, visibility, field, fields)
     return Target(
         field=field,
-        visibility=_build_visibility(scenes, settings, visibility, field, fields),
+        visibility=way if receiver is None else HeardVisibility(way, receiver),
         log_column_weights=log_column_weights,
         optics=optics,
         space=space,

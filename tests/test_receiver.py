@@ -1,0 +1,154 @@
+"""The density of emitters for a fixed receiver: both ways must be free, and the receiver must look there."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from lidardesign.density.receiver import HeardVisibility
+from lidardesign.density.settings import DensitySettings
+from lidardesign.density.target import build_target
+from lidardesign.density.visibility import NoVisibility
+from lidardesign.errors import ConfigError
+from lidardesign.scene import Body, Box, Receiver, Scene, Sphere, rigid
+from lidardesign.space import RANGE, DesignSpace, aim, observed_point
+
+SPACE = DesignSpace((-0.3, -0.3, -0.3, -0.7, -0.7, 0.2), (0.3, 0.3, 0.3, 0.7, 0.7, 4.0))
+SETTINGS = DensitySettings(sigma_m=0.05, attenuation_per_m=20.0, sharpness_per_m=40.0, margin_m=0.05)
+CENTRES = ((2.0, 0.0, 0.0), (2.1, 0.2, 0.1))
+WIDE = Receiver((0.0, 0.0, 0.0), 0.0, 0.0, math.radians(160), math.radians(160), (0.0, 100.0))
+
+
+def looking(**changes):
+    values = {
+        "origin_m": (0.0, 0.25, 0.0), "azimuth_rad": 0.1, "elevation_rad": -0.05,
+        "horizontal_rad": math.radians(60), "vertical_rad": math.radians(50), "range_m": (0.1, 3.0),
+    }  # fmt: skip
+    return Receiver(**{**values, **changes})
+
+
+def balls(receiver, *further):
+    return [
+        Scene((Body(Sphere(0.5), poses=rigid(translation_m=centre)), *further), receiver=receiver)
+        for centre in CENTRES
+    ]
+
+
+def plate(centre, half=(0.005, 0.2, 0.2)):
+    return Body(Box(half), role="occluder", poses=rigid(translation_m=centre))
+
+
+def points_near(count=80, seed=0):
+    generator = np.random.default_rng(seed)
+    points = SPACE.sample(count, generator)
+    ahead = np.array([1.5, 0.0, 0.0]) + generator.normal(scale=0.1, size=(count, 3))
+    return aim(points[:, :3], ahead)
+
+
+@pytest.mark.parametrize("visibility", ["raycast", "quadrature", "off"])
+def test_the_gradient_agrees_with_differences(visibility):
+    occluder = plate((0.8, 0.6, 0.0))
+    target = build_target(balls(looking(), occluder), SPACE, SETTINGS, visibility)
+    points = points_near()
+    values, gradient = target.log_density_and_gradient(points)
+    assert np.isfinite(values).all()
+    step = 1e-5
+    for axis in range(6):
+        ends = []
+        for sign in (-1.0, 1.0):
+            moved = points.copy()
+            if axis == 4:
+                # the chart's coordinate is the sine of the elevation
+                moved[:, axis] = np.arcsin(np.sin(moved[:, axis]) + sign * step)
+            else:
+                moved[:, axis] += sign * step
+            ends.append(target.log_density(moved))
+        numeric = (ends[1] - ends[0]) / (2 * step)
+        # a column more or less within the tolerance, or a silhouette, moves single points
+        close = np.isclose(gradient[:, axis], numeric, rtol=2e-3, atol=2e-2)
+        assert close.mean() > 0.95
+
+
+def test_a_point_in_full_view_keeps_its_density_and_one_behind_a_plate_loses_it():
+    points = points_near(seed=1)
+    alone = build_target(balls(None), SPACE, SETTINGS, "off").log_density(points)
+    heard = build_target(balls(WIDE), SPACE, SETTINGS, "off").log_density(points)
+    assert np.allclose(heard, alone, atol=1e-9)
+    clear = alone > alone.max() - 3
+    # a plate right in front of the receiver hides everything from it and nothing from emitters beside it
+    blind = looking(origin_m=(0.0, 0.0, -0.6), elevation_rad=0.3)
+    in_front = plate((0.3, 0.0, -0.5), (0.005, 0.1, 0.1))
+    scenes, dark = balls(blind), balls(blind, in_front)
+    without, behind = (build_target(s, SPACE, SETTINGS, "raycast").log_density(points) for s in (scenes, dark))
+    assert np.all(behind[clear] < without[clear] - 10)
+
+
+def test_an_emitter_at_the_receiver_has_the_square_of_its_own_visibility():
+    receiver = Receiver((0.0, 0.0, 0.0), 0.0, 0.0, math.radians(170), math.radians(170), (0.0, 100.0))
+    hidden = plate((1.0, 0.0, 0.0))
+    generator = np.random.default_rng(2)
+    points = aim(np.zeros((60, 3)), np.array([1.5, 0.0, 0.0]) + generator.normal(scale=0.15, size=(60, 3)))
+    ways = {}
+    for name, there in (("alone", None), ("heard", receiver)):
+        for way in ("off", "raycast"):
+            # one scene, so that the sum over scenes does not mix visibilities
+            scene = balls(there, hidden)[:1]
+            ways[name, way] = build_target(scene, SPACE, SETTINGS, way).log_density(points)
+    one_way = ways["alone", "raycast"] - ways["alone", "off"]
+    both_ways = ways["heard", "raycast"] - ways["heard", "off"]
+    assert one_way.min() < -1
+    assert np.allclose(both_ways, 2 * one_way, atol=1e-9)
+
+
+def test_the_view_is_one_inside_a_half_on_its_edges_and_nothing_outside():
+    receiver = looking(origin_m=(0.0, 0.0, 0.0), azimuth_rad=0.0, elevation_rad=0.0)
+    way = HeardVisibility(NoVisibility(), receiver)
+    half = receiver.horizontal_rad / 2
+    points = np.array([
+        [1.0, 0.0, 0.0],
+        [math.cos(half), math.sin(half), 0.0],
+        [math.cos(half), -math.sin(half), 0.0],
+        [math.cos(receiver.vertical_rad / 2), 0.0, math.sin(receiver.vertical_rad / 2)],
+        [3.0, 0.0, 0.0],
+        [-1.0, 0.0, 0.0],
+        [1.0, 1.0, 0.0],
+        [3.1, 0.0, 0.0],
+        [0.0, 0.0, 0.0],
+    ])  # fmt: skip
+    values, gradient = way.log_view(points, 0.01)
+    assert values[0] == pytest.approx(0.0, abs=1e-6)
+    assert values[1:5] == pytest.approx(np.full(4, math.log(0.5)), abs=1e-6)
+    assert (values[5:] < -10).all()
+    assert np.isfinite(gradient).all()
+
+
+def test_turning_and_moving_everything_changes_nothing():
+    receiver, turn = looking(), 0.4
+    cos, sin = math.cos(turn), math.sin(turn)
+    rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    shift = np.array([3.0, -2.0, 1.0])
+    turned = looking(
+        origin_m=tuple(rotation @ np.array(receiver.origin_m) + shift), azimuth_rad=receiver.azimuth_rad + turn
+    )
+    points = np.random.default_rng(3).normal(size=(200, 3)) + np.array([1.5, 0.0, 0.0])
+    before, _ = HeardVisibility(NoVisibility(), receiver).log_view(points, 0.05)
+    after, _ = HeardVisibility(NoVisibility(), turned).log_view(points @ rotation.T + shift, 0.05)
+    assert np.allclose(before, after, atol=1e-9)
+
+
+def test_a_design_point_that_listens_at_the_receiver_itself_stays_finite():
+    receiver = looking()
+    target = build_target(balls(receiver), SPACE, SETTINGS, "raycast")
+    points = aim(np.zeros((1, 3)), np.array([receiver.origin_m]))
+    assert np.allclose(observed_point(points), receiver.origin_m)
+    values, gradient = target.log_density_and_gradient(points)
+    assert points[0, RANGE] > 0
+    assert np.isfinite(values).all()
+    assert np.isfinite(gradient).all()
+
+
+def test_scenes_with_different_receivers_are_refused():
+    with pytest.raises(ConfigError, match="different receivers"):
+        build_target([balls(looking())[0], balls(None)[1]], SPACE, SETTINGS, "raycast")
