@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +17,7 @@ from lidardesign.task import Metric, Score, random_generator
 MILLIMETRES = 1000.0
 RECONSTRUCTION_POINTS = 4000
 COVERED_M = 0.010
+OUTLIER_M = 0.010  # a return further than this from the surface is none of it
 STEEPEST_DEG = 85.0  # flatter triangles bridge depth steps: with dense rays they made up half of the error
 
 
@@ -58,7 +59,7 @@ def with_visible_truth(
 ) -> Scene:
     """The scene with what some admissible ray can see as its truth: `surface`, a `SurfaceCloud`."""
     truth = VisibleTruth(scene, space, points, int(generator.integers(2**62)))
-    return Scene(scene.bodies, scene.name, truth, scene.frame_rate_hz)
+    return replace(scene, truth=truth)
 
 
 def reconstruct(returns: Sequence[Returns]) -> SurfaceCloud | None:
@@ -79,10 +80,14 @@ def reconstruct(returns: Sequence[Returns]) -> SurfaceCloud | None:
 def surface_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Score:
     """Chamfer distance [mm] of the reconstruction to the visible surface, at most the metric's worst value.
 
-    Details: `returns`, and `coverage`, the share of the visible surface with the reconstruction within 10 mm.
+    Details: `returns`, `outliers_percent`, the returns further than 10 mm from the visible surface, and `coverage`, the
+    share of the visible surface with the reconstruction within 10 mm.
     """
     details = {"returns": float(sum(int(frame.returned.sum()) for frame in returns))}
     estimate, truth = reconstruct(returns), scene.truth["surface"]
+    if details["returns"]:
+        away_m = truth.distance_m(np.concatenate([frame.points_m for frame in returns]))
+        details["outliers_percent"] = 100.0 * float((away_m > OUTLIER_M).mean())
     if estimate is None:
         return Score(metric.worst, failed=True, details={**details, "coverage": 0.0})
     missed, wrong = estimate.distance_m(truth.points), truth.distance_m(estimate.points)
