@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidardesign.errors import DataError
-from lidardesign.scene import Scene
+from lidardesign.scene import Receiver, Scene
 from lidardesign.simulate.raycast import SceneCaster
+from lidardesign.simulate.receiver_view import in_view
 from lidardesign.space import RANGE, DesignSpace, aim
 from lidardesign.surface import sample_body, sample_triangles
 
@@ -218,6 +219,7 @@ def visible_surface(
 
     A point counts when, from one of the tried origins, its direction and distance lie in the space and
     nothing is in front of it. A free origin box is tried at its corners, its centre and a few random places.
+    Where the scene has a fixed receiver, that must see the point too.
 
     Raises:
         DataError: No part of any target can be seen.
@@ -227,7 +229,8 @@ def visible_surface(
     points, triangles, found, draw = [], [], 0, 3 * count
     for _ in range(DRAW_ROUNDS):
         candidates = sample_body(targets, space, min(draw, LARGEST_DRAW), generator, frame)
-        seen = is_visible(caster, space, origins, candidates.points)
+        seen = is_heard(caster, scene.receiver, candidates.points)
+        seen[seen] = is_visible(caster, space, origins, candidates.points[seen])
         points.append(candidates.points[seen])
         triangles.append(candidates.triangles[seen])
         found += int(seen.sum())
@@ -269,3 +272,14 @@ def is_visible(
         hits = caster.first_hit(design[:, :3], points[left] - origin)
         visible[left] = hits.range_m > design[:, RANGE] * (1 - HIT_TOLERANCE)
     return visible
+
+
+def is_heard(caster: SceneCaster, receiver: Receiver | None, points: np.ndarray) -> np.ndarray:
+    """Which points (N, 3) a fixed receiver has in its view with nothing in front, shape (N,); all without one."""
+    if receiver is None:
+        return np.ones(len(points), dtype=bool)
+    heard = in_view(receiver, points)
+    way = points[heard] - np.asarray(receiver.origin_m)
+    hits = caster.first_hit(np.asarray(receiver.origin_m), way)
+    heard[heard] = hits.range_m > np.linalg.norm(way, axis=1) * (1 - HIT_TOLERANCE)
+    return heard

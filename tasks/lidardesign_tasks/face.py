@@ -19,7 +19,7 @@ from pydantic import Field
 
 from lidardesign.errors import ConfigError
 from lidardesign.meshio import check_mesh, usable_faces
-from lidardesign.scene import Body, Mesh, Scene, Sign
+from lidardesign.scene import Body, Mesh, Receiver, Scene, Sign
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Score, Split, TaskConfig, random_generator
@@ -33,8 +33,8 @@ WORLD_AXES = [2, 0, 1]
 LARGEST_COEFFICIENT = 3.0  # identities further from the mean than this in any mode are cut: no faces are so
 
 
-class FaceConfig(TaskConfig):
-    """The model, how many heads, how much they move, and where the sensor may be."""
+class HeadConfig(TaskConfig):
+    """The model, how many heads, how much they move, and how finely they are judged."""
 
     model: Path | None = Field(
         None, description="HDF5 file of a morphable model; empty: the embedded head model"
@@ -53,15 +53,20 @@ class FaceConfig(TaskConfig):
     jitter_translation_m: float = Field(
         0.008, ge=0, le=0.5, description="standard deviation of the place [m]"
     )
+    truth_points: int = Field(
+        5000, ge=100, le=200_000, description="points of the visible surface to judge by"
+    )
+
+
+class FaceConfig(HeadConfig):
+    """Heads, and where the sensor in front of them may be."""
+
     distance_m: float = Field(0.40, ge=0.1, le=5, description="from the mean nose tip to the sensor [m]")
     origin_box_m: float | Vector = Field(
         0.0, description="half size of the box of sensor origins [m]; 0: fixed"
     )
     half_angle_deg: float = Field(30.0, gt=0, le=80, description="azimuth and elevation span +- this [deg]")
     range_m: tuple[float, float] = Field((0.05, 1.05), description="shortest and longest range [m]")
-    truth_points: int = Field(
-        5000, ge=100, le=200_000, description="points of the visible surface to judge by"
-    )
 
 
 class FaceTask:
@@ -90,30 +95,39 @@ class FaceTask:
     def scenes(
         self, config: FaceConfig, split: Split, seed: int, space: DesignSpace | None = None
     ) -> Sequence[Scene]:
-        """Random heads; each has generators of its own, so counts do not change them.
-
-        Raises:
-            DataError: The model cannot be used, or no ray can reach a head.
-            ConfigError: All heads would be the same.
-        """
-        if (
-            config.identity_scale == 0
-            and config.jitter_rotation_deg == 0
-            and config.jitter_translation_m == 0
-        ):
-            raise ConfigError(
-                "without identities and pose jitter all heads are the same, and held-out ones would be known",
-                where="task.identity_scale",
-                hint="set identity_scale, jitter_rotation_deg or jitter_translation_m above 0",
-            )
-        space = space or self.space(config)
-        heads = HeadFamily.load(config)
-        count = config.train if split == "train" else config.test
-        return [heads.scene(config, space, split, seed, index) for index in range(count)]
+        """Random heads, see `head_scenes`."""
+        return head_scenes(config, space or self.space(config), split, seed)
 
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """Chamfer distance [mm] between the reconstruction and the part of the face that could be seen."""
         return surface_score(self.metric, scene, returns)
+
+
+def head_scenes(
+    config: HeadConfig, space: DesignSpace, split: Split, seed: int, receiver: Receiver | None = None
+) -> list[Scene]:
+    """Random heads; each has generators of its own, so counts do not change them.
+
+    Arguments:
+        config: Which heads, and how many.
+        space: What the sensors may do; truths follow it.
+        split: Training or held-out heads.
+        seed: Of all of them.
+        receiver: A fixed detector that stands in every scene.
+
+    Raises:
+        DataError: The model cannot be used, or no ray can reach a head.
+        ConfigError: All heads would be the same.
+    """
+    if config.identity_scale == 0 and config.jitter_rotation_deg == 0 and config.jitter_translation_m == 0:
+        raise ConfigError(
+            "without identities and pose jitter all heads are the same, and held-out ones would be known",
+            where="task.identity_scale",
+            hint="set identity_scale, jitter_rotation_deg or jitter_translation_m above 0",
+        )
+    heads = HeadFamily.load(config)
+    count = config.train if split == "train" else config.test
+    return [heads.scene(config, space, split, seed, index, receiver) for index in range(count)]
 
 
 class HeadFamily:
@@ -130,7 +144,7 @@ class HeadFamily:
         self.centre = (mean - self.nose_tip)[np.unique(self.faces)].mean(axis=0)
 
     @classmethod
-    def load(cls, config: FaceConfig) -> HeadFamily:
+    def load(cls, config: HeadConfig) -> HeadFamily:
         """The family of a configuration.
 
         Raises:
@@ -147,7 +161,15 @@ class HeadFamily:
         vertices = self.model.shape(coefficients)[:, WORLD_AXES] - self.nose_tip
         return Mesh(vertices, self.faces, self.sign, self.notes)
 
-    def scene(self, config: FaceConfig, space: DesignSpace, split: Split, seed: int, index: int) -> Scene:
+    def scene(
+        self,
+        config: HeadConfig,
+        space: DesignSpace,
+        split: Split,
+        seed: int,
+        index: int,
+        receiver: Receiver | None = None,
+    ) -> Scene:
         """One head of a split with its pose and truth."""
         drawn = random_generator(seed, "face", split, index, "identity").normal(size=len(self.model.modes))
         coefficients = config.identity_scale * np.clip(drawn, -LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
@@ -157,7 +179,8 @@ class HeadFamily:
             config.jitter_translation_m,
             self.centre,
         )
-        scene = Scene((Body(self.mesh(coefficients), "head", "both", pose),), f"{split} head {index}")
+        head = Body(self.mesh(coefficients), "head", "both", pose)
+        scene = Scene((head,), f"{split} head {index}", receiver=receiver)
         generator = random_generator(seed, "face", split, index, "truth")
         return with_visible_truth(scene, space, config.truth_points, generator)
 

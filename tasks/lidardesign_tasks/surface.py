@@ -62,16 +62,21 @@ def with_visible_truth(
     return replace(scene, truth=truth)
 
 
-def reconstruct(returns: Sequence[Returns]) -> SurfaceCloud | None:
-    """The surface through all returns, seen from the mean origin of the rays; `None` where they span none.
+def reconstruct(returns: Sequence[Returns], viewpoint_m: np.ndarray | None = None) -> SurfaceCloud | None:
+    """The surface through all returns, neighbours as seen from a viewpoint; `None` where they span none.
 
     Nothing but rays and returns goes in: a return from an occluder inside the gate is taken for surface.
+
+    Arguments:
+        returns: Of all frames.
+        viewpoint_m: The place that sees all of them, shape (3,); None: the mean origin of the rays.
     """
     origins = np.concatenate([frame.rays.origin_m for frame in returns])
     if not len(origins):
         return None
     points = np.concatenate([frame.points_m for frame in returns])
-    surface = delaunay_surface(points, origins.mean(axis=0), steepest_deg=STEEPEST_DEG)
+    viewpoint_m = origins.mean(axis=0) if viewpoint_m is None else viewpoint_m
+    surface = delaunay_surface(points, viewpoint_m, steepest_deg=STEEPEST_DEG)
     if surface is None:
         return None
     return surface_cloud(*surface, RECONSTRUCTION_POINTS, random_generator(0, "reconstruction"))
@@ -80,11 +85,14 @@ def reconstruct(returns: Sequence[Returns]) -> SurfaceCloud | None:
 def surface_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Score:
     """Chamfer distance [mm] of the reconstruction to the visible surface, at most the metric's worst value.
 
+    Where a fixed receiver hears all rays, neighbours are those that it sees side by side.
+
     Details: `returns`, `outliers_percent`, the returns further than 10 mm from the visible surface, and `coverage`, the
     share of the visible surface with the reconstruction within 10 mm.
     """
     details = {"returns": float(sum(int(frame.returned.sum()) for frame in returns))}
-    estimate, truth = reconstruct(returns), scene.truth["surface"]
+    viewpoint_m = None if scene.receiver is None else np.array(scene.receiver.origin_m)
+    estimate, truth = reconstruct(returns, viewpoint_m), scene.truth["surface"]
     if details["returns"]:
         away_m = truth.distance_m(np.concatenate([frame.points_m for frame in returns]))
         details["outliers_percent"] = 100.0 * float((away_m > OUTLIER_M).mean())

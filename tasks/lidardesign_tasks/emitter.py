@@ -1,0 +1,97 @@
+"""Emitter design: a detector that is fixed in front of a face, as a smartphone's, and where its light should come from.
+
+World frame and heads are those of the task `face`. The detector stands at one place and hears every ray; what is
+designed are the emitters around it: their places, directions and ranges. Light goes from an emitter to the face and
+from there to the detector, so only what both of them see counts, and the range along a ray follows from the whole
+path of its light (`lidardesign.simulate.bistatic`). A flood emitter is a sensor whose rays are the dots of its pattern.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from lidardesign.scene import Receiver, Scene
+from lidardesign.simulate.returns import Returns
+from lidardesign.space import DesignSpace
+from lidardesign.task import Defaults, Metric, Score, Split
+from lidardesign_tasks.face import FaceTask, HeadConfig, Vector, head_scenes
+from lidardesign_tasks.surface import surface_score
+
+
+class EmitterConfig(HeadConfig):
+    """Heads, the detector in front of them, and where emitters may be."""
+
+    detector_m: Vector = Field((0.40, 0.0, 0.0), description="place of the detector [m]; the nose tip is at 0")
+    detector_azimuth_deg: float = Field(180.0, ge=-360, le=360, description="where the detector looks [deg]")
+    detector_elevation_deg: float = Field(0.0, ge=-90, le=90, description="and how far upwards [deg]")
+    field_of_view_deg: tuple[float, float] = Field(
+        (60.0, 50.0), description="the detector's whole horizontal and vertical field of view [deg]"
+    )
+    emitter_box_m: float | Vector = Field(
+        (0.03, 0.15, 0.15), description="half size of the box of emitter places around the detector [m]"
+    )
+    half_angle_deg: float = Field(
+        40.0, gt=0, le=80, description="emitted azimuth and elevation span +- this around the detector's [deg]"
+    )
+    range_m: tuple[float, float] = Field(
+        (0.05, 1.05), description="shortest and longest one-way range of emitters and detector [m]"
+    )
+
+    @field_validator("field_of_view_deg")
+    @classmethod
+    def _below_a_half_turn(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if not all(0 < angle < 180 for angle in value):
+            raise ValueError("both angles of a field of view lie above 0 and below 180 degrees")
+        return value
+
+    @property
+    def receiver(self) -> Receiver:
+        """The detector of every scene."""
+        horizontal, vertical = (math.radians(angle) for angle in self.field_of_view_deg)
+        return Receiver(
+            origin_m=self.detector_m,
+            azimuth_rad=math.radians(self.detector_azimuth_deg),
+            elevation_rad=math.radians(self.detector_elevation_deg),
+            horizontal_rad=horizontal,
+            vertical_rad=vertical,
+            range_m=self.range_m,
+        )
+
+
+class EmitterTask:
+    """Light unknown faces for a fixed detector, and reconstruct their surface from few rays."""
+
+    name: ClassVar[str] = "emitter"
+    summary: ClassVar[str] = "emitters around a fixed smartphone-like detector, 0.40 m in front of a face"
+    api_version: ClassVar[int] = 1
+    Config: ClassVar[type[EmitterConfig]] = EmitterConfig
+    metric: ClassVar[Metric] = FaceTask.metric
+    defaults: ClassVar[Defaults] = Defaults(
+        sensors=1, rays=(100, 196, 361, 576), density={"sigma_m": 0.005}
+    )
+
+    def space(self, config: EmitterConfig) -> DesignSpace:
+        """Emitter places in a box around the detector, directions around where it looks."""
+        half = np.broadcast_to(np.abs(np.asarray(config.emitter_box_m, dtype=np.float64)), 3)
+        centre, angle = np.array(config.detector_m), math.radians(config.half_angle_deg)
+        azimuth, elevation = math.radians(config.detector_azimuth_deg), math.radians(config.detector_elevation_deg)
+        bottom, top = max(elevation - angle, -math.pi / 2), min(elevation + angle, math.pi / 2)
+        return DesignSpace(
+            low=(*(centre - half).tolist(), azimuth - angle, bottom, config.range_m[0]),
+            high=(*(centre + half).tolist(), azimuth + angle, top, config.range_m[1]),
+        )
+
+    def scenes(
+        self, config: EmitterConfig, split: Split, seed: int, space: DesignSpace | None = None
+    ) -> Sequence[Scene]:
+        """The heads of the task `face` with the detector in front of them, see `head_scenes`."""
+        return head_scenes(config, space or self.space(config), split, seed, config.receiver)
+
+    def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
+        """Chamfer distance [mm] between the reconstruction and the part of the face that could be heard."""
+        return surface_score(self.metric, scene, returns)
