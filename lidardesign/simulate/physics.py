@@ -8,6 +8,7 @@ module of `simulate.effects`, imported when it is on and never otherwise.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -20,7 +21,6 @@ from lidardesign.simulate.echoes import Background, Beams, Echoes
 from lidardesign.simulate.hits import Hits
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.returns import Outcome, Rays, Returns
-from lidardesign.task import random_generator
 
 EFFECTS = {
     "footprint": "beams have a width: mixed pixels, several returns",
@@ -58,8 +58,8 @@ class Physics:
 
     def stream(self, effect: str, scene: Scene, frame: int) -> int:
         """The key of an effect's random numbers in a frame of a scene; no other effect changes them."""
-        generator = random_generator(self.seed, "physics", effect, scene.name, frame)
-        return int(generator.integers(2**63))
+        label = "\0".join((str(self.seed), effect, scene.name, str(frame)))
+        return int.from_bytes(hashlib.sha256(label.encode()).digest()[:8], "little")
 
 
 def measure(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: Physics) -> Returns:
