@@ -18,6 +18,7 @@ FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 
 Emission = Literal["scanned", "flood"]
 Estimator = Literal["peak", "matched"]
+HistogramStart = Literal["gate", "pulse"]
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,8 @@ class Detector:
         photons: The light budget; None: any light at all is enough, and none is mistaken for it.
         estimator: The range from the histogram: its highest bin, or the log-matched filter with the pulse.
         false_alarm: Probability that a gate full of background light alone is taken for a return.
+        bins: How many bins a histogram has; None: as many as a gate needs.
+        histogram_start: Where its first bin starts: with the gate, or with the pulse, at range 0.
     """
 
     name: str
@@ -90,6 +93,13 @@ class Detector:
     photons: Photons | None = field(default=None)
     estimator: Estimator = "peak"
     false_alarm: float = 0.01
+    bins: int | None = None
+    histogram_start: HistogramStart = "gate"
+
+    @property
+    def timing_sigma_s(self) -> float:
+        """Standard deviation of when one photon is counted: pulse and jitter together [s]."""
+        return math.hypot(self.pulse_sigma_s, self.jitter_sigma_s)
 
     @property
     def bin_m(self) -> float | None:
