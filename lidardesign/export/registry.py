@@ -49,6 +49,12 @@ EXPORTERS: dict[str, Exporter] = {
             "one sensor per row, the 16 columns of the research code",
             "lidardesign.export.sensors_csv",
         ),
+        Exporter(
+            "galvo",
+            ".galvo.csv",
+            "mirror angles in the order of least travel, gates in ps: +-20 degrees per axis",
+            "lidardesign.export.galvo",
+        ),
     )
 }
 

@@ -1,0 +1,227 @@
+"""Rays for a two-mirror scanner with a gated single-photon detector: mirror angles in the order of least travel.
+
+One row per ray, in the order in which the mirrors reach them. `lidardesign.design.galvo` says what the angles mean: x
+and y are optical, twice the mechanical ones. A scanner has one place, so rays that start elsewhere are the rows of
+another `position`, with its own origin, boresight and tour: the scanner is moved there, or another one stands there.
+A position's boresight is the middle of its rays.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.galvo import (
+    LIMIT_DEG,
+    degree_frame,
+    gate_m,
+    gate_ps,
+    middle_boresight_deg,
+    scan_angles_deg,
+    scan_directions,
+)
+from lidardesign.design.rays import fire_times
+from lidardesign.design.sensor import Design
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.export.columns import losses
+from lidardesign.export.steering import short_tour, travel
+from lidardesign.run.files import write_atomic
+from lidardesign.simulate.returns import Rays
+
+WHOLE = ("step", "position", "gate_start_ps", "gate_width_ps", "sensor", "ray")
+COLUMNS = (
+    "step", "position", "origin_x_m", "origin_y_m", "origin_z_m", "boresight_azimuth_deg", "boresight_elevation_deg",
+    "x_deg", "y_deg", "gate_start_ps", "gate_width_ps", "sensor", "ray",
+)  # fmt: skip
+# Angles at the limit come out of sines and cosines a few units in the last place off.
+ROUNDING_DEG = 1e-9
+MOST_ROWS = 1_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Position:
+    """Where a scanner stands, and its rays in the order of their steps.
+
+    Arguments:
+        origin_m: Its place [m], shape (3,).
+        boresight_deg: Azimuth and elevation of where both mirrors are at zero [deg].
+        ray: Indices into the design's rays, shape (K,).
+        angles_deg: Optical scan angles x and y, shape (K, 2).
+        own_travel_deg: The length of the round trip in the design's own order [deg].
+    """
+
+    origin_m: np.ndarray
+    boresight_deg: tuple[float, float]
+    ray: np.ndarray
+    angles_deg: np.ndarray
+    own_travel_deg: float
+
+
+def write(design: Design, rays: Rays, path: Path) -> list[str]:
+    """Write the file, atomically; returns what it came to and notes of what the format cannot hold.
+
+    Raises:
+        ConfigError: Rays of one sensor start at several places, or look beyond what the mirrors reach.
+    """
+    positions = plan(design, rays)
+    gates = gate_ps(rays.gate_m)
+    lines = [",".join(COLUMNS)]
+    for number, one in enumerate(positions):
+        shared = [repr(float(value)) for value in (*one.origin_m, *one.boresight_deg)]
+        for ray, (x, y) in zip(one.ray.tolist(), one.angles_deg.tolist(), strict=True):
+            start, width = gates[ray].tolist()
+            row = (len(lines) - 1, number, *shared, repr(x), repr(y), start, width, int(rays.sensor[ray]), ray)
+            lines.append(",".join(map(str, row)))
+    write_atomic(path, "\n".join(lines) + "\n")
+    return [*_summary(positions), *losses(design), "firing times follow from the order of the rows"]
+
+
+def plan(design: Design, rays: Rays) -> list[Position]:
+    """The positions of a scanner that fires all rays, in the order of the rays that need them first.
+
+    Raises:
+        ConfigError: Rays of one sensor start at several places, or look beyond what the mirrors reach.
+    """
+    origins, first, place = np.unique(rays.origin_m, axis=0, return_index=True, return_inverse=True)
+    place = place.reshape(-1)
+    _refuse_spread_origins(design, rays, place)
+    found = [_position(origins[here], rays, np.flatnonzero(place == here)) for here in np.argsort(first)]
+    _refuse_far_rays(design, rays, found)
+    return found
+
+
+def read(path: Path) -> Rays:
+    """The rays of a file that `write` made, in the design's own order.
+
+    They fire at the times of their steps, 10 frames a second. Directions come back to rounding, gates to the whole
+    picoseconds that hold them.
+
+    Raises:
+        DataError: The file is not there, no such table, or has values out of their range.
+    """
+    table = _columns(path)
+    count = len(table["ray"])
+    if sorted(table["ray"].tolist()) != list(range(count)) or sorted(table["step"].tolist()) != list(range(count)):
+        raise DataError(
+            "rays or steps are missing or there twice", where=str(path), allowed=f"each of 0 to {count - 1}"
+        )
+    directions = np.empty((count, 3))
+    boresights = np.stack([table["boresight_azimuth_deg"], table["boresight_elevation_deg"]], axis=1)
+    scan_deg = np.stack([table["x_deg"], table["y_deg"]], axis=1)
+    for boresight in np.unique(boresights, axis=0):
+        rows = (boresights == boresight).all(axis=1)
+        directions[rows] = scan_directions(degree_frame(*boresight), scan_deg[rows])
+    gates = gate_m(np.stack([table["gate_start_ps"], table["gate_width_ps"]], axis=1))
+    origins = np.stack([table[f"origin_{axis}_m"] for axis in "xyz"], axis=1)
+    times = fire_times(count, Bandwidth().rate_hz)[table["step"]]
+    return Rays(origins, directions, gates, table["sensor"], times).subset(np.argsort(table["ray"]))
+
+
+def is_galvo_file(path: Path) -> bool:
+    """Whether a file begins as `write` begins one."""
+    header = ",".join(COLUMNS).encode()
+    try:
+        with Path(path).open("rb") as file:
+            return file.read(len(header)) == header
+    except OSError:
+        return False
+
+
+def _position(origin_m: np.ndarray, rays: Rays, chosen: np.ndarray) -> Position:
+    directions = rays.direction[chosen]
+    boresight = middle_boresight_deg(directions)
+    angles_deg = scan_angles_deg(degree_frame(*boresight), directions)
+    order = short_tour(angles_deg)
+    return Position(origin_m, boresight, chosen[order], angles_deg[order], travel(angles_deg))
+
+
+def _refuse_spread_origins(design: Design, rays: Rays, place: np.ndarray) -> None:
+    for index, sensor in enumerate(design.sensors):
+        places = len(np.unique(place[rays.sensor == index]))
+        if places > 1:
+            raise ConfigError(
+                f"the rays of sensor {sensor.name!r} start at {places} places, and a steering mirror stands at one",
+                where=design.name,
+                allowed="one origin per sensor",
+                hint="lidardesign constrain RUN --layout grid, or with origin.fixed_m in the constraints",
+            )
+
+
+def _refuse_far_rays(design: Design, rays: Rays, positions: list[Position]) -> None:
+    """Refuse the design where mirrors would have to turn beyond `LIMIT_DEG`, with how many rays and the worst."""
+    ray = np.concatenate([one.ray for one in positions] or [np.zeros(0, dtype=np.int64)])
+    angles_deg = np.concatenate([one.angles_deg for one in positions] or [np.zeros((0, 2))])
+    beyond = np.abs(angles_deg).max(axis=1) > LIMIT_DEG + ROUNDING_DEG
+    if not beyond.any():
+        return
+    worst = int(np.abs(angles_deg).max(axis=1).argmax())
+    x, y = angles_deg[worst]
+    sensor = design.sensors[int(rays.sensor[ray[worst]])].name
+    raise ConfigError(
+        f"{int(beyond.sum())} of {len(ray)} rays are out of the mirrors' reach, the furthest at x = {x:.2f}, "
+        f"y = {y:.2f} degrees from the middle of the rays (ray {ray[worst]}, sensor {sensor!r})",
+        where=design.name,
+        allowed=f"+-{LIMIT_DEG:g} degrees of optical scan angle per axis",
+        hint="constrain field_of_view and boresight, as boresight.elevation_deg.max=20, or fewer sensors apart",
+    )
+
+
+def _summary(positions: list[Position]) -> list[str]:
+    if not positions:
+        return []
+    after = sum(travel(one.angles_deg) for one in positions)
+    before = sum(one.own_travel_deg for one in positions)
+    widest = np.abs(np.concatenate([one.angles_deg for one in positions])).max(axis=0)
+    notes = [
+        f"the mirrors travel {after:.1f} degrees per frame, {before:.1f} in the design's own order",
+        f"optical angles (twice the mechanical ones) up to +-{widest[0]:.2f} in x and +-{widest[1]:.2f} degrees in y",
+    ]
+    if len(positions) > 1:
+        notes.append(f"the rays start at {len(positions)} places: one scanner each, or one that is moved there")
+    else:
+        azimuth, elevation = positions[0].boresight_deg
+        place = ", ".join(f"{value:g}" for value in positions[0].origin_m)
+        notes.append(f"scanner at ({place}) m, boresight at azimuth {azimuth:g}, elevation {elevation:g} degrees")
+    return notes
+
+
+def _columns(path: Path) -> dict[str, np.ndarray]:
+    """The table of a file by column, whole numbers where they must be."""
+    where = str(path)
+    try:
+        with Path(path).open(encoding="utf-8", newline="") as file:
+            rows = [row for row, _ in zip(csv.reader(file), range(MOST_ROWS + 1), strict=False)]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise DataError(f"cannot be read as a table ({error})", where=where) from error
+    if not rows or tuple(rows[0]) != COLUMNS:
+        raise DataError("is no ray list of the galvo format", where=where, allowed=",".join(COLUMNS))
+    if len(rows) > MOST_ROWS:
+        raise DataError(f"holds more than {MOST_ROWS} rays", where=where)
+    values = np.empty((len(rows) - 1, len(COLUMNS)))
+    for number, row in enumerate(rows[1:], start=2):
+        values[number - 2] = _numbers(row, f"{where}, line {number}")
+    return {
+        name: column.astype(np.int64) if name in WHOLE else column
+        for name, column in zip(COLUMNS, values.T, strict=True)
+    }
+
+
+def _numbers(row: list[str], where: str) -> list[float]:
+    """The values of a row: finite, and whole and not negative where they count or time something."""
+    try:
+        found = [float(cell) for cell in row]
+    except ValueError as error:
+        raise DataError(f"{error}", where=where, allowed="numbers") from error
+    if len(found) != len(COLUMNS) or not all(map(math.isfinite, found)):
+        raise DataError(f"holds {row}", where=where, allowed=f"{len(COLUMNS)} finite numbers")
+    for name, value in zip(COLUMNS, found, strict=True):
+        if name in WHOLE and (value < 0 or value != int(value) or value > 2**53):
+            raise DataError(f"{name} is {value:g}", where=where, allowed="whole numbers, 0 or more")
+        if name in ("x_deg", "y_deg") and abs(value) > LIMIT_DEG + ROUNDING_DEG:
+            raise DataError(f"{name} is {value:g}", where=where, allowed=f"+-{LIMIT_DEG:g} degrees")
+    return found
