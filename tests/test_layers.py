@@ -58,6 +58,10 @@ HOMES = {
     "rich": ("lidardesign.cli.",),
     "plotly": ("lidardesign.evaluate.report",),
     "matplotlib": ("lidardesign.evaluate.plots",),
+    # it can abort its process: only the one of its own imports it
+    "mitsuba": ("lidardesign.simulate.light_transport_worker",),
+    "mitransient": ("lidardesign.simulate.light_transport_worker",),
+    "drjit": ("lidardesign.simulate.light_transport_worker",),
 }
 # safetensors writes checkpoints of torch tensors beside the density, in the run
 TORCH_SIDE_FILES = ("lidardesign.run.checkpoint",)

@@ -1,0 +1,154 @@
+"""The two ends of light paths in the simulator's process: a sensor that is a list of rays, and a list of small lights.
+
+Made from the modules given, not imported: only the simulator's process has them. What a sensor and an emitter are asked
+is mitsuba's protocol; a path's length counts from the ray's origin to the light, and on by the light's own lead.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+RAY_COLUMNS = ("origin", "direction", "cone_cosine_m1", "baseline")
+LIGHT_COLUMNS = (
+    "light",
+    "light_forward",
+    "light_left",
+    "light_up",
+    "light_cosine",
+    "light_left_tan",
+    "light_up_tan",
+    "light_lambert",
+    "light_intensity",
+    "light_radius",
+    "light_lead",
+)
+
+
+class Job:
+    """What the sensor and the emitter of a request share; its arrays live as long as kernels may read them.
+
+    Arguments:
+        mi, dr: mitsuba with its variant set, and drjit.
+        arrays: The columns of rays and lights.
+        samples: Paths per ray.
+        own: Whether ray n sees light n alone; otherwise all of them.
+    """
+
+    def __init__(self, mi: Any, dr: Any, arrays: dict[str, np.ndarray], samples: int, own: bool) -> None:
+        self._dr, self.samples, self.own = dr, samples, own
+        # not written into the kernel, so that one kernel serves all numbers of lights
+        self.lights = dr.opaque(mi.UInt32, len(arrays["light"]))
+        self._columns: dict[str, Any] = {}
+        for name in (*RAY_COLUMNS, *LIGHT_COLUMNS):
+            values = np.ascontiguousarray(arrays[name].T, dtype=np.float32)
+            self._columns[name] = (mi.Float if values.ndim == 1 else mi.Vector3f)(values)
+
+    def at(self, name: str, index: Any) -> Any:
+        """A column's values at indices."""
+        values = self._columns[name]
+        return self._dr.gather(type(values), values, index)
+
+
+current: list[Job] = []
+
+
+def register(mi: Any, dr: Any) -> None:
+    """Make `lidardesign_rays` and `lidardesign_lights` known; they work on the one job in `current`."""
+    mi.register_sensor("lidardesign_rays", _ray_list(mi, dr))
+    mi.register_emitter("lidardesign_lights", _lights(mi, dr))
+
+
+def _ray_list(mi: Any, dr: Any) -> type:
+    class RayList(mi.Sensor):
+        """Rays with an origin each, spread evenly within a cone around their directions."""
+
+        def __init__(self, properties: Any) -> None:
+            super().__init__(properties)
+            self.m_needs_sample_3 = True
+
+        def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
+            job = current[0]
+            ray = dr.arange(mi.UInt32, dr.width(sample2)) // job.samples
+            axis, cosine_m1 = job.at("direction", ray), job.at("cone_cosine_m1", ray)
+            # 1 - cos of a narrow cone is kept apart: cos alone would round to 1
+            drop, turn = sample3.x * cosine_m1, dr.two_pi * sample3.y
+            sine = dr.safe_sqrt(drop * (2 - drop))
+            local = mi.Vector3f(sine * dr.cos(turn), sine * dr.sin(turn), 1 - drop)
+            spread = dr.normalize(mi.Frame3f(axis).to_world(local))
+            direction = dr.select(cosine_m1 > 0, spread, axis)
+            # nothing moves: time is free to carry the ray's number along the path, exact below 2^24
+            return mi.Ray3f(mi.Point3f(job.at("origin", ray)), direction, mi.Float(ray), []), mi.Spectrum(1)
+
+        def sample_ray_differential(
+            self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
+        ) -> Any:
+            ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
+            return mi.RayDifferential3f(ray), weight
+
+        def bbox(self) -> Any:
+            return mi.BoundingBox3f()
+
+        def to_string(self) -> str:
+            return "RayList[]"
+
+    return RayList
+
+
+def _lights(mi: Any, dr: Any) -> type:
+    class Lights(mi.Emitter):
+        """Points that send light into a part of what lies in front of them, or everywhere."""
+
+        def __init__(self, properties: Any) -> None:
+            super().__init__(properties)
+            self.m_flags = mi.EmitterFlags.DeltaPosition
+
+        def sample_direction(self, it: Any, sample: Any, active: Any = True) -> Any:
+            job = current[0]
+            ray = mi.UInt32(it.time + 0.5)
+            chosen = mi.UInt32(sample.x * mi.Float(job.lights))
+            index = ray if job.own else dr.minimum(chosen, job.lights - 1)
+            place = mi.Point3f(job.at("light", index))
+            offset = place - it.p
+            distance = dr.norm(offset)
+            toward = offset / dr.maximum(distance, dr.smallest(mi.Float))
+            strength = _strength(dr, job, index, -toward, distance)
+            if not job.own:
+                strength *= mi.Float(job.lights)
+            ds = dr.zeros(mi.DirectionSample3f)
+            ds.p, ds.n, ds.d, ds.time = place, -toward, toward, it.time
+            ds.dist = distance + job.at("light_lead", index) - job.at("baseline", ray)
+            lit = active & (strength > 0)
+            ds.pdf, ds.delta = dr.select(lit, mi.Float(1), 0), mi.Bool(True)
+            ds.emitter = mi.EmitterPtr(self)
+            return ds, mi.Spectrum(dr.select(lit, strength, 0))
+
+        def pdf_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+            return mi.Float(0)
+
+        def eval_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+            return mi.Spectrum(0)
+
+        def eval(self, si: Any, active: Any = True) -> Any:
+            return mi.Spectrum(0)
+
+        def bbox(self) -> Any:
+            return mi.BoundingBox3f()
+
+        def to_string(self) -> str:
+            return "Lights[]"
+
+    return Lights
+
+
+def _strength(dr: Any, job: Job, index: Any, away: Any, distance: Any) -> Any:
+    """The irradiance of lights at a distance in a direction away from them, on a surface that faces them."""
+    forward, left, up = (dr.dot(away, job.at(f"light_{name}", index)) for name in ("forward", "left", "up"))
+    inside = (forward >= job.at("light_cosine", index)) & (distance > 0)
+    inside &= dr.abs(left) <= job.at("light_left_tan", index) * dr.abs(forward)
+    inside &= dr.abs(up) <= job.at("light_up_tan", index) * dr.abs(forward)
+    intensity = job.at("light_intensity", index)
+    intensity *= dr.select(job.at("light_lambert", index) > 0, dr.maximum(forward, 0), 1)
+    near = dr.maximum(distance, job.at("light_radius", index))
+    return dr.select(inside, intensity / dr.square(near), 0)
