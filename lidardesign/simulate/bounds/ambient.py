@@ -1,0 +1,49 @@
+r"""Light of the surroundings and dark counts: false peaks, hidden echoes, and returns where there is none.
+
+With mean counts b per bin, B bins and s counts in the echo's bin, another bin wins with at most
+(B - 1) exp(-(sqrt(s + b) - sqrt(b))^2): the union over bins of Chernoff's bound. A threshold that lets background pass
+with the probability `false_alarm` hides echoes below it, and a ray that has no return invents one as often as that.
+Counts among the echo's own move its range by its error times sqrt(b / s), the share of the noise that is theirs.
+
+Nothing of this can be where no count arrives: all are at most 1 - exp(-B b). Light is bounded as if all were reflected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lidardesign.numerics import safe_divide
+from lidardesign.scene import Scene
+from lidardesign.simulate.bounds.counts import Counts, share_in_bin
+from lidardesign.simulate.bounds.sight import Sight, Stake
+from lidardesign.simulate.detector import Detector
+from lidardesign.simulate.returns import Rays
+
+
+def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
+    """Why nothing but the emitter's light is counted, if so."""
+    if detector.photons is None:
+        return "the detector does not count photons"
+    dark = scene.ambient is None or scene.ambient.illuminance_lux == 0
+    return "it is dark and the detector is quiet" if dark and detector.photons.dark_hz == 0 else None
+
+
+def stake(sight: Sight, counts: Counts) -> Stake:
+    """Of counts that no echo brought."""
+    sigma_s = sight.detector.timing_sigma_s
+    signal, per_bin = counts.in_air, counts.per_bin
+    any_count = -np.expm1(-per_bin * counts.bins)
+    hidden = np.maximum(counts.missed(signal, per_bin, sigma_s) - counts.missed(signal, 0.0, sigma_s), 0.0)
+    wrong = counts.mistaken(signal, per_bin, per_bin, sigma_s) + hidden
+    lost = np.minimum(np.where(sight.returned, wrong, sight.detector.false_alarm), any_count)
+    echo = signal * share_in_bin(counts.bin_m, sigma_s)
+    squared = counts.error_m(signal, sigma_s) ** 2 * np.minimum(safe_divide(per_bin, echo, 1.0), any_count)
+    return Stake(squared, lost, _reason(sight, float(np.median(per_bin * counts.bins))))
+
+
+def _reason(sight: Sight, gate: float) -> str:
+    ambient = sight.scene.ambient
+    light = "dark counts" if ambient is None else f"{ambient.illuminance_lux:,.0f} lux ({ambient.source}), dark counts"
+    return f"{light}: at most {gate:.3g} in a gate"

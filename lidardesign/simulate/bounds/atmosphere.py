@@ -1,0 +1,52 @@
+r"""Fog and haze: light that fades, and light that comes back from the air itself.
+
+Over a range R the air leaves exp(-2 alpha R) of an echo's photons: the range strays more and returns are lost, as
+from fewer photons. Haze sends h counts into a bin, most at the gate's start; it is taken for the echo with at most
+(B - 1) exp(-(sqrt(s) - sqrt(h))^2) (see `Counts.mistaken`), and for a return by a ray that has none wherever its
+fullest bin reaches the threshold, bounded by B times Poisson's tail there, and by 1 - exp(-all of its counts).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lidardesign.scene import Scene
+from lidardesign.simulate.bounds.counts import Counts, changed_share, needed_counts
+from lidardesign.simulate.bounds.sight import Sight, Stake
+from lidardesign.simulate.detector import Detector
+from lidardesign.simulate.returns import Rays
+
+
+def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
+    """Why the air does not matter, if so."""
+    if scene.medium is None or scene.medium.extinction_per_m == scene.medium.backscatter_per_m_sr == 0:
+        return "the air is clear"
+    return None if detector.photons is not None else "the detector hears an echo however weak"
+
+
+def stake(sight: Sight, counts: Counts) -> Stake:
+    """Of air that weakens and scatters."""
+    sigma_s = sight.detector.timing_sigma_s
+    clear, left = counts.signal, counts.in_air
+    fewer = counts.missed(left, counts.per_bin, sigma_s) - counts.missed(clear, counts.per_bin, sigma_s)
+    haze, fullest = (counts.pulses * part for part in counts.haze_per_pulse)
+    any_count = -np.expm1(-haze)
+    wrong = np.minimum(counts.mistaken(left, counts.per_bin + fullest, counts.per_bin, sigma_s), any_count)
+    squared = counts.error_m(left, sigma_s) ** 2 * np.minimum(
+        2 * np.sqrt(changed_share(clear, left)) + any_count, 1.0
+    )
+    lost = np.where(sight.returned, np.maximum(fewer, 0.0) + wrong, _invented(counts, haze, fullest))
+    medium = sight.scene.medium
+    reason = f"air that dims light by {100 * -np.expm1(-2 * medium.extinction_per_m):.3g} % per metre of range"
+    return Stake(squared, np.minimum(lost, 1.0), reason)
+
+
+def _invented(counts: Counts, haze: np.ndarray, fullest: np.ndarray) -> np.ndarray:
+    """Probability that haze alone makes a return, at most."""
+    from scipy.special import pdtr
+
+    needed = needed_counts(counts.per_bin, counts.bins, counts.sight.detector.false_alarm)
+    reached = 1 - pdtr(needed - 1, fullest + counts.per_bin)
+    return np.minimum(counts.bins * reached, -np.expm1(-haze))

@@ -1,0 +1,174 @@
+"""Expected counts of signal and background, and how likely a detector misses the one or mistakes the other for it.
+
+Counts are Poisson. A return is the highest of B bins, reported if it holds at least k counts, the fewest that B bins of
+background alone reach together with at most the detector's probability of a false alarm.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from lidardesign.numerics import safe_divide
+from lidardesign.simulate.bounds.light import ambient_per_metre, haze_per_pulse
+from lidardesign.simulate.bounds.sight import BINS_PER_SIGMA, Sight
+from lidardesign.simulate.detector import Detector, metres
+
+# The highest of a histogram's bins strays by this many of (sigma^5 / (n b))^(1/4), see `peak_error_m`.
+PEAK_STRAY = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Counts:
+    """Counts per frame of every ray of a sight, for a detector that counts photons.
+
+    Arguments:
+        sight: What the rays meet.
+    """
+
+    sight: Sight
+
+    @cached_property
+    def pulses(self) -> np.ndarray:
+        """Pulses of each ray in a frame, shape (N,)."""
+        return self._by_sharing("pulses")
+
+    @cached_property
+    def signal_per_pulse(self) -> np.ndarray:
+        """Counts of the first hit in clear air, shape (N,)."""
+        photons = self.sight.detector.photons
+        return self._by_sharing("emitted") * photons.aperture_m2 * photons.efficiency * self.sight.gain
+
+    @cached_property
+    def signal(self) -> np.ndarray:
+        """Counts of the first hit in a frame, in clear air, shape (N,)."""
+        return self.signal_per_pulse * self.pulses
+
+    @property
+    def typical(self) -> str:
+        """The median of `in_air` over returns, for people."""
+        returned = self.in_air[self.sight.returned]
+        return f"{np.median(returned):.3g}" if len(returned) else "no"
+
+    @cached_property
+    def in_air(self) -> np.ndarray:
+        """`signal` weakened by the air, shape (N,)."""
+        medium = self.sight.scene.medium
+        if medium is None:
+            return self.signal
+        path_m = self.sight.window_m[:, 0] + self.sight.before_m
+        return self.signal * np.exp(-2 * medium.extinction_per_m * path_m)
+
+    @cached_property
+    def background_per_metre(self) -> np.ndarray:
+        """Ambient light and dark counts per pulse and metre, shape (N,)."""
+        return ambient_per_metre(self.sight)
+
+    @cached_property
+    def haze_per_pulse(self) -> tuple[np.ndarray, np.ndarray]:
+        """Counts that the air sends back: in the whole window, and in its fullest bin, shapes (N,)."""
+        return haze_per_pulse(self.sight, self._by_sharing("emitted"), self.bin_m)
+
+    @cached_property
+    def bin_m(self) -> float:
+        """The width of a histogram's bins [m]."""
+        return bin_width_m(self.sight.detector)
+
+    @cached_property
+    def bins(self) -> np.ndarray:
+        """How many of them a window has, shape (N,)."""
+        return np.maximum(np.ceil(self.sight.width_m / self.bin_m), 1.0)
+
+    @cached_property
+    def per_bin(self) -> np.ndarray:
+        """Ambient and dark counts per bin in a frame, shape (N,)."""
+        return self.background_per_metre * self.bin_m * self.pulses
+
+    def missed(self, signal: np.ndarray, per_bin: np.ndarray | float, sigma_s: float) -> np.ndarray:
+        """Probability that the echo's bin holds fewer counts than it takes to be reported, shape (N,).
+
+        Arguments:
+            signal: Counts of the echo, shape (N,).
+            per_bin: Background counts in each bin, shape (N,).
+            sigma_s: How far a photon's time strays [s].
+        """
+        from scipy.special import pdtr
+
+        per_bin = np.broadcast_to(per_bin, signal.shape)
+        needed = needed_counts(per_bin, self.bins, self.sight.detector.false_alarm)
+        return pdtr(needed - 1, signal * share_in_bin(self.bin_m, sigma_s) + per_bin)
+
+    def mistaken(self, signal: np.ndarray, other: np.ndarray, per_bin: np.ndarray, sigma_s: float) -> np.ndarray:
+        """Bound of the probability that another bin beats the echo's, shape (N,).
+
+        The union over all bins of P(X >= Y) <= exp(-(sqrt(E Y) - sqrt(E X))^2), Chernoff's bound for a difference of
+        Poisson counts X of the fullest other bin (`other`) and Y of the echo's.
+        """
+        expected = signal * share_in_bin(self.bin_m, sigma_s) + per_bin
+        lead = np.maximum(np.sqrt(expected) - np.sqrt(other), 0.0)
+        return np.minimum((self.bins - 1) * np.exp(-(lead**2)), 1.0)
+
+    def error_m(self, signal: np.ndarray, sigma_s: float) -> np.ndarray:
+        """How far the range from so many photons strays, rms, shape (N,) [m]."""
+        return estimate_error_m(self.sight.detector, signal, sigma_s)
+
+    def _by_sharing(self, name: str) -> np.ndarray:
+        shared, place = np.unique(self.sight.sharing, return_inverse=True)
+        return np.array([getattr(self.sight.detector.photons, name)(int(rays)) for rays in shared])[place]
+
+
+def bin_width_m(detector: Detector) -> float:
+    """A histogram's bins: the detector's own, or a share of a photon's timing error [m].
+
+    A detector without either has one bin per nanometre: ranges are then exact.
+    """
+    own = detector.bin_m or metres(detector.timing_sigma_s) / BINS_PER_SIGMA
+    return own or 1e-9
+
+
+def share_in_bin(bin_m: float, sigma_s: float) -> float:
+    """Share of an echo's photons in its fullest bin, in the worst case: the echo lies on a bin's edge."""
+    spread_m = metres(sigma_s)
+    return 0.5 if spread_m == 0 else 0.5 * math.erf(bin_m / (math.sqrt(2) * spread_m))
+
+
+def needed_counts(per_bin: np.ndarray, bins: np.ndarray, false_alarm: float) -> np.ndarray:
+    """Fewest counts k >= 1 that B bins of Poisson background reach with a probability of at most that, shape (N,).
+
+    The union over bins: B P(X >= k) <= false_alarm.
+    """
+    from scipy.special import pdtr, pdtrik
+
+    allowed = np.clip(false_alarm / bins, np.finfo(float).eps, 1.0)
+    least = np.maximum(per_bin, np.finfo(float).tiny)
+    quiet = -np.expm1(-least) <= allowed
+    with np.errstate(invalid="ignore"):
+        needed = np.ceil(np.nan_to_num(pdtrik(1 - allowed, least))) + 1
+    # the inverse is of a smooth curve through the steps: one step more where it fell short
+    needed += 1 - pdtr(needed - 1, least) > allowed
+    return np.where(quiet, 1.0, np.maximum(needed, 1.0))
+
+
+def estimate_error_m(detector: Detector, signal: np.ndarray, sigma_s: float) -> np.ndarray:
+    """How far the range from n photons that stray by sigma strays, rms, shape (N,) [m]: the pulse and what times it.
+
+    The matched filter averages: sigma / sqrt(n). The highest bin is a mode: it strays to where the expected counts
+    n b f fall short of the peak's by about their own noise; with f a Gaussian, e^4 = (8 sqrt(2 pi)) sigma^5 / (n b) up
+    to a factor (Chernoff 1964: a mode converges slower than a mean). Neither strays further than a single photon.
+    """
+    single_m = metres(sigma_s)
+    count = np.maximum(signal, 1.0)
+    averaged = single_m / np.sqrt(count)
+    if detector.estimator == "matched":
+        return averaged
+    width_m = bin_width_m(detector)
+    mode = PEAK_STRAY * (single_m**5 / (count * width_m)) ** 0.25 if single_m else np.zeros_like(count)
+    return np.minimum(np.maximum(averaged, mode), single_m)
+
+
+def changed_share(signal: np.ndarray, fewer: np.ndarray) -> np.ndarray:
+    """Share of an echo's photons that are not there any more, shape (N,)."""
+    return np.clip(1 - safe_divide(fewer, signal, 1.0), 0.0, 1.0)

@@ -1,0 +1,46 @@
+r"""Timing errors of the detector: (c / 2) sigma_j for one time per return, less for the mean of n photons.
+
+Without photons each return has one normal error, (c / 2) sigma_j rms. With n photons the matched filter averages them:
+(c / 2) sigma_j / sqrt(n). The highest bin does not average; with timing errors it strays as `estimate_error_m` says of
+pulse and timing together, and without them it strayed by itself, so that the two differ by at most
+sqrt(e(sigma_p, sigma_j)^2 + e(sigma_p)^2). A wider echo is also lower: returns are lost where it now falls below what
+is reported.
+
+The pulse is taken as Gaussian and n as its expectation: an estimate where n is small.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lidardesign.scene import Scene
+from lidardesign.simulate.bounds.counts import Counts, estimate_error_m
+from lidardesign.simulate.bounds.sight import Sight, Stake
+from lidardesign.simulate.detector import Detector, metres
+from lidardesign.simulate.returns import Rays
+
+
+def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
+    """Why photons are timed exactly, if so."""
+    return None if detector.jitter_sigma_s > 0 else "the detector times without error"
+
+
+def stake(sight: Sight, counts: Counts) -> Stake:
+    """Of a timing error per return, or per photon."""
+    detector = sight.detector
+    sigma_s = detector.jitter_sigma_s
+    if detector.photons is None:
+        error = np.full(len(sight), metres(sigma_s))
+        return Stake(error**2, np.zeros(len(sight)), f"a return is timed to {1e12 * sigma_s:.3g} ps")
+    signal, pulse_s, both_s = counts.in_air, detector.pulse_sigma_s, detector.timing_sigma_s
+    if detector.estimator == "matched":
+        squared = estimate_error_m(detector, signal, sigma_s) ** 2
+    else:
+        squared = counts.error_m(signal, both_s) ** 2 + counts.error_m(signal, pulse_s) ** 2
+    lost = np.maximum(
+        counts.missed(signal, counts.per_bin, both_s) - counts.missed(signal, counts.per_bin, pulse_s), 0.0
+    )
+    reason = f"a photon is timed to {1e12 * sigma_s:.3g} ps; a return has about {counts.typical} of them"
+    return Stake(squared, np.where(sight.returned, lost, 0.0), reason)

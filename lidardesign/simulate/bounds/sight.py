@@ -1,0 +1,129 @@
+"""What all rays of a scene's frame meet, and the light that comes back from it: what bounds are worked out from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from lidardesign.scene import Scene
+from lidardesign.simulate.bistatic import path_of_range, path_windows
+from lidardesign.simulate.detector import FWHM_PER_SIGMA, Detector, metres
+from lidardesign.simulate.echoes import Beams
+from lidardesign.simulate.hits import Hits
+from lidardesign.simulate.physics import direct_echoes
+from lidardesign.simulate.raycast import SceneCaster
+from lidardesign.simulate.returns import Outcome, Rays
+from lidardesign.simulate.simulate import gate_outcomes
+
+# A surface that is grazed more flatly than this counts as met at it: ranges then change by up to 50 times a step aside.
+FLATTEST_COSINE = 0.02
+# Without bins of its own a detector's histogram has bins of this share of a photon's timing error.
+BINS_PER_SIGMA = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Stake:
+    """What an effect could change, ray by ray.
+
+    Arguments:
+        squared_m2: Mean squared error of the range of a return, (N,) [m^2].
+        lost: Probability that a return is lost, or invented, or taken from somewhere else, (N,).
+        reason: Why, in one line.
+    """
+
+    squared_m2: np.ndarray
+    lost: np.ndarray
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """First hits of all rays in a frame.
+
+    Arguments:
+        scene: What they meet.
+        frame: The time frame.
+        detector: What hears their light.
+        rays: Those of all lists, N.
+        row: The list of each, ascending, shape (N,).
+        sharing: How many rays share its emitter's energy, shape (N,).
+        hits: What they meet first.
+    """
+
+    scene: Scene
+    frame: int
+    detector: Detector
+    rays: Rays
+    row: np.ndarray
+    sharing: np.ndarray
+    hits: Hits
+
+    @classmethod
+    def of(cls, scene: Scene, frame: int, detector: Detector, lists: Sequence[Rays], caster: SceneCaster) -> Sight:
+        """What lists of rays meet in a frame."""
+        names = ("origin_m", "direction", "gate_m", "sensor", "time_s")
+        rays = Rays(*(np.concatenate([getattr(one, name) for one in lists]) for name in names))
+        sizes = np.array([len(one) for one in lists])
+        row = np.repeat(np.arange(len(lists)), sizes)
+        hits = caster.first_hit(rays.origin_m, rays.direction)
+        return cls(scene, frame, detector, rays, row, sizes[row], hits)
+
+    def __len__(self) -> int:
+        return len(self.rays)
+
+    def nothing(self, reason: str) -> Stake:
+        """No error, and nothing lost."""
+        return Stake(np.zeros(len(self)), np.zeros(len(self)), reason)
+
+    @cached_property
+    def returned(self) -> np.ndarray:
+        """Which rays have a return by geometry alone, shape (N,)."""
+        return gate_outcomes(self.hits.range_m, self.rays.gate_m) == Outcome.RETURN
+
+    @cached_property
+    def range_m(self) -> np.ndarray:
+        """Ranges of first hits, 0 where there is none, shape (N,) [m]."""
+        return np.where(self.hits.body >= 0, self.hits.range_m, 0.0)
+
+    @cached_property
+    def cosine(self) -> np.ndarray:
+        """Of incidence at the first hit, at least `FLATTEST_COSINE`; 1 on a miss, shape (N,)."""
+        along = np.abs(np.einsum("nk,nk->n", self.hits.normal, self.rays.direction))
+        return np.where(self.hits.body >= 0, np.maximum(along, FLATTEST_COSINE), 1.0)
+
+    @cached_property
+    def tangent(self) -> np.ndarray:
+        """Of incidence: how much the range changes by a step aside, shape (N,)."""
+        return np.sqrt(np.maximum(1 / self.cosine**2 - 1, 0.0))
+
+    @cached_property
+    def window_m(self) -> np.ndarray:
+        """Gates as half paths, shape (N, 2) [m]."""
+        return path_windows(self.rays, self.scene.receiver)
+
+    @cached_property
+    def width_m(self) -> np.ndarray:
+        """How much of half a path each ray listens to: no return is further off than that, shape (N,) [m]."""
+        return self.window_m[:, 1] - self.window_m[:, 0]
+
+    @cached_property
+    def before_m(self) -> np.ndarray:
+        """How much of its window lies before a ray's return; the whole window without one, shape (N,) [m]."""
+        path = path_of_range(self.rays, self.scene.receiver, np.where(self.returned, self.range_m, 0.0))
+        return np.where(self.returned, np.clip(path - self.window_m[:, 0], 0.0, self.width_m), self.width_m)
+
+    @cached_property
+    def gain(self) -> np.ndarray:
+        """Share of a ray's light that its first hit sends to 1 m^2 of aperture; 0 outside the gate, (N,) [1/m^2]."""
+        echoes = direct_echoes(self.scene, Beams.of(self.rays), self.hits)
+        gain = np.zeros(len(self))
+        gain[echoes.ray] = echoes.gain
+        return np.where(self.returned, gain, 0.0)
+
+    @cached_property
+    def resolution_m(self) -> float:
+        """Echoes closer than this are one: a bin or the width of the pulse, whichever is more [m]."""
+        return max(self.detector.bin_m or 0.0, metres(FWHM_PER_SIGMA * self.detector.pulse_sigma_s))

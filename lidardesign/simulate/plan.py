@@ -1,0 +1,269 @@
+"""The plan: which effects a scene calls for with a detector and lists of rays, and why.
+
+Each effect's bound says what it could change at most (`simulate.bounds`). The smallest are skipped as long as all that
+is skipped stays within a tolerance together: errors of range add up in the worst case, and so do shares of returns.
+Where nothing calls for an effect that is seen without casting a ray.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from lidardesign.errors import ConfigError
+from lidardesign.run.validation import suggest
+from lidardesign.scene import Scene
+from lidardesign.simulate.bounds import MODULES
+from lidardesign.simulate.bounds.counts import Counts
+from lidardesign.simulate.bounds.sight import Sight, Stake
+from lidardesign.simulate.cost import predicted_seconds
+from lidardesign.simulate.detector import IDEAL, Detector
+from lidardesign.simulate.physics import EFFECTS, Physics
+from lidardesign.simulate.raycast import SceneCaster
+from lidardesign.simulate.returns import Rays
+from lidardesign.simulate.simulate import build_casters
+
+Choice = Literal["auto", "all", "none"] | frozenset[str]
+# Ranges may be off by this share of a bin, or by this where there are none [m].
+TOLERATED_BIN_SHARE = 0.1
+TOLERATED_RANGE_M = 0.001
+TOLERATED_RETURNS = 0.001
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """What all skipped effects together may change.
+
+    Arguments:
+        range_m: Of ranges, rms over returns [m].
+        lost: Of returns, the share that is lost, invented or taken from somewhere else.
+
+    Raises:
+        ConfigError: A value that is not above 0, or not finite.
+    """
+
+    range_m: float
+    lost: float = TOLERATED_RETURNS
+
+    def __post_init__(self) -> None:
+        for name, value in (("of ranges", self.range_m), ("of returns", self.lost)):
+            if not math.isfinite(value) or value <= 0:
+                raise ConfigError(f"a tolerance {name} of {value:g}", where="effects", allowed="finite, above 0")
+
+    @classmethod
+    def of(cls, detector: Detector) -> Tolerance:
+        """A tenth of a bin, or 1 mm without bins, and a thousandth of the returns."""
+        return cls(TOLERATED_RANGE_M if detector.bin_m is None else TOLERATED_BIN_SHARE * detector.bin_m)
+
+
+@dataclass(frozen=True)
+class Bound:
+    """What an effect could change in the list of rays where it changes most.
+
+    Arguments:
+        range_m: Error of range, rms over returns [m].
+        lost: Share of returns that are lost, invented or taken from somewhere else, at most 1.
+        reason: Why, in one line.
+    """
+
+    range_m: float
+    lost: float
+    reason: str
+
+    def relative(self, tolerance: Tolerance) -> float:
+        """In units of the tolerance, whichever of the two is more."""
+        return max(self.range_m / tolerance.range_m, self.lost / tolerance.lost)
+
+
+@dataclass(frozen=True)
+class Decision:
+    """An effect in a plan.
+
+    Arguments:
+        name: Of `EFFECTS`.
+        on: Whether it is simulated.
+        bound: What it could change.
+        seconds: What simulating it takes on a typical core [s].
+        missing: What its simulation needs and is not there; None: nothing.
+    """
+
+    name: str
+    on: bool
+    bound: Bound
+    seconds: float
+    missing: str | None = None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is simulated of a scene, the same for all lists of rays.
+
+    Arguments:
+        decisions: One per effect, in the order in which light meets them.
+        tolerance: Of what is skipped.
+    """
+
+    decisions: tuple[Decision, ...]
+    tolerance: Tolerance
+
+    @property
+    def effects(self) -> frozenset[str]:
+        """What is on."""
+        return frozenset(decision.name for decision in self.decisions if decision.on)
+
+
+@dataclass(frozen=True)
+class Planner:
+    """How effects are chosen.
+
+    Arguments:
+        detector: What measures.
+        choice: `auto` takes what a scene calls for, `all` whatever the detector and this machine have, `none` nothing;
+            names are taken as they are.
+        tolerance: Of what `auto` skips; None: `Tolerance.of` the detector.
+    """
+
+    detector: Detector = IDEAL
+    choice: Choice = "auto"
+    tolerance: Tolerance | None = None
+
+    @property
+    def tolerated(self) -> Tolerance:
+        """Of what `auto` skips."""
+        return self.tolerance or Tolerance.of(self.detector)
+
+    def plan(self, scene: Scene, lists: Sequence[Rays], casters: Sequence[SceneCaster] | None = None) -> Plan:
+        """Which effects are on for lists of rays in a scene.
+
+        Arguments:
+            scene: The scene.
+            lists: Each shares the emitter's energy among its own rays; the list that changes most decides.
+            casters: One per frame; None builds them where a ray has to be cast.
+
+        Raises:
+            ConfigError: An effect that was named cannot be simulated here.
+        """
+        found = _bounds(scene, lists, self.detector, casters)
+        missing = {name: _missing(name) for name in self._asked(found)}
+        on = self._chosen(found, missing)
+        rays = sum(len(rays) for rays in lists) * scene.frames
+        return Plan(
+            tuple(
+                Decision(name, name in on, found[name], predicted_seconds(name, self.detector, rays), missing.get(name))
+                for name in EFFECTS
+            ),
+            self.tolerated,
+        )
+
+    def physics(self, plan: Plan, seed: int) -> Physics | None:
+        """What `simulate` takes for a plan; None where nothing is on."""
+        return Physics(self.detector, plan.effects, seed) if plan.effects else None
+
+    def _asked(self, found: dict[str, Bound]) -> list[str]:
+        """Effects that are on wherever they can be simulated."""
+        if self.choice == "auto":
+            return sorted(_called_for(found, self.tolerated))
+        if self.choice == "all":
+            return [name for name in EFFECTS if name in found_here(self.detector)]
+        return [] if self.choice == "none" else sorted(self.choice)
+
+    def _chosen(self, found: dict[str, Bound], missing: dict[str, str | None]) -> frozenset[str]:
+        for name, reason in missing.items():
+            if reason is not None and isinstance(self.choice, frozenset):
+                raise ConfigError(f"{name} cannot be simulated here: {reason}", where="--effects", hint="leave it out")
+        return frozenset(name for name, reason in missing.items() if reason is None)
+
+
+def parse_effects(text: str) -> Choice:
+    """`auto`, `all`, `none`, or names of effects between commas.
+
+    Raises:
+        ConfigError: An unknown effect; all are listed.
+    """
+    if text in ("auto", "all", "none"):
+        return text
+    names = [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in EFFECTS:
+            allowed = "auto, all, none, audit, or any of " + ", ".join(EFFECTS)
+            hint = suggest(name, [*EFFECTS, "auto", "all", "none", "audit"])
+            raise ConfigError(f"unknown effect {name!r}", where="--effects", allowed=allowed, hint=hint)
+    return frozenset(names)
+
+
+def found_here(detector: Detector) -> frozenset[str]:
+    """The effects that a detector has at all."""
+    from lidardesign.simulate.bounds.motion import is_instant
+
+    return frozenset(EFFECTS) - ({"motion"} if is_instant(detector) else set())
+
+
+def _called_for(found: dict[str, Bound], tolerance: Tolerance) -> set[str]:
+    """What is left when effects are skipped, the smallest first, while all that is skipped is within the tolerance."""
+    on = set()
+    range_m = lost = 0.0
+    for name in sorted(found, key=lambda name: found[name].relative(tolerance)):
+        bound = found[name]
+        if range_m + bound.range_m > tolerance.range_m or lost + bound.lost > tolerance.lost:
+            on.add(name)
+        else:
+            range_m, lost = range_m + bound.range_m, lost + bound.lost
+    return on
+
+
+def _missing(name: str) -> str | None:
+    """What an effect's simulation needs that is not here."""
+    if name != "multipath":
+        return None
+    from lidardesign.simulate.light_transport_process import missing
+
+    return missing()
+
+
+def _bounds(
+    scene: Scene, lists: Sequence[Rays], detector: Detector, casters: Sequence[SceneCaster] | None
+) -> dict[str, Bound]:
+    """The bound of every effect over all frames, for the list that it changes most."""
+    absent = {name: MODULES[name].absent(detector, scene, lists) for name in EFFECTS}
+    present = [name for name, reason in absent.items() if reason is None]
+    found = {name: Bound(0.0, 0.0, reason) for name, reason in absent.items() if reason is not None}
+    if not present:
+        return found
+    fired = [rays for rays in lists if len(rays)]
+    if not fired:
+        return found | {name: Bound(0.0, 0.0, "no ray is fired") for name in present}
+    sums = {name: _Sum(len(fired)) for name in present}
+    for frame, caster in enumerate(build_casters(scene) if casters is None else casters):
+        counts = Counts(Sight.of(scene, frame, detector, fired, caster))
+        for name, total in sums.items():
+            total.add(counts.sight, MODULES[name].stake(counts.sight, counts))
+    return found | {name: total.bound() for name, total in sums.items()}
+
+
+class _Sum:
+    """An effect's stakes over frames, list by list."""
+
+    def __init__(self, lists: int) -> None:
+        self._squared_m2, self._lost, self._returns = np.zeros(lists), np.zeros(lists), np.zeros(lists)
+        self._reason, self._largest = "", -1.0
+
+    def add(self, sight: Sight, stake: Stake) -> None:
+        def per_list(values: np.ndarray) -> np.ndarray:
+            return np.bincount(sight.row, weights=values, minlength=len(self._lost))
+
+        squared, lost = per_list(stake.squared_m2 * sight.returned), per_list(stake.lost)
+        self._squared_m2 += squared
+        self._lost += lost
+        self._returns += per_list(sight.returned.astype(float))
+        if float(squared.max() + lost.max()) > self._largest:
+            self._largest, self._reason = float(squared.max() + lost.max()), stake.reason
+
+    def bound(self) -> Bound:
+        # without a single return, every one that is invented is one too many
+        returns = np.maximum(self._returns, 1.0)
+        range_m, lost = np.sqrt(self._squared_m2 / returns).max(), np.minimum(self._lost / returns, 1.0).max()
+        return Bound(float(range_m), float(lost), self._reason)
