@@ -87,7 +87,7 @@ def measure(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: 
     if "atmosphere" in effects:
         from lidardesign.simulate.effects.atmosphere import through_air
 
-        echoes, background = through_air(scene, rays, windows_m, echoes, detector, background)
+        echoes, background = through_air(scene, rays, beams, hits, windows_m, echoes, detector, background)
     if "ambient" in effects:
         from lidardesign.simulate.effects.ambient import lit
 
@@ -102,9 +102,11 @@ def direct_echoes(scene: Scene, beams: Beams, hits: Hits) -> Echoes:
     """The echo of every beam's first hit, wherever it is heard: share * reflectance * cosine / (pi * distance^2)."""
     seen = np.flatnonzero(hits.body >= 0)
     points = beams.origin_m[seen] + hits.range_m[seen, None] * beams.direction[seen]
-    home = beams.origin_m[seen] if scene.receiver is None else np.asarray(scene.receiver.origin_m)
+    origins = beams.origin_m[seen]
+    home = origins if scene.receiver is None else np.broadcast_to(np.asarray(scene.receiver.origin_m), origins.shape)
     back = home - points
-    back_m = np.linalg.norm(back, axis=1) if scene.receiver is not None else hits.range_m[seen]
+    # what starts at the receiver comes back by the way that it took, to the last bit
+    back_m = np.where((origins == home).all(axis=1), hits.range_m[seen], np.linalg.norm(back, axis=1))
     reflectance = np.array([body.reflectance for body in scene.bodies])[hits.body[seen]]
     with np.errstate(divide="ignore", invalid="ignore"):
         cosine = np.maximum(np.einsum("nk,nk->n", hits.normal[seen], back) / back_m, 0.0)
@@ -136,7 +138,7 @@ def _with_detours(
     if "shadowing" in physics.effects and scene.receiver is not None:
         from lidardesign.simulate.effects.shadowing import heard
 
-        echoes = heard(scene.receiver, beams, hits, echoes, tracer)
+        echoes = heard(scene, beams, hits, echoes, tracer)
     if "specular" in physics.effects:
         from lidardesign.simulate.effects.specular import detours
 

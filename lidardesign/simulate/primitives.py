@@ -50,6 +50,11 @@ class PrimitiveGroup:
         self._offsets = poses[:, :3, 3] - self._middle
         self._to_body = inverse_rigid(poses)
 
+    @property
+    def radius_m(self) -> float:
+        """The radius of a ball around a member's origin that holds any of them."""
+        return float(self._radii_m.max())
+
     def keep_nearer(self, hits: Hits, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> None:
         """Enter the hits that are nearer than what `hits` holds."""
         for pairs in self._pairs(origins, directions, limit_m):

@@ -1,0 +1,198 @@
+r"""Things move within a frame: every ray meets them where they are at its own time.
+
+A body with a pose per frame goes from each pose T_0 to the next T_1 on the one screw that joins them,
+T(s) = exp(s log(T_1 T_0^{-1})) T_0 with s = time * frame rate: with a constant turn about a fixed axis and a constant
+travel along it, which is how the links of a robot move when one joint turns (Murray, Li, Sastry 1994, chapter 2).
+After its last pose a body goes on as it came. A body at rest in all frames goes on with its velocity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lidardesign.scene import Body, Mesh, Scene, Shape, inverse_rigid
+from lidardesign.simulate.hits import Hits
+from lidardesign.simulate.physics import Tracer
+from lidardesign.simulate.primitives import BALL_SLACK, PrimitiveGroup
+from lidardesign.simulate.raycast import SceneCaster, mesh_caster, shared_caster
+
+# Rays (N, 3), (N, 3) in a body's own frame and limits (N,) to ranges (N,), infinite on a miss, and normals (N, 3).
+LocalTracer = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True, eq=False)
+class Screw:
+    """A pose that turns and travels evenly in time.
+
+    Arguments:
+        pose: Body to world at time 0, shape (4, 4).
+        turn_rad_s: Axis times angular speed, in the world [rad/s], shape (3,).
+        drift_m_s: Velocity of the point that passes the world's origin [m/s], shape (3,).
+    """
+
+    pose: np.ndarray
+    turn_rad_s: np.ndarray
+    drift_m_s: np.ndarray
+
+    @classmethod
+    def between(cls, pose: np.ndarray, later: np.ndarray, rate_hz: float) -> Screw:
+        """The screw that joins two poses, the shorter way round, the second 1 / rate after the first."""
+        step = later @ inverse_rigid(pose)
+        turn = Rotation.from_matrix(step[:3, :3]).as_rotvec()
+        drift = np.linalg.solve(_translations(turn, np.ones(1))[0], step[:3, 3])
+        return cls(pose, turn * rate_hz, drift * rate_hz)
+
+    @property
+    def moves(self) -> bool:
+        """Whether anything changes with time."""
+        return bool(self.turn_rad_s.any() or self.drift_m_s.any())
+
+    def at(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations (N, 3, 3) and translations (N, 3) of the body at times (N,) [s]."""
+        turned, moved = _turns(self.turn_rad_s, time_s), _translations(self.turn_rad_s, time_s) @ self.drift_m_s
+        return turned @ self.pose[:3, :3], turned @ self.pose[:3, 3] + moved
+
+    def speed_m_s(self, point: np.ndarray) -> float:
+        """How fast a point of the body (3,), in its own frame, moves: on a screw, the same at all times."""
+        place = self.pose[:3, :3] @ point + self.pose[:3, 3]
+        return float(np.linalg.norm(np.cross(self.turn_rad_s, place) + self.drift_m_s))
+
+
+def _cross_matrix(vector: np.ndarray) -> np.ndarray:
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def _turns(turn: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Rotations exp(t [w]) for a rate w (3,) and times (N,), shape (N, 3, 3) (Rodrigues 1840)."""
+    speed = float(np.linalg.norm(turn))
+    axis = _cross_matrix(turn / speed if speed else turn)
+    angle = (speed * time)[:, None, None]
+    # 1 - cos written without its cancellation
+    return np.eye(3) + np.sin(angle) * axis + 2 * np.sin(angle / 2) ** 2 * (axis @ axis)
+
+
+def _translations(turn: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """The integral of exp(s [w]) over s from 0 to t, for a rate w (3,) and times t (N,), shape (N, 3, 3)."""
+    speed = float(np.linalg.norm(turn))
+    axis = _cross_matrix(turn / speed if speed else turn)
+    time = time[:, None, None]
+    half = speed * time / 2
+    # sinc(x) = sin(pi x) / (pi x) has no hole at 0
+    versed = time * np.sin(half) * np.sinc(half / np.pi)
+    return time * np.eye(3) + versed * axis + time * (1 - np.sinc(speed * time / np.pi)) * (axis @ axis)
+
+
+def path_of(body: Body, frame: int, rate_hz: float) -> Screw:
+    """How a body moves during a frame."""
+    if body.poses.ndim == 2:
+        return Screw(body.poses, np.zeros(3), np.asarray(body.velocity_m_s))
+    last = len(body.poses) - 1
+    if last == 0:
+        return Screw(body.poses[0], np.zeros(3), np.zeros(3))
+    start = min(frame, last - 1)
+    joined = Screw.between(body.poses[start], body.poses[start + 1], rate_hz)
+    return replace(joined, pose=body.poses[frame])
+
+
+class _MovingBody:
+    """A body that rays meet at different times, traced in its own frame."""
+
+    def __init__(self, index: int, body: Body, path: Screw) -> None:
+        self.index, self.path = index, path
+        self._trace, self._centre, self._radius_m = _local_tracer(body.shape)
+
+    def keep_nearer(self, hits: Hits, origins: np.ndarray, directions: np.ndarray, time_s: np.ndarray) -> None:
+        """Enter the hits that are nearer than what `hits` holds."""
+        rows = self._near(origins, directions, time_s, hits.range_m)
+        if not len(rows):
+            return
+        rotation, translation = self.path.at(time_s[rows])
+        local_origins = np.einsum("nji,nj->ni", rotation, origins[rows] - translation)
+        local_directions = np.einsum("nji,nj->ni", rotation, directions[rows])
+        range_m, normal = self._trace(local_origins, local_directions, hits.range_m[rows])
+        hit = np.flatnonzero(np.isfinite(range_m))
+        turned = np.einsum("nij,nj->ni", rotation[hit], normal[hit])
+        won = rows[hit]
+        facing = np.einsum("nk,nk->n", turned, directions[won]) > 0
+        turned[facing] *= -1
+        hits.range_m[won], hits.body[won], hits.normal[won] = range_m[hit], self.index, turned
+
+    def _near(
+        self, origins: np.ndarray, directions: np.ndarray, time_s: np.ndarray, limit_m: np.ndarray
+    ) -> np.ndarray:
+        """Rows of rays that pass, before their limit, the ball that holds the body at all their times."""
+        if not np.isfinite(self._radius_m) or not len(origins):
+            return np.arange(len(origins))
+        earliest, latest = time_s.min(), time_s.max()
+        rotation, translation = self.path.at(np.array([(earliest + latest) / 2]))
+        offset = rotation[0] @ self._centre + translation[0] - origins
+        radius_m = self._radius_m + self.path.speed_m_s(self._centre) * (latest - earliest) / 2
+        along = np.einsum("nk,nk->n", offset, directions)
+        squared = np.einsum("nk,nk->n", offset, offset)
+        slack = BALL_SLACK * squared
+        reach = radius_m + np.sqrt(slack)
+        passes = (squared - along**2 <= radius_m**2 + slack) & (along >= -reach) & (along - reach <= limit_m)
+        return np.flatnonzero(passes)
+
+
+def _local_tracer(shape: Shape) -> tuple[LocalTracer, np.ndarray, float]:
+    """How rays are traced at a shape in its own frame, with the centre (3,) and radius [m] of a ball around it."""
+    if isinstance(shape, Mesh):
+        caster = mesh_caster(shape)
+        return caster.trace, caster.centre_m, caster.radius_m
+    group = PrimitiveGroup([(0, Body(shape))], 0)
+
+    def trace(origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        count = len(origins)
+        hits = Hits(np.full(count, np.inf), np.full(count, -1, dtype=np.int64), np.zeros((count, 3)))
+        group.keep_nearer(hits, origins, directions, limit_m)
+        return hits.range_m, hits.normal
+
+    return trace, np.zeros(3), group.radius_m
+
+
+# The bodies that never move, as a scene of their own, so that its meshes are built once for all frames and designs.
+_still_scenes: WeakKeyDictionary[Scene, tuple[Scene, np.ndarray]] = WeakKeyDictionary()
+
+
+def _still(scene: Scene) -> tuple[SceneCaster | None, np.ndarray]:
+    """A caster of the bodies that move in no frame, and their indices in the scene."""
+    if scene not in _still_scenes:
+        chosen = [i for i, body in enumerate(scene.bodies) if body.poses.ndim == 2 and not any(body.velocity_m_s)]
+        if not chosen:
+            return None, np.empty(0, dtype=np.int64)
+        bodies = tuple(replace(scene.bodies[i], role="both") for i in chosen)
+        _still_scenes[scene] = Scene(bodies, f"{scene.name}, what rests"), np.array(chosen)
+    part, indices = _still_scenes[scene]
+    return shared_caster(part), indices
+
+
+def moving_tracer(scene: Scene, frame: int) -> Tracer:
+    """First hits of rays (N, 3), (N, 3) of unit length that are sent at times (N,) [s] within a frame."""
+    caster, indices = _still(scene)
+    rest = set(indices.tolist())
+    moving = [
+        _MovingBody(index, body, path_of(body, frame, scene.frame_rate_hz))
+        for index, body in enumerate(scene.bodies)
+        if index not in rest
+    ]
+
+    def trace(origins: np.ndarray, directions: np.ndarray, time_s: np.ndarray) -> Hits:
+        count = len(origins)
+        if caster is None:
+            hits = Hits(np.full(count, np.inf), np.full(count, -1, dtype=np.int64), np.zeros((count, 3)))
+        else:
+            found = caster.first_hit(origins, directions)
+            body = np.where(found.body >= 0, indices[found.body], -1)
+            hits = Hits(found.range_m, body, found.normal)
+        for one in moving:
+            one.keep_nearer(hits, origins, directions, time_s)
+        return hits
+
+    return trace

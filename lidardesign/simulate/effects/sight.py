@@ -1,0 +1,58 @@
+"""What a fixed receiver sees of lit points: those in its view with nothing in between, or nothing but glass."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidardesign.scene import Scene
+from lidardesign.simulate.physics import Tracer
+from lidardesign.simulate.receiver_view import in_view
+
+# Hits on meshes are exact to float32, some 1e-7 of the distances at hand: a hundred times that clears a surface, and
+# is still far below the thickness of any pane.
+CLEARANCE_SHARE = 1e-5
+# A line of sight through more surfaces than this counts as blocked.
+MAXIMUM_SURFACES = 8
+
+
+def clearance_m(distance_m: np.ndarray) -> np.ndarray:
+    """How far off a surface a ray starts or ends [m], so that rounding does not let it meet that surface again."""
+    return CLEARANCE_SHARE * distance_m
+
+
+def sight_shares(
+    scene: Scene, points: np.ndarray, normal: np.ndarray, time_s: np.ndarray, tracer: Tracer
+) -> np.ndarray:
+    """The share of the light of surface points (N, 3) that comes straight to the receiver, shape (N,).
+
+    0 outside its field of view or range, and behind anything; a transparent surface in between lets its transmission
+    through. Sight ends a clearance above the surface, so that surfaces that touch the lit one do not hide it.
+
+    Arguments:
+        scene: Its receiver and its bodies' transmissions.
+        points: Lit points [m].
+        normal: Unit normals towards the light, shape (N, 3).
+        time_s: When they are lit within the frame [s], shape (N,).
+        tracer: First hits of any rays at any time within the frame.
+    """
+    receiver = scene.receiver
+    passing = np.array([body.transmission for body in scene.bodies])
+    start = np.asarray(receiver.origin_m)
+    ends = points + clearance_m(np.linalg.norm(points - start, axis=1))[:, None] * normal
+    length_m = np.linalg.norm(ends - start, axis=1)
+    lit_side = np.einsum("nk,nk->n", normal, start - points) > 0
+    share = (in_view(receiver, points) & (lit_side | (length_m == 0))).astype(np.float64)
+    rows, travelled_m = np.flatnonzero(share * length_m > 0), np.zeros(len(points))
+    for _ in range(MAXIMUM_SURFACES):
+        direction = (ends[rows] - start) / length_m[rows, None]
+        found = tracer(start + travelled_m[rows, None] * direction, direction, time_s[rows])
+        met_m = travelled_m[rows] + found.range_m
+        blocked = (found.body >= 0) & (met_m < length_m[rows])
+        rows, met_m, body = rows[blocked], met_m[blocked], found.body[blocked]
+        share[rows] *= passing[body]
+        travelled_m[rows] = met_m + clearance_m(met_m)
+        rows = rows[(share[rows] > 0) & (travelled_m[rows] < length_m[rows])]
+        if not len(rows):
+            return share
+    share[rows] = 0.0
+    return share

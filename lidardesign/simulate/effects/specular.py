@@ -1,0 +1,130 @@
+"""Mirrors and glass lead light elsewhere: what it meets there comes back later, and fainter.
+
+At every surface a beam goes on twice, mirrored with the share `specular` and straight on with the share
+`transmission`; nothing is drawn at random. What it meets sends light back. A ray that is heard at its own origin is
+heard through the pixel that it was sent from, so its light comes back the way it went and meets every mirror and pane
+twice: an emitter behind a mirror is its image there, and an echo is that of the image, times the square of the share
+that went out. A fixed receiver elsewhere hears a lit surface straight, through glass but by no mirror. Mirrors are
+flat over the width of a beam: curved ones neither gather nor spread it. Panes do not bend light. A mirror that a beam
+meets squarely enough to shine back into the receiver is not taken for an echo.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidardesign.scene import Scene
+from lidardesign.simulate.echoes import Beams, Echoes
+from lidardesign.simulate.effects.sight import clearance_m, sight_shares
+from lidardesign.simulate.hits import Hits
+from lidardesign.simulate.physics import Tracer, direct_echoes
+
+# Beams that have met more surfaces than this are given up: four panes, in and out.
+MAXIMUM_TURNS = 8
+# Beams of less than this share of their light are given up: both ways, a millionth of it comes back.
+FAINTEST_SHARE = 1e-3
+# Where a beam grazes a surface, it is followed from at most this many clearances further on.
+GRAZING_STEPS = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Front:
+    """Beams on their way, unfolded: each starts at the image of its emitter and runs straight to where it is now.
+
+    Arguments:
+        beams: Images of the emitter and directions from there, any order of rays; shares are of what is left.
+        passed: What is left of a beam's light, between 0 and 1, shape (B,).
+        hits: What they meet, ranges from the image on.
+    """
+
+    beams: Beams
+    passed: np.ndarray
+    hits: Hits
+
+    def kept(self, chosen: np.ndarray) -> _Front:
+        beams, hits = self.beams, self.hits
+        return _Front(
+            Beams(*(column[chosen] for column in _columns(beams))),
+            self.passed[chosen],
+            Hits(hits.range_m[chosen], hits.body[chosen], hits.normal[chosen]),
+        )
+
+
+def detours(scene: Scene, beams: Beams, hits: Hits, tracer: Tracer) -> Echoes:
+    """Echoes of all that beams meet after mirrors and glass, up to `MAXIMUM_TURNS` of them.
+
+    Arguments:
+        scene: Its bodies' shares of light, and its receiver.
+        beams: The beams as they leave.
+        hits: Their first hits.
+        tracer: First hits of any rays at any time within the frame.
+    """
+    mirrored = np.array([body.specular for body in scene.bodies])
+    passing = np.array([body.transmission for body in scene.bodies])
+    front = _Front(beams, np.ones(len(beams)), hits)
+    echoes = []
+    for _ in range(MAXIMUM_TURNS):
+        turned = _followed(front, mirrored, _mirrored(front), tracer)
+        straight = _followed(front, passing, front.beams.direction, tracer)
+        front = _joined(turned, straight)
+        if not len(front.beams):
+            break
+        echoes.append(_heard(scene, front, tracer))
+    return Echoes.joined([*echoes, _no_echoes()])
+
+
+def _mirrored(front: _Front) -> np.ndarray:
+    """Directions after a mirror, v - 2 (v.n) n; anything where nothing was hit."""
+    direction, normal = front.beams.direction, front.hits.normal
+    return direction - 2 * np.einsum("nk,nk->n", direction, normal)[:, None] * normal
+
+
+def _followed(front: _Front, shares: np.ndarray, direction: np.ndarray, tracer: Tracer) -> _Front:
+    """What beams that go on from their hits with a body's share (bodies,), in directions (B, 3), meet next."""
+    passed = np.where(front.hits.body >= 0, shares[front.hits.body] * front.passed, 0.0)
+    rows = np.flatnonzero(passed >= FAINTEST_SHARE)
+    old, direction = front.kept(rows), direction[rows]
+    beams, path_m = old.beams, old.hits.range_m
+    point = beams.origin_m + path_m[:, None] * beams.direction
+    cosine = np.abs(np.einsum("nk,nk->n", direction, old.hits.normal))
+    # a step along the beam that lifts its start off the surface
+    step_m = clearance_m(path_m) / np.maximum(cosine, 1 / GRAZING_STEPS)
+    found = tracer(point + step_m[:, None] * direction, direction, beams.time_s)
+    image = replace(
+        beams,
+        origin_m=point - path_m[:, None] * direction,
+        direction=direction,
+        share=beams.share * shares[old.hits.body],
+    )
+    return _Front(image, passed[rows], Hits(path_m + step_m + found.range_m, found.body, found.normal))
+
+
+def _heard(scene: Scene, front: _Front, tracer: Tracer) -> Echoes:
+    """The echoes of what beams meet, where they are heard."""
+    front = front.kept(front.hits.body >= 0)
+    if scene.receiver is None:
+        squared = replace(front.beams, share=front.beams.share * front.passed)
+        return direct_echoes(scene, squared, front.hits)
+    echoes = direct_echoes(scene, front.beams, front.hits)
+    point = front.beams.origin_m + front.hits.range_m[:, None] * front.beams.direction
+    share = sight_shares(scene, point, front.hits.normal, front.beams.time_s, tracer)
+    return replace(echoes, gain=echoes.gain * share).kept(share > 0)
+
+
+def _joined(first: _Front, second: _Front) -> _Front:
+    hits = (first.hits, second.hits)
+    return _Front(
+        Beams(*(np.concatenate(pair) for pair in zip(_columns(first.beams), _columns(second.beams), strict=True))),
+        np.concatenate([first.passed, second.passed]),
+        Hits(*(np.concatenate([getattr(one, name) for one in hits]) for name in ("range_m", "body", "normal"))),
+    )
+
+
+def _columns(beams: Beams) -> tuple[np.ndarray, ...]:
+    return beams.ray, beams.origin_m, beams.direction, beams.time_s, beams.share
+
+
+def _no_echoes() -> Echoes:
+    return Echoes(np.empty(0, dtype=np.int64), np.empty(0), np.empty(0), np.empty(0, dtype=np.int64))

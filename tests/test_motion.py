@@ -1,0 +1,204 @@
+"""Rays meet moving bodies where they are at their own time."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.simulate.effects.motion import Screw, moving_tracer, path_of
+from lidardesign.simulate.raycast import SceneCaster
+from lidardesign.space import direction
+
+RATE_HZ = 10.0
+
+
+def random_pose(generator, reach_m=1.0):
+    return rigid(Rotation.random(random_state=generator).as_matrix(), generator.uniform(-reach_m, reach_m, 3))
+
+
+def fan(count=300, seed=0, spread=0.5):
+    generator = np.random.default_rng(seed)
+    looking = direction(generator.uniform(-spread, spread, count), generator.uniform(-spread, spread, count))
+    return np.zeros((count, 3)), looking, generator.uniform(0, 1 / RATE_HZ, count)
+
+
+def icosphere(radius_m=0.5):
+    made = trimesh.creation.icosphere(subdivisions=3, radius=radius_m)
+    return Mesh(np.array(made.vertices), np.array(made.faces))
+
+
+SHAPES = {
+    "sphere": Sphere(0.5),
+    "box": Box((0.3, 0.5, 0.2)),
+    "capsule": Capsule(0.2, 0.4),
+    "plane": Plane(),
+    "mesh": icosphere(),
+}
+
+
+def test_a_flying_ball_is_hit_where_it_is_at_each_rays_time():
+    velocity, start = np.array([4.0, -3.0, 1.0]), np.array([3.0, 0.2, 0.0])
+    scene = Scene((Body(Sphere(0.5), poses=rigid(translation_m=start), velocity_m_s=tuple(velocity)),))
+    origins, looking, time_s = fan()
+    hits = moving_tracer(scene, 0)(origins, looking, time_s)
+    centre = start + time_s[:, None] * velocity
+    along = np.einsum("nk,nk->n", centre, looking)
+    root = along**2 - np.einsum("nk,nk->n", centre, centre) + 0.25
+    assert np.array_equal(hits.body == 0, root > 0)
+    hit = root > 0
+    assert hits.range_m[hit] == pytest.approx(along[hit] - np.sqrt(root[hit]), abs=1e-7)
+    points = hits.range_m[hit, None] * looking[hit]
+    assert hits.normal[hit] == pytest.approx((points - centre[hit]) / 0.5, abs=1e-7)
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_every_ray_sees_what_a_scene_at_rest_at_its_time_shows(shape):
+    generator = np.random.default_rng(3)
+    ahead = rigid(translation_m=(2.5, 0.0, 0.0))
+    poses = np.stack([ahead @ random_pose(generator, 0.3) for _ in range(3)])
+    scene = Scene((Body(shape, poses=poses), Body(Box((0.1, 3, 3)), poses=rigid(translation_m=(5, 0, 0)))))
+    origins, looking, time_s = fan(40)
+    for frame in range(3):
+        tracer = moving_tracer(scene, frame)
+        hits = tracer(origins, looking, time_s)
+        path = path_of(scene.bodies[0], frame, scene.frame_rate_hz)
+        for ray in range(len(looking)):
+            rotation, translation = path.at(time_s[ray : ray + 1])
+            now = Scene((Body(shape, poses=rigid(rotation[0], translation[0])), scene.bodies[1]))
+            alone = SceneCaster(now).first_hit(origins[ray : ray + 1], looking[ray : ray + 1])
+            assert hits.body[ray] == alone.body[0]
+            assert hits.range_m[ray] == pytest.approx(alone.range_m[0], abs=2e-6)
+            assert hits.normal[ray] == pytest.approx(alone.normal[0], abs=1e-5)
+
+
+def test_the_screw_is_the_exponential_of_its_twist_and_joins_its_poses():
+    generator = np.random.default_rng(5)
+    for _ in range(20):
+        first, second = random_pose(generator, 2.0), random_pose(generator, 2.0)
+        screw = Screw.between(first, second, RATE_HZ)
+        x, y, z = screw.turn_rad_s
+        twist = np.zeros((4, 4))
+        twist[:3, :3], twist[:3, 3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]], screw.drift_m_s
+        times = np.array([0.0, 0.03, 1 / RATE_HZ, 0.17])
+        rotation, translation = screw.at(times)
+        for index, time_s in enumerate(times):
+            assert rigid(rotation[index], translation[index]) == pytest.approx(expm(time_s * twist) @ first, abs=1e-12)
+        assert rigid(rotation[2], translation[2]) == pytest.approx(second, abs=1e-12)
+        point, step_s = generator.normal(size=3), 1e-6
+        near = [
+            rotation @ point + place for rotation, place in zip(*screw.at(np.array([0.05, 0.05 + step_s])), strict=True)
+        ]
+        assert screw.speed_m_s(point) == pytest.approx(np.linalg.norm(near[1] - near[0]) / step_s, rel=1e-4)
+
+
+def test_tiny_turns_lose_no_digits():
+    pose = rigid(translation_m=(1.0, 2.0, 3.0))
+    for angle in (1e-12, 1e-9, 1e-6):
+        later = rigid(Rotation.from_rotvec([0, 0, angle]).as_matrix(), (1.0 + 1e-9, 2.0, 3.0))
+        rotation, translation = Screw.between(pose, later, RATE_HZ).at(np.array([0.05]))
+        assert rotation[0] == pytest.approx(Rotation.from_rotvec([0, 0, angle / 2]).as_matrix(), abs=3e-16)
+        assert translation[0] == pytest.approx([1.0 + 5e-10, 2.0, 3.0], abs=2e-15)
+
+
+def test_a_link_on_a_hinge_stays_on_its_circle():
+    hinge = np.array([0.7, -0.4, 0.2])
+    turns = [Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix() for angle in (0.2, 1.1)]
+    poses = np.stack([rigid(turn, hinge + turn @ [0.5, 0.0, 0.0]) for turn in turns])
+    rotation, translation = path_of(Body(Sphere(0.1), poses=poses), 0, RATE_HZ).at(np.linspace(0, 0.1, 11))
+    assert np.linalg.norm(translation - hinge, axis=1) == pytest.approx(np.full(11, 0.5), abs=1e-13)
+    assert Rotation.from_matrix(rotation).as_rotvec()[:, 2] == pytest.approx(np.linspace(0.2, 1.1, 11), abs=1e-12)
+
+
+def test_after_its_last_pose_a_body_goes_on_as_it_came():
+    poses = np.stack([rigid(translation_m=(x, 0.0, 0.0)) for x in (2.0, 3.0, 3.5)])
+    paths = [path_of(Body(Sphere(0.1), poses=poses), frame, RATE_HZ) for frame in range(3)]
+    for path, halfway in zip(paths, (2.5, 3.25, 3.75), strict=True):
+        assert path.at(np.array([0.05]))[1][0] == pytest.approx([halfway, 0, 0], abs=1e-13)
+
+
+def test_frames_meet_without_a_jump():
+    generator = np.random.default_rng(8)
+    poses = np.stack([random_pose(generator) for _ in range(4)])
+    body = Body(Box((0.1, 0.2, 0.3)), poses=poses)
+    for frame in range(3):
+        rotation, translation = path_of(body, frame, RATE_HZ).at(np.array([0.0, 1 / RATE_HZ]))
+        assert rigid(rotation[0], translation[0]) == pytest.approx(poses[frame], abs=1e-13)
+        assert rigid(rotation[1], translation[1]) == pytest.approx(poses[frame + 1], abs=1e-12)
+
+
+def test_a_scene_at_rest_gives_the_same_bits_as_its_caster():
+    generator = np.random.default_rng(11)
+    bodies = tuple(
+        Body(shape, poses=rigid(translation_m=(2.5, 0, 0)) @ random_pose(generator, 0.8))
+        for shape in (SHAPES["sphere"], SHAPES["mesh"], SHAPES["box"], icosphere(0.3))
+    )
+    scene = Scene(bodies)
+    origins, looking, time_s = fan(500)
+    moving, still = moving_tracer(scene, 0)(origins, looking, time_s), SceneCaster(scene).first_hit(origins, looking)
+    for name in ("range_m", "body", "normal"):
+        assert np.array_equal(getattr(moving, name), getattr(still, name))
+
+
+def test_at_the_start_of_a_frame_bodies_are_where_the_frame_has_them():
+    generator = np.random.default_rng(12)
+    poses = [
+        np.stack([rigid(translation_m=(2.5, 0, 0)) @ random_pose(generator, 0.8) for _ in range(3)]) for _ in SHAPES
+    ]
+    scene = Scene(tuple(Body(shape, poses=pose) for shape, pose in zip(SHAPES.values(), poses, strict=True)))
+    origins, looking, _ = fan(400)
+    for frame in range(3):
+        hits = moving_tracer(scene, frame)(origins, looking, np.zeros(400))
+        still = SceneCaster(scene, frame).first_hit(origins, looking)
+        assert np.array_equal(hits.body, still.body)
+        assert hits.range_m == pytest.approx(still.range_m, abs=1e-6)
+
+
+def test_turning_the_world_and_its_motion_changes_nothing():
+    generator = np.random.default_rng(13)
+    world = random_pose(generator, 3.0)
+    poses = np.stack([rigid(translation_m=(2.5, 0, 0)) @ random_pose(generator, 0.3) for _ in range(2)])
+    velocity = np.array([1.0, -4.0, 2.0])
+    bodies = (
+        Body(SHAPES["box"], poses=poses),
+        Body(Sphere(0.4), poses=rigid(translation_m=(2, 1, 0)), velocity_m_s=velocity),
+    )
+    turned = (
+        Body(SHAPES["box"], poses=world @ poses),
+        Body(Sphere(0.4), poses=world @ bodies[1].poses, velocity_m_s=tuple(world[:3, :3] @ velocity)),
+    )
+    origins, looking, time_s = fan(400)
+    here = moving_tracer(Scene(bodies), 0)(origins, looking, time_s)
+    there = moving_tracer(Scene(turned), 0)(origins + world[:3, 3], looking @ world[:3, :3].T, time_s)
+    assert np.array_equal(here.body, there.body)
+    hit = here.body >= 0
+    assert there.range_m[hit] == pytest.approx(here.range_m[hit], abs=1e-7)
+    assert there.normal[hit] == pytest.approx(here.normal[hit] @ world[:3, :3].T, abs=1e-7)
+
+
+def test_results_do_not_depend_on_the_other_rays():
+    generator = np.random.default_rng(14)
+    poses = np.stack([rigid(translation_m=(2.5, 0, 0)) @ random_pose(generator, 0.5) for _ in range(2)])
+    tracer = moving_tracer(Scene((Body(SHAPES["mesh"], poses=poses), Body(Plane()))), 0)
+    origins, looking, time_s = fan(200)
+    origins[:, 2] = 0.5
+    together = tracer(origins, looking, time_s)
+    for part in (slice(0, 1), slice(50, 120)):
+        alone = tracer(origins[part], looking[part], time_s[part])
+        assert np.array_equal(alone.range_m, together.range_m[part])
+
+
+def test_nothing_is_missed_however_fast_it_flies():
+    # by the end of the frame the ball is 30 m further: the ball that holds its way still lets every ray through
+    scene = Scene((Body(Sphere(0.2), poses=rigid(translation_m=(3, -15, 0)), velocity_m_s=(0.0, 300.0, 0.0)),))
+    time_s = np.linspace(0, 0.1, 101)
+    towards = np.stack([np.full(101, 3.0), -15 + 300 * time_s, np.zeros(101)], axis=1)
+    length = np.linalg.norm(towards, axis=1)
+    hits = moving_tracer(scene, 0)(np.zeros((101, 3)), towards / length[:, None], time_s)
+    assert hits.range_m == pytest.approx(length - 0.2, abs=1e-6)
+    assert math.isinf(moving_tracer(scene, 0)(np.zeros((1, 3)), np.array([[1.0, 0, 0]]), np.zeros(1)).range_m[0])
