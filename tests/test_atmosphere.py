@@ -1,0 +1,150 @@
+"""Air: exponentials of the whole way, and haze whose counts are the lidar equation's integral."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import exp1
+
+from lidardesign.scene import Body, Box, Medium, Receiver, Scene, rigid
+from lidardesign.simulate.bistatic import path_windows
+from lidardesign.simulate.detector import IDEAL, Detector, Photons
+from lidardesign.simulate.echoes import Background, Beams
+from lidardesign.simulate.effects.atmosphere import through_air
+from lidardesign.simulate.effects.footprint import split
+from lidardesign.simulate.physics import direct_echoes
+from lidardesign.simulate.raycast import SceneCaster
+from lidardesign.simulate.returns import Rays
+
+PHOTONS = Photons(905e-9, 1e-6, 1e4, "scanned", 1e6, 1e-6, 1e-4, 0.2, 1e-9, 1e3, 0.0)
+COUNTING = Detector("counting", photons=PHOTONS)
+FOG = Medium(extinction_per_m=0.3, backscatter_per_m_sr=0.015)
+WALL = Body(Box((0.1, 20, 20)), poses=rigid(translation_m=(5.1, 0, 0)))
+
+
+def rays_along(directions, gate_m=(0.5, 8.0), origin=(0.0, 0.0, 0.0)):
+    directions = np.atleast_2d(np.asarray(directions, float))
+    count = len(directions)
+    return Rays(np.tile(origin, (count, 1)), directions, np.tile(gate_m, (count, 1)), np.zeros(count), np.zeros(count))
+
+
+def in_air(scene, rays, detector=COUNTING):
+    beams = split(Beams.of(rays), detector)
+    hits = SceneCaster(scene).first_hit(beams.origin_m, beams.direction)
+    echoes = direct_echoes(scene, beams, hits)
+    background = Background(np.zeros(len(rays)))
+    windows_m = path_windows(rays, scene.receiver)
+    return echoes, *through_air(scene, rays, beams, hits, windows_m, echoes, detector, background)
+
+
+def integral(low_m, high_m, medium=FOG):
+    """Of exp(-2 alpha r) / r^2, in closed form by the exponential integral (Abramowitz, Stegun 5.1)."""
+    rate = 2 * medium.extinction_per_m
+
+    def primitive(r):
+        return -math.exp(-rate * r) / r + rate * exp1(rate * r)
+
+    return primitive(high_m) - primitive(low_m)
+
+
+def test_clear_air_leaves_echoes_and_background_the_same_objects():
+    scene = Scene((WALL,))
+    echoes, faded, background = in_air(scene, rays_along([[1.0, 0, 0]]))
+    assert faded is echoes
+    assert background.edges_m is None
+
+
+def test_light_fades_over_its_way_out_and_back():
+    for receiver in (None, Receiver((0.0, 2.0, 0.0), 0.0, 0.0, 3.0, 3.0, (0.0, 99.0))):
+        echoes, faded, _ = in_air(Scene((WALL,), medium=FOG, receiver=receiver), rays_along([[1.0, 0, 0]]))
+        whole = 10.0 if receiver is None else 5.0 + math.hypot(5.0, 2.0)
+        assert faded.gain == pytest.approx(echoes.gain * math.exp(-0.3 * whole))
+        assert np.array_equal(faded.path_m, echoes.path_m)
+
+
+def test_haze_up_to_the_surface_sends_back_the_integral_of_the_lidar_equation():
+    directions = [[1.0, 0, 0], [math.cos(0.5), math.sin(0.5), 0], [-1.0, 0, 0]]
+    _, _, background = in_air(Scene((WALL,), medium=FOG), rays_along(directions))
+    unit = PHOTONS.emitted(3) * PHOTONS.efficiency * PHOTONS.aperture_m2 * FOG.backscatter_per_m_sr
+    ends = [5.0, 5.0 / math.cos(0.5), 8.0]
+    assert background.edges_m[:, 0] == pytest.approx(np.full(3, 0.5))
+    assert background.edges_m[:, -1] == pytest.approx(ends)
+    # the disc's solid angle is 1e-6 m^2 / r^2 but for 3/4 (aperture radius / r)^2, some 1e-6 here
+    expected = [unit * integral(0.5, end) for end in ends]
+    assert background.counts.sum(axis=1) == pytest.approx(expected, rel=2e-6)
+    cells = [unit * integral(*pair) for pair in zip(background.edges_m[0], background.edges_m[0, 1:], strict=False)]
+    assert background.counts[0] == pytest.approx(cells, rel=2e-6)
+
+
+def test_a_gate_from_the_aperture_on_counts_a_finite_share():
+    _, _, background = in_air(Scene((WALL,), medium=FOG), rays_along([[1.0, 0, 0]], (0.0, 8.0)))
+    radius = math.sqrt(PHOTONS.aperture_m2 / math.pi)
+
+    def profile(r):
+        return 2 * math.pi * (1 - r / math.hypot(r, radius)) * math.exp(-0.6 * r) * FOG.backscatter_per_m_sr
+
+    pieces = [0.0, radius, 10 * radius, 100 * radius, 1.0, 5.0]
+    whole = sum(quad(profile, *pair, epsabs=1e-14)[0] for pair in itertools.pairwise(pieces))
+    assert background.counts.sum() == pytest.approx(PHOTONS.emitted(1) * PHOTONS.efficiency * whole, rel=1e-4)
+    assert (np.diff(background.edges_m) > 0).all()
+
+
+def test_gates_behind_the_surface_and_gates_without_width_hear_no_haze():
+    for gate in ((6.0, 8.0), (2.0, 2.0)):
+        _, _, background = in_air(Scene((WALL,), medium=FOG), rays_along([[1.0, 0, 0]], gate))
+        assert background.counts.shape == background.edges_m[:, 1:].shape
+        assert not background.counts.any()
+        assert np.isfinite(background.edges_m).all()
+
+
+def test_detectors_without_photons_count_no_haze():
+    _, faded, background = in_air(Scene((WALL,), medium=FOG), rays_along([[1.0, 0, 0]]), IDEAL)
+    assert len(faded) == 1
+    assert background.counts is None
+
+
+def test_behind_an_edge_only_the_light_that_passed_it_is_sent_back():
+    plate = Body(Box((0.001, 5.0, 5.0)), poses=rigid(translation_m=(2.001, 5.0, 0.0)))
+    wide = Detector("wide", divergence_rad=0.02, footprint_rays=64, photons=PHOTONS)
+    _, _, whole = in_air(Scene((WALL,), medium=FOG), rays_along([[1.0, 0, 0]]), wide)
+    _, _, background = in_air(Scene((plate, WALL), medium=FOG), rays_along([[1.0, 0, 0]]), wide)
+    assert np.array_equal(whole.edges_m, background.edges_m)
+    before, behind = whole.edges_m[0, 1:] < 2.0, whole.edges_m[0, :-1] > 2.001
+    assert background.counts[0, before] == pytest.approx(whole.counts[0, before], rel=1e-12)
+    # the last cell ends with the farthest part of the beam
+    assert background.counts[0, behind][:-1] == pytest.approx(whole.counts[0, behind][:-1] / 2, rel=1e-12)
+
+
+def test_a_receiver_elsewhere_hears_the_haze_in_its_view_by_the_whole_path():
+    receiver = Receiver((0.0, 1.0, 0.0), 0.0, 0.0, 3.0, 3.0, (0.0, 99.0))
+    scene = Scene((WALL,), medium=FOG, receiver=receiver)
+    _, _, background = in_air(scene, rays_along([[1.0, 0, 0]], (0.5, 8.0)))
+
+    def profile(r):
+        return math.exp(-0.3 * (r + math.hypot(r, 1.0))) / (r * r + 1)
+
+    unit = PHOTONS.emitted(1) * PHOTONS.efficiency * PHOTONS.aperture_m2 * FOG.backscatter_per_m_sr
+    assert background.counts.sum() == pytest.approx(unit * quad(profile, 0.5, 5.0)[0], rel=1e-5)
+    assert background.edges_m[0, [0, -1]] == pytest.approx([(r + math.hypot(r, 1)) / 2 for r in (0.5, 5.0)])
+
+
+def test_a_receiver_at_the_emitter_hears_the_same_haze():
+    here = Receiver((0.0, 0.0, 0.0), 0.0, 0.0, 3.0, 3.0, (0.0, 99.0))
+    rays = rays_along([[1.0, 0, 0], [0.8, 0.6, 0]])
+    _, alone, mono = in_air(Scene((WALL,), medium=FOG), rays)
+    _, both, bistatic = in_air(Scene((WALL,), medium=FOG, receiver=here), rays)
+    assert np.array_equal(mono.edges_m, bistatic.edges_m)
+    assert bistatic.counts == pytest.approx(mono.counts, rel=1e-12)
+    assert both.gain == pytest.approx(alone.gain, rel=1e-12)
+
+
+def test_a_rays_haze_depends_on_no_other_ray_but_for_the_shared_energy():
+    many = rays_along([[1.0, 0, 0], [0.8, 0.6, 0], [0.0, 0.0, 1.0]])
+    _, _, together = in_air(Scene((WALL,), medium=FOG), many)
+    _, _, alone = in_air(Scene((WALL,), medium=FOG), many.subset(np.array([1])))
+    assert np.array_equal(together.edges_m[1], alone.edges_m[0])
+    assert np.array_equal(together.counts[1], alone.counts[0])

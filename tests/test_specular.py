@@ -1,0 +1,201 @@
+"""Mirrors and glass: images behind mirrors, squares of shares both ways, panes, and their limits."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from lidardesign.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
+from lidardesign.simulate.echoes import Beams
+from lidardesign.simulate.effects.specular import MAXIMUM_TURNS, detours
+from lidardesign.simulate.physics import direct_echoes
+from lidardesign.simulate.raycast import SceneCaster
+from lidardesign.simulate.returns import Rays
+from lidardesign.space import direction
+
+EVERYWHERE = {"azimuth_rad": 0.0, "elevation_rad": 0.0, "horizontal_rad": 3.1, "vertical_rad": 3.1}
+
+
+def beams_along(directions, origins=(0.0, 0.0, 0.0)):
+    directions = np.atleast_2d(np.asarray(directions, float))
+    origins = np.broadcast_to(np.asarray(origins, float), directions.shape)
+    count = len(directions)
+    return Beams.of(Rays(origins, directions, np.tile([0.0, 99.0], (count, 1)), np.zeros(count), np.zeros(count)))
+
+
+def traced(scene, beams):
+    caster = SceneCaster(scene)
+
+    def tracer(origins, directions, time_s):
+        return caster.first_hit(origins, directions)
+
+    hits = tracer(beams.origin_m, beams.direction, beams.time_s)
+    return direct_echoes(scene, beams, hits), detours(scene, beams, hits, tracer)
+
+
+def slab(x_m, thickness_m=0.01, yaw_rad=0.0, **material):
+    """A wide plate whose near face is at x = x_m, turned about the middle of that face."""
+    turn = Rotation.from_euler("z", yaw_rad).as_matrix()
+    centre = np.array([x_m, 0.0, 0.0]) + turn @ [thickness_m / 2, 0.0, 0.0]
+    return Body(Box((thickness_m / 2, 3.0, 3.0)), poses=rigid(turn, centre), **material)
+
+
+def meshed(body):
+    made = trimesh.creation.box(extents=2 * np.array(body.shape.half_extents_m))
+    mesh = Mesh(np.array(made.vertices), np.array(made.faces))
+    return Body(mesh, poses=body.poses, reflectance=body.reflectance, specular=body.specular)
+
+
+def fan(count=100, spread=0.2, seed=0):
+    generator = np.random.default_rng(seed)
+    return direction(generator.uniform(-spread, spread, count), generator.uniform(-spread, spread, count))
+
+
+@pytest.mark.parametrize("made", [lambda body: body, meshed], ids=["box", "mesh"])
+def test_a_flat_mirror_shows_the_image_of_the_scene_at_its_whole_distance(made):
+    mirror = made(slab(2.0, yaw_rad=math.radians(45), reflectance=0.0, specular=0.7))
+    # the mirror x + ... turned by 45 degrees sends x to -y: the ball is seen as if it lay behind the mirror
+    ball = Body(Sphere(0.8), poses=rigid(translation_m=(2.0, -3.0, 0.1)), reflectance=0.4)
+    normal = mirror.poses[:3, :3] @ [-1.0, 0.0, 0.0]
+    image = np.array([2.0, -3.0, 0.1]) - 2 * ((np.array([2.0, -3.0, 0.1]) - [2.0, 0, 0]) @ normal) * normal
+    looking = fan(spread=0.1)
+    direct, led = traced(Scene((mirror, ball)), beams_along(looking))
+    behind, _ = traced(
+        Scene((Body(Sphere(0.8), poses=rigid(translation_m=image), reflectance=0.4),)), beams_along(looking)
+    )
+    assert len(behind) == len(led) == 100
+    assert np.array_equal(led.ray, behind.ray)
+    assert (led.body == 1).all()
+    assert led.path_m == pytest.approx(behind.path_m, abs=1e-6)
+    assert led.gain == pytest.approx(0.7**2 * behind.gain, rel=1e-5)
+    assert (direct.gain == 0).all()
+
+
+def test_a_pane_weakens_what_lies_behind_it_by_both_faces_both_ways():
+    pane, wall = (
+        slab(1.0, transmission=0.9, reflectance=0.02),
+        Body(Box((0.1, 9, 9)), poses=rigid(translation_m=(3.1, 0, 0))),
+    )
+    looking = fan()
+    direct, led = traced(Scene((pane, wall)), beams_along(looking))
+    clear, _ = traced(Scene((wall,)), beams_along(looking))
+    assert (direct.body == 0).all()
+    behind, far_face = led.kept(led.body == 1), led.kept(led.body == 0)
+    assert behind.path_m == pytest.approx(clear.path_m, abs=1e-12)
+    assert behind.gain == pytest.approx(0.9**4 * clear.gain, rel=1e-12)
+    assert far_face.path_m == pytest.approx(direct.path_m * 1.01, abs=1e-12)
+    assert far_face.gain == pytest.approx(0.9**2 * direct.gain / 1.01**2, rel=1e-12)
+
+
+def test_panes_add_up_until_beams_are_given_up():
+    wall = Body(Box((0.1, 9, 9)), poses=rigid(translation_m=(9.1, 0, 0)))
+    for panes in range(1, MAXIMUM_TURNS // 2 + 2):
+        bodies = tuple(slab(1.0 + index, transmission=0.8, reflectance=0.0) for index in range(panes))
+        _, led = traced(Scene((*bodies, wall)), beams_along([[1.0, 0, 0]]))
+        behind = led.kept(led.body == panes)
+        if panes <= MAXIMUM_TURNS // 2:
+            assert behind.path_m == pytest.approx([9.0], abs=1e-12)
+            assert behind.gain == pytest.approx([0.8 ** (4 * panes) * 0.5 / (math.pi * 81)], rel=1e-9)
+        else:
+            assert not len(behind)
+
+
+def test_a_ball_of_glass_is_crossed_through_both_of_its_sides():
+    ball = Body(Sphere(0.5), poses=rigid(translation_m=(2, 0, 0)), reflectance=0.0, transmission=0.6)
+    wall = Body(Box((0.1, 9, 9)), poses=rigid(translation_m=(5.1, 0, 0)), reflectance=0.5)
+    _, led = traced(Scene((ball, wall)), beams_along([[1.0, 0, 0]]))
+    behind = led.kept(led.body == 1)
+    assert behind.gain == pytest.approx([0.6**4 * 0.5 / (math.pi * 25)], rel=1e-9)
+
+
+def test_two_mirrors_face_to_face_make_a_row_of_images():
+    mirrors = slab(2.0, reflectance=0.0, specular=0.5), slab(-1.0, yaw_rad=math.pi, reflectance=0.1, specular=0.5)
+    looking = direction(np.array([0.0]), np.array([0.05]))
+    direct, led = traced(Scene(mirrors), beams_along(looking))
+    # the near mirror at x = -1 is met after 2 + 3, 2 + 3 + 6, ... metres; each turn takes half both ways
+    slant = math.cos(0.05)
+    met = led.kept(led.body == 1)
+    turns = np.arange(1, 2 * len(met), 2)
+    lengths = (2 + 3 * turns) / slant
+    assert len(met) == MAXIMUM_TURNS // 2
+    assert np.sort(met.path_m) == pytest.approx(lengths, abs=1e-9)
+    order = np.argsort(met.path_m)
+    assert met.gain[order] == pytest.approx(0.25**turns * 0.1 * slant / (math.pi * lengths**2), rel=1e-9)
+    assert not direct.gain.any()
+
+
+def test_faint_beams_are_given_up():
+    mirror = slab(2.0, yaw_rad=math.radians(45), specular=0.0009, reflectance=0.1)
+    ball = Body(Sphere(0.8), poses=rigid(translation_m=(2.0, -3.0, 0.1)))
+    assert not len(traced(Scene((mirror, ball)), beams_along([[1.0, 0, 0]]))[1])
+
+
+def test_matt_scenes_and_lists_without_rays_have_no_detours():
+    scene = Scene((slab(2.0), Body(Plane(), poses=rigid(translation_m=(0, 0, -1)))))
+    assert not len(traced(scene, beams_along(fan()))[1])
+    glossy = Scene((slab(2.0, specular=0.5),))
+    assert not len(traced(glossy, beams_along(np.empty((0, 3))))[1])
+
+
+def test_turning_the_world_changes_no_path_and_no_gain():
+    generator = np.random.default_rng(4)
+    bodies = (
+        slab(2.0, yaw_rad=0.6, specular=0.6, reflectance=0.2),
+        slab(1.2, yaw_rad=-0.3, transmission=0.8, specular=0.1, reflectance=0.05),
+        Body(Sphere(6.0), poses=np.eye(4)),
+    )
+    world = rigid(Rotation.random(random_state=generator).as_matrix(), generator.normal(size=3))
+    turned = tuple(
+        Body(
+            b.shape, poses=world @ b.poses, reflectance=b.reflectance, specular=b.specular, transmission=b.transmission
+        )
+        for b in bodies
+    )
+    looking = fan(50)
+    _, here = traced(Scene(bodies), beams_along(looking))
+    _, there = traced(Scene(turned), beams_along(looking @ world[:3, :3].T, world[:3, 3]))
+    assert len(here) > 200
+    assert np.array_equal(here.ray, there.ray)
+    assert np.array_equal(here.body, there.body)
+    assert there.path_m == pytest.approx(here.path_m, abs=1e-9)
+    assert there.gain == pytest.approx(here.gain, rel=1e-7, abs=1e-15)
+
+
+def test_light_is_never_made():
+    # inside a white, half mirroring room all that comes back by detours is less than what a matt one sends directly
+    room = Body(Sphere(3.0), reflectance=0.5, specular=0.3, transmission=0.2)
+    matt = Body(Sphere(3.0), reflectance=1.0)
+    looking = fan(200, spread=1.5)
+    direct, led = traced(Scene((room,)), beams_along(looking, (1.0, 0.5, 0.0)))
+    white, _ = traced(Scene((matt,)), beams_along(looking, (1.0, 0.5, 0.0)))
+    assert direct.gain.sum() + led.gain.sum() < white.gain.sum()
+
+
+def test_a_fixed_receiver_hears_what_a_mirror_lights_straight_from_there():
+    mirror = slab(2.0, yaw_rad=math.radians(45), reflectance=0.0, specular=0.7)
+    floor = Body(Box((3.0, 0.1, 3.0)), poses=rigid(translation_m=(2.0, -3.1, 0.0)), reflectance=0.4)
+    receiver = Receiver((0.0, -1.0, 0.0), **{**EVERYWHERE, "azimuth_rad": -0.8}, range_m=(0.0, 9.0))
+    _, led = traced(Scene((mirror, floor), receiver=receiver), beams_along([[1.0, 0.0, 0.0]]))
+    # out: 2 m to the mirror and 3 m to the floor at (2, -3); back from there to (0, -1), at 45 degrees
+    back_m = math.sqrt(8)
+    assert led.path_m == pytest.approx([(5 + back_m) / 2], abs=1e-9)
+    assert led.gain == pytest.approx([0.7 * 0.4 * math.cos(math.pi / 4) / (math.pi * 8)], rel=1e-9)
+    behind = Receiver((0.0, -1.0, 0.0), **{**EVERYWHERE, "azimuth_rad": 2.5}, range_m=(0.0, 9.0))
+    assert not len(traced(Scene((mirror, floor), receiver=behind), beams_along([[1.0, 0.0, 0.0]]))[1])
+
+
+def test_a_fixed_receiver_hears_through_panes_on_both_ways():
+    pane, wall = (
+        slab(1.0, transmission=0.9, reflectance=0.0),
+        Body(Box((0.1, 9, 9)), poses=rigid(translation_m=(3.1, 0, 0))),
+    )
+    receiver = Receiver((0.0, 0.5, 0.0), **EVERYWHERE, range_m=(0.0, 9.0))
+    _, led = traced(Scene((pane, wall), receiver=receiver), beams_along([[1.0, 0.0, 0.0]]))
+    behind = led.kept(led.body == 1)
+    back_m = math.hypot(3.0, 0.5)
+    assert behind.path_m == pytest.approx([(3 + back_m) / 2], abs=1e-9)
+    assert behind.gain == pytest.approx([0.9**4 * 0.5 * (3 / back_m) / (math.pi * back_m**2)], rel=1e-9)
