@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from lidardesign_tasks.arm import ArmTask
+from lidardesign_tasks.emitter import EmitterTask
 from lidardesign_tasks.face import FaceTask
 from lidardesign_tasks.flatland import FlatlandTask
 from lidardesign_tasks.meshes import MeshesTask
@@ -35,6 +36,7 @@ CASES = {
     "face embedded": (FaceTask, SMALL),
     "face with a free origin": (FaceTask, {**SMALL, "origin_box_m": 0.05}),
     "face of the real model": (FaceTask, {**SMALL, "model": str(REAL_MODEL)}),
+    "emitter": (EmitterTask, SMALL),
     "meshes": (MeshesTask, {"folder": "three", "truth_points": 800, "poses": 2}),
     "one mesh": (MeshesTask, {"folder": "one", "truth_points": 800, "poses": 2}),
     "meshes behind an occluder": (MeshesTask, {"folder": "three", "occluders": "front", "truth_points": 800}),
@@ -263,7 +265,7 @@ def test_a_design_that_sees_nothing_anywhere_fails_with_the_worst_value(often):
         assert found.value == task.metric.worst
 
 
-@pytest.mark.parametrize("kind", [ArmTask, FaceTask, FlatlandTask, MeshesTask, WarehouseTask])
+@pytest.mark.parametrize("kind", [ArmTask, EmitterTask, FaceTask, FlatlandTask, MeshesTask, WarehouseTask])
 @pytest.mark.parametrize("values", [{"no_such_key": 1}, {"train": float("nan")}])
 def test_unknown_keys_and_values_that_are_no_numbers_are_refused(kind, values):
     with pytest.raises(ValueError, match="validation error"):

@@ -42,6 +42,13 @@ class EmitterConfig(HeadConfig):
         (0.05, 1.05), description="shortest and longest one-way range of emitters and detector [m]"
     )
 
+    @field_validator("range_m")
+    @classmethod
+    def _ascending(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if not 0 <= value[0] < value[1]:
+            raise ValueError("the shortest range is 0 m or more, and the longest above it")
+        return value
+
     @field_validator("field_of_view_deg")
     @classmethod
     def _below_a_half_turn(cls, value: tuple[float, float]) -> tuple[float, float]:
@@ -72,7 +79,7 @@ class EmitterTask:
     Config: ClassVar[type[EmitterConfig]] = EmitterConfig
     metric: ClassVar[Metric] = FaceTask.metric
     defaults: ClassVar[Defaults] = Defaults(
-        sensors=1, rays=(100, 196, 361, 576), density={"sigma_m": 0.005}
+        sensors=1, rays=(100, 196, 361, 576), layout="density", level=0.98, density={"sigma_m": 0.005}
     )
 
     def space(self, config: EmitterConfig) -> DesignSpace:

@@ -11,6 +11,7 @@ from lidardesign.simulate.echoes import Beams, Echoes
 from lidardesign.simulate.effects.sight import sight_shares
 from lidardesign.simulate.hits import Hits
 from lidardesign.simulate.physics import Tracer
+from lidardesign.simulate.receiver_view import in_view
 
 
 def heard(scene: Scene, beams: Beams, hits: Hits, echoes: Echoes, tracer: Tracer) -> Echoes:
@@ -27,5 +28,9 @@ def heard(scene: Scene, beams: Beams, hits: Hits, echoes: Echoes, tracer: Tracer
         return echoes
     seen = np.flatnonzero(hits.body >= 0)
     points = beams.origin_m[seen] + hits.range_m[seen, None] * beams.direction[seen]
-    share = sight_shares(scene, points, hits.normal[seen], beams.time_s[seen], tracer)
+    share = in_view(scene.receiver, points).astype(np.float64)
+    # what starts at the receiver finds its way back open: nothing was in its way out
+    apart = (beams.origin_m[seen] != np.asarray(scene.receiver.origin_m)).any(axis=1)
+    rows = seen[apart]
+    share[apart] = sight_shares(scene, points[apart], hits.normal[rows], beams.time_s[rows], tracer)
     return replace(echoes, gain=echoes.gain * share).kept(share > 0)
