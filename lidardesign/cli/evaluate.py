@@ -14,6 +14,7 @@ import typer
 from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
 from lidardesign.cli.designs import number
+from lidardesign.cli.physics import Detector, Effects, RangeTolerance, ReturnTolerance, planner_of
 from lidardesign.cli.runs import open_run, run_of
 from lidardesign.cli.scores import show_evaluation
 from lidardesign.errors import ConfigError, DataError, ThresholdError
@@ -82,6 +83,10 @@ def evaluate(
             show_default=False,
         ),
     ] = None,
+    effects: Effects = "auto",
+    detector: Detector = "ideal",
+    range_tolerance_mm: RangeTolerance = None,
+    return_tolerance: ReturnTolerance = None,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -92,14 +97,16 @@ def evaluate(
         if fail_above is not None and not math.isfinite(fail_above):
             raise ConfigError(f"{fail_above}", where="--fail-above", allowed="a finite number")
         _check_baselines(baseline or [])
+        planner, audit = planner_of(effects, detector, range_tolerance_mm, return_tolerance)
         entries, runs = _collect(targets)
         run = _common_run(_named_apart(entries), runs)
-        request = _request(run, entries, rays, baseline or [], seed)
+        request = replace(_request(run, entries, rays, baseline or [], seed), planner=planner, audit=audit)
         evaluation = _evaluate(request, console)
         written = _write_files(evaluation, request, report, plots, csv)
         document = {**evaluation.as_dict(), "files": [str(path) for path in written]}
         console.result(document, lambda rich: show_evaluation(document, written, rich))
         _check_threshold(evaluation, fail_above)
+        _check_audit(evaluation)
 
 
 def _check_baselines(names: list[str]) -> None:
@@ -274,3 +281,17 @@ def _check_threshold(evaluation: Evaluation, limit: float | None) -> None:
         bound = "at most" if evaluation.metric.better == "lower" else "at least"
         rows = ", ".join(f"{row.design} with {row.rays} rays: {number(row.value)} {unit}" for row in missed)
         raise ThresholdError(rows, where="--fail-above", allowed=f"{bound} {limit:g} {unit}")
+
+
+def _check_audit(evaluation: Evaluation) -> None:
+    """Exit 1 where skipped effects change a row by more than the metric's tolerance."""
+    audit = evaluation.audit
+    if audit is None or not audit.failed:
+        return
+    rows = ", ".join(f"{row.design} with {row.rays} rays by {number(abs(row.difference))}" for row in audit.failed)
+    raise ThresholdError(
+        f"skipped effects move {rows} {audit.unit}",
+        where="--effects audit",
+        allowed=f"at most {audit.tolerance:g} {audit.unit}, the metric's tolerance",
+        hint=f"--effects all, or a smaller tolerance; skipped: {', '.join(audit.skipped)}",
+    )

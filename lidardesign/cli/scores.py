@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
 Entry = dict[str, Any]
+MILLIMETRES = 1000.0
 
 
 def show_evaluation(document: dict[str, Any], written: Sequence[Path], rich: RichConsole) -> None:
@@ -28,6 +29,9 @@ def show_evaluation(document: dict[str, Any], written: Sequence[Path], rich: Ric
     _show_grid(against, title, ("a", "rays"), "b", _difference, rich)
     title = f"baselines with as much bandwidth as the design: value \\[{unit}] (rays)"
     _show_grid(document["equal_bandwidth"], title, ("matched_to", "matched_rays"), "design", _value, rich)
+    _show_effects(document, rich)
+    if "audit" in document:
+        _show_audit(document["audit"], rich)
     for note in document.get("notes", []):
         rich.print(f"note: {escape(note)}", soft_wrap=True)
     for path in written:
@@ -86,3 +90,54 @@ def _difference(pair: Entry) -> str:
 
 def _value(row: Entry) -> str:
     return f"{number(row['value'])} ({row['rays']})"
+
+
+def _show_effects(document: Entry, rich: RichConsole) -> None:
+    """What was simulated and why; one line where nothing is called for."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    detector, effects = escape(document["detector"]), document["effects"]
+    if not any(effect["on"] or effect["bound"] or effect["lost"] for effect in effects):
+        rich.print(f"effects: none called for with the detector {detector}", soft_wrap=True)
+        return
+    first = effects[0]
+    allowed = f"{MILLIMETRES * first['tolerance']:.3g} mm and {first['lost_tolerance']:.2g} of returns"
+    title = f"effects with the detector {detector}; all that are skipped may change {allowed} together"
+    rich.print(f"[italic]{title}[/italic]", soft_wrap=True)
+    table = Table("effect", "on")
+    for heading in ("range \\[mm]", "returns", "cost \\[s]"):
+        table.add_column(heading, justify="right")
+    table.add_column("reason")
+    for effect in effects:
+        cells = (f"{MILLIMETRES * effect['bound']:.3g}", f"{effect['lost']:.2g}", f"{effect['seconds']:.2g}")
+        table.add_row(effect["name"].replace("_", " "), _where_on(effect), *cells, escape(effect["reason"]))
+    rich.print(table)
+
+
+def _where_on(effect: Entry) -> str:
+    if not effect["on"]:
+        return "no" if effect["missing"] is None else "missing"
+    return "yes" if effect["scenes_on"] == 1 else f"in {effect['scenes_on']:.0%}"
+
+
+def _show_audit(audit: Entry, rich: RichConsole) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    unit = escape(audit["unit"])
+    skipped = ", ".join(audit["skipped"]) or "nothing"
+    verdict = "passed" if audit["passed"] else "failed"
+    title = f"audit {verdict}: the plan skips {skipped}; rows may move by {audit['tolerance']:g} {unit}"
+    rich.print(f"[italic]{title}[/italic]", soft_wrap=True)
+    table = Table("design", "matched to")
+    for heading in ("rays", f"planned \\[{unit}]", f"all \\[{unit}]", "difference (95 % interval)", "seconds", "all"):
+        table.add_column(heading, justify="right")
+    for row in audit["rows"]:
+        cells = (row["planned"], row["everything"])
+        times = (number(row["seconds"], 2), number(row["seconds_everything"], 2))
+        matched = escape(row.get("matched_to", "-"))
+        table.add_row(
+            escape(row["design"]), matched, str(row["rays"]), *map(number, cells), _difference(row), *times
+        )
+    rich.print(table)

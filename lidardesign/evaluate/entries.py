@@ -18,6 +18,7 @@ from lidardesign.evaluate.candidates import Candidate, Positions, mean_mbps
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.scoring import score_lists
 from lidardesign.registry import plugin_guard
+from lidardesign.scene import Scene
 from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import conditions_of
 
@@ -172,10 +173,14 @@ def _judge(request: EvaluationRequest) -> Judge:
     sign = 1.0 if request.task.metric.better == "lower" else -1.0
 
     def judge(lists: Sequence[Positions]) -> Sequence[float]:
-        values = [
-            [score.value for score, _ in score_lists(request.task, scene, lists, build_casters(scene))]
-            for scene in request.train[:JUDGED_SCENES]
-        ]
+        values = [_values(request, scene, lists) for scene in request.train[:JUDGED_SCENES]]
         return [float(value) for value in sign * np.mean(values, axis=0)] if values else [0.0] * len(lists)
 
     return judge
+
+
+def _values(request: EvaluationRequest, scene: Scene, lists: Sequence[Positions]) -> list[float]:
+    """Scores in a training scene, with the physics that it calls for."""
+    casters, planner = build_casters(scene), request.planner
+    physics = planner.physics(planner.plan(scene, [rays for one in lists for rays in one], casters), request.seed)
+    return [score.value for score, _ in score_lists(request.task, scene, lists, casters, physics)]

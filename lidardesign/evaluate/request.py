@@ -15,6 +15,7 @@ from lidardesign.errors import ConfigError, PluginError
 from lidardesign.evaluate.ablation import LayOut
 from lidardesign.evaluate.baselines import BASELINES
 from lidardesign.scene import Scene
+from lidardesign.simulate.plan import Planner
 from lidardesign.space import DesignSpace
 from lidardesign.task import Task
 
@@ -38,6 +39,8 @@ class EvaluationRequest:
         lay_out: How a design becomes a ray list of a given length.
         without_visibility: The design that stands for the baseline `no-visibility`, and the samples that it was
             fitted to; called when that is asked for.
+        planner: The detector, and how the effects that are simulated are chosen.
+        audit: Whether all rows are scored under all effects too.
     """
 
     task: Task
@@ -54,6 +57,8 @@ class EvaluationRequest:
     test: Sequence[Scene] = ()
     lay_out: LayOut = lay_out
     without_visibility: Callable[[], tuple[Design, Samples]] | None = None
+    planner: Planner = field(default_factory=Planner)
+    audit: bool = False
 
     def check(self) -> None:
         """Refuse what makes no sense.

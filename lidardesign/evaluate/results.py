@@ -8,11 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lidardesign.task import Metric
+
+if TYPE_CHECKING:
+    from lidardesign.evaluate.audit import Audit
+    from lidardesign.evaluate.effects import EffectSummary
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +109,10 @@ class Evaluation:
         equal_bandwidth: Every baseline with as many rays as fit in the bandwidth of each row of a design.
         paired_bandwidth: Every design against those.
         notes: What a reader should know, one line each.
+        detector: The name of what measured.
+        effects: What was simulated, and why.
+        planning_seconds: Time to find that out [s].
+        audit: The same rows under all effects, where that was asked for.
     """
 
     metric: Metric
@@ -114,15 +122,20 @@ class Evaluation:
     equal_bandwidth: Sequence[Row] = ()
     paired_bandwidth: Sequence[Paired] = ()
     notes: Sequence[str] = ()
+    detector: str = "ideal"
+    effects: Sequence[EffectSummary] = ()
+    planning_seconds: float = 0.0
+    audit: Audit | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """The contract's JSON form of `evaluate`.
 
         Beyond the contract: `equal_bandwidth` rows name the design and rays that they are `matched_to`,
-        `paired_equal_bandwidth` compares each design with them (`rays_b` are the baseline's), and `notes`.
+        `paired_equal_bandwidth` compares each design with them (`rays_b` are the baseline's), `notes`, `detector`,
+        `planning_seconds`, and `audit` where that was asked for.
         """
         metric = self.metric
-        return {
+        values = {
             "metric": {
                 "name": metric.name,
                 "unit": metric.unit,
@@ -134,10 +147,13 @@ class Evaluation:
             "paired": [pair.as_dict() for pair in self.paired],
             "equal_bandwidth": [row.as_dict() for row in self.equal_bandwidth],
             "paired_equal_bandwidth": [pair.as_dict() for pair in self.paired_bandwidth],
-            "effects": [],
+            "detector": self.detector,
+            "effects": [effect.as_dict() for effect in self.effects],
+            "planning_seconds": self.planning_seconds,
             "accuracy": [],
             "notes": list(self.notes),
         }
+        return values if self.audit is None else {**values, "audit": self.audit.as_dict()}
 
 
 def leading_detail(rows: Sequence[Row]) -> str | None:

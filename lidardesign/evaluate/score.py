@@ -3,23 +3,27 @@
 Honest by construction: every design and baseline sees the same scenes; a scene where the returns are too few
 to score counts as a failure at the metric's worst value and is never dropped; baselines are built from
 training scenes alone. In each scene the rays of all rows are traced together, frame by frame, and rows that fire the
-same rays are scored once.
+same rays are scored once. All rows of a scene meet the same effects: those that the scene calls for with any of them.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from lidardesign.evaluate.audit import Audit, audit_rows
+from lidardesign.evaluate.effects import EffectSummary, effect_notes, summaries
 from lidardesign.evaluate.entries import Entry, entries_of
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.results import Evaluation, Paired, Row, worse_than_threshold
 from lidardesign.evaluate.scoring import score_lists, score_scene
 from lidardesign.evaluate.statistics import bootstrap_interval, paired_difference
+from lidardesign.simulate.plan import Plan, Planner
 from lidardesign.simulate.simulate import build_casters
 
 __all__ = [
@@ -45,6 +49,15 @@ class _Tally:
     seconds: float = 0.0
 
 
+@dataclass(frozen=True, eq=False)
+class _Scored:
+    """All entries under a planner's effects: their tallies, a plan per scene, and the time to plan [s]."""
+
+    tallies: Mapping[tuple[Any, ...], _Tally]
+    plans: Sequence[Plan]
+    planning_seconds: float
+
+
 def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Evaluation:
     """Score every design and baseline on every held-out scene.
 
@@ -53,13 +66,17 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
         progress: Called with the scenes done, all scenes, and the name of the scene.
 
     Raises:
-        ConfigError: No scenes, designs of one name, an unknown baseline, or a layout that cannot be had.
+        ConfigError: No scenes, designs of one name, an unknown baseline, a layout that cannot be had, or an effect that
+            was named and cannot be simulated here.
         PluginError: The task's score raised, or returned something that is no finite score.
     """
     request.check()
     entries = entries_of(request)
-    tallies = _score_all(request, entries, progress)
-    rows = [_row(request, entry, tallies[entry.key]) for entry in entries]
+    passes = 1 + request.audit
+    scored = _score_all(request, entries, request.planner, _part(progress, 0, passes))
+    rows = _rows(request, entries, scored)
+    effects = summaries(scored.plans)
+    audit = _audit(request, entries, rows, effects, _part(progress, 1, passes)) if request.audit else None
     plain = [row for row in rows if row.matched_to is None]
     matched = [row for row in rows if row.matched_to is not None]
     return Evaluation(
@@ -69,31 +86,66 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
         paired=_pairs(plain, request.seed),
         equal_bandwidth=matched,
         paired_bandwidth=_bandwidth_pairs(plain, matched, request.seed),
-        notes=_notes(request, entries, matched),
+        notes=_notes(request, entries, matched) + effect_notes(effects, request.planner.choice),
+        detector=request.planner.detector.name,
+        effects=effects,
+        planning_seconds=scored.planning_seconds,
+        audit=audit,
     )
 
 
+def _part(progress: Progress | None, number: int, passes: int) -> Progress | None:
+    """Progress of one of several passes over the scenes."""
+    if progress is None:
+        return None
+    return lambda done, total, name: progress(number * total + done, passes * total, name)
+
+
+def _audit(
+    request: EvaluationRequest,
+    entries: Sequence[Entry],
+    rows: Sequence[Row],
+    effects: Sequence[EffectSummary],
+    progress: Progress | None,
+) -> Audit:
+    """The same entries under all effects that there are, with the same random numbers."""
+    scored = _score_all(request, entries, replace(request.planner, choice="all"), progress)
+    paired = zip(effects, summaries(scored.plans), strict=True)
+    skipped = [planned.name for planned, every in paired if every.scenes_on > planned.scenes_on]
+    unavailable = [effect.name for effect in summaries(scored.plans) if effect.missing is not None]
+    metric = request.task.metric
+    found = audit_rows(rows, _rows(request, entries, scored), request.seed)
+    return Audit(metric.tolerance, metric.unit, found, skipped, unavailable)
+
+
 def _score_all(
-    request: EvaluationRequest, entries: Sequence[Entry], progress: Progress | None
-) -> dict[tuple[Any, ...], _Tally]:
+    request: EvaluationRequest, entries: Sequence[Entry], planner: Planner, progress: Progress | None
+) -> _Scored:
     """Scene by scene, so that only one scene's casters are held at a time."""
     jobs = {entry.key: entry for entry in entries}
     tallies = {key: _Tally() for key in jobs}
+    plans, planning_seconds = [], 0.0
     for done, scene in enumerate(request.test):
         if progress:
             progress(done, len(request.test), scene.name)
         casters = build_casters(scene)
         fired = [jobs[key].drawn(done) for key in jobs]
-        for tally, (score, seconds) in zip(
-            tallies.values(), score_lists(request.task, scene, fired, casters), strict=True
-        ):
+        started = time.perf_counter()
+        plans.append(planner.plan(scene, [rays for positions in fired for rays in positions], casters))
+        planning_seconds += time.perf_counter() - started
+        scores = score_lists(request.task, scene, fired, casters, planner.physics(plans[-1], request.seed))
+        for tally, (score, seconds) in zip(tallies.values(), scores, strict=True):
             tally.seconds += seconds
             tally.values.append(score.value)
             tally.details.append(score.details)
             tally.failures += score.failed
     if progress:
         progress(len(request.test), len(request.test), "")
-    return tallies
+    return _Scored(tallies, plans, planning_seconds)
+
+
+def _rows(request: EvaluationRequest, entries: Sequence[Entry], scored: _Scored) -> list[Row]:
+    return [_row(request, entry, scored.tallies[entry.key]) for entry in entries]
 
 
 def _row(request: EvaluationRequest, entry: Entry, tally: _Tally) -> Row:

@@ -12,6 +12,7 @@ from lidardesign.errors import PluginError
 from lidardesign.evaluate.candidates import Positions
 from lidardesign.registry import plugin_guard
 from lidardesign.scene import Scene
+from lidardesign.simulate.physics import Physics
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.returns import Rays, Returns
 from lidardesign.simulate.simulate import simulate, simulate_many
@@ -22,15 +23,27 @@ MOST_RETURNS = 4_000_000
 
 
 def score_lists(
-    task: Task, scene: Scene, jobs: Sequence[Positions], casters: Sequence[SceneCaster]
+    task: Task,
+    scene: Scene,
+    jobs: Sequence[Positions],
+    casters: Sequence[SceneCaster],
+    physics: Physics | None = None,
 ) -> Iterator[tuple[Score, float]]:
     """Scores of many sets of rays in one scene, in their order, each with its share of the time [s].
 
     As many are traced together as a bounded memory allows.
+
+    Arguments:
+        task: Whose score is taken.
+        scene: The scene.
+        jobs: The sets of rays.
+        casters: One per frame.
+        physics: The detector and the effects that are on; None: geometry alone.
     """
     for group in _groups(jobs, scene.frames):
         started = time.perf_counter()
-        found = iter(simulate_many(scene, [rays for positions in group for rays in positions], casters=casters))
+        lists = [rays for positions in group for rays in positions]
+        found = iter(simulate_many(scene, lists, casters=casters, physics=physics))
         rays = sum(_count(positions) for positions in group)
         per_ray = (time.perf_counter() - started) / max(rays, 1)
         for positions in group:

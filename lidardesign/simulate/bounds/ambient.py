@@ -5,7 +5,7 @@ With mean counts b per bin, B bins and s counts in the echo's bin, another bin w
 with the probability `false_alarm` hides echoes below it, and a ray that has no return invents one as often as that.
 Counts among the echo's own move its range by its error times sqrt(b / s), the share of the noise that is theirs.
 
-Nothing of this can be where no count arrives: all are at most 1 - exp(-B b). Light is bounded as if all were reflected.
+Nothing of this can be where no count arrives: all are at most 1 - exp(-B b).
 """
 
 from __future__ import annotations

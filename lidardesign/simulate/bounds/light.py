@@ -7,26 +7,29 @@ import math
 import numpy as np
 
 from lidardesign.simulate.bounds.sight import Sight
+from lidardesign.simulate.daylight import spectral_irradiance
 from lidardesign.simulate.detector import SPEED_OF_LIGHT_M_S
-
-# The most that the sun sends at any wavelength when it gives 100,000 lux [W / (m^2 m)] (ASTM G173-03, near 480 nm).
-SUN_W_M2_M = 1.65e9
-FULL_SUN_LUX = 100_000.0
 
 
 def ambient_per_metre(sight: Sight) -> np.ndarray:
     """Ambient and dark counts per pulse and metre of range, at most, shape (N,).
 
-    Whatever a ray looks at reflects at most all light: radiance E / pi, seen through the aperture and the pixel's field
-    of view; a metre of range takes 2 / c.
+    What a ray looks at has the radiance reflectance E / pi, that of its first hit, or of the most reflecting body where
+    it meets nothing; it is seen through the aperture and the pixel's field of view; a metre of range takes 2 / c.
     """
     photons, ambient = sight.detector.photons, sight.scene.ambient
-    rate_hz = photons.dark_hz
+    rate_hz = np.full(len(sight), photons.dark_hz)
     if ambient is not None:
-        radiance = SUN_W_M2_M * ambient.illuminance_lux / FULL_SUN_LUX / math.pi
-        power_w = radiance * photons.filter_m * photons.aperture_m2 * photons.field_of_view_sr
-        rate_hz += power_w * photons.efficiency / photons.photon_energy_j
-    return np.full(len(sight), rate_hz * 2 / SPEED_OF_LIGHT_M_S)
+        irradiance = spectral_irradiance(ambient, photons.wavelength_m, photons.filter_m)
+        power_w = irradiance / math.pi * photons.filter_m * photons.aperture_m2 * photons.field_of_view_sr
+        rate_hz += _reflectance(sight) * power_w * photons.efficiency / photons.photon_energy_j
+    return rate_hz * 2 / SPEED_OF_LIGHT_M_S
+
+
+def _reflectance(sight: Sight) -> np.ndarray:
+    """Of what each ray looks at, mirrored light included, at most, shape (N,)."""
+    matt = np.array([min(body.reflectance + body.specular + body.transmission, 1.0) for body in sight.scene.bodies])
+    return np.where(sight.hits.body >= 0, matt[sight.hits.body], matt.max())
 
 
 def haze_per_pulse(sight: Sight, emitted: np.ndarray, bin_m: float) -> tuple[np.ndarray, np.ndarray]:
