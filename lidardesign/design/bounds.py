@@ -28,6 +28,7 @@ class Bounds:
     Arguments:
         interval: z, the standard deviations on each side of a mean that an interval spans.
         origin_low, origin_high: Box of the mean origin [m], shape (K, 3).
+        free_low, free_high: Boxes one of which holds the interval of the origin along each axis, shape (K, M, 3) [m].
         origin_spread: Largest standard deviation of the origin along any direction [m].
         origin_thickness: Largest standard deviation of the origin along its thinnest direction [m].
         azimuth_centre, azimuth_half: Interval of the boresight's azimuth on the circle [rad].
@@ -39,6 +40,8 @@ class Bounds:
     interval: float
     origin_low: np.ndarray
     origin_high: np.ndarray
+    free_low: np.ndarray
+    free_high: np.ndarray
     origin_spread: np.ndarray
     origin_thickness: np.ndarray
     azimuth_centre: np.ndarray
@@ -75,6 +78,8 @@ class Bounds:
             interval=interval,
             origin_low=np.full((count, 3), -math.inf),
             origin_high=np.full((count, 3), math.inf),
+            free_low=np.full((count, 1, 3), -math.inf),
+            free_high=np.full((count, 1, 3), math.inf),
             origin_spread=high,
             origin_thickness=high,
             azimuth_centre=np.zeros(count),

@@ -14,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from lidardesign.design.check_excluded import excluded_rows, excluded_starts, excluded_travel
+
 # Rounding of the checker's own conversions between radians and degrees, as a share of the bound.
 ROUNDING = 1e-12
 # A reported interval may differ from its mean and spread by this share (decimal digits in a file).
@@ -67,11 +69,13 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
         name = str(sensor.get("name", index))
         checks += _consistency(name, sensor, z)
         checks += _origin(name, sensor, own) + _boresight(name, sensor, own, bounds)
+        checks += [ConstraintCheck(*row) for row in excluded_rows(name, sensor, own, z)]
         checks += _intervals(name, sensor, own, z)
         if bounds is not None:
             checks += _inside_space(name, sensor, bounds)
     checks += _table(document, rules)
     if document.get("track"):
+        checks += [ConstraintCheck(*row) for row in excluded_travel(document["track"], sensors, rules)]
         checks += _track(document["track"], rules, bounds)
     return checks + _mounts(sensors, rules, each) + _budget(document, rules)
 
@@ -288,7 +292,8 @@ def _table(document: Mapping[str, Any], rules: Mapping[str, Any]) -> list[Constr
         own = _over(rules, each[sensor]) if sensor < len(each) else rules
         for key, value in (("start_m", start), ("end_m", end), ("width_m", end - start)):
             failed += [c for c in _between(f"ray{ray}.gate.{key}", value, _get(own, "gate", key)) if not c.satisfied]
-    return failed
+    owners = [_over(rules, each[sensor]) if sensor < len(each) else rules for sensor in table["sensor"]]
+    return failed + [ConstraintCheck(*row) for row in excluded_starts(table, owners)]
 
 
 def _track(track: Mapping[str, Any], rules: Mapping[str, Any], space: Any) -> list[ConstraintCheck]:

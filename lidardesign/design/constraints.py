@@ -7,6 +7,8 @@ What the bounds mean, here and in `check`, which verifies them on the finished f
 - `origin.spread_m.max` bounds the standard deviation of the origin along every direction, `thickness_m.max` that
   along its thinnest principal direction, so that sensors spread over lines or sheets of any tilt;
 - `origin.mounts_m` lists the points where sensors can be fixed, one sensor at each at most (see `mounts`);
+- `origin.exclude` lists boxes whose interior holds no mean origin, no part of its interval, mean -+ z spread along
+  each axis, and no start of a ray; samples are taken from outside them (see `origins`);
 - `boresight.azimuth_deg` is an interval on the circle: with `min` above `max` it passes through 0;
 - every gate stays inside the range bounds of the design space, whatever the file says.
 
@@ -26,6 +28,8 @@ from lidardesign.run.validation import check_model
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 Distance = Annotated[float, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
+# The boxes between excluded ones grow faster than their number: with so many a fit still takes seconds.
+MOST_EXCLUDED = 32
 
 
 class _Keys(BaseModel):
@@ -82,6 +86,20 @@ class SpreadLimit(_Keys):
     max: Positive | None = None
 
 
+class ExcludedBox(_Keys):
+    """A box in whose interior no sensor may be [m]; one without volume excludes nothing."""
+
+    low_m: Vector
+    high_m: Vector
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ExcludedBox:
+        for axis, low, high in zip("xyz", self.low_m, self.high_m, strict=True):
+            if low > high:
+                raise ValueError(f"low_m is above high_m along {axis}")
+        return self
+
+
 class Origin(_Keys):
     """Where a sensor may sit [m]."""
 
@@ -91,6 +109,7 @@ class Origin(_Keys):
     spread_m: SpreadLimit = SpreadLimit()
     thickness_m: SpreadLimit = SpreadLimit()
     mounts_m: Annotated[list[Vector], Field(min_length=1)] | None = None
+    exclude: Annotated[list[ExcludedBox], Field(max_length=MOST_EXCLUDED)] | None = None
 
     @model_validator(mode="after")
     def _distinct_mounts(self) -> Origin:

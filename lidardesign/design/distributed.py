@@ -26,16 +26,17 @@ import numpy as np
 from scipy.special import chdtri, ndtri
 
 from lidardesign.design.bounds import Bounds
-from lidardesign.design.constraints import Constraints
+from lidardesign.design.constraints import Constraints, SensorConstraints
 from lidardesign.design.coupling import conditional_means, conditional_spreads
 from lidardesign.design.features import Axes, Features
 from lidardesign.design.gates import SMALLEST_CELL, central_intervals, kept_gates
 from lidardesign.design.grid import field_on_sphere, low_discrepancy
 from lidardesign.design.lines import mean_squares, nearest_lines
 from lidardesign.design.looks import looks
+from lidardesign.design.origins import box_around, free_boxes, origin_box
 from lidardesign.design.quantise import lloyd, samples_for
 from lidardesign.design.regions import owned, principal_axes
-from lidardesign.design.resolve import bounds_of, origin_box
+from lidardesign.design.resolve import bounds_of
 from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import Design, Sensor, interval_factor, tangent_directions
 from lidardesign.numerics import systematic_draw
@@ -84,8 +85,8 @@ def distributed_beams(design: Design, shares: np.ndarray, samples: Samples | Non
     for index, (sensor, count) in enumerate(zip(design.sensors, shares, strict=True)):
         bounds = bounds_of(constraints, space, (index,), interval_factor(design.level))
         if samples is None or count == 0 or len(np.unique(fired[index][:, :RANGE], axis=0)) < count:
-            low, high = origin_box(constraints.of_sensor(index), space)
-            beams.append(_gaussian_beams(sensor, int(count), bounds, np.stack([low, high]), space))
+            box = _own_box(sensor, constraints.of_sensor(index), space)
+            beams.append(_gaussian_beams(sensor, int(count), bounds, box, space))
             continue
         generator = random_generator(seed, "distributed layout", index)
         beams.append(_sampled_beams(sensor, int(count), bounds, samples, members[index], fired[index], generator))
@@ -102,6 +103,18 @@ def _space_of(design: Design) -> DesignSpace:
         low, high = low - reach, high + reach
     farthest = max(sensor.gate_m[1] for sensor in design.sensors)
     return DesignSpace((*low, 0.0, -math.pi / 2, 0.0), (*high, FULL_TURN, math.pi / 2, farthest))
+
+
+def _own_box(sensor: Sensor, one: SensorConstraints, space: DesignSpace) -> np.ndarray:
+    """Lowest and highest origins of a sensor's rays, outside the excluded boxes, shape (2, 3) [m]."""
+    low, high = origin_box(one, space)
+    free = free_boxes(one, space)
+    if len(free.low_m):
+        reach = interval_factor(sensor.level) * np.sqrt(np.diag(sensor.origin_covariance_m2))
+        beside, beyond = box_around(np.asarray(sensor.origin_m), reach, free)
+        low = np.clip(beside, low, high)
+        high = np.clip(beyond, low, high)
+    return np.stack([low, high])
 
 
 def _sampled_beams(

@@ -18,6 +18,7 @@ from lidardesign.design.mixture import (
     responsibilities,
 )
 from lidardesign.design.mstep import maximise
+from lidardesign.design.origins import nearest_admitted
 from lidardesign.design.quantise import lloyd
 from lidardesign.errors import NumericalError
 from lidardesign.numerics import effective_count, wrap_angle
@@ -156,7 +157,7 @@ def _matched(features: Features, labels: np.ndarray, bounds: Bounds) -> np.ndarr
         one = bounds.take(np.full(count, component))
         turned = wrap_angle(clip_azimuth(azimuth, one) - azimuth) / features.angular_scale
         tilted = (np.clip(elevation, one.elevation_low, one.elevation_high) - elevation) / features.angular_scale
-        moved = np.clip(means[:, :3], one.origin_low, one.origin_high) - means[:, :3]
+        moved = _nearest_origins(means[:, :3], bounds, component) - means[:, :3]
         reach = np.clip(means[:, 5], one.start_low, one.end_high) - means[:, 5]
         unit = features.scale.max() if len(features.scale) else 1.0
         cost[component] = np.square(turned) + np.square(tilted) + (np.square(moved).sum(1) + np.square(reach)) / unit**2
@@ -169,6 +170,13 @@ def _matched(features: Features, labels: np.ndarray, bounds: Bounds) -> np.ndarr
     renumbered = np.empty(count, dtype=np.int64)
     renumbered[cell] = component
     return renumbered[labels]
+
+
+def _nearest_origins(origins_m: np.ndarray, bounds: Bounds, component: int) -> np.ndarray:
+    """The nearest mean origins that a component's bounds admit, (N, 3) to (N, 3) [m]."""
+    low = np.maximum(bounds.origin_low[component], bounds.free_low[component])
+    high = np.maximum(np.minimum(bounds.origin_high[component], bounds.free_high[component]), low)
+    return nearest_admitted(origins_m, low, high)
 
 
 def fit_mixture(

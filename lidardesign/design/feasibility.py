@@ -6,13 +6,15 @@ through at most three bounds: all five kinds of cycle are checked with the tight
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints import Constraints, SensorConstraints
-from lidardesign.design.mounts import most_mounted
+from lidardesign.design.mounts import most_mounted, mounts_of
+from lidardesign.design.origins import free_boxes
 from lidardesign.errors import InfeasibleError
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace
 
@@ -41,10 +43,13 @@ def check_feasible(constraints: Constraints, space: DesignSpace, *, sensors: int
     """
     _check_count(constraints, sensors)
     _check_mount_count(constraints, sensors)
-    for index in range(max(len(constraints.each), 1)):
+    # sensors beyond the entries of `each` have the common constraints
+    entries = len(constraints.each) + (least_sensors(constraints, sensors).value > len(constraints.each))
+    for index in range(entries):
         one = constraints.of_sensor(index)
         _check_origin(constraints, one, index, space)
         _check_mounts(constraints, one, index, space)
+        _check_excluded(constraints, one, index, space)
         _check_boresight(constraints, one, index, space)
         _check_field(constraints, one, index, space)
         _check_gate(constraints, one, index, space)
@@ -122,7 +127,44 @@ def _check_mount_count(constraints: Constraints, sensors: int | None) -> None:
     if most is not None and most < least.value:
         names = [constraints.name_of(i, "origin.mounts_m") for i in range(len(constraints.each) or 1)]
         mounted = [name for i, name in enumerate(names) if constraints.of_sensor(i).origin.mounts_m]
-        _refuse(f"{least.value:g} sensors for {most} mounts", [least.name or "sensors", *mounted])
+        some = [constraints.name_of(i, "origin.exclude") for i in range(len(names)) if _lost_mounts(constraints, i)]
+        _refuse(f"{least.value:g} sensors for {most} mounts", [least.name or "sensors", *mounted, *some])
+
+
+def _lost_mounts(constraints: Constraints, index: int) -> bool:
+    """Whether some of a sensor's mounts lie in an excluded box."""
+    return len(mounts_of(constraints, index)) < len(constraints.of_sensor(index).origin.mounts_m or [])
+
+
+def _check_excluded(constraints: Constraints, one: SensorConstraints, index: int, space: DesignSpace) -> None:
+    """Excluded boxes leave room for a sensor's origin, or some of its mounts."""
+    if not one.origin.exclude:
+        return
+    name = constraints.name_of(index, "origin.exclude")
+    if one.origin.mounts_m is not None:
+        if not mounts_of(constraints, index):
+            _refuse("every mount lies in an excluded box", [constraints.name_of(index, "origin.mounts_m"), name])
+        return
+    if _has_room(one, space):
+        return
+    alone = [i for i, box in enumerate(one.origin.exclude) if not _has_room(_given(one, exclude=[box]), space)]
+    given = [key for key in ("low_m", "high_m", "fixed_m") if getattr(one.origin, key) is not None]
+    some = (kept for count in range(len(given) + 1) for kept in itertools.combinations(given, count))
+    fewest = next(k for k in some if not _has_room(_given(one, **{key: None for key in given if key not in k}), space))
+    bounds = [constraints.name_of(index, f"origin.{key}") for key in fewest]
+    boxes = "an excluded box holds" if alone else "the excluded boxes hold"
+    place = "its fixed origin" if fewest == ("fixed_m",) else "all origins"
+    where = bounds or [f"space.{DIMENSIONS[axis]}" for axis in range(3)]
+    _refuse(f"{boxes} {place}", [f"{name}[{alone[0]}]" if alone else name, *where])
+
+
+def _has_room(one: SensorConstraints, space: DesignSpace) -> bool:
+    return len(free_boxes(one, space).low_m) > 0
+
+
+def _given(one: SensorConstraints, **values: object) -> SensorConstraints:
+    """The constraints with other keys of the origin."""
+    return one.model_copy(update={"origin": one.origin.model_copy(update=values)})
 
 
 def _check_boresight(constraints: Constraints, one: SensorConstraints, index: int, space: DesignSpace) -> None:

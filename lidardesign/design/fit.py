@@ -18,7 +18,7 @@ from lidardesign.design.ensemble import Ensemble, Part, fit_parts, heaviest_firs
 from lidardesign.design.feasibility import check_feasible, least_sensors
 from lidardesign.design.features import Axes, Features
 from lidardesign.design.mount_choice import at_mounts
-from lidardesign.design.mounts import is_mounted, most_mounted
+from lidardesign.design.mounts import is_mounted, most_mounted, placement_notes
 from lidardesign.design.quantise import SAMPLES_PER_RAY
 from lidardesign.design.rays import Gates, make_ray_table, own_gates, split_budget
 from lidardesign.design.resolve import bounds_of, groups
@@ -153,7 +153,7 @@ def fit(
         satisfied=all(check.satisfied for check in checks),
         constraints=checks,
         seconds=time.perf_counter() - started,
-        notes=notes,
+        notes=(*placement_notes(constraints), *notes),
     )
 
 
@@ -172,6 +172,7 @@ def _along_condition(
         satisfied=all(check.satisfied for check in checks),
         constraints=checks,
         seconds=time.perf_counter() - started,
+        notes=placement_notes(constraints),
     )
 
 

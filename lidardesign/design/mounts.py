@@ -7,14 +7,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from lidardesign.design.constraints import Constraints
+from lidardesign.design.origins import inside_excluded
 
 Mount = tuple[float, float, float]
 
 
 def mounts_of(constraints: Constraints, sensor: int) -> list[Mount]:
-    """The mounts that one sensor may take; none where it is not mounted."""
-    listed = constraints.of_sensor(sensor).origin.mounts_m or []
-    return [(x, y, z) for x, y, z in listed]
+    """The mounts that one sensor may take, those in an excluded box left out; none where it is not mounted."""
+    one = constraints.of_sensor(sensor)
+    listed = [(x, y, z) for x, y, z in one.origin.mounts_m or []]
+    dropped = inside_excluded(np.array(listed, dtype=np.float64).reshape(-1, 3), one)
+    return [mount for mount, inside in zip(listed, dropped, strict=True) if not inside]
 
 
 def is_mounted(constraints: Constraints) -> bool:
@@ -59,3 +62,20 @@ def fixed_at(constraints: Constraints, places: Sequence[Mount | None]) -> Constr
         each.append(one)
     common = constraints.origin.model_copy(update={"mounts_m": None})
     return constraints.model_copy(update={"origin": common, "each": each})
+
+
+def placement_notes(constraints: Constraints) -> tuple[str, ...]:
+    """What the constraints say without effect: mounts in excluded boxes, and excluded boxes without volume."""
+    notes = []
+    for index in range(len(constraints.each) + 1):
+        one = constraints.of_sensor(index)
+        left, listed = mounts_of(constraints, index), one.origin.mounts_m or []
+        name = constraints.name_of(index, "origin.exclude")
+        if len(left) < len(listed):
+            mounts = constraints.name_of(index, "origin.mounts_m")
+            places = ", ".join(str(mount) for mount in listed if tuple(mount) not in left)
+            notes.append(f"{len(listed) - len(left)} of {len(listed)} {mounts} left out, inside {name}: {places}")
+        for number, box in enumerate(one.origin.exclude or []):
+            if not all(low < high for low, high in zip(box.low_m, box.high_m, strict=True)):
+                notes.append(f"{name}[{number}] has no volume and excludes nothing")
+    return tuple(dict.fromkeys(notes))

@@ -1,9 +1,10 @@
 r"""The constrained M-step: each block of parameters at its best inside the bounds.
 
 Origin, range, and angular spreads with roll are exact maximisers of the expected log-likelihood Q inside
-their bounds. The boresight moves by the weighted mean of the tangent coordinates along the sphere (exponential
-map); that is exact in the flat limit, so `em` accepts it only where the log-likelihood does not fall and
-otherwise keeps the boresight, which makes the remaining step exact.
+their bounds (an origin between excluded boxes is at least no worse than before, see `origin_step`). The boresight
+moves by the weighted mean of the tangent coordinates along the sphere (exponential map); that is exact in the
+flat limit, so `em` accepts it only where the log-likelihood does not fall and otherwise keeps the boresight, which
+makes the remaining step exact.
 """
 
 from __future__ import annotations
@@ -15,14 +16,13 @@ import numpy as np
 from lidardesign.design.bounds import Bounds, Floors, clip_azimuth
 from lidardesign.design.features import Features
 from lidardesign.design.mixture import SMALLEST_WEIGHT, Mixture, Statistics, frames
-from lidardesign.numerics import box_quadratic_minimum, clipped_eigenvalues, wrap_angle
+from lidardesign.design.origin_step import Limits, best_origins
+from lidardesign.numerics import box_quadratic_minimum, wrap_angle
 
 # A component with less than this share of the samples keeps its parameters: its moments are rounding noise.
 SMALLEST_MASS = 1e-9
 # Rolls beyond this would swap what is called horizontal and vertical.
 LARGEST_ROLL_RAD = math.pi / 4
-# Alternations between mean and covariance of the origin; each is exact, three reach rounding where both bind.
-ORIGIN_ALTERNATIONS = 3
 # Boresights this close to a pole have no usable azimuth metric; the box is then enforced by clipping alone.
 POLE_COSINE = 1e-6
 
@@ -77,19 +77,20 @@ def _origin(
         value = (phi[:, start + column] - first[:, i] * first[:, j]) * scale[i] * scale[j]
         scatter[:, i, j] = scatter[:, j, i] = value
     # a floor above the largest admitted spread yields to it
-    high = np.square(bounds.origin_spread)
-    low = np.minimum(floors.origin_m**2, high)
-    box = bounds.origin_low[:, axes], bounds.origin_high[:, axes]
-    # fewer free axes leave the origin no thickness at all
-    thinnest = np.square(bounds.origin_thickness) if count == 3 else np.inf
-    best = clipped_eigenvalues(scatter, low, high, thinnest)
-    point = np.clip(mean, *box)
-    for _ in range(ORIGIN_ALTERNATIONS):
-        if np.array_equal(point, mean):
-            break
-        point = box_quadratic_minimum(np.linalg.inv(best), mean, *box)
-        away = mean - point
-        best = clipped_eigenvalues(scatter + away[:, :, None] * away[:, None, :], low, high, thinnest)
+    most = np.square(bounds.origin_spread)
+    limits = Limits(
+        low=bounds.origin_low[:, axes],
+        high=bounds.origin_high[:, axes],
+        free_low=bounds.free_low[:, :, axes],
+        free_high=bounds.free_high[:, :, axes],
+        interval=bounds.interval,
+        least=np.minimum(floors.origin_m**2, most),
+        most=most,
+        # fewer free axes leave the origin no thickness at all
+        thinnest=np.square(bounds.origin_thickness) if count == 3 else np.full(len(mixture), np.inf),
+    )
+    old = mixture.origin_m[:, axes], mixture.origin_covariance_m2[:, axes][:, :, axes]
+    point, best = best_origins(mean, scatter, limits, *old)
     origin[:, axes] = point
     covariance[np.ix_(range(len(mixture)), axes, axes)] = best
     return origin, covariance

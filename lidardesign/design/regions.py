@@ -14,7 +14,7 @@ from scipy.special import chdtri
 from lidardesign.design.constraints import Constraints
 from lidardesign.design.coupling import conditional_means, conditional_spreads, relative
 from lidardesign.design.membership import FIELD_ROUNDING_RAD, SMALLEST_ANGLE_RAD, SMALLEST_LENGTH
-from lidardesign.design.resolve import origin_box
+from lidardesign.design.origins import inside_excluded, origin_box
 from lidardesign.design.sensor import Design, Sensor, angle_over_sine
 from lidardesign.space import DesignSpace, aim, observed_point
 
@@ -30,7 +30,7 @@ def owned(
     """The samples of each sensor: their indices and, as it fires them, their design points.
 
     A sample belongs to the sensor with the highest weighted density of its own origin, direction and range
-    among those whose region and origin box hold its ray, the first where they tie.
+    among those whose region and origin box hold its ray, outside the excluded boxes, the first where they tie.
 
     Arguments:
         design: G sensors.
@@ -47,8 +47,10 @@ def owned(
         fired.append(own)
         if share == 0:
             continue
-        low, high = origin_box(constraints.of_sensor(index), space)
+        one = constraints.of_sensor(index)
+        low, high = origin_box(one, space)
         inside = ((own[:, :3] >= low - ROUNDING_M) & (own[:, :3] <= high + ROUNDING_M)).all(axis=1)
+        inside &= ~inside_excluded(own[:, :3], one)
         inside &= in_region(sensor, own) & space.contains(own) & (weights > 0)
         score = np.where(inside, np.log(share) + log_joint_density(sensor, own, smallest_m=smallest), -np.inf)
         better = score > best

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -11,14 +12,14 @@ from lidardesign.design.bounds import Bounds
 from lidardesign.design.constraints import Constraints, SensorConstraints
 from lidardesign.design.feasibility import azimuth_interval
 from lidardesign.design.features import Axes
+from lidardesign.design.origins import PINNED_BOX_M, free_boxes, origin_box
+from lidardesign.errors import InfeasibleError
 from lidardesign.numerics import wrap_angle
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace
 
 # Bounds move inward by this share, so that a value at its bound still keeps it after unit conversions, the
 # interval's own arithmetic and writing; a micrometre per kilometre.
 INWARD = 1e-9
-# Origin boxes thinner than this along an axis pin it [m].
-PINNED_BOX_M = 1e-9
 
 Pins = tuple[float | None, float | None, float | None]
 
@@ -43,20 +44,6 @@ def inward(low: float, high: float) -> tuple[float, float]:
     if fresh[0] <= fresh[1]:
         return fresh
     return (low + high) / 2, (low + high) / 2
-
-
-def origin_box(one: SensorConstraints, space: DesignSpace) -> tuple[np.ndarray, np.ndarray]:
-    """The box of a sensor's mean origin inside the design space, (3,) each [m]; a point where it is fixed."""
-    low, high = (np.array(bound[:3], dtype=np.float64) for bound in (space.low, space.high))
-    if one.origin.low_m is not None:
-        low = np.maximum(low, one.origin.low_m)
-    if one.origin.high_m is not None:
-        high = np.minimum(high, one.origin.high_m)
-    if one.origin.fixed_m is not None:
-        fixed = np.array(one.origin.fixed_m)
-        free = np.isin(np.arange(3), space.free)
-        low = high = np.where(free, fixed, np.array(space.low[:3]))
-    return low, np.maximum(low, high)
 
 
 def pins_of(one: SensorConstraints, space: DesignSpace) -> Pins:
@@ -85,7 +72,8 @@ def bounds_of(constraints: Constraints, space: DesignSpace, sensors: tuple[int, 
         interval: z, half an interval in standard deviations.
     """
     axes = Axes.of(space)
-    distinct = {i: _row(constraints.of_sensor(i), space, axes, interval) for i in _distinct(constraints, sensors)}
+    distinct = {i: _row(constraints, i, space, axes, interval) for i in _distinct(constraints, sensors)}
+    _even_out(list(distinct.values()))
     last = len(constraints.each)
     rows = [distinct[min(i, last)] for i in sensors]
     arrays = {key: np.array([row[key] for row in rows]) for key in rows[0]}
@@ -97,12 +85,25 @@ def _distinct(constraints: Constraints, sensors: tuple[int, ...]) -> set[int]:
     return {min(i, len(constraints.each)) for i in sensors}
 
 
-def _row(one: SensorConstraints, space: DesignSpace, axes: Axes, interval: float) -> dict[str, object]:
+def _even_out(rows: list[dict[str, Any]]) -> None:
+    """Give all rows as many free boxes as the longest has, by repeating their first."""
+    most = max(len(row["free_low"]) for row in rows)
+    for row in rows:
+        for key in ("free_low", "free_high"):
+            boxes = row[key]
+            row[key] = np.concatenate([boxes, np.repeat(boxes[:1], most - len(boxes), axis=0)])
+
+
+def _row(constraints: Constraints, index: int, space: DesignSpace, axes: Axes, interval: float) -> dict[str, Any]:
+    one = constraints.of_sensor(index)
     low, high = origin_box(one, space)
     spread, thickness = one.origin.spread_m.max, one.origin.thickness_m.max
-    row: dict[str, object] = {
+    free_low, free_high = _free_sides(constraints, index, space)
+    row: dict[str, Any] = {
         "origin_low": low,
         "origin_high": high,
+        "free_low": free_low,
+        "free_high": free_high,
         "origin_spread": math.inf if spread is None else (1 - INWARD) * spread,
         "origin_thickness": math.inf if thickness is None else (1 - INWARD) * thickness,
     }
@@ -110,6 +111,17 @@ def _row(one: SensorConstraints, space: DesignSpace, axes: Axes, interval: float
     row |= _field_row(one, axes, interval)
     row |= _gate_row(one, space)
     return row
+
+
+def _free_sides(constraints: Constraints, index: int, space: DesignSpace) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of the boxes between the excluded ones, a little inward, (M, 3) each [m]."""
+    low, high = free_boxes(constraints.of_sensor(index), space)
+    if not len(low):
+        name = constraints.name_of(index, "origin.exclude")
+        raise InfeasibleError(f"{name} leaves sensor {index} no place", conflicts=[name])
+    size = np.where(np.isfinite(low), np.abs(low), 0.0), np.where(np.isfinite(high), np.abs(high), 0.0)
+    step = np.minimum(INWARD * np.maximum(*size), (high - low) / 4)
+    return low + step, high - step
 
 
 def _boresight_row(one: SensorConstraints, space: DesignSpace, axes: Axes) -> dict[str, object]:

@@ -1,9 +1,9 @@
 r"""Restricting the density to what constrained sensors can measure, and pinning origins.
 
-Which constraints restrict the samples: the origin boxes, the ranges between the earliest admitted gate start
-and the latest admitted gate end, and, where both boresight and field of view are bounded, the directions
-within half of the largest diagonal field of view of an admitted boresight. The others bound sensors, not
-rays. With `each`, a sample is kept where any sensor admits it.
+Which constraints restrict the samples: the origin boxes less what they exclude, the ranges between the
+earliest admitted gate start and the latest admitted gate end, and, where both boresight and field of view are
+bounded, the directions within half of the largest diagonal field of view of an admitted boresight. The others
+bound sensors, not rays. With `each`, a sample is kept where any sensor admits it.
 
 A pinned origin has measure zero. A sample d = (x, v, r) that observes the scene point s is re-aimed at s from
 the pinned origin x': E over (x, s) is with respect to p*(d) / r^2, so the new weight is
@@ -20,7 +20,8 @@ import numpy as np
 
 from lidardesign.design.constraints import Constraints
 from lidardesign.design.feasibility import azimuth_interval
-from lidardesign.design.resolve import Group, Pins, origin_box
+from lidardesign.design.origins import inside_excluded, origin_box
+from lidardesign.design.resolve import Group, Pins
 from lidardesign.design.samples import Samples
 from lidardesign.errors import ConfigError, InfeasibleError, NumericalError
 from lidardesign.numerics import effective_count, systematic_draw, wrap_angle
@@ -64,6 +65,7 @@ def admissible(points: np.ndarray, constraints: Constraints, space: DesignSpace,
         one = constraints.of_sensor(index)
         low, high = origin_box(one, space)
         inside = ((points[:, :3] >= low - TOLERANCE) & (points[:, :3] <= high + TOLERANCE)).all(axis=1)
+        inside &= ~inside_excluded(points[:, :3], one)
         if one.gate.start_m.min is not None:
             inside &= points[:, RANGE] >= one.gate.start_m.min
         if one.gate.end_m.max is not None:

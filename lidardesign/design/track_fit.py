@@ -26,7 +26,8 @@ from lidardesign.design.em import from_labels
 from lidardesign.design.features import Axes, Features
 from lidardesign.design.gates import admissible_gates, central_intervals
 from lidardesign.design.mixture import Mixture, log_density
-from lidardesign.design.resolve import Group, bounds_of, origin_box
+from lidardesign.design.origins import free_boxes, origin_box
+from lidardesign.design.resolve import Group, bounds_of
 from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import DEFAULT_LEVEL, Design, Sensor, Track, interval_factor
 from lidardesign.design.support import check_support, restricted
@@ -145,8 +146,8 @@ def _ends(space: DesignSpace, constraints: Constraints, dimension: int, level: f
         InfeasibleError: The constraints hold the origin still.
     """
     one = constraints.of_sensor(0)
-    low, high = (float(end[dimension]) for end in origin_box(one, space))
     name = DIMENSIONS[dimension]
+    low, high = _way(constraints, space, dimension)
     if not low < high:
         raise InfeasibleError(
             f"the origin is fixed at {name}={low:g}, but a track follows {name}",
@@ -163,6 +164,28 @@ def _ends(space: DesignSpace, constraints: Constraints, dimension: int, level: f
             hint="a shorter origin box, or --at",
         )
     return low, high
+
+
+def _way(constraints: Constraints, space: DesignSpace, dimension: int) -> tuple[float, float]:
+    """The one interval that the origin box and the excluded boxes leave along a dimension [m].
+
+    Raises:
+        InfeasibleError: Excluded boxes divide it.
+    """
+    one = constraints.of_sensor(0)
+    low, high = (float(end[dimension]) for end in origin_box(one, space))
+    if not low < high:
+        return low, high
+    free = free_boxes(one, space)
+    pieces = sorted(zip(free.low_m[:, dimension], free.high_m[:, dimension], strict=True))
+    if len(pieces) > 1:
+        raise InfeasibleError(
+            f"the excluded boxes divide the track into {len(pieces)} pieces",
+            conflicts=["origin.exclude", "--layout scan"],
+            hint=f"one of the pieces, as origin.low_m or origin.high_m with {DIMENSIONS[dimension]} "
+            f"up to {pieces[0][1]:g} or from {pieces[-1][0]:g}",
+        )
+    return max(low, pieces[0][0]), min(high, pieces[0][1])
 
 
 def _knots(low: float, high: float, effective: float, rays: int, wanted: int | None) -> np.ndarray:

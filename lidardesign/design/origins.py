@@ -1,0 +1,116 @@
+"""Where a sensor's origin may be: its box, minus the boxes that constraints exclude.
+
+What is left is not convex, so it is described by its maximal boxes: a box avoids the interiors of all excluded boxes
+just where it lies in one of the maximal boxes between them. So an interval of origins, which is a box of its own, is
+kept out of all excluded boxes by keeping it in one maximal box, and nothing is lost.
+
+Sides of maximal boxes that no excluded box stops are infinite: the mean of an origin keeps to its sensor's box, while
+its interval, which may be longer, has only the excluded boxes to avoid. Along axes on which the box is thin the origin
+has no freedom: an excluded box that does not hold its coordinate there is not in its way.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lidardesign.design.constraints import SensorConstraints
+from lidardesign.space import DesignSpace
+
+# Origin boxes thinner than this along an axis pin it, and gaps thinner than this are none [m].
+PINNED_BOX_M = 1e-9
+
+
+class Boxes(NamedTuple):
+    """Boxes with their sides along the axes.
+
+    Arguments:
+        low_m: Lower corners, shape (M, 3); may be -inf.
+        high_m: Upper corners, shape (M, 3); may be inf.
+    """
+
+    low_m: np.ndarray
+    high_m: np.ndarray
+
+
+def origin_box(one: SensorConstraints, space: DesignSpace) -> tuple[np.ndarray, np.ndarray]:
+    """The box of a sensor's mean origin inside the design space, (3,) each [m]; a point where it is fixed."""
+    low, high = (np.array(bound[:3], dtype=np.float64) for bound in (space.low, space.high))
+    if one.origin.low_m is not None:
+        low = np.maximum(low, one.origin.low_m)
+    if one.origin.high_m is not None:
+        high = np.minimum(high, one.origin.high_m)
+    if one.origin.fixed_m is not None:
+        fixed = np.array(one.origin.fixed_m)
+        free = np.isin(np.arange(3), space.free)
+        low = high = np.where(free, fixed, np.array(space.low[:3]))
+    return low, np.maximum(low, high)
+
+
+def excluded(one: SensorConstraints) -> Boxes:
+    """The boxes that a sensor's constraints exclude, flat ones included."""
+    boxes = one.origin.exclude or []
+    low, high = ([getattr(box, key) for box in boxes] for key in ("low_m", "high_m"))
+    return Boxes(np.array(low, dtype=np.float64).reshape(-1, 3), np.array(high, dtype=np.float64).reshape(-1, 3))
+
+
+def inside_excluded(origins_m: np.ndarray, one: SensorConstraints) -> np.ndarray:
+    """Which origins (N, 3) lie in the interior of an excluded box, shape (N,) bool."""
+    inside = np.zeros(len(origins_m), dtype=bool)
+    for low, high in zip(*excluded(one), strict=True):
+        inside |= ((origins_m > low) & (origins_m < high)).all(axis=1)
+    return inside
+
+
+def free_boxes(one: SensorConstraints, space: DesignSpace) -> Boxes:
+    """The maximal boxes between the excluded ones in which a sensor's mean origin may lie; none where all is excluded.
+
+    Along axes without freedom they are the whole line.
+    """
+    low, high = origin_box(one, space)
+    fixed = high - low <= PINNED_BOX_M
+    middle = (low + high) / 2
+    free = Boxes(np.full((1, 3), -np.inf), np.full((1, 3), np.inf))
+    for bottom, top in zip(*excluded(one), strict=True):
+        held = (bottom < middle) & (middle < top)
+        if (bottom < top).all() and held[fixed].all():
+            free = _admitted(_without(free, bottom, top, ~fixed), low, high, ~fixed)
+    return free
+
+
+def _without(boxes: Boxes, bottom: np.ndarray, top: np.ndarray, axes: np.ndarray) -> Boxes:
+    """The maximal boxes inside the union of some maximal boxes that avoid one more box, cut along some axes."""
+    met = ((boxes.low_m < top) & (boxes.high_m > bottom) | ~axes).all(axis=1)
+    lows, highs = [boxes.low_m[~met]], [boxes.high_m[~met]]
+    for axis in np.flatnonzero(axes):
+        below, above = boxes.high_m[met].copy(), boxes.low_m[met].copy()
+        below[:, axis] = np.minimum(below[:, axis], bottom[axis])
+        above[:, axis] = np.maximum(above[:, axis], top[axis])
+        lows += [boxes.low_m[met], above]
+        highs += [below, boxes.high_m[met]]
+    return Boxes(np.concatenate(lows), np.concatenate(highs))
+
+
+def _admitted(boxes: Boxes, low: np.ndarray, high: np.ndarray, axes: np.ndarray) -> Boxes:
+    """The boxes that leave room inside [low, high] along some axes, without those that lie in another one."""
+    room = np.minimum(boxes.high_m, high) - np.maximum(boxes.low_m, low)
+    wide = (room > PINNED_BOX_M)[:, axes].all(axis=1) & (boxes.high_m - boxes.low_m > PINNED_BOX_M).all(axis=1)
+    corners = np.unique(np.concatenate([boxes.low_m[wide], -boxes.high_m[wide]], axis=1), axis=0)
+    holds = (corners[None] <= corners[:, None]).all(axis=2)
+    kept = corners[holds.sum(axis=1) == 1]
+    return Boxes(kept[:, :3], -kept[:, 3:])
+
+
+def box_around(mean_m: np.ndarray, reach_m: np.ndarray, boxes: Boxes) -> tuple[np.ndarray, np.ndarray]:
+    """The box that holds an interval, mean -+ reach (3,) each, or lacks least of it: low and high, (3,) each [m]."""
+    lacking = np.maximum(boxes.low_m - (mean_m - reach_m), 0.0) + np.maximum(mean_m + reach_m - boxes.high_m, 0.0)
+    best = int(np.square(lacking).sum(axis=1).argmin())
+    return boxes.low_m[best], boxes.high_m[best]
+
+
+def nearest_admitted(origins_m: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """The nearest point of any of M boxes, given by corners (M, 3), to each of some origins (N, 3): shape (N, 3)."""
+    clipped = np.clip(origins_m[:, None], low, high)
+    away = np.square(clipped - origins_m[:, None]).sum(axis=2)
+    return np.take_along_axis(clipped, away.argmin(axis=1)[:, None, None], axis=1)[:, 0]
