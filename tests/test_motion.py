@@ -122,6 +122,21 @@ def test_after_its_last_pose_a_body_goes_on_as_it_came():
         assert path.at(np.array([0.05]))[1][0] == pytest.approx([halfway, 0, 0], abs=1e-13)
 
 
+def test_rays_sent_after_a_frame_meet_a_body_on_its_further_way():
+    generator = np.random.default_rng(21)
+    poses = np.stack([rigid(translation_m=(2.5, 0, 0)) @ random_pose(generator, 0.3) for _ in range(4)])
+    scene = Scene((Body(SHAPES["box"], poses=poses), Body(Box((0.1, 3, 3)), poses=rigid(translation_m=(5, 0, 0)))))
+    origins, looking, time_s = fan(200)
+    now, earlier = moving_tracer(scene, 2), moving_tracer(scene, 0)
+    # what is sent 0.2 s into frame 0 meets what frame 2 shows, and beyond the last pose too
+    for shift in (0.0, 0.1, 0.25):
+        here = now(origins, looking, time_s + shift)
+        there = earlier(origins, looking, time_s + shift + 2 / RATE_HZ)
+        assert np.array_equal(here.body, there.body)
+        assert there.range_m == pytest.approx(here.range_m, abs=1e-9)
+    assert len(earlier(origins[:0], looking[:0], time_s[:0]).range_m) == 0
+
+
 def test_frames_meet_without_a_jump():
     generator = np.random.default_rng(8)
     poses = np.stack([random_pose(generator) for _ in range(4)])

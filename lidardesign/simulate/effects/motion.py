@@ -3,12 +3,13 @@ r"""Things move within a frame: every ray meets them where they are at its own t
 A body with a pose per frame goes from each pose T_0 to the next T_1 on the one screw that joins them,
 T(s) = exp(s log(T_1 T_0^{-1})) T_0 with s = time * frame rate: with a constant turn about a fixed axis and a constant
 travel along it, which is how the links of a robot move when one joint turns (Murray, Li, Sastry 1994, chapter 2).
-After its last pose a body goes on as it came. A body at rest in all frames goes on with its velocity.
+Rays that are sent later than a frame lasts meet it on its way to the pose after that. After its last pose a body goes
+on as it came. A body at rest in all frames goes on with its velocity.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
@@ -46,11 +47,6 @@ class Screw:
         turn = Rotation.from_matrix(step[:3, :3]).as_rotvec()
         drift = np.linalg.solve(_translations(turn, np.ones(1))[0], step[:3, 3])
         return cls(pose, turn * rate_hz, drift * rate_hz)
-
-    @property
-    def moves(self) -> bool:
-        """Whether anything changes with time."""
-        return bool(self.turn_rad_s.any() or self.drift_m_s.any())
 
     def at(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rotations (N, 3, 3) and translations (N, 3) of the body at times (N,) [s]."""
@@ -101,38 +97,51 @@ def path_of(body: Body, frame: int, rate_hz: float) -> Screw:
 
 
 class _MovingBody:
-    """A body that rays meet at different times, traced in its own frame."""
+    """A body of a scene that rays meet at different times of a frame, traced in its own frame."""
 
-    def __init__(self, index: int, body: Body, path: Screw) -> None:
-        self.index, self.path = index, path
-        self._trace, self._centre, self._radius_m = _local_tracer(body.shape)
+    def __init__(self, scene: Scene, index: int, frame: int) -> None:
+        self._index, self._body, self._frame, self._rate_hz = index, scene.bodies[index], frame, scene.frame_rate_hz
+        self._trace, self._centre, self._radius_m = _local_tracer(self._body.shape)
 
     def keep_nearer(self, hits: Hits, origins: np.ndarray, directions: np.ndarray, time_s: np.ndarray) -> None:
         """Enter the hits that are nearer than what `hits` holds."""
-        rows = self._near(origins, directions, time_s, hits.range_m)
-        if not len(rows):
+        for path, piece, elapsed_s in self._pieces(time_s):
+            near = self._near(path, origins[piece], directions[piece], elapsed_s, hits.range_m[piece])
+            if not len(near):
+                continue
+            rows = piece[near]
+            rotation, translation = path.at(elapsed_s[near])
+            local_origins = np.einsum("nji,nj->ni", rotation, origins[rows] - translation)
+            local_directions = np.einsum("nji,nj->ni", rotation, directions[rows])
+            range_m, normal = self._trace(local_origins, local_directions, hits.range_m[rows])
+            hit = np.flatnonzero(np.isfinite(range_m))
+            won, turned = rows[hit], np.einsum("nij,nj->ni", rotation[hit], normal[hit])
+            facing = np.einsum("nk,nk->n", turned, directions[won]) > 0
+            turned[facing] *= -1
+            hits.range_m[won], hits.body[won], hits.normal[won] = range_m[hit], self._index, turned
+
+    def _pieces(self, time_s: np.ndarray) -> Iterator[tuple[Screw, np.ndarray, np.ndarray]]:
+        """Parts of its way, with the rows of the rays that meet it there and their times since that part began."""
+        if self._body.poses.ndim == 2:
+            yield path_of(self._body, self._frame, self._rate_hz), np.arange(len(time_s)), time_s
             return
-        rotation, translation = self.path.at(time_s[rows])
-        local_origins = np.einsum("nji,nj->ni", rotation, origins[rows] - translation)
-        local_directions = np.einsum("nji,nj->ni", rotation, directions[rows])
-        range_m, normal = self._trace(local_origins, local_directions, hits.range_m[rows])
-        hit = np.flatnonzero(np.isfinite(range_m))
-        turned = np.einsum("nij,nj->ni", rotation[hit], normal[hit])
-        won = rows[hit]
-        facing = np.einsum("nk,nk->n", turned, directions[won]) > 0
-        turned[facing] *= -1
-        hits.range_m[won], hits.body[won], hits.normal[won] = range_m[hit], self.index, turned
+        left = len(self._body.poses) - 1 - self._frame
+        passed = np.clip(np.floor(time_s * self._rate_hz), 0, left).astype(np.int64)
+        for frames in np.unique(passed).tolist():
+            rows = np.flatnonzero(passed == frames)
+            path = path_of(self._body, self._frame + frames, self._rate_hz)
+            yield path, rows, time_s[rows] - frames / self._rate_hz
 
     def _near(
-        self, origins: np.ndarray, directions: np.ndarray, time_s: np.ndarray, limit_m: np.ndarray
+        self, path: Screw, origins: np.ndarray, directions: np.ndarray, time_s: np.ndarray, limit_m: np.ndarray
     ) -> np.ndarray:
         """Rows of rays that pass, before their limit, the ball that holds the body at all their times."""
         if not np.isfinite(self._radius_m) or not len(origins):
             return np.arange(len(origins))
         earliest, latest = time_s.min(), time_s.max()
-        rotation, translation = self.path.at(np.array([(earliest + latest) / 2]))
+        rotation, translation = path.at(np.array([(earliest + latest) / 2]))
         offset = rotation[0] @ self._centre + translation[0] - origins
-        radius_m = self._radius_m + self.path.speed_m_s(self._centre) * (latest - earliest) / 2
+        radius_m = self._radius_m + path.speed_m_s(self._centre) * (latest - earliest) / 2
         along = np.einsum("nk,nk->n", offset, directions)
         squared = np.einsum("nk,nk->n", offset, offset)
         slack = BALL_SLACK * squared
@@ -177,11 +186,7 @@ def moving_tracer(scene: Scene, frame: int) -> Tracer:
     """First hits of rays (N, 3), (N, 3) of unit length that are sent at times (N,) [s] within a frame."""
     caster, indices = _still(scene)
     rest = set(indices.tolist())
-    moving = [
-        _MovingBody(index, body, path_of(body, frame, scene.frame_rate_hz))
-        for index, body in enumerate(scene.bodies)
-        if index not in rest
-    ]
+    moving = [_MovingBody(scene, index, frame) for index in range(len(scene.bodies)) if index not in rest]
 
     def trace(origins: np.ndarray, directions: np.ndarray, time_s: np.ndarray) -> Hits:
         count = len(origins)
