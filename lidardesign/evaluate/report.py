@@ -16,6 +16,7 @@ from lidardesign.design.sensor import Design
 from lidardesign.evaluate.drawing import MOST_FACES, drawn_share
 from lidardesign.evaluate.figures import curve_figure, scene_figure
 from lidardesign.evaluate.page import page
+from lidardesign.evaluate.physics_tables import audit_section, effects_section
 from lidardesign.evaluate.results import Evaluation
 from lidardesign.evaluate.verdicts import (
     bandwidth_table,
@@ -86,6 +87,8 @@ def report_html(
         _section("All scores", rows_table(evaluation)),
         _section("Paired differences at equal rays", paired_table(evaluation)),
         _section("At equal bandwidth", bandwidth_table(evaluation)) if evaluation.equal_bandwidth else "",
+        _section("Physics", effects_section(evaluation)) if evaluation.effects else "",
+        _section("Audit of the physics", audit_section(evaluation.audit)) if evaluation.audit else "",
         *(_section(f"Sensors of {design.name}", sensors_table(design)) for design in designs),
         _section("How to reproduce", _definitions(reproduce)) if reproduce else "",
     ]

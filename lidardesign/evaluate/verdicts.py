@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from lidardesign.design.sensor import Design
 from lidardesign.evaluate.results import Evaluation, Paired, Row, leading_detail
 
 MOST_SENSORS = 60  # listed in a table
+VERDICTS = {"better": "better", "worse": "worse", "open": "not clear"}
 
 
 def figure(value: float) -> str:
@@ -50,7 +51,7 @@ def rows_table(evaluation: Evaluation) -> str:
     headings = ["design", "rays", f"{evaluation.metric.name} [{unit}]", "95 % interval", "failures"]
     detail = leading_detail(evaluation.rows)
     headings += [] if detail is None else [_words(detail)]
-    return _table([*headings, "Mbit/s", "seconds"], _grouped(evaluation.rows, detail), text_columns=1)
+    return table([*headings, "Mbit/s", "seconds"], _grouped(evaluation.rows, detail), text_columns=1)
 
 
 def paired_table(evaluation: Evaluation) -> str:
@@ -66,7 +67,7 @@ def paired_table(evaluation: Evaluation) -> str:
         )
         for index, pair in enumerate(evaluation.paired)
     ]
-    return _table(headings, lines, text_columns=2)
+    return table(headings, lines, text_columns=2)
 
 
 def bandwidth_table(evaluation: Evaluation) -> str:
@@ -88,7 +89,7 @@ def bandwidth_table(evaluation: Evaluation) -> str:
                 bool(index and row.design == evaluation.equal_bandwidth[0].design),
             )
         )
-    return _table([*headings, "difference (95 % interval)", "design is"], lines, text_columns=2)
+    return table([*headings, "difference (95 % interval)", "design is"], lines, text_columns=2)
 
 
 def sensors_table(design: Design) -> str:
@@ -115,7 +116,7 @@ def sensors_table(design: Design) -> str:
         ]
         lines.append((cells, "", False))
     rest = len(design.sensors) - MOST_SENSORS
-    return _table(headings, lines, text_columns=1) + (f"<p>and {rest} more.</p>" if rest > 0 else "")
+    return table(headings, lines, text_columns=1) + (f"<p>and {rest} more.</p>" if rest > 0 else "")
 
 
 def _told(evaluation: Evaluation, pair: Paired, other: float) -> str:
@@ -145,23 +146,27 @@ def _grouped(rows: Sequence[Row], detail: str | None) -> list[tuple[list[str], s
     return lines
 
 
-def _table(
-    headings: Sequence[str], lines: Sequence[tuple[list[str], str, bool]], *, text_columns: int
+def table(
+    headings: Sequence[str],
+    lines: Sequence[tuple[list[str], str, bool]],
+    *,
+    text_columns: int,
+    words: Mapping[str, str] = VERDICTS,
 ) -> str:
-    """An HTML table; a line is its cells, a verdict for the last cell, and whether a group begins."""
+    """An HTML table; a line is its cells, a verdict for the last cell (in `words`), and whether a group begins."""
     head = "".join(
         f'<th{" class=text" if column < text_columns else ""} scope="col">{html.escape(heading)}</th>'
         for column, heading in enumerate(headings)
     )
-    body = "".join(_line(*line, text_columns) for line in lines)
+    body = "".join(_line(cells, word, words, first, text_columns) for cells, word, first in lines)
     return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
-def _line(cells: list[str], word: str, first: bool, text_columns: int) -> str:
+def _line(cells: list[str], word: str, words: Mapping[str, str], first: bool, text_columns: int) -> str:
     shown = [
         f"<td{' class=name' if column < text_columns else ''}>{html.escape(cell)}</td>"
         for column, cell in enumerate(cells)
     ]
     if word:
-        shown[-1] = f'<td class="{word}">{"not clear" if word == "open" else word}</td>'
+        shown[-1] = f'<td class="{word}">{words[word]}</td>'
     return f"<tr{' class=first' if first else ''}>{''.join(shown)}</tr>"

@@ -1,0 +1,77 @@
+"""The report's tables about physics: what was simulated and why, and what skipping the rest changes."""
+
+from __future__ import annotations
+
+import html
+
+from lidardesign.evaluate.audit import Audit, AuditRow
+from lidardesign.evaluate.effects import EffectSummary
+from lidardesign.evaluate.results import Evaluation
+from lidardesign.evaluate.verdicts import figure, table
+
+MILLIMETRES = 1000.0
+
+
+def effects_section(evaluation: Evaluation) -> str:
+    """What could change the scores, and what of it was simulated; one sentence where nothing could."""
+    effects = evaluation.effects
+    detector = html.escape(evaluation.detector)
+    if not any(effect.on or effect.range_m or effect.lost for effect in effects):
+        return f"<p>The detector is {detector}. No scene calls for any effect: returns are exact first hits.</p>"
+    tolerance = effects[0].tolerance
+    head = (
+        f"<p>The detector is {detector}. For each effect, the most that it could change in any scene and row: errors "
+        f"of range (rms) and the share of returns lost, invented or misplaced. All that is skipped may change "
+        f"{MILLIMETRES * tolerance.range_m:.3g} mm and {tolerance.lost:.2g} of the returns together.</p>"
+    )
+    headings = ["effect", "reason", "range [mm]", "returns", "cost [s]", "simulated"]
+    return head + table(headings, [(_effect_cells(effect), "", False) for effect in effects], text_columns=2)
+
+
+def audit_section(audit: Audit) -> str:
+    """Every row under the plan and under all effects, with a verdict each."""
+    planned, everything = audit.seconds
+    skipped = html.escape(", ".join(_words(name) for name in audit.skipped)) or "nothing"
+    passed = "failed" if audit.failed else "passed"
+    head = (
+        f"<p>The audit {passed}. The plan skips {skipped}; all rows took {planned:.2f} s under it and "
+        f"{everything:.2f} s under all effects, with the same random numbers. A mean may move by {audit.tolerance:g} "
+        f"{html.escape(audit.unit)}, the metric's tolerance; the largest difference is {figure(audit.worst)}.</p>"
+    )
+    unit = audit.unit
+    headings = ["design", "rays", f"planned [{unit}]", f"all [{unit}]", "difference", "95 % interval", "s", "s, all"]
+    lines = [
+        (
+            _audit_cells(row),
+            "worse" if row in audit.failed else "better",
+            bool(index and row.design != audit.rows[index - 1].design),
+        )
+        for index, row in enumerate(audit.rows)
+    ]
+    words = {"worse": "too far", "better": "within"}
+    return head + table([*headings, "moved"], lines, text_columns=1, words=words)
+
+
+def _effect_cells(effect: EffectSummary) -> list[str]:
+    shown = [_words(effect.name), effect.reason, f"{MILLIMETRES * effect.range_m:.3g}", f"{effect.lost:.2g}"]
+    return [*shown, f"{effect.seconds:.2g}", _simulated(effect)]
+
+
+def _simulated(effect: EffectSummary) -> str:
+    if effect.on:
+        return "yes" if effect.scenes_on == 1 else f"in {effect.scenes_on:.0%} of scenes"
+    return "no" if effect.missing is None else "not possible here"
+
+
+def _audit_cells(row: AuditRow) -> list[str]:
+    name = row.design if row.matched_to is None else f"{row.design}, in the bandwidth of {row.matched_to}"
+    cells = [name, str(row.rays), figure(row.planned), figure(row.everything), figure(row.difference)]
+    return [*cells, f"{figure(row.ci_low)} to {figure(row.ci_high)}", *_times(row), ""]
+
+
+def _times(row: AuditRow) -> list[str]:
+    return [f"{row.seconds:.2f}", f"{row.seconds_everything:.2f}"]
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
