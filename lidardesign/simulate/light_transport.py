@@ -25,10 +25,12 @@ from lidardesign.simulate.receiver_view import receiver_axes
 from lidardesign.simulate.returns import Rays
 
 # Rays of one request: what they need in memory stays small, and the numbers of rays that kernels are compiled for few.
-CHUNK_RAYS = 4096
-CHUNK_VALUES = 2_000_000
+CHUNK_RAYS = 16_384
+CHUNK_VALUES = 1 << 23
 FEWEST_RAYS = 16
 EVERYWHERE = -2.0  # a cosine that every direction exceeds
+# Points closer than this share of the reach are one: some hundred times the rounding of float32 paths.
+SAME_PLACE = 1e-4
 
 
 def available() -> bool:
@@ -149,17 +151,27 @@ class PathBins:
 
 @dataclass(frozen=True, eq=False)
 class Transients:
-    """Light that arrives along N rays by the length of its path, in T bins [W / (m^2 sr)] for lights in W/sr.
+    """Light that arrives along N rays by the length of its path [W / (m^2 sr)] for lights in W/sr.
 
     Arguments:
         bins: The path lengths.
-        binned: What arrives in each bin, shape (N, T).
-        steady: What arrives in all, also outside of the bins, shape (N,).
+        ray, cell: Where light arrives, each pair once, shape (K,).
+        radiance: How much, shape (K,).
+        steady: What arrives along each ray in all, also outside of the bins, shape (N,).
     """
 
     bins: PathBins
-    binned: np.ndarray
+    ray: np.ndarray
+    cell: np.ndarray
+    radiance: np.ndarray
     steady: np.ndarray
+
+    @property
+    def binned(self) -> np.ndarray:
+        """The radiance of every ray in every bin, shape (N, count)."""
+        table = np.zeros((len(self.steady), self.bins.count))
+        table[self.ray, self.cell] = self.radiance
+        return table
 
 
 def render_transient(
@@ -172,6 +184,7 @@ def render_transient(
     bounces: int = 1,
     samples: int = 1,
     seed: int = 0,
+    direct: bool = True,
     own_light: bool = False,
     cone_sr: np.ndarray | None = None,
     baseline_m: np.ndarray | None = None,
@@ -190,6 +203,7 @@ def render_transient(
         samples: Light paths per ray; standard errors fall with its root.
         seed: Of the simulator's random numbers; those of a ray depend on its number in the list, and on
             those of samples and bins.
+        direct: Whether light that meets one surface alone counts.
         own_light: Whether ray n sees light n alone; otherwise all of them.
         cone_sr: Solid angle around each ray that its radiance is the mean of [sr], shape (N,); None: thin rays.
         baseline_m: Length to take off the paths of each ray [m], shape (N,); None: 0.
@@ -202,27 +216,33 @@ def render_transient(
     count = len(rays)
     _check(count, lights, bounces, samples, own_light)
     if not count or not len(lights):
-        return Transients(bins, np.zeros((count, bins.count)), np.zeros(count))
-    centre_m, reach_m = _neighbourhood(scene, frame, rays, lights)
+        nothing = np.zeros(0, dtype=np.int64)
+        return Transients(bins, nothing, nothing, np.zeros(0), np.zeros(count))
+    first = shared_caster(scene, frame).first_hit(rays.origin_m, rays.direction)
+    centre_m, reach_m = _neighbourhood(first, rays, lights)
     shapes, arrays = exported(scene, frame, centre_m, reach_m)
+    met = np.where(np.isfinite(first.range_m), first.range_m, 0.0)
     columns = {
         "origin": rays.origin_m - centre_m,
         "direction": rays.direction,
         "cone_cosine_m1": (np.zeros(count) if cone_sr is None else np.asarray(cone_sr)) / (2 * math.pi),
         "baseline": (np.zeros(count) if baseline_m is None else baseline_m) + bins.start_m,
+        "dark_place": rays.origin_m - centre_m + met[:, None] * rays.direction,
+        "dark_radius": np.full(count, 0.0 if direct else SAME_PLACE * reach_m),
     }
     request = {"shapes": shapes, "samples": samples, "bins": bins.count, "width_m": bins.width_m}
     request |= {"bounces": bounces, "own": own_light}
-    light_columns = _light_columns(lights, centre_m)
+    light_columns = _light_columns(lights, centre_m, reach_m)
     parts = []
     for number, rows in enumerate(_chunks(count, bins.count)):
         mine = {name: values[rows] for name, values in (columns | (light_columns if own_light else {})).items()}
-        seeded = {**request, "seed": _seed(seed, number)}
-        parts.append(ask(seeded, arrays | light_columns | mine, limit_s=limit_s))
-    binned, steady = (
-        np.concatenate([part[name] for part in parts])[:count].astype(float) for name in ("transient", "steady")
+        answer = ask({**request, "seed": _seed(seed, number)}, arrays | light_columns | mine, limit_s=limit_s)
+        parts.append({**answer, "ray": answer["ray"] + rows[0]})
+    ray, cell, radiance, steady = (
+        np.concatenate([part[name] for part in parts]) for name in ("ray", "cell", "radiance", "steady")
     )
-    return Transients(bins, binned, steady)
+    real = ray < count
+    return Transients(bins, ray[real], cell[real], radiance[real].astype(float), steady[:count].astype(float))
 
 
 def pixel_rays(receiver: Receiver, columns: int, rows: int) -> tuple[Rays, np.ndarray]:
@@ -257,17 +277,16 @@ def _check(count: int, lights: Lights, bounces: int, samples: int, own_light: bo
         raise ConfigError(f"{len(lights)} lights of {count} rays", where="own_light", allowed="one for each ray")
 
 
-def _neighbourhood(scene: Scene, frame: int, rays: Rays, lights: Lights) -> tuple[np.ndarray, float]:
+def _neighbourhood(first: Hits, rays: Rays, lights: Lights) -> tuple[np.ndarray, float]:
     """The middle of all ends and first hits of paths, shape (3,), and the furthest of them from it [m]."""
-    range_m = shared_caster(scene, frame).first_hit(rays.origin_m, rays.direction).range_m
-    seen = np.isfinite(range_m)
-    points = rays.origin_m[seen] + range_m[seen, None] * rays.direction[seen]
+    seen = np.isfinite(first.range_m)
+    points = rays.origin_m[seen] + first.range_m[seen, None] * rays.direction[seen]
     points = np.concatenate([points, rays.origin_m, lights.origin_m])
     centre_m = (points.min(axis=0) + points.max(axis=0)) / 2
     return centre_m, float(np.linalg.norm(points - centre_m, axis=1).max())
 
 
-def _light_columns(lights: Lights, centre_m: np.ndarray) -> dict[str, np.ndarray]:
+def _light_columns(lights: Lights, centre_m: np.ndarray, reach_m: float) -> dict[str, np.ndarray]:
     return {
         "light": lights.origin_m - centre_m,
         "light_forward": lights.axes[:, 0],
@@ -279,6 +298,8 @@ def _light_columns(lights: Lights, centre_m: np.ndarray) -> dict[str, np.ndarray
         "light_lambert": lights.lambertian.astype(float),
         "light_intensity": lights.intensity,
         "light_radius": lights.radius_m,
+        # a patch does not light itself
+        "light_itself": np.where(lights.lambertian, SAME_PLACE * reach_m, 0.0),
         "light_lead": lights.lead_m,
     }
 

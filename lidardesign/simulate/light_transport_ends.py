@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-RAY_COLUMNS = ("origin", "direction", "cone_cosine_m1", "baseline")
+RAY_COLUMNS = ("origin", "direction", "cone_cosine_m1", "baseline", "dark_place", "dark_radius")
 LIGHT_COLUMNS = (
     "light",
     "light_forward",
@@ -22,6 +22,7 @@ LIGHT_COLUMNS = (
     "light_lambert",
     "light_intensity",
     "light_radius",
+    "light_itself",
     "light_lead",
 )
 
@@ -114,6 +115,8 @@ def _lights(mi: Any, dr: Any) -> type:
             distance = dr.norm(offset)
             toward = offset / dr.maximum(distance, dr.smallest(mi.Float))
             strength = _strength(dr, job, index, -toward, distance)
+            dark = dr.norm(it.p - mi.Point3f(job.at("dark_place", ray))) < job.at("dark_radius", ray)
+            strength = dr.select(dark, 0, strength)
             if not job.own:
                 strength *= mi.Float(job.lights)
             ds = dr.zeros(mi.DirectionSample3f)
@@ -145,7 +148,7 @@ def _lights(mi: Any, dr: Any) -> type:
 def _strength(dr: Any, job: Job, index: Any, away: Any, distance: Any) -> Any:
     """The irradiance of lights at a distance in a direction away from them, on a surface that faces them."""
     forward, left, up = (dr.dot(away, job.at(f"light_{name}", index)) for name in ("forward", "left", "up"))
-    inside = (forward >= job.at("light_cosine", index)) & (distance > 0)
+    inside = (forward >= job.at("light_cosine", index)) & (distance > job.at("light_itself", index))
     inside &= dr.abs(left) <= job.at("light_left_tan", index) * dr.abs(forward)
     inside &= dr.abs(up) <= job.at("light_up_tan", index) * dr.abs(forward)
     intensity = job.at("light_intensity", index)

@@ -94,10 +94,9 @@ def _render(mi: Any, dr: Any, request: dict[str, Any], arrays: dict[str, np.ndar
     integrator = mi.load_dict({"type": "transient_path", "max_depth": depth, "rr_depth": depth})
     ends.current[:] = [ends.Job(mi, dr, arrays, samples, bool(request["own"]))]
     steady, transient = integrator.render(scene, seed=int(request["seed"]), spp=samples)
-    return {
-        "transient": np.asarray(transient)[0, :, :, 0],
-        "steady": np.asarray(steady)[0, :, 0],
-    }
+    binned = np.asarray(transient)[0, :, :, 0]
+    ray, cell = np.nonzero(binned)
+    return {"ray": ray, "cell": cell, "radiance": binned[ray, cell], "steady": np.asarray(steady)[0, :, 0]}
 
 
 def answer(folder: Path, mi: Any, dr: Any) -> None:
