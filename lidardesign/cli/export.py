@@ -94,7 +94,7 @@ def _export(
     target = out if out is not None else path.with_suffix(exporter.suffix)
     if target.exists() and path.exists() and target.samefile(path):
         raise ConfigError("would overwrite the design itself", where=str(target), hint="give another --out")
-    design, laid_out = _design_and_rays(design, path, exporter.name, rays, at, seed, console)
+    design, laid_out = design_and_rays(design, path, exporter.name, rays, at, seed, console)
     notes = list(exporter.write(design, laid_out, target))
     for note in notes:
         console.note(f"note: {note}")
@@ -106,7 +106,7 @@ def _export(
     console.result(document, lambda rich: rich.print(f"wrote {target} ({content})", soft_wrap=True, markup=False))
 
 
-def _design_and_rays(
+def design_and_rays(
     design: Design, path: Path, name: str, count: int | None, at: Mapping[str, float], seed: int, console: Console
 ) -> tuple[Design, Rays]:
     """A design and its explicit rays at a condition; another number of rays may need the samples of its run.

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from lidardesign import __version__
+from lidardesign.cli.capture import capture
 from lidardesign.cli.console import EXIT_BROKEN_PIPE, Console, forget_stdout, print_json, report_error
 from lidardesign.cli.constrain import constrain
 from lidardesign.cli.environment import make_streams_tolerant, set_cache_default, set_thread_defaults, terminate_cleanly
@@ -55,6 +56,10 @@ EXAMPLES = {
     export: (
         "lidardesign export runs/face/designs/free.yaml --format csv --rays 576 --out rays.csv",
         "lidardesign export --list",
+    ),
+    capture: (
+        "lidardesign capture scan.npz runs/face/designs/free.yaml --rays 576",
+        "lidardesign capture scan.mat free.galvo.csv --reference head.ply --csv points.csv",
     ),
     show: (
         "lidardesign show runs/face/designs/free.yaml",

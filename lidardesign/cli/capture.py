@@ -1,0 +1,191 @@
+"""`lidardesign capture`: score designs by what a lab captured."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lidardesign.cli import options
+from lidardesign.cli.console import Console, command
+from lidardesign.cli.designs import number
+from lidardesign.cli.runs import check_choice, parse_at
+from lidardesign.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    from rich.console import Console as RichConsole
+
+    from lidardesign.evaluate.capture import Capture
+    from lidardesign.evaluate.capture_score import CaptureEvaluation, CaptureSettings
+    from lidardesign.simulate.returns import Rays
+
+ESTIMATORS = ("peak", "matched")
+COLUMNS = {
+    "rays": "rays",
+    "captured": "captured",
+    "returns": "returns",
+    "outliers": "outliers",
+    "outliers_percent": "outliers\n[%]",
+    "range_error_mm": "range error\n[mm]",
+    "chamfer_mm": "Chamfer\n[mm]",
+    "bins_per_ray": "bins\nper ray",
+    "photons_per_ray": "photons\nper ray",
+}
+
+
+EstimatorOption = Annotated[
+    str,
+    typer.Option(
+        "--estimator", metavar="peak|matched", help="Range from the highest bin, or from the log-matched filter."
+    ),
+]
+FalseAlarm = Annotated[
+    float, typer.Option("--false-alarm", metavar="P", help="Probability that background alone is taken for a return.")
+]
+Within = Annotated[
+    float | None,
+    typer.Option(
+        "--within-deg",
+        metavar="DEG",
+        help="Largest angle between a ray and the pixel that stands for it.",
+        show_default="the spacing of the pixels",
+    ),
+]
+Outlier = Annotated[
+    float, typer.Option("--outlier-mm", metavar="MM", help="Returns that are off by more are outliers.")
+]
+Reference = Annotated[
+    Path | None,
+    typer.Option(
+        "--reference",
+        metavar="MESH",
+        help="The true surface, in metres in the design's frame.",
+        show_default="through the capture's true ranges",
+    ),
+]
+CsvFile = Annotated[
+    Path | None,
+    typer.Option("--csv", metavar="FILE", help="Write every ray's range and point as CSV.", show_default=False),
+]
+
+
+def capture(
+    file: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Captured histograms, .npz or .mat.")],
+    designs: Annotated[
+        list[Path], typer.Argument(metavar="DESIGN", help="Design files, or what `export --format galvo` wrote.")
+    ],
+    rays: options.RayCount = None,
+    at: options.At = None,
+    estimator: EstimatorOption = "peak",
+    false_alarm: FalseAlarm = 0.01,
+    within_deg: Within = None,
+    outlier_mm: Outlier = 10.0,
+    reference: Reference = None,
+    csv: CsvFile = None,
+    seed: options.Seed = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Score designs by a captured scan: with their gates, without, and beside even rays."""
+    with command(json=json, quiet=quiet, debug=debug) as console:
+        _check_numbers(false_alarm, within_deg, outlier_mm)
+        check_choice(estimator, "--estimator", ESTIMATORS)
+        from lidardesign.evaluate.capture import load_capture
+        from lidardesign.evaluate.capture_score import evaluate_capture
+
+        place = parse_at(at)
+        named = _named_apart([(path, _rays(path, rays, place, seed or 0, console)) for path in designs])
+        captured = load_capture(file)
+        settings = _settings(captured, estimator, false_alarm, within_deg, outlier_mm, reference)
+        found = evaluate_capture(captured, named, settings)
+        for note in found.notes:
+            console.note(f"note: {note}")
+        if csv is not None:
+            from lidardesign.evaluate.capture_table import write_csv
+
+            write_csv(found, csv)
+        document = {"capture": str(file), **found.as_dict(), "files": [] if csv is None else [str(csv)]}
+        console.result(document, lambda rich: _show(document, found, rich))
+
+
+def _check_numbers(false_alarm: float, within_deg: float | None, outlier_mm: float) -> None:
+    if not 0 < false_alarm < 1:
+        raise ConfigError(f"{false_alarm}", where="--false-alarm", allowed="above 0 and below 1")
+    if within_deg is not None and not (0 < within_deg <= 180):
+        raise ConfigError(f"{within_deg}", where="--within-deg", allowed="above 0, at most 180 degrees")
+    if not (math.isfinite(outlier_mm) and outlier_mm > 0):
+        raise ConfigError(f"{outlier_mm}", where="--outlier-mm", allowed="a finite number above 0")
+
+
+def _settings(
+    captured: Capture,
+    estimator: str,
+    false_alarm: float,
+    within_deg: float | None,
+    outlier_mm: float,
+    reference: Path | None,
+) -> CaptureSettings:
+    from lidardesign.evaluate.capture_ranges import Estimation
+    from lidardesign.evaluate.capture_scan import default_within_rad
+    from lidardesign.evaluate.capture_score import CaptureSettings
+
+    within = default_within_rad(captured) if within_deg is None else math.radians(within_deg)
+    return CaptureSettings(Estimation(estimator, false_alarm), within, outlier_mm / 1000.0, reference)  # type: ignore[arg-type]
+
+
+def _rays(path: Path, count: int | None, at: dict[str, float], seed: int, console: Console) -> Rays:
+    """The rays of a design file, or of what was exported of it for a scanner."""
+    from lidardesign.cli.export import design_and_rays
+    from lidardesign.design.files import load_design
+    from lidardesign.export.galvo import is_galvo_file, read
+
+    if not path.exists():
+        raise DataError("no such design", where=str(path), hint="give design files or files of export --format galvo")
+    if is_galvo_file(path):
+        if count is not None or at:
+            raise ConfigError(
+                "holds its rays already",
+                where=str(path),
+                allowed="a design file with --rays and --at",
+                hint="leave them out",
+            )
+        return read(path)
+    return design_and_rays(load_design(path), path, "galvo", count, at, seed, console)[1]
+
+
+def _named_apart(found: list[tuple[Path, Rays]]) -> list[tuple[str, Rays]]:
+    """Designs by their files' names; files that share one keep their folders."""
+    names = [path.name.removesuffix(".yaml").removesuffix(".csv").removesuffix(".galvo") for path, _ in found]
+    paths = [path.resolve() for path, _ in found]
+    twice = next((path for path in paths if paths.count(path) > 1), None)
+    if twice is not None:
+        raise ConfigError("is given twice", where=str(twice))
+    return [
+        (str(path) if names.count(name) > 1 else name, rays) for name, (path, rays) in zip(names, found, strict=True)
+    ]
+
+
+def _show(document: dict[str, Any], found: CaptureEvaluation, rich: RichConsole) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    start, end = document["window_m"]
+    rich.print(
+        f"{document['pixels']} pixels, {document['bins']} bins of {number(document['bin_ps'])} ps from {start:.4g} to "
+        f"{end:.4g} m; estimator {document['estimator']}; pixels within {number(document['within_deg'], 3)} degrees",
+        soft_wrap=True,
+    )
+    rich.print(f"outliers: more than {number(document['outlier_mm'])} mm from {found.ranges_from}", soft_wrap=True)
+    if found.surface_from is not None:
+        rich.print(escape(f"Chamfer distance: to {found.surface_from}"), soft_wrap=True)
+    table = Table()
+    for heading in ("design", "gate", *COLUMNS.values()):
+        table.add_column(escape(heading), justify="left" if heading in ("design", "gate") else "right")
+    for row in document["rows"]:
+        table.add_row(escape(row["design"]), row["gate"], *(number(row[name]) for name in COLUMNS))
+    rich.print(table)
+    for path in document["files"]:
+        rich.print(f"wrote {escape(path)}", soft_wrap=True)

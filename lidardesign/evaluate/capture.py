@@ -1,0 +1,244 @@
+"""Captured transients: one photon histogram per pixel of a scan, as a lab measures them.
+
+A capture is a `.npz` or MATLAB `.mat` file with these keys; the pixels are a list (P) or an image (H x W):
+
+- `counts` (P, B) or (H, W, B): photons per time bin, whole numbers;
+- `bin_width_ps`: the width of a bin [ps];
+- `start_ps`: when the first bin begins, after the pulse left the scanner, two-way time [ps];
+- `origin_m` (3,): where the scanner stands [m];
+- either `direction` (P, 3) or (H, W, 3): unit vectors; or `x_deg`, `y_deg`: optical scan angles as in
+  `lidardesign.design.galvo`, with `boresight_azimuth_deg` and `boresight_elevation_deg` [deg];
+- optional `true_range_m` (P) or (H, W): the true one-way range [m], NaN where nothing is;
+- optional `pulse_fwhm_ps`: full width at half maximum of the whole system's response [ps], for the matched filter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from lidardesign.design.galvo import SPEED_OF_LIGHT_M_PER_PS, degree_frame, scan_directions
+from lidardesign.errors import DataError
+from lidardesign.evaluate.capture_arrays import read_arrays
+
+REQUIRED = ("counts", "bin_width_ps", "start_ps", "origin_m")
+BORESIGHT = ("boresight_azimuth_deg", "boresight_elevation_deg")
+GALVO = ("x_deg", "y_deg", *BORESIGHT)
+OPTIONAL = ("true_range_m", "pulse_fwhm_ps")
+KEYS = (*REQUIRED, "direction", *GALVO, *OPTIONAL)
+# A femtosecond and a microsecond: what lies outside was given in another unit.
+BIN_LIMITS_PS = (1e-3, 1e6)
+# Light that was under way for a tenth of a second came back from beyond the horizon.
+LATEST_PS = 1e11
+# Directions of float32 are unit vectors to 1e-7; further ones are no directions.
+UNIT_TOLERANCE = 1e-3
+# Counts are checked so many numbers at a time, which bounds memory.
+CHUNK = 1 << 22
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """Histograms of P pixels over B bins.
+
+    Arguments:
+        counts: Photons per bin, shape (P, B), whole numbers of any numeric type.
+        bin_ps: Width of a bin of two-way time [ps].
+        start_ps: When the first bin begins [ps].
+        origin_m: Where the scanner stands [m], shape (3,).
+        direction: Unit vectors, shape (P, 3).
+        true_range_m: The true one-way ranges [m], NaN where nothing is, shape (P,); None: unknown.
+        pulse_fwhm_ps: Width of the system's response [ps]; None: unknown.
+    """
+
+    counts: np.ndarray
+    bin_ps: float
+    start_ps: float
+    origin_m: np.ndarray
+    direction: np.ndarray
+    true_range_m: np.ndarray | None = None
+    pulse_fwhm_ps: float | None = None
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+    @property
+    def bins(self) -> int:
+        """Bins of a histogram."""
+        return self.counts.shape[1]
+
+    @property
+    def bin_m(self) -> float:
+        """The one-way range of a bin [m]."""
+        return self.bin_ps * SPEED_OF_LIGHT_M_PER_PS / 2
+
+    @property
+    def start_m(self) -> float:
+        """The one-way range at which the first bin begins [m]."""
+        return self.start_ps * SPEED_OF_LIGHT_M_PER_PS / 2
+
+    @property
+    def window_m(self) -> tuple[float, float]:
+        """The ranges that the histograms hold [m]."""
+        return self.start_m, self.start_m + self.bins * self.bin_m
+
+    @cached_property
+    def spacing_rad(self) -> float | None:
+        """The median angle between a pixel and the nearest other one; None for a single pixel."""
+        from scipy.spatial import cKDTree
+
+        if len(self) < 2:
+            return None
+        chord = cKDTree(self.direction).query(self.direction, k=2)[0][:, 1]
+        return float(np.median(2 * np.arcsin(np.minimum(chord / 2, 1.0))))
+
+
+def load_capture(path: Path) -> Capture:
+    """A checked capture from a file.
+
+    Raises:
+        DataError: The file cannot be read, a key is missing, unknown or in another unit, or a value cannot be.
+    """
+    where = str(path)
+    arrays = read_arrays(Path(path))
+    _check_keys(arrays, where)
+    counts = arrays["counts"]
+    if counts.ndim not in (2, 3) or not counts.size:
+        raise _shape("counts", counts, "(P, B) or (H, W, B), not empty", where)
+    pixels = counts.shape[:-1]
+    counts = counts.reshape(-1, counts.shape[-1])
+    _check_counts(counts, where)
+    pulse = _scalar(arrays, "pulse_fwhm_ps", where) if "pulse_fwhm_ps" in arrays else None
+    origin = np.asarray(arrays["origin_m"], dtype=np.float64)
+    if origin.size != 3:
+        raise _shape("origin_m", origin, "(3,)", where)
+    capture = Capture(
+        counts,
+        _scalar(arrays, "bin_width_ps", where),
+        _scalar(arrays, "start_ps", where),
+        _finite(origin.reshape(3), "origin_m", where),
+        _directions(arrays, pixels, where),
+        _per_pixel(arrays, "true_range_m", pixels, where) if "true_range_m" in arrays else None,
+        pulse,
+    )
+    _check_values(capture, where)
+    return capture
+
+
+def _check_keys(arrays: Mapping[str, np.ndarray], where: str) -> None:
+    for name in arrays:
+        if name not in KEYS:
+            same = [key for key in KEYS if key.rpartition("_")[0] and name.startswith(key.rpartition("_")[0] + "_")]
+            hint = f"is it {same[0]!r} in another unit?" if same else None
+            raise DataError(f"has an unknown key {name!r}", where=where, allowed=", ".join(KEYS), hint=hint)
+    missing = [name for name in REQUIRED if name not in arrays]
+    if missing:
+        raise DataError(f"has no {', '.join(missing)}", where=where, allowed=", ".join(KEYS))
+    angles = [name for name in GALVO if name in arrays]
+    if ("direction" in arrays) == bool(angles) or len(angles) not in (0, len(GALVO)):
+        found = ", ".join([*(["direction"] if "direction" in arrays else []), *angles]) or "neither"
+        raise DataError(
+            f"says where the pixels look by {found}", where=where, allowed=f"direction, or all of {', '.join(GALVO)}"
+        )
+
+
+def _shape(name: str, array: np.ndarray, allowed: str, where: str) -> DataError:
+    return DataError(f"{name} has the shape {array.shape}", where=where, allowed=allowed)
+
+
+def _finite(values: np.ndarray, name: str, where: str) -> np.ndarray:
+    if not np.isfinite(values).all():
+        raise DataError(f"{name} has values that are NaN or infinite", where=where, allowed="finite numbers")
+    return values
+
+
+def _scalar(arrays: Mapping[str, np.ndarray], name: str, where: str) -> float:
+    if arrays[name].size != 1:
+        raise _shape(name, arrays[name], "one number", where)
+    return float(_finite(np.asarray(arrays[name], dtype=np.float64).reshape(()), name, where))
+
+
+def _per_pixel(arrays: Mapping[str, np.ndarray], name: str, pixels: tuple[int, ...], where: str) -> np.ndarray:
+    """One number per pixel, shape (P,); of a list of pixels a row or a column is one too, as MATLAB has no lists."""
+    array = arrays[name]
+    count = int(np.prod(pixels))
+    of_list = len(pixels) == 1 and array.size == count and array.ndim <= 2 and count in array.shape
+    if array.shape != pixels and not of_list:
+        raise _shape(name, array, f"{pixels}, one number per pixel of counts", where)
+    return np.asarray(array, dtype=np.float64).reshape(-1)
+
+
+def _directions(arrays: Mapping[str, np.ndarray], pixels: tuple[int, ...], where: str) -> np.ndarray:
+    """Unit vectors, shape (P, 3), from vectors or from scan angles."""
+    if "direction" not in arrays:
+        scan = [_finite(_per_pixel(arrays, name, pixels, where), name, where) for name in ("x_deg", "y_deg")]
+        if max(np.abs(scan[0]).max(), np.abs(scan[1]).max()) > 90:
+            raise DataError("scan angles are beyond 90 degrees", where=where, allowed="optical angles in degrees")
+        frame = degree_frame(*(_scalar(arrays, name, where) for name in BORESIGHT))
+        return scan_directions(frame, np.stack(scan, axis=1))
+    array = arrays["direction"]
+    if array.shape != (*pixels, 3):
+        raise _shape("direction", array, f"{(*pixels, 3)}", where)
+    vectors = _finite(np.asarray(array, dtype=np.float64).reshape(-1, 3), "direction", where)
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    if np.abs(length - 1).max() > UNIT_TOLERANCE:
+        worst = float(length[np.abs(length - 1).argmax(), 0])
+        raise DataError(f"direction has a vector of length {worst:.4g}", where=where, allowed="unit vectors")
+    return vectors / length
+
+
+def _check_counts(counts: np.ndarray, where: str) -> None:
+    rows = max(1, CHUNK // counts.shape[1])
+    seen = False
+    for first in range(0, len(counts), rows):
+        part = counts[first : first + rows]
+        if part.dtype.kind == "f":
+            bad = ~np.isfinite(part)
+            _refuse_counts(bad, part, first, "finite numbers", where)
+            _refuse_counts(part != np.floor(part), part, first, "whole numbers of photons", where)
+        _refuse_counts(part < 0, part, first, "0 or more", where)
+        seen = seen or bool(part.any())
+    if not seen:
+        raise DataError("counts are all zero: no photon was captured", where=where)
+
+
+def _refuse_counts(bad: np.ndarray, part: np.ndarray, first: int, allowed: str, where: str) -> None:
+    if bad.any():
+        pixel, at = np.argwhere(bad)[0]
+        raise DataError(
+            f"counts holds {part[pixel, at]} in pixel {first + pixel}, bin {at}",
+            where=where,
+            allowed=allowed,
+            hint="give raw counts: neither averaged nor with a background taken off",
+        )
+
+
+def _check_values(capture: Capture, where: str) -> None:
+    """Refuse numbers that are right for another unit."""
+    low, high = BIN_LIMITS_PS
+    for name, value in (("bin_width_ps", capture.bin_ps), ("pulse_fwhm_ps", capture.pulse_fwhm_ps)):
+        if value is not None and not low <= value <= high:
+            raise DataError(f"{name} is {value:g}", where=where, allowed=f"{low:g} to {high:g} ps")
+    end_ps = capture.start_ps + capture.bins * capture.bin_ps
+    if not 0 < end_ps <= LATEST_PS:
+        raise DataError(
+            f"the histograms last from {capture.start_ps:g} to {end_ps:g} ps",
+            where=where,
+            allowed=f"an end after the pulse and before {LATEST_PS:g} ps",
+        )
+    known = capture.true_range_m
+    if known is None:
+        return
+    seen = known[~np.isnan(known)]
+    if np.isinf(seen).any() or (seen < 0).any():
+        raise DataError("true_range_m is negative or infinite", where=where, allowed="0 or more, NaN where nothing is")
+    start, end = capture.window_m
+    if not ((seen >= start) & (seen < end)).any():
+        raise DataError(
+            f"no true range lies where the histograms are, {start:.4g} to {end:.4g} m",
+            where=where,
+            hint="true_range_m is one-way, in metres; start_ps and bin_width_ps are two-way times",
+        )

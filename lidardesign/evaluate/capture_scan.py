@@ -1,0 +1,171 @@
+"""A captured scan seen through a list of rays: of each ray the nearest pixel, and its histogram inside the ray's gate.
+
+What a design would have measured is cut out of what was captured: a ray takes the pixel that looks its way, and hears
+only the bins whose middles lie in its gate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from lidardesign.design.galvo import degree_frame, middle_boresight_deg, scan_angles_deg, scan_directions
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.evaluate.capture import Capture
+from lidardesign.evaluate.capture_ranges import Estimation, measured
+from lidardesign.evaluate.placement import even_unit
+from lidardesign.simulate.returns import Rays
+
+# A ray that starts further from the scanner than this was not captured: it sees other surfaces.
+SAME_PLACE_M = 0.005
+
+
+class Captured(IntEnum):
+    """Whether a capture has what a ray would have measured."""
+
+    YES = 0
+    OTHER_PLACE = 1
+    OUT_OF_FIELD = 2
+    OUT_OF_WINDOW = 3
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedScan:
+    """What rays measure in a capture, N of them.
+
+    Arguments:
+        captured: Values of `Captured`, shape (N,).
+        pixel: The pixel that each ray takes, -1 where it was not captured, shape (N,).
+        away_rad: The angle between the ray and its pixel, or the nearest one, shape (N,).
+        first_bin, last_bin: The bins that it hears, the last one excluded, shape (N,).
+        photons: Counts in them, shape (N,).
+        range_m: The measured one-way range [m], NaN without a return, shape (N,).
+        points_m: Measured points along the pixels, NaN without a return, shape (N, 3).
+    """
+
+    captured: np.ndarray
+    pixel: np.ndarray
+    away_rad: np.ndarray
+    first_bin: np.ndarray
+    last_bin: np.ndarray
+    photons: np.ndarray
+    range_m: np.ndarray
+    points_m: np.ndarray
+
+    @property
+    def returned(self) -> np.ndarray:
+        """Mask of the rays with a return, shape (N,)."""
+        return np.isfinite(self.range_m)
+
+
+def scan(capture: Capture, rays: Rays, within_rad: float, estimation: Estimation) -> CapturedScan:
+    """What a list of rays measures in a capture.
+
+    Arguments:
+        capture: The captured histograms.
+        rays: The rays; their gates are one-way ranges.
+        within_rad: The largest angle between a ray and the pixel that it takes [rad].
+        estimation: How ranges follow from histograms.
+
+    Raises:
+        DataError: Not one ray was captured.
+    """
+    chord, nearest = cKDTree(capture.direction).query(rays.direction)
+    away = 2 * np.arcsin(np.minimum(np.asarray(chord) / 2, 1.0))
+    first, last = gate_bins(capture, rays.gate_m)
+    offset = np.linalg.norm(rays.origin_m - capture.origin_m, axis=1)
+    captured = np.full(len(rays), Captured.YES, dtype=np.int64)
+    captured[last <= first] = Captured.OUT_OF_WINDOW
+    captured[away > within_rad] = Captured.OUT_OF_FIELD
+    captured[offset > SAME_PLACE_M] = Captured.OTHER_PLACE
+    _refuse_nothing_captured(capture, rays, captured, away, offset)
+    pixel = np.where(captured == Captured.YES, nearest, -1)
+    return _measured(capture, captured, pixel, away, first, last, estimation)
+
+
+def scan_pixels(capture: Capture, estimation: Estimation) -> CapturedScan:
+    """What every pixel measures in its whole histogram."""
+    count = len(capture)
+    zeros = np.zeros(count, dtype=np.int64)
+    last = np.full(count, capture.bins)
+    return _measured(capture, zeros, np.arange(count), np.zeros(count), zeros, last, estimation)
+
+
+def gate_bins(capture: Capture, gate_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The bins whose middles lie in gates (N, 2) [m], start <= middle < end: first and last (excluded), shape (N,)."""
+    places = (gate_m - capture.start_m) / capture.bin_m - 0.5
+    bins = np.clip(np.ceil(places), 0, capture.bins).astype(np.int64)
+    return bins[:, 0], bins[:, 1]
+
+
+def whole_window(rays: Rays, capture: Capture) -> Rays:
+    """The same rays without gates: they hear all that was captured."""
+    # the scanner hears nothing before the pulse left it
+    gate = np.maximum(capture.window_m, 0.0)
+    return Rays(rays.origin_m, rays.direction, np.tile(gate, (len(rays), 1)), rays.sensor, rays.time_s)
+
+
+def uniform_rays(capture: Capture, count: int) -> Rays:
+    """So many rays even over the field of a capture, without gates: what a scanner without a design would fire.
+
+    A cell-centred grid in scan angles over all pixels and half a pixel round them.
+    """
+    frame = degree_frame(*middle_boresight_deg(capture.direction))
+    seen = scan_angles_deg(frame, capture.direction)
+    half = np.degrees(capture.spacing_rad or 0.0) / 2
+    low, high = seen.min(axis=0) - half, seen.max(axis=0) + half
+    # a scan along a line, or of a single pixel, has no extent across it
+    extents = np.maximum(high - low, np.finfo(float).eps)
+    looking = scan_directions(frame, low + even_unit(count, extents) * (high - low))
+    none = np.zeros(count)
+    rays = Rays(np.tile(capture.origin_m, (count, 1)), looking, np.zeros((count, 2)), none, none)
+    return whole_window(rays, capture)
+
+
+def default_within_rad(capture: Capture) -> float:
+    """The angle within which a pixel stands for a ray: as far as neighbouring pixels are apart.
+
+    Raises:
+        ConfigError: A single pixel has no neighbour.
+    """
+    if capture.spacing_rad is None:
+        raise ConfigError("a single pixel has no spacing to go by", where="--within-deg", allowed="an angle in degrees")
+    return capture.spacing_rad
+
+
+def _measured(
+    capture: Capture,
+    captured: np.ndarray,
+    pixel: np.ndarray,
+    away: np.ndarray,
+    first: np.ndarray,
+    last: np.ndarray,
+    estimation: Estimation,
+) -> CapturedScan:
+    taken = np.flatnonzero(pixel >= 0)
+    range_m, photons = np.full(len(pixel), np.nan), np.zeros(len(pixel))
+    range_m[taken], photons[taken] = measured(capture, pixel[taken], first[taken], last[taken], estimation)
+    points = capture.origin_m + range_m[:, None] * capture.direction[pixel]
+    return CapturedScan(captured, pixel, away, first, last, photons, range_m, points)
+
+
+def _refuse_nothing_captured(
+    capture: Capture, rays: Rays, captured: np.ndarray, away: np.ndarray, offset: np.ndarray
+) -> None:
+    """Refuse rays of which none was captured: the two are of other places or in other frames."""
+    if not len(rays) or (captured == Captured.YES).any():
+        return
+    counts = {reason: int((captured == reason).sum()) for reason in Captured}
+    start, end = capture.window_m
+    text = {
+        Captured.OTHER_PLACE: f"they start {offset.min():.4g} m from {capture.origin_m.tolist()} or further",
+        Captured.OUT_OF_FIELD: f"they look {np.degrees(away.min()):.3g} degrees past the nearest pixel or more",
+        Captured.OUT_OF_WINDOW: f"their gates hold no bin between {start:.4g} and {end:.4g} m",
+    }[max((Captured.OTHER_PLACE, Captured.OUT_OF_FIELD, Captured.OUT_OF_WINDOW), key=lambda reason: counts[reason])]
+    raise DataError(
+        f"none of the {len(rays)} rays was captured: {text}",
+        hint="give the capture's origin_m and directions in the design's frame, and start_ps from the scanner",
+    )
