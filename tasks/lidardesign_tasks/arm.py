@@ -20,17 +20,18 @@ from lidardesign.evaluate.metrics import discrete_frechet_m
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Metric, Score, Split, TaskConfig, random_generator
+from lidardesign.task import Defaults, Metric, Score, Split, random_generator
 from lidardesign_tasks.arm_motion import Arm, Motion
 from lidardesign_tasks.arm_robot import BALL_RADIUS_M, Robot, load_robot
 from lidardesign_tasks.arm_tracking import FEWEST_FRAMES, filled_path, tracked_places
+from lidardesign_tasks.surroundings import Surroundings
 
 CEILING_M = 1.0
 SMALL = {"train": 4, "test": 4, "frames": 12}
 
 
-class ArmConfig(TaskConfig):
-    """The arm, how many trajectories of how many frames, how much they differ, and where sensors look."""
+class ArmConfig(Surroundings):
+    """The arm, how many trajectories of how many frames, how much they differ, its surroundings, and the sensors'."""
 
     size: Literal["full", "small"] = Field(
         "full", description="small: 4 trajectories of 12 frames in each split unless told otherwise, for trials"
@@ -103,7 +104,8 @@ class ArmTask:
             generator = random_generator(seed, "arm", split, index)
             motions.append(arm.draw(config.jitter_m, config.frames, rate_hz, generator, f"{split} {index}"))
         notes = (*robot.notes, *rejection_notes(motions, split))
-        return [_scene(robot, motion, f"{split} {i}", rate_hz, notes) for i, motion in enumerate(motions)]
+        named = [(f"{split} {index}", motion) for index, motion in enumerate(motions)]
+        return [config.around(_scene(robot, motion, name, rate_hz, notes)) for name, motion in named]
 
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """Discrete Frechet distance [m] between the tracked path and the ball's; fails below two tracked frames."""

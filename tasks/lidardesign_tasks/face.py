@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from importlib.resources import as_file, files
 from pathlib import Path
@@ -22,10 +23,11 @@ from lidardesign.meshio import check_mesh, usable_faces
 from lidardesign.scene import Body, Mesh, Receiver, Scene, Sign
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Metric, Score, Split, TaskConfig, random_generator
+from lidardesign.task import Defaults, Metric, Score, Split, random_generator
 from lidardesign_tasks.basel import MorphableModel, Unit, load_model
 from lidardesign_tasks.pose import jittered_pose
 from lidardesign_tasks.surface import surface_score, with_visible_truth
+from lidardesign_tasks.surroundings import Surroundings, any_direction, moving
 
 Vector = tuple[float, float, float]
 # columns: the world's x, y, z are the model's z (out of the face), x (to the head's left) and y (up)
@@ -33,8 +35,8 @@ WORLD_AXES = [2, 0, 1]
 LARGEST_COEFFICIENT = 3.0  # identities further from the mean than this in any mode are cut: no faces are so
 
 
-class HeadConfig(TaskConfig):
-    """The model, how many heads, how much they move, and how finely they are judged."""
+class HeadConfig(Surroundings):
+    """The model, how many heads, how much they move, how finely they are judged, and what surrounds them."""
 
     model: Path | None = Field(
         None, description="HDF5 file of a morphable model; empty: the embedded head model"
@@ -56,6 +58,7 @@ class HeadConfig(TaskConfig):
     truth_points: int = Field(
         5000, ge=100, le=200_000, description="points of the visible surface to judge by"
     )
+    speed_m_s: float = Field(0.0, ge=0, le=100, description="how fast heads move within a frame, in any direction")
 
 
 class FaceConfig(HeadConfig):
@@ -182,7 +185,9 @@ class HeadFamily:
         head = Body(self.mesh(coefficients), "head", "both", pose)
         scene = Scene((head,), f"{split} head {index}", receiver=receiver)
         generator = random_generator(seed, "face", split, index, "truth")
-        return with_visible_truth(scene, space, config.truth_points, generator)
+        judged = with_visible_truth(scene, space, config.truth_points, generator)
+        direction = any_direction(random_generator(seed, "face", split, index, "velocity"))
+        return config.around(replace(judged, bodies=(moving(head, config.speed_m_s * direction),)))
 
 
 @lru_cache(maxsize=1)

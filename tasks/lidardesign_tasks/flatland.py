@@ -20,7 +20,8 @@ from lidardesign.scene import Body, Capsule, Scene, Sphere, rigid
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace, aim
-from lidardesign.task import Defaults, Metric, Score, Split, TaskConfig, random_generator
+from lidardesign.task import Defaults, Metric, Score, Split, random_generator
+from lidardesign_tasks.surroundings import Surroundings
 
 MILLIMETRES = 1000.0
 BUMP_VERTICES = np.array([-1.5, -0.9, -0.4, 0.0, 0.4, 0.9, 1.5])  # in widths: the curve bends only there
@@ -31,8 +32,8 @@ TRUTH_ORIGINS = 17  # positions on the sensor line that the truth is looked at f
 SAME_POINT_M = 1e-4
 
 
-class FlatlandConfig(TaskConfig):
-    """What the scenes show and how many there are."""
+class FlatlandConfig(Surroundings):
+    """What the scenes show, how many there are, and what surrounds them."""
 
     scene: Literal["surface", "discs", "occluded"] = Field(
         "surface", description="a bumpy curve, two discs, or the curve behind an occluding disc"
@@ -97,7 +98,7 @@ def build_scene(
     if config.scene == "occluded":
         bodies = (*bodies, occluder(config.variation, generator))
     scene = Scene(bodies, name)
-    return Scene(bodies, name, truth={"curve_m": visible_outline(scene, space)})
+    return config.around(Scene(bodies, name, truth={"curve_m": visible_outline(scene, space)}))
 
 
 def surface(variation: float, generator: np.random.Generator) -> tuple[Body, ...]:

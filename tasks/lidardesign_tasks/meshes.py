@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -23,9 +24,10 @@ from lidardesign.meshio import list_mesh_files, load_mesh
 from lidardesign.scene import Body, Mesh, Scene, Sign
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace, aim
-from lidardesign.task import Defaults, Metric, Score, Split, TaskConfig, random_generator
+from lidardesign.task import Defaults, Metric, Score, Split, random_generator
 from lidardesign_tasks.pose import jittered_pose
 from lidardesign_tasks.surface import surface_score, with_visible_truth
+from lidardesign_tasks.surroundings import Surroundings, any_direction, moving
 
 Vector = tuple[float, float, float]
 Axis = Literal["x", "y", "z"]
@@ -37,8 +39,8 @@ DOUBTFUL_EXTENT_M = 20.0  # an object that large is more likely in another unit
 ROOM = 1.1  # around the bounding sphere, for the pose jitter
 
 
-class MeshesConfig(TaskConfig):
-    """Where the meshes are, how to read them, how they are split and moved, and where the sensor may be."""
+class MeshesConfig(Surroundings):
+    """Where the meshes are, how they are read, split and moved, what surrounds them, and where the sensor may be."""
 
     folder: Path | None = Field(None, description="folder of mesh files (glb, gltf, obj, off, ply, stl)")
     scale: float = Field(1.0, gt=0, description="factor from the files' unit to metres (0.001 for mm)")
@@ -61,6 +63,7 @@ class MeshesConfig(TaskConfig):
     truth_points: int = Field(
         5000, ge=100, le=200_000, description="points of the visible surface to judge by"
     )
+    speed_m_s: float = Field(0.0, ge=0, le=100, description="how fast objects move within a frame, in any direction")
 
 
 class MeshesTask:
@@ -110,7 +113,9 @@ class MeshesTask:
                 mesh, name, "both", jittered_pose(generator, config.jitter_rotation_deg, shift, centre)
             )
             scene = Scene((placed, *occluders), f"{split} {name} pose {pose}")
-            scenes.append(with_visible_truth(scene, space, config.truth_points, generator))
+            judged = with_visible_truth(scene, space, config.truth_points, generator)
+            velocity = config.speed_m_s * any_direction(random_generator(seed, "meshes", split, name, pose, "velocity"))
+            scenes.append(config.around(replace(judged, bodies=(moving(placed, velocity), *occluders))))
         return scenes
 
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -18,7 +19,8 @@ from lidardesign.errors import ConfigError
 from lidardesign.scene import Scene
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DIMENSIONS, DesignSpace, X
-from lidardesign.task import Defaults, Metric, Score, Split, TaskConfig, conditions_of, random_generator
+from lidardesign.task import Defaults, Metric, Score, Split, conditions_of, random_generator
+from lidardesign_tasks.surroundings import Surroundings, moving
 from lidardesign_tasks.warehouse_shelf import Interval, ShelfPlan, build_shelf
 from lidardesign_tasks.warehouse_truth import BoxTruth, miss_score
 
@@ -35,8 +37,8 @@ SIZES: dict[str, dict[str, int]] = {
 }
 
 
-class WarehouseConfig(TaskConfig):
-    """How many shelves, how they differ, and where they are looked at from."""
+class WarehouseConfig(Surroundings):
+    """How many shelves, how they differ, where they are looked at from, and what surrounds them."""
 
     size: Size = Field("full", description="small: 6 training and 4 held-out shelves of 2 bays, for quick checks")
     train: int | None = Field(None, ge=1, le=10_000, description="training shelves; default 100, small 6")
@@ -56,6 +58,7 @@ class WarehouseConfig(TaskConfig):
     box_setback_m: Interval = Field((0.0, 0.05), description="from the shelf's edge to the boxes' fronts [m]")
     empty_share: float = Field(0.15, ge=0, le=0.9, description="share of boxes with an empty place beside them")
     second_row_share: float = Field(0.15, ge=0, le=1, description="share of boxes with another one behind them")
+    speed_m_s: float = Field(0.0, ge=0, le=100, description="how fast the robot drives along the aisle [m/s]")
 
     @model_validator(mode="after")
     def _check_the_plan(self) -> WarehouseConfig:
@@ -127,10 +130,11 @@ class WarehouseTask:
         space = space or self.space(config)
         _check_space(space)
         origins = [space.at(one).low[:3] for one in conditions_of(self, config, space)]
-        return [
+        shelves = [
             _visible_shelf(config.plan, space, np.array(origins), split, seed, index)
             for index in range(config.count(split))
         ]
+        return [config.around(_driven_past(shelf, config.speed_m_s)) for shelf in shelves]
 
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """The share [%] of boxes in the sensor's plane that no ray returned on; one `Returns` per position."""
@@ -157,6 +161,11 @@ def _check_space(space: DesignSpace) -> None:
             where="space.x_m",
             allowed=f"{AISLE_M[0]:g} to {AISLE_M[1]:g} m, where designs are evaluated, or one number between them",
         )
+
+
+def _driven_past(shelf: Scene, speed_m_s: float) -> Scene:
+    """The shelf as a robot sees it within a frame: it stands still, and the shelf comes towards -x."""
+    return replace(shelf, bodies=tuple(moving(body, (-speed_m_s, 0.0, 0.0)) for body in shelf.bodies))
 
 
 def _visible_shelf(

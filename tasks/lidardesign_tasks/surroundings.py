@@ -1,0 +1,66 @@
+"""What a task's scenes are made of and what is around them: surfaces, light, air, speed.
+
+Detectors that count photons meet these; geometry alone does not, and no truth of a scene depends on them. By default
+matt grey surfaces rest in clear air and the light of a room.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from lidardesign.scene import Ambient, Body, Medium, Scene
+from lidardesign.task import TaskConfig
+
+# At the visibility one tells 2 % of a contrast: exp(-extinction * visibility) = 0.02 (Koschmieder 1924).
+VISIBLE_CONTRAST = 0.02
+# Extinction over backscatter of water droplets in near infrared light (O'Connor, Illingworth, Hogan 2004).
+DROPLET_LIDAR_RATIO_SR = 18.8
+# What bodies reflect that no task gave a reflectance: then nothing needs to be said about them.
+MATT_GREY = 0.5
+
+
+class Surroundings(TaskConfig):
+    """Surfaces, light and air, the same in all scenes of a task."""
+
+    illuminance_lux: float = Field(
+        300.0, ge=0, le=200_000, description="light on the surfaces; sunlight has 100,000 [lux]"
+    )
+    light: Literal["indoor", "sun"] = Field("indoor", description="its spectrum: white LEDs, or the sun")
+    visibility_m: float | None = Field(None, gt=0, description="how far one sees through fog [m]; empty: clear air")
+    reflectance: float = Field(MATT_GREY, ge=0, le=1, description="share of the light that matt surfaces send back")
+    gloss: float = Field(0.0, ge=0, le=1, description="share of the light that surfaces mirror instead")
+
+    def around(self, scene: Scene) -> Scene:
+        """The scene in these surroundings; its truth stays."""
+        return replace(
+            scene,
+            bodies=tuple(self._surfaced(body) for body in scene.bodies),
+            ambient=Ambient(self.illuminance_lux, self.light) if self.illuminance_lux else None,
+            medium=None if self.visibility_m is None else fog(self.visibility_m),
+        )
+
+    def _surfaced(self, body: Body) -> Body:
+        """A body with these surfaces: what is mirrored is missing from what is matt."""
+        return replace(body, reflectance=(1 - self.gloss) * self.reflectance, specular=self.gloss)
+
+
+def fog(visibility_m: float) -> Medium:
+    """Fog of droplets that are large against the wavelength, so that infrared light fades as visible light does."""
+    extinction_per_m = -math.log(VISIBLE_CONTRAST) / visibility_m
+    return Medium(extinction_per_m, extinction_per_m / DROPLET_LIDAR_RATIO_SR)
+
+
+def moving(body: Body, velocity_m_s: Any) -> Body:
+    """A body at rest in all frames that moves within one, at a velocity (3,) [m/s]."""
+    return replace(body, velocity_m_s=tuple(np.asarray(velocity_m_s, dtype=np.float64).tolist()))
+
+
+def any_direction(generator: np.random.Generator) -> np.ndarray:
+    """A unit vector, even over all directions, shape (3,)."""
+    vector = generator.normal(size=3)
+    return vector / np.linalg.norm(vector)
