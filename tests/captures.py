@@ -25,9 +25,7 @@ def bin_of(range_m):
     return np.floor((2 * range_m / C_M_PER_PS - START_PS) / BIN_PS).astype(int)
 
 
-def make_capture(
-    side=31, *, photons=60, background=0.05, outliers=0.0, half_deg=15.0, truth=True, seed=0, images=True
-):
+def make_capture(side=31, *, photons=60, background=0.05, outliers=0.0, half_deg=15.0, truth=True, seed=0, images=True):
     """The arrays of a capture of side x side pixels; a share of them has a false peak that is higher than the true."""
     generator = np.random.default_rng(seed)
     axis = np.linspace(-half_deg, half_deg, side)
