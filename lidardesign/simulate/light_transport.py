@@ -199,10 +199,9 @@ def render_transient(
         lights: Where light comes from, M of them.
         bins: Path lengths to tell apart.
         bounces: Most surfaces that light meets: 1 for the direct component, which one sample gives exactly for thin
-            rays and a single light.
+            rays and one light.
         samples: Light paths per ray; standard errors fall with its root.
-        seed: Of the simulator's random numbers; those of a ray depend on its number in the list, and on
-            those of samples and bins.
+        seed: Of the simulator's random numbers; a ray's depend on its number in the list, and on samples and bins.
         direct: Whether light that meets one surface alone counts.
         own_light: Whether ray n sees light n alone; otherwise all of them.
         cone_sr: Solid angle around each ray that its radiance is the mean of [sr], shape (N,); None: thin rays.
@@ -221,23 +220,23 @@ def render_transient(
     first = shared_caster(scene, frame).first_hit(rays.origin_m, rays.direction)
     centre_m, reach_m = _neighbourhood(first, rays, lights)
     shapes, arrays = exported(scene, frame, centre_m, reach_m)
-    met = np.where(np.isfinite(first.range_m), first.range_m, 0.0)
-    columns = {
-        "origin": rays.origin_m - centre_m,
-        "direction": rays.direction,
-        "cone_cosine_m1": (np.zeros(count) if cone_sr is None else np.asarray(cone_sr)) / (2 * math.pi),
-        "baseline": (np.zeros(count) if baseline_m is None else baseline_m) + bins.start_m,
-        "dark_place": rays.origin_m - centre_m + met[:, None] * rays.direction,
-        "dark_radius": np.full(count, 0.0 if direct else SAME_PLACE * reach_m),
-    }
+    columns = _ray_columns(rays, first, centre_m, cone_sr)
+    columns["baseline"] = bins.start_m + (np.zeros(count) if baseline_m is None else baseline_m)
+    columns["dark_radius"] = np.full(count, 0.0 if direct else SAME_PLACE * reach_m)
     request = {"shapes": shapes, "samples": samples, "bins": bins.count, "width_m": bins.width_m}
     request |= {"bounces": bounces, "own": own_light}
-    light_columns = _light_columns(lights, centre_m, reach_m)
+    arrays |= (light_columns := _light_columns(lights, centre_m, reach_m))
+    by_ray = columns | (light_columns if own_light else {})
     parts = []
     for number, rows in enumerate(_chunks(count, bins.count)):
-        mine = {name: values[rows] for name, values in (columns | (light_columns if own_light else {})).items()}
-        answer = ask({**request, "seed": _seed(seed, number)}, arrays | light_columns | mine, limit_s=limit_s)
-        parts.append({**answer, "ray": answer["ray"] + rows[0]})
+        mine = arrays | {name: values[rows] for name, values in by_ray.items()}
+        parts.append((rows[0], ask({**request, "seed": _seed(seed, number)}, mine, limit_s=limit_s)))
+    return _joined(bins, count, parts)
+
+
+def _joined(bins: PathBins, count: int, answers: list[tuple[int, dict[str, np.ndarray]]]) -> Transients:
+    """What all requests found, by the first ray of each, without the rays that filled up the last."""
+    parts = [{**found, "ray": found["ray"] + start} for start, found in answers]
     ray, cell, radiance, steady = (
         np.concatenate([part[name] for part in parts]) for name in ("ray", "cell", "radiance", "steady")
     )
@@ -284,6 +283,17 @@ def _neighbourhood(first: Hits, rays: Rays, lights: Lights) -> tuple[np.ndarray,
     points = np.concatenate([points, rays.origin_m, lights.origin_m])
     centre_m = (points.min(axis=0) + points.max(axis=0)) / 2
     return centre_m, float(np.linalg.norm(points - centre_m, axis=1).max())
+
+
+def _ray_columns(rays: Rays, first: Hits, centre_m: np.ndarray, cone_sr: np.ndarray | None) -> dict[str, np.ndarray]:
+    met_m = np.where(np.isfinite(first.range_m), first.range_m, 0.0)
+    origin = rays.origin_m - centre_m
+    return {
+        "origin": origin,
+        "direction": rays.direction,
+        "dark_place": origin + met_m[:, None] * rays.direction,
+        "cone_cosine_m1": np.zeros(len(rays)) if cone_sr is None else np.asarray(cone_sr) / (2 * math.pi),
+    }
 
 
 def _light_columns(lights: Lights, centre_m: np.ndarray, reach_m: float) -> dict[str, np.ndarray]:

@@ -5,7 +5,7 @@ Which detours a receiver hears depends on what is lit and what is looked at whil
 - A *flood* lights all rays' spots at once, and each pixel sees its own: light goes from the emitter to Q, to P and
   back, and pixel n sees its spot P, which all other spots Q light too. The spots are the lights, matt points with the
   power of what they reflect (Keller 1997, Instant radiosity), so that light goes where the design's rays go and nowhere
-  else. Where pixels overlap, each gets its part of what is seen there, as it gets its own ray's light alone.
+  else. Where pixels overlap, each hears the part that is its own ray's, of detours as of direct light.
 - A *scanned* beam lights one spot P, and its pixel sees a cone around the beam: light comes back by P, Q, P and, where
   Q lies in that cone, by P, Q. The beam's own spot is the only light, looked at along rays spread in the cone. A pixel
   without a solid angle hears no detours.
@@ -47,12 +47,10 @@ CELLS_PER_RESOLUTION = 4
 MOST_CELLS = 512
 # Widths are rounded up to one of these steps per decade: the simulator compiles kernels per width.
 WIDTHS_PER_DECADE = 6
-# Rays that share a pixel's view are counted among so many.
-COUNTED_SPOTS = 4096
-# Surfaces that are met more flatly than this count as met at it.
-FLATTEST_COSINE = 0.02
-# What is fainter than this share of a ray's direct light is not worth an echo.
-FAINTEST_SHARE = 1e-9
+# How densely a flood's rays lie is told from so many neighbours: right for grids and for random ones, within 5 %.
+NEIGHBOURS = 6
+# Rays whose detours together are fainter than this share of the direct light hear none: no detector counts so far.
+FAINTEST_SHARE = 1e-8
 
 
 def interreflections(scene: Scene, frame: int, rays: Rays, physics: Physics) -> Echoes:
@@ -75,9 +73,10 @@ def interreflections(scene: Scene, frame: int, rays: Rays, physics: Physics) -> 
     if not len(view.rays) or (by_pixel and view.pixel_sr == 0):
         return nothing
     found = view.of_a_flood() if flood else view.of_a_pixel() if by_pixel else view.of_a_receiver()
-    heard_sr = view.pixel_sr / view.sharing() if flood else np.full(len(view.rays), view.pixel_sr if by_pixel else 1.0)
+    heard_sr = view.solid_angles() if flood else np.full(len(view.rays), view.pixel_sr if by_pixel else 1.0)
     gain = found.radiance * heard_sr[found.ray]
-    kept = gain > FAINTEST_SHARE * view.direct.gain[found.ray]
+    together = np.bincount(found.ray, gain, len(view.rays))
+    kept = (together > FAINTEST_SHARE * view.direct.gain)[found.ray]
     ray, cell = found.ray[kept], found.cell[kept]
     path_m = (view.start_m[ray] + found.bins.centres_m[cell]) / 2
     return Echoes(view.number[ray], path_m, gain[kept], view.hits.body[ray])
@@ -151,17 +150,18 @@ class _View:
         lights = Lights.receiver(self.scene.receiver)
         return self._rendered(lights, bounces=MOST_SURFACES, direct=False)
 
-    def sharing(self) -> np.ndarray:
-        """How many rays' spots lie in each one's pixel, its own among them, shape (K,)."""
+    def solid_angles(self) -> np.ndarray:
+        """The solid angle that each pixel of a flood sees, or that its ray's part of the flood fills if less, (K,)."""
         from scipy.spatial import cKDTree
 
+        count = min(NEIGHBOURS, len(self.rays) - 1)
+        if count == 0:
+            return np.array([self.pixel_sr])
         points = self._points()
-        radius_m = math.sqrt(self.pixel_sr / math.pi) * self.hits.range_m
-        step = -(-len(points) // COUNTED_SPOTS)
-        others = cKDTree(points[::step]).query_ball_point(points, radius_m, return_length=True) * step - 1
+        apart_m, _ = cKDTree(points).query(points, k=[count + 1])
+        area_m2 = np.pi * apart_m[:, 0] ** 2 / count
         cosine = np.abs(np.einsum("nk,nk->n", self.hits.normal, self.rays.direction))
-        # on a slanted surface the pixel reaches further than the ball around its spot
-        return 1 + np.maximum(others, 0) / np.maximum(cosine, FLATTEST_COSINE)
+        return np.minimum(area_m2 * cosine / self.hits.range_m**2, self.pixel_sr)
 
     def _points(self) -> np.ndarray:
         return self.rays.origin_m + self.hits.range_m[:, None] * self.rays.direction
