@@ -157,7 +157,8 @@ def estimate_error_m(detector: Detector, signal: np.ndarray, sigma_s: float) -> 
 
     The matched filter averages: sigma / sqrt(n). The highest bin is a mode: it strays to where the expected counts
     n b f fall short of the peak's by about their own noise; with f a Gaussian, e^4 = (8 sqrt(2 pi)) sigma^5 / (n b) up
-    to a factor (Chernoff 1964: a mode converges slower than a mean). Neither strays further than a single photon.
+    to a factor (Chernoff 1964: a mode converges slower than a mean), and no further than the earliest photon, which the
+    highest bin may hold where most bins hold one: sigma sqrt(1 + ln n).
     """
     single_m = metres(sigma_s)
     count = np.maximum(signal, 1.0)
@@ -166,7 +167,7 @@ def estimate_error_m(detector: Detector, signal: np.ndarray, sigma_s: float) -> 
         return averaged
     width_m = bin_width_m(detector)
     mode = PEAK_STRAY * (single_m**5 / (count * width_m)) ** 0.25 if single_m else np.zeros_like(count)
-    return np.minimum(np.maximum(averaged, mode), single_m)
+    return np.minimum(np.maximum(averaged, mode), single_m * np.sqrt(1 + np.log(count)))
 
 
 def changed_share(signal: np.ndarray, fewer: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Expected counts of light that the emitter did not send, and of what the air sends back: bounds from above."""
+"""Expected counts of light that the emitter did not send, and of what the air sends back."""
 
 from __future__ import annotations
 
@@ -12,24 +12,19 @@ from lidardesign.simulate.detector import SPEED_OF_LIGHT_M_S
 
 
 def ambient_per_metre(sight: Sight) -> np.ndarray:
-    """Ambient and dark counts per pulse and metre of range, at most, shape (N,).
+    """Ambient and dark counts per pulse and metre of range, shape (N,).
 
-    What a ray looks at has the radiance reflectance E / pi, that of its first hit, or of the most reflecting body where
-    it meets nothing; it is seen through the aperture and the pixel's field of view; a metre of range takes 2 / c.
+    What a ray meets has the radiance reflectance E / pi, seen through the aperture and the pixel's field of view, and
+    what meets nothing sees no light; a metre of range takes 2 / c.
     """
     photons, ambient = sight.detector.photons, sight.scene.ambient
     rate_hz = np.full(len(sight), photons.dark_hz)
     if ambient is not None:
         irradiance = spectral_irradiance(ambient, photons.wavelength_m, photons.filter_m)
         power_w = irradiance / math.pi * photons.filter_m * photons.aperture_m2 * photons.field_of_view_sr
-        rate_hz += _reflectance(sight) * power_w * photons.efficiency / photons.photon_energy_j
+        reflectance = np.array([*(body.reflectance for body in sight.scene.bodies), 0.0])[sight.hits.body]
+        rate_hz += reflectance * power_w * photons.efficiency / photons.photon_energy_j
     return rate_hz * 2 / SPEED_OF_LIGHT_M_S
-
-
-def _reflectance(sight: Sight) -> np.ndarray:
-    """Of what each ray looks at, mirrored light included, at most, shape (N,)."""
-    matt = np.array([min(body.reflectance + body.specular + body.transmission, 1.0) for body in sight.scene.bodies])
-    return np.where(sight.hits.body >= 0, matt[sight.hits.body], matt.max())
 
 
 def haze_per_pulse(sight: Sight, emitted: np.ndarray, bin_m: float) -> tuple[np.ndarray, np.ndarray]:

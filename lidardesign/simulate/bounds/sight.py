@@ -51,6 +51,7 @@ class Sight:
         row: The list of each, ascending, shape (N,).
         sharing: How many rays share its emitter's energy, shape (N,).
         hits: What they meet first.
+        caster: Of the frame, for the few further rays that a bound may need.
     """
 
     scene: Scene
@@ -60,6 +61,7 @@ class Sight:
     row: np.ndarray
     sharing: np.ndarray
     hits: Hits
+    caster: SceneCaster
 
     @classmethod
     def of(cls, scene: Scene, frame: int, detector: Detector, lists: Sequence[Rays], caster: SceneCaster) -> Sight:
@@ -69,7 +71,7 @@ class Sight:
         sizes = np.array([len(one) for one in lists])
         row = np.repeat(np.arange(len(lists)), sizes)
         hits = caster.first_hit(rays.origin_m, rays.direction)
-        return cls(scene, frame, detector, rays, row, sizes[row], hits)
+        return cls(scene, frame, detector, rays, row, sizes[row], hits, caster)
 
     def __len__(self) -> int:
         return len(self.rays)
