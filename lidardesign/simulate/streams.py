@@ -101,7 +101,7 @@ def _mixed(word):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def uniform(key, row, draw):  # noqa: ANN001, ANN201
-    """A number in (0, 1) for a key (below 2^63), a row and a draw; for compiled loops."""
+    """A number in (0, 1) for a key (below 2^64), a row and a draw; for compiled loops."""
     word = _mixed(np.uint64(key) + GOLDEN)
     word = _mixed(word + np.uint64(row) * GOLDEN + GOLDEN)
     word = _mixed(word + np.uint64(draw) * GOLDEN + GOLDEN)
@@ -168,6 +168,12 @@ def _uniforms(key, row, draw):  # noqa: ANN001, ANN202
 @vectorize(["float64(uint64, uint64, uint64)"], cache=True)
 def _normals(key, row, draw):  # noqa: ANN001, ANN202
     return normal(key, row, draw)
+
+
+@vectorize(["float64(float64)"], cache=True)
+def normal_quantiles(shares):  # noqa: ANN001, ANN201
+    """Standard normal quantiles of shares in (0, 1), of any shape."""
+    return normal_quantile(shares)
 
 
 def uniforms(key: int, rows: np.ndarray, draws: np.ndarray | int = 0) -> np.ndarray:

@@ -1,0 +1,206 @@
+"""Histograms of counted photons: what arrives, by effect, and what of it is counted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidardesign.scene import Scene
+from lidardesign.simulate.arrival_kernels import (
+    add_bins,
+    add_even_light,
+    add_photons,
+    echo_of,
+    even_counts,
+    expected_in_bins,
+)
+from lidardesign.simulate.detector import metres
+from lidardesign.simulate.echoes import Background, Echoes
+from lidardesign.simulate.histogram import Bins, bins_of
+from lidardesign.simulate.physics import Physics
+from lidardesign.simulate.streams import MOST_COUNTS, normal_quantiles
+
+# Rays that more photons than this are expected of are counted bin by bin, others photon by photon
+PHOTONS_ONE_BY_ONE = 512.0
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """The light that N neighbouring rays of a list get in a frame, E echoes.
+
+    Arguments:
+        bins: What it is sorted into.
+        first_ray: Index of the first of them in the list.
+        rays: How many rays the list has, which share the emitter's energy.
+        pulses: How many pulses each of them gets.
+        echo_offset: Echoes of ray i are echo_offset[i] to echo_offset[i + 1], shape (N + 1,).
+        path_m: Their half paths, shape (E,) [m].
+        expected: Their expected counts in a frame, shape (E,).
+        per_metre: Ambient and dark counts per pulse and metre, shape (N,).
+        edges_m, haze: Cells of haze, (N, C + 1) [m], and their counts per pulse, (N, C); None: clear air.
+    """
+
+    bins: Bins
+    first_ray: int
+    rays: int
+    pulses: float
+    echo_offset: np.ndarray
+    path_m: np.ndarray
+    expected: np.ndarray
+    per_metre: np.ndarray
+    edges_m: np.ndarray | None = None
+    haze: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, windows_m: np.ndarray, echoes: Echoes, background: Background, physics: Physics) -> Light:
+        """All the light of a list of rays with windows (N, 2) [m].
+
+        Raises:
+            ConfigError: A window has too many bins.
+        """
+        count, photons = len(windows_m), physics.detector.photons
+        bins = bins_of(windows_m, echoes, physics.detector, "quantisation" in physics.effects)
+        order = np.argsort(echoes.ray, kind="stable")
+        offset = np.concatenate([[0], np.cumsum(np.bincount(echoes.ray, minlength=count))])
+        pulses = photons.pulses(count)
+        per_gain = pulses * photons.emitted(count) * photons.aperture_m2 * photons.efficiency
+        # limited before the product: a surface that touches the receiver has the largest gain there is
+        expected = np.minimum(echoes.gain[order], MOST_COUNTS / per_gain) * per_gain
+        return cls(
+            bins,
+            0,
+            count,
+            pulses,
+            offset,
+            echoes.path_m[order],
+            expected,
+            background.per_metre,
+            background.edges_m,
+            background.counts,
+        )
+
+    def part(self, begin: int, end: int) -> Light:
+        """That of rays begin to end."""
+        echoes = slice(self.echo_offset[begin], self.echo_offset[end])
+        return Light(
+            self.bins.part(begin, end),
+            self.first_ray + begin,
+            self.rays,
+            self.pulses,
+            self.echo_offset[begin : end + 1] - self.echo_offset[begin],
+            self.path_m[echoes],
+            self.expected[echoes],
+            self.per_metre[begin:end],
+            None if self.edges_m is None else self.edges_m[begin:end],
+            None if self.haze is None else self.haze[begin:end],
+        )
+
+
+def histogram(scene: Scene, frame: int, light: Light, physics: Physics) -> np.ndarray:
+    """Counts per bin of the rays that `light` is of, flat as its bins say."""
+    counts = np.zeros(light.bins.offset[-1], np.int64)
+    _add_echoes(counts, scene, frame, light, physics)
+    if "ambient" in physics.effects:
+        total = light.pulses * light.per_metre * np.diff(light.bins.windows_m, axis=1)[:, 0]
+        _add_even(counts, light, light.bins.windows_m, total[:, None], physics.stream("ambient", scene, frame))
+    if light.haze is not None:
+        key = physics.stream("atmosphere", scene, frame)
+        _add_even(counts, light, light.edges_m, light.pulses * light.haze, key)
+    if "pile_up" in physics.effects:
+        from lidardesign.simulate.effects.pile_up import counted
+
+        key = physics.stream("pile_up", scene, frame)
+        counts = counted(counts, light.bins, physics.detector.photons, light.rays, key, light.first_ray)
+    return counts
+
+
+def _add_even(counts: np.ndarray, light: Light, edges_m: np.ndarray, expected: np.ndarray, key: int) -> None:
+    bins = light.bins
+    add_even_light(
+        counts,
+        bins.offset,
+        bins.first_m,
+        bins.width_m,
+        bins.windows_m,
+        np.ascontiguousarray(edges_m),
+        np.minimum(expected, MOST_COUNTS),
+        np.uint64(key),
+        light.first_ray,
+    )
+
+
+def _add_echoes(counts: np.ndarray, scene: Scene, frame: int, light: Light, physics: Physics) -> None:
+    """Photons of echoes: one by one in rays with few of them, bin by bin in others."""
+    cumulated = np.concatenate([[0.0], np.cumsum(light.expected)])
+    total = np.diff(cumulated[light.echo_offset])
+    few = np.flatnonzero((total <= PHOTONS_ONE_BY_ONE) & (total > 0))
+    many = np.flatnonzero(total > PHOTONS_ONE_BY_ONE)
+    if len(few):
+        _add_one_by_one(counts, scene, frame, light, few, total[few], physics)
+    if len(many):
+        _add_bin_by_bin(counts, scene, frame, light, many, physics)
+
+
+def _add_one_by_one(
+    counts: np.ndarray,
+    scene: Scene,
+    frame: int,
+    light: Light,
+    few: np.ndarray,
+    total: np.ndarray,
+    physics: Physics,
+) -> None:
+    detector, effects, bins = physics.detector, physics.effects, light.bins
+    noisy = "photon_noise" in effects
+    if noisy:
+        from lidardesign.simulate.effects import photon_noise
+
+        key = physics.stream("photon_noise", scene, frame)
+        number = photon_noise.numbers(total, light.first_ray + few, key)
+    else:
+        number = np.floor(total + 0.5).astype(np.int64)
+    ray = np.repeat(few, number)
+    order = np.arange(len(ray)) - np.repeat(np.cumsum(number) - number, number)
+    if noisy:
+        share, stray = photon_noise.places(light.first_ray + ray, order, key)
+        echo, _ = echo_of(ray, share, light.echo_offset, light.expected)
+    else:
+        echo, rest = echo_of(ray, (order + 0.5) / np.repeat(number, number), light.echo_offset, light.expected)
+        stray = normal_quantiles(rest)
+    path_m = light.path_m[echo] + metres(detector.pulse_sigma_s) * stray
+    if "jitter" in effects:
+        from lidardesign.simulate.effects.jitter import displaced
+
+        path_m = displaced(path_m, light.first_ray + ray, order, detector, physics.stream("jitter", scene, frame))
+    add_photons(counts, bins.offset, bins.first_m, bins.width_m, bins.windows_m, ray, path_m)
+
+
+def _add_bin_by_bin(
+    counts: np.ndarray, scene: Scene, frame: int, light: Light, many: np.ndarray, physics: Physics
+) -> None:
+    detector, effects, bins = physics.detector, physics.effects, light.bins
+    sigma_m = metres(detector.timing_sigma_s if "jitter" in effects else detector.pulse_sigma_s)
+    expected = expected_in_bins(
+        many,
+        bins.offset,
+        bins.first_m,
+        bins.width_m,
+        bins.windows_m,
+        light.echo_offset,
+        light.path_m,
+        light.expected,
+        sigma_m,
+    )
+    offset = np.concatenate([[0], np.cumsum(np.diff(bins.offset)[many])])
+    if "photon_noise" in effects:
+        from lidardesign.simulate.effects.photon_noise import of_bins
+
+        found = of_bins(expected, offset, light.first_ray + many, physics.stream("photon_noise", scene, frame))
+    elif "jitter" in effects:
+        from lidardesign.simulate.effects.jitter import of_bins
+
+        found = of_bins(expected, offset, light.first_ray + many, physics.stream("jitter", scene, frame))
+    else:
+        found = even_counts(expected, offset)
+    add_bins(counts, bins.offset, many, found)

@@ -1,0 +1,136 @@
+"""A detector is blind after a count: within a pulse the first photon hides later ones, and those of further pulses.
+
+Every photon falls into one of a ray's P pulses, each as likely as the others. A pulse in which nothing was counted
+within the dead time before is alive; in it, the photon is counted. Light that is not synchronous with the pulses, and
+counts before the window opens, blind nobody: the detector is armed at the window's start.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from lidardesign.simulate.detector import Photons, metres
+from lidardesign.simulate.histogram import Bins
+from lidardesign.simulate.streams import normal, uniform
+
+# More photons in one bin than this are counted together, by mean and variance of how many pulses they fall into
+ONE_BY_ONE = 32
+# A ray with more photons than this, where dead times reach across pulses, is followed in a share of its pulses only
+MOST_PHOTONS = 1 << 24
+# draws of a ray: one per photon, and far beyond one per bin
+FIRST_BIN = 1 << 40
+
+
+def counted(counts: np.ndarray, bins: Bins, photons: Photons, rays: int, key: int, first_ray: int) -> np.ndarray:
+    """The photons that are counted among those that arrive, flat as `bins` says.
+
+    Arguments:
+        counts: Arriving photons per bin, over all pulses of a frame.
+        bins: Of N rays.
+        photons: Its dead time and its pulses.
+        rays: How many rays share the pulses.
+        key: Of this effect's random numbers.
+        first_ray: Index of the first of the N rays.
+    """
+    if photons.dead_s == 0:
+        return counts
+    pulses = max(round(photons.pulses(rays)), 1)
+    dead_bins = metres(photons.dead_s) / bins.width_m
+    period_bins = metres(1 / photons.repetition_hz) / bins.width_m
+    return _counted(counts, bins.offset, pulses, dead_bins, period_bins, np.uint64(key), first_ray)
+
+
+@njit(cache=True, nogil=True)
+def _counted(counts, offset, pulses, dead, period, key, first_ray):  # noqa: ANN001, ANN202
+    found = np.zeros_like(counts)
+    for i in range(len(offset) - 1):
+        arrived, mine = counts[offset[i] : offset[i + 1]], found[offset[i] : offset[i + 1]]
+        if len(arrived) - 1 + dead < period:
+            _within_pulses(arrived, mine, pulses, dead, key, first_ray + i)
+        else:
+            _across_pulses(arrived, mine, pulses, dead, period, key, first_ray + i)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _within_pulses(arrived, mine, pulses, dead, key, ray):  # noqa: ANN001, ANN202
+    """Bin after bin: a photon finds its pulse alive with the share of pulses without a count in the dead time."""
+    blind, photon, oldest = 0, 0, 0
+    for b in range(len(arrived)):
+        while oldest < b and b - oldest >= dead:
+            blind -= mine[oldest]
+            oldest += 1
+        number = arrived[b]
+        if number == 0:
+            continue
+        if number <= ONE_BY_ONE:
+            for _ in range(number):
+                if uniform(key, ray, photon) * pulses < pulses - blind - mine[b]:
+                    mine[b] += 1
+                photon += 1
+        else:
+            mine[b] = _hit_pulses(number, pulses - blind, pulses, normal(key, ray, FIRST_BIN + b))
+        blind += mine[b]
+
+
+@njit(cache=True, nogil=True)
+def _hit_pulses(number, alive, pulses, z):  # noqa: ANN001, ANN202
+    """How many of the alive pulses get at least one of so many photons: a rounded normal of its mean and variance."""
+    empty = math.exp(number * math.log1p(-1.0 / pulses)) if pulses > 1 else 0.0
+    two_empty = math.exp(number * math.log1p(-2.0 / pulses)) if pulses > 2 else 0.0
+    mean = alive * (1 - empty)
+    variance = alive * empty + alive * (alive - 1.0) * two_empty - (alive * empty) ** 2
+    return min(max(math.floor(mean + math.sqrt(max(variance, 0.0)) * z + 0.5), 0), min(alive, number))
+
+
+@njit(cache=True, nogil=True)
+def _one_of(arrived, shares):  # noqa: ANN001, ANN202
+    """One of so many equal shares of photons, evenly over time."""
+    total, before = 0, 0
+    found = np.empty_like(arrived)
+    for b in range(len(arrived)):
+        total += arrived[b]
+        found[b] = total // shares - before
+        before += found[b]
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _across_pulses(arrived, mine, pulses, dead, period, key, ray):  # noqa: ANN001, ANN202
+    """Pulse after pulse, where a count may blind the next ones: photons wait in line in theirs, earliest first."""
+    total = 0
+    for b in range(len(arrived)):
+        total += arrived[b]
+    if total > MOST_PHOTONS and pulses > 1:
+        shares = min(total // MOST_PHOTONS + 1, pulses)
+        _across_pulses(_one_of(arrived, shares), mine, pulses // shares, dead, period, key, ray)
+        mine *= shares
+        return
+    head = np.full(pulses, -1, np.int64)
+    tail = np.full(pulses, -1, np.int64)
+    following = np.full(total, -1, np.int64)
+    bin_of = np.empty(total, np.int64)
+    photon = 0
+    for b in range(len(arrived)):
+        for _ in range(arrived[b]):
+            pulse = min(int(uniform(key, ray, photon) * pulses), pulses - 1)
+            bin_of[photon] = b
+            if head[pulse] < 0:
+                head[pulse] = photon
+            else:
+                following[tail[pulse]] = photon
+            tail[pulse] = photon
+            photon += 1
+    alive_at = -1.0
+    for pulse in range(pulses):
+        photon = head[pulse]
+        while photon >= 0:
+            time = pulse * period + bin_of[photon]
+            if time >= alive_at:
+                mine[bin_of[photon]] += 1
+                # a pulse's photons in one bin are counted once, however short the dead time
+                alive_at = time + max(dead, 1.0)
+            photon = following[photon]
