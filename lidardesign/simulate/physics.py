@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -72,6 +73,25 @@ def measure(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: 
         caster: Of this frame.
         physics: The detector and at least one effect.
     """
+    light = followed_light(scene, frame, rays, caster, physics)
+    from lidardesign.simulate.detection import detect
+
+    found = detect(scene, frame, light.windows_m, light.echoes, light.background, physics)
+    return _returns(scene, frame, rays, light.beams, light.hits, found.path_m, found.body)
+
+
+class FollowedLight(NamedTuple):
+    """What arrives of rays' light, before anything is detected."""
+
+    beams: Beams
+    hits: Hits
+    windows_m: np.ndarray
+    echoes: Echoes
+    background: Background
+
+
+def followed_light(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: Physics) -> FollowedLight:
+    """The light of rays on its way out and back, as far as the effects that are on lead it; see `measure`."""
     effects, detector = physics.effects, physics.detector
     tracer = _tracer(scene, frame, caster, effects)
     beams = Beams.of(rays)
@@ -92,10 +112,7 @@ def measure(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: 
         from lidardesign.simulate.effects.ambient import lit
 
         background = lit(scene, rays, beams, hits, detector, background)
-    from lidardesign.simulate.detection import detect
-
-    found = detect(scene, frame, windows_m, echoes, background, physics)
-    return _returns(scene, frame, rays, beams, hits, found.path_m, found.body)
+    return FollowedLight(beams, hits, windows_m, echoes, background)
 
 
 def direct_echoes(scene: Scene, beams: Beams, hits: Hits) -> Echoes:
