@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -239,9 +239,24 @@ def _bounds(
     sums = {name: _Sum(len(fired)) for name in present}
     for frame, caster in enumerate(build_casters(scene) if casters is None else casters):
         counts = Counts(Sight.of(scene, frame, detector, fired, caster))
-        for name, total in sums.items():
-            total.add(counts.sight, MODULES[name].stake(counts.sight, counts))
+        for name, stake in _stakes(counts, present).items():
+            sums[name].add(counts.sight, stake)
     return found | {name: total.bound() for name, total in sums.items()}
+
+
+def _stakes(counts: Counts, present: Sequence[str]) -> dict[str, Stake]:
+    """What each effect could change: anything, where mirrors and glass lead light to what no first hit shows."""
+    stakes = {name: MODULES[name].stake(counts.sight, counts) for name in present}
+    led = stakes["specular"].lost if "specular" in stakes else np.zeros(0)
+    if not led.any():
+        return stakes
+    unknown = f"; mirrors or glass lead {led.mean():.1%} of rays elsewhere"
+    return {
+        name: stake
+        if name == "specular"
+        else replace(stake, lost=np.maximum(stake.lost, led), reason=stake.reason + unknown)
+        for name, stake in stakes.items()
+    }
 
 
 class _Sum:
