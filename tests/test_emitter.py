@@ -10,20 +10,28 @@ import pytest
 from lidardesign_tasks.emitter import EmitterTask
 from lidardesign_tasks.face import FaceTask
 
+from lidardesign.density.proposals import propose
+from lidardesign.density.settings import DensitySettings
+from lidardesign.density.target import build_target
+from lidardesign.design.constraints import Constraints
+from lidardesign.design.fit import fit
+from lidardesign.design.rays import lay_out
+from lidardesign.design.samples import Samples
 from lidardesign.errors import DataError
 from lidardesign.evaluate.metrics import is_heard, is_visible, trial_origins, visible_surface
-from lidardesign.scene import Body, Box, Plane, Receiver, Scene, Sphere, rigid
+from lidardesign.scene import Ambient, Body, Box, Medium, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.bistatic import path_of_range, path_windows, range_of_path
 from lidardesign.simulate.detector import IDEAL
+from lidardesign.simulate.detector_files import load_detector
 from lidardesign.simulate.echoes import Beams
-from lidardesign.simulate.physics import Physics, direct_echoes
+from lidardesign.simulate.physics import EFFECTS, Physics, direct_echoes
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.receiver_view import in_view
 from lidardesign.simulate.returns import Outcome, Rays
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import RANGE, aim, direction
 
-SMALL = {"train": 3, "test": 2, "truth_points": 800}
+SMALL = {"train": 4, "test": 2, "truth_points": 800}
 SHADOWED = Physics(IDEAL, frozenset({"shadowing"}))
 HALF_GATE_M = 0.02
 
@@ -222,6 +230,19 @@ def test_an_emitter_at_the_detector_gives_the_returns_of_a_monostatic_sensor_to_
             assert first == second
 
 
+def test_at_the_detector_noise_and_light_are_those_of_a_monostatic_sensor_too(heads):
+    """Every effect but detours, which a receiver of a whole field of view hears and a scanned pixel does not."""
+    _, config, scenes = heads
+    scene = replace(scenes[0], ambient=Ambient(100_000.0), medium=Medium(0.1, 0.01))
+    targets = np.random.default_rng(14).uniform((-0.2, -0.12, -0.12), (0.02, 0.12, 0.12), (1500, 3))
+    rays = rays_from(np.array(config.detector_m), targets, (0.05, 1.05))
+    physics = Physics(load_detector("single-photon"), frozenset(EFFECTS) - {"multipath"})
+    (alone,), (heard,) = (simulate(one, rays, physics=physics) for one in (replace(scene, receiver=None), scene))
+    assert 0.1 < alone.returned.mean() < 0.9
+    for name in ("outcome", "range_m", "body"):
+        np.testing.assert_array_equal(getattr(heard, name), getattr(alone, name))
+
+
 def test_heads_are_those_of_the_face_task(heads):
     _, config, scenes = heads
     faces = FaceTask().scenes(FaceTask.Config(**SMALL), "train", 0)
@@ -293,3 +314,82 @@ def test_a_detector_that_looks_straight_down_has_an_upright_design_space():
     centre = np.array([*config.detector_m, space.low[3], space.low[4], 0.5])
     assert space.contains(centre)
     assert space.high[RANGE] == config.range_m[1]
+
+
+# designs
+
+RAYS = 400
+FORBIDDEN = {"low_m": [0.3, -0.025, -0.02], "high_m": [0.5, 0.025, 0.02]}
+DESIGNS = {
+    "laser": {"sensors": {"count": 1}, "origin": {"fixed_m": [0.4, 0.0, 0.0]}},
+    "flood": {
+        "sensors": {"count": 1},
+        "origin": {
+            "low_m": [0.38, -0.04, 0.0], "high_m": [0.42, 0.04, 0.07],
+            "spread_m": {"max": 0.005}, "exclude": [FORBIDDEN],
+        },
+    },
+    "floods": {
+        "sensors": {"count": 2},
+        "origin": {"spread_m": {"max": 0.005}, "exclude": [FORBIDDEN]},
+        "each": [
+            {"origin": {"low_m": [0.38, 0.0, -0.05], "high_m": [0.42, 0.1, 0.05]}},
+            {"origin": {"low_m": [0.38, -0.1, -0.05], "high_m": [0.42, 0.0, 0.05]}},
+        ],
+    },
+    "bistatic": {
+        "sensors": {"count": 1},
+        "origin": {"fixed_m": [0.4, 0.0, 0.1]},
+        "field_of_view": {"horizontal_deg": {"max": 26}, "vertical_deg": {"max": 38}},
+    },
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def fitted(heads):
+    """Designs by name, fitted to the exact density of training heads without learning it."""
+    task, config, scenes = heads
+    space, settings = task.space(config), DensitySettings(**task.defaults.density)
+    target = build_target(scenes, space, settings, "raycast")
+    proposals = propose(scenes, space, 60_000, settings.sigma_m, np.random.default_rng(13))
+    samples = Samples(proposals.points, proposals.log_density, target.log_density(proposals.points), space)
+    return {
+        name: fit(
+            samples,
+            constraints=Constraints.from_mapping(values),
+            rays=RAYS,
+            layout=task.defaults.layout,
+            level=task.defaults.level,
+            retarget=target.log_density,
+        )
+        for name, values in DESIGNS.items()
+    }
+
+
+@pytest.mark.slow
+def test_emitters_keep_their_placement_and_the_forbidden_region_stays_empty(fitted):
+    for name, result in fitted.items():
+        assert result.satisfied, name
+        origins = lay_out(result.design, RAYS).origin_m
+        assert len(origins) == RAYS
+        if "exclude" in DESIGNS[name]["origin"]:
+            inside = (origins > FORBIDDEN["low_m"]) & (origins < FORBIDDEN["high_m"])
+            assert not inside.all(axis=1).any()
+        for sensor, one in zip(result.design.sensors, DESIGNS[name].get("each", [DESIGNS[name]]), strict=True):
+            low, high = (one["origin"].get(key, one["origin"].get("fixed_m")) for key in ("low_m", "high_m"))
+            assert (sensor.origin_m >= np.array(low) - 1e-9).all()
+            assert (sensor.origin_m <= np.array(high) + 1e-9).all()
+
+
+@pytest.mark.slow
+def test_emitters_that_are_not_at_the_detector_are_nearly_as_good_as_a_laser_that_is(heads, fitted):
+    task, config, _ = heads
+    held_out = task.scenes(config.model_copy(update={"test": 8}), "test", 0)
+    chamfer_mm = {}
+    for name, result in fitted.items():
+        rays = lay_out(result.design, RAYS)
+        scores = [task.score(scene, simulate(scene, rays, physics=SHADOWED)) for scene in held_out]
+        chamfer_mm[name] = np.mean([score.value for score in scores])
+    assert chamfer_mm["laser"] < 8.0
+    for name, value in chamfer_mm.items():
+        assert value < 1.15 * chamfer_mm["laser"], (name, chamfer_mm)

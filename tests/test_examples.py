@@ -13,6 +13,8 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 QUICK = ("learning.samples=10000", "learning.coverage_proposals=1024")
 SETTINGS = {
     "arm": (*QUICK, "learning.steps=50"),
+    # a hundredth of the density lies where the flood may be: with fewer samples nothing could be fitted there
+    "emitter": (QUICK[1], "learning.steps=80", "density.sigma_m=0.02", "train=4", "test=2", "truth_points=1000"),
     # a blurred shelf is learned at once
     "warehouse": (*QUICK, "learning.steps=150", "density.sigma_m=0.1"),
 }
@@ -46,3 +48,11 @@ def test_the_warehouse_is_designed_for_every_position(tmp_path):
             rows = list(csv.DictReader(file))
         assert len(rows) == 12
         assert {row["origin_x_m"] for row in rows} == {x_m}
+
+
+@pytest.mark.slow
+def test_emitters_are_designed_beside_a_laser_at_the_detector(tmp_path):
+    out = run_example("emitter", tmp_path / "phone")
+    for name in ("laser", "flood", "floods", "bistatic"):
+        assert (tmp_path / "phone" / "run" / "designs" / f"{name}.yaml").exists()
+        assert any(line.startswith(name) and line.endswith("%") for line in out.splitlines())
