@@ -81,7 +81,8 @@ def _from_photons(scene: Scene, frame: int, light: Light, physics: Physics) -> n
     detector, bins = physics.detector, light.bins
     sigma_m = metres(detector.timing_sigma_s)
     half = int(FWHM_PER_SIGMA * sigma_m / (2 * bins.width_m))
-    known = light.pulses * light.per_metre * bins.width_m
+    blind_m = metres(detector.photons.dead_s) if "pile_up" in physics.effects else 0.0
+    known = light.pulses * bins.width_m * light.per_metre / (1 + light.per_metre * blind_m)
     counts = histogram(scene, frame, light, physics)
     matched = detector.estimator == "matched"
     place = find_returns(counts, bins.offset, bins.width_m, sigma_m, half, known, detector.false_alarm, matched)

@@ -3,9 +3,10 @@
 The range is the middle of the highest bin, or the maximum of the log-matched filter: the likelihood of a pulse of the
 known shape g at a bin k in an even background b,
 
-    L(k) = sum_j h_{k+j} log(1 + s g_j / b),
+    L(k) = sum_j h_{k+j} log(1 + s g_j / b) - s sum_j g_j,
 
-with as many signal photons s as stand out (Rapp and Goyal 2017), refined by a parabola through its neighbours.
+over the bins k + j in the window, with as many signal photons s as stand out (Rapp and Goyal 2017; the second term
+only tells pulses that the window cuts off), refined by a parabola through its neighbours.
 
 It is reported if the photons within one full width at half maximum around it are more than the background alone
 brings anywhere in the window with the allowed probability: bins * P(Poisson(b m) >= n) <= false_alarm, m bins wide.
@@ -85,11 +86,16 @@ def _sum_around(counts, middle, half):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def _matched(counts, shape, signal, level, score):  # noqa: ANN001, ANN202
-    """The bin of the largest log-likelihood, and by how much of a bin its vertex lies off the bin's middle."""
+def _matched(counts, shape, below, signal, level, score):  # noqa: ANN001, ANN202
+    """The bin of the largest log-likelihood, and by how much of a bin its vertex lies off the bin's middle.
+
+    `below` are the running sums of the pulse's shape, from 0 on.
+    """
     size, reach = len(counts), len(shape) // 2
     weight = np.log1p(signal / level * shape)
-    score[:size] = 0.0
+    for b in range(size):
+        inside = below[min(reach, size - 1 - b) + reach + 1] - below[max(-reach, -b) + reach]
+        score[b] = -signal * inside
     for b in range(size):
         if counts[b] > 0:
             for j in range(max(-reach, b - size + 1), min(reach, b) + 1):
@@ -115,6 +121,7 @@ def find_returns(counts, offset, width, sigma, half, known_level, false_alarm, m
     """
     found = np.full(len(offset) - 1, np.nan)
     shape = pulse_shape(width, sigma)
+    below = np.concatenate((np.zeros(1), np.cumsum(shape)))
     reach = len(shape) // 2
     longest = 0
     for i in range(len(offset) - 1):
@@ -135,7 +142,7 @@ def find_returns(counts, offset, width, sigma, half, known_level, false_alarm, m
         if matched:
             signal = max(pulse - level * (size - others), 1.0)
             # less than one photon in the whole window cannot be told from none
-            best, within = _matched(mine, shape, signal, max(level, 1.0 / size), score)
+            best, within = _matched(mine, shape, below, signal, max(level, 1.0 / size), score)
         else:
             best = mine.argmax()
         around = min(best + half, size - 1) - max(best - half, 0) + 1
