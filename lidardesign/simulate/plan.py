@@ -32,6 +32,8 @@ Choice = Literal["auto", "all", "none"] | frozenset[str]
 TOLERATED_BIN_SHARE = 0.1
 TOLERATED_RANGE_M = 0.001
 TOLERATED_RETURNS = 0.001
+# What these change depends on first hits alone, behind mirrors and glass too.
+OF_FIRST_HITS = ("specular", "multipath", "shadowing")
 
 
 @dataclass(frozen=True)
@@ -253,7 +255,7 @@ def _stakes(counts: Counts, present: Sequence[str]) -> dict[str, Stake]:
     unknown = f"; mirrors or glass lead {led.mean():.1%} of rays elsewhere"
     return {
         name: stake
-        if name == "specular"
+        if name in OF_FIRST_HITS
         else replace(stake, lost=np.maximum(stake.lost, led), reason=stake.reason + unknown)
         for name, stake in stakes.items()
     }
@@ -264,6 +266,7 @@ class _Sum:
 
     def __init__(self, lists: int) -> None:
         self._squared_m2, self._lost, self._returns = np.zeros(lists), np.zeros(lists), np.zeros(lists)
+        self._unseen_m2, self._rays = np.zeros(lists), np.zeros(lists)
         self._reason, self._largest = "", -1.0
 
     def add(self, sight: Sight, stake: Stake) -> None:
@@ -271,6 +274,8 @@ class _Sum:
             return np.bincount(sight.row, weights=values, minlength=len(self._lost))
 
         squared, lost = per_list(stake.squared_m2 * sight.returned), per_list(stake.lost)
+        self._unseen_m2 += per_list(stake.squared_m2)
+        self._rays += per_list(np.ones(len(sight)))
         self._squared_m2 += squared
         self._lost += lost
         self._returns += per_list(sight.returned.astype(float))
@@ -278,7 +283,8 @@ class _Sum:
             self._largest, self._reason = float(squared.max() + lost.max()), stake.reason
 
     def bound(self) -> Bound:
-        # without a single return, every one that is invented is one too many
+        # without a single return, every one that is invented is one too many, and may be of any ray
         returns = np.maximum(self._returns, 1.0)
-        range_m, lost = np.sqrt(self._squared_m2 / returns).max(), np.minimum(self._lost / returns, 1.0).max()
-        return Bound(float(range_m), float(lost), self._reason)
+        squared_m2 = np.where(self._returns > 0, self._squared_m2 / returns, self._unseen_m2 / self._rays)
+        lost = np.minimum(self._lost / returns, 1.0)
+        return Bound(float(np.sqrt(squared_m2.max())), float(lost.max()), self._reason)

@@ -5,7 +5,7 @@ With mean counts b per bin, B bins and s counts in the echo's bin, another bin w
 with the probability `false_alarm` hides echoes below it, and a ray that has no return invents one as often as that.
 Counts among the echo's own move its range by its error times sqrt(b / s), the share of the noise that is theirs.
 
-Nothing of this can be where no count arrives: all are at most 1 - exp(-B b).
+No false peak can be where no count arrives: it is at most 1 - exp(-B b).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from lidardesign.numerics import safe_divide
 from lidardesign.scene import Scene
-from lidardesign.simulate.bounds.counts import Counts, share_in_bin
+from lidardesign.simulate.bounds.counts import Counts, share_in_bins
 from lidardesign.simulate.bounds.sight import Sight, Stake
 from lidardesign.simulate.detector import Detector
 from lidardesign.simulate.returns import Rays
@@ -32,14 +32,15 @@ def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | Non
 
 def stake(sight: Sight, counts: Counts) -> Stake:
     """Of counts that no echo brought."""
-    sigma_s = sight.detector.timing_sigma_s
+    sigma_m = sight.sigma_m()
     signal, per_bin = counts.in_air, counts.per_bin
     any_count = -np.expm1(-per_bin * counts.bins)
-    hidden = np.maximum(counts.missed(signal, per_bin, sigma_s) - counts.missed(signal, 0.0, sigma_s), 0.0)
-    wrong = counts.mistaken(signal, per_bin, per_bin, sigma_s) + hidden
-    lost = np.minimum(np.where(sight.returned, wrong, sight.detector.false_alarm), any_count)
-    echo = signal * share_in_bin(counts.bin_m, sigma_s)
-    squared = counts.error_m(signal, sigma_s) ** 2 * np.minimum(safe_divide(per_bin, echo, 1.0), any_count)
+    hidden = np.maximum(counts.missed(signal, per_bin, sigma_m) - counts.missed(signal, 0.0, sigma_m), 0.0)
+    wrong = np.minimum(counts.mistaken(signal, per_bin, per_bin, sigma_m), any_count)
+    invented = np.minimum(sight.detector.false_alarm, any_count)
+    lost = np.where(sight.returned, np.minimum(wrong + hidden, 1.0), invented)
+    echo = signal * share_in_bins(1, counts.bin_m, sigma_m)
+    squared = counts.error_m(signal, sigma_m) ** 2 * np.minimum(safe_divide(per_bin, echo, 1.0), any_count)
     return Stake(squared, lost, _reason(sight, float(np.median(per_bin * counts.bins))))
 
 

@@ -28,13 +28,13 @@ def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | Non
 
 def stake(sight: Sight, counts: Counts) -> Stake:
     """Of air that weakens and scatters."""
-    sigma_s = sight.detector.timing_sigma_s
+    sigma_m = sight.sigma_m()
     clear, left = counts.signal, counts.in_air
-    fewer = counts.missed(left, counts.per_bin, sigma_s) - counts.missed(clear, counts.per_bin, sigma_s)
+    fewer = counts.missed(left, counts.per_bin, sigma_m) - counts.missed(clear, counts.per_bin, sigma_m)
     haze, fullest = (counts.pulses * part for part in counts.haze_per_pulse)
     any_count = -np.expm1(-haze)
-    wrong = np.minimum(counts.mistaken(left, counts.per_bin + fullest, counts.per_bin, sigma_s), any_count)
-    squared = counts.error_m(left, sigma_s) ** 2 * np.minimum(
+    wrong = np.minimum(counts.mistaken(left, counts.per_bin + fullest, counts.per_bin, sigma_m), any_count)
+    squared = counts.error_m(left, sigma_m) ** 2 * np.minimum(
         2 * np.sqrt(changed_share(clear, left)) + any_count, 1.0
     )
     lost = np.where(sight.returned, np.maximum(fewer, 0.0) + wrong, _invented(counts, haze, fullest))
@@ -47,6 +47,7 @@ def _invented(counts: Counts, haze: np.ndarray, fullest: np.ndarray) -> np.ndarr
     """Probability that haze alone makes a return, at most."""
     from scipy.special import pdtr
 
-    needed = needed_counts(counts.per_bin, counts.bins, counts.sight.detector.false_alarm)
-    reached = 1 - pdtr(needed - 1, fullest + counts.per_bin)
+    background = counts.pulse_bins * counts.per_bin
+    needed = needed_counts(background, counts.bins, counts.sight.detector.false_alarm)
+    reached = 1 - pdtr(needed - 1, counts.pulse_bins * fullest + background)
     return np.minimum(counts.bins * reached, -np.expm1(-haze))

@@ -1,7 +1,8 @@
 """Expected counts of signal and background, and how likely a detector misses the one or mistakes the other for it.
 
-Counts are Poisson. A return is the highest of B bins, reported if it holds at least k counts, the fewest that B bins of
-background alone reach together with at most the detector's probability of a false alarm.
+Counts are Poisson. A return is the highest of B bins, or where a pulse fits best, reported if the m bins of one pulse's
+width around it hold at least k counts, the fewest that background alone brings to any of B such places with at most the
+detector's probability of a false alarm.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from lidardesign.numerics import safe_divide
 from lidardesign.simulate.bounds.light import ambient_per_metre, haze_per_pulse
 from lidardesign.simulate.bounds.sight import BINS_PER_SIGMA, Sight
-from lidardesign.simulate.detector import Detector, metres
+from lidardesign.simulate.detector import FWHM_PER_SIGMA, Detector, metres
 
 # The highest of a histogram's bins strays by this many of (sigma^5 / (n b))^(1/4), see `peak_error_m`.
 PEAK_STRAY = 1.5
@@ -87,33 +88,42 @@ class Counts:
         """Ambient and dark counts per bin in a frame, shape (N,)."""
         return self.background_per_metre * self.bin_m * self.pulses
 
-    def missed(self, signal: np.ndarray, per_bin: np.ndarray | float, sigma_s: float) -> np.ndarray:
-        """Probability that the echo's bin holds fewer counts than it takes to be reported, shape (N,).
+    @cached_property
+    def pulse_bins(self) -> int:
+        """How many bins a pulse is wide, at half of its height: 2 half + 1."""
+        return 2 * int(FWHM_PER_SIGMA * metres(self.sight.detector.timing_sigma_s) / (2 * self.bin_m)) + 1
+
+    def missed(self, signal: np.ndarray, per_bin: np.ndarray | float, sigma_m: np.ndarray) -> np.ndarray:
+        """Probability that the echo's bins hold fewer counts than it takes to be reported, shape (N,).
 
         Arguments:
             signal: Counts of the echo, shape (N,).
             per_bin: Background counts in each bin, shape (N,).
-            sigma_s: How far a photon's time strays [s].
+            sigma_m: How far one photon strays, shape (N,) [m].
         """
         from scipy.special import pdtr
 
-        per_bin = np.broadcast_to(per_bin, signal.shape)
-        needed = needed_counts(per_bin, self.bins, self.sight.detector.false_alarm)
-        return pdtr(needed - 1, signal * share_in_bin(self.bin_m, sigma_s) + per_bin)
+        background = np.broadcast_to(per_bin, signal.shape) * self.pulse_bins
+        needed = needed_counts(background, self.bins, self.sight.detector.false_alarm)
+        return pdtr(needed - 1, signal * share_in_bins(self.pulse_bins, self.bin_m, sigma_m) + background)
 
-    def mistaken(self, signal: np.ndarray, other: np.ndarray, per_bin: np.ndarray, sigma_s: float) -> np.ndarray:
+    def mistaken(
+        self, signal: np.ndarray, other: np.ndarray, per_bin: np.ndarray, sigma_m: np.ndarray
+    ) -> np.ndarray:
         """Bound of the probability that another bin beats the echo's, shape (N,).
 
         The union over all bins of P(X >= Y) <= exp(-(sqrt(E Y) - sqrt(E X))^2), Chernoff's bound for a difference of
-        Poisson counts X of the fullest other bin (`other`) and Y of the echo's.
+        Poisson counts X of the fullest other bin (`other`) and Y of the echo's. The matched filter compares places as
+        wide as a pulse, no worse than by their sums.
         """
-        expected = signal * share_in_bin(self.bin_m, sigma_s) + per_bin
-        lead = np.maximum(np.sqrt(expected) - np.sqrt(other), 0.0)
+        wide = self.pulse_bins if self.sight.detector.estimator == "matched" else 1
+        expected = signal * share_in_bins(wide, self.bin_m, sigma_m) + wide * per_bin
+        lead = np.maximum(np.sqrt(expected) - np.sqrt(wide * other), 0.0)
         return np.minimum((self.bins - 1) * np.exp(-(lead**2)), 1.0)
 
-    def error_m(self, signal: np.ndarray, sigma_s: float) -> np.ndarray:
+    def error_m(self, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
         """How far the range from so many photons strays, rms, shape (N,) [m]."""
-        return estimate_error_m(self.sight.detector, signal, sigma_s)
+        return estimate_error_m(self.sight.detector, signal, sigma_m)
 
     def _by_sharing(self, name: str) -> np.ndarray:
         shared, place = np.unique(self.sight.sharing, return_inverse=True)
@@ -129,10 +139,12 @@ def bin_width_m(detector: Detector) -> float:
     return own or 1e-9
 
 
-def share_in_bin(bin_m: float, sigma_s: float) -> float:
-    """Share of an echo's photons in its fullest bin, in the worst case: the echo lies on a bin's edge."""
-    spread_m = metres(sigma_s)
-    return 0.5 if spread_m == 0 else 0.5 * math.erf(bin_m / (math.sqrt(2) * spread_m))
+def share_in_bins(count: int, bin_m: float, sigma_m: np.ndarray) -> np.ndarray:
+    """Share of an echo's photons in an odd number of bins, in the worst case: it lies on an edge of the middle one."""
+    from scipy.special import erf
+
+    spread_m = math.sqrt(2) * np.maximum(sigma_m, np.finfo(float).tiny)
+    return 0.5 * (erf((count - 1) / 2 * bin_m / spread_m) + erf((count + 1) / 2 * bin_m / spread_m))
 
 
 def needed_counts(per_bin: np.ndarray, bins: np.ndarray, false_alarm: float) -> np.ndarray:
@@ -152,22 +164,20 @@ def needed_counts(per_bin: np.ndarray, bins: np.ndarray, false_alarm: float) -> 
     return np.where(quiet, 1.0, np.maximum(needed, 1.0))
 
 
-def estimate_error_m(detector: Detector, signal: np.ndarray, sigma_s: float) -> np.ndarray:
-    """How far the range from n photons that stray by sigma strays, rms, shape (N,) [m]: the pulse and what times it.
+def estimate_error_m(detector: Detector, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
+    """How far the range from n photons (N,) that stray by sigma (N,) [m] strays, rms, shape (N,) [m].
 
     The matched filter averages: sigma / sqrt(n). The highest bin is a mode: it strays to where the expected counts
     n b f fall short of the peak's by about their own noise; with f a Gaussian, e^4 = (8 sqrt(2 pi)) sigma^5 / (n b) up
     to a factor (Chernoff 1964: a mode converges slower than a mean), and no further than the earliest photon, which the
     highest bin may hold where most bins hold one: sigma sqrt(1 + ln n).
     """
-    single_m = metres(sigma_s)
     count = np.maximum(signal, 1.0)
-    averaged = single_m / np.sqrt(count)
+    averaged = sigma_m / np.sqrt(count)
     if detector.estimator == "matched":
         return averaged
-    width_m = bin_width_m(detector)
-    mode = PEAK_STRAY * (single_m**5 / (count * width_m)) ** 0.25 if single_m else np.zeros_like(count)
-    return np.minimum(np.maximum(averaged, mode), single_m * np.sqrt(1 + np.log(count)))
+    mode = PEAK_STRAY * (sigma_m**5 / (count * bin_width_m(detector))) ** 0.25
+    return np.minimum(np.maximum(averaged, mode), sigma_m * np.sqrt(1 + np.log(count)))
 
 
 def changed_share(signal: np.ndarray, fewer: np.ndarray) -> np.ndarray:

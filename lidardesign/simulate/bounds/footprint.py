@@ -29,10 +29,9 @@ def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | Non
 
 def stake(sight: Sight, counts: Counts) -> Stake:
     """Of beams with a width."""
-    half_rad = sight.detector.divergence_rad / 2
-    radius_m = half_rad * sight.range_m
+    radius_m, wide_rad = sight.beam_m, sight.detector.divergence_rad
     spread_m = np.minimum(radius_m * sight.tangent, sight.width_m)
     lost = edge_probability(sight, radius_m)
     wide_m = float(np.median(2 * radius_m[sight.returned])) if sight.returned.any() else 0.0
-    reason = f"beams of {2000 * half_rad:.3g} mrad are {1000 * wide_m:.3g} mm wide where they return"
+    reason = f"beams of {1000 * wide_rad:.3g} mrad are {1000 * wide_m:.3g} mm wide where they return"
     return Stake(spread_m**2, lost, reason)

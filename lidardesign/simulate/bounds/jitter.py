@@ -30,17 +30,17 @@ def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | Non
 def stake(sight: Sight, counts: Counts) -> Stake:
     """Of a timing error per return, or per photon."""
     detector = sight.detector
-    sigma_s = detector.jitter_sigma_s
+    sigma_s, timed = detector.jitter_sigma_s, f"timed to {1e12 * detector.jitter_sigma_s:.3g} ps"
     if detector.photons is None:
         error = np.full(len(sight), metres(sigma_s))
-        return Stake(error**2, np.zeros(len(sight)), f"a return is timed to {1e12 * sigma_s:.3g} ps")
-    signal, pulse_s, both_s = counts.in_air, detector.pulse_sigma_s, detector.timing_sigma_s
+        return Stake(error**2, np.zeros(len(sight)), f"a return is {timed}")
+    signal, pulse_m, both_m = counts.in_air, sight.sigma_m(jitter=False), sight.sigma_m()
     if detector.estimator == "matched":
-        squared = estimate_error_m(detector, signal, sigma_s) ** 2
+        squared = estimate_error_m(detector, signal, metres(sigma_s)) ** 2
     else:
-        squared = counts.error_m(signal, both_s) ** 2 + counts.error_m(signal, pulse_s) ** 2
+        squared = counts.error_m(signal, both_m) ** 2 + counts.error_m(signal, pulse_m) ** 2
     lost = np.maximum(
-        counts.missed(signal, counts.per_bin, both_s) - counts.missed(signal, counts.per_bin, pulse_s), 0.0
+        counts.missed(signal, counts.per_bin, both_m) - counts.missed(signal, counts.per_bin, pulse_m), 0.0
     )
-    reason = f"a photon is timed to {1e12 * sigma_s:.3g} ps; a return has about {counts.typical} of them"
+    reason = f"a photon is {timed}; a return has about {counts.typical} of them"
     return Stake(squared, np.where(sight.returned, lost, 0.0), reason)

@@ -30,16 +30,18 @@ def ambient_per_metre(sight: Sight) -> np.ndarray:
 def haze_per_pulse(sight: Sight, emitted: np.ndarray, bin_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Counts per pulse that the air sends back, at most: in the window up to the return, and in one bin, shapes (N,).
 
-    From r to r + dr it sends beta exp(-2 alpha r) / r^2 dr to 1 m^2 of aperture, most at the window's start a; over the
-    whole window at most beta (1 / a - 1 / b), whatever fades besides.
+    From r to r + dr it sends beta Omega(r) exp(-2 alpha r) dr into an aperture, a disc of radius a seen under the solid
+    angle Omega = 2 pi (1 - r / sqrt(r^2 + a^2)), with the integral 2 pi (r - sqrt(r^2 + a^2)); what fades within the
+    window is not taken off. A fixed receiver is taken to be as far away as the emitter.
     """
     photons, medium = sight.detector.photons, sight.scene.medium
     if medium is None:
         return np.zeros(len(sight)), np.zeros(len(sight))
     start, end = sight.window_m[:, 0], sight.window_m[:, 0] + sight.before_m
-    light = emitted * photons.aperture_m2 * photons.efficiency * medium.backscatter_per_m_sr
-    light = light * np.exp(-2 * medium.extinction_per_m * start)
-    # a window that starts at the sensor hears the air in front of it at once
-    nearest = np.maximum(start, math.sqrt(photons.aperture_m2))
-    whole = light * (1 / nearest - 1 / np.maximum(end, nearest))
-    return whole, np.minimum(light * bin_m / nearest**2, whole)
+    light = emitted * photons.efficiency * medium.backscatter_per_m_sr
+    light = 2 * math.pi * light * np.exp(-2 * medium.extinction_per_m * start)
+    squared = photons.aperture_m2 / math.pi
+    near, far = np.sqrt(start**2 + squared), np.sqrt(end**2 + squared)
+    # differences of roots without their cancellation
+    whole = light * (end - start) * (1 - (end + start) / (far + near))
+    return whole, np.minimum(light * bin_m * squared / (near * (near + start)), whole)

@@ -28,7 +28,7 @@ def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | Non
 
 def stake(sight: Sight, counts: Counts) -> Stake:
     """Of few photons."""
-    sigma_s = sight.detector.timing_sigma_s
-    lost = counts.missed(counts.in_air, counts.per_bin, sigma_s)
+    sigma_m = sight.sigma_m()
+    lost = counts.missed(counts.in_air, counts.per_bin, sigma_m)
     reason = f"a return has about {counts.typical} photons"
-    return Stake(counts.error_m(counts.in_air, sigma_s) ** 2, np.where(sight.returned, lost, 0.0), reason)
+    return Stake(counts.error_m(counts.in_air, sigma_m) ** 2, np.where(sight.returned, lost, 0.0), reason)

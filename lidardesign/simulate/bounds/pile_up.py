@@ -34,40 +34,39 @@ def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | Non
 
 def stake(sight: Sight, counts: Counts) -> Stake:
     """Of counts that blind it."""
-    sigma_s = sight.detector.timing_sigma_s
+    sigma_m = sight.sigma_m()
     echo = counts.signal_per_pulse
     haze = counts.haze_per_pulse[0]
     before = counts.background_per_metre * sight.before_m + haze
     whole = counts.background_per_metre * sight.width_m + haze + echo
     first = -np.expm1(-echo)
     photons = sight.detector.photons
-    covered = math.ceil(photons.dead_s * photons.repetition_hz)
+    covered = np.floor((photons.dead_s + sight.width_m / metres(1)) * photons.repetition_hz)
     awake = 1 / (1 + covered * -np.expm1(-whole))
     left = counts.pulses * awake * np.exp(-before) * first
     gone = counts.signal - left
     several = np.maximum(safe_divide(echo, first, 1.0), 1.0)
     early = np.minimum(np.sqrt(2 * np.log(several)), (several - 1) / math.sqrt(math.pi))
-    squared = (metres(sigma_s) * early) ** 2 + _strayed(counts, left, sigma_s)
-    lost = np.minimum(_beaten(counts, left, sigma_s), np.maximum(gone, 0.0) + counts.pulses * before)
+    squared = (sigma_m * early) ** 2 + _strayed(counts, left, sigma_m)
+    lost = np.minimum(_beaten(counts, left, sigma_m), np.maximum(gone, 0.0) + counts.pulses * before)
     reason = f"{_typical(sight, whole):.2g} counts a pulse, {1e9 * photons.dead_s:.3g} ns blind after each"
     return Stake(squared, np.where(sight.returned, lost, 0.0), reason)
 
 
-def _strayed(counts: Counts, left: np.ndarray, sigma_s: float) -> np.ndarray:
+def _strayed(counts: Counts, left: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
     """Variance by what is not there: all of the error where many photons are gone, its share where few are."""
     gone = changed_share(counts.signal, left)
-    error = counts.error_m(left, sigma_s) ** 2
+    error = counts.error_m(left, sigma_m) ** 2
     if counts.sight.detector.estimator == "matched":
         return error * gone
     return error * np.minimum(2 * np.sqrt(gone), 1.0)
 
 
-def _beaten(counts: Counts, left: np.ndarray, sigma_s: float) -> np.ndarray:
-    """How much more often fewer photons are missed or mistaken."""
+def _beaten(counts: Counts, left: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
+    """How much more often fewer photons are missed, and how often they are mistaken."""
     per_bin = counts.per_bin
-    full = counts.missed(counts.signal, per_bin, sigma_s) + counts.mistaken(counts.signal, per_bin, per_bin, sigma_s)
-    thin = counts.missed(left, per_bin, sigma_s) + counts.mistaken(left, per_bin, per_bin, sigma_s)
-    return np.clip(thin - full, 0.0, 1.0)
+    missed = counts.missed(left, per_bin, sigma_m) - counts.missed(counts.signal, per_bin, sigma_m)
+    return np.clip(missed + counts.mistaken(left, per_bin, per_bin, sigma_m), 0.0, 1.0)
 
 
 def _typical(sight: Sight, whole: np.ndarray) -> float:

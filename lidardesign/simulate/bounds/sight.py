@@ -126,6 +126,21 @@ class Sight:
         return np.where(self.returned, gain, 0.0)
 
     @cached_property
+    def beam_m(self) -> np.ndarray:
+        """Radius of each beam at its first hit; 0 where beams are lines, shape (N,) [m]."""
+        detector = self.detector
+        half_rad = detector.divergence_rad / 2 if detector.footprint_rays > 1 else 0.0
+        return half_rad * self.range_m
+
+    def sigma_m(self, *, jitter: bool = True) -> np.ndarray:
+        """How far one photon of an echo strays: the pulse, timing errors, and a slanted beam's spread, (N,) [m].
+
+        A beam that is even over a disc of radius a strays by a / 2 along any axis, times the tangent of incidence.
+        """
+        timed = self.detector.timing_sigma_s if jitter else self.detector.pulse_sigma_s
+        return np.hypot(metres(timed), self.beam_m * self.tangent / 2)
+
+    @cached_property
     def resolution_m(self) -> float:
         """Echoes closer than this are one: a bin or the width of the pulse, whichever is more [m]."""
         return max(self.detector.bin_m or 0.0, metres(FWHM_PER_SIGMA * self.detector.pulse_sigma_s))

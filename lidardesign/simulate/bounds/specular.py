@@ -1,7 +1,8 @@
 """Mirrors and glass: what they lead elsewhere may meet anything, so every ray that they meet may be wrong.
 
-Lost is the share of rays whose first hit is on a body that mirrors or lets through; the others are as they were. It
-bounds strictly: where that light goes is not known without following it, and how much it weighs is not asked.
+Lost is the share of rays whose first hit is on a body that mirrors or lets through, and what else comes back of them
+may move their echoes by as much as the detector does not tell apart; the others are as they were. It bounds strictly:
+where that light goes is not known without following it, and how much it weighs is not asked.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     leading = np.array([_leads(body) for body in sight.scene.bodies])
     met = np.where(sight.hits.body >= 0, leading[sight.hits.body], False)
     names = ", ".join(dict.fromkeys(body.name for body in sight.scene.bodies if _leads(body)))
-    return Stake(np.zeros(len(sight)), met.astype(float), f"{met.mean():.1%} of rays meet mirrors or glass: {names}")
+    moved_m = np.minimum(sight.resolution_m, sight.width_m) * met
+    return Stake(moved_m**2, met.astype(float), f"{met.mean():.1%} of rays meet mirrors or glass: {names}")
 
 
 def _leads(body: object) -> bool:
