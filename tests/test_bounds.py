@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import norm, poisson
 from test_plan import CONSUMER, SINGLE, TIMED, decisions, grid, room
 
-from lidardesign.scene import Ambient, Body, Box, Medium, Receiver, Scene, Sphere, rigid
+from lidardesign.scene import Ambient, Body, Box, Medium, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.bounds.counts import Counts, estimate_error_m, needed_counts, share_in_bins
 from lidardesign.simulate.bounds.motion import point_velocities
 from lidardesign.simulate.bounds.multipath import _detours
@@ -230,6 +230,15 @@ def test_a_receiver_loses_what_lies_outside_its_view_and_may_lose_all_it_does_no
     azimuth = np.abs(np.arctan2(seen.rays.direction[:, 1], seen.rays.direction[:, 0]))
     assert found.lost == pytest.approx((azimuth > 0.15).sum() / seen.returned.sum())
     assert bound("shadowing", Scene(room().bodies, receiver=replace(here, origin_m=(0, 0.1, 0))), TIMED).lost == 1.0
+
+
+def test_a_wall_fills_half_of_what_the_floor_before_it_sees():
+    floor, wall = Body(Plane(), "floor"), Body(Box((0.05, 1e4, 1e4)), "wall", poses=rigid(translation_m=(2, 0, 0)))
+    down = grid(side=5, half_rad=0.2)
+    looking = down.direction[:, [1, 2, 0]] * np.array([1, 1, -1])
+    rays = replace(down, origin_m=down.origin_m + np.array([0, 0, 1.0]), direction=looking)
+    found = _detours(sight(Scene((floor, wall)), CONSUMER, rays), np.arange(25))
+    assert found.seen.mean() == pytest.approx(0.5, abs=0.02)
 
 
 def test_a_convex_body_alone_lights_nothing_and_a_corner_lights_itself():
