@@ -1,0 +1,183 @@
+"""Scenes call for the effects that matter in them, for the right reason; skipping one of those fails the audit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from lidardesign_tasks.arm import ArmTask
+from lidardesign_tasks.face import FaceTask
+from lidardesign_tasks.flatland import FlatlandTask
+from scipy.spatial.transform import Rotation
+
+from lidardesign.design.rays import fire_times
+from lidardesign.evaluate.audit import Audit, AuditRow
+from lidardesign.scene import Body, Box, rigid
+from lidardesign.simulate.detector import Detector
+from lidardesign.simulate.detector_files import load_detector
+from lidardesign.simulate.physics import EFFECTS, Physics
+from lidardesign.simulate.plan import Planner
+from lidardesign.simulate.returns import Rays
+from lidardesign.simulate.simulate import simulate
+from lidardesign.space import direction
+
+SINGLE_PHOTON = load_detector("single-photon")
+# Detours by matt surfaces are rendered by another program, and tested with it.
+EVERYTHING = frozenset(EFFECTS) - {"multipath"}
+FACE, ARM, FLATLAND = FaceTask(), ArmTask(), FlatlandTask()
+
+
+def rays_of(origin_m, looking, gate_m):
+    count = len(looking)
+    origins = np.broadcast_to(np.asarray(origin_m, dtype=float), (count, 3))
+    return Rays(origins, looking, np.tile(gate_m, (count, 1)), np.zeros(count), fire_times(count, 10.0))
+
+
+def face_rays():
+    """An even grid that the face fills, 0.4 m in front of it."""
+    turn = np.linspace(-0.28, 0.28, 14)
+    azimuth, elevation = map(np.ravel, np.meshgrid(math.pi + turn, turn))
+    return rays_of((0.4, 0.0, 0.0), direction(azimuth, elevation), (0.05, 1.05))
+
+
+def heads(*others, **surroundings):
+    config = FACE.Config(test=3, truth_points=1000, **surroundings)
+    return [replace(head, bodies=(*head.bodies, *others)) for head in FACE.scenes(config, "test", 0)]
+
+
+def plans(scenes, rays, detector):
+    return [{one.name: one for one in Planner(detector).plan(scene, [rays]).decisions} for scene in scenes]
+
+
+def switched_on(decisions):
+    return frozenset(name for name, decision in decisions.items() if decision.on) - {"multipath"}
+
+
+def mean_score(task, scenes, rays, detector, effects):
+    """Of all scenes, each with its own set of effects."""
+    values = []
+    for scene, on in zip(scenes, effects, strict=True):
+        returns = simulate(scene, rays, physics=Physics(detector, on) if on else None)
+        values.append(task.score(scene, returns).value)
+    return float(np.mean(values))
+
+
+def audit(task, scenes, rays, detector, effects):
+    """The audit of sets of effects, one for each scene, against everything."""
+    planned = mean_score(task, scenes, rays, detector, effects)
+    everything = mean_score(task, scenes, rays, detector, [EVERYTHING] * len(scenes))
+    moved = planned - everything
+    row = AuditRow("grid", len(rays), planned, everything, moved, moved, moved, 0.0, 0.0)
+    return Audit(task.metric.tolerance, task.metric.unit, [row], [], [])
+
+
+def assert_called_for(effect, reason, task, scenes, rays, detector):
+    """The plan of every scene has the effect for that reason and passes the audit; without it, the audit fails."""
+    found = plans(scenes, rays, detector)
+    for decisions in found:
+        assert decisions[effect].on
+        assert reason in decisions[effect].bound.reason
+    planned = [switched_on(decisions) for decisions in found]
+    assert not audit(task, scenes, rays, detector, planned).failed
+    assert audit(task, scenes, rays, detector, [on - {effect} for on in planned]).failed
+    assert audit(task, scenes, rays, detector, [EVERYTHING - {effect}] * len(scenes)).failed
+
+
+def test_a_face_indoors_calls_for_the_detectors_own_limits_and_nothing_else():
+    scenes, rays = heads(), face_rays()
+    found = plans(scenes, rays, SINGLE_PHOTON)
+    for decisions in found:
+        assert {"photon_noise", "jitter", "quantisation"} <= switched_on(decisions)
+        for name in ("motion", "specular", "multipath", "shadowing", "atmosphere", "pile_up"):
+            assert not decisions[name].on
+        assert decisions["motion"].bound.reason == "nothing moves"
+        assert decisions["specular"].bound.reason == "nothing mirrors or lets light through"
+        assert decisions["atmosphere"].bound.reason == "the air is clear"
+        assert decisions["shadowing"].bound.reason == "every ray is heard where it starts"
+    assert not audit(FACE, scenes, rays, SINGLE_PHOTON, [switched_on(decisions) for decisions in found]).failed
+
+
+def test_a_face_indoors_fails_the_audit_by_geometry_alone_where_bins_are_wide():
+    scenes, rays, coarse = heads(), face_rays(), load_detector("consumer-8x8")
+    found = plans(scenes, rays, coarse)
+    assert all({"footprint", "quantisation"} <= switched_on(decisions) for decisions in found)
+    assert not audit(FACE, scenes, rays, coarse, [switched_on(decisions) for decisions in found]).failed
+    assert audit(FACE, scenes, rays, coarse, [frozenset()] * len(scenes)).failed
+
+
+def test_sunlight_calls_for_ambient_light_and_pile_up():
+    scenes, rays = heads(illuminance_lux=100_000, light="sun"), face_rays()
+    assert_called_for("ambient", "100,000 lux (sun)", FACE, scenes, rays, SINGLE_PHOTON)
+    assert_called_for("pile_up", "ns blind after each", FACE, scenes, rays, SINGLE_PHOTON)
+
+
+def test_fog_calls_for_the_atmosphere():
+    assert_called_for("atmosphere", "air that dims light by", FACE, heads(visibility_m=10), face_rays(), SINGLE_PHOTON)
+
+
+def test_a_mirror_calls_for_specular_surfaces():
+    turned = rigid(Rotation.from_euler("z", -45, degrees=True).as_matrix(), (-0.10, 0.15, 0.0))
+    mirror = Body(Box((0.002, 0.1, 0.25)), "mirror", "occluder", turned, reflectance=0.05, specular=0.9)
+    assert_called_for("specular", "meet mirrors or glass: mirror", FACE, heads(mirror), face_rays(), SINGLE_PHOTON)
+
+
+def test_a_pane_in_front_of_the_face_calls_for_specular_surfaces_and_hides_what_else_matters():
+    place = rigid(translation_m=(0.2, 0.0, 0.0))
+    pane = Body(Box((0.001, 0.5, 0.5)), "pane", "occluder", place, reflectance=0.02, transmission=0.9)
+    scenes, rays = heads(pane), face_rays()
+    assert_called_for("specular", "meet mirrors or glass: pane", FACE, scenes, rays, SINGLE_PHOTON)
+    for decisions in plans(scenes, rays, SINGLE_PHOTON):
+        assert decisions["footprint"].on
+        assert decisions["footprint"].bound.reason.endswith("mirrors or glass lead 100.0% of rays elsewhere")
+
+
+def test_an_arm_that_moves_fast_calls_for_motion():
+    scenes = ARM.scenes(ARM.Config(size="small", test=1, frames=8, duration_s=2), "test", 0)
+    generator = np.random.default_rng(0)
+    count = 3000
+    origins = np.stack(
+        [generator.uniform(-0.2, 1.0, count), generator.uniform(-1.0, 1.0, count), np.ones(count)], axis=1
+    )
+    looking = direction(generator.uniform(0, 2 * math.pi, count), generator.uniform(-math.pi / 2, -1.05, count))
+    timing = Detector("timing", bin_s=2e-11)
+    rays = rays_of(origins, looking, (0.1, 2.0))
+    assert_called_for("motion", "surfaces move by up to", ARM, scenes, rays, timing)
+    at_once = replace(rays, time_s=np.zeros(count))
+    (decisions,) = plans(scenes, at_once, timing)
+    assert not decisions["motion"].on
+    assert decisions["motion"].bound.reason == "all rays are fired at once"
+
+
+def test_a_wide_beam_at_a_depth_edge_calls_for_its_footprint():
+    scenes = FLATLAND.scenes(FLATLAND.Config(scene="occluded", test=4), "test", 0)
+    place = np.linspace(0.05, 0.95, 64)
+    origins = np.stack([place, 0 * place, 0 * place], axis=1)
+    rays = rays_of(origins, np.tile([0.0, 1.0, 0.0], (64, 1)), (0.0, 1.2))
+    wide = Detector("wide", bin_s=2e-11, divergence_rad=0.1, footprint_rays=16)
+    assert_called_for("footprint", "beams of 100 mrad", FLATLAND, scenes, rays, wide)
+    for decisions in plans(scenes, rays, replace(wide, divergence_rad=1e-6)):
+        assert not decisions["footprint"].on
+
+
+def test_what_a_scene_does_not_call_for_changes_not_a_bit():
+    (head,) = heads()[:1]
+    rays = face_rays()
+    calm = frozenset({"photon_noise", "jitter", "quantisation", "pile_up"})
+    (planned,) = simulate(head, rays, physics=Physics(SINGLE_PHOTON, calm))
+    more = calm | {"motion", "specular", "atmosphere", "shadowing"}
+    (everything,) = simulate(head, rays, physics=Physics(SINGLE_PHOTON, more))
+    assert np.array_equal(planned.range_m, everything.range_m, equal_nan=True)
+    assert np.array_equal(planned.outcome, everything.outcome)
+
+
+@pytest.mark.parametrize("effect", ["footprint", "motion", "specular", "shadowing", "atmosphere"])
+def test_effects_of_geometry_leave_a_plain_scene_as_geometry_has_it(effect):
+    (head,) = heads()[:1]
+    thin = Detector("thin", pulse_sigma_s=1e-12)
+    (alone,) = simulate(head, face_rays())
+    (measured,) = simulate(head, face_rays(), physics=Physics(thin, frozenset({effect})))
+    assert np.array_equal(alone.outcome, measured.outcome)
+    assert np.array_equal(alone.range_m, measured.range_m, equal_nan=True)
+    assert np.array_equal(alone.body, measured.body)
