@@ -90,7 +90,7 @@ def test_rays_beside_the_pixels_take_the_nearest_and_say_how_far_it_is(clean):
 
 @pytest.mark.parametrize("gate", [(0.3, 2.0), (0.5, 0.55), (0.4501, 0.4502), (0.0, 0.1), (1.9, 50.0)])
 def test_a_gate_hears_the_bins_whose_middles_lie_in_it(clean, gate):
-    first, last = gate_bins(clean, np.array([gate]))
+    first, last = gate_bins(clean, np.zeros(1, dtype=int), np.array([gate]))
     middles = (START_PS + (np.arange(clean.bins) + 0.5) * BIN_PS) * C_M_PER_PS / 2
     inside = np.flatnonzero((middles >= gate[0]) & (middles < gate[1]))
     np.testing.assert_array_equal(np.arange(first[0], last[0]), inside)
@@ -101,7 +101,7 @@ def test_what_lies_outside_a_gate_changes_nothing(noisy, estimation):
     rays = lay_out(ball_design())
     within = default_within_rad(noisy)
     found = scan(noisy, rays, within, estimation)
-    middles = noisy.start_m + (np.arange(noisy.bins) + 0.5) * noisy.bin_m
+    middles = noisy.start_m[0] + (np.arange(noisy.bins) + 0.5) * noisy.bin_m
     start, end = rays.gate_m[0]
     silenced = np.where((middles >= start) & (middles < end), noisy.counts, 0)
     quiet = replace(noisy, counts=silenced)
@@ -133,6 +133,20 @@ def test_ranges_do_not_depend_on_how_many_are_worked_on_at_once(noisy, estimatio
     np.testing.assert_array_equal(found.range_m, again.range_m)
     some = np.arange(0, len(rays), 7)
     np.testing.assert_array_equal(scan(noisy, rays.subset(some), 0.1, estimation).range_m, found.range_m[some])
+
+
+@pytest.mark.parametrize("estimation", ESTIMATIONS, ids=lambda one: one.estimator)
+def test_pixels_may_begin_to_count_at_different_times(clean, estimation):
+    cut = np.random.default_rng(4).integers(0, 40, len(clean))
+    at = np.minimum(cut[:, None] + np.arange(560), 599)
+    later = replace(
+        clean, counts=np.take_along_axis(clean.counts, at, axis=1), start_ps=clean.start_ps + cut * clean.bin_ps
+    )
+    later.__dict__["background_per_bin"] = clean.background_per_bin
+    rays = looking([[0, 0], [3, 4], [-10, 8], [7, -7]], gate=(0.42, 0.9))
+    found, again = (scan(one, rays, 0.02, estimation) for one in (clean, later))
+    np.testing.assert_allclose(again.range_m, found.range_m, atol=1e-12)
+    np.testing.assert_array_equal(again.photons, found.photons)
 
 
 def test_the_usual_background_is_what_was_put_in(clean, noisy):
@@ -181,7 +195,7 @@ def test_a_design_of_which_nothing_was_captured_is_refused(clean, rays, message)
 
 
 def test_a_single_pixel_needs_an_angle(clean):
-    one = replace(clean, counts=clean.counts[:1], direction=clean.direction[:1], true_range_m=None)
+    one = Capture(clean.counts[:1], BIN_PS, START_PS, np.zeros(3), clean.direction[:1])
     with pytest.raises(ConfigError, match="--within-deg"):
         default_within_rad(one)
     assert uniform_rays(one, 4).direction == pytest.approx(np.repeat(clean.direction[:1], 4, axis=0))

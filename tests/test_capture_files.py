@@ -53,7 +53,8 @@ def test_a_capture_is_the_same_from_every_kind_of_file(tmp_path, kind, images):
     np.testing.assert_array_equal(found.counts, arrays["counts"].reshape(-1, BINS))
     np.testing.assert_array_equal(found.true_range_m, arrays["true_range_m"].reshape(-1))
     np.testing.assert_allclose(np.linalg.norm(found.direction, axis=1), 1.0, atol=1e-15)
-    assert (found.bin_ps, found.start_ps, found.pulse_fwhm_ps) == (20.0, 2000.0, 60.0)
+    assert (found.bin_ps, found.pulse_fwhm_ps) == (20.0, 60.0)
+    np.testing.assert_array_equal(found.start_ps, np.full(81, 2000.0))
     assert found.window_m == pytest.approx((0.29979, 2.09855), abs=1e-5)
     assert np.degrees(found.spacing_rad) == pytest.approx(30 / 8, rel=0.01)
 
@@ -74,6 +75,13 @@ def test_directions_and_scan_angles_say_the_same(tmp_path, kind):
 def test_counts_keep_their_small_type(tmp_path, kind):
     FORMATS[kind](path_of(tmp_path, kind), make_capture(4))
     assert load_capture(path_of(tmp_path, kind)).counts.dtype == np.uint16
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_every_pixel_may_have_a_start_of_its_own(tmp_path, kind):
+    starts = 2000.0 + np.arange(25.0).reshape(5, 5)
+    FORMATS[kind](path_of(tmp_path, kind), {**make_capture(5), "start_ps": starts})
+    np.testing.assert_array_equal(load_capture(path_of(tmp_path, kind)).start_ps, starts.ravel())
 
 
 def changed(**values):
@@ -130,6 +138,12 @@ WRONG = {
     "histograms before the pulse": (changed(start_ps=-1e9), "an end after the pulse"),
     "a first bin after a minute": (changed(start_ps=6e13), "an end after the pulse"),
     "pulse in s": (changed(pulse_fwhm_ps=5e-11), "pulse_fwhm_ps is 5e-11"),
+    "too few starts": (changed(start_ps=np.ones(3)), "start_ps has the shape"),
+    "one NaN start": (
+        changed(start_ps=lambda s: np.where(np.arange(25).reshape(5, 5) == 7, np.nan, s)),
+        "start_ps has values",
+    ),
+    "one late start": (changed(start_ps=lambda s: np.where(np.arange(25).reshape(5, 5) == 7, 1e13, s)), "an end after"),
     "flat origin": (changed(origin_m=np.zeros(2)), r"origin_m has the shape \(2,\)"),
     "NaN origin": (changed(origin_m=np.full(3, np.nan)), "origin_m has values that are NaN"),
     "angles beyond a right angle": (changed(x_deg=lambda x: x * 10), "beyond 90 degrees"),

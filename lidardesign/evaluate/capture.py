@@ -4,7 +4,8 @@ A capture is a `.npz` or MATLAB `.mat` file with these keys; the pixels are a li
 
 - `counts` (P, B) or (H, W, B): photons per time bin, whole numbers;
 - `bin_width_ps`: the width of a bin [ps];
-- `start_ps`: when the first bin begins, after the pulse left the scanner, two-way time [ps];
+- `start_ps`: when the first bin begins, after the pulse left the scanner, two-way time [ps]; one number, or one per
+  pixel (P) or (H, W) where the detector was gated;
 - `origin_m` (3,): where the scanner stands [m];
 - either `direction` (P, 3) or (H, W, 3): unit vectors; or `x_deg`, `y_deg`: optical scan angles as in
   `lidardesign.design.galvo`, with `boresight_azimuth_deg` and `boresight_elevation_deg` [deg];
@@ -49,7 +50,7 @@ class Capture:
     Arguments:
         counts: Photons per bin, shape (P, B), whole numbers of any numeric type.
         bin_ps: Width of a bin of two-way time [ps].
-        start_ps: When the first bin begins [ps].
+        start_ps: When the first bin begins [ps], shape (P,); one number counts for all pixels.
         origin_m: Where the scanner stands [m], shape (3,).
         direction: Unit vectors, shape (P, 3).
         true_range_m: The true one-way ranges [m], NaN where nothing is, shape (P,); None: unknown.
@@ -58,11 +59,15 @@ class Capture:
 
     counts: np.ndarray
     bin_ps: float
-    start_ps: float
+    start_ps: np.ndarray
     origin_m: np.ndarray
     direction: np.ndarray
     true_range_m: np.ndarray | None = None
     pulse_fwhm_ps: float | None = None
+
+    def __post_init__(self) -> None:
+        start_ps = np.broadcast_to(np.asarray(self.start_ps, dtype=np.float64), (len(self.counts),))
+        object.__setattr__(self, "start_ps", start_ps)
 
     def __len__(self) -> int:
         return len(self.counts)
@@ -78,14 +83,14 @@ class Capture:
         return self.bin_ps * SPEED_OF_LIGHT_M_PER_PS / 2
 
     @property
-    def start_m(self) -> float:
-        """The one-way range at which the first bin begins [m]."""
+    def start_m(self) -> np.ndarray:
+        """The one-way range at which each pixel's first bin begins, shape (P,) [m]."""
         return self.start_ps * SPEED_OF_LIGHT_M_PER_PS / 2
 
     @property
     def window_m(self) -> tuple[float, float]:
-        """The ranges that the histograms hold [m]."""
-        return self.start_m, self.start_m + self.bins * self.bin_m
+        """The first and the last range that any histogram holds [m]."""
+        return float(self.start_m.min()), float(self.start_m.max()) + self.bins * self.bin_m
 
     @cached_property
     def spacing_rad(self) -> float | None:
@@ -136,7 +141,7 @@ def load_capture(path: Path) -> Capture:
     capture = Capture(
         counts,
         _scalar(arrays, "bin_width_ps", where),
-        _scalar(arrays, "start_ps", where),
+        _starts(arrays, pixels, where),
         _finite(origin.reshape(3), "origin_m", where),
         _directions(arrays, pixels, where),
         _per_pixel(arrays, "true_range_m", pixels, where) if "true_range_m" in arrays else None,
@@ -177,6 +182,13 @@ def _scalar(arrays: Mapping[str, np.ndarray], name: str, where: str) -> float:
     if arrays[name].size != 1:
         raise _shape(name, arrays[name], "one number", where)
     return float(_finite(np.asarray(arrays[name], dtype=np.float64).reshape(()), name, where))
+
+
+def _starts(arrays: Mapping[str, np.ndarray], pixels: tuple[int, ...], where: str) -> np.ndarray:
+    """When histograms begin [ps]: one number, or one per pixel."""
+    if arrays["start_ps"].size == 1:
+        return np.array(_scalar(arrays, "start_ps", where))
+    return _finite(_per_pixel(arrays, "start_ps", pixels, where), "start_ps", where)
 
 
 def _per_pixel(arrays: Mapping[str, np.ndarray], name: str, pixels: tuple[int, ...], where: str) -> np.ndarray:
@@ -241,9 +253,9 @@ def _check_values(capture: Capture, where: str) -> None:
         if value is not None and not low <= value <= high:
             raise DataError(f"{name} is {value:g}", where=where, allowed=f"{low:g} to {high:g} ps")
     end_ps = capture.start_ps + capture.bins * capture.bin_ps
-    if not 0 < end_ps <= LATEST_PS:
+    if not (end_ps.min() > 0 and end_ps.max() <= LATEST_PS):
         raise DataError(
-            f"the histograms last from {capture.start_ps:g} to {end_ps:g} ps",
+            f"the histograms last from {capture.start_ps.min():g} to {end_ps.max():g} ps",
             where=where,
             allowed=f"an end after the pulse and before {LATEST_PS:g} ps",
         )
@@ -254,7 +266,8 @@ def _check_values(capture: Capture, where: str) -> None:
     if np.isinf(seen).any() or (seen < 0).any():
         raise DataError("true_range_m is negative or infinite", where=where, allowed="0 or more, NaN where nothing is")
     start, end = capture.window_m
-    if not ((seen >= start) & (seen < end)).any():
+    heard = (known >= capture.start_m) & (known < capture.start_m + capture.bins * capture.bin_m)
+    if not heard.any():
         raise DataError(
             f"no true range lies where the histograms are, {start:.4g} to {end:.4g} m",
             where=where,

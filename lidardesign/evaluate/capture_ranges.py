@@ -60,7 +60,7 @@ def measured(
         place[begin:end] = find_returns(
             counts, offset, capture.bin_ps, sigma_ps, half, known, estimation.false_alarm, matched
         )
-    return capture.start_m + (first + place) * capture.bin_m, photons
+    return capture.start_m[pixel] + (first + place) * capture.bin_m, photons
 
 
 def _chunks(lengths: np.ndarray) -> Iterator[tuple[int, int]]:

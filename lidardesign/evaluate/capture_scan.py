@@ -75,7 +75,7 @@ def scan(capture: Capture, rays: Rays, within_rad: float, estimation: Estimation
     """
     chord, nearest = cKDTree(capture.direction).query(rays.direction)
     away = 2 * np.arcsin(np.minimum(np.asarray(chord) / 2, 1.0))
-    first, last = gate_bins(capture, rays.gate_m)
+    first, last = gate_bins(capture, nearest, rays.gate_m)
     offset = np.linalg.norm(rays.origin_m - capture.origin_m, axis=1)
     captured = np.full(len(rays), Captured.YES, dtype=np.int64)
     captured[last <= first] = Captured.OUT_OF_WINDOW
@@ -94,9 +94,12 @@ def scan_pixels(capture: Capture, estimation: Estimation) -> CapturedScan:
     return _measured(capture, zeros, np.arange(count), np.zeros(count), zeros, last, estimation)
 
 
-def gate_bins(capture: Capture, gate_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The bins whose middles lie in gates (N, 2) [m], start <= middle < end: first and last (excluded), shape (N,)."""
-    places = (gate_m - capture.start_m) / capture.bin_m - 0.5
+def gate_bins(capture: Capture, pixel: np.ndarray, gate_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The bins of pixels (N,) whose middles lie in gates (N, 2) [m], start <= middle < end.
+
+    First and last (excluded), each of shape (N,).
+    """
+    places = (gate_m - capture.start_m[pixel, None]) / capture.bin_m - 0.5
     bins = np.clip(np.ceil(places), 0, capture.bins).astype(np.int64)
     return bins[:, 0], bins[:, 1]
 

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from lidardesign.evaluate.capture_score import CaptureEvaluation, CaptureRow
 
 COLUMNS = (
-    "design", "gate", "ray", "sensor", "captured", "pixel", "away_deg", "photons", "range_m", "reference_m", "outlier",
+    "design", "gate", "ray", "sensor", "captured", "pixel", "away_deg", "gate_start_m", "gate_end_m", "photons",
+    "range_m", "reference_m", "outlier",
     "point_x_m", "point_y_m", "point_z_m",
 )  # fmt: skip
 
@@ -37,7 +38,8 @@ def _lines(row: CaptureRow) -> list[list[object]]:
     return [
         [
             row.design, row.gate, ray, int(row.rays.sensor[ray]), Captured(scan.captured[ray]).name.lower(),
-            int(scan.pixel[ray]) if scan.pixel[ray] >= 0 else "", repr(float(away[ray])), int(scan.photons[ray]),
+            int(scan.pixel[ray]) if scan.pixel[ray] >= 0 else "", repr(float(away[ray])),
+            *map(repr, row.rays.gate_m[ray].tolist()), int(scan.photons[ray]),
             _cell(scan.range_m[ray]), _cell(row.reference_m[ray]), int(row.outlier[ray]),
             *(_cell(value) for value in scan.points_m[ray]),
         ]
