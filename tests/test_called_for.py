@@ -12,8 +12,10 @@ from lidardesign_tasks.face import FaceTask
 from lidardesign_tasks.flatland import FlatlandTask
 from scipy.spatial.transform import Rotation
 
+from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.rays import fire_times
 from lidardesign.evaluate.audit import Audit, AuditRow
+from lidardesign.evaluate.placement import even_placement, rays_at
 from lidardesign.scene import Body, Box, rigid
 from lidardesign.simulate.detector import Detector
 from lidardesign.simulate.detector_files import load_detector
@@ -181,3 +183,9 @@ def test_effects_of_geometry_leave_a_plain_scene_as_geometry_has_it(effect):
     assert np.array_equal(alone.outcome, measured.outcome)
     assert np.array_equal(alone.range_m, measured.range_m, equal_nan=True)
     assert np.array_equal(alone.body, measured.body)
+
+
+def test_baselines_fire_over_the_same_frame_as_designs():
+    config = FACE.Config()
+    points = even_placement(np.array(FACE.space(config).low[:5]), np.array(FACE.space(config).high[:5]), 40)
+    assert np.array_equal(rays_at(points, np.array([0.1, 1.0])).time_s, fire_times(40, Bandwidth().rate_hz))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.grid import grid_tangent, low_discrepancy
+from lidardesign.design.rays import fire_times
 from lidardesign.simulate.returns import Rays
 from lidardesign.space import AZIMUTH, ELEVATION, direction
 
@@ -44,14 +46,17 @@ def even_placement(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
 
 
 def rays_at(points: np.ndarray, gate_m: np.ndarray) -> Rays:
-    """Rays of one sensor at (x, y, z, azimuth, elevation), shape (N, 5 or 6), all with one gate (2,) [m]."""
+    """Rays of one sensor at (x, y, z, azimuth, elevation), shape (N, 5 or 6), all with one gate (2,) [m].
+
+    They fire one after another over a frame, as a design's do.
+    """
     count = len(points)
     return Rays(
         origin_m=points[:, :3],
         direction=direction(points[:, AZIMUTH], points[:, ELEVATION]),
         gate_m=np.tile(gate_m, (count, 1)),
         sensor=np.zeros(count),
-        time_s=np.zeros(count),
+        time_s=fire_times(count, Bandwidth().rate_hz),
     )
 
 
