@@ -3,13 +3,16 @@ r"""Light of the surroundings and dark counts: false peaks, hidden echoes, and r
 With mean counts b per bin, B bins and s counts in the echo's bin, another bin wins with at most
 (B - 1) exp(-(sqrt(s + b) - sqrt(b))^2): the union over bins of Chernoff's bound. A threshold that lets background pass
 with the probability `false_alarm` hides echoes below it, and a ray that has no return invents one as often as that.
-Counts among the echo's own move its range by its error times sqrt(b / s), the share of the noise that is theirs.
+Counts under the echo make its range stray: in much background, b per metre, n photons of a Gaussian are placed with the
+variance (sigma^2 / n) (4 sqrt(pi) sigma b / n) (Cramer and Rao's bound), which is added to that without; the highest
+bin strays (1 + b / s)^(1/4) times as far.
 
 No false peak can be where no count arrives: it is at most 1 - exp(-B b).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -39,9 +42,18 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     wrong = np.minimum(counts.mistaken(signal, per_bin, per_bin, sigma_m), any_count)
     invented = np.minimum(sight.detector.false_alarm, any_count)
     lost = np.where(sight.returned, np.minimum(wrong + hidden, 1.0), invented)
-    echo = signal * share_in_bins(1, counts.bin_m, sigma_m)
-    squared = counts.error_m(signal, sigma_m) ** 2 * np.minimum(safe_divide(per_bin, echo, 1.0), any_count)
+    squared = np.minimum(_strayed(counts, signal, sigma_m), sight.width_m) ** 2
     return Stake(squared, lost, _reason(sight, float(np.median(per_bin * counts.bins))))
+
+
+def _strayed(counts: Counts, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
+    """How far counts under the echo make its range stray, shape (N,) [m]."""
+    error, per_bin = counts.error_m(signal, sigma_m), counts.per_bin
+    if counts.sight.detector.estimator == "matched":
+        per_metre = per_bin / counts.bin_m
+        return error * np.sqrt(4 * math.sqrt(math.pi) * sigma_m * safe_divide(per_metre, np.maximum(signal, 1.0)))
+    echo = np.maximum(signal, 1.0) * share_in_bins(1, counts.bin_m, sigma_m)
+    return error * np.sqrt(np.sqrt(1 + safe_divide(per_bin, echo)) - 1)
 
 
 def _reason(sight: Sight, gate: float) -> str:

@@ -30,8 +30,10 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     """Of air that weakens and scatters."""
     sigma_m = sight.sigma_m()
     clear, left = counts.signal, counts.in_air
-    fewer = counts.missed(left, counts.per_bin, sigma_m) - counts.missed(clear, counts.per_bin, sigma_m)
     haze, fullest = (counts.pulses * part for part in counts.haze_per_pulse)
+    # haze raises the level of background that a return has to stand out from
+    level = counts.per_bin + haze / counts.bins
+    fewer = counts.missed(left, level, sigma_m) - counts.missed(clear, counts.per_bin, sigma_m)
     any_count = -np.expm1(-haze)
     wrong = np.minimum(counts.mistaken(left, counts.per_bin + fullest, counts.per_bin, sigma_m), any_count)
     squared = counts.error_m(left, sigma_m) ** 2 * np.minimum(

@@ -39,9 +39,23 @@ class Counts:
 
     @cached_property
     def signal_per_pulse(self) -> np.ndarray:
-        """Counts of the first hit in clear air, shape (N,)."""
+        """Counts of a return in clear air, 0 where there is none, shape (N,)."""
+        return np.where(self.sight.returned, self._of_first_hit, 0.0)
+
+    @cached_property
+    def _of_first_hit(self) -> np.ndarray:
         photons = self.sight.detector.photons
         return self._by_sharing("emitted") * photons.aperture_m2 * photons.efficiency * self.sight.gain
+
+    def leaked(self, sigma_m: np.ndarray) -> np.ndarray:
+        """Counts that the pulse of a hit outside the gate spills into it in a frame, in clear air, shape (N,).
+
+        The part of a Gaussian inside the window, at most its part beyond the nearer end.
+        """
+        from scipy.special import ndtr
+
+        share = ndtr(-self.sight.gate_edge_m / np.maximum(sigma_m, np.finfo(float).tiny))
+        return np.where(self.sight.returned, 0.0, self._of_first_hit * self.pulses * share)
 
     @cached_property
     def signal(self) -> np.ndarray:

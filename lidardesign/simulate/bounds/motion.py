@@ -1,8 +1,9 @@
 r"""What moves while the rays of a frame are fired one after another.
 
 A ray fired at the time t meets a body that has moved by v t, v the velocity of the point it meets: its range changes by
-at most |v| t / cos(theta) on a plane met at the angle theta, and at the body's edges it meets something else, with the
-probability that an edge lies within |v| t; see `edge_probability` (an estimate). A detector without any error or width,
+at most |v| t / cos(theta) on a plane met at the angle theta, which may lead it into or out of its gate, and at the
+body's edges it meets something else, with the probability that an edge lies within |v| t; see `edge_probability` (an
+estimate). A detector without any error or width,
 `ideal`, takes the whole frame at one instant.
 """
 
@@ -39,10 +40,12 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     """Of moving bodies."""
     velocity = point_velocities(sight)
     step_m = np.linalg.norm(velocity, axis=1) * sight.rays.time_s
-    error_m = np.minimum(step_m / sight.cosine, sight.width_m)
-    lost = edge_probability(sight, step_m)
+    moved_m = step_m / sight.cosine
+    edge = edge_probability(sight, step_m)
+    squared = np.minimum(moved_m, sight.width_m) ** 2 + edge * sight.resolution_m**2
+    lost = np.maximum(edge, (sight.gate_edge_m <= moved_m) & (moved_m > 0))
     reason = f"surfaces move by up to {1000 * step_m.max(initial=0.0):.3g} mm within a frame"
-    return Stake(error_m**2, lost, reason)
+    return Stake(squared, lost, reason)
 
 
 def point_velocities(sight: Sight) -> np.ndarray:

@@ -3,13 +3,16 @@ r"""The chance in photons: their number, and when in the pulse they were sent.
 n photons of a pulse (c / 2) sigma_p wide give a range that strays by (c / 2) sigma_p / sqrt(n) (Cramer and Rao's bound
 for a Gaussian without background), or as far as the highest bin does; see `estimate_error_m`. Where photons are timed
 with an error too, other photons bring other errors, and both count. The number is Poisson: the return is lost with the
-probability that the echo's bin holds fewer than a return needs.
+probability that the echo's bins hold fewer than a return needs. A pulse has a width: a gate's end that cuts it off
+moves the mean of what is left by sigma phi(z) / Phi(z), z the distance in sigma, and a surface outside the gate spills
+n Phi(-z) photons into it, which make a return with at most the probability that there is any.
 
 An estimate where n is a few: photons are then in the tail as often as not, and a lost return has no range.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -29,6 +32,16 @@ def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | Non
 def stake(sight: Sight, counts: Counts) -> Stake:
     """Of few photons."""
     sigma_m = sight.sigma_m()
-    lost = counts.missed(counts.in_air, counts.per_bin, sigma_m)
+    missed = counts.missed(counts.in_air, counts.per_bin, sigma_m)
+    invented = -np.expm1(-counts.leaked(sigma_m))
     reason = f"a return has about {counts.typical} photons"
-    return Stake(counts.error_m(counts.in_air, sigma_m) ** 2, np.where(sight.returned, lost, 0.0), reason)
+    squared = counts.error_m(counts.in_air, sigma_m) ** 2 + _cut_m(sight, sigma_m) ** 2
+    return Stake(squared, np.where(sight.returned, missed, invented), reason)
+
+
+def _cut_m(sight: Sight, sigma_m: np.ndarray) -> np.ndarray:
+    """How far the mean of a pulse moves where the gate's end cuts it off, shape (N,) [m]."""
+    from scipy.special import ndtr
+
+    away = np.where(sight.returned, sight.gate_edge_m, np.inf) / np.maximum(sigma_m, np.finfo(float).tiny)
+    return sigma_m * np.exp(-(away**2) / 2) / (math.sqrt(2 * math.pi) * ndtr(away))

@@ -112,18 +112,28 @@ class Sight:
         return self.window_m[:, 1] - self.window_m[:, 0]
 
     @cached_property
+    def path_m(self) -> np.ndarray:
+        """Half paths of first hits, 0 where there is none, shape (N,) [m]."""
+        return path_of_range(self.rays, self.scene.receiver, self.range_m)
+
+    @cached_property
     def before_m(self) -> np.ndarray:
         """How much of its window lies before a ray's return; the whole window without one, shape (N,) [m]."""
-        path = path_of_range(self.rays, self.scene.receiver, np.where(self.returned, self.range_m, 0.0))
-        return np.where(self.returned, np.clip(path - self.window_m[:, 0], 0.0, self.width_m), self.width_m)
+        return np.where(self.returned, np.clip(self.path_m - self.window_m[:, 0], 0.0, self.width_m), self.width_m)
+
+    @cached_property
+    def gate_edge_m(self) -> np.ndarray:
+        """How far a first hit lies from the nearer end of its window, infinite on a miss, shape (N,) [m]."""
+        away_m = np.abs(self.path_m[:, None] - self.window_m).min(axis=1)
+        return np.where(self.hits.body >= 0, away_m, np.inf)
 
     @cached_property
     def gain(self) -> np.ndarray:
-        """Share of a ray's light that its first hit sends to 1 m^2 of aperture; 0 outside the gate, (N,) [1/m^2]."""
+        """Share of a ray's light that its first hit sends to 1 m^2 of aperture, inside or outside the gate, (N,)."""
         echoes = direct_echoes(self.scene, Beams.of(self.rays), self.hits)
         gain = np.zeros(len(self))
         gain[echoes.ray] = echoes.gain
-        return np.where(self.returned, gain, 0.0)
+        return gain
 
     @cached_property
     def beam_m(self) -> np.ndarray:
