@@ -222,6 +222,13 @@ def test_uniform_rays_are_as_many_as_asked_for_and_all_captured(clean, count):
     assert (found.captured == Captured.YES).all()
 
 
+def test_a_gated_capture_knows_nothing_of_rays_without_gates(clean):
+    gated = replace(clean, start_ps=clean.start_ps + 20.0 * (np.arange(len(clean)) % 2))
+    found = evaluate_capture(gated, [("ball", lay_out(ball_design()))], settings(gated))
+    assert [(row.design, row.gate) for row in found.rows] == [("ball", "own")]
+    assert any("gated" in note for note in found.notes)
+
+
 def test_gates_remove_the_false_peaks_that_lie_outside_them(noisy):
     rays = lay_out(ball_design())
     own, whole, uniform = evaluate_capture(noisy, [("ball", rays)], settings(noisy)).rows

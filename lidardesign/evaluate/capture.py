@@ -92,6 +92,11 @@ class Capture:
         """The first and the last range that any histogram holds [m]."""
         return float(self.start_m.min()), float(self.start_m.max()) + self.bins * self.bin_m
 
+    @property
+    def gated(self) -> bool:
+        """Whether pixels begin to count at different times."""
+        return bool((self.start_ps != self.start_ps[0]).any())
+
     @cached_property
     def spacing_rad(self) -> float | None:
         """The median angle between a pixel and the nearest other one; None for a single pixel."""

@@ -110,7 +110,8 @@ class CaptureEvaluation:
     Arguments:
         capture: What was captured.
         settings: How it was judged.
-        rows: Each design with its gates and without, then `uniform` at their numbers of rays.
+        rows: Each design with its gates and without, then `uniform` at their numbers of rays; of a gated detector
+            only the first.
         ranges_from, surface_from: What ranges and the surface were judged by, in words; None: no surface.
         notes: What a reader should know, one line each.
     """
@@ -167,14 +168,19 @@ def evaluate_capture(
 
     rows = []
     for name, rays in designs:
-        rows += [row(name, OWN, rays), row(name, WHOLE, whole_window(rays, capture))]
-    for count in dict.fromkeys(len(rays) for _, rays in designs):
-        rows.append(row(UNIFORM, WHOLE, uniform_rays(capture, count), baseline=True))
+        rows.append(row(name, OWN, rays))
+        if not capture.gated:
+            rows.append(row(name, WHOLE, whole_window(rays, capture)))
+    if not capture.gated:
+        for count in dict.fromkeys(len(rays) for _, rays in designs):
+            rows.append(row(UNIFORM, WHOLE, uniform_rays(capture, count), baseline=True))
     return CaptureEvaluation(capture, settings, rows, ranges_from, surface_from, _notes(capture, rows))
 
 
 def _notes(capture: Capture, rows: Sequence[CaptureRow]) -> list[str]:
     notes = []
+    if capture.gated:
+        notes.append("the detector was gated: what rays without gates would have measured is not known")
     for row in rows:
         missing = int((row.scan.captured != Captured.YES).sum())
         if missing and row.gate == (WHOLE if row.baseline else OWN):
