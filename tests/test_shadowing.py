@@ -157,3 +157,17 @@ def test_turning_the_world_changes_nothing_that_is_heard():
     assert 20 < len(here) < 380
     assert np.array_equal(here.ray, there.ray)
     assert there.gain == pytest.approx(here.gain, rel=1e-9)
+
+
+@pytest.mark.parametrize("radius_m", [1.0, 30.0, 1000.0])
+def test_a_receiver_just_above_a_large_mesh_sees_all_that_is_lit_there(radius_m):
+    room = trimesh.creation.box(extents=[2 * radius_m] * 3)
+    mesh = Mesh(np.array(room.vertices), np.array(room.faces), "unsigned")
+    generator = np.random.default_rng(0)
+    looking = direction(generator.uniform(0, 2 * math.pi, 1000), generator.uniform(-1.5, -0.3, 1000))
+    place = np.array([0.31, -0.27, 0.05 / radius_m - 1]) * radius_m
+    for aside_m in (0.0, 0.01):
+        receiver = replace(BESIDE, origin_m=tuple(place + np.array([aside_m, 0, 0])), elevation_rad=-math.pi / 2)
+        direct, kept = both(Scene((Body(mesh),), receiver=receiver), looking, tuple(place))
+        # a view of 3 rad leaves out what is flatter than 4 degrees, and no ray is
+        assert len(direct) == len(kept) == 1000

@@ -199,3 +199,26 @@ def test_a_fixed_receiver_hears_through_panes_on_both_ways():
     back_m = math.hypot(3.0, 0.5)
     assert behind.path_m == pytest.approx([(3 + back_m) / 2], abs=1e-9)
     assert behind.gain == pytest.approx([0.9**4 * 0.5 * (3 / back_m) / (math.pi * back_m**2)], rel=1e-9)
+
+
+@pytest.mark.parametrize("radius_m", [1.0, 30.0, 1000.0])
+@pytest.mark.parametrize("height_m", [0.05, 1.0])
+def test_beams_leave_large_meshes_for_good_however_near_they_start(radius_m, height_m):
+    room = trimesh.creation.box(extents=[2 * radius_m] * 3)
+    mesh = Mesh(np.array(room.vertices), np.array(room.faces), "unsigned")
+    scene = Scene((Body(mesh, reflectance=0.1, specular=0.4, transmission=0.3),))
+    generator = np.random.default_rng(0)
+    looking = direction(generator.uniform(0, 2 * math.pi, 1000), generator.uniform(-1.5, -0.5, 1000))
+    direct, led = traced(scene, beams_along(looking, (0.31 * radius_m, -0.27 * radius_m, height_m - radius_m)))
+    # out of a floor at a height the next wall is far: nothing is met where the floor was
+    again = led.path_m < direct.path_m[led.ray] + 1e-3 * radius_m
+    beside_a_wall = np.abs(looking[led.ray, :2] * direct.path_m[led.ray, None]).max(axis=1) > 0.6 * radius_m
+    assert len(led) > 900
+    assert not (again & ~beside_a_wall).any()
+
+
+def test_a_beam_that_starts_on_a_mirror_comes_back_finite():
+    scene = Scene((slab(0.0, reflectance=0.1, specular=0.5, transmission=0.4),))
+    _, led = traced(scene, beams_along(fan()))
+    assert np.isfinite(led.gain).all()
+    assert np.isfinite(led.path_m).all()

@@ -98,9 +98,7 @@ def _cells(starts: np.ndarray, ends: np.ndarray, aperture_m2: float) -> np.ndarr
     return np.maximum.accumulate(np.clip(edges, starts[:, None], ends[:, None]), axis=1)
 
 
-def _haze(
-    rays: Rays, receiver: Receiver | None, medium: Medium, edges_m: np.ndarray, aperture_m2: float
-) -> np.ndarray:
+def _haze(rays: Rays, receiver: Receiver | None, medium: Medium, edges_m: np.ndarray, aperture_m2: float) -> np.ndarray:
     """The share of each ray's light that haze in cells of half paths (N, C + 1) sends into the aperture, (N, C)."""
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
     ranges = np.stack([range_of_path(rays, receiver, column) for column in edges_m.T], axis=1)

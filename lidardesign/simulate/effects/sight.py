@@ -2,22 +2,50 @@
 
 from __future__ import annotations
 
+from weakref import WeakKeyDictionary
+
 import numpy as np
 
-from lidardesign.scene import Scene
+from lidardesign.scene import Mesh, Scene
 from lidardesign.simulate.physics import Tracer
 from lidardesign.simulate.receiver_view import in_view
 
-# Hits on meshes are exact to float32, some 1e-7 of the distances at hand: a hundred times that clears a surface, and
-# is still far below the thickness of any pane.
+# Closed forms round at 1e-15 of a distance or so; this clears a surface and is far below the thickness of any pane.
 CLEARANCE_SHARE = 1e-5
+# Hits on meshes are exact to float32, up to 1e-6 of their radius from as far away as Embree is asked: twice that.
+MESH_CLEARANCE_SHARE = 2e-6
 # A line of sight through more surfaces than this counts as blocked.
 MAXIMUM_SURFACES = 8
 
 
-def clearance_m(distance_m: np.ndarray) -> np.ndarray:
-    """How far off a surface a ray starts or ends [m], so that rounding does not let it meet that surface again."""
-    return CLEARANCE_SHARE * distance_m
+_mesh_radii_m: WeakKeyDictionary[Scene, float] = WeakKeyDictionary()
+
+
+def clearance_m(scene: Scene, distance_m: np.ndarray) -> np.ndarray:
+    """How far off a surface a ray starts or ends, so that rounding does not let it meet that surface again.
+
+    Arguments:
+        scene: Its meshes are as coarse as they are large.
+        distance_m: How far the ray has gone so far, shape (N,) [m].
+    """
+    if scene not in _mesh_radii_m:
+        _mesh_radii_m[scene] = _mesh_radius_m(scene)
+    return CLEARANCE_SHARE * distance_m + MESH_CLEARANCE_SHARE * _mesh_radii_m[scene]
+
+
+def _mesh_radius_m(scene: Scene) -> float:
+    """Half the diagonal around what is traced as one: each moving mesh, or all that rest [m]."""
+    radii_m, resting = [0.0], []
+    for body in scene.bodies:
+        if isinstance(body.shape, Mesh):
+            low, high = body.shape.bounds_m
+            radii_m.append(float(np.linalg.norm(high - low)) / 2)
+            if body.poses.ndim == 2:
+                middle = body.poses[:3, :3] @ (low + high) / 2 + body.poses[:3, 3]
+                resting += [middle - radii_m[-1], middle + radii_m[-1]]
+    if resting:
+        radii_m.append(float(np.linalg.norm(np.ptp(resting, axis=0))) / 2)
+    return max(radii_m)
 
 
 def sight_shares(
@@ -38,7 +66,7 @@ def sight_shares(
     receiver = scene.receiver
     passing = np.array([body.transmission for body in scene.bodies])
     start = np.asarray(receiver.origin_m)
-    ends = points + clearance_m(np.linalg.norm(points - start, axis=1))[:, None] * normal
+    ends = points + clearance_m(scene, np.linalg.norm(points - start, axis=1))[:, None] * normal
     length_m = np.linalg.norm(ends - start, axis=1)
     lit_side = np.einsum("nk,nk->n", normal, start - points) > 0
     share = (in_view(receiver, points) & (lit_side | (length_m == 0))).astype(np.float64)
@@ -50,7 +78,7 @@ def sight_shares(
         blocked = (found.body >= 0) & (met_m < length_m[rows])
         rows, met_m, body = rows[blocked], met_m[blocked], found.body[blocked]
         share[rows] *= passing[body]
-        travelled_m[rows] = met_m + clearance_m(met_m)
+        travelled_m[rows] = met_m + clearance_m(scene, met_m)
         rows = rows[(share[rows] > 0) & (travelled_m[rows] < length_m[rows])]
         if not len(rows):
             return share

@@ -66,8 +66,8 @@ def detours(scene: Scene, beams: Beams, hits: Hits, tracer: Tracer) -> Echoes:
     front = _Front(beams, np.ones(len(beams)), hits)
     echoes = []
     for _ in range(MAXIMUM_TURNS):
-        turned = _followed(front, mirrored, _mirrored(front), tracer)
-        straight = _followed(front, passing, front.beams.direction, tracer)
+        turned = _followed(scene, front, mirrored, _mirrored(front), tracer)
+        straight = _followed(scene, front, passing, front.beams.direction, tracer)
         front = _joined(turned, straight)
         if not len(front.beams):
             break
@@ -81,7 +81,7 @@ def _mirrored(front: _Front) -> np.ndarray:
     return direction - 2 * np.einsum("nk,nk->n", direction, normal)[:, None] * normal
 
 
-def _followed(front: _Front, shares: np.ndarray, direction: np.ndarray, tracer: Tracer) -> _Front:
+def _followed(scene: Scene, front: _Front, shares: np.ndarray, direction: np.ndarray, tracer: Tracer) -> _Front:
     """What beams that go on from their hits with a body's share (bodies,), in directions (B, 3), meet next."""
     passed = np.where(front.hits.body >= 0, shares[front.hits.body] * front.passed, 0.0)
     rows = np.flatnonzero(passed >= FAINTEST_SHARE)
@@ -90,7 +90,7 @@ def _followed(front: _Front, shares: np.ndarray, direction: np.ndarray, tracer: 
     point = beams.origin_m + path_m[:, None] * beams.direction
     cosine = np.abs(np.einsum("nk,nk->n", direction, old.hits.normal))
     # a step along the beam that lifts its start off the surface
-    step_m = clearance_m(path_m) / np.maximum(cosine, 1 / GRAZING_STEPS)
+    step_m = clearance_m(scene, path_m) / np.maximum(cosine, 1 / GRAZING_STEPS)
     found = tracer(point + step_m[:, None] * direction, direction, beams.time_s)
     image = replace(
         beams,
