@@ -8,7 +8,9 @@ without pickle.
 from __future__ import annotations
 
 import atexit
+import contextlib
 import importlib.util
+import io
 import json
 import os
 import queue
@@ -127,9 +129,8 @@ class Worker:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
-            text=True,
-            encoding="utf-8",
-            errors="replace",
+            # a request that is written is gone: nothing is left over to be written to a process that died
+            bufsize=0,
             env=dict(environment),
         )
         self.owner = os.getpid()
@@ -151,12 +152,9 @@ class Worker:
         if not self._started:
             self._await("ready", limit_s)
             self._started = True
-        try:
-            self._process.stdin.write(f"{folder}\n")
-            self._process.stdin.flush()
-        except OSError:
-            # it died since: what it printed last says why
-            self._await("done", limit_s)
+        # if it died since, its last words follow
+        with contextlib.suppress(OSError, ValueError):
+            self._process.stdin.write(f"{folder}\n".encode())
         self._await("done", limit_s)
 
     def end(self) -> None:
@@ -166,8 +164,8 @@ class Worker:
         self._process.stdin.close()
 
     def _read(self) -> None:
-        with self._process.stdout:
-            for line in self._process.stdout:
+        with io.TextIOWrapper(io.BufferedReader(self._process.stdout), "utf-8", "replace") as printed:
+            for line in printed:
                 self._lines.put(line.rstrip("\n"))
         self._lines.put(None)
 
@@ -185,7 +183,9 @@ class Worker:
             if line == word:
                 return
             if line is None:
-                self._process.wait()
+                # for whoever asks again
+                self._lines.put(None)
+                self.end()
                 raise NumericalError(_epitaph(self._process.returncode, printed), hint=HINT)
             printed.append(line)
 
