@@ -13,7 +13,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from drawing import INK, command, save
+from drawing import INK, Camera, command, save
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
@@ -39,32 +39,6 @@ BALL, PATH, EDGE = "#f0a202", "#b45309", "#b8c2cc"
 SHADOW = 0.9
 GRID_M, LINE_PIXELS, LINE_DARKNESS = 0.25, 0.8, 0.07  # lines on the floor
 FLOOR_M = 1.15  # as far as they are drawn to each side
-
-
-class Camera:
-    """A pinhole camera that looks from `EYE_M` to `AIM_M`."""
-
-    def __init__(self) -> None:
-        forward = AIM_M - EYE_M
-        self.forward = forward / np.linalg.norm(forward)
-        right = np.cross(self.forward, [0.0, 0.0, 1.0])
-        self.right = right / np.linalg.norm(right)
-        self.up = np.cross(self.right, self.forward)
-
-    def directions(self) -> np.ndarray:
-        """Unit vectors through all pixels, row by row from above, shape (N, 3)."""
-        across, down = np.meshgrid(*(np.arange(count) + 0.5 for count in PIXELS))
-        right, up = (across - PIXELS[0] / 2), (PIXELS[1] / 2 - down)
-        scale = 2 * HALF_WIDTH / PIXELS[0]
-        rays = self.forward + scale * (right[..., None] * self.right + up[..., None] * self.up)
-        return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).reshape(-1, 3)
-
-    def pixels(self, points_m: np.ndarray) -> np.ndarray:
-        """Where points (..., 3) appear, in pixels from the upper left, shape (..., 2)."""
-        away = points_m - EYE_M
-        depth = away @ self.forward
-        scale = PIXELS[0] / (2 * HALF_WIDTH) / depth
-        return np.stack([PIXELS[0] / 2 + scale * (away @ self.right), PIXELS[1] / 2 - scale * (away @ self.up)], -1)
 
 
 def draw_arm(axes: Axes, camera: Camera, scene: Scene) -> None:
@@ -102,15 +76,15 @@ def ends(returns: Returns, range_m: np.ndarray) -> np.ndarray:
 
 def draw_rays(axes: Axes, camera: Camera, rays: Rays, returns: Returns) -> None:
     """Where rays start, coloured by sensor; all of them faintly to their gates' ends, the ball's returns boldly."""
-    started = camera.pixels(rays.origin_m)
-    edge = camera.pixels(np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1], [-1, -1, 1]], dtype=float))
+    started = camera.project(rays.origin_m)
+    edge = camera.project(np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1], [-1, -1, 1]], dtype=float))
     axes.plot(*edge.T, color=EDGE, linewidth=1.2, linestyle=(0, (4, 3)))
     for sensor in range(SENSORS):
         colour, own = COLOURS[sensor], rays.sensor == sensor
-        heard = np.stack([started, camera.pixels(ends(returns, rays.gate_m[:, 1]))], axis=1)
+        heard = np.stack([started, camera.project(ends(returns, rays.gate_m[:, 1]))], axis=1)
         axes.add_collection(LineCollection(heard[own], colors=colour, linewidths=0.5, alpha=0.13))
         met = own & returns.returned
-        full = np.stack([started, camera.pixels(ends(returns, np.nan_to_num(returns.range_m)))], axis=1)
+        full = np.stack([started, camera.project(ends(returns, np.nan_to_num(returns.range_m)))], axis=1)
         axes.add_collection(LineCollection(full[met], colors=colour, linewidths=1.6))
         axes.plot(*started[own].T, "o", color=colour, markersize=3.0, alpha=0.85, label=f"sensor {sensor}")
 
@@ -119,11 +93,11 @@ def picture(scenes: list[Scene], rays: Rays) -> Figure:
     """The whole picture."""
     figure = Figure(figsize=(PIXELS[0] / 100, PIXELS[1] / 100), dpi=100, facecolor="white")
     FigureCanvasAgg(figure)
-    axes, camera = figure.add_axes((0, 0, 1, 1)), Camera()
+    axes, camera = figure.add_axes((0, 0, 1, 1)), Camera(EYE_M, AIM_M, PIXELS, HALF_WIDTH)
     draw_arm(axes, camera, scenes[0])
     for scene in scenes[1:]:
-        axes.plot(*camera.pixels(scene.truth["ball_m"]).T, color=BALL, linewidth=0.8, alpha=0.6)
-    axes.plot(*camera.pixels(scenes[0].truth["ball_m"]).T, color=PATH, linewidth=2.2)
+        axes.plot(*camera.project(scene.truth["ball_m"]).T, color=BALL, linewidth=0.8, alpha=0.6)
+    axes.plot(*camera.project(scenes[0].truth["ball_m"]).T, color=PATH, linewidth=2.2)
     draw_rays(axes, camera, rays, simulate(scenes[0], rays)[FRAME])
     axes.legend(loc="lower right", frameon=False, fontsize=11, labelcolor=INK, markerscale=2.5, handletextpad=0.1)
     return figure
