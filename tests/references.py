@@ -135,3 +135,24 @@ def quarter_turned(samples):
     low[0], high[0], low[1], high[1] = -high[1], -low[1], low[0], high[0]
     low[3], high[3] = low[3] + math.pi / 2, high[3] + math.pi / 2
     return Samples(points, samples.log_prob, samples.log_target, DesignSpace(tuple(low), tuple(high)))
+
+
+def naive_counts_with_dead_time(pulse_of_photon, bin_of_photon, bins, dead_bins, period_bins):
+    """Counts per bin by following photons through time one after the other; of a pulse's photons in one bin, one."""
+    counts = [0] * bins
+    alive_at = -math.inf
+    for pulse, place in sorted(zip(pulse_of_photon, bin_of_photon, strict=True)):
+        time = pulse * period_bins + place
+        if time >= alive_at:
+            counts[place] += 1
+            alive_at = time + max(dead_bins, 1)
+    return np.array(counts)
+
+
+def first_photon_distribution(arriving):
+    """p_i = (1 - exp(-l_i)) prod_{j<i} exp(-l_j) of expected photons per pulse and bin (B,); the last is for none."""
+    survived, shares = 1.0, []
+    for expected in arriving:
+        shares.append(survived * (1 - math.exp(-expected)))
+        survived *= math.exp(-expected)
+    return np.array([*shares, survived])
