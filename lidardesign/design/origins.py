@@ -18,8 +18,10 @@ import numpy as np
 from lidardesign.design.constraints import SensorConstraints
 from lidardesign.space import DesignSpace
 
-# Origin boxes thinner than this along an axis pin it, and gaps thinner than this are none [m].
+# Origin boxes thinner than this along an axis pin it [m].
 PINNED_BOX_M = 1e-9
+# Gaps between excluded boxes narrower than this, in metres and relative to coordinates, leave no place.
+SMALLEST_GAP = 1e-8
 
 
 class Boxes(NamedTuple):
@@ -75,31 +77,40 @@ def free_boxes(one: SensorConstraints, space: DesignSpace) -> Boxes:
     for bottom, top in zip(*excluded(one), strict=True):
         held = (bottom < middle) & (middle < top)
         if (bottom < top).all() and held[fixed].all():
-            free = _admitted(_without(free, bottom, top, ~fixed), low, high, ~fixed)
+            free = _without(free, bottom, top, low, high, ~fixed)
     return free
 
 
-def _without(boxes: Boxes, bottom: np.ndarray, top: np.ndarray, axes: np.ndarray) -> Boxes:
-    """The maximal boxes inside the union of some maximal boxes that avoid one more box, cut along some axes."""
+def _without(
+    boxes: Boxes, bottom: np.ndarray, top: np.ndarray, low: np.ndarray, high: np.ndarray, axes: np.ndarray
+) -> Boxes:
+    """The maximal boxes inside some others that avoid one more, cut along some axes, with room in [low, high]."""
     met = ((boxes.low_m < top) & (boxes.high_m > bottom) | ~axes).all(axis=1)
-    lows, highs = [boxes.low_m[~met]], [boxes.high_m[~met]]
+    lows, highs = [], []
     for axis in np.flatnonzero(axes):
         below, above = boxes.high_m[met].copy(), boxes.low_m[met].copy()
         below[:, axis] = np.minimum(below[:, axis], bottom[axis])
         above[:, axis] = np.maximum(above[:, axis], top[axis])
         lows += [boxes.low_m[met], above]
         highs += [below, boxes.high_m[met]]
-    return Boxes(np.concatenate(lows), np.concatenate(highs))
+    old = np.concatenate([boxes.low_m, -boxes.high_m], axis=1)[~met]
+    if not lows:
+        return Boxes(old[:, :3], -old[:, 3:])
+    fresh = np.concatenate([np.concatenate(lows), -np.concatenate(highs)], axis=1)
+    fresh = fresh[_roomy(Boxes(fresh[:, :3], -fresh[:, 3:]), low, high, axes)]
+    # no old box lies in a fresh one, which is part of another old box
+    fresh = np.unique(fresh, axis=0)
+    holds = (np.concatenate([old, fresh])[None] <= fresh[:, None]).all(axis=2)
+    corners = np.concatenate([old, fresh[holds.sum(axis=1) == 1]])
+    return Boxes(corners[:, :3], -corners[:, 3:])
 
 
-def _admitted(boxes: Boxes, low: np.ndarray, high: np.ndarray, axes: np.ndarray) -> Boxes:
-    """The boxes that leave room inside [low, high] along some axes, without those that lie in another one."""
+def _roomy(boxes: Boxes, low: np.ndarray, high: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Which boxes leave room inside [low, high] along some axes, shape (M,) bool."""
+    size = np.maximum(np.maximum(np.abs(low), np.abs(high)), 1.0)
+    needed = np.minimum(SMALLEST_GAP * size, (high - low) / 2)
     room = np.minimum(boxes.high_m, high) - np.maximum(boxes.low_m, low)
-    wide = (room > PINNED_BOX_M)[:, axes].all(axis=1) & (boxes.high_m - boxes.low_m > PINNED_BOX_M).all(axis=1)
-    corners = np.unique(np.concatenate([boxes.low_m[wide], -boxes.high_m[wide]], axis=1), axis=0)
-    holds = (corners[None] <= corners[:, None]).all(axis=2)
-    kept = corners[holds.sum(axis=1) == 1]
-    return Boxes(kept[:, :3], -kept[:, 3:])
+    return (room > needed)[:, axes].all(axis=1)
 
 
 def box_around(mean_m: np.ndarray, reach_m: np.ndarray, boxes: Boxes) -> tuple[np.ndarray, np.ndarray]:
