@@ -85,7 +85,8 @@ def _from_photons(scene: Scene, frame: int, light: Light, physics: Physics) -> n
     known = light.pulses * bins.width_m * light.per_metre / (1 + light.per_metre * blind_m)
     counts = histogram(scene, frame, light, physics)
     matched = detector.estimator == "matched"
-    place = find_returns(counts, bins.offset, bins.width_m, sigma_m, half, known, detector.false_alarm, matched)
+    allowed = detector.false_alarm
+    place = find_returns(counts, bins.offset, bins.heard_ends, bins.width_m, sigma_m, half, known, allowed, matched)
     low, high = bins.windows_m[:, 0], bins.windows_m[:, 1]
     return np.clip(bins.first_m + place * bins.width_m, low, np.nextafter(high, low))
 

@@ -23,6 +23,8 @@ from numba import njit
 PULSE_REACH = 4.0
 # With fewer photons outside of the pulse than this, the level that is known beforehand is the better one
 FEW_PHOTONS = 10
+# A level that is measured in less than this many bins is none
+LEAST_BINS = 0.5
 # Above this mean, Poisson's tail is taken as a normal one
 NORMAL_MEAN = 1e5
 # Terms of a tail's sum that are smaller than this share of it do not change it
@@ -112,12 +114,24 @@ def _matched(counts, shape, below, signal, level, score):  # noqa: ANN001, ANN20
 
 
 @njit(cache=True, nogil=True)
-def find_returns(counts, offset, width, sigma, half, known_level, false_alarm, matched):  # noqa: ANN001, ANN201
+def _heard(first, last, size, ends):  # noqa: ANN001, ANN202
+    """How many bins are listened to between two, both included, where the outermost ones are listened to in part."""
+    count = last - first + 1.0
+    if first == 0:
+        count -= 1.0 - ends[0]
+    if last == size - 1:
+        count -= 1.0 - ends[1]
+    return count
+
+
+@njit(cache=True, nogil=True)
+def find_returns(counts, offset, ends, width, sigma, half, known_level, false_alarm, matched):  # noqa: ANN001, ANN201
     """Where each ray's return is, in bins from its first bin's start, NaN without one, shape (N,).
 
-    Arguments are the flat counts and where rays begin in them, a bin's width and a photon's timing error in the same
-    unit, bins on either side of a bin that belong to its pulse, the background per bin that is known beforehand (N,),
-    the allowed probability of a false alarm, and whether to take the matched filter's maximum or the highest bin.
+    Arguments are the flat counts and where rays begin in them, the shares of a ray's first and last bin that lie in its
+    window (N, 2), a bin's width and a photon's timing error in the same unit, bins on either side of a bin that belong
+    to its pulse, the background per bin that is known beforehand (N,), the allowed probability of a false alarm, and
+    whether to take the matched filter's maximum or the highest bin.
     """
     found = np.full(len(offset) - 1, np.nan)
     shape = pulse_shape(width, sigma)
@@ -134,18 +148,19 @@ def find_returns(counts, offset, width, sigma, half, known_level, false_alarm, m
             continue
         middle = _fullest(mine, half)
         pulse = _sum_around(mine, middle, reach)
-        others = size - (min(middle + reach, size - 1) - max(middle - reach, 0) + 1)
-        level = (total - pulse) / others if others > 0 else known_level[i]
+        own = _heard(max(middle - reach, 0), min(middle + reach, size - 1), size, ends[i])
+        others = _heard(0, size - 1, size, ends[i]) - own
+        level = (total - pulse) / others if others > LEAST_BINS else known_level[i]
         if total - pulse < FEW_PHOTONS:
             level = max(level, known_level[i])
         within = 0.0
         if matched:
-            signal = max(pulse - level * (size - others), 1.0)
+            signal = max(pulse - level * own, 1.0)
             # less than one photon in the whole window cannot be told from none
             best, within = _matched(mine, shape, below, signal, max(level, 1.0 / size), score)
         else:
             best = mine.argmax()
-        around = min(best + half, size - 1) - max(best - half, 0) + 1
+        around = _heard(max(best - half, 0), min(best + half, size - 1), size, ends[i])
         if size * at_least(_sum_around(mine, best, half), level * around) <= false_alarm:
             found[i] = best + 0.5 + within
     return found

@@ -59,6 +59,12 @@ class Bins:
             )
         return cls(windows_m, first_m, width_m, np.concatenate([[0], np.cumsum(number.astype(np.int64))]))
 
+    @property
+    def heard_ends(self) -> np.ndarray:
+        """The shares of each ray's first and last bin that lie in its window, shape (N, 2)."""
+        before, after = ((self.windows_m[:, end] - self.first_m) / self.width_m for end in (0, 1))
+        return np.clip(np.stack([1 - before, after - np.diff(self.offset) + 1], axis=1), 0.0, 1.0)
+
     def part(self, begin: int, end: int) -> Bins:
         """The bins of rays begin to end."""
         offset = self.offset[begin : end + 1] - self.offset[begin]
