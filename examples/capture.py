@@ -57,6 +57,7 @@ def main() -> None:
     parser.add_argument("--run", type=Path, help="a run of the task face in sunlight, instead of learning one")
     parser.add_argument("--detector", default="single-photon", help="a detector that counts photons")
     parser.add_argument("--side", type=int, default=128, help="the capture has SIDE x SIDE pixels")
+    parser.add_argument("--head", type=int, default=0, help="which held-out head is captured")
     parser.add_argument("--picture", type=Path, help="where to draw the picture; in the folder by default")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="further settings of `learn`")
     options = parser.parse_args()
@@ -69,7 +70,7 @@ def main() -> None:
         step("What a scanner needs: mirror angles and gates.", "export", design, "--format", "galvo", "--out", file)
 
     run = open_run(learned_run)
-    scene, detector = run.scenes("test", run.config.seed)[0], load_detector(options.detector)
+    scene, detector = run.scenes("test", run.config.seed)[options.head], load_detector(options.detector)
     head, scan = folder / "head.ply", folder / "scan.npz"
     write_mesh(scene, head)
     grid = scanned_rays(run.config.space, options.side)

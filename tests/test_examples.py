@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from lidardesign.export.galvo import is_galvo_file
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 QUICK = ("learning.samples=10000", "learning.coverage_proposals=1024")
 SETTINGS = {
@@ -17,14 +19,15 @@ SETTINGS = {
     "emitter": (QUICK[1], "learning.steps=80", "density.sigma_m=0.02", "train=4", "test=2", "truth_points=1000"),
     # a blurred shelf is learned at once
     "warehouse": (*QUICK, "learning.steps=150", "density.sigma_m=0.1"),
+    "capture": (*QUICK, "learning.steps=50"),
 }
 
 
-def run_example(name: str, folder: Path) -> str:
+def run_example(name: str, folder: Path, *further: str) -> str:
     """What an example prints that ends well."""
     words = [word for setting in SETTINGS[name] for word in ("--set", setting)]
     done = subprocess.run(
-        [sys.executable, EXAMPLES / f"{name}.py", "--out", folder, *words],
+        [sys.executable, EXAMPLES / f"{name}.py", "--out", folder, *words, *further],
         capture_output=True, text=True, check=False, cwd=folder.parent,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr + done.stdout
@@ -56,3 +59,17 @@ def test_emitters_are_designed_beside_a_laser_at_the_detector(tmp_path):
     for name in ("laser", "flood", "floods", "bistatic"):
         assert (tmp_path / "phone" / "run" / "designs" / f"{name}.yaml").exists()
         assert any(line.startswith(name) and line.endswith("%") for line in out.splitlines())
+
+
+@pytest.mark.slow
+def test_a_simulated_laboratory_captures_a_head_and_gates_remove_outliers(tmp_path):
+    run_example("capture", tmp_path / "lab", "--side", "48")
+    assert is_galvo_file(tmp_path / "lab" / "sensors-10.galvo.csv")
+    with open(tmp_path / "lab" / "scan.points.csv", encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["range_m"] and row["design"] == "sensors-10"]
+    shares = {}
+    for gate in ("own", "whole"):
+        outliers = [int(row["outlier"]) for row in rows if row["gate"] == gate]
+        shares[gate] = sum(outliers) / len(outliers)
+    assert shares["own"] < 0.3 * shares["whole"]
+    assert (tmp_path / "lab" / "capture.png").stat().st_size > 10_000
