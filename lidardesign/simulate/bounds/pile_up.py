@@ -8,6 +8,7 @@ concave in K or linear; Jensen), with E K = s / (1 - exp(-s)).
 
 What is left of the echo strays, and is missed or mistaken, as fewer photons do: bounds grow by the difference. Nothing
 of this can be where no pulse has two counts: lost is at most the expected number of counts that are not there.
+Echoes are those that the air leaves, and haze is part of what they are mistaken for.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | Non
 def stake(sight: Sight, counts: Counts) -> Stake:
     """Of counts that blind it."""
     sigma_m = sight.sigma_m()
-    echo = counts.signal_per_pulse
+    echo = safe_divide(counts.in_air, counts.pulses)
     haze = counts.haze_per_pulse[0]
     before = counts.background_per_metre * sight.before_m + haze
     whole = counts.background_per_metre * sight.width_m + haze + echo
@@ -44,7 +45,7 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     covered = np.floor((photons.dead_s + sight.width_m / metres(1)) * photons.repetition_hz)
     awake = 1 / (1 + covered * -np.expm1(-whole))
     left = counts.pulses * awake * np.exp(-before) * first
-    gone = counts.signal - left
+    gone = counts.in_air - left
     several = np.maximum(safe_divide(echo, first, 1.0), 1.0)
     early = np.minimum(np.sqrt(2 * np.log(several)), (several - 1) / math.sqrt(math.pi))
     squared = (sigma_m * early) ** 2 + _strayed(counts, left, sigma_m)
@@ -55,7 +56,7 @@ def stake(sight: Sight, counts: Counts) -> Stake:
 
 def _strayed(counts: Counts, left: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
     """Variance by what is not there: all of the error where many photons are gone, its share where few are."""
-    gone = changed_share(counts.signal, left)
+    gone = changed_share(counts.in_air, left)
     error = counts.error_m(left, sigma_m) ** 2
     if counts.sight.detector.estimator == "matched":
         return error * gone
@@ -65,8 +66,9 @@ def _strayed(counts: Counts, left: np.ndarray, sigma_m: np.ndarray) -> np.ndarra
 def _beaten(counts: Counts, left: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
     """How much more often fewer photons are missed, and how often they are mistaken."""
     per_bin = counts.per_bin
-    missed = counts.missed(left, per_bin, sigma_m) - counts.missed(counts.signal, per_bin, sigma_m)
-    return np.clip(missed + counts.mistaken(left, per_bin, per_bin, sigma_m), 0.0, 1.0)
+    fullest = per_bin + counts.pulses * counts.haze_per_pulse[1]
+    missed = counts.missed(left, per_bin, sigma_m) - counts.missed(counts.in_air, per_bin, sigma_m)
+    return np.clip(missed + counts.mistaken(left, fullest, per_bin, sigma_m), 0.0, 1.0)
 
 
 def _typical(sight: Sight, whole: np.ndarray) -> float:
