@@ -17,11 +17,13 @@ import numpy as np
 from lidardesign.errors import ConfigError
 from lidardesign.run.validation import suggest
 from lidardesign.scene import Scene
+from lidardesign.simulate.bistatic import path_windows
 from lidardesign.simulate.bounds import MODULES
 from lidardesign.simulate.bounds.counts import Counts
 from lidardesign.simulate.bounds.sight import Sight, Stake
 from lidardesign.simulate.cost import predicted_seconds
 from lidardesign.simulate.detector import IDEAL, Detector
+from lidardesign.simulate.histogram import check_windows
 from lidardesign.simulate.physics import EFFECTS, Physics
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.returns import Rays
@@ -147,8 +149,10 @@ class Planner:
             casters: One per frame; None builds them where a ray has to be cast.
 
         Raises:
-            ConfigError: An effect that was named cannot be simulated here.
+            ConfigError: An effect that was named cannot be simulated here, or a gate lies outside the histogram.
         """
+        for rays in lists:
+            check_windows(path_windows(rays, scene.receiver), self.detector)
         found = _bounds(scene, lists, self.detector, casters)
         missing = {name: _missing(name) for name in self._asked(found)}
         on = self._chosen(found, missing)
