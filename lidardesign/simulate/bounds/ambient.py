@@ -40,7 +40,10 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     any_count = -np.expm1(-per_bin * counts.bins)
     hidden = np.maximum(counts.missed(signal, per_bin, sigma_m) - counts.missed(signal, 0.0, sigma_m), 0.0)
     wrong = np.minimum(counts.mistaken(signal, per_bin, per_bin, sigma_m), any_count)
-    invented = np.minimum(sight.detector.false_alarm, any_count)
+    # light that is no echo makes a return where one count is enough, and none where background asks for more
+    stray = counts.leaked(sigma_m) + counts.pulses * counts.haze_per_pulse[0]
+    unmade = np.where(counts.needed(per_bin) > 1, -np.expm1(-stray), 0.0)
+    invented = np.minimum(np.minimum(sight.detector.false_alarm, any_count) + unmade, 1.0)
     lost = np.where(sight.returned, np.minimum(wrong + hidden, 1.0), invented)
     squared = np.minimum(_strayed(counts, signal, sigma_m), sight.width_m) ** 2
     return Stake(squared, lost, _reason(sight, float(np.median(per_bin * counts.bins))))

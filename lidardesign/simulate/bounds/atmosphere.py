@@ -2,8 +2,9 @@ r"""Fog and haze: light that fades, and light that comes back from the air itsel
 
 Over a range R the air leaves exp(-2 alpha R) of an echo's photons: the range strays more and returns are lost, as
 from fewer photons. Haze sends h counts into a bin, most at the gate's start; it is taken for the echo with at most
-(B - 1) exp(-(sqrt(s) - sqrt(h))^2) (see `Counts.mistaken`), and for a return by a ray that has none wherever its
-fullest bin reaches the threshold, bounded by B times Poisson's tail there, and by 1 - exp(-all of its counts).
+(B - 1) exp(-(sqrt(s) - sqrt(h))^2) (see `Counts.mistaken`), and raises the level that an echo has to stand out from. A
+ray without a return may take it for one where any of it is counted: 1 - exp(-all of its counts), as one count is enough
+in the dark.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lidardesign.scene import Scene
-from lidardesign.simulate.bounds.counts import Counts, changed_share, needed_counts
+from lidardesign.simulate.bounds.counts import Counts, changed_share
 from lidardesign.simulate.bounds.sight import Sight, Stake
 from lidardesign.simulate.detector import Detector
 from lidardesign.simulate.returns import Rays
@@ -39,17 +40,7 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     squared = counts.error_m(left, sigma_m) ** 2 * np.minimum(
         2 * np.sqrt(changed_share(clear, left)) + any_count, 1.0
     )
-    lost = np.where(sight.returned, np.maximum(fewer, 0.0) + wrong, _invented(counts, haze, fullest))
+    lost = np.where(sight.returned, np.maximum(fewer, 0.0) + wrong, any_count)
     medium = sight.scene.medium
     reason = f"air that dims light by {100 * -np.expm1(-2 * medium.extinction_per_m):.3g} % per metre of range"
     return Stake(squared, np.minimum(lost, 1.0), reason)
-
-
-def _invented(counts: Counts, haze: np.ndarray, fullest: np.ndarray) -> np.ndarray:
-    """Probability that haze alone makes a return, at most."""
-    from scipy.special import pdtr
-
-    background = counts.pulse_bins * counts.per_bin
-    needed = needed_counts(background, counts.bins, counts.sight.detector.false_alarm)
-    reached = 1 - pdtr(needed - 1, counts.pulse_bins * fullest + background)
-    return np.minimum(counts.bins * reached, -np.expm1(-haze))

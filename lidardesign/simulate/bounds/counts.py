@@ -107,6 +107,10 @@ class Counts:
         """How many bins a pulse is wide, at half of its height: 2 half + 1."""
         return 2 * int(FWHM_PER_SIGMA * metres(self.sight.detector.timing_sigma_s) / (2 * self.bin_m)) + 1
 
+    def needed(self, per_bin: np.ndarray) -> np.ndarray:
+        """The fewest counts in a pulse's width that are reported in so much background per bin (N,), shape (N,)."""
+        return needed_counts(per_bin * self.pulse_bins, self.bins, self.sight.detector.false_alarm)
+
     def missed(self, signal: np.ndarray, per_bin: np.ndarray | float, sigma_m: np.ndarray) -> np.ndarray:
         """Probability that the echo's bins hold fewer counts than it takes to be reported, shape (N,).
 
@@ -117,9 +121,9 @@ class Counts:
         """
         from scipy.special import pdtr
 
-        background = np.broadcast_to(per_bin, signal.shape) * self.pulse_bins
-        needed = needed_counts(background, self.bins, self.sight.detector.false_alarm)
-        return pdtr(needed - 1, signal * share_in_bins(self.pulse_bins, self.bin_m, sigma_m) + background)
+        per_bin = np.broadcast_to(per_bin, signal.shape)
+        expected = signal * share_in_bins(self.pulse_bins, self.bin_m, sigma_m) + per_bin * self.pulse_bins
+        return pdtr(self.needed(per_bin) - 1, expected)
 
     def mistaken(
         self, signal: np.ndarray, other: np.ndarray, per_bin: np.ndarray, sigma_m: np.ndarray
