@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +19,12 @@ from lidardesign_tasks.warehouse import WarehouseTask
 from pydantic import ValidationError
 
 from lidardesign.scene import Ambient
+from lidardesign.simulate.detector_files import load_detector
+from lidardesign.simulate.physics import Physics
+from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.raycast import shared_caster
+from lidardesign.simulate.returns import Outcome, Rays
+from lidardesign.simulate.simulate import simulate
 from lidardesign.space import direction
 
 TASKS = {task.name: task() for task in (FaceTask, EmitterTask, MeshesTask, ArmTask, WarehouseTask, FlatlandTask)}
@@ -120,3 +127,27 @@ def test_surroundings_that_cannot_be_are_refused(wrong):
 
 def test_darkness_is_no_light_at_all(folder):
     assert scene_of("flatland", folder, illuminance_lux=0).ambient is None
+
+
+def test_the_guides_surroundings_change_what_a_photon_counter_reports(folder):
+    page = Path(__file__).parents[1] / "docs" / "writing-tasks.md"
+    (block,) = re.findall(r"```python\n(from dataclasses.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    namespace: dict[str, object] = {}
+    exec(block, namespace)  # the page's own text
+    calm = scene_of("face", folder)
+    outdoors = namespace["at_noon_in_haze"](calm)
+    assert outdoors.truth is calm.truth
+    turn = np.linspace(-0.25, 0.25, 12)
+    azimuth, elevation = map(np.ravel, np.meshgrid(math.pi + turn, turn))
+    looking, count = direction(azimuth, elevation), len(azimuth)
+    places = np.tile([0.4, 0.0, 0.0], (count, 1))
+    rays = Rays(places, looking, np.tile([0.05, 1.05], (count, 1)), np.zeros(count), np.zeros(count))
+    planner = Planner(load_detector("single-photon"))
+    names = {"ambient", "atmosphere", "specular", "pile_up"}
+    assert names <= planner.plan(outdoors, [rays]).effects
+    assert not names & (planner.plan(calm, [rays]).effects - {"ambient"})
+    effects = planner.plan(outdoors, [rays]).effects - {"multipath"}
+    (returns,) = simulate(outdoors, rays, physics=Physics(planner.detector, effects))
+    found = set(returns.outcome.tolist())
+    assert Outcome.RETURN in found
+    assert (returns.returned & (returns.body == -1)).any() or Outcome.NOT_DETECTED in found
