@@ -201,6 +201,13 @@ def test_a_single_pixel_needs_an_angle(clean):
     assert uniform_rays(one, 4).direction == pytest.approx(np.repeat(clean.direction[:1], 4, axis=0))
 
 
+def test_pixels_that_were_captured_twice_are_as_far_apart_as_before(clean):
+    twice = Capture(
+        np.repeat(clean.counts, 2, axis=0), BIN_PS, START_PS, np.zeros(3), np.repeat(clean.direction, 2, axis=0)
+    )
+    assert twice.spacing_rad == pytest.approx(clean.spacing_rad, rel=1e-6)
+
+
 def test_the_matched_filter_needs_to_know_the_pulse(clean):
     with pytest.raises(DataError, match="pulse_fwhm_ps"):
         scan_pixels(replace(clean, pulse_fwhm_ps=None), Estimation("matched"))

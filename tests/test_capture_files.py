@@ -127,6 +127,7 @@ WRONG = {
     "NaN counts": (changed(counts=at((1, 2, 3), np.nan)), "nan in pixel 7, bin 3"),
     "infinite counts": (changed(counts=at((1, 2, 3), np.inf)), "inf in pixel 7, bin 3"),
     "negative counts": (changed(counts=at((0, 4, 599), -1)), "-1.0 in pixel 4, bin 599"),
+    "counts beyond counting": (changed(counts=at((0, 0, 0), 1e300)), "1e.300 in pixel 0, bin 0"),
     "averaged counts": (changed(counts=lambda c: c / 10), "whole numbers"),
     "no photons": (changed(counts=lambda c: 0 * c), "no photon"),
     "complex counts": (changed(counts=lambda c: c * 1j), "complex"),

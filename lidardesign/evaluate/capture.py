@@ -37,6 +37,10 @@ BIN_LIMITS_PS = (1e-3, 1e6)
 LATEST_PS = 1e11
 # Directions of float32 are unit vectors to 1e-7; further ones are no directions.
 UNIT_TOLERANCE = 1e-3
+# Pixels that look the same way to so many decimals are one place, captured more than once.
+SAME_DIRECTION_DECIMALS = 9
+# More photons than this in a bin are no photons; sums over all bins stay whole numbers of 64 bits.
+MOST_COUNTS = 1 << 40
 # Surfaces fill few stretches of a histogram; the middle one of so many is background.
 STRETCHES = 16
 # Counts are checked so many numbers at a time, which bounds memory.
@@ -99,12 +103,13 @@ class Capture:
 
     @cached_property
     def spacing_rad(self) -> float | None:
-        """The median angle between a pixel and the nearest other one; None for a single pixel."""
+        """The median angle between a pixel and the nearest that looks elsewhere; None where all look one way."""
         from scipy.spatial import cKDTree
 
-        if len(self) < 2:
+        apart = np.unique(np.round(self.direction, SAME_DIRECTION_DECIMALS), axis=0)
+        if len(apart) < 2:
             return None
-        chord = cKDTree(self.direction).query(self.direction, k=2)[0][:, 1]
+        chord = cKDTree(apart).query(apart, k=2)[0][:, 1]
         return float(np.median(2 * np.arcsin(np.minimum(chord / 2, 1.0))))
 
     @cached_property
@@ -235,6 +240,7 @@ def _check_counts(counts: np.ndarray, where: str) -> None:
             _refuse_counts(bad, part, first, "finite numbers", where)
             _refuse_counts(part != np.floor(part), part, first, "whole numbers of photons", where)
         _refuse_counts(part < 0, part, first, "0 or more", where)
+        _refuse_counts(part > MOST_COUNTS, part, first, f"at most {MOST_COUNTS:.3g}", where)
         seen = seen or bool(part.any())
     if not seen:
         raise DataError("counts are all zero: no photon was captured", where=where)

@@ -20,11 +20,13 @@ from lidardesign.errors import DataError, LidardesignError
 LARGEST_BYTES = 1 << 30
 SUFFIXES = (".npz", ".mat")
 NUMERIC_KINDS = "buif"
-MATLAB_NUMBERS = frozenset(
-    {"double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))}
-)
-# Numbers of MATLAB files take at most so many bytes; smaller ones are only known once they are read.
-LARGEST_NUMBER_BYTES = 8
+# Bytes of a number of each MATLAB class.
+MATLAB_NUMBERS = {
+    "double": 8,
+    "single": 4,
+    "logical": 1,
+    **{f"{sign}int{bits}": bits // 8 for sign in ("", "u") for bits in (8, 16, 32, 64)},
+}
 LARGEST_HEADER_BYTES = 10_000
 
 
@@ -129,7 +131,7 @@ def _read_matlab(path: Path) -> dict[str, np.ndarray]:
     listed = whosmat(path, appendmat=False)
     for name, _, kind in listed:
         _check_class(name, kind, where)
-    _check_size(sum(math.prod(shape) * LARGEST_NUMBER_BYTES for _, shape, _ in listed), "its arrays as doubles", where)
+    _check_size(sum(math.prod(shape) * MATLAB_NUMBERS[kind] for _, shape, kind in listed), "its arrays", where)
     found = loadmat(path, appendmat=False)
     arrays = {name: np.asarray(found[name]) for name, _, _ in listed}
     for name, array in arrays.items():

@@ -58,7 +58,15 @@ def measured(
         known = np.full(end - begin, capture.background_per_bin)
         sigma_ps = pulse_ps / FWHM_PER_SIGMA
         place[begin:end] = find_returns(
-            counts, offset, np.ones((end - begin, 2)), capture.bin_ps, sigma_ps, half, known, estimation.false_alarm, matched
+            counts,
+            offset,
+            np.ones((end - begin, 2)),
+            capture.bin_ps,
+            sigma_ps,
+            half,
+            known,
+            estimation.false_alarm,
+            matched,
         )
     return capture.start_m[pixel] + (first + place) * capture.bin_m, photons
 

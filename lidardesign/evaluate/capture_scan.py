@@ -132,10 +132,14 @@ def default_within_rad(capture: Capture) -> float:
     """The angle within which a pixel stands for a ray: as far as neighbouring pixels are apart.
 
     Raises:
-        ConfigError: A single pixel has no neighbour.
+        ConfigError: All pixels look one way.
     """
     if capture.spacing_rad is None:
-        raise ConfigError("a single pixel has no spacing to go by", where="--within-deg", allowed="an angle in degrees")
+        raise ConfigError(
+            "all pixels look one way, so that there is no spacing to go by",
+            where="--within-deg",
+            allowed="an angle in degrees",
+        )
     return capture.spacing_rad
 
 
