@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import importlib.metadata
 import importlib.util
 import io
 import json
@@ -30,7 +31,8 @@ import numpy as np
 from lidardesign.errors import ConfigError, NumericalError
 
 WORKER = "lidardesign.simulate.light_transport_worker"
-PACKAGES = ("mitsuba", "mitransient", "drjit")
+# The simulator's packages and the oldest versions that answer as its tests expect.
+PACKAGES = {"mitsuba": (3, 9), "mitransient": (1, 3), "drjit": (1, 0)}
 # Older ones cannot select instructions for the kernels and abort (14 to 16), or are refused.
 OLDEST_LLVM = 19
 LLVM_FOLDERS = (
@@ -56,6 +58,10 @@ def missing() -> str | None:
     absent = [name for name in PACKAGES if importlib.util.find_spec(name) is None]
     if absent:
         return f"not installed: {', '.join(absent)}"
+    for name, oldest in PACKAGES.items():
+        found = importlib.metadata.version(name)
+        if tuple(int(part) for part in re.findall(r"\d+", found)[:2]) < oldest:
+            return f"{name} {found} is too old: {'.'.join(map(str, oldest))} or newer is needed"
     if llvm_library() is None:
         return f"no LLVM library of version {OLDEST_LLVM} or newer was found"
     return None
