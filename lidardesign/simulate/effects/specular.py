@@ -4,9 +4,10 @@ At every surface a beam goes on twice, mirrored with the share `specular` and st
 `transmission`; nothing is drawn at random. What it meets sends light back. A ray that is heard at its own origin is
 heard through the pixel that it was sent from, so its light comes back the way it went and meets every mirror and pane
 twice: an emitter behind a mirror is its image there, and an echo is that of the image, times the square of the share
-that went out. A fixed receiver elsewhere hears a lit surface straight, through glass but by no mirror. Mirrors are
-flat over the width of a beam: curved ones neither gather nor spread it. Panes do not bend light. A mirror that a beam
-meets squarely enough to shine back into the receiver is not taken for an echo.
+that went out. A fixed receiver elsewhere hears a lit surface straight, through glass but by no mirror; rays that start
+where it stands are heard as without one. Mirrors are flat over the width of a beam: curved ones neither gather nor
+spread it. Panes do not bend light. A mirror that a beam meets squarely enough to shine back into the receiver is not
+taken for an echo.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from lidardesign.simulate.echoes import Beams, Echoes
 from lidardesign.simulate.effects.sight import clearance_m, sight_shares
 from lidardesign.simulate.hits import Hits
 from lidardesign.simulate.physics import Tracer, direct_echoes
+from lidardesign.simulate.receiver_view import in_view
 
 # Beams that have met more surfaces than this are given up: four panes, in and out.
 MAXIMUM_TURNS = 8
@@ -35,11 +37,13 @@ class _Front:
 
     Arguments:
         beams: Images of the emitter and directions from there, any order of rays; shares are of what is left.
+        number: Which of the beams that left the emitter each comes from, shape (B,).
         passed: What is left of a beam's light, between 0 and 1, shape (B,).
         hits: What they meet, ranges from the image on.
     """
 
     beams: Beams
+    number: np.ndarray
     passed: np.ndarray
     hits: Hits
 
@@ -47,6 +51,7 @@ class _Front:
         beams, hits = self.beams, self.hits
         return _Front(
             Beams(*(column[chosen] for column in _columns(beams))),
+            self.number[chosen],
             self.passed[chosen],
             Hits(hits.range_m[chosen], hits.body[chosen], hits.normal[chosen]),
         )
@@ -63,7 +68,7 @@ def detours(scene: Scene, beams: Beams, hits: Hits, tracer: Tracer) -> Echoes:
     """
     mirrored = np.array([body.specular for body in scene.bodies])
     passing = np.array([body.transmission for body in scene.bodies])
-    front = _Front(beams, np.ones(len(beams)), hits)
+    front = _Front(beams, np.arange(len(beams)), np.ones(len(beams)), hits)
     echoes = []
     for _ in range(MAXIMUM_TURNS):
         turned = _followed(scene, front, mirrored, _mirrored(front), tracer)
@@ -71,7 +76,7 @@ def detours(scene: Scene, beams: Beams, hits: Hits, tracer: Tracer) -> Echoes:
         front = _joined(turned, straight)
         if not len(front.beams):
             break
-        echoes.append(_heard(scene, front, tracer))
+        echoes.append(_heard(scene, beams, front, tracer))
     return Echoes.joined([*echoes, _no_echoes()])
 
 
@@ -98,15 +103,30 @@ def _followed(scene: Scene, front: _Front, shares: np.ndarray, direction: np.nda
         direction=direction,
         share=beams.share * shares[old.hits.body],
     )
-    return _Front(image, passed[rows], Hits(path_m + step_m + found.range_m, found.body, found.normal))
+    return _Front(image, old.number, passed[rows], Hits(path_m + step_m + found.range_m, found.body, found.normal))
 
 
-def _heard(scene: Scene, front: _Front, tracer: Tracer) -> Echoes:
+def _heard(scene: Scene, beams: Beams, front: _Front, tracer: Tracer) -> Echoes:
     """The echoes of what beams meet, where they are heard."""
     front = front.kept(front.hits.body >= 0)
     if scene.receiver is None:
-        squared = replace(front.beams, share=front.beams.share * front.passed)
-        return direct_echoes(scene, squared, front.hits)
+        return _heard_back(scene, front)
+    together = (beams.origin_m[front.number] == np.asarray(scene.receiver.origin_m)).all(axis=1)
+    back = front.kept(together)
+    image = beams.origin_m[back.number] + back.hits.range_m[:, None] * beams.direction[back.number]
+    back = back.kept(in_view(scene.receiver, image))
+    return Echoes.joined(
+        [_heard_back(replace(scene, receiver=None), back), _heard_elsewhere(scene, front.kept(~together), tracer)]
+    )
+
+
+def _heard_back(scene: Scene, front: _Front) -> Echoes:
+    """The way that the light came."""
+    return direct_echoes(scene, replace(front.beams, share=front.beams.share * front.passed), front.hits)
+
+
+def _heard_elsewhere(scene: Scene, front: _Front, tracer: Tracer) -> Echoes:
+    """Straight from what is lit, by a fixed receiver."""
     echoes = direct_echoes(scene, front.beams, front.hits)
     point = front.beams.origin_m + front.hits.range_m[:, None] * front.beams.direction
     share = sight_shares(scene, point, front.hits.normal, front.beams.time_s, tracer)
@@ -117,6 +137,7 @@ def _joined(first: _Front, second: _Front) -> _Front:
     hits = (first.hits, second.hits)
     return _Front(
         Beams(*(np.concatenate(pair) for pair in zip(_columns(first.beams), _columns(second.beams), strict=True))),
+        np.concatenate([first.number, second.number]),
         np.concatenate([first.passed, second.passed]),
         Hits(*(np.concatenate([getattr(one, name) for one in hits]) for name in ("range_m", "body", "normal"))),
     )
