@@ -95,9 +95,11 @@ def _matched(counts, shape, below, signal, level, score):  # noqa: ANN001, ANN20
     """
     size, reach = len(counts), len(shape) // 2
     weight = np.log1p(signal / level * shape)
-    for b in range(size):
-        inside = below[min(reach, size - 1 - b) + reach + 1] - below[max(-reach, -b) + reach]
-        score[b] = -signal * inside
+    score[:size] = -signal
+    for edge in range(min(reach, size)):
+        for b in (edge, size - 1 - edge):
+            inside = below[min(reach, size - 1 - b) + reach + 1] - below[max(-reach, -b) + reach]
+            score[b] = -signal * inside
     for b in range(size):
         if counts[b] > 0:
             for j in range(max(-reach, b - size + 1), min(reach, b) + 1):
