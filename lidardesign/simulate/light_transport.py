@@ -185,6 +185,7 @@ def render_transient(
     samples: int = 1,
     seed: int = 0,
     direct: bool = True,
+    matt: bool = False,
     own_light: bool = False,
     cone_sr: np.ndarray | None = None,
     baseline_m: np.ndarray | None = None,
@@ -198,11 +199,11 @@ def render_transient(
         rays: What is looked along, N of them; gates play no part.
         lights: Where light comes from, M of them.
         bins: Path lengths to tell apart.
-        bounces: Most surfaces that light meets: 1 for the direct component, which one sample gives exactly for thin
-            rays and one light.
+        bounces: Most surfaces that light meets: 1 is the direct component, exact for thin rays, one light, one sample.
         samples: Light paths per ray; standard errors fall with its root.
         seed: Of the simulator's random numbers; a ray's depend on its number in the list, and on samples and bins.
         direct: Whether light that meets one surface alone counts.
+        matt: Whether mirrors and glass swallow the light that they do not scatter.
         own_light: Whether ray n sees light n alone; otherwise all of them.
         cone_sr: Solid angle around each ray that its radiance is the mean of [sr], shape (N,); None: thin rays.
         baseline_m: Length to take off the paths of each ray [m], shape (N,); None: 0.
@@ -219,7 +220,7 @@ def render_transient(
         return Transients(bins, nothing, nothing, np.zeros(0), np.zeros(count))
     first = shared_caster(scene, frame).first_hit(rays.origin_m, rays.direction)
     centre_m, reach_m = _neighbourhood(first, rays, lights)
-    shapes, arrays = exported(scene, frame, centre_m, reach_m)
+    shapes, arrays = exported(scene, frame, centre_m, reach_m, matt=matt)
     columns = _ray_columns(rays, first, centre_m, cone_sr)
     columns["baseline"] = bins.start_m + (np.zeros(count) if baseline_m is None else baseline_m)
     columns["dark_radius"] = np.full(count, 0.0 if direct else SAME_PLACE * reach_m)

@@ -49,8 +49,8 @@ HINT = (
     "pip install 'lidardesign[transport]' and an LLVM library of version 19 or newer (Debian, Ubuntu: apt install "
     f"libllvm19), or name one in {LLVM_VARIABLE}"
 )
-# The end of what the simulator printed is enough to tell what went wrong.
-LAST_LINES = 12
+# What names an error, or else the end of what was printed, is enough to tell what went wrong.
+SHOWN_LINES = 4
 
 
 def missing() -> str | None:
@@ -199,7 +199,8 @@ class Worker:
 def _epitaph(code: int, printed: list[str]) -> str:
     names = {int(number): number.name for number in signal.Signals}
     cause = f"was ended by {names.get(-code, -code)}" if code < 0 else f"ended with exit code {code}"
-    said = "\n".join(line for line in printed[-LAST_LINES:] if line.strip())
+    errors = [line.strip() for line in printed if "error" in line.lower()]
+    said = "\n".join((errors or [line for line in printed if line.strip()])[-SHOWN_LINES:])
     return f"the light-transport simulator's process {cause}" + (f"; it said:\n{said}" if said else "")
 
 

@@ -20,7 +20,7 @@ _BOX_QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 
 
 
 def exported(
-    scene: Scene, frame: int, centre_m: np.ndarray, reach_m: float
+    scene: Scene, frame: int, centre_m: np.ndarray, reach_m: float, *, matt: bool = False
 ) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
     """The shapes of a frame as JSON and their arrays.
 
@@ -29,11 +29,14 @@ def exported(
         frame: The time frame.
         centre_m: What becomes the origin, shape (3,) [m].
         reach_m: The furthest distance from it that is looked at [m].
+        matt: Whether what mirrors and glass do not scatter is lost.
     """
     shapes, arrays = [], {}
     for number, body in enumerate(scene.bodies):
         document, own = _shape(body, frame, centre_m, reach_m)
-        shares = {name: float(getattr(body, name)) for name in ("reflectance", "specular", "transmission")}
+        shares = {"reflectance": float(body.reflectance), "specular": 0.0, "transmission": 0.0}
+        if not matt:
+            shares |= {"specular": float(body.specular), "transmission": float(body.transmission)}
         shapes.append({**document, **shares})
         arrays.update({f"{name}{number}": values for name, values in own.items()})
     return shapes, arrays

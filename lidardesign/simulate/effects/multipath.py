@@ -14,7 +14,8 @@ Which detours a receiver hears depends on what is lit and what is looked at whil
 
 Paths have up to `MOST_SURFACES` surfaces. A spot has a size, within which its light grows no stronger: without it, the
 few paths that end next to a spot in a crease would be worth any amount; light within a spot's own size is not told from
-its direct echo. Beams are thin, and nothing moves within a frame. What arrives earlier than a ray's direct echo by more
+its direct echo. Beams are thin, and nothing moves within a frame. Mirrors and glass are left to `specular`: here they
+swallow what they do not scatter, so that no light is heard twice. What arrives earlier than a ray's direct echo by more
 than the emitters are apart (from nearer surfaces at the edge of its pixel) is left out. Estimates are unbiased up to
 that; their noise falls with the root of `PATHS`, which all rays share.
 
@@ -178,6 +179,7 @@ class _View:
             self._looks(),
             lights,
             self.bins,
+            matt=True,
             samples=self.samples,
             seed=self.seed,
             baseline_m=self.start_m,
