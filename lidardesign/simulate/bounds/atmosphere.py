@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lidardesign.scene import Scene
-from lidardesign.simulate.bounds.counts import Counts, changed_share
+from lidardesign.simulate.bounds.counts import Counts, Echo, changed_share
 from lidardesign.simulate.bounds.sight import Sight, Stake
 from lidardesign.simulate.detector import Detector
 from lidardesign.simulate.returns import Rays
@@ -33,14 +33,13 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     clear, left = counts.signal, counts.in_air
     haze, fullest = (counts.pulses * part for part in counts.haze_per_pulse)
     # haze raises the level of background that a return has to stand out from
-    level = counts.per_bin + haze / counts.bins
-    fewer = counts.missed(left, level, sigma_m) - counts.missed(clear, counts.per_bin, sigma_m)
+    fewer = counts.more_missed(Echo(clear, sigma_m), Echo(left, sigma_m, haze / counts.bins))
     any_count = -np.expm1(-haze)
     wrong = np.minimum(counts.mistaken(left, counts.per_bin + fullest, counts.per_bin, sigma_m), any_count)
     squared = counts.error_m(left, sigma_m) ** 2 * np.minimum(
         2 * np.sqrt(changed_share(clear, left)) + any_count, 1.0
     )
-    lost = np.where(sight.returned, np.maximum(fewer, 0.0) + wrong, any_count)
+    lost = np.where(sight.returned, fewer + wrong, any_count)
     medium = sight.scene.medium
     reason = f"air that dims light by {100 * -np.expm1(-2 * medium.extinction_per_m):.3g} % per metre of range"
     return Stake(squared, np.minimum(lost, 1.0), reason)

@@ -23,6 +23,21 @@ PEAK_STRAY = 1.5
 
 
 @dataclass(frozen=True, eq=False)
+class Echo:
+    """What arrives of the echoes of N rays.
+
+    Arguments:
+        signal: Counts, shape (N,).
+        sigma_m: How far one photon strays, shape (N,) [m].
+        level: Counts per bin besides ambient and dark ones, shape (N,).
+    """
+
+    signal: np.ndarray
+    sigma_m: np.ndarray
+    level: np.ndarray | float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
 class Counts:
     """Counts per frame of every ray of a sight, for a detector that counts photons.
 
@@ -124,6 +139,15 @@ class Counts:
         per_bin = np.broadcast_to(per_bin, signal.shape)
         expected = signal * share_in_bins(self.pulse_bins, self.bin_m, sigma_m) + per_bin * self.pulse_bins
         return pdtr(self.needed(per_bin) - 1, expected)
+
+    def more_missed(self, before: Echo, after: Echo) -> np.ndarray:
+        """How much more often an echo is missed, in the light of the surroundings or in the dark, shape (N,)."""
+        changes = [
+            self.missed(after.signal, level + after.level, after.sigma_m)
+            - self.missed(before.signal, level + before.level, before.sigma_m)
+            for level in (self.per_bin, np.zeros_like(self.per_bin))
+        ]
+        return np.maximum(np.maximum(*changes), 0.0)
 
     def mistaken(
         self, signal: np.ndarray, other: np.ndarray, per_bin: np.ndarray, sigma_m: np.ndarray

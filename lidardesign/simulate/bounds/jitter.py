@@ -4,7 +4,7 @@ Without photons each return has one normal error, (c / 2) sigma_j rms. With n ph
 (c / 2) sigma_j / sqrt(n). The highest bin does not average; with timing errors it strays as `estimate_error_m` says of
 pulse and timing together, and without them it strayed by itself, so that the two differ by at most
 sqrt(e(sigma_p, sigma_j)^2 + e(sigma_p)^2). A wider echo is also lower: returns are lost where it now falls below what
-is reported.
+is reported, and surfaces outside a gate spill more photons into it.
 
 The pulse is taken as Gaussian and n as its expectation: an estimate where n is small.
 """
@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lidardesign.scene import Scene
-from lidardesign.simulate.bounds.counts import Counts, estimate_error_m
+from lidardesign.simulate.bounds.counts import Counts, Echo, estimate_error_m
 from lidardesign.simulate.bounds.sight import Sight, Stake
 from lidardesign.simulate.detector import Detector, metres
 from lidardesign.simulate.returns import Rays
@@ -39,8 +39,7 @@ def stake(sight: Sight, counts: Counts) -> Stake:
         squared = estimate_error_m(detector, signal, metres(sigma_s)) ** 2
     else:
         squared = counts.error_m(signal, both_m) ** 2 + counts.error_m(signal, pulse_m) ** 2
-    lost = np.maximum(
-        counts.missed(signal, counts.per_bin, both_m) - counts.missed(signal, counts.per_bin, pulse_m), 0.0
-    )
+    lost = counts.more_missed(Echo(signal, pulse_m), Echo(signal, both_m))
+    spilled = -np.expm1(-np.maximum(counts.leaked(both_m) - counts.leaked(pulse_m), 0.0))
     reason = f"a photon is {timed}; a return has about {counts.typical} of them"
-    return Stake(squared, np.where(sight.returned, lost, 0.0), reason)
+    return Stake(squared, np.where(sight.returned, lost, spilled), reason)

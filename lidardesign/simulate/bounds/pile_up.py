@@ -20,7 +20,7 @@ import numpy as np
 
 from lidardesign.numerics import safe_divide
 from lidardesign.scene import Scene
-from lidardesign.simulate.bounds.counts import Counts, changed_share
+from lidardesign.simulate.bounds.counts import Counts, Echo, changed_share
 from lidardesign.simulate.bounds.sight import Sight, Stake
 from lidardesign.simulate.detector import Detector, metres
 from lidardesign.simulate.returns import Rays
@@ -67,7 +67,7 @@ def _beaten(counts: Counts, left: np.ndarray, sigma_m: np.ndarray) -> np.ndarray
     """How much more often fewer photons are missed, and how often they are mistaken."""
     per_bin = counts.per_bin
     fullest = per_bin + counts.pulses * counts.haze_per_pulse[1]
-    missed = counts.missed(left, per_bin, sigma_m) - counts.missed(counts.in_air, per_bin, sigma_m)
+    missed = counts.more_missed(Echo(counts.in_air, sigma_m), Echo(left, sigma_m))
     return np.clip(missed + counts.mistaken(left, fullest, per_bin, sigma_m), 0.0, 1.0)
 
 
