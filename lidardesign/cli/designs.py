@@ -27,7 +27,9 @@ TRACK_COLUMNS = ("ray", "azimuth\n[deg]", "elevation\n[deg]", "gate start\n[m]",
 
 
 def number(value: Any, digits: int = 4) -> str:
-    """A figure, a text or a list of them for people; a dash where there is none."""
+    """A figure, a text, or a list or mapping of them, for people; a dash where there is none."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {number(item, digits)}" for name, item in value.items())
     if isinstance(value, list | tuple):
         return "[" + ", ".join(number(item, digits) for item in value) + "]"
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
