@@ -10,7 +10,7 @@ from lidardesign.simulate.detector import Detector
 # Casting a ray and following its echo [s].
 RAY_SECONDS = 1.5e-6
 # Per ray [s]: body by body at its own time; a few mirrors and panes; a second ray to the receiver; cells of air.
-PER_RAY_SECONDS = {"motion": 1e-5, "specular": 1e-5, "shadowing": 5e-6, "atmosphere": 2e-5, "multipath": 1e-3}
+PER_RAY_SECONDS = {"motion": 1e-5, "specular": 1e-5, "shadowing": 5e-6, "atmosphere": 2e-5, "multipath": 3e-4}
 # Per ray [s], where photons are counted into histograms, and where a time is only rounded or moved.
 COUNTED_SECONDS, TIMED_SECONDS = 2e-5, 2e-7
 
