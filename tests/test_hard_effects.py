@@ -1,0 +1,80 @@
+"""All effects at once where it is awkward: nothing to fire, on surfaces, inside things, along the baseline."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from lidardesign.scene import Ambient, Body, Medium, Plane, Receiver, Scene, Sphere, rigid
+from lidardesign.simulate.detector import IDEAL
+from lidardesign.simulate.detector_files import load_detector
+from lidardesign.simulate.physics import EFFECTS, Physics
+from lidardesign.simulate.returns import Outcome, Rays
+from lidardesign.simulate.simulate import simulate
+
+EVERYTHING = frozenset(EFFECTS) - {"multipath"}
+BALL = Body(
+    Sphere(0.5),
+    "ball",
+    poses=rigid(translation_m=(2.0, 0.0, 0.0)),
+    specular=0.3,
+    transmission=0.2,
+    velocity_m_s=(1.0, 0.0, 0.0),
+)
+FLOOR = Body(Plane(), "floor", poses=rigid(translation_m=(0.0, 0.0, -1.0)))
+
+RECEIVERS = {
+    "none": None,
+    "at the emitter": Receiver((0.0, 0.0, 0.0), 0.0, 0.0, 1.0, 1.0, (0.0, 9.0)),
+    "on the ray": Receiver((1.0, 0.0, 0.0), 0.0, 0.0, 1.0, 1.0, (0.0, 9.0)),
+    "beside it": Receiver((0.0, 0.3, 0.0), 0.0, 0.0, 1.0, 1.0, (0.0, 9.0)),
+    "on the ball": Receiver((1.5, 0.0, 0.0), 0.0, 0.0, 1.0, 1.0, (0.0, 9.0)),
+    "on the floor": Receiver((0.0, 0.0, -1.0), 0.0, math.pi / 2, 1.0, 1.0, (0.0, 9.0)),
+}
+
+
+def rays_of(directions, origin=(0.0, 0.0, 0.0), gate=(0.0, 2.5)):
+    directions = np.asarray(directions, dtype=float).reshape(-1, 3)
+    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    count = len(directions)
+    places, gates = np.tile(np.asarray(origin, float), (count, 1)), np.tile(np.asarray(gate, float), (count, 1))
+    return Rays(places, directions, gates, np.zeros(count), np.linspace(0.0, 0.1, count))
+
+
+RAYS = {
+    "no rays": rays_of([]),
+    "axes and poles": rays_of([[1, 0, 0], [0, 0, 1], [0, 0, -1], [-1, 0, 0], [1, 1e-9, -0.3]]),
+    "gates without width": rays_of([[1, 0, 0], [0, 0, -1]], gate=(1.0, 1.0)),
+    "from the ball's surface": rays_of([[1, 0, 0], [0, 0, -1]], origin=(1.5, 0.0, 0.0)),
+    "from inside the ball": rays_of([[1, 0, 0]], origin=(2.0, 0.0, 0.0)),
+    "from the floor": rays_of([[0, 0, -1], [0, 0, 1]], origin=(0.0, 0.0, -1.0)),
+}
+
+
+@pytest.mark.parametrize("receiver", RECEIVERS.values(), ids=RECEIVERS)
+@pytest.mark.parametrize("rays", RAYS.values(), ids=RAYS)
+@pytest.mark.parametrize("name", ["single-photon", "consumer-8x8", "ideal"])
+def test_every_ray_has_one_outcome_and_a_range_in_its_gate_where_it_returns(receiver, rays, name):
+    scene = Scene((BALL, FLOOR), ambient=Ambient(1e5), medium=Medium(0.3, 0.02), receiver=receiver)
+    (returns,) = simulate(scene, rays, physics=Physics(load_detector(name), EVERYTHING))
+    assert len(returns.outcome) == len(rays)
+    assert np.isin(returns.outcome, list(Outcome)).all()
+    found = returns.returned
+    assert np.array_equal(np.isfinite(returns.range_m), found)
+    # ranges are solved from paths: a few roundings beyond a gate's end
+    assert (returns.range_m[found] >= rays.gate_m[found, 0] - 1e-9).all()
+    assert (returns.range_m[found] <= rays.gate_m[found, 1] + 1e-9).all()
+    assert (returns.body[~found] == -1).all()
+
+
+def test_a_scene_of_mirrors_alone_returns_nothing():
+    mirrors = tuple(
+        Body(Sphere(radius), poses=rigid(translation_m=(2.0, y, 0.0)), reflectance=0.0, specular=1.0)
+        for radius, y in ((0.5, 0.0), (0.4, 1.2))
+    )
+    rays = rays_of([[1, 0.01, 0.01], [1, 0.2, 0], [1, 0.5, 0]])
+    (returns,) = simulate(Scene(mirrors), rays, physics=Physics(IDEAL, frozenset({"specular"})))
+    assert not returns.returned.any()
+    assert (returns.outcome[:2] == Outcome.NOT_DETECTED).all()
