@@ -21,7 +21,7 @@ from synthetic_light import (
 from lidardesign.errors import ConfigError
 from lidardesign.simulate import detection
 from lidardesign.simulate.counting import PHOTONS_ONE_BY_ONE
-from lidardesign.simulate.detector import FWHM_PER_SIGMA, Detector, metres
+from lidardesign.simulate.detector import FWHM_PER_SIGMA, Detector, Photons, metres
 from lidardesign.simulate.echoes import Background, Echoes
 
 RAYS = 4000
@@ -457,3 +457,43 @@ class TestGatesThatDoNotFit:
         with pytest.raises(ConfigError, match=r"bins of 1.5e-07 m"):
             detected(windows(1, 1.0, 3.0), no_echoes(), background(1), detector, ALL)
 
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_any_detector_and_any_light_give_ranges_in_their_gates_or_none(seed):
+    """Values from end to end of what detector files may hold; warnings are errors."""
+    generator = np.random.default_rng(seed)
+
+    def between(low, high):
+        return float(10.0 ** generator.uniform(np.log10(low), np.log10(high)))
+
+    rays = 5
+    photons = Photons(
+        wavelength_m=between(280e-9, 4000e-9),
+        pulse_energy_j=between(1e-21, 1.0),
+        pulses_per_frame=between(1, 1e12),
+        emission=("scanned", "flood")[seed % 2],
+        repetition_hz=between(1e-3, 1e7),
+        aperture_m2=between(1e-12, 10),
+        field_of_view_sr=1e-6,
+        efficiency=between(1e-9, 1),
+        filter_m=1e-9,
+        dark_hz=0.0,
+        dead_s=between(1e-12, 1.0),
+    )
+    detector = Detector(
+        "any",
+        pulse_sigma_s=between(1e-15, 1e-6),
+        jitter_sigma_s=between(1e-15, 1e-6),
+        bin_s=None if seed % 3 == 0 else between(1e-12, 1e-6),
+        photons=photons,
+        estimator=("peak", "matched")[seed // 2 % 2],
+    )
+    echoes, light = random_light(rays, seed)
+    gain = echoes.gain * between(1e-12, 1e12)
+    echoes = Echoes(echoes.ray, echoes.path_m, gain, echoes.body)
+    light = Background(light.per_metre * between(1e-9, 1e13), light.edges_m, light.counts * between(1e-9, 1e9))
+    for effects in (ALL, ALL - {"quantisation"}, {"photon_noise"}, {"jitter"}, {"ambient", "pile_up"}):
+        found = detected(windows(rays, 1.0, 3.0), echoes, light, detector, effects)
+        inside = np.isfinite(found.path_m)
+        assert ((found.path_m[inside] >= 1.0) & (found.path_m[inside] < 3.0)).all()

@@ -105,7 +105,7 @@ BAD = {
     "sub-rays of a line": ("footprint_rays: 7", ["mine.yaml:1:17", "divergence 0"]),
     "bins without a width": ("bins: 128", ["bin_ps"]),
     "some light": ("wavelength_nm: 670", ["does not say energy_fj", "dead_time_ps, emission"]),
-    "more than all photons": (LIGHT.replace("0.1", "1.1"), ["efficiency: found 1.1", "up to 1"]),
+    "more than all photons": (LIGHT.replace("0.1", "1.1"), ["efficiency: found 1.1", "to 1"]),
     "a wavelength in micrometres": (LIGHT.replace("670", "0.67"), ["wavelength_nm: found 0.67", "280"]),
     "negative dark counts": (LIGHT.replace("dark_rate_hz: 100", "dark_rate_hz: -1"), ["dark_rate_hz", "from 0"]),
     "a wide filter": (LIGHT.replace("filter_width_nm: 10", "filter_width_nm: 670"), ["filter_width_nm", "670 nm"]),

@@ -20,6 +20,7 @@ from lidardesign.simulate.detector import FWHM_PER_SIGMA, Detector, Photons
 FOLDER = Path(__file__).parent / "detectors"
 TIMES = {"ps": 1e-12, "ns": 1e-9}
 FREQUENCIES = {"hz": 1.0, "khz": 1e3, "mhz": 1e6}
+ENERGIES = {"fj": 1e-15, "pj": 1e-12, "nj": 1e-9, "uj": 1e-6, "mj": 1e-3}
 LENGTHS = {"nm": 1e-9, "um": 1e-6}
 MOST_FOOTPRINT_RAYS = 1024
 MOST_BINS = 1_000_000
@@ -50,10 +51,11 @@ class Quantity:
 
 
 ONE = {"": 1.0}
+# The limits are wider than any part's, and keep typing errors and overflows out.
 TIMING = {
-    "pulse_fwhm": Quantity(TIMES, above=False, default=0.0),
-    "jitter_fwhm": Quantity(TIMES, above=False, default=0.0),
-    "bin": Quantity(TIMES),
+    "pulse_fwhm": Quantity(TIMES, high=1e-6, above=False, default=0.0),
+    "jitter_fwhm": Quantity(TIMES, high=1e-6, above=False, default=0.0),
+    "bin": Quantity(TIMES, high=1e-6),
     "bins": Quantity(ONE, low=1, high=MOST_BINS, above=False, whole=True),
     "divergence": Quantity({"mrad": 1e-3, "deg": math.pi / 180}, high=math.pi / 2, above=False, default=0.0),
     "footprint_rays": Quantity(ONE, low=1, high=MOST_FOOTPRINT_RAYS, above=False, whole=True, default=1),
@@ -61,15 +63,15 @@ TIMING = {
 }
 LIGHT = {
     "wavelength": Quantity(LENGTHS, low=280e-9, high=4000e-9, above=False),
-    "energy": Quantity({"fj": 1e-15, "pj": 1e-12, "nj": 1e-9, "uj": 1e-6, "mj": 1e-3}),
-    "pulses_per_frame": Quantity(ONE),
-    "repetition": Quantity(FREQUENCIES),
-    "aperture": Quantity({"mm2": 1e-6, "cm2": 1e-4}),
-    "field_of_view": Quantity({"usr": 1e-6, "msr": 1e-3, "sr": 1.0}, high=2 * math.pi),
-    "efficiency": Quantity(ONE, high=1.0),
-    "filter_width": Quantity(LENGTHS),
-    "dark_rate": Quantity(FREQUENCIES, above=False),
-    "dead_time": Quantity({**TIMES, "us": 1e-6}, above=False),
+    "energy": Quantity(ENERGIES, low=1e-21, high=1.0, above=False),
+    "pulses_per_frame": Quantity(ONE, low=1, high=1e12, above=False),
+    "repetition": Quantity(FREQUENCIES, low=1e-3, high=1e12, above=False),
+    "aperture": Quantity({"mm2": 1e-6, "cm2": 1e-4}, low=1e-12, high=10.0, above=False),
+    "field_of_view": Quantity({"usr": 1e-6, "msr": 1e-3, "sr": 1.0}, low=1e-15, high=2 * math.pi, above=False),
+    "efficiency": Quantity(ONE, low=1e-9, high=1.0, above=False),
+    "filter_width": Quantity(LENGTHS, low=1e-15, above=False),
+    "dark_rate": Quantity(FREQUENCIES, high=1e12, above=False),
+    "dead_time": Quantity({**TIMES, "us": 1e-6}, high=1.0, above=False),
 }
 CHOICES = {
     "estimator": ("peak", "matched"),

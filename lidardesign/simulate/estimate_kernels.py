@@ -50,15 +50,15 @@ def at_least(number, mean):  # noqa: ANN001, ANN201
 
 
 @njit(cache=True, nogil=True)
-def pulse_shape(width, sigma):  # noqa: ANN001, ANN201
-    """The share of a pulse in each bin around the one that it is centred in, shape (2 R + 1,)."""
-    reach = math.ceil(PULSE_REACH * sigma / width)
+def pulse_shape(width, sigma, longest):  # noqa: ANN001, ANN201
+    """The share of a pulse in each bin around the one that it is centred in, as far as bins can lie apart."""
+    reach = min(math.ceil(PULSE_REACH * sigma / width), max(longest - 1, 0))
     shape = np.ones(2 * reach + 1)
     if sigma > 0:
         scale = width / (math.sqrt(2.0) * sigma)
         for j in range(-reach, reach + 1):
             shape[j + reach] = 0.5 * (math.erf((j + 0.5) * scale) - math.erf((j - 0.5) * scale))
-    return shape / shape.sum()
+    return shape
 
 
 @njit(cache=True, nogil=True)
@@ -136,12 +136,12 @@ def find_returns(counts, offset, ends, width, sigma, half, known_level, false_al
     whether to take the matched filter's maximum or the highest bin.
     """
     found = np.full(len(offset) - 1, np.nan)
-    shape = pulse_shape(width, sigma)
-    below = np.concatenate((np.zeros(1), np.cumsum(shape)))
-    reach = len(shape) // 2
     longest = 0
     for i in range(len(offset) - 1):
         longest = max(longest, offset[i + 1] - offset[i])
+    shape = pulse_shape(width, sigma, longest)
+    below = np.concatenate((np.zeros(1), np.cumsum(shape)))
+    reach = len(shape) // 2
     score = np.empty(longest)
     for i in range(len(offset) - 1):
         mine = counts[offset[i] : offset[i + 1]]

@@ -22,6 +22,9 @@ from lidardesign.simulate.echoes import Background, Beams
 from lidardesign.simulate.hits import Hits
 from lidardesign.simulate.returns import Rays
 
+# Brighter light is no brighter: every pulse of any detector counts it at once
+MOST_PER_METRE = 1e12
+
 
 def lit(
     scene: Scene, rays: Rays, beams: Beams, hits: Hits, detector: Detector, background: Background
@@ -49,4 +52,4 @@ def lit(
         power_w = irradiance / math.pi * photons.filter_m * photons.aperture_m2 * photons.field_of_view_sr
         rate_hz += average * power_w * photons.efficiency / photons.photon_energy_j
     per_metre = background.per_metre + rate_hz * 2 / SPEED_OF_LIGHT_M_S
-    return replace(background, per_metre=per_metre)
+    return replace(background, per_metre=np.minimum(per_metre, MOST_PER_METRE))

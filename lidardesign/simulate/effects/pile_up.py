@@ -18,8 +18,10 @@ from lidardesign.simulate.streams import normal, uniform
 
 # More photons in one bin than this are counted together, by mean and variance of how many pulses they fall into
 ONE_BY_ONE = 32
+# More photons per pulse in one bin than this are no more: they leave a pulse without any with the probability exp(-32)
+MOST_PER_PULSE = 32
 # A ray with more photons than this, where dead times reach across pulses, is followed in a share of its pulses only
-MOST_PHOTONS = 1 << 24
+MOST_PHOTONS = 1 << 21
 # draws of a ray: one per photon, and far beyond one per bin
 FIRST_BIN = 1 << 40
 
@@ -100,37 +102,41 @@ def _one_of(arrived, shares):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _across_pulses(arrived, mine, pulses, dead, period, key, ray):  # noqa: ANN001, ANN202
-    """Pulse after pulse, where a count may blind the next ones: photons wait in line in theirs, earliest first."""
-    total = 0
-    for b in range(len(arrived)):
-        total += arrived[b]
+    """Photon after photon in the order of time, where a count may blind the pulses after its own."""
+    arrived = np.minimum(arrived, MOST_PER_PULSE * pulses)
+    total = arrived.sum()
     if total > MOST_PHOTONS and pulses > 1:
         shares = min(total // MOST_PHOTONS + 1, pulses)
         _across_pulses(_one_of(arrived, shares), mine, pulses // shares, dead, period, key, ray)
         mine *= shares
         return
-    head = np.full(pulses, -1, np.int64)
-    tail = np.full(pulses, -1, np.int64)
-    following = np.full(total, -1, np.int64)
-    bin_of = np.empty(total, np.int64)
+    size = len(arrived)
+    times = np.empty(total, np.int64)
     photon = 0
-    for b in range(len(arrived)):
+    for b in range(size):
         for _ in range(arrived[b]):
-            pulse = min(int(uniform(key, ray, photon) * pulses), pulses - 1)
-            bin_of[photon] = b
-            if head[pulse] < 0:
-                head[pulse] = photon
-            else:
-                following[tail[pulse]] = photon
-            tail[pulse] = photon
+            times[photon] = min(int(uniform(key, ray, photon) * pulses), pulses - 1) * size + b
             photon += 1
+    ordered = np.sort(times) if pulses > total else _by_pulse(times, size, pulses)
     alive_at = -1.0
+    for time in ordered:
+        pulse, b = time // size, time % size
+        if pulse * period + b >= alive_at:
+            mine[b] += 1
+            # a pulse's photons in one bin are counted once, however short the dead time
+            alive_at = pulse * period + b + max(dead, 1.0)
+
+
+@njit(cache=True, nogil=True)
+def _by_pulse(times, size, pulses):  # noqa: ANN001, ANN202
+    """Times pulse * size + bin that are in the order of bins, in the order of pulses and then bins (counting sort)."""
+    place = np.zeros(pulses + 1, np.int64)
+    for time in times:
+        place[time // size + 1] += 1
     for pulse in range(pulses):
-        photon = head[pulse]
-        while photon >= 0:
-            time = pulse * period + bin_of[photon]
-            if time >= alive_at:
-                mine[bin_of[photon]] += 1
-                # a pulse's photons in one bin are counted once, however short the dead time
-                alive_at = time + max(dead, 1.0)
-            photon = following[photon]
+        place[pulse + 1] += place[pulse]
+    ordered = np.empty_like(times)
+    for time in times:
+        ordered[place[time // size]] = time
+        place[time // size] += 1
+    return ordered
