@@ -11,11 +11,12 @@ gets more than rho F_max of what the brightest has. With the receiver in the emi
 whose detours a fixed receiver hears, by reciprocity. A pixel that is lit through itself alone gets back
 
     share = mean over directions of rho_P rho_Q (form factor of the pixel's spot from Q), at most rho_P rho_Q,
-    and for all later surfaces at most the same times rho F_max / (1 - rho F_max).
+    and for all later surfaces at most the same times rho F_max / (1 - rho F_max), late by as much more as there are.
 
 Light that is late by d moves a range by at most its share times d; what is late by more than a detector tells apart
 makes a peak of its own, which may be taken for the echo where all of it outweighs that. Directions are laid out evenly
-(Lambert's equal-area disc), not drawn: shares are measured by casting them, to within a few hundredths.
+(Lambert's equal-area disc), not drawn: shares are measured by casting them, to within a few hundredths. A surface that
+fills less than a hundredth of a view may be missed by a point, and is met by others as often as it should.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ from lidardesign.simulate.returns import Rays
 
 # Points whose view is measured, and directions from each: some thousand rays.
 MOST_POINTS, DIRECTIONS = 64, 96
+# A surface that a pixel grazes more flatly than this counts as met at it: a spot is then 50 times as long as wide.
+FLATTEST_COSINE = 0.02
 GOLDEN_ANGLE_RAD = math.pi * (3 - math.sqrt(5))
 # Rays start this share of their distance above a surface, so as not to hit it again.
 CLEARANCE = 1e-6
@@ -99,7 +102,7 @@ def lamp_bound(
     late_m = (lit_m + view.away_m - direct_m[:, None]) / 2
     most = max((body.reflectance for body in scene.bodies), default=0.0)
     later = later_share(most, view.seen, view.seen.max(initial=0.0), brightest)
-    return view.detours(each, late_m, later, resolution_m)
+    return view.detours(each, late_m, later, later * resolution_m, resolution_m)
 
 
 def pixel_bound(
@@ -110,7 +113,7 @@ def pixel_bound(
     back = view.origin_m - view.point_m
     distance_m = np.linalg.norm(back, axis=1)
     cosine = np.einsum("kj,kj->k", view.normal, back) / distance_m
-    spot_m2 = pixel_sr * distance_m**2 / np.maximum(cosine, np.finfo(np.float32).eps)
+    spot_m2 = pixel_sr * distance_m**2 / np.maximum(cosine, FLATTEST_COSINE)
     facing = np.maximum(np.einsum("kdj,kdj->kd", view.found_normal, -view.direction), 0.0)
     leaving = np.einsum("kdj,kj->kd", view.direction, view.normal)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -119,7 +122,9 @@ def pixel_bound(
     each = np.where(np.isfinite(view.away_m), own[:, None] * view.reflectance * factor, 0.0) / DIRECTIONS
     most = max((body.reflectance for body in scene.bodies), default=0.0)
     once = min(most * view.seen.max(initial=0.0), WHITEST)
-    return view.detours(each, view.away_m, each.sum(axis=1) * once / (1 - once), resolution_m)
+    # the k-th bounce more comes from k times as far: sum k once^(k - 1) = 1 / (1 - once)^2
+    moved_m = view.moved_m(each, view.away_m, resolution_m) * (1 / (1 - once) ** 2 - 1)
+    return view.detours(each, view.away_m, each.sum(axis=1) * once / (1 - once), moved_m, resolution_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,12 +183,25 @@ class _View:
         free[asked] = caster.first_hit(places[asked], toward[asked]).range_m >= distance_m[asked]
         return np.where(free, cosine / distance_m**2, 0.0), distance_m
 
-    def detours(self, each: np.ndarray, late_m: np.ndarray, later: np.ndarray, resolution_m: float) -> Detours:
-        lit = each > 0
-        near = lit & (late_m < resolution_m)
-        moved_m = (each * np.where(near, np.maximum(late_m, 0.0), 0.0)).sum(axis=1)
-        apart = np.where(lit & ~near, each, 0.0).sum(axis=1)
-        return Detours(self.chosen, each.sum(axis=1) + later, apart + later, moved_m + later * resolution_m, self.seen)
+    def moved_m(self, each: np.ndarray, late_m: np.ndarray, resolution_m: float) -> np.ndarray:
+        """Shares (K, D) of light times their delays (K, D), of what is late by less than a resolution, shape (K,)."""
+        near = (each > 0) & (late_m < resolution_m)
+        return (each * np.where(near, np.maximum(late_m, 0.0), 0.0)).sum(axis=1)
+
+    def detours(
+        self,
+        each: np.ndarray,
+        late_m: np.ndarray,
+        later: np.ndarray,
+        later_moved_m: np.ndarray,
+        resolution_m: float,
+    ) -> Detours:
+        moved_m = self.moved_m(each, late_m, resolution_m) + np.minimum(later_moved_m, later * resolution_m)
+        # a mean of the echo and what is near to it lies no further off than its share of the furthest
+        beside = np.where(late_m < resolution_m, each, 0.0).sum(axis=1) + later
+        shift_m = np.minimum(moved_m, resolution_m * beside / (1 + beside))
+        apart = np.where(late_m < resolution_m, 0.0, each).sum(axis=1) + later
+        return Detours(self.chosen, each.sum(axis=1) + later, apart, shift_m, self.seen)
 
 
 def _hemispheres(normal: np.ndarray) -> np.ndarray:
