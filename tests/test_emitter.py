@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from lidardesign.design.rays import lay_out
 from lidardesign.design.samples import Samples
 from lidardesign.errors import DataError
 from lidardesign.evaluate.metrics import is_heard, is_visible, trial_origins, visible_surface
+from lidardesign.run.yaml import parse_yaml
 from lidardesign.scene import Ambient, Body, Box, Medium, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.bistatic import path_of_range, path_windows, range_of_path
 from lidardesign.simulate.detector import IDEAL
@@ -393,3 +396,18 @@ def test_emitters_that_are_not_at_the_detector_are_nearly_as_good_as_a_laser_tha
     assert chamfer_mm["laser"] < 8.0
     for name, value in chamfer_mm.items():
         assert value < 1.15 * chamfer_mm["laser"], (name, chamfer_mm)
+
+
+# the page and the example
+
+
+def test_the_constraints_of_the_page_are_those_of_the_example():
+    root = Path(__file__).parents[1]
+    page = (root / "docs" / "emitter.md").read_text("utf-8")
+    blocks = re.findall(r"```yaml\n# (\w+)\.yaml.*?\n(.*?)```", page, re.DOTALL)
+    example = (root / "examples" / "emitter.py").read_text("utf-8")
+    written = re.findall(r'^([A-Z]+) = """\\\n# .*?\n(.*?)"""', example, re.DOTALL | re.MULTILINE)
+    assert {name.upper(): text for name, text in blocks} == dict(written)
+    assert [name for name, _ in blocks] == ["laser", "flood", "floods", "bistatic"]
+    for name, text in blocks:
+        Constraints.from_mapping(parse_yaml(text, where=name).value)
