@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
+import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from command_line import caller, make_run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lidardesign.design.check import check_design
 from lidardesign.design.constraints import Constraints
-from lidardesign.design.files import design_document
+from lidardesign.design.files import design_document, load_design, save_design
 from lidardesign.design.fit import fit
+from lidardesign.design.rays import lay_out
 from lidardesign.design.samples import Samples
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.space import DesignSpace, aim, observed_point
@@ -218,6 +224,208 @@ def test_the_written_design_keeps_its_boxes():
     assert design_document(result.design)["constraints"] == {"origin": {"exclude": [SLAB]}}
 
 
+@pytest.mark.parametrize("count", [40, 90])
+def test_rays_of_another_number_keep_out_with_and_without_samples(count, tmp_path):
+    result = fitted(layout="distributed", rays=40, count=3, origin={"exclude": [PILLAR]})
+    path = tmp_path / "design.yaml"
+    save_design(result.design, path)
+    design = load_design(path)
+    assert design.constraints == {"origin": {"exclude": [PILLAR]}}
+    for samples in (SAMPLES, None):
+        rays = lay_out(design, count, samples)
+        assert not ((rays.origin_m > PILLAR["low_m"]) & (rays.origin_m < PILLAR["high_m"])).all(axis=1).any()
+        again = lay_out(replace(design, ray_table=None), count, samples)
+        assert not ((again.origin_m > PILLAR["low_m"]) & (again.origin_m < PILLAR["high_m"])).all(axis=1).any()
+
+
+def test_the_number_of_sensors_is_found_between_boxes():
+    result = fit(
+        SAMPLES, sensors="auto", em_samples=1500, restarts=1,
+        constraints=Constraints.from_mapping({"origin": {"exclude": [SLAB]}, "sensors": {"max": 4}}),
+    )  # fmt: skip
+    assert_outside(result.design, [SLAB])
+    assert result.satisfied
+
+
+@pytest.mark.parametrize("height", [0.5, 1.5])
+def test_in_a_plane_only_boxes_that_it_cuts_are_in_the_way(height):
+    space = DesignSpace((-1, -1, height, *ROOM.low[3:]), (1, 1, height, *ROOM.high[3:]))
+    pillar = {"low_m": [-0.6, -0.6, 0.0], "high_m": [0.6, 0.6, 1.5]}
+    result = fitted(room(space=space), count=3, origin={"exclude": [pillar]})
+    assert result.satisfied
+    if height == 0.5:
+        assert_outside(result.design, [pillar])
+    else:
+        assert places(result) == places(fitted(room(space=space), count=3))
+
+
+def test_a_pinned_coordinate_is_in_a_box_or_not():
+    origin = {"low_m": [-1, -1, 0.4], "high_m": [1, 1, 0.4], "exclude": [PILLAR]}
+    result = fitted(count=2, origin=origin)
+    assert result.satisfied
+    assert_outside(result.design, [PILLAR])
+    origin = {"low_m": [-1, -1, 1.8], "high_m": [1, 1, 1.8]}
+    above = fitted(count=2, origin=origin | {"exclude": [PILLAR]})
+    assert places(above) == places(fitted(count=2, origin=origin))
+
+
+def test_a_narrow_gap_between_boxes_is_a_place():
+    walls = [{"low_m": [-2, -2, -1], "high_m": [0.6, 2, 3]}, {"low_m": [0.61, -2, -1], "high_m": [2, 2, 3]}]
+    result = fitted(room(60_000), count=1, origin={"exclude": walls})
+    assert result.satisfied
+    (sensor,) = result.design.sensors
+    assert 0.6 <= interval(sensor)[0][0] < interval(sensor)[1][0] <= 0.61
+
+
+def test_far_from_the_origin_of_coordinates_nothing_changes():
+    """Boxes ten kilometres away are kept as those around the origin are."""
+    shift = np.array([10_000.0, -20_000.0, 500.0])
+    space = DesignSpace((*(ROOM.low[:3] + shift), *ROOM.low[3:]), (*(ROOM.high[:3] + shift), *ROOM.high[3:]))
+    points = SAMPLES.points.copy()
+    points[:, :3] += shift
+    box = {key: (np.array(value) + shift).tolist() for key, value in PILLAR.items()}
+    moved = fitted(Samples(points, SAMPLES.log_prob, SAMPLES.log_target, space), count=3, origin={"exclude": [box]})
+    here = fitted(count=3, origin={"exclude": [PILLAR]})
+    assert moved.satisfied
+    for one, other in zip(moved.design.sensors, here.design.sensors, strict=True):
+        np.testing.assert_allclose(one.origin_m - shift, other.origin_m, atol=1e-3)
+
+
+# --- the independent checker
+
+
+@pytest.fixture(scope="module")
+def document():
+    return design_document(fitted(layout="distributed", rays=20, count=2, origin={"exclude": [PILLAR]}).design)
+
+
+def broken(document):
+    checks = check_design(document, document["constraints"], ROOM)
+    return [check.name for check in checks if not check.satisfied and "exclude" in check.name]
+
+
+def test_a_mean_inside_a_box_is_seen(document):
+    assert broken(document) == []
+    moved = copy.deepcopy(document)
+    moved["sensors"][0]["origin_m"] = {"mean": [0.0, 0.0, 1.0], "covariance": np.zeros((3, 3)).tolist()}
+    assert broken(moved) == ["s0.origin.exclude[0]"]
+
+
+def test_an_interval_that_reaches_into_a_box_is_seen(document):
+    moved = copy.deepcopy(document)
+    moved["sensors"][1]["origin_m"] = {"mean": [0.7, 0.0, 1.0], "covariance": np.diag([0.1**2, 0, 0]).tolist()}
+    assert broken(moved) == []
+    moved["sensors"][1]["origin_m"]["covariance"][0][0] = 0.11**2
+    assert broken(moved) == ["s1.origin.exclude[0]"]
+
+
+def test_a_ray_that_starts_in_a_box_is_seen(document):
+    moved = copy.deepcopy(document)
+    for key in ("origin_x_m", "origin_y_m"):
+        moved["ray_table"][key][7] = 0.0
+    moved["ray_table"]["origin_z_m"][7] = 1.4999
+    assert broken(moved) == ["ray7.origin.exclude[0]"]
+    moved["ray_table"]["origin_z_m"][7] = 1.5
+    assert broken(moved) == []
+
+
+# --- tracks
+
+AISLE = DesignSpace(
+    (-0.5, 0.0, 0.0, -math.pi / 2, 0.0, 0.1), (4.0, 0.0, 0.0, -math.pi / 2, math.pi / 2, 5.0), condition=("x_m",),
+    measure="angles",
+)  # fmt: skip
+
+
+def shelf(count=6000):
+    """A wall along an aisle."""
+    generator = np.random.default_rng(0)
+    points = np.zeros((count, 6))
+    points[:, 0] = generator.uniform(-0.5, 4.0, count)
+    points[:, 3] = -math.pi / 2
+    height = generator.uniform(0.2, 0.8, count)
+    points[:, 4], points[:, 5] = np.arctan2(height, 1.2), np.hypot(height, 1.2)
+    return Samples(points, np.zeros(count), np.zeros(count), AISLE)
+
+
+def test_a_track_ends_at_a_box():
+    gate = {"low_m": [3.0, -1, -1], "high_m": [9, 1, 1]}
+    result = fit(shelf(), layout="scan", rays=4, constraints=Constraints.from_mapping({"origin": {"exclude": [gate]}}))
+    assert (result.design.track.knots[0], result.design.track.knots[-1]) == (-0.5, 3.0)
+    assert result.satisfied
+    written = design_document(result.design)
+    written["track"]["knots_m"][-1] = 3.1
+    checks = check_design(written, written["constraints"])
+    assert "track.origin.exclude[0]" in [check.name for check in checks if not check.satisfied]
+
+
+def test_a_box_beside_a_track_is_in_nobodys_way():
+    rules = Constraints.from_mapping({"origin": {"exclude": [{"low_m": [1.0, 0.0, -1], "high_m": [2.0, 1, 1]}]}})
+    result = fit(shelf(), layout="scan", rays=4, constraints=rules)
+    assert (result.design.track.knots[0], result.design.track.knots[-1]) == (-0.5, 4.0)
+    assert result.satisfied
+
+
+def test_a_box_that_cuts_a_track_is_refused_with_the_pieces():
+    cut = {"low_m": [1.0, -1, -1], "high_m": [2.0, 1, 1]}
+    rules = Constraints.from_mapping({"origin": {"exclude": [cut]}})
+    with pytest.raises(InfeasibleError, match="2 pieces") as caught:
+        fit(shelf(), layout="scan", rays=4, constraints=rules)
+    assert list(caught.value.conflicts) == ["origin.exclude", "--layout scan"]
+    assert "up to 1 or from 2" in caught.value.hint
+    kept = Constraints.from_mapping({"origin": {"exclude": [cut], "low_m": [2, -1, -1]}})
+    assert fit(shelf(), layout="scan", rays=4, constraints=kept).design.track.knots[0] == 2
+
+
+# --- the command line
+
+
+@pytest.fixture
+def call(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+def test_boxes_are_given_by_option_and_by_file(call, tmp_path):
+    make_run(tmp_path / "run")
+    box = "[{low_m: [-9, -9, -9], high_m: [0.5, 9, 9]}]"
+    result = call("constrain", "run", "--set", f"origin.exclude={box}", "--json", "--name", "right")
+    assert result.code == 0, result.err
+    rows = [row for row in result.json["constraints"] if "exclude" in row["name"]]
+    assert rows
+    assert all(row["satisfied"] and row["value"]["low_m"][0] >= 0.5 for row in rows)
+    (tmp_path / "rules.yaml").write_text(f"origin:\n  exclude: {box}\n")
+    options = ["--constraints", "rules.yaml", "--set", "origin.exclude.0.high_m=[0.6, 9, 9]"]
+    result = call("constrain", "run", *options, "--json")
+    assert result.code == 0, result.err
+    rows = [row for row in json.loads(result.out)["constraints"] if "exclude" in row["name"]]
+    assert rows[0]["bound"]["high_m"] == [0.6, 9, 9]
+    shown = call("constrain", "run", "--constraints", "rules.yaml", "--set", "sensors.count=1")
+    assert "s0.origin.exclude[0]" in shown.out
+    assert "low_m [-9, -9, -9], high_m [0.5, 9, 9]" in shown.out
+    again = call("constrain", "run/designs/right.yaml", "--json")
+    assert again.code == 0, again.err
+
+
+@pytest.mark.parametrize(
+    ("option", "code", "text"),
+    [
+        ("origin.exclude=[{low_m: [0, 0, 1], high_m: [1, 1, 0]}]", 2, "low_m is above high_m along z"),
+        ("origin.exclude=[{low_m: [0, 0, 0]}]", 2, "origin.exclude.0.high_m is missing"),
+        ("origin.exclude=[{low_m: [0, 0, .nan], high_m: [1, 1, 1]}]", 2, "origin.exclude"),
+        ("origin.exclude=5", 2, "origin.exclude"),
+        ("origin.exclud=[]", 2, "did you mean 'exclude'"),
+        ("exclude=[]", 2, "did you mean 'origin.exclude'"),
+        ("origin.exclude=[{low_m: [-99, -99, -99], high_m: [99, 99, 99]}]", 4, "origin.exclude[0]"),
+    ],
+)
+def test_wrong_boxes_are_refused_in_one_message(call, tmp_path, option, code, text):
+    make_run(tmp_path / "run")
+    result = call("constrain", "run", "--set", option)
+    assert result.code == code
+    assert text in result.err
+    assert "Traceback" not in result.err
+
+
 side = st.floats(-1.2, 1.2).map(lambda value: round(value, 3))
 corner = st.tuples(side, side, side.map(lambda value: value + 1))
 box = st.tuples(corner, corner).map(
@@ -225,7 +433,7 @@ box = st.tuples(corner, corner).map(
 )
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.lists(box, min_size=1, max_size=4), st.integers(1, 3), st.sampled_from(["grid", "distributed", "scan"]))
 def test_whatever_the_boxes_nothing_is_inside_one(boxes, sensors, layout):
     try:

@@ -40,9 +40,7 @@ def one_with(boxes, **origin):
 
 def reaches_into(low, high, box):
     """The definition, axis by axis."""
-    return all(
-        b < t and h > b and lo < t for lo, h, b, t in zip(low, high, box["low_m"], box["high_m"], strict=True)
-    )
+    return all(b < t and h > b and lo < t for lo, h, b, t in zip(low, high, box["low_m"], box["high_m"], strict=True))
 
 
 def corners(free):
