@@ -1,0 +1,87 @@
+"""Every shipped task scores what noisy detectors report: nothing at all, or returns that no surface sent."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from lidardesign_tasks.arm import ArmTask
+from lidardesign_tasks.emitter import EmitterTask
+from lidardesign_tasks.face import FaceTask
+from lidardesign_tasks.flatland import FlatlandTask
+from lidardesign_tasks.meshes import MeshesTask
+from lidardesign_tasks.warehouse import WarehouseTask
+from test_tasks import write_ball
+
+from lidardesign.evaluate.scoring import checked_score
+from lidardesign.simulate.returns import Outcome, Rays
+from lidardesign.simulate.simulate import simulate
+from lidardesign.space import DIMENSIONS, RANGE, direction
+from lidardesign.task import conditions_of, scenes_of
+
+TASKS = {
+    "arm": (ArmTask, {"train": 1, "test": 1, "frames": 12}),
+    "emitter": (EmitterTask, {"train": 1, "test": 1, "truth_points": 800}),
+    "face": (FaceTask, {"train": 1, "test": 1, "truth_points": 800}),
+    "flatland": (FlatlandTask, {"train": 1, "test": 1}),
+    "meshes": (MeshesTask, {"folder": "balls", "truth_points": 800, "poses": 2}),
+    "warehouse": (WarehouseTask, {"train": 1, "test": 1}),
+}
+
+
+@pytest.fixture(params=sorted(TASKS))
+def measured(request, tmp_path):
+    """A task, a scene of it, and what even rays return there, one list per condition value and frame."""
+    make, options = TASKS[request.param]
+    task = make()
+    if "folder" in options:
+        for name in ("one", "two", "three"):
+            write_ball(tmp_path / "balls" / f"{name}.stl", (0.1, 0.12, 0.2))
+        options = {**options, "folder": tmp_path / "balls"}
+    config = task.Config(**options)
+    space = task.space(config)
+    scene = scenes_of(task, config, "test", 0, space)[0]
+    returns = []
+    for condition in conditions_of(task, config, space):
+        points = space.sample(300, np.random.default_rng(1))
+        for name, value in condition.items():
+            points[:, DIMENSIONS.index(name)] = value
+        gates = np.tile((space.low[RANGE], space.high[RANGE]), (len(points), 1))
+        looking = direction(points[:, 3], points[:, 4])
+        rays = Rays(points[:, :3], looking, gates, np.zeros(len(points)), np.zeros(len(points)))
+        returns += simulate(scene, rays)
+    return task, scene, returns
+
+
+def turned(returns, chosen, outcome, range_m):
+    """Returns in which chosen rays have another outcome and range, of no body."""
+    mask = np.broadcast_to(chosen, returns.outcome.shape)
+    return replace(
+        returns,
+        outcome=np.where(mask, outcome, returns.outcome),
+        range_m=np.where(mask, range_m, returns.range_m),
+        body=np.where(mask, -1, returns.body),
+    )
+
+
+def test_without_a_single_detection_a_design_fails_at_the_worst_value(measured):
+    task, scene, returns = measured
+    score = checked_score(task, scene, [turned(one, True, Outcome.NOT_DETECTED, np.nan) for one in returns])
+    assert score.failed
+    assert score.value == task.metric.worst
+
+
+def test_invented_returns_are_scored_as_returns_of_no_body(measured):
+    task, scene, returns = measured
+    generator = np.random.default_rng(2)
+    noisy = []
+    for one in returns:
+        gate = one.rays.gate_m
+        noisy.append(turned(one, generator.uniform(size=len(gate)) < 0.3, 0, generator.uniform(gate[:, 0], gate[:, 1])))
+    clean, score = (checked_score(task, scene, each) for each in (returns, noisy))
+    sign = 1 if task.metric.better == "lower" else -1
+    assert np.isfinite(score.value)
+    assert sign * score.value >= sign * clean.value or not clean.failed
+    invented = [turned(one, True, 0, one.rays.gate_m[:, 1] * 0.999) for one in returns]
+    assert sign * checked_score(task, scene, invented).value >= sign * clean.value
