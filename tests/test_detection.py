@@ -234,6 +234,10 @@ def test_results_do_not_depend_on_how_many_rays_are_counted_at_once(monkeypatch)
         parts = detected(windows(rays, 1.0, 3.0), echoes, light, detector, ALL)
         assert np.array_equal(parts.path_m, whole.path_m, equal_nan=True)
         assert np.array_equal(parts.body, whole.body)
+    monkeypatch.undo()
+    monkeypatch.setattr(detection, "RAYS_AT_ONCE", 7)
+    parts = detected(windows(rays, 1.0, 3.0), echoes, light, detector, ALL)
+    assert np.array_equal(parts.path_m, whole.path_m, equal_nan=True)
 
 
 def test_a_ray_s_result_does_not_depend_on_other_rays_light():

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 # Bins that are filled at once: 32 MB of counts, whatever the number of rays
 BINS_AT_ONCE = 1 << 22
+# Rays that are counted at once: of the photons that are followed one by one, some 100 MB at most
+RAYS_AT_ONCE = 4096
 # A range further than this many standard deviations (and half a bin) from every echo was found in noise
 EXPLAINED_SIGMAS = 3.0
 
@@ -68,7 +70,7 @@ def chunks(bins: Bins) -> Iterator[tuple[int, int]]:
     begin = 0
     while begin < len(bins):
         end = int(np.searchsorted(bins.offset, bins.offset[begin] + BINS_AT_ONCE, side="right")) - 1
-        end = max(end, begin + 1)
+        end = min(max(end, begin + 1), begin + RAYS_AT_ONCE)
         yield begin, end
         begin = end
 
