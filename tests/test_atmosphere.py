@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from scipy.special import exp1
 
 from lidardesign.scene import Body, Box, Medium, Receiver, Scene, rigid
 from lidardesign.simulate.bistatic import path_windows
+from lidardesign.simulate.bounds.light import haze_per_pulse
+from lidardesign.simulate.bounds.sight import Sight
 from lidardesign.simulate.detector import IDEAL, Detector, Photons
 from lidardesign.simulate.echoes import Background, Beams
 from lidardesign.simulate.effects.atmosphere import through_air
@@ -80,17 +83,28 @@ def test_haze_up_to_the_surface_sends_back_the_integral_of_the_lidar_equation():
     assert background.counts[0] == pytest.approx(cells, rel=2e-6)
 
 
-def test_a_gate_from_the_aperture_on_counts_a_finite_share():
+def test_a_gate_from_the_aperture_on_counts_what_falls_on_the_pixel():
     _, _, background = in_air(Scene((WALL,), medium=FOG), rays_along([[1.0, 0, 0]], (0.0, 8.0)))
-    radius = math.sqrt(PHOTONS.aperture_m2 / math.pi)
+    radius, area, pixel = math.sqrt(PHOTONS.aperture_m2 / math.pi), PHOTONS.aperture_m2, PHOTONS.field_of_view_sr
 
     def profile(r):
-        return 2 * math.pi * (1 - r / math.hypot(r, radius)) * math.exp(-0.6 * r) * FOG.backscatter_per_m_sr
+        share = min(1.0, pixel / (area * (1 / r - 1 / 5) ** 2))
+        return 2 * math.pi * (1 - r / math.hypot(r, radius)) * share * math.exp(-0.6 * r) * FOG.backscatter_per_m_sr
 
-    pieces = [0.0, radius, 10 * radius, 100 * radius, 1.0, 5.0]
+    sharp_from = 1 / (1 / 5 + math.sqrt(pixel / area))
+    pieces = [1e-9, radius, 10 * radius, sharp_from, 1.0, 4.0, 4.999999]
     whole = sum(quad(profile, *pair, epsabs=1e-14)[0] for pair in itertools.pairwise(pieces))
-    assert background.counts.sum() == pytest.approx(PHOTONS.emitted(1) * PHOTONS.efficiency * whole, rel=1e-4)
+    assert background.counts.sum() == pytest.approx(PHOTONS.emitted(1) * PHOTONS.efficiency * whole, rel=2e-3)
     assert (np.diff(background.edges_m) > 0).all()
+
+
+def test_haze_before_the_sensor_counts_no_more_than_the_pixels_solid_angle():
+    # nothing is met, so the pixel is sharp far away: up to sqrt(A / pixel) = 0.1 m haze fills it evenly
+    _, _, background = in_air(Scene((WALL,), medium=FOG), rays_along([[-1.0, 0, 0]], (0.01, 0.09)))
+    faded = (math.exp(-0.6 * 0.01) - math.exp(-0.6 * 0.09)) / 0.6
+    expected = PHOTONS.emitted(1) * PHOTONS.efficiency * FOG.backscatter_per_m_sr * PHOTONS.field_of_view_sr * faded
+    # the disc is seen from near under a little less than A / r^2
+    assert background.counts.sum() == pytest.approx(expected, rel=1e-3)
 
 
 def test_gates_behind_the_surface_and_gates_without_width_hear_no_haze():
@@ -148,3 +162,19 @@ def test_a_rays_haze_depends_on_no_other_ray_but_for_the_shared_energy():
     _, _, alone = in_air(Scene((WALL,), medium=FOG), many.subset(np.array([1])))
     assert np.array_equal(together.edges_m[1], alone.edges_m[0])
     assert np.array_equal(together.counts[1], alone.counts[0])
+
+
+@pytest.mark.parametrize("gate", [(0.0, 8.0), (0.05, 3.0), (0.5, 8.0), (4.0, 4.5)])
+@pytest.mark.parametrize("pixel_sr", [1e-7, 1e-4, 1.0])
+def test_the_planner_bounds_the_haze_that_is_counted(gate, pixel_sr):
+    detector = replace(COUNTING, photons=replace(PHOTONS, field_of_view_sr=pixel_sr))
+    scene, rays = Scene((WALL,), medium=FOG), rays_along([[1.0, 0, 0], [0.8, 0.6, 0], [-1.0, 0, 0]], gate)
+    _, _, background = in_air(scene, rays, detector)
+    sight = Sight.of(scene, 0, detector, [rays], SceneCaster(scene))
+    whole, fullest = haze_per_pulse(sight, np.full(3, PHOTONS.emitted(3)), 0.01)
+    assert (background.counts.sum(axis=1) <= whole * (1 + 1e-6)).all()
+    # all but what fades within the window
+    faded = np.exp(-0.6 * (np.minimum(gate[1], [5.0, 6.25, 8.0]) - gate[0]))
+    assert (background.counts.sum(axis=1) >= whole * faded * (1 - 2e-3)).all()
+    density = background.counts / np.diff(background.edges_m)
+    assert (density.max(axis=1) * 0.01 * (1 - 1e-9) <= fullest).all() or (fullest == whole).all()

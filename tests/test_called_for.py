@@ -118,7 +118,7 @@ def test_sunlight_calls_for_ambient_light_and_pile_up():
 
 
 def test_fog_calls_for_the_atmosphere():
-    assert_called_for("atmosphere", "air that dims light by", FACE, heads(visibility_m=10), face_rays(), SINGLE_PHOTON)
+    assert_called_for("atmosphere", "air that dims light by", FACE, heads(visibility_m=2), face_rays(), SINGLE_PHOTON)
 
 
 def test_a_mirror_calls_for_specular_surfaces():

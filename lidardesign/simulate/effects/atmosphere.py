@@ -2,20 +2,25 @@ r"""The air weakens light and sends some of it back.
 
 Light fades as exp(-alpha * length) over its whole way, twice the half path (Beer, Lambert). Haze at a range r of a ray
 sends back, per metre, beta times the solid angle of the aperture there times exp(-alpha (r + b)), with b the way from
-there to the receiver: b = r at the emitter's own place (Koschmieder 1924; the lidar equation with full overlap).
+there to the receiver: b = r at the emitter's own place (the lidar equation; Measures 1984, chapter 7).
+
+There a pixel looks along the ray, sharp at the range f of what the ray meets, or far away. Haze at r is blurred on it
+to the solid angle A (1 / r - 1 / f)^2, as an aperture A seen from r is wider than from f; a pixel of a smaller solid
+angle catches its share of that (the overlap of an ideal lens). So haze right before the sensor counts no more than a
+pixel's solid angle, and not 1 / r^2. A fixed receiver elsewhere hears all haze in its view.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lidardesign.numerics import safe_divide
 from lidardesign.scene import Medium, Receiver, Scene
 from lidardesign.simulate.bistatic import path_of_range, range_of_path
-from lidardesign.simulate.detector import Detector
+from lidardesign.simulate.detector import Detector, Photons
 from lidardesign.simulate.echoes import Background, Beams, Echoes
 from lidardesign.simulate.hits import Hits
 from lidardesign.simulate.receiver_view import in_view
@@ -60,7 +65,7 @@ def through_air(
     ends = np.full(len(rays), -np.inf)
     np.maximum.at(ends, beams.ray, stops_m)
     edges_m = _cells(windows_m[:, 0], np.clip(ends, windows_m[:, 0], windows_m[:, 1]), photons.aperture_m2)
-    gain = _haze(rays, scene.receiver, medium, edges_m, photons.aperture_m2) * _lit_shares(beams, stops_m, edges_m)
+    gain = _Haze(rays, scene.receiver, medium, photons, ends).gain(edges_m) * _lit_shares(beams, stops_m, edges_m)
     counts = photons.emitted(len(rays)) * photons.efficiency * gain
     return faded, replace(background, edges_m=edges_m, counts=counts)
 
@@ -98,30 +103,50 @@ def _cells(starts: np.ndarray, ends: np.ndarray, aperture_m2: float) -> np.ndarr
     return np.maximum.accumulate(np.clip(edges, starts[:, None], ends[:, None]), axis=1)
 
 
-def _haze(rays: Rays, receiver: Receiver | None, medium: Medium, edges_m: np.ndarray, aperture_m2: float) -> np.ndarray:
-    """The share of each ray's light that haze in cells of half paths (N, C + 1) sends into the aperture, (N, C)."""
-    nodes, weights = np.polynomial.legendre.leggauss(NODES)
-    ranges = np.stack([range_of_path(rays, receiver, column) for column in edges_m.T], axis=1)
-    # paths shorter than the way from emitter to receiver come from no range
-    ranges = np.nan_to_num(ranges, nan=0.0)
-    middle, half = (ranges[:, 1:] + ranges[:, :-1]) / 2, (ranges[:, 1:] - ranges[:, :-1]) / 2
-    gain = np.zeros_like(middle)
-    for node, weight in zip(nodes, weights, strict=True):
-        gain += weight * half * _profile(rays, receiver, medium, middle + node * half, aperture_m2)
-    return gain
+@dataclass(frozen=True, eq=False)
+class _Haze:
+    """What haze along rays sends back.
 
+    Arguments:
+        rays, receiver, medium, photons: Who sends, who hears, what is between, and with which aperture and pixel.
+        focus_m: Ranges that the rays' pixels are sharp at, infinite for far away, shape (N,) [m].
+    """
 
-def _profile(
-    rays: Rays, receiver: Receiver | None, medium: Medium, range_m: np.ndarray, aperture_m2: float
-) -> np.ndarray:
-    """What haze at ranges (N, C) sends into the aperture per metre [1/m]."""
-    if receiver is None:
-        back_m, seen = range_m, 1.0
-    else:
-        points = rays.origin_m[:, None] + range_m[..., None] * rays.direction[:, None]
-        back_m, seen = np.linalg.norm(points - np.asarray(receiver.origin_m), axis=-1), in_view(receiver, points)
-    faded = np.exp(-medium.extinction_per_m * (range_m + back_m))
-    return medium.backscatter_per_m_sr * _solid_angle_sr(back_m, aperture_m2) * faded * seen
+    rays: Rays
+    receiver: Receiver | None
+    medium: Medium
+    photons: Photons
+    focus_m: np.ndarray
+
+    def gain(self, edges_m: np.ndarray) -> np.ndarray:
+        """The share of each ray's light that haze in cells of half paths (N, C + 1) sends into the aperture, (N, C)."""
+        nodes, weights = np.polynomial.legendre.leggauss(NODES)
+        ranges = np.stack([range_of_path(self.rays, self.receiver, column) for column in edges_m.T], axis=1)
+        # paths shorter than the way from emitter to receiver come from no range
+        ranges = np.nan_to_num(ranges, nan=0.0)
+        middle, half = (ranges[:, 1:] + ranges[:, :-1]) / 2, (ranges[:, 1:] - ranges[:, :-1]) / 2
+        gain = np.zeros_like(middle)
+        for node, weight in zip(nodes, weights, strict=True):
+            gain += weight * half * self._profile(middle + node * half)
+        return gain
+
+    def _profile(self, range_m: np.ndarray) -> np.ndarray:
+        """What haze at ranges (N, C) sends into the aperture and the pixel per metre [1/m]."""
+        overlap, back_m, seen = self._overlap(range_m), range_m, 1.0
+        if self.receiver is not None:
+            place = np.asarray(self.receiver.origin_m)
+            points = self.rays.origin_m[:, None] + range_m[..., None] * self.rays.direction[:, None]
+            back_m, seen = np.linalg.norm(points - place, axis=-1), in_view(self.receiver, points)
+            overlap = np.where((self.rays.origin_m == place).all(axis=1)[:, None], overlap, 1.0)
+        faded = np.exp(-self.medium.extinction_per_m * (range_m + back_m))
+        caught_sr = _solid_angle_sr(back_m, self.photons.aperture_m2) * overlap
+        return self.medium.backscatter_per_m_sr * caught_sr * faded * seen
+
+    def _overlap(self, range_m: np.ndarray) -> np.ndarray:
+        """The share of the light in the aperture that falls on the pixel which looks along the ray, (N, C)."""
+        blurred = 1 - safe_divide(range_m, np.broadcast_to(self.focus_m[:, None], range_m.shape), 1.0)
+        sharp = self.photons.field_of_view_sr * range_m**2
+        return np.minimum(safe_divide(sharp, self.photons.aperture_m2 * blurred**2, 1.0), 1.0)
 
 
 def _solid_angle_sr(distance_m: np.ndarray, aperture_m2: float) -> np.ndarray:
