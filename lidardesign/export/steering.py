@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import numpy as np
 
-NEIGHBOURS = 10
+NEIGHBOURS = 6
 LONGEST_MOVED = 3
 # So many stops are improved from both starts, for some percent of the way; more from one, to save time.
 MOST_TWICE = 2000
 # Nearest-neighbour tours cost time with the square of their stops; larger ones start from rows.
 MOST_NEAREST = 20_000
-# Rounds of improvement: 576 stops take 40, 5000 take 180; bounds the time of ever larger tours.
+# Rounds of improvement: 576 stops take 40, 5000 take 200; bounds the time of ever larger tours.
 MOST_ROUNDS = 500
 # Gains below this share of the tour's extent are rounding noise, and could be taken back and forth for ever.
 LEAST_GAIN = 1e-12
