@@ -31,7 +31,7 @@ def show_evaluation(document: dict[str, Any], written: Sequence[Path], rich: Ric
     _show_grid(document["equal_bandwidth"], title, ("matched_to", "matched_rays"), "design", _value, rich)
     _show_effects(document, rich)
     if "audit" in document:
-        _show_audit(document["audit"], rich)
+        _show_audit(document, rich)
     for note in document.get("notes", []):
         rich.print(f"note: {escape(note)}", soft_wrap=True)
     for path in written:
@@ -121,12 +121,14 @@ def _where_on(effect: Entry) -> str:
     return "yes" if effect["scenes_on"] == 1 else f"in {effect['scenes_on']:.0%}"
 
 
-def _show_audit(audit: Entry, rich: RichConsole) -> None:
+def _show_audit(document: Entry, rich: RichConsole) -> None:
     from rich.markup import escape
     from rich.table import Table
 
+    audit = document["audit"]
     unit = escape(audit["unit"])
-    skipped = ", ".join(audit["skipped"]) or "nothing"
+    there = {effect["name"] for effect in document["effects"] if effect["bound"] or effect["lost"]}
+    skipped = ", ".join(name for name in audit["skipped"] if name in there) or "nothing that is there"
     verdict = "passed" if audit["passed"] else "failed"
     title = f"audit {verdict}: the plan skips {skipped}; rows may move by {audit['tolerance']:g} {unit}"
     rich.print(f"[italic]{title}[/italic]", soft_wrap=True)

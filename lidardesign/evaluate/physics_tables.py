@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+from collections.abc import Sequence
 
 from lidardesign.evaluate.audit import Audit, AuditRow
 from lidardesign.evaluate.effects import EffectSummary
@@ -28,28 +29,34 @@ def effects_section(evaluation: Evaluation) -> str:
     return head + table(headings, [(_effect_cells(effect), "", False) for effect in effects], text_columns=2)
 
 
-def audit_section(audit: Audit) -> str:
+def audit_section(evaluation: Evaluation, audit: Audit) -> str:
     """Every row under the plan and under all effects, with a verdict each."""
     planned, everything = audit.seconds
-    skipped = html.escape(", ".join(_words(name) for name in audit.skipped)) or "nothing"
+    there = {effect.name for effect in evaluation.effects if effect.range_m or effect.lost}
+    skipped = html.escape(", ".join(_words(name) for name in audit.skipped if name in there))
+    skipped = skipped or "nothing that is there"
     passed = "failed" if audit.failed else "passed"
     head = (
         f"<p>The audit {passed}. The plan skips {skipped}; all rows took {planned:.2f} s under it and "
         f"{everything:.2f} s under all effects, with the same random numbers. A mean may move by {audit.tolerance:g} "
-        f"{html.escape(audit.unit)}, the metric's tolerance; the largest difference is {figure(audit.worst)}.</p>"
+        f"{html.escape(audit.unit)}, the metric's tolerance; the largest difference is {audit.worst:.2g}.</p>"
     )
     unit = audit.unit
-    headings = ["design", "rays", f"planned [{unit}]", f"all [{unit}]", "difference", "95 % interval", "s", "s, all"]
+    headings = ["design", "rays", f"planned [{unit}]", f"all [{unit}]", "difference", "95 % interval"]
     lines = [
-        (
-            _audit_cells(row),
-            "worse" if row in audit.failed else "better",
-            bool(index and row.design != audit.rows[index - 1].design),
-        )
+        (_audit_cells(row), "worse" if row in audit.failed else "better", bool(index and _starts(audit.rows, index)))
         for index, row in enumerate(audit.rows)
     ]
     words = {"worse": "too far", "better": "within"}
-    return head + table([*headings, "moved"], lines, text_columns=1, words=words)
+    return head + table([*headings, "planned [s]", "all [s]", "moved"], lines, text_columns=1, words=words)
+
+
+def _starts(rows: Sequence[AuditRow], index: int) -> bool:
+    """Whether a row begins a group: another design, or the rows at equal bandwidth of another one."""
+    row, before = rows[index], rows[index - 1]
+    if row.matched_to is None:
+        return row.design != before.design
+    return (row.matched_to, row.matched_rays) != (before.matched_to, before.matched_rays)
 
 
 def _effect_cells(effect: EffectSummary) -> list[str]:
@@ -64,9 +71,9 @@ def _simulated(effect: EffectSummary) -> str:
 
 
 def _audit_cells(row: AuditRow) -> list[str]:
-    name = row.design if row.matched_to is None else f"{row.design}, in the bandwidth of {row.matched_to}"
-    cells = [name, str(row.rays), figure(row.planned), figure(row.everything), figure(row.difference)]
-    return [*cells, f"{figure(row.ci_low)} to {figure(row.ci_high)}", *_times(row), ""]
+    name = row.design if row.matched_to is None else f"{row.design} (bandwidth of {row.matched_to})"
+    cells = [name, str(row.rays), figure(row.planned), figure(row.everything), f"{row.difference:.2g}"]
+    return [*cells, f"{row.ci_low:.2g} to {row.ci_high:.2g}", *_times(row), ""]
 
 
 def _times(row: AuditRow) -> list[str]:

@@ -88,7 +88,7 @@ def report_html(
         _section("Paired differences at equal rays", paired_table(evaluation)),
         _section("At equal bandwidth", bandwidth_table(evaluation)) if evaluation.equal_bandwidth else "",
         _section("Physics", effects_section(evaluation)) if evaluation.effects else "",
-        _section("Audit of the physics", audit_section(evaluation.audit)) if evaluation.audit else "",
+        _section("Audit of the physics", audit_section(evaluation, evaluation.audit)) if evaluation.audit else "",
         *(_section(f"Sensors of {design.name}", sensors_table(design)) for design in designs),
         _section("How to reproduce", _definitions(reproduce)) if reproduce else "",
     ]
