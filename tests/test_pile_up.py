@@ -10,7 +10,13 @@ from synthetic_light import PULSES, background, counted, counting_detector, no_e
 
 from lidardesign.errors import ConfigError
 from lidardesign.simulate.detector import metres
-from lidardesign.simulate.effects.pile_up import _across_pulses, _hit_pulses, _one_of, _within_pulses
+from lidardesign.simulate.effects.pile_up import (
+    DRAWS_PER_BIN,
+    _across_pulses,
+    _hit_pulses,
+    _one_of,
+    _within_pulses,
+)
 from lidardesign.simulate.photon_histograms import coates
 from lidardesign.simulate.streams import uniform
 
@@ -79,8 +85,9 @@ def test_a_gate_that_starts_later_is_not_hidden():
     assert peaks[1] / peaks[0] == pytest.approx(np.exp(per_bin * late), rel=0.03)
 
 
-def pulses_of(key, ray, photons, pulses):
-    return [min(int(uniform(np.uint64(key), ray, k) * pulses), pulses - 1) for k in range(photons)]
+def pulses_of(key, ray, arrived, pulses):
+    draws = [b * DRAWS_PER_BIN + k for b, number in enumerate(arrived) for k in range(number)]
+    return [min(int(uniform(np.uint64(key), ray, draw) * pulses), pulses - 1) for draw in draws]
 
 
 @pytest.mark.parametrize(("dead", "period"), [(3.0, 45.0), (30.0, 45.0), (44.0, 45.0), (100.5, 45.0), (1000.0, 45.0)])
@@ -92,7 +99,7 @@ def test_dead_times_that_reach_across_pulses_agree_with_a_naive_loop_to_the_phot
         # fewer pulses than photons, and more
         pulses = 50 if ray % 2 else 500
         _across_pulses(arrived, found, pulses, dead, period, np.uint64(5), ray)
-        pulse = pulses_of(5, ray, arrived.sum(), pulses)
+        pulse = pulses_of(5, ray, arrived, pulses)
         expected = naive_counts_with_dead_time(pulse, np.repeat(np.arange(BINS), arrived), BINS, dead, period)
         assert np.array_equal(found, expected)
 
@@ -114,6 +121,20 @@ def test_dead_times_within_pulses_agree_with_a_naive_loop_on_average(dead, per_b
     # 40 bins: the largest of so many differences
     assert (off <= (STANDARD_ERRORS + 0.5) * spread + 1e-9).all()
     assert ours.sum(axis=1).std() == pytest.approx(naive.sum(axis=1).std(), rel=0.4, abs=0.2)
+
+
+@pytest.mark.parametrize("follow", [_within_pulses, _across_pulses])
+def test_a_photon_more_changes_nothing_in_bins_that_its_pulse_does_not_blind(follow):
+    arrived = np.random.default_rng(8).poisson(3.0, BINS)
+    one_more = arrived.copy()
+    one_more[10] += 1
+    period = () if follow is _within_pulses else (45.0,)
+    counts = []
+    for photons in (arrived, one_more):
+        counts.append(np.zeros(BINS, np.int64))
+        follow(photons, counts[-1], 1000, 5.0, *period, np.uint64(6), 0)
+    changed = np.flatnonzero(counts[0] != counts[1])
+    assert np.array_equal(changed, [10])
 
 
 def test_dead_times_that_reach_the_next_pulse_blind_its_start():

@@ -22,8 +22,10 @@ ONE_BY_ONE = 32
 MOST_PER_PULSE = 32
 # A ray with more photons than this, where dead times reach across pulses, is followed in a share of its pulses only
 MOST_PHOTONS = 1 << 21
-# draws of a ray: one per photon, and far beyond one per bin
-FIRST_BIN = 1 << 40
+# draws of a ray: one per photon by its bin and its place among the bin's photons, so that a photon more or less changes
+# nothing in other bins; and far beyond one per bin
+DRAWS_PER_BIN = 1 << 32
+FIRST_BIN = 1 << 62
 
 
 def counted(counts: np.ndarray, bins: Bins, photons: Photons, rays: int, key: int, first_ray: int) -> np.ndarray:
@@ -60,7 +62,7 @@ def _counted(counts, offset, pulses, dead, period, key, first_ray):  # noqa: ANN
 @njit(cache=True, nogil=True)
 def _within_pulses(arrived, mine, pulses, dead, key, ray):  # noqa: ANN001, ANN202
     """Bin after bin: a photon finds its pulse alive with the share of pulses without a count in the dead time."""
-    blind, photon, oldest = 0, 0, 0
+    blind, oldest = 0, 0
     for b in range(len(arrived)):
         while oldest < b and b - oldest >= dead:
             blind -= mine[oldest]
@@ -69,10 +71,9 @@ def _within_pulses(arrived, mine, pulses, dead, key, ray):  # noqa: ANN001, ANN2
         if number == 0:
             continue
         if number <= ONE_BY_ONE:
-            for _ in range(number):
-                if uniform(key, ray, photon) * pulses < pulses - blind - mine[b]:
+            for k in range(number):
+                if uniform(key, ray, b * DRAWS_PER_BIN + k) * pulses < pulses - blind - mine[b]:
                     mine[b] += 1
-                photon += 1
         else:
             mine[b] = _hit_pulses(number, pulses - blind, pulses, normal(key, ray, FIRST_BIN + b))
         blind += mine[b]
@@ -114,8 +115,9 @@ def _across_pulses(arrived, mine, pulses, dead, period, key, ray):  # noqa: ANN0
     times = np.empty(total, np.int64)
     photon = 0
     for b in range(size):
-        for _ in range(arrived[b]):
-            times[photon] = min(int(uniform(key, ray, photon) * pulses), pulses - 1) * size + b
+        for k in range(arrived[b]):
+            share = uniform(key, ray, b * DRAWS_PER_BIN + k)
+            times[photon] = min(int(share * pulses), pulses - 1) * size + b
             photon += 1
     ordered = np.sort(times) if pulses > total else _by_pulse(times, size, pulses)
     alive_at = -1.0
