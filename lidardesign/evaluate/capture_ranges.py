@@ -15,7 +15,7 @@ from lidardesign.errors import DataError
 from lidardesign.evaluate.capture import Capture
 from lidardesign.simulate.detector import FWHM_PER_SIGMA, Estimator
 
-# Histograms are worked on so many bins at a time, which bounds memory at 32 MB.
+# Histograms are worked on so many bins at a time, which bounds memory at some 150 MB.
 CHUNK_BINS = 1 << 22
 
 
