@@ -26,7 +26,9 @@ table { border-collapse: collapse; width: 100%; font-size: 0.9rem; font-variant-
 th, td { padding: 5px 12px; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
 th { background: var(--tint); font-weight: 600; color: var(--soft); }
 th.text, td.text { text-align: left; }
-td.name { text-align: left; white-space: normal; min-width: 9ch; max-width: 32ch; overflow-wrap: anywhere; }
+td.name { text-align: left; white-space: normal; min-width: 12ch; max-width: 32ch; overflow-wrap: anywhere; }
+.reasons td.name:nth-child(2) { min-width: 9ch; }
+.reasons td.name:nth-child(3) { min-width: 26ch; max-width: 48ch; }
 tr.first td { border-top: 2px solid #cbd2d9; }
 .better { color: #00664b; font-weight: 600; }
 .worse { color: #a13d00; font-weight: 600; }

@@ -25,8 +25,9 @@ def effects_section(evaluation: Evaluation) -> str:
         f"of range (rms) and the share of returns lost, invented or misplaced. All that is skipped may change "
         f"{MILLIMETRES * tolerance.range_m:.3g} mm and {tolerance.lost:.2g} of the returns together.</p>"
     )
-    headings = ["effect", "reason", "range [mm]", "returns", "cost [s]", "simulated"]
-    return head + table(headings, [(_effect_cells(effect), "", False) for effect in effects], text_columns=2)
+    headings = ["effect", "simulated", "reason", "range [mm]", "returns", "cost [s]"]
+    lines = [(_effect_cells(effect), "", False) for effect in effects]
+    return f'{head}<div class="reasons">{table(headings, lines, text_columns=3)}</div>'
 
 
 def audit_section(evaluation: Evaluation, audit: Audit) -> str:
@@ -60,8 +61,8 @@ def _starts(rows: Sequence[AuditRow], index: int) -> bool:
 
 
 def _effect_cells(effect: EffectSummary) -> list[str]:
-    shown = [_words(effect.name), effect.reason, f"{MILLIMETRES * effect.range_m:.3g}", f"{effect.lost:.2g}"]
-    return [*shown, f"{effect.seconds:.2g}", _simulated(effect)]
+    shown = [_words(effect.name), _simulated(effect), effect.reason]
+    return [*shown, f"{MILLIMETRES * effect.range_m:.3g}", f"{effect.lost:.2g}", f"{effect.seconds:.2g}"]
 
 
 def _simulated(effect: EffectSummary) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 
 from lidardesign.numerics import safe_divide
 from lidardesign.scene import Scene
-from lidardesign.simulate.bounds.counts import Counts, share_in_bins
+from lidardesign.simulate.bounds.counts import Counts, counted, share_in_bins
 from lidardesign.simulate.bounds.sight import Sight, Stake
 from lidardesign.simulate.detector import Detector
 from lidardesign.simulate.returns import Rays
@@ -62,4 +62,4 @@ def _strayed(counts: Counts, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndar
 def _reason(sight: Sight, gate: float) -> str:
     ambient = sight.scene.ambient
     light = "dark counts" if ambient is None else f"{ambient.illuminance_lux:,.0f} lux ({ambient.source}), dark counts"
-    return f"{light}: at most {gate:.3g} in a gate"
+    return f"{light}: about {counted(gate)} in a gate"

@@ -18,6 +18,8 @@ from lidardesign.simulate.bounds.light import ambient_per_metre, haze_per_pulse
 from lidardesign.simulate.bounds.sight import BINS_PER_SIGMA, Sight
 from lidardesign.simulate.detector import FWHM_PER_SIGMA, Detector, metres
 
+# Counts from here on are shown as whole numbers.
+MANY = 100
 # The highest of a histogram's bins strays by this many of (sigma^5 / (n b))^(1/4), see `peak_error_m`.
 PEAK_STRAY = 1.5
 
@@ -81,7 +83,7 @@ class Counts:
     def typical(self) -> str:
         """The median of `in_air` over returns, for people."""
         returned = self.in_air[self.sight.returned]
-        return f"{np.median(returned):.3g}" if len(returned) else "no"
+        return counted(float(np.median(returned))) if len(returned) else "no"
 
     @cached_property
     def in_air(self) -> np.ndarray:
@@ -170,6 +172,11 @@ class Counts:
     def _by_sharing(self, name: str) -> np.ndarray:
         shared, place = np.unique(self.sight.sharing, return_inverse=True)
         return np.array([getattr(self.sight.detector.photons, name)(int(rays)) for rays in shared])[place]
+
+
+def counted(number: float) -> str:
+    """An expected count for people."""
+    return f"{number:,.0f}" if number >= MANY else f"{number:.2g}"
 
 
 def bin_width_m(detector: Detector) -> float:

@@ -52,11 +52,13 @@ def _detours(sight: Sight, rows: np.ndarray) -> Detours:
     rays, hits = sight.rays.subset(rows), sight.hits
     hits = Hits(hits.range_m[rows], hits.body[rows], hits.normal[rows])
     photons, receiver = sight.detector.photons, sight.scene.receiver
-    if receiver is None and (photons is None or photons.emission == "scanned"):
+    flood = photons is not None and photons.emission == "flood"
+    if not flood and receiver is None:
         beam_sr = math.pi * (sight.detector.divergence_rad / 2) ** 2
         pixel_sr = beam_sr if photons is None else max(photons.field_of_view_sr, beam_sr)
         return pixel_bound(sight.scene, rays, hits, sight.caster, pixel_sr, sight.resolution_m)
-    lamp_m = None if receiver is None else np.asarray(receiver.origin_m)
+    # a flood's pixels look at spots that its emitters light; a receiver alone hears what is sent anywhere in its view
+    lamp_m = None if flood or receiver is None else np.asarray(receiver.origin_m)
     return lamp_bound(sight.scene, rays, hits, sight.caster, lamp_m, sight.resolution_m)
 
 
