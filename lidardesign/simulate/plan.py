@@ -151,8 +151,9 @@ class Planner:
         Raises:
             ConfigError: An effect that was named cannot be simulated here, or a gate lies outside the histogram.
         """
-        for rays in lists:
-            check_windows(path_windows(rays, scene.receiver), self.detector)
+        if self.detector.bins is not None or self.detector.photons is not None:
+            for rays in lists:
+                check_windows(path_windows(rays, scene.receiver), self.detector)
         found = _bounds(scene, lists, self.detector, casters)
         missing = {name: _missing(name) for name in self._asked(found)}
         on = self._chosen(found, missing)
