@@ -6,9 +6,11 @@ Without the simulator only its process and its absence are tested; everything el
 from __future__ import annotations
 
 import math
+import subprocess
 import sys
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -329,6 +331,25 @@ def test_a_process_that_takes_too_long_is_ended(tmp_path):
     with pytest.raises(NumericalError, match="no answer within"):
         slow.ask(tmp_path, 0.5)
     assert not slow.alive
+
+
+@needs_simulator
+def test_the_simulator_runs_from_any_folder_and_is_imported_in_its_own_process_alone(tmp_path):
+    (tmp_path / "mitsuba.py").write_text("raise SystemExit('the wrong one')")
+    code = (
+        "import sys\n"
+        f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "from test_light_transport import *\n"
+        "rays = rays_from((0, 0, 0), spiral(4, 0.1))\n"
+        "found = render_transient(sphere_scene(), 0, rays, Lights.flood(rays.origin_m[:1]), PathBins(0.1, 9))\n"
+        "assert found.steady.all()\n"
+        "assert not {'mitsuba', 'drjit', 'mitransient'} & set(sys.modules)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-P" if sys.version_info >= (3, 11) else "-s", "-c", code],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
 
 
 @needs_simulator

@@ -14,7 +14,7 @@ from lidardesign.simulate.detector import Detector
 from lidardesign.simulate.detector_files import load_detector
 from lidardesign.simulate.echoes import Beams
 from lidardesign.simulate.light_transport import Lights, PathBins, render_transient
-from lidardesign.simulate.multipath_bound import Detours, lamp_bound, later_share, pixel_bound
+from lidardesign.simulate.multipath_bound import Detours, lamp_bound, pixel_bound, series
 from lidardesign.simulate.physics import Physics, direct_echoes
 from lidardesign.simulate.raycast import shared_caster
 from lidardesign.simulate.returns import Rays
@@ -65,10 +65,11 @@ def shares(scene: Scene, rays: Rays, detector: Detector) -> tuple[np.ndarray, np
 def bounded(scene: Scene, rays: Rays, detector: Detector) -> Detours:
     caster = shared_caster(scene, 0)
     hits = caster.first_hit(rays.origin_m, rays.direction)
-    if scene.receiver is None and detector.photons.emission == "scanned":
+    if detector.photons.emission == "flood":
+        return lamp_bound(scene, rays, hits, caster, None, 0.15)
+    if scene.receiver is None:
         return pixel_bound(scene, rays, hits, caster, detector.photons.field_of_view_sr, 0.0075)
-    lamp_m = None if scene.receiver is None else np.asarray(scene.receiver.origin_m)
-    return lamp_bound(scene, rays, hits, caster, lamp_m, 0.0375)
+    return lamp_bound(scene, rays, hits, caster, np.asarray(scene.receiver.origin_m), 0.0075)
 
 
 @needs_simulator
@@ -166,10 +167,10 @@ def test_the_bound_holds_and_says_something(scene, detector, receiver):
     assert bound.seen.mean() == pytest.approx(1.0 if scene is room else 0.5, abs=0.02)
 
 
-def test_white_walls_all_around_have_no_useful_bound_but_a_finite_one():
-    assert math.isfinite(later_share(1.0, np.ones(1), 1.0, np.ones(1))[0])
-    assert later_share(0.5, np.ones(1), 1.0, np.ones(1))[0] == pytest.approx(0.5)
-    assert later_share(0.0, np.ones(1), 1.0, np.ones(1))[0] == 0
+def test_bounces_add_up_to_a_geometric_series_and_to_a_finite_one_between_white_walls():
+    for once in (0.0, 0.3, 0.9):
+        assert series(once) == pytest.approx(sum(once**k for k in range(1, 400)))
+    assert math.isfinite(series(1.0))
 
 
 def test_bounds_do_not_depend_on_where_a_scene_is():

@@ -112,7 +112,8 @@ def ask(
         folder = Path(name)
         (folder / "request.json").write_text(json.dumps(request), encoding="utf-8")
         np.savez(folder / "request.npz", **arrays)
-        _worker().ask(folder, limit_s)
+        with _one_at_a_time:
+            _worker().ask(folder, limit_s)
         failure = folder / "error.txt"
         if failure.exists():
             lines = failure.read_text(encoding="utf-8").strip().splitlines()
@@ -138,6 +139,8 @@ class Worker:
             # a request that is written is gone: nothing is left over to be written to a process that died
             bufsize=0,
             env=dict(environment),
+            # where this package is found, and nothing of a user's folder is mistaken for a library
+            cwd=Path(__file__).parents[2],
         )
         self.owner = os.getpid()
         self._lines: queue.Queue[str | None] = queue.Queue()
@@ -205,6 +208,7 @@ def _epitaph(code: int, printed: list[str]) -> str:
 
 
 _running: list[Worker] = []
+_one_at_a_time = threading.Lock()
 
 
 def _worker() -> Worker:

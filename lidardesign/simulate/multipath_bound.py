@@ -1,22 +1,23 @@
 r"""How much light may come back by way of other surfaces, and how far it may move a range, without simulating it.
 
 From a matt point P some directions lead to other surfaces Q: F is their share of P's view, weighted with the cosine.
-All that a flood sends to P from there, relative to what it sends P directly, is
+All that a flood sends to P by way of them, relative to what it sends P directly, is
 
-    share = mean over directions of rho_Q E(Q) / E(P), and for all later surfaces at most
-    rho F (rho F_max E_max / E(P)) / (1 - rho F_max),
+    share = mean over Q of rho_Q E(Q) / E(P)  +  mean over Q and what Q sees, R, of rho_Q rho_R E(R) / E(P)  + ...
 
-E = cosine / distance^2 to the emitter, 0 in its shadow, rho the largest reflectance: a geometric series, since no point
-gets more than rho F_max of what the brightest has. With the receiver in the emitter's place the same holds for a beam
-whose detours a fixed receiver hears, by reciprocity. A pixel that is lit through itself alone gets back
+with E = cosine / distance^2 to the emitter, 0 in its shadow. The first two sums are measured by casting rays; all the
+others are at most mean(rho_Q rho_R) once E_max / E(P) / (1 - once), once = rho F_max for the largest reflectance: a
+geometric series, since no point gets more than that part of what the brightest has. With the receiver in the emitter's
+place the same holds for a beam whose detours a fixed receiver hears, by reciprocity. A pixel that is lit through itself
+alone gets back
 
-    share = mean over directions of rho_P rho_Q (form factor of the pixel's spot from Q), at most rho_P rho_Q,
-    and for all later surfaces at most the same times rho F_max / (1 - rho F_max), late by as much more as there are.
+    share = mean over Q of rho_P rho_Q (form factor of the pixel's spot from Q), at most rho_P rho_Q,
+    and by all later surfaces at most the same times once / (1 - once), late by as much more as there are.
 
 Light that is late by d moves a range by at most its share times d; what is late by more than a detector tells apart
 makes a peak of its own, which may be taken for the echo where all of it outweighs that. Directions are laid out evenly
-(Lambert's equal-area disc), not drawn: shares are measured by casting them, to within a few hundredths. A surface that
-fills less than a hundredth of a view may be missed by a point, and is met by others as often as it should.
+(Lambert's equal-area disc), not drawn: shares are measured to within a few hundredths. A surface that fills less than a
+hundredth of a view may be missed by a point, and is met by others as often as it should.
 """
 
 from __future__ import annotations
@@ -32,14 +33,14 @@ from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.receiver_view import in_view
 from lidardesign.simulate.returns import Rays
 
-# Points whose view is measured, and directions from each: some thousand rays.
-MOST_POINTS, DIRECTIONS = 64, 96
+# Points whose view is measured, directions from each, and from what they meet: up to forty thousand rays.
+MOST_POINTS, DIRECTIONS, FURTHER_DIRECTIONS = 64, 64, 4
 # A surface that a pixel grazes more flatly than this counts as met at it: a spot is then 50 times as long as wide.
 FLATTEST_COSINE = 0.02
 GOLDEN_ANGLE_RAD = math.pi * (3 - math.sqrt(5))
 # Rays start this share of their distance above a surface, so as not to hit it again.
 CLEARANCE = 1e-6
-# A series of bounces between perfect mirrors of matt white never ends; a share this close to 1 stands for it.
+# Bounces between white walls all around never end; a share this close to 1 stands for theirs.
 WHITEST = 0.999
 
 
@@ -62,17 +63,10 @@ class Detours:
     seen: np.ndarray
 
 
-def later_share(reflectance: float, seen: np.ndarray, most_seen: float, brightest: np.ndarray) -> np.ndarray:
-    """Light that met three surfaces or more, over direct light, at most.
-
-    Arguments:
-        reflectance: The largest of a scene.
-        seen: Share of each point's view that other surfaces fill, shape (K,).
-        most_seen: The largest of all such shares.
-        brightest: What the brightest point gets, over what each gets, directly, shape (K,).
-    """
-    once = min(reflectance * most_seen, WHITEST)
-    return reflectance * seen * once * brightest / (1 - once)
+def series(once: float) -> float:
+    """What all further bounces add to 1, of which each keeps a share: once / (1 - once), finite for any share."""
+    kept = min(once, WHITEST)
+    return kept / (1 - kept)
 
 
 def lamp_bound(
@@ -90,129 +84,161 @@ def lamp_bound(
         lamp_m: Where light comes from, or is heard, shape (3,) [m]; None: at each ray's origin.
         resolution_m: Half paths that a detector does not tell apart [m].
     """
-    view = _View.of(scene, rays, hits, caster)
-    lamp = view.origin_m if lamp_m is None else np.broadcast_to(np.asarray(lamp_m, dtype=float), view.point_m.shape)
-    toward = lamp - view.point_m
-    direct_m = np.linalg.norm(toward, axis=1)
-    own = np.maximum(np.einsum("kj,kj->k", view.normal, toward), 0.0) / direct_m**3
-    lit, lit_m = view.lit_from(lamp, caster, None if lamp_m is None else scene)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        each = np.where(own[:, None] > 0, view.reflectance * lit / own[:, None], 0.0) / DIRECTIONS
-        brightest = np.where(own > 0, max(own.max(initial=0.0), lit.max(initial=0.0)) / own, 0.0)
-    late_m = (lit_m + view.away_m - direct_m[:, None]) / 2
-    most = max((body.reflectance for body in scene.bodies), default=0.0)
-    later = later_share(most, view.seen, view.seen.max(initial=0.0), brightest)
-    return view.detours(each, late_m, later, later * resolution_m, resolution_m)
+    chosen = _sample(hits)
+    lamp = rays.origin_m[chosen] if lamp_m is None else np.tile(np.asarray(lamp_m, dtype=float), (len(chosen), 1))
+    place = rays.origin_m[chosen] + hits.range_m[chosen, None] * rays.direction[chosen]
+    start = _Ends(np.arange(len(chosen)), np.ones(len(chosen)), place, hits.normal[chosen], np.zeros(len(chosen)))
+    direct_m = np.linalg.norm(lamp - place, axis=1)
+    own = np.maximum(np.einsum("kj,kj->k", start.normal, lamp - place), 0.0) / direct_m**3
+    first = _next(scene, caster, start, DIRECTIONS)
+    second = _next(scene, caster, first, FURTHER_DIRECTIONS)
+    # a pixel that looks at a flood's spots sees them wherever they are; a receiver hears what is in its view
+    viewed = scene if lamp_m is not None else None
+    lit = [_lit(ends, lamp[ends.point], caster, viewed) for ends in (first, second)]
+    brightest = max([own.max(initial=0.0), *(light.max(initial=0.0) for light, _ in lit)])
+    seen = first.seen(len(chosen))
+    most = max(body.reflectance for body in scene.bodies)
+    with np.errstate(divide="ignore"):
+        over_own = np.where(own > 0, 1 / own, 0.0)
+    late = _Late(len(chosen), resolution_m)
+    for ends, (light, away_m) in zip((first, second), lit, strict=True):
+        late.add(
+            ends.point, ends.weight * light * over_own[ends.point], (ends.path_m + away_m - direct_m[ends.point]) / 2
+        )
+    twice = np.bincount(second.point, second.weight, len(chosen))
+    rest = twice * series(most * seen.max(initial=0.0)) * brightest * over_own
+    return late.detours(chosen, rest, rest * resolution_m, seen)
 
 
 def pixel_bound(
     scene: Scene, rays: Rays, hits: Hits, caster: SceneCaster, pixel_sr: float, resolution_m: float
 ) -> Detours:
     """Detours of scanned beams that only the pixel around each beam hears; arguments as in `lamp_bound`."""
-    view = _View.of(scene, rays, hits, caster)
-    back = view.origin_m - view.point_m
-    distance_m = np.linalg.norm(back, axis=1)
-    cosine = np.einsum("kj,kj->k", view.normal, back) / distance_m
+    chosen = _sample(hits)
+    distance_m, normal = hits.range_m[chosen], hits.normal[chosen]
+    place = rays.origin_m[chosen] + distance_m[:, None] * rays.direction[chosen]
+    own = np.array([body.reflectance for body in scene.bodies])[hits.body[chosen]]
+    start = _Ends(np.arange(len(chosen)), own, place, normal, np.zeros(len(chosen)))
+    cosine = np.abs(np.einsum("kj,kj->k", normal, rays.direction[chosen]))
     spot_m2 = pixel_sr * distance_m**2 / np.maximum(cosine, FLATTEST_COSINE)
-    facing = np.maximum(np.einsum("kdj,kdj->kd", view.found_normal, -view.direction), 0.0)
-    leaving = np.einsum("kdj,kj->kd", view.direction, view.normal)
+    ends = _next(scene, caster, start, DIRECTIONS)
+    back = place[ends.point] - ends.place
+    facing = np.maximum(np.einsum("mj,mj->m", ends.normal, back), 0.0)
+    leaving = np.maximum(-np.einsum("mj,mj->m", normal[ends.point], back), 0.0)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        factor = np.minimum(facing * leaving * spot_m2[:, None] / (math.pi * view.away_m**2), 1.0)
-    own = np.array([body.reflectance for body in scene.bodies])[hits.body[view.chosen]]
-    each = np.where(np.isfinite(view.away_m), own[:, None] * view.reflectance * factor, 0.0) / DIRECTIONS
-    most = max((body.reflectance for body in scene.bodies), default=0.0)
-    once = min(most * view.seen.max(initial=0.0), WHITEST)
-    # the k-th bounce more comes from k times as far: sum k once^(k - 1) = 1 / (1 - once)^2
-    moved_m = view.moved_m(each, view.away_m, resolution_m) * (1 / (1 - once) ** 2 - 1)
-    return view.detours(each, view.away_m, each.sum(axis=1) * once / (1 - once), moved_m, resolution_m)
+        factor = np.fmin(facing * leaving * spot_m2[ends.point] / (math.pi * ends.path_m**4), 1.0)
+    late = _Late(len(chosen), resolution_m)
+    late.add(ends.point, ends.weight * factor, ends.path_m)
+    seen = ends.seen(len(chosen))
+    further = series(max(body.reflectance for body in scene.bodies) * seen.max(initial=0.0))
+    # the k-th bounce more comes from k times as far: sum over k of k once^(k - 1) = 1 / (1 - once)^2
+    return late.detours(chosen, late.share * further, late.moved_m * ((1 + further) ** 2 - 1), seen)
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
-    """What K points on surfaces see in D directions: arrays (K, ...) and (K, D, ...)."""
+class _Ends:
+    """Where paths that started at points have got to, as flat lists.
 
-    chosen: np.ndarray
-    origin_m: np.ndarray
-    point_m: np.ndarray
+    Arguments:
+        point: The point that each started at.
+        weight: The share of its view that each stands for, times the reflectances met.
+        place, normal: Where it is on which surface, (M, 3).
+        path_m: How long it is [m].
+    """
+
+    point: np.ndarray
+    weight: np.ndarray
+    place: np.ndarray
     normal: np.ndarray
-    direction: np.ndarray
-    away_m: np.ndarray
-    found_normal: np.ndarray
-    reflectance: np.ndarray
+    path_m: np.ndarray
 
-    @classmethod
-    def of(cls, scene: Scene, rays: Rays, hits: Hits, caster: SceneCaster) -> _View:
-        met = np.flatnonzero(hits.body >= 0)
-        chosen = met[np.unique(np.linspace(0, len(met) - 1, min(MOST_POINTS, len(met))).astype(int))]
-        origin_m, normal = rays.origin_m[chosen], hits.normal[chosen]
-        lift_m = CLEARANCE * (1 + hits.range_m[chosen])
-        point_m = origin_m + hits.range_m[chosen, None] * rays.direction[chosen] + lift_m[:, None] * normal
-        direction = _hemispheres(normal)
-        starts = np.repeat(point_m, DIRECTIONS, axis=0)
-        found = caster.first_hit(starts, direction.reshape(-1, 3))
-        shape = (len(chosen), DIRECTIONS)
-        reflectance = np.array([*(body.reflectance for body in scene.bodies), 0.0])[found.body]
-        return cls(
-            chosen,
-            origin_m,
-            point_m,
-            normal,
-            direction,
-            found.range_m.reshape(shape),
-            found.normal.reshape(*shape, 3),
-            reflectance.reshape(shape),
-        )
+    def seen(self, points: int) -> np.ndarray:
+        """The share of the directions from each point that met something, after one step."""
+        return np.bincount(self.point, minlength=points) / DIRECTIONS
+
+
+class _Late:
+    """Shares of light by how late they are, added up by point."""
+
+    def __init__(self, points: int, resolution_m: float) -> None:
+        self._resolution_m = resolution_m
+        self.near, self.apart, self.moved_m = np.zeros(points), np.zeros(points), np.zeros(points)
 
     @property
-    def seen(self) -> np.ndarray:
-        return np.isfinite(self.away_m).mean(axis=1)
+    def share(self) -> np.ndarray:
+        return self.near + self.apart
 
-    def lit_from(self, lamp_m: np.ndarray, caster: SceneCaster, viewed: Scene | None) -> tuple[np.ndarray, np.ndarray]:
-        """What the surfaces seen get from a lamp, cosine / distance^2, and how far it is, both (K, D)."""
-        away_m = np.where(np.isfinite(self.away_m), self.away_m, 0.0)
-        lift_m = CLEARANCE * (1 + away_m)
-        places = self.point_m[:, None] + away_m[..., None] * self.direction + lift_m[..., None] * self.found_normal
-        toward = lamp_m[:, None] - places
-        distance_m = np.linalg.norm(toward, axis=-1)
-        toward = toward / distance_m[..., None]
-        cosine = np.maximum(np.einsum("kdj,kdj->kd", toward, self.found_normal), 0.0)
-        asked = np.isfinite(self.away_m) & (cosine > 0)
-        if viewed is not None and viewed.receiver is not None:
-            asked &= in_view(viewed.receiver, places)
-        free = np.zeros(asked.shape, dtype=bool)
-        free[asked] = caster.first_hit(places[asked], toward[asked]).range_m >= distance_m[asked]
-        return np.where(free, cosine / distance_m**2, 0.0), distance_m
+    def add(self, point: np.ndarray, share: np.ndarray, late_m: np.ndarray) -> None:
+        near, points = late_m < self._resolution_m, len(self.near)
+        self.near += np.bincount(point, share * near, points)
+        self.apart += np.bincount(point, share * ~near, points)
+        self.moved_m += np.bincount(point, share * near * np.maximum(late_m, 0.0), points)
 
-    def moved_m(self, each: np.ndarray, late_m: np.ndarray, resolution_m: float) -> np.ndarray:
-        """Shares (K, D) of light times their delays (K, D), of what is late by less than a resolution, shape (K,)."""
-        near = (each > 0) & (late_m < resolution_m)
-        return (each * np.where(near, np.maximum(late_m, 0.0), 0.0)).sum(axis=1)
-
-    def detours(
-        self,
-        each: np.ndarray,
-        late_m: np.ndarray,
-        later: np.ndarray,
-        later_moved_m: np.ndarray,
-        resolution_m: float,
-    ) -> Detours:
-        moved_m = self.moved_m(each, late_m, resolution_m) + np.minimum(later_moved_m, later * resolution_m)
+    def detours(self, chosen: np.ndarray, rest: np.ndarray, rest_moved_m: np.ndarray, seen: np.ndarray) -> Detours:
+        """With the rest of the light, which may be late by anything."""
+        moved_m = self.moved_m + np.minimum(rest_moved_m, rest * self._resolution_m)
         # a mean of the echo and what is near to it lies no further off than its share of the furthest
-        beside = np.where(late_m < resolution_m, each, 0.0).sum(axis=1) + later
-        shift_m = np.minimum(moved_m, resolution_m * beside / (1 + beside))
-        apart = np.where(late_m < resolution_m, 0.0, each).sum(axis=1) + later
-        return Detours(self.chosen, each.sum(axis=1) + later, apart, shift_m, self.seen)
+        beside = self.near + rest
+        shift_m = np.minimum(moved_m, self._resolution_m * beside / (1 + beside))
+        return Detours(chosen, self.share + rest, self.apart + rest, shift_m, seen)
 
 
-def _hemispheres(normal: np.ndarray) -> np.ndarray:
-    """Directions above surfaces with normals (K, 3), as dense as the cosine, turned from point to point, (K, D, 3)."""
-    number = np.arange(DIRECTIONS)
-    radius = np.sqrt((number + 0.5) / DIRECTIONS)
-    angle = GOLDEN_ANGLE_RAD * number + GOLDEN_ANGLE_RAD * DIRECTIONS * np.arange(len(normal))[:, None]
+def _sample(hits: Hits) -> np.ndarray:
+    """Rays that hit something, evenly out of all of them."""
+    met = np.flatnonzero(hits.body >= 0)
+    return met[np.unique(np.linspace(0, len(met) - 1, min(MOST_POINTS, len(met))).astype(int))]
+
+
+def _next(scene: Scene, caster: SceneCaster, ends: _Ends, directions: int) -> _Ends:
+    """What is met from the ends of paths, in so many directions each."""
+    direction = _hemispheres(ends.normal, directions)
+    source = np.repeat(np.arange(len(ends.point)), directions)
+    start = _lifted(ends.place, ends.normal)[source]
+    found = caster.first_hit(start, direction)
+    met = np.flatnonzero(found.body >= 0)
+    source, reached = source[met], found.range_m[met]
+    reflectance = np.array([body.reflectance for body in scene.bodies])[found.body[met]]
+    return _Ends(
+        ends.point[source],
+        ends.weight[source] * reflectance / directions,
+        start[met] + reached[:, None] * direction[met],
+        found.normal[met],
+        ends.path_m[source] + reached,
+    )
+
+
+def _lit(ends: _Ends, lamp_m: np.ndarray, caster: SceneCaster, viewed: Scene | None) -> tuple[np.ndarray, np.ndarray]:
+    """What places get from lamps (M, 3), cosine / distance^2, and how far those are [m], both (M,)."""
+    places = _lifted(ends.place, ends.normal)
+    toward = lamp_m - places
+    away_m = np.linalg.norm(toward, axis=1)
+    cosine = np.einsum("mj,mj->m", toward, ends.normal) / away_m
+    asked = cosine > 0
+    if viewed is not None and viewed.receiver is not None:
+        asked &= in_view(viewed.receiver, places)
+    asked = np.flatnonzero(asked)
+    free = caster.first_hit(places[asked], toward[asked]).range_m >= away_m[asked]
+    light = np.zeros(len(places))
+    light[asked] = np.where(free, cosine[asked] / away_m[asked] ** 2, 0.0)
+    return light, away_m
+
+
+def _lifted(places: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    if not len(places):
+        return places
+    return places + CLEARANCE * (1 + np.ptp(places, axis=0).max()) * normal
+
+
+def _hemispheres(normal: np.ndarray, directions: int) -> np.ndarray:
+    """Directions above surfaces with normals (M, 3), dense as the cosine, turned from each to the next, (M D, 3)."""
+    number = np.arange(directions)
+    radius = np.sqrt((number + 0.5) / directions)
+    angle = GOLDEN_ANGLE_RAD * (number + directions * np.arange(len(normal))[:, None])
     other = np.eye(3)[np.abs(normal).argmin(axis=1)]
     left = np.cross(other, normal)
     left /= np.linalg.norm(left, axis=1, keepdims=True)
     up = np.cross(normal, left)
-    height = np.sqrt(1 - radius**2)
     x, y = radius * np.cos(angle), radius * np.sin(angle)
-    return x[..., None] * left[:, None] + y[..., None] * up[:, None] + height[:, None] * normal[:, None]
+    height = np.sqrt(1 - radius**2)[:, None]
+    spread = x[..., None] * left[:, None] + y[..., None] * up[:, None] + height * normal[:, None]
+    return spread.reshape(-1, 3)
