@@ -47,6 +47,11 @@ def corners(free):
     return {(*low, *high) for low, high in zip(free.low_m.tolist(), free.high_m.tolist(), strict=True)}
 
 
+def meets_space(box):
+    """Whether it takes some of the volume of the space."""
+    return all(b < t and b < 6 and t > 0 for b, t in zip(box["low_m"], box["high_m"], strict=True))
+
+
 @settings(deadline=None)
 @given(boxes_drawn, interval_drawn)
 def test_an_interval_avoids_all_boxes_just_where_it_lies_in_a_free_one(boxes, interval):
@@ -57,7 +62,9 @@ def test_an_interval_avoids_all_boxes_just_where_it_lies_in_a_free_one(boxes, in
         return
     free = free_boxes(one_with(boxes), SPACE)
     held = ((free.low_m <= low) & (high <= free.high_m)).all(axis=1).any()
-    assert held == (not any(reaches_into(low, high, box) for box in boxes))
+    avoids = not any(reaches_into(low, high, box) for box in boxes)
+    inside = ((low >= 0) & (high <= 6)).all()
+    assert held == (avoids and (inside or not any(meets_space(box) for box in boxes)))
 
 
 @settings(deadline=None)
@@ -88,12 +95,16 @@ def test_a_point_is_inside_a_box_or_in_a_free_one(boxes, point):
 
 def test_one_pillar_leaves_its_six_sides():
     free = free_boxes(one_with([{"low_m": [2, 2, 2], "high_m": [3, 4, 5]}]), SPACE)
-    inf = math.inf
     assert corners(free) == {
-        (-inf, -inf, -inf, 2, inf, inf), (3, -inf, -inf, inf, inf, inf),
-        (-inf, -inf, -inf, inf, 2, inf), (-inf, 4, -inf, inf, inf, inf),
-        (-inf, -inf, -inf, inf, inf, 2), (-inf, -inf, 5, inf, inf, inf),
+        (0, 0, 0, 2, 6, 6), (3, 0, 0, 6, 6, 6), (0, 0, 0, 6, 2, 6), (0, 4, 0, 6, 6, 6), (0, 0, 0, 6, 6, 2),
+        (0, 0, 5, 6, 6, 6),
     }  # fmt: skip
+
+
+def test_boxes_beside_the_space_leave_intervals_free_on_its_other_sides():
+    free = free_boxes(one_with([{"low_m": [-3, -1, -1], "high_m": [0, 7, 7]}]), SPACE)
+    inf = math.inf
+    assert (0, -inf, -inf, inf, inf, inf) in corners(free)
 
 
 def test_sides_beyond_the_origin_box_are_left_out():

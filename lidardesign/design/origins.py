@@ -4,9 +4,11 @@ What is left is not convex, so it is described by its maximal boxes: a box avoid
 just where it lies in one of the maximal boxes between them. So an interval of origins, which is a box of its own, is
 kept out of all excluded boxes by keeping it in one maximal box, and nothing is lost.
 
-Sides of maximal boxes that no excluded box stops are infinite: the mean of an origin keeps to its sensor's box, while
-its interval, which may be longer, has only the excluded boxes to avoid. Along axes on which the box is thin the origin
-has no freedom: an excluded box that does not hold its coordinate there is not in its way.
+Excluded boxes that take part of the origin box divide what is left of it, and an interval keeps to one of its parts:
+it would otherwise balance on an edge of the origin box, half of it outside, to cover other parts. Where none does,
+the mean alone keeps to the origin box, and its interval, which may be longer, has the excluded boxes beyond to avoid.
+Along axes on which the origin box is thin there is no freedom: an excluded box that does not hold the coordinate there
+is not in the way.
 """
 
 from __future__ import annotations
@@ -66,18 +68,21 @@ def inside_excluded(origins_m: np.ndarray, one: SensorConstraints) -> np.ndarray
 
 
 def free_boxes(one: SensorConstraints, space: DesignSpace) -> Boxes:
-    """The maximal boxes between the excluded ones in which a sensor's mean origin may lie; none where all is excluded.
+    """The maximal boxes between the excluded ones that hold a sensor's intervals; none where all is excluded.
 
-    Along axes without freedom they are the whole line.
+    Where no excluded box meets the origin box they may reach beyond it; along axes without freedom they are the line.
     """
     low, high = origin_box(one, space)
     fixed = high - low <= PINNED_BOX_M
     middle = (low + high) / 2
-    free = Boxes(np.full((1, 3), -np.inf), np.full((1, 3), np.inf))
-    for bottom, top in zip(*excluded(one), strict=True):
-        held = (bottom < middle) & (middle < top)
-        if (bottom < top).all() and held[fixed].all():
-            free = _without(free, bottom, top, low, high, ~fixed)
+    bottoms, tops = excluded(one)
+    held = np.where(fixed, (bottoms < middle) & (middle < tops), bottoms < tops).all(axis=1)
+    bottoms, tops = bottoms[held], tops[held]
+    inside = (((bottoms < high) & (tops > low)) | fixed).all(axis=1).any()
+    kept = ~fixed & inside
+    free = Boxes(np.where(kept, low, -np.inf)[None], np.where(kept, high, np.inf)[None])
+    for bottom, top in zip(bottoms, tops, strict=True):
+        free = _without(free, bottom, top, low, high, ~fixed)
     return free
 
 

@@ -192,7 +192,7 @@ def check_support(support: Support, group: Group, *, mass: float | None, several
             f"the constraints of {which} hold {mass:.3g} of the density",
             admissible_mass=mass,
             allowed=f"at least {LEAST_MASS:g}",
-            hint="widen the origin box, the gate or the field of view, or learn inside the smaller space",
+            hint="widen the origin box, the gate or the field of view, exclude less, or learn inside the smaller space",
         )
     if support.effective < needed:
         raise InfeasibleError(
