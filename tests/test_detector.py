@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -148,3 +149,25 @@ def test_the_documentation_s_example_is_a_detector(tmp_path):
     text = (ROOT / "docs" / "detectors.md").read_text(encoding="utf-8")
     for block in re.findall(r"```yaml\n(.*?)```", text, re.DOTALL):
         load(tmp_path, block)
+
+
+STRANGE = ["-1", "0", "1e308", "-1e308", "1e-308", "x", "''", "~", "true", "[]", "{}", ".nan", "-.inf", "1:30", "0x10"]
+NEVER = set(STRANGE) - {"0", "1e-308"}
+
+
+@pytest.mark.parametrize("name", QUANTITIES)
+def test_strange_values_of_any_quantity_are_refused_or_possible(tmp_path, name):
+    others = [line for line in LIGHT.splitlines() if not re.match(rf"{name}(_[a-z0-9]+)?:", line)]
+    for key in QUANTITIES[name].keys(name):
+        for value in STRANGE:
+            try:
+                detector = load(tmp_path, "\n".join([*others, f"{key}: {value}"]))
+            except ConfigError as error:
+                complaint = str(error)
+            else:
+                complaint = ""
+                numbers = [*vars(detector).values(), *vars(detector.photons).values()]
+                assert all(math.isfinite(number) for number in numbers if isinstance(number, float))
+            # the last line's value, or what is missing where it is all of a quantity
+            assert not complaint or "mine.yaml" in complaint
+            assert bool(complaint) or value not in NEVER, (key, value)

@@ -19,6 +19,7 @@ from lidardesign.simulate.detector import PLANCK_J_S, SPEED_OF_LIGHT_M_S, metres
 from lidardesign.simulate.detector_files import load_detector
 from lidardesign.simulate.photon_histograms import photon_histograms
 from lidardesign.simulate.physics import Physics, followed_light
+from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.returns import Outcome, Rays
 from lidardesign.simulate.simulate import build_casters, simulate
 
@@ -216,6 +217,14 @@ def test_noise_that_is_taken_for_a_return_belongs_to_no_body():
     assert (found.body == -1).all()
     assert (found.range_m[found.returned] >= 0.5).all()
     assert set(found.outcome.tolist()) == {Outcome.RETURN, Outcome.MISS}
+
+
+@pytest.mark.parametrize("choice", ["auto", "none", "all"])
+def test_gates_that_a_detector_cannot_hear_are_refused_whatever_is_simulated(choice):
+    scene, directions = face_like()
+    short = replace(DETECTOR, bins=100)
+    with pytest.raises(ConfigError, match="longer than the histogram"):
+        Planner(short, choice).plan(scene, [rays_towards(directions, (0.3, 0.6))])
 
 
 SCRIPT = """
