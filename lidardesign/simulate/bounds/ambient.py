@@ -46,7 +46,7 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     invented = np.minimum(np.minimum(sight.detector.false_alarm, any_count) + unmade, 1.0)
     lost = np.where(sight.returned, np.minimum(wrong + hidden, 1.0), invented)
     squared = np.minimum(_strayed(counts, signal, sigma_m), sight.width_m) ** 2
-    return Stake(squared, lost, _reason(sight, float(np.median(per_bin * counts.bins))))
+    return Stake(squared, lost, _reason(sight, per_bin * counts.bins))
 
 
 def _strayed(counts: Counts, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
@@ -59,7 +59,8 @@ def _strayed(counts: Counts, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndar
     return error * np.sqrt(np.sqrt(1 + safe_divide(per_bin, echo)) - 1)
 
 
-def _reason(sight: Sight, gate: float) -> str:
+def _reason(sight: Sight, in_gate: np.ndarray) -> str:
+    gate = float(np.median(in_gate[sight.returned] if sight.returned.any() else in_gate))
     ambient = sight.scene.ambient
     light = "dark counts" if ambient is None else f"{ambient.illuminance_lux:,.0f} lux ({ambient.source}), dark counts"
     return f"{light}: about {counted(gate)} in a gate"

@@ -6,9 +6,7 @@ which leaves the share 1 / (1 + c r) of them, c pulses covered, r counts per pul
 first is early by at most sigma min(sqrt(2 ln K), (K - 1) / sqrt(pi)), in the mean over K >= 1 as well (both bounds are
 concave in K or linear; Jensen), with E K = s / (1 - exp(-s)).
 
-What is left of the echo strays, and is missed or mistaken, as fewer photons do: bounds grow by the difference. Nothing
-of this can be where no pulse has two counts: lost is at most the expected number of counts that are not there.
-Echoes are those that the air leaves, and haze is part of what they are mistaken for.
+What is left of the echo strays, and is missed or mistaken, as fewer photons do: bounds grow by the difference.
 """
 
 from __future__ import annotations
@@ -49,7 +47,7 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     several = np.maximum(safe_divide(echo, first, 1.0), 1.0)
     early = np.minimum(np.sqrt(2 * np.log(several)), (several - 1) / math.sqrt(math.pi))
     squared = (sigma_m * early) ** 2 + _strayed(counts, left, sigma_m)
-    lost = np.minimum(_beaten(counts, left, sigma_m), np.maximum(gone, 0.0) + counts.pulses * before)
+    lost = _beaten(counts, left, np.clip(gone, 0.0, 1.0), sigma_m)
     reason = f"{_typical(sight, whole):.2g} counts a pulse, {1e9 * photons.dead_s:.3g} ns blind after each"
     return Stake(squared, np.where(sight.returned, lost, 0.0), reason)
 
@@ -63,12 +61,18 @@ def _strayed(counts: Counts, left: np.ndarray, sigma_m: np.ndarray) -> np.ndarra
     return error * np.minimum(2 * np.sqrt(gone), 1.0)
 
 
-def _beaten(counts: Counts, left: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
-    """How much more often fewer photons are missed, and how often they are mistaken."""
+def _beaten(counts: Counts, left: np.ndarray, gone: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
+    """How much more often fewer photons are missed or mistaken.
+
+    With Y Poisson of mean m and f(Y) the probability that Y counts are beaten, which falls with Y,
+    |d/dm E f(Y)| = E[f(Y) - f(Y + 1)] <= E f(Y): what is gone makes at most its number times that more mistakes.
+    """
     per_bin = counts.per_bin
     fullest = per_bin + counts.pulses * counts.haze_per_pulse[1]
     missed = counts.more_missed(Echo(counts.in_air, sigma_m), Echo(left, sigma_m))
-    return np.clip(missed + counts.mistaken(left, fullest, per_bin, sigma_m), 0.0, 1.0)
+    any_count = -np.expm1(-counts.bins * per_bin - counts.pulses * counts.haze_per_pulse[0])
+    mistaken = np.minimum(counts.mistaken(left, fullest, per_bin, sigma_m), any_count)
+    return np.clip(missed + gone * mistaken, 0.0, 1.0)
 
 
 def _typical(sight: Sight, whole: np.ndarray) -> float:
