@@ -105,7 +105,11 @@ def test_boxes_beyond_the_space_change_nothing():
 
 
 def test_the_order_of_the_boxes_does_not_matter():
-    boxes = [SLAB, PILLAR, {"low_m": [0.4, 0.2, 0], "high_m": [0.9, 0.9, 1]}]
+    boxes = [
+        PILLAR,
+        {"low_m": [0.6, 0.2, 0], "high_m": [0.8, 0.9, 1]},
+        {"low_m": [-0.8, -0.9, 0], "high_m": [-0.6, -0.2, 1]},
+    ]
     first, *others = [places(fitted(origin={"exclude": list(some)})) for some in itertools.permutations(boxes)]
     assert all(other == first for other in others)
 

@@ -8,7 +8,8 @@ What the bounds mean, here and in `check`, which verifies them on the finished f
   along its thinnest principal direction, so that sensors spread over lines or sheets of any tilt;
 - `origin.mounts_m` lists the points where sensors can be fixed, one sensor at each at most (see `mounts`);
 - `origin.exclude` lists boxes whose interior holds no mean origin, no part of its interval, mean -+ z spread along
-  each axis, and no start of a ray; samples are taken from outside them (see `origins`);
+  each axis, and no start of a ray; samples are taken from outside them, and where one takes part of the origin box
+  the intervals keep to that box too (see `origins`);
 - `boresight.azimuth_deg` is an interval on the circle: with `min` above `max` it passes through 0;
 - every gate stays inside the range bounds of the design space, whatever the file says.
 

@@ -83,7 +83,9 @@ def free_boxes(one: SensorConstraints, space: DesignSpace) -> Boxes:
     free = Boxes(np.where(kept, low, -np.inf)[None], np.where(kept, high, np.inf)[None])
     for bottom, top in zip(bottoms, tops, strict=True):
         free = _without(free, bottom, top, low, high, ~fixed)
-    return free
+    # in an order that is not that of the excluded boxes, for where two are equally good
+    corners = np.unique(np.concatenate(free, axis=1), axis=0)
+    return Boxes(corners[:, :3], corners[:, 3:])
 
 
 def _without(
