@@ -1,5 +1,5 @@
 # make demo   sets everything up in .venv and runs the whole chain on the built-in face task, about three minutes
-# make test   sets up, lints and runs the tests, a few minutes; also downloads the light-transport simulator, 300 MB
+# make test   sets up, lints and runs the tests, a few minutes; also installs the light-transport simulator, 200 MB
 # make clean  takes all of it away again
 PYTHON ?= python3
 VENV := .venv
@@ -23,7 +23,7 @@ demo: $(BIN)/.ready
 	$(BIN)/python examples/demo.py
 
 $(BIN)/.transport: $(BIN)/.ready
-	@echo "Adding the light-transport simulator: once, 300 MB"
+	@echo "Adding the light-transport simulator: once, 200 MB"
 	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[transport]' \
 		&& touch $@ || echo "It could not be installed; its tests are skipped"
 	@tools/install-llvm.sh $(BIN)/python
