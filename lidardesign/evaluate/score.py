@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.evaluate.audit import Audit, audit_rows
-from lidardesign.evaluate.effects import EffectSummary, effect_notes, summaries
+from lidardesign.evaluate.effects import effect_notes, summaries
 from lidardesign.evaluate.entries import Entry, entries_of
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.results import Evaluation, Paired, Row, worse_than_threshold
@@ -76,7 +76,7 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
     scored = _score_all(request, entries, request.planner, _part(progress, 0, passes))
     rows = _rows(request, entries, scored)
     effects = summaries(scored.plans)
-    audit = _audit(request, entries, rows, effects, _part(progress, 1, passes)) if request.audit else None
+    audit = _audit(request, entries, rows, scored.plans, _part(progress, 1, passes)) if request.audit else None
     plain = [row for row in rows if row.matched_to is None]
     matched = [row for row in rows if row.matched_to is not None]
     return Evaluation(
@@ -105,12 +105,13 @@ def _audit(
     request: EvaluationRequest,
     entries: Sequence[Entry],
     rows: Sequence[Row],
-    effects: Sequence[EffectSummary],
+    plans: Sequence[Plan],
     progress: Progress | None,
 ) -> Audit:
     """The same entries under all effects that there are, with the same random numbers."""
-    scored = _score_all(request, entries, replace(request.planner, choice="all"), progress)
-    paired = zip(effects, summaries(scored.plans), strict=True)
+    planner = replace(request.planner, choice="all")
+    scored = _score_all(request, entries, planner, progress, [planner.chosen_from(plan) for plan in plans])
+    paired = zip(summaries(plans), summaries(scored.plans), strict=True)
     skipped = [planned.name for planned, every in paired if every.scenes_on > planned.scenes_on]
     unavailable = [effect.name for effect in summaries(scored.plans) if effect.missing is not None]
     metric = request.task.metric
@@ -119,9 +120,13 @@ def _audit(
 
 
 def _score_all(
-    request: EvaluationRequest, entries: Sequence[Entry], planner: Planner, progress: Progress | None
+    request: EvaluationRequest,
+    entries: Sequence[Entry],
+    planner: Planner,
+    progress: Progress | None,
+    known: Sequence[Plan] = (),
 ) -> _Scored:
-    """Scene by scene, so that only one scene's casters are held at a time."""
+    """Scene by scene, so that only one scene's casters are held at a time; plans that are known are not made again."""
     jobs = {entry.key: entry for entry in entries}
     tallies = {key: _Tally() for key in jobs}
     plans, planning_seconds = [], 0.0
@@ -131,7 +136,8 @@ def _score_all(
         casters = build_casters(scene)
         fired = [jobs[key].drawn(done) for key in jobs]
         started = time.perf_counter()
-        plans.append(planner.plan(scene, [rays for positions in fired for rays in positions], casters))
+        lists = [rays for positions in fired for rays in positions]
+        plans.append(known[done] if known else planner.plan(scene, lists, casters))
         planning_seconds += time.perf_counter() - started
         scores = score_lists(request.task, scene, fired, casters, planner.physics(plans[-1], request.seed))
         for tally, (score, seconds) in zip(tallies.values(), scores, strict=True):

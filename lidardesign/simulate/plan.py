@@ -34,6 +34,8 @@ Choice = Literal["auto", "all", "none"] | frozenset[str]
 TOLERATED_BIN_SHARE = 0.1
 TOLERATED_RANGE_M = 0.001
 TOLERATED_RETURNS = 0.001
+# Scenes that move are looked at in so many frames, evenly spread: bounds are means over time.
+MOST_FRAMES = 16
 # What these change depends on first hits alone, behind mirrors and glass too.
 OF_FIRST_HITS = ("specular", "multipath", "shadowing")
 
@@ -155,16 +157,19 @@ class Planner:
             for rays in lists:
                 check_windows(path_windows(rays, scene.receiver), self.detector)
         found = _bounds(scene, lists, self.detector, casters)
+        rays = sum(len(rays) for rays in lists) * scene.frames
+        return self._decided(found, {name: predicted_seconds(name, self.detector, rays) for name in EFFECTS})
+
+    def chosen_from(self, plan: Plan) -> Plan:
+        """What this planner makes of the bounds in another's plan of the same rays, with the same detector."""
+        found = {decision.name: decision.bound for decision in plan.decisions}
+        return self._decided(found, {decision.name: decision.seconds for decision in plan.decisions})
+
+    def _decided(self, found: dict[str, Bound], seconds: dict[str, float]) -> Plan:
         missing = {name: _missing(name) for name in self._asked(found)}
         on = self._chosen(found, missing)
-        rays = sum(len(rays) for rays in lists) * scene.frames
-        return Plan(
-            tuple(
-                Decision(name, name in on, found[name], predicted_seconds(name, self.detector, rays), missing.get(name))
-                for name in EFFECTS
-            ),
-            self.tolerated,
-        )
+        decisions = (Decision(name, name in on, found[name], seconds[name], missing.get(name)) for name in EFFECTS)
+        return Plan(tuple(decisions), self.tolerated)
 
     def physics(self, plan: Plan, seed: int) -> Physics | None:
         """What `simulate` takes for a plan; None where nothing is on."""
@@ -234,7 +239,7 @@ def _missing(name: str) -> str | None:
 def _bounds(
     scene: Scene, lists: Sequence[Rays], detector: Detector, casters: Sequence[SceneCaster] | None
 ) -> dict[str, Bound]:
-    """The bound of every effect over all frames, for the list that it changes most."""
+    """The bound of every effect over frames evenly spread, for the list that it changes most."""
     absent = {name: MODULES[name].absent(detector, scene, lists) for name in EFFECTS}
     present = [name for name, reason in absent.items() if reason is None]
     found = {name: Bound(0.0, 0.0, reason) for name, reason in absent.items() if reason is not None}
@@ -244,11 +249,19 @@ def _bounds(
     if not fired:
         return found | {name: Bound(0.0, 0.0, "no ray is fired") for name in present}
     sums = {name: _Sum(len(fired)) for name in present}
-    for frame, caster in enumerate(build_casters(scene) if casters is None else casters):
+    casters = build_casters(scene) if casters is None else casters
+    for frame in _spread(scene.frames):
+        caster = casters[frame]
         counts = Counts(Sight.of(scene, frame, detector, fired, caster))
         for name, stake in _stakes(counts, present).items():
             sums[name].add(counts.sight, stake)
     return found | {name: total.bound() for name, total in sums.items()}
+
+
+def _spread(frames: int) -> list[int]:
+    """All frames, or `MOST_FRAMES` of them: the middles of equal shares of time."""
+    most = min(frames, MOST_FRAMES)
+    return [int((i + 0.5) * frames / most) for i in range(most)]
 
 
 def _stakes(counts: Counts, present: Sequence[str]) -> dict[str, Stake]:

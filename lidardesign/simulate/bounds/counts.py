@@ -18,6 +18,8 @@ from lidardesign.simulate.bounds.light import ambient_per_metre, haze_per_pulse
 from lidardesign.simulate.bounds.sight import BINS_PER_SIGMA, Sight
 from lidardesign.simulate.detector import FWHM_PER_SIGMA, Detector, metres
 
+# Steps of the logarithm, 1 % each, in which levels of background are told apart.
+LEVELS_PER_UNIT = 100
 # Counts from here on are shown as whole numbers.
 MANY = 100
 # The highest of a histogram's bins strays by this many of (sigma^5 / (n b))^(1/4), see `peak_error_m`.
@@ -125,8 +127,14 @@ class Counts:
         return 2 * int(FWHM_PER_SIGMA * metres(self.sight.detector.timing_sigma_s) / (2 * self.bin_m)) + 1
 
     def needed(self, per_bin: np.ndarray) -> np.ndarray:
-        """The fewest counts in a pulse's width that are reported in so much background per bin (N,), shape (N,)."""
-        return needed_counts(per_bin * self.pulse_bins, self.bins, self.sight.detector.false_alarm)
+        """The fewest counts in a pulse's width that are reported in so much background per bin (N,), shape (N,).
+
+        Levels and numbers of bins are rounded up to one of `LEVELS_PER_UNIT` per factor e: few are worked out.
+        """
+        level, bins = (_rounded_up(values) for values in (per_bin * self.pulse_bins, self.bins))
+        # pairs as complex numbers: those are told apart fastest
+        pairs, place = np.unique(level + 1j * bins, return_inverse=True)
+        return needed_counts(pairs.real, pairs.imag, self.sight.detector.false_alarm)[place]
 
     def missed(self, signal: np.ndarray, per_bin: np.ndarray | float, sigma_m: np.ndarray) -> np.ndarray:
         """Probability that the echo's bins hold fewer counts than it takes to be reported, shape (N,).
@@ -172,6 +180,11 @@ class Counts:
     def _by_sharing(self, name: str) -> np.ndarray:
         shared, place = np.unique(self.sight.sharing, return_inverse=True)
         return np.array([getattr(self.sight.detector.photons, name)(int(rays)) for rays in shared])[place]
+
+
+def _rounded_up(values: np.ndarray) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        return np.exp(np.ceil(LEVELS_PER_UNIT * np.log(values)) / LEVELS_PER_UNIT)
 
 
 def counted(number: float) -> str:

@@ -20,6 +20,8 @@ from lidardesign.simulate.simulate import gate_outcomes
 
 # A surface that is grazed more flatly than this counts as met at it: ranges then change by up to 50 times a step aside.
 FLATTEST_COSINE = 0.02
+# Rays whose ends a step aside is compared with.
+NEIGHBOURS = 4
 # Without bins of its own a detector's histogram has bins of this share of a photon's timing error.
 BINS_PER_SIGMA = 4.0
 
@@ -79,6 +81,24 @@ class Sight:
     def nothing(self, reason: str) -> Stake:
         """No error, and nothing lost."""
         return Stake(np.zeros(len(self)), np.zeros(len(self)), reason)
+
+    @cached_property
+    def neighbours(self) -> np.ndarray:
+        """The `NEIGHBOURS` rays of the same list that end nearest to each; itself where there are fewer, (N, K)."""
+        ends = self.rays.origin_m + self._typical_range_m * self.rays.direction
+        # the lists side by side, further from each other than the rays of any
+        apart = 4 * (1 + np.abs(ends).max(initial=0.0) + np.abs(self.rays.origin_m).max(initial=0.0))
+        places = np.concatenate([self.rays.origin_m, ends, apart * self.row[:, None]], axis=1)
+        from scipy.spatial import cKDTree
+
+        away, near = cKDTree(places).query(places, k=NEIGHBOURS + 1, distance_upper_bound=apart)
+        own = np.arange(len(self))[:, None]
+        return np.where(np.isfinite(away), near, own)
+
+    @cached_property
+    def _typical_range_m(self) -> float:
+        met = self.range_m[self.hits.body >= 0]
+        return float(np.median(met)) if len(met) else 1.0
 
     @cached_property
     def returned(self) -> np.ndarray:
