@@ -39,9 +39,9 @@ origin:
   exclude: [{low_m: [0.3, -0.025, -0.02], high_m: [0.5, 0.025, 0.02]}]
 budget: {rays: 576}
 each:
-- origin: {low_m: [0.39, 0, -0.04], high_m: [0.41, 0.1, 0.04]}
-- origin: {low_m: [0.39, -0.1, -0.04], high_m: [0.41, 0, 0.04]}
-- origin: {low_m: [0.39, -0.03, 0], high_m: [0.41, 0.03, 0.1]}
+- origin: {low_m: [0.39, 0.02, -0.03], high_m: [0.41, 0.08, 0.03]}
+- origin: {low_m: [0.39, -0.08, -0.03], high_m: [0.41, -0.02, 0.03]}
+- origin: {low_m: [0.39, -0.03, 0.01], high_m: [0.41, 0.03, 0.07]}
 """
 BISTATIC = """\
 # a narrow emitter 10 cm above the detector
