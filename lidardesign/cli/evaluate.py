@@ -42,51 +42,52 @@ class _Entry:
     run: Run | None
 
 
+Targets = Annotated[
+    list[Path], typer.Argument(metavar="RUN|DESIGN", help="Run folders (all their designs) and design files.")
+]
+RayCounts = Annotated[
+    list[int] | None,
+    typer.Option(
+        "--rays", metavar="N", min=1, help="Rays per frame and position; repeatable.", show_default="the task's"
+    ),
+]
+Baseline = Annotated[
+    list[str] | None, typer.Option("--baseline", metavar="NAME", help=BASELINE_HELP, show_default=False)
+]
+Report = Annotated[
+    Path | None,
+    typer.Option(
+        "--report", metavar="FILE.html", help="Write one HTML page: tables, curves, 3D view.", show_default=False
+    ),
+]
+Plots = Annotated[
+    Path | None,
+    typer.Option("--plots", metavar="DIR", help="Write PNG curves into this folder.", show_default=False),
+]
+Csv = Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write the rows as CSV.", show_default=False)]
+FailAbove = Annotated[
+    float | None,
+    typer.Option(
+        "--fail-above",
+        metavar="VALUE",
+        help="Exit 1 if a design scores worse, in the metric's unit.",
+        show_default=False,
+    ),
+]
+
+
 def evaluate(
-    targets: Annotated[
-        list[Path], typer.Argument(metavar="RUN|DESIGN", help="Run folders (all their designs) and design files.")
-    ],
-    rays: Annotated[
-        list[int] | None,
-        typer.Option(
-            "--rays", metavar="N", min=1, help="Rays per frame and position; repeatable.", show_default="the task's"
-        ),
-    ] = None,
-    baseline: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--baseline",
-            metavar="NAME",
-            help=BASELINE_HELP,
-            show_default=False,
-        ),
-    ] = None,
-    report: Annotated[
-        Path | None,
-        typer.Option(
-            "--report", metavar="FILE.html", help="Write one HTML page: tables, curves, 3D view.", show_default=False
-        ),
-    ] = None,
-    plots: Annotated[
-        Path | None,
-        typer.Option("--plots", metavar="DIR", help="Write PNG curves into this folder.", show_default=False),
-    ] = None,
-    csv: Annotated[
-        Path | None, typer.Option("--csv", metavar="FILE", help="Write the rows as CSV.", show_default=False)
-    ] = None,
-    fail_above: Annotated[
-        float | None,
-        typer.Option(
-            "--fail-above",
-            metavar="VALUE",
-            help="Exit 1 if a design scores worse, in the metric's unit.",
-            show_default=False,
-        ),
-    ] = None,
+    targets: Targets,
+    rays: RayCounts = None,
+    baseline: Baseline = None,
     effects: Effects = "auto",
     detector: Detector = "ideal",
     range_tolerance_mm: RangeTolerance = None,
     return_tolerance: ReturnTolerance = None,
+    report: Report = None,
+    plots: Plots = None,
+    csv: Csv = None,
+    fail_above: FailAbove = None,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,

@@ -51,6 +51,7 @@ EXAMPLES = {
     evaluate: (
         "lidardesign evaluate runs/face --report report.html",
         "lidardesign evaluate runs/face/designs/free.yaml --rays 100 --rays 576 --fail-above 8",
+        "lidardesign evaluate runs/face --detector single-photon --effects audit",
         "lidardesign evaluate runs/arm --baseline occupancy --baseline no-visibility",
     ),
     export: (
