@@ -183,6 +183,52 @@ def test_false_alarms_in_even_light_are_as_rare_as_asked():
             assert invented.mean() <= allowed + STANDARD_ERRORS * np.sqrt(allowed / RAYS), per_metre
 
 
+@pytest.mark.parametrize("per_metre", [0.1, 2.0])
+@pytest.mark.parametrize(("dead_s", "repetition_hz"), [(1e-9, 1e6), (40e-9, 1e6), (40e-9, 20e6)])
+def test_false_alarms_under_pile_up_are_as_rare_as_asked_of_a_detector_that_reckons_with_it(
+    per_metre, dead_s, repetition_hz
+):
+    timing = {"pulse_sigma_s": SIGMA_S, "bin_s": BIN_S, "dead_s": dead_s, "repetition_hz": repetition_hz}
+    effects, rays = {"ambient", "pile_up", "quantisation"}, 1000
+    shares = {}
+    for correction in ("none", "coates"):
+        for estimator in ("peak", "matched"):
+            detector = counting_detector(rays, estimator=estimator, correction=correction, **timing)
+            light = background(rays, per_metre)
+            found = detected(windows(rays, 1.0, 3.0), no_echoes(), light, detector, effects)
+            shares[correction, estimator] = np.isfinite(found.path_m).mean()
+    for estimator in ("peak", "matched"):
+        assert shares["coates", estimator] <= 0.01 + STANDARD_ERRORS * np.sqrt(0.01 / rays)
+    if per_metre > 1 and dead_s > 1e-8 and repetition_hz < 1e7:
+        assert shares["none", "matched"] > 0.2
+
+
+@pytest.mark.parametrize("counts", [500.0, 3000.0])
+def test_a_detector_that_reckons_with_its_dead_time_is_not_early(counts):
+    """With 0.5 or 3 photons a pulse, of which the first is counted."""
+    timing = {"pulse_sigma_s": SIGMA_S, "bin_s": SIGMA_S / 2, "dead_s": 50e-9, "estimator": "matched"}
+    rays = 1000
+    echoes = single_echoes(PATHS[:rays], counts)
+    off = {}
+    for correction in ("none", "coates"):
+        detector = counting_detector(rays, correction=correction, **timing)
+        gate = windows(rays, 1.0, 3.0)
+        found = detected(gate, echoes, background(rays), detector, {"photon_noise", "pile_up", "quantisation"})
+        off[correction] = (found.path_m - PATHS[:rays]).mean()
+    assert off["none"] < -0.1 * SIGMA_M
+    # what is left is the error of a likelihood in which counts are Poisson
+    assert abs(off["coates"]) < 0.1 * abs(off["none"])
+
+
+def test_a_correction_changes_nothing_where_nothing_piles_up():
+    echoes, light = random_light(200)
+    gate, found = windows(200, 1.0, 3.0), []
+    for correction in ("none", "coates"):
+        detector = counting_detector(200, correction=correction, **FULL)
+        found.append(detected(gate, echoes, light, detector, ALL - {"pile_up"}).path_m)
+    assert np.array_equal(*found, equal_nan=True)
+
+
 def test_false_peaks_stay_below_their_union_bound_and_grow_with_the_gate():
     """P <= (B - 1) P(X >= Y), with X ~ Poisson(b) in another bin and Y ~ Poisson(s + b) in the echo's."""
     signal, per_bin, shares = 8.0, 0.6, []

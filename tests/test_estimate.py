@@ -6,9 +6,11 @@ import math
 
 import numpy as np
 import pytest
+from references import first_photon_distribution
 from scipy.special import pdtrc
 from scipy.stats import norm
 
+from lidardesign.simulate.corrected_kernels import alive_shares, find_corrected
 from lidardesign.simulate.estimate_kernels import at_least, find_returns, pulse_shape
 
 WHOLE = np.ones((1, 2))
@@ -19,6 +21,13 @@ def found(counts, *, known=0.0, false_alarm=0.01, matched=True, sigma=SIGMA, hal
     counts = np.asarray(counts, np.int64)
     offset = np.array([0, len(counts)])
     return find_returns(counts, offset, ends, 1.0, sigma, half, np.array([known]), false_alarm, matched)[0]
+
+
+def found_corrected(counts, *, matched=True, false_alarm=0.01, pulses, dead, period=1e6):
+    counts = np.asarray(counts, np.int64)
+    offset, known = np.array([0, len(counts)]), np.array([0.0])
+    times = float(pulses), dead, period
+    return find_corrected(counts, offset, WHOLE, 1.0, SIGMA, HALF, known, false_alarm, matched, *times)[0]
 
 
 def pulse(size, centre, photons, sigma=SIGMA):
@@ -137,3 +146,69 @@ def test_any_histogram_gives_a_place_inside_or_none(matched):
                 counts = generator.poisson(brightness, size)
                 place = found(counts, matched=matched, sigma=sigma, half=int(1.18 * sigma), false_alarm=1e9)
                 assert np.isnan(place) if counts.sum() == 0 else 0 <= place <= size
+
+
+class TestCorrected:
+    """With a dead time that the detector reckons with."""
+
+    @pytest.mark.parametrize(("dead", "period"), [(0.5, 1e6), (4.0, 1e6), (50.0, 1e6), (50.0, 45.0), (130.0, 45.0)])
+    def test_alive_shares_agree_with_a_naive_count_over_pulses(self, dead, period):
+        counts = np.random.default_rng(1).poisson(3.0, 40)
+        pulses = 10_000.0
+        naive = []
+        for b in range(40):
+            blind = 0
+            for back in range(0, 10):
+                for other in range(40):
+                    age = b + back * period - other
+                    # a count blinds what comes after it, in its own pulse or in later ones
+                    blind += counts[other] * (0 < age < dead if back == 0 else age < dead)
+            naive.append(1 - blind / pulses)
+        np.testing.assert_allclose(alive_shares(counts, pulses, dead, period), naive, rtol=1e-12)
+
+    @pytest.mark.parametrize("matched", [True, False])
+    @pytest.mark.parametrize("seed", range(5))
+    def test_without_blindness_it_agrees_with_the_uncorrected_search(self, matched, seed):
+        generator = np.random.default_rng(seed)
+        counts = generator.poisson(1.0, 80) + generator.poisson(pulse(80, 40.3, 60))
+        plain = found(counts, matched=matched)
+        corrected = found_corrected(counts, matched=matched, dead=1e-9, pulses=1e12)
+        if matched:
+            # its signal is measured around the filter's maximum, not around the fullest bins
+            assert corrected == pytest.approx(plain, abs=0.05)
+        else:
+            assert corrected == plain
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_what_pile_up_tilts_is_no_pulse(self, seed):
+        """Even light that is counted once per pulse: exp(-l b)."""
+        generator = np.random.default_rng(seed)
+        counts = generator.multinomial(4000, first_photon_distribution([0.02] * 200))[:-1]
+        assert np.isfinite(found(counts))
+        assert np.isnan(found_corrected(counts, dead=1e3, pulses=4000))
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_a_pulse_behind_the_tilt_is_found(self, seed):
+        generator = np.random.default_rng(seed)
+        arriving = np.full(200, 0.01) + 0.15 * np.diff(norm.cdf((np.arange(201) - 90.2) / SIGMA))
+        counts = generator.multinomial(4000, first_photon_distribution(arriving))[:-1]
+        assert abs(found_corrected(counts, dead=1e3, pulses=4000) - 90.2) < 4 * SIGMA / math.sqrt(200)
+
+    def test_a_bright_pulse_is_found_where_it_is_and_not_where_its_first_photons_are(self):
+        """Two photons a pulse: the first of them comes half a standard deviation early."""
+        arriving = 2.0 * np.diff(norm.cdf((np.arange(61) - 30.3) / SIGMA))
+        counts = np.round(1e5 * first_photon_distribution(arriving)[:-1]).astype(int)
+        assert found(counts) < 30.3 - 0.4 * SIGMA
+        assert found_corrected(counts, dead=1e3, pulses=1e5) == pytest.approx(30.3, abs=0.1 * SIGMA)
+
+    @pytest.mark.parametrize("matched", [True, False])
+    def test_any_histogram_gives_a_place_inside_or_none(self, matched):
+        generator = np.random.default_rng(2)
+        for size in (1, 2, 3, 7, 50):
+            for brightness in (0.01, 1.0, 1e3, 1e11):
+                for dead, period in ((1.0, 1e3), (1e6, 1e3), (1e12, 60.0)):
+                    counts = generator.poisson(brightness, size)
+                    place = found_corrected(
+                        counts, matched=matched, dead=dead, period=period, pulses=10, false_alarm=1e9
+                    )
+                    assert np.isnan(place) if counts.sum() == 0 else 0 <= place <= size

@@ -78,19 +78,39 @@ def chunks(bins: Bins) -> Iterator[tuple[int, int]]:
 def _from_photons(scene: Scene, frame: int, light: Light, physics: Physics) -> np.ndarray:
     """The half paths that are read from a chunk's histograms, NaN without a return [m]."""
     from lidardesign.simulate.counting import histogram
-    from lidardesign.simulate.estimate_kernels import find_returns
 
     detector, bins = physics.detector, light.bins
+    counts = histogram(scene, frame, light, physics)
     sigma_m = metres(detector.timing_sigma_s)
     half = int(FWHM_PER_SIGMA * sigma_m / (2 * bins.width_m))
-    blind_m = metres(detector.photons.dead_s) if "pile_up" in physics.effects else 0.0
-    known = light.pulses * bins.width_m * light.per_metre / (1 + light.per_metre * blind_m)
-    counts = histogram(scene, frame, light, physics)
+    known = _known_level(light, physics)
     matched = detector.estimator == "matched"
-    allowed = detector.false_alarm
-    place = find_returns(counts, bins.offset, bins.heard_ends, bins.width_m, sigma_m, half, known, allowed, matched)
+    judged = (counts, bins.offset, bins.heard_ends, bins.width_m, sigma_m, half, known, detector.false_alarm, matched)
+    if detector.correction == "coates" and "pile_up" in physics.effects and detector.photons.dead_s > 0:
+        from lidardesign.simulate.corrected_kernels import find_corrected
+
+        times_m = metres(detector.photons.dead_s), metres(1 / detector.photons.repetition_hz)
+        place = find_corrected(*judged, max(light.pulses, 1.0), *(time_m / bins.width_m for time_m in times_m))
+    else:
+        from lidardesign.simulate.estimate_kernels import find_returns
+
+        place = find_returns(*judged)
     low, high = bins.windows_m[:, 0], bins.windows_m[:, 1]
     return np.clip(bins.first_m + place * bins.width_m, low, np.nextafter(high, low))
+
+
+def _known_level(light: Light, physics: Physics) -> np.ndarray:
+    """Background counts per bin that a detector measures between its pulses, shape (N,): blind after each, or not.
+
+    With a correction, they are those of pulses that are all alive; at most one per pulse and bin.
+    """
+    detector, width_m = physics.detector, light.bins.width_m
+    arriving = light.per_metre * width_m
+    if "pile_up" not in physics.effects:
+        return light.pulses * arriving
+    if detector.correction == "coates" and detector.photons.dead_s > 0:
+        return light.pulses * -np.expm1(-arriving)
+    return light.pulses * arriving / (1 + light.per_metre * metres(detector.photons.dead_s))
 
 
 def _strongest(scene: Scene, frame: int, windows_m: np.ndarray, echoes: Echoes, physics: Physics) -> Detections:

@@ -19,6 +19,7 @@ FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 Emission = Literal["scanned", "flood"]
 Estimator = Literal["peak", "matched"]
 HistogramStart = Literal["gate", "pulse"]
+Correction = Literal["none", "coates"]
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,7 @@ class Detector:
         false_alarm: Probability that a gate full of background light alone is taken for a return.
         bins: How many bins a histogram has; None: as many as a gate needs.
         histogram_start: Where its first bin starts: with the gate, or with the pulse, at range 0.
+        correction: Whether it reckons with its own dead time where it judges a histogram (`coates`).
     """
 
     name: str
@@ -95,6 +97,7 @@ class Detector:
     false_alarm: float = 0.01
     bins: int | None = None
     histogram_start: HistogramStart = "gate"
+    correction: Correction = "none"
 
     @property
     def timing_sigma_s(self) -> float:

@@ -77,6 +77,7 @@ CHOICES = {
     "estimator": ("peak", "matched"),
     "emission": ("scanned", "flood"),
     "histogram_start": ("gate", "pulse"),
+    "correction": ("none", "coates"),
 }
 QUANTITIES = {**TIMING, **LIGHT}
 
@@ -124,6 +125,7 @@ def _detector(document: Document, fallback: str) -> Detector:
         false_alarm=found["false_alarm"],
         bins=whole["bins"],
         histogram_start=chosen["histogram_start"] or "gate",
+        correction=chosen["correction"] or "none",
     )
     _check_together(document, detector)
     return detector

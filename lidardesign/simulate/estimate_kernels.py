@@ -88,6 +88,16 @@ def _sum_around(counts, middle, half):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
+def vertex(score, best):  # noqa: ANN001, ANN201
+    """By how much of a bin the vertex of the parabola through a maximum and its neighbours lies off it."""
+    if best == 0 or best == len(score) - 1:
+        return 0.0
+    left, middle, right = score[best - 1], score[best], score[best + 1]
+    bend = left - 2 * middle + right
+    return 0.5 * (left - right) / bend if bend < 0 else 0.0
+
+
+@njit(cache=True, nogil=True)
 def _matched(counts, shape, below, signal, level, score):  # noqa: ANN001, ANN202
     """The bin of the largest log-likelihood, and by how much of a bin its vertex lies off the bin's middle.
 
@@ -108,11 +118,7 @@ def _matched(counts, shape, below, signal, level, score):  # noqa: ANN001, ANN20
     for b in range(1, size):
         if score[b] > score[best]:
             best = b
-    if best == 0 or best == size - 1:
-        return best, 0.0
-    left, middle, right = score[best - 1], score[best], score[best + 1]
-    bend = left - 2 * middle + right
-    return best, (0.5 * (left - right) / bend if bend < 0 else 0.0)
+    return best, vertex(score[:size], best)
 
 
 @njit(cache=True, nogil=True)
