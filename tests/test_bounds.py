@@ -50,7 +50,8 @@ def test_one_time_per_return_strays_by_the_whole_jitter():
 
 
 def test_the_matched_filter_averages_photons():
-    detector = replace(SINGLE, divergence_rad=0.0, footprint_rays=1)
+    never_blind = replace(SINGLE.photons, dead_s=0.0)
+    detector = replace(SINGLE, divergence_rad=0.0, footprint_rays=1, photons=never_blind)
     signal = float(counts(facing_wall(), detector, NARROW).signal[0])
     found = bound("photon_noise", facing_wall(), detector, NARROW).range_m
     assert found == pytest.approx(metres(detector.timing_sigma_s) / math.sqrt(signal), rel=1e-3)

@@ -7,7 +7,8 @@ Counts under the echo make its range stray: in much background, b per metre, n p
 variance (sigma^2 / n) (4 sqrt(pi) sigma b / n) (Cramer and Rao's bound), which is added to that without; the highest
 bin strays (1 + b / s)^(1/4) times as far.
 
-No false peak can be where no count arrives: it is at most 1 - exp(-B b).
+No false peak can be where no count arrives: it is at most 1 - exp(-B b). Where a detector is blind after a count, light
+before an echo leaves less of it (see `Blindness`), and is uneven, so that more of it is taken for returns.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 
 from lidardesign.numerics import safe_divide
 from lidardesign.scene import Scene
+from lidardesign.simulate.bounds.blindness import Blindness, missed_behind, unevenness, variance_of_missing
 from lidardesign.simulate.bounds.counts import Counts, counted, share_in_bins
 from lidardesign.simulate.bounds.sight import Sight, Stake
 from lidardesign.simulate.detector import Detector
@@ -36,16 +38,18 @@ def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | Non
 def stake(sight: Sight, counts: Counts) -> Stake:
     """Of counts that no echo brought."""
     sigma_m = sight.sigma_m()
-    signal, per_bin = counts.in_air, counts.per_bin
+    blind, in_the_dark = Blindness.of(counts), Blindness.of(counts, ambient=False)
+    signal, per_bin = blind.left, counts.per_bin
     any_count = -np.expm1(-per_bin * counts.bins)
-    hidden = np.maximum(counts.missed(signal, per_bin, sigma_m) - counts.missed(signal, 0.0, sigma_m), 0.0)
-    wrong = np.minimum(counts.mistaken(signal, per_bin, per_bin, sigma_m), any_count)
+    hidden = np.maximum(missed_behind(counts, blind, sigma_m) - counts.missed(in_the_dark.left, 0.0, sigma_m), 0.0)
+    wrong = np.minimum(counts.mistaken(signal, per_bin, per_bin * blind.under, sigma_m), any_count)
     # light that is no echo makes a return where one count is enough, and none where background asks for more
     stray = counts.leaked(sigma_m) + counts.pulses * counts.haze_per_pulse[0]
     unmade = np.where(counts.needed(per_bin) > 1, -np.expm1(-stray), 0.0)
-    invented = np.minimum(np.minimum(sight.detector.false_alarm, any_count) + unmade, 1.0)
-    lost = np.where(sight.returned, np.minimum(wrong + hidden, 1.0), invented)
+    alarms = np.minimum(sight.detector.false_alarm + unevenness(counts, blind), any_count)
+    lost = np.minimum(np.where(sight.returned, wrong + hidden, alarms + unmade), 1.0)
     squared = np.minimum(_strayed(counts, signal, sigma_m), sight.width_m) ** 2
+    squared += variance_of_missing(counts, in_the_dark.left, signal, sigma_m)
     return Stake(squared, lost, _reason(sight, per_bin * counts.bins))
 
 

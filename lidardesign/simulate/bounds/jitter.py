@@ -4,7 +4,8 @@ Without photons each return has one normal error, (c / 2) sigma_j rms. With n ph
 (c / 2) sigma_j / sqrt(n). The highest bin does not average; with timing errors it strays as `estimate_error_m` says of
 pulse and timing together, and without them it strayed by itself, so that the two differ by at most
 sqrt(e(sigma_p, sigma_j)^2 + e(sigma_p)^2). A wider echo is also lower: returns are lost where it now falls below what
-is reported, and surfaces outside a gate spill more photons into it.
+is reported, and surfaces outside a gate spill more photons into it. Of several photons in a pulse a detector that is
+blind after a count times the first, which is the earlier the more they stray.
 
 The pulse is taken as Gaussian and n as its expectation: an estimate where n is small.
 """
@@ -16,6 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lidardesign.scene import Scene
+from lidardesign.simulate.bounds.blindness import Blindness
 from lidardesign.simulate.bounds.counts import Counts, Echo, estimate_error_m
 from lidardesign.simulate.bounds.sight import Sight, Stake
 from lidardesign.simulate.detector import Detector, metres
@@ -34,11 +36,13 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     if detector.photons is None:
         error = np.full(len(sight), metres(sigma_s))
         return Stake(error**2, np.zeros(len(sight)), f"a return is {timed}")
-    signal, pulse_m, both_m = counts.in_air, sight.sigma_m(jitter=False), sight.sigma_m()
+    blind = Blindness.of(counts)
+    signal, pulse_m, both_m = blind.left, sight.sigma_m(jitter=False), sight.sigma_m()
     if detector.estimator == "matched":
         squared = estimate_error_m(detector, signal, metres(sigma_s)) ** 2
     else:
         squared = counts.error_m(signal, both_m) ** 2 + counts.error_m(signal, pulse_m) ** 2
+    squared = squared + ((both_m - pulse_m) * blind.early) ** 2
     lost = counts.more_missed(Echo(signal, pulse_m), Echo(signal, both_m))
     spilled = -np.expm1(-np.maximum(counts.leaked(both_m) - counts.leaked(pulse_m), 0.0))
     reason = f"a photon is {timed}; a return has about {counts.typical} of them"

@@ -7,6 +7,8 @@ probability that the echo's bins hold fewer than a return needs. A pulse has a w
 moves the mean of what is left by sigma phi(z) / Phi(z), z the distance in sigma, and a surface outside the gate spills
 n Phi(-z) photons into it, which make a return with at most the probability that there is any.
 
+n is what a detector that is blind after a count leaves of them.
+
 An estimate where n is a few: photons are then in the tail as often as not, and a lost return has no range.
 """
 
@@ -18,6 +20,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lidardesign.scene import Scene
+from lidardesign.simulate.bounds.blindness import Blindness, missed_behind
 from lidardesign.simulate.bounds.counts import Counts
 from lidardesign.simulate.bounds.sight import Sight, Stake
 from lidardesign.simulate.detector import Detector
@@ -32,10 +35,11 @@ def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | Non
 def stake(sight: Sight, counts: Counts) -> Stake:
     """Of few photons."""
     sigma_m = sight.sigma_m()
-    missed = counts.missed(counts.in_air, counts.per_bin, sigma_m)
+    blind = Blindness.of(counts)
+    missed = missed_behind(counts, blind, sigma_m)
     invented = -np.expm1(-counts.leaked(sigma_m))
     reason = f"a return has about {counts.typical} photons"
-    squared = counts.error_m(counts.in_air, sigma_m) ** 2 + _cut_m(sight, sigma_m) ** 2
+    squared = counts.error_m(blind.left, sigma_m) ** 2 + _cut_m(sight, sigma_m) ** 2
     return Stake(squared, np.where(sight.returned, missed, invented), reason)
 
 
