@@ -10,7 +10,7 @@ from test_bound_laws import SIMULATED, errors
 from test_bounds import counts, facing_wall
 from test_plan import SINGLE, grid
 
-from lidardesign.scene import Ambient, Body, Box, Scene, rigid
+from lidardesign.scene import Ambient, Body, Box, Medium, Scene, rigid
 from lidardesign.simulate.bounds.blindness import Blindness, missed_behind, unevenness
 from lidardesign.simulate.photon_histograms import photon_histograms
 from lidardesign.simulate.physics import Physics
@@ -75,20 +75,22 @@ def test_what_is_left_is_what_is_counted(field_of_view_sr):
 
 
 def test_light_that_hides_echoes_behind_it_is_called_for_though_its_level_is_low():
-    called_for = check_plan(wall(0.8), counting(pulse_energy_j=1e-12, field_of_view_sr=5e-5))
-    assert {"ambient", "pile_up"} <= called_for
+    assert {"ambient", "pile_up"} <= check_plan(wall(0.8), counting(pulse_energy_j=1e-12, field_of_view_sr=5e-5))
 
 
 def test_false_alarms_where_gates_start_call_for_light_and_pile_up():
-    called_for = check_plan(wall(3.0), counting(pulse_energy_j=1e-13))
-    assert {"ambient", "pile_up"} <= called_for
+    assert {"ambient", "pile_up"} <= check_plan(wall(3.0), counting(pulse_energy_j=1e-13))
 
 
 def test_rare_false_alarms_are_none_under_pile_up():
-    called_for = check_plan(wall(1.0, half_width_m=0.15), replace(counting(pulse_energy_j=1e-13), false_alarm=1e-4))
-    assert {"ambient", "pile_up"} <= called_for
+    detector = replace(counting(pulse_energy_j=1e-13), false_alarm=1e-4)
+    assert {"ambient", "pile_up"} <= check_plan(wall(1.0, half_width_m=0.15), detector)
+
+
+def test_fog_that_hides_echoes_behind_it_is_called_for_though_it_is_faint():
+    foggy = replace(wall(0.8, lux=0.0), medium=Medium(0.39, 0.02))
+    assert {"atmosphere", "pile_up"} <= check_plan(foggy, counting(pulse_energy_j=1e-11))
 
 
 def test_timing_errors_count_for_the_first_of_many_photons():
-    called_for = check_plan(wall(0.8, lux=0.0), counting(pulse_energy_j=1e-12))
-    assert "jitter" in called_for
+    assert "jitter" in check_plan(wall(0.8, lux=0.0), counting(pulse_energy_j=1e-12))

@@ -43,20 +43,20 @@ class Blindness:
     per_pulse: np.ndarray
 
     @classmethod
-    def of(cls, counts: Counts, *, ambient: bool = True) -> Blindness:
-        """With ambient light and dark counts, or as if there were none."""
+    def of(cls, counts: Counts, *, ambient: bool = True, haze: bool = True) -> Blindness:
+        """With ambient light and dark counts, and with what the air sends back, or as if there were none."""
         sight, photons = counts.sight, counts.sight.detector.photons
         echo = safe_divide(counts.in_air, counts.pulses)
-        haze = counts.haze_per_pulse[0]
-        per_metre = counts.background_per_metre if ambient else np.zeros(len(sight))
-        whole = per_metre * sight.width_m + haze + echo
+        from_air = counts.haze_per_pulse[0] * haze
+        per_metre = counts.background_per_metre * ambient
+        whole = per_metre * sight.width_m + from_air + echo
         if photons.dead_s == 0:
             every = np.ones(len(sight))
             return cls(counts.in_air, every, every, every, np.zeros(len(sight)), whole)
         first = -np.expm1(-echo)
         covered = np.floor((photons.dead_s + sight.width_m / metres(1)) * photons.repetition_hz)
         awake = 1 / (1 + covered * -np.expm1(-whole))
-        under = awake * np.exp(-(per_metre * sight.before_m + haze))
+        under = awake * np.exp(-(per_metre * sight.before_m + from_air))
         level = awake * safe_divide(-np.expm1(-whole), whole, 1.0)
         several = np.maximum(safe_divide(echo, first, 1.0), 1.0)
         early = np.minimum(np.sqrt(2 * np.log(several)), (several - 1) / math.sqrt(math.pi))
