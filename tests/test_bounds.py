@@ -7,16 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
 from scipy.stats import norm, poisson
 from test_plan import CONSUMER, SINGLE, TIMED, decisions, grid, room
 
-from lidardesign.scene import Ambient, Body, Box, Medium, Plane, Receiver, Scene, Sphere, rigid
+from lidardesign.scene import Ambient, Body, Box, Capsule, Medium, Mesh, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.bounds.counts import Counts, estimate_error_m, needed_counts, share_in_bins
-from lidardesign.simulate.bounds.motion import point_velocities
+from lidardesign.simulate.bounds.motion import entered_rays, point_velocities
 from lidardesign.simulate.bounds.multipath import _detours
 from lidardesign.simulate.bounds.neighbours import edge_probability
 from lidardesign.simulate.bounds.sight import Sight
 from lidardesign.simulate.detector import metres
+from lidardesign.simulate.effects.motion import moving_tracer
 from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.raycast import SceneCaster
 
@@ -36,6 +39,11 @@ def counts(scene, detector, rays=None):
 def facing_wall(**body):
     """A wall far wider than the view, 2 m ahead, met head-on by a narrow beam."""
     return Scene((Body(Box((0.05, 50, 50)), "wall", poses=rigid(translation_m=(2.05, 0, 0)), **body),))
+
+
+def box_mesh():
+    made = trimesh.creation.box((0.2, 0.1, 0.3))
+    return Mesh(np.array(made.vertices) + 0.05, np.array(made.faces))
 
 
 NARROW = grid(side=4, half_rad=1e-4)
@@ -254,3 +262,30 @@ def test_shares_of_light_that_leads_elsewhere_are_counted():
     share = (seen.hits.body == 0).sum() / seen.returned.sum()
     assert bound("specular", room(ball={"specular": 0.2}), TIMED).lost == pytest.approx(share)
     assert bound("specular", room(wall={"transmission": 0.2}), TIMED).lost == pytest.approx(1 - share)
+
+
+MOVERS = {
+    "sphere": Sphere(0.1),
+    "box": Box((0.1, 0.05, 0.2)),
+    "capsule": Capsule(0.05, 0.1),
+    "plane": Plane(),
+    "mesh": box_mesh(),
+}
+
+
+@pytest.mark.parametrize("shape", MOVERS.values(), ids=MOVERS)
+def test_what_flies_into_view_calls_for_motion(shape):
+    """Nothing of the body is met when the frame begins; rays that it has reached by their time are, exactly."""
+    still = rigid(Rotation.from_rotvec((0.3, math.pi / 2, 0.2)).as_matrix(), (0.7, -0.8, 0.0))
+    moving = Body(shape, "flyer", poses=still, velocity_m_s=(0.0, 14.0, 0.0))
+    if isinstance(shape, Plane):
+        away = rigid(Rotation.from_rotvec((0.0, -math.pi / 2, 0.0)).as_matrix(), (9.0, 0.0, 0.0))
+        moving = replace(moving, poses=away, velocity_m_s=(-90.0, 0.0, 0.0))
+    wall = Body(Box((0.05, 9, 9)), "wall", poses=rigid(translation_m=(1.5, 0, 0)))
+    scene, rays = Scene((wall, moving)), grid(side=30)
+    seen = sight(scene, TIMED, rays)
+    assert (seen.hits.body == 0).all()
+    later = moving_tracer(scene, 0)(rays.origin_m, rays.direction, rays.time_s)
+    assert (later.body == 1).any()
+    assert np.array_equal(entered_rays(seen), later.body == 1)
+    assert "motion" in Planner(TIMED).plan(scene, [rays]).effects
