@@ -60,14 +60,19 @@ def random_detector(generator):
         width = 10 ** generator.uniform(-3, -1)
         pulse_s = float(generator.choice([0.0, 1e-10]))
         return replace(TIMED, bin_s=bin_s, divergence_rad=width, footprint_rays=19, pulse_sigma_s=pulse_s)
-    energy = chosen.photons.pulse_energy_j * 10 ** generator.uniform(-1.5, 2)
+    photons = replace(
+        chosen.photons,
+        pulse_energy_j=chosen.photons.pulse_energy_j * 10 ** generator.uniform(-1.5, 2),
+        dead_s=10 ** generator.uniform(-9.5, -6.5),
+        dark_hz=10 ** generator.uniform(1, 6),
+    )
     return replace(
         chosen,
         estimator=str(generator.choice(["peak", "matched"])),
         divergence_rad=chosen.divergence_rad * generator.uniform(0.2, 1),
         footprint_rays=19,
         bins=None,
-        photons=replace(chosen.photons, pulse_energy_j=energy),
+        photons=photons,
     )
 
 
