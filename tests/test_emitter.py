@@ -24,6 +24,9 @@ from lidardesign.evaluate.metrics import is_heard, is_visible, trial_origins, vi
 from lidardesign.run.yaml import parse_yaml
 from lidardesign.scene import Ambient, Body, Box, Medium, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.bistatic import path_of_range, path_windows, range_of_path
+from lidardesign.simulate.bounds.counts import Counts
+from lidardesign.simulate.bounds.multipath import _hidden, stake
+from lidardesign.simulate.bounds.sight import Sight
 from lidardesign.simulate.detector import IDEAL
 from lidardesign.simulate.detector_files import load_detector
 from lidardesign.simulate.echoes import Beams
@@ -207,6 +210,32 @@ def test_what_lies_outside_the_view_of_the_receiver_is_not_detected():
     heard = heard_rays(wall, rays_from(np.array([0.4, 0.1, 0.05]), targets))
     half = 0.4 * np.tan(np.radians([30, 25]))
     np.testing.assert_array_equal(heard.returned, (np.abs(targets[:, 1:]) <= half).all(axis=1))
+
+
+def test_an_ideal_detector_takes_no_detour_for_an_echo_where_none_comes_straight(heads):
+    _, config, scenes = heads
+    targets = np.random.default_rng(15).uniform((-0.2, -0.12, -0.12), (0.02, 0.12, 0.12), (2000, 3))
+    rays = rays_from(np.add(config.detector_m, (0.0, 0.12, 0.0)), targets, config.range_m)
+    shadowed = heard_rays(scenes[0], rays)
+    (with_all,) = simulate(scenes[0], rays, physics=Physics(IDEAL, frozenset(EFFECTS)))
+    assert (shadowed.outcome == Outcome.NOT_DETECTED).any()
+    for name in ("outcome", "range_m", "body"):
+        np.testing.assert_array_equal(getattr(with_all, name), getattr(shadowed, name))
+
+
+def test_detours_are_bounded_by_all_returns_of_which_nothing_else_is_heard():
+    open_air, detector = ball_and_plate(), load_detector("single-photon")
+    room = replace(open_air, bodies=(*open_air.bodies, Body(Box((2.0, 2.0, 2.0)), "room")))
+    targets = np.random.default_rng(16).uniform((-0.1, -0.1, -0.1), (0.0, 0.1, 0.1), (3000, 3))
+    rays = rays_from(np.array([0.4, 0.15, 0.0]), targets)
+    (free,) = simulate(replace(room, receiver=None), rays)
+    hidden = ~is_heard(SceneCaster(room), room.receiver, free.points_m)
+    sight = Sight.of(room, 0, detector, [rays], SceneCaster(room))
+    np.testing.assert_array_equal(_hidden(sight, np.flatnonzero(sight.returned)), hidden)
+    # from inside a room every point sees its walls; of a few of the points 5 % more or less are hidden
+    assert stake(sight, Counts(sight)).lost[sight.returned].mean() > hidden.mean() - 0.15 > 0.0
+    alone = Sight.of(replace(room, receiver=None), 0, detector, [rays], SceneCaster(room))
+    assert not stake(alone, Counts(alone)).lost.any()
 
 
 # the monostatic limit

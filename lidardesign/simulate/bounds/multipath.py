@@ -3,7 +3,8 @@
 From points that rays meet, other surfaces are looked for, and what they send there is bounded (`multipath_bound`): of
 a flood or for one receiver that hears all, what they get of the light; where one spot at a time is lit and seen,
 what falls on it again. What is late by less than a detector tells apart moves the echo by its delay times its share;
-what is late by more makes its own peak, taken for the echo at most where all of it outweighs that.
+what is late by more makes its own peak, taken for the echo at most where all of it outweighs that. Where a receiver
+that stands elsewhere does not hear the echo at all, whatever comes by detours may be taken for it.
 """
 
 from __future__ import annotations
@@ -19,7 +20,11 @@ from lidardesign.simulate.bounds.sight import Sight, Stake
 from lidardesign.simulate.detector import Detector
 from lidardesign.simulate.hits import Hits
 from lidardesign.simulate.multipath_bound import Detours, lamp_bound, pixel_bound
+from lidardesign.simulate.receiver_view import in_view
 from lidardesign.simulate.returns import Rays
+
+# What lies in the way by less than this share of it is the surface itself: rays are traced to float32.
+CLEARANCE_SHARE = 1e-4
 
 
 def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
@@ -40,12 +45,29 @@ def stake(sight: Sight, counts: Counts) -> Stake:
         return sight.nothing("no ray returns")
     found = _detours(sight, rows)
     moved_m = np.minimum(found.shift_m, sight.width_m[rows][found.chosen])
-    outweighed = np.mean(found.apart > 1)
+    alone = _hidden(sight, rows[found.chosen]) & (found.seen > 0)
+    outweighed = np.mean((found.apart > 1) | alone)
     reason = (
         f"surfaces fill {found.seen.mean():.2g} of what others see; "
         f"late light is at most {100 * found.share.mean():.2g} %"
+        + (f", and all there is of {alone.mean():.1%} of returns" if alone.any() else "")
     )
     return Stake(np.full(len(sight), np.mean(moved_m**2)), np.where(sight.returned, outweighed, 0.0), reason)
+
+
+def _hidden(sight: Sight, rows: np.ndarray) -> np.ndarray:
+    """Whether the light of some rays that hit something does not come straight to a receiver elsewhere, (K,) bool."""
+    receiver = sight.scene.receiver
+    if receiver is None:
+        return np.zeros(len(rows), dtype=bool)
+    home, origin_m = np.asarray(receiver.origin_m), sight.rays.origin_m[rows]
+    points = origin_m + sight.range_m[rows, None] * sight.rays.direction[rows]
+    way, hidden = points - home, ~in_view(receiver, points)
+    length_m = np.linalg.norm(way, axis=1)
+    asked = ~hidden & (origin_m != home).any(axis=1) & (length_m > 0)
+    met_m = sight.caster.first_hit(np.broadcast_to(home, way[asked].shape), way[asked]).range_m
+    hidden[asked] = met_m < length_m[asked] * (1 - CLEARANCE_SHARE)
+    return hidden
 
 
 def _detours(sight: Sight, rows: np.ndarray) -> Detours:

@@ -12,6 +12,9 @@ Which detours a receiver hears depends on what is lit and what is looked at whil
 - A *fixed receiver* hears a scanned beam's detours P, Q from all Q that lie in its field of view. By reciprocity light
   is sent from the receiver instead, and what is seen along the beam is its gain.
 
+A detector that resolves everything and counts nothing (`ideal`) takes no late light for an echo, not even where no
+direct one arrives.
+
 Paths have up to `MOST_SURFACES` surfaces. A spot has a size, within which its light grows no stronger: without it, the
 few paths that end next to a spot in a crease would be worth any amount; light within a spot's own size is not told from
 its direct echo. Beams are thin, and nothing moves within a frame. Mirrors and glass are left to `specular`: here they
@@ -32,8 +35,9 @@ import numpy as np
 
 from lidardesign.scene import Scene
 from lidardesign.simulate.bistatic import path_windows
-from lidardesign.simulate.detector import FWHM_PER_SIGMA, Detector, metres
+from lidardesign.simulate.detector import Detector
 from lidardesign.simulate.echoes import Beams, Echoes
+from lidardesign.simulate.histogram import resolution_m
 from lidardesign.simulate.hits import Hits
 from lidardesign.simulate.light_transport import Lights, PathBins, Transients, render_transient
 from lidardesign.simulate.physics import Physics, direct_echoes
@@ -69,6 +73,8 @@ def interreflections(scene: Scene, frame: int, rays: Rays, physics: Physics) -> 
     """
     view = _View.of(scene, frame, rays, physics)
     nothing = view.direct.kept(np.zeros(len(view.direct), dtype=bool))
+    if physics.detector.photons is None and resolution_m(physics.detector) == 0:
+        return nothing
     flood = physics.detector.photons is not None and physics.detector.photons.emission == "flood"
     by_pixel = flood or scene.receiver is None
     if not len(view.rays) or (by_pixel and view.pixel_sr == 0):
@@ -207,8 +213,8 @@ def _pixel_sr(detector: Detector) -> float:
 
 def _bins(detector: Detector, reach_m: float) -> PathBins:
     """Bins of whole paths that cover twice a reach of half paths, and half a bin on either side of it."""
-    resolution_m = max(detector.bin_m or 0.0, metres(FWHM_PER_SIGMA * detector.pulse_sigma_s))
-    finest_m = max(2 * resolution_m / CELLS_PER_RESOLUTION, 2 * reach_m / MOST_CELLS, np.finfo(np.float32).eps)
+    told_apart_m = 2 * resolution_m(detector) / CELLS_PER_RESOLUTION
+    finest_m = max(told_apart_m, 2 * reach_m / MOST_CELLS, np.finfo(np.float32).eps)
     width_m = 10 ** (math.ceil(math.log10(finest_m) * WIDTHS_PER_DECADE) / WIDTHS_PER_DECADE)
     count = math.ceil(2 * reach_m / width_m) + 1
     return PathBins(width_m, 1 << (count - 1).bit_length())
