@@ -290,9 +290,11 @@ def _check_audit(evaluation: Evaluation) -> None:
     if audit is None or not audit.failed:
         return
     rows = ", ".join(f"{row.design} with {row.rays} rays by {number(abs(row.difference))}" for row in audit.failed)
+    there = {effect.name for effect in evaluation.effects if effect.range_m or effect.lost}
     raise ThresholdError(
         f"skipped effects move {rows} {audit.unit}",
         where="--effects audit",
         allowed=f"at most {audit.tolerance:g} {audit.unit}, the metric's tolerance",
-        hint=f"--effects all, or a smaller tolerance; skipped: {', '.join(audit.skipped)}",
+        hint="--effects all, or a smaller --range-tolerance-mm or --return-tolerance; skipped: "
+        + ", ".join(name for name in audit.skipped if name in there),
     )
