@@ -20,6 +20,7 @@ from lidardesign.simulate.bounds.neighbours import edge_probability
 from lidardesign.simulate.bounds.sight import Sight
 from lidardesign.simulate.detector import metres
 from lidardesign.simulate.effects.motion import moving_tracer
+from lidardesign.simulate.physics import Physics, followed_light
 from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.raycast import SceneCaster
 
@@ -289,3 +290,23 @@ def test_what_flies_into_view_calls_for_motion(shape):
     assert (later.body == 1).any()
     assert np.array_equal(entered_rays(seen), later.body == 1)
     assert "motion" in Planner(TIMED).plan(scene, [rays]).effects
+
+
+@pytest.mark.parametrize("place", [(4.8, 0, 0.3), (2, 0.01, 0), (0, 0, 0), (-1, 0.5, 0.2), (5, 1, 0)])
+@pytest.mark.parametrize("gate_m", [(0.1, 6.5), (2.5, 3.0)])
+def test_haze_beside_a_fixed_receiver_is_bounded(place, gate_m):
+    """Against what the effect counts: all haze, and the fullest cell per length."""
+    receiver = Receiver(place, 0.0, 0.0, 3.1, 3.1, (0.0, 20.0))
+    wall = Body(Box((0.05, 50, 50)), "wall", poses=rigid(translation_m=(6.05, 0, 0)))
+    scene = Scene((wall,), medium=Medium(0.01, 0.02), receiver=receiver)
+    rays = grid(side=8, half_rad=0.1, gate_m=gate_m)
+    found = counts(scene, replace(SINGLE, divergence_rad=0.0, footprint_rays=1), rays)
+    background = followed_light(
+        scene, 0, rays, SceneCaster(scene), Physics(found.sight.detector, frozenset({"atmosphere"}))
+    ).background
+    whole, fullest = found.haze_per_pulse
+    assert (background.counts.sum(axis=1) <= whole * (1 + 1e-6) + 1e-300).all()
+    length = np.diff(background.edges_m, axis=1)
+    long = length > found.bin_m
+    densest = np.where(long, background.counts / np.where(long, length, 1.0), 0.0).max(axis=1) * found.bin_m
+    assert (densest <= fullest * (1 + 1e-6) + 1e-300).all()
