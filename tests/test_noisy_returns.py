@@ -14,11 +14,14 @@ from lidardesign_tasks.meshes import MeshesTask
 from lidardesign_tasks.warehouse import WarehouseTask
 from test_tasks import write_ball
 
-from lidardesign.evaluate.scoring import checked_score
+from lidardesign.evaluate.scoring import checked_score, score_lists
+from lidardesign.scene import Body, Box, Scene, rigid
+from lidardesign.simulate.detector import Detector
+from lidardesign.simulate.physics import Physics
 from lidardesign.simulate.returns import Outcome, Rays
-from lidardesign.simulate.simulate import simulate
+from lidardesign.simulate.simulate import build_casters, simulate
 from lidardesign.space import DIMENSIONS, RANGE, direction
-from lidardesign.task import conditions_of, scenes_of
+from lidardesign.task import Metric, Score, conditions_of, scenes_of
 
 TASKS = {
     "arm": (ArmTask, {"train": 1, "test": 1, "frames": 12}),
@@ -85,3 +88,30 @@ def test_invented_returns_are_scored_as_returns_of_no_body(measured):
     assert sign * score.value >= sign * clean.value or not clean.failed
     invented = [turned(one, True, 0, one.rays.gate_m[:, 1] * 0.999) for one in returns]
     assert sign * checked_score(task, scene, invented).value >= sign * clean.value
+
+
+class Remembering:
+    """A task that keeps the returns that it is asked to score."""
+
+    name, metric = "remembering", Metric("nothing", "m", "lower", worst=1.0, tolerance=0.1)
+
+    def __init__(self):
+        self.ranges = []
+
+    def score(self, scene, returns):
+        self.ranges.append([one.range_m for one in returns])
+        return Score(0.0)
+
+
+def test_chance_is_the_same_for_rival_rays_and_another_one_at_each_position():
+    wall = Body(Box((0.05, 2, 2)), "wall", poses=rigid(translation_m=(1.05, 0, 0)))
+    scene, count = Scene((wall,)), 50
+    along = np.tile((1.0, 0.0, 0.0), (count, 1))
+    rays = Rays(np.zeros((count, 3)), along, np.tile((0.5, 2.0), (count, 1)), np.zeros(count), np.zeros(count))
+    task, detector = Remembering(), Detector("timed", jitter_sigma_s=1e-11)
+    jobs = [(rays, rays), (rays, rays)]
+    list(score_lists(task, scene, jobs, build_casters(scene), Physics(detector, frozenset({"jitter"}))))
+    (here, there), (other_here, other_there) = task.ranges
+    assert np.array_equal(here, other_here)
+    assert np.array_equal(there, other_there)
+    assert abs(np.corrcoef(here, there)[0, 1]) < 4 / np.sqrt(count)

@@ -31,7 +31,8 @@ def score_lists(
 ) -> Iterator[tuple[Score, float]]:
     """Scores of many sets of rays in one scene, in their order, each with its share of the time [s].
 
-    As many are traced together as a bounded memory allows.
+    As many are traced together as a bounded memory allows. Chance is the same for all sets and another one at each
+    position.
 
     Arguments:
         task: Whose score is taken.
@@ -43,7 +44,8 @@ def score_lists(
     for group in _groups(jobs, scene.frames):
         started = time.perf_counter()
         lists = [rays for positions in group for rays in positions]
-        found = iter(simulate_many(scene, lists, casters=casters, physics=physics))
+        repeats = [number for positions in group for number in range(len(positions))]
+        found = iter(simulate_many(scene, lists, casters=casters, physics=physics, repeats=repeats))
         rays = sum(_count(positions) for positions in group)
         per_ray = (time.perf_counter() - started) / max(rays, 1)
         for positions in group:

@@ -51,15 +51,18 @@ class Physics:
         detector: How returns are measured.
         effects: Names out of `EFFECTS`.
         seed: Root of every effect's own random stream.
+        repeat: Which time the scene is measured: rays that are fired again from elsewhere meet other chance.
     """
 
     detector: Detector = IDEAL
     effects: frozenset[str] = frozenset()
     seed: int = 0
+    repeat: int = 0
 
     def stream(self, effect: str, scene: Scene, frame: int) -> int:
         """The key of an effect's random numbers in a frame of a scene; no other effect changes them."""
-        label = "\0".join((str(self.seed), effect, scene.name, str(frame)))
+        again = (str(self.repeat),) if self.repeat else ()
+        label = "\0".join((str(self.seed), effect, scene.name, str(frame), *again))
         return int.from_bytes(hashlib.sha256(label.encode()).digest()[:8], "little")
 
 

@@ -7,6 +7,7 @@ gate hides what is behind it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -46,6 +47,7 @@ def simulate_many(
     *,
     casters: Sequence[SceneCaster] | None = None,
     physics: Physics | None = None,
+    repeats: Sequence[int] | None = None,
 ) -> list[list[Returns]]:
     """The returns of several lists of rays in every time frame of a scene, each as `simulate` gives them.
 
@@ -56,6 +58,7 @@ def simulate_many(
         lists: Lists of rays, each fired anew in each frame.
         casters: One caster per frame; None builds them here.
         physics: A detector and the effects that are on; each list shares the emitter's energy among its own rays.
+        repeats: For each list, the `Physics.repeat` that its random numbers are of; None: the same for all lists.
 
     Returns:
         For each list, one `Returns` per frame.
@@ -71,8 +74,10 @@ def simulate_many(
     if physics is not None and physics.effects:
         from lidardesign.simulate.physics import measure
 
+        each = [physics if repeats is None else replace(physics, repeat=repeats[i]) for i in range(len(lists))]
         return [
-            [measure(scene, frame, rays, caster, physics) for frame, caster in enumerate(casters)] for rays in lists
+            [measure(scene, frame, rays, caster, chance) for frame, caster in enumerate(casters)]
+            for rays, chance in zip(lists, each, strict=True)
         ]
     ends = np.cumsum([len(rays) for rays in lists])
     origins, directions, gate_m = (
