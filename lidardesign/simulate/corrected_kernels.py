@@ -89,16 +89,25 @@ def _heard(alive, shape, middle):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def _matched(counts, alive, shape, signal, level):  # noqa: ANN001, ANN202
-    """The bin of the largest log-likelihood, and by how much of a bin its vertex lies off the bin's middle."""
+def _matched(counts, alive, shape, signal, level, score):  # noqa: ANN001, ANN202
+    """The bin of the largest log-likelihood, and by how much of a bin its vertex lies off the bin's middle.
+
+    Only bins that a photon speaks for are considered.
+    """
     size, reach = len(counts), len(shape) // 2
     weight = np.log1p(signal / level * shape)
-    score = np.zeros(size)
+    score[:size] = 0.0
     for b in range(size):
-        for j in range(max(-reach, b - size + 1), min(reach, b) + 1):
-            score[b - j] += counts[b] * weight[j + reach] - signal * alive[b] * shape[j + reach]
-    best = score.argmax()
-    return best, vertex(score, best)
+        if counts[b] > 0:
+            for j in range(max(-reach, b - size + 1), min(reach, b) + 1):
+                score[b - j] += counts[b] * weight[j + reach]
+    best, most = 0, -np.inf
+    for b in range(size):
+        spoken_for = score[b] > 0
+        score[b] = score[b] - signal * _heard(alive, shape, b) if spoken_for else -np.inf
+        if score[b] > most:
+            best, most = b, score[b]
+    return best, vertex(score[:size], best)
 
 
 @njit(cache=True, nogil=True)
@@ -118,6 +127,10 @@ def find_corrected(  # noqa: ANN201
 ):
     """As `find_returns`, with the pulses of a frame, and dead time and time between pulses in bins."""
     found = np.full(len(offset) - 1, np.nan)
+    longest = 0
+    for i in range(len(offset) - 1):
+        longest = max(longest, offset[i + 1] - offset[i])
+    score = np.empty(longest)
     for i in range(len(offset) - 1):
         mine = counts[offset[i] : offset[i + 1]]
         size, total = len(mine), mine.sum()
@@ -135,6 +148,7 @@ def find_corrected(  # noqa: ANN201
         level, within = total / room[size], 0.0
         best = _stands_out(counted, room, level, half)
         for _ in range(PASSES):
+            before = best
             pulse, own = _around(counted, best, reach), _around(room, best, reach)
             others = room[size] - own
             level = (total - pulse) / others if others > LEAST_BINS else known_level[i]
@@ -143,9 +157,11 @@ def find_corrected(  # noqa: ANN201
             if matched:
                 ambient = max(arrived(level, pulses), 1.0 / size)
                 signal = max(_around(light, best, reach) - ambient * own, 1.0) / _heard(alive, shape, best)
-                best, within = _matched(photons, alive, shape, signal, ambient)
+                best, within = _matched(photons, alive, shape, signal, ambient, score)
             else:
                 best = _stands_out(counted, room, level, 0)
+            if best == before:
+                break
         if size * at_least(_around(counted, best, half), level * _around(room, best, half)) <= false_alarm:
             found[i] = best + 0.5 + within
     return found

@@ -93,6 +93,8 @@ def vertex(score, best):  # noqa: ANN001, ANN201
     if best == 0 or best == len(score) - 1:
         return 0.0
     left, middle, right = score[best - 1], score[best], score[best + 1]
+    if not (math.isfinite(left) and math.isfinite(right)):
+        return 0.0
     bend = left - 2 * middle + right
     return 0.5 * (left - right) / bend if bend < 0 else 0.0
 
