@@ -22,6 +22,8 @@ from lidardesign.simulate.simulate import gate_outcomes
 FLATTEST_COSINE = 0.02
 # Rays whose ends a step aside is compared with.
 NEIGHBOURS = 4
+# The matched filter takes photons up to so many standard deviations from its pulse's centre into account.
+PULSE_REACH = 4.0
 # Without bins of its own a detector's histogram has bins of this share of a photon's timing error.
 BINS_PER_SIGMA = 4.0
 
@@ -172,5 +174,11 @@ class Sight:
 
     @cached_property
     def resolution_m(self) -> float:
-        """Echoes closer than this are one: a bin or the width of the pulse, whichever is more [m]."""
-        return max(self.detector.bin_m or 0.0, metres(FWHM_PER_SIGMA * self.detector.pulse_sigma_s))
+        """Echoes closer than this are one: a bin or the width of the pulse, whichever is more [m].
+
+        The matched filter averages over all of a pulse, far into its tails.
+        """
+        detector = self.detector
+        told_apart = max(detector.bin_m or 0.0, metres(FWHM_PER_SIGMA * detector.pulse_sigma_s))
+        averages = detector.photons is not None and detector.estimator == "matched"
+        return max(told_apart, PULSE_REACH * metres(detector.timing_sigma_s)) if averages else told_apart
