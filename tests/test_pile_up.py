@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from references import STANDARD_ERRORS, first_photon_distribution, naive_counts_with_dead_time
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 from synthetic_light import PULSES, background, counted, counting_detector, no_echoes, single_echoes, windows
 
 from lidardesign.errors import ConfigError
@@ -157,6 +157,15 @@ def test_photons_that_fall_into_the_same_pulse_are_counted_once():
     assert ours.var() == pytest.approx(naive.var() + 1 / 12, rel=0.15)
 
 
+@pytest.mark.parametrize(("alive", "pulses"), [(1, 10_000), (7, 10_000), (60, 10_000), (300, 10_000), (5, 40)])
+@pytest.mark.parametrize("photons", [33, 80, 400])
+def test_the_last_pulses_are_hit_as_often_as_they_should(alive, pulses, photons):
+    """Few of many pulses are alive where gates begin brightly: less than one is hit per bin."""
+    share = (np.arange(100_000) + 0.5) / 100_000
+    mean = np.mean([_hit_pulses(photons, alive, pulses, z) for z in norm.ppf(share)])
+    assert mean == pytest.approx(alive * (1 - (1 - 1 / pulses) ** photons), rel=0.01)
+
+
 @pytest.mark.parametrize(("alive", "pulses", "photons"), [(0, 10, 50), (1, 1, 10**12), (2, 2, 100), (10, 10, 10**12)])
 def test_light_that_hits_every_pulse_is_counted_in_every_pulse_that_is_alive(alive, pulses, photons):
     for z in (-3.0, 0.0, 3.0):
@@ -177,6 +186,15 @@ def test_endless_light_is_counted_in_a_share_of_the_pulses():
     # every pulse is hit in every bin: one count, 30 bins dead, the second one in bin 30, dead until bin 15 of the next
     assert 0 < found.sum() <= 2 * 1000 + BINS
     assert found.sum() == pytest.approx(1000 * 45 / 30, rel=0.05)
+
+
+def test_an_echo_that_blinds_one_ray_changes_no_other():
+    expected = [0.4999, np.finfo(float).max, 0.4999]
+    window_m = windows(3, 0.0, BINS * BIN_M)
+    detector = counting_detector(3, bin_s=BIN_S)
+    found, _ = counted(window_m, single_echoes(np.full(3, BIN_M), expected), background(3), detector, {"quantisation"})
+    assert found.sum(axis=1).tolist() == [0, found[1].sum(), 0]
+    assert found[1].sum() > 1e12
 
 
 def test_a_detector_without_dead_time_counts_everything():

@@ -132,8 +132,9 @@ def _add_even(counts: np.ndarray, light: Light, edges_m: np.ndarray, expected: n
 
 def _add_echoes(counts: np.ndarray, scene: Scene, frame: int, light: Light, physics: Physics) -> None:
     """Photons of echoes: one by one in rays with few of them, bin by bin in others."""
-    cumulated = np.concatenate([[0.0], np.cumsum(light.expected)])
-    total = np.diff(cumulated[light.echo_offset])
+    # ray by ray: in differences of running sums a blinding echo would drown those of other rays
+    ray = np.repeat(np.arange(len(light.bins)), np.diff(light.echo_offset))
+    total = np.bincount(ray, weights=light.expected, minlength=len(light.bins))
     few = np.flatnonzero((total <= PHOTONS_ONE_BY_ONE) & (total > 0))
     many = np.flatnonzero(total > PHOTONS_ONE_BY_ONE)
     if len(few):

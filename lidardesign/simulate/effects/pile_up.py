@@ -18,6 +18,8 @@ from lidardesign.simulate.streams import normal, uniform
 
 # More photons in one bin than this are counted together, by mean and variance of how many pulses they fall into
 ONE_BY_ONE = 32
+# Expected hits of alive pulses below which a rounded normal would be wrong on average
+FEW_PULSES = 8.0
 # More photons per pulse in one bin than this are no more: they leave a pulse without any with the probability exp(-32)
 MOST_PER_PULSE = 32
 # A ray with more photons than this, where dead times reach across pulses, is followed in a share of its pulses only
@@ -81,12 +83,30 @@ def _within_pulses(arrived, mine, pulses, dead, key, ray):  # noqa: ANN001, ANN2
 
 @njit(cache=True, nogil=True)
 def _hit_pulses(number, alive, pulses, z):  # noqa: ANN001, ANN202
-    """How many of the alive pulses get at least one of so many photons: a rounded normal of its mean and variance."""
+    """How many of the alive pulses get at least one of so many photons: a rounded normal of its mean and variance.
+
+    Where it is few, the binomial quantile of the normal number z, as if pulses got photons independently.
+    """
     empty = math.exp(number * math.log1p(-1.0 / pulses)) if pulses > 1 else 0.0
     two_empty = math.exp(number * math.log1p(-2.0 / pulses)) if pulses > 2 else 0.0
     mean = alive * (1 - empty)
+    if mean < FEW_PULSES and empty > 0:
+        return min(_binomial_quantile(alive, empty, 0.5 * math.erfc(-z / math.sqrt(2.0))), number)
     variance = alive * empty + alive * (alive - 1.0) * two_empty - (alive * empty) ** 2
     return min(max(math.floor(mean + math.sqrt(max(variance, 0.0)) * z + 0.5), 0), min(alive, number))
+
+
+@njit(cache=True, nogil=True)
+def _binomial_quantile(trials, failure, share):  # noqa: ANN001, ANN202
+    """The least number of successes whose distribution function reaches a share."""
+    count = 0
+    probability = math.exp(trials * math.log(failure))
+    total = probability
+    while total < share and count < trials:
+        probability *= (trials - count) / (count + 1.0) * (1 - failure) / failure
+        count += 1
+        total += probability
+    return count
 
 
 @njit(cache=True, nogil=True)
