@@ -18,11 +18,13 @@ from lidardesign.simulate.bounds.motion import entered_rays, point_velocities
 from lidardesign.simulate.bounds.multipath import _detours
 from lidardesign.simulate.bounds.neighbours import edge_probability
 from lidardesign.simulate.bounds.sight import Sight
+from lidardesign.simulate.bounds.spots import _moved_m
 from lidardesign.simulate.detector import metres
 from lidardesign.simulate.effects.motion import moving_tracer
 from lidardesign.simulate.physics import Physics, followed_light
 from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.raycast import SceneCaster
+from lidardesign.simulate.returns import Rays
 
 
 def bound(name, scene, detector, rays=None):
@@ -256,6 +258,22 @@ def test_a_convex_body_alone_lights_nothing_and_a_corner_lights_itself():
     side = Body(Box((2, 0.05, 2)), "side", poses=rigid(translation_m=(2, 0.3, 0)))
     corner = Scene((*facing_wall().bodies, side))
     assert bound("multipath", corner, CONSUMER).range_m > 0.005
+
+
+def test_the_spots_of_a_flood_light_each_other_as_two_small_surfaces_do():
+    """One spot on a wall ahead, one on a wall to the left of it, seen from two places."""
+    side = Body(Box((5, 0.05, 5)), "side", poses=rigid(translation_m=(0, 0.55, 0)), reflectance=0.4)
+    scene = Scene((*facing_wall(reflectance=0.2).bodies, side))
+    origin, looking = np.array([[1.0, 0, 0], [1.7, 0, 0]]), np.array([[1.0, 0, 0], [0, 1.0, 0]])
+    rays = Rays(origin, looking, np.tile((0.1, 4.0), (2, 1)), np.zeros(2), np.zeros(2))
+    detector = replace(CONSUMER, divergence_rad=0.0, footprint_rays=1)
+    ahead_m, aside_m = 0.3, 0.5
+    apart_m = math.hypot(ahead_m, aside_m)
+    factor = ahead_m * aside_m / (math.pi * apart_m**4) * detector.photons.field_of_view_sr / (1 - 0.4)
+    first = 0.4 * factor * 1.0**2 * (0.5 + apart_m - 1.0) / 2
+    second = 0.2 * factor * 0.5**2 * (1.0 + apart_m - 0.5) / 2
+    found = sight(scene, replace(detector, bin_s=1e-8), rays)
+    assert _moved_m(found, np.arange(2), np.arange(2)) == pytest.approx([first, second], rel=1e-6)
 
 
 def test_shares_of_light_that_leads_elsewhere_are_counted():

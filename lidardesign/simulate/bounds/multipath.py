@@ -17,6 +17,7 @@ import numpy as np
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere
 from lidardesign.simulate.bounds.counts import Counts
 from lidardesign.simulate.bounds.sight import Sight, Stake
+from lidardesign.simulate.bounds.spots import moved_by_spots_m
 from lidardesign.simulate.detector import Detector
 from lidardesign.simulate.hits import Hits
 from lidardesign.simulate.multipath_bound import Detours, lamp_bound, pixel_bound
@@ -45,6 +46,9 @@ def stake(sight: Sight, counts: Counts) -> Stake:
         return sight.nothing("no ray returns")
     found = _detours(sight, rows)
     moved_m = np.minimum(found.shift_m, sight.width_m[rows][found.chosen])
+    squared_m2 = np.mean(moved_m**2)
+    if _is_flood(sight):
+        squared_m2 = max(squared_m2, np.mean(moved_by_spots_m(sight) ** 2))
     alone = _hidden(sight, rows[found.chosen]) & (found.seen > 0)
     outweighed = np.mean((found.apart > 1) | alone)
     reason = (
@@ -52,7 +56,7 @@ def stake(sight: Sight, counts: Counts) -> Stake:
         f"late light is at most {100 * found.share.mean():.2g} %"
         + (f", and all there is of {alone.mean():.1%} of returns" if alone.any() else "")
     )
-    return Stake(np.full(len(sight), np.mean(moved_m**2)), np.where(sight.returned, outweighed, 0.0), reason)
+    return Stake(np.full(len(sight), squared_m2), np.where(sight.returned, outweighed, 0.0), reason)
 
 
 def _hidden(sight: Sight, rows: np.ndarray) -> np.ndarray:
@@ -68,6 +72,12 @@ def _hidden(sight: Sight, rows: np.ndarray) -> np.ndarray:
     met_m = sight.caster.first_hit(np.broadcast_to(home, way[asked].shape), way[asked]).range_m
     hidden[asked] = met_m < length_m[asked] * (1 - CLEARANCE_SHARE)
     return hidden
+
+
+def _is_flood(sight: Sight) -> bool:
+    """Whether all rays are lit at once, and each is heard where it starts."""
+    photons = sight.detector.photons
+    return sight.scene.receiver is None and photons is not None and photons.emission == "flood"
 
 
 def _detours(sight: Sight, rows: np.ndarray) -> Detours:
