@@ -227,7 +227,7 @@ def test_the_program_shows_effects_with_their_reasons(lidardesign, fitted):
     ("options", "message"),
     [
         ("--effects ambint", "unknown effect 'ambint'"),
-        ("--effects jitter,audit", "unknown effect 'audit'"),
+        ("--effects jitter,audit", "'audit' stands among effects"),
         ("--detector nothing", "there is no detector 'nothing'"),
         ("--detector broken.yaml", "broken.yaml:1"),
         ("--range-tolerance-mm 0", "--range-tolerance-mm: 0"),

@@ -168,11 +168,17 @@ def test_what_cannot_be_simulated_here_is_named_and_asking_for_it_is_refused(mon
         Planner(CONSUMER, parse_effects("multipath")).plan(scene, [grid()])
 
 
-@pytest.mark.parametrize("text", ["noise", "", "auto,jitter", "jitter,", "photon_noise,ambint", "Auto"])
+@pytest.mark.parametrize("text", ["noise", "", "jitter,", "photon_noise,ambint", "Auto"])
 def test_unknown_effects_are_refused_with_the_names_of_all(text):
     with pytest.raises(ConfigError) as caught:
         parse_effects(text)
     assert all(name in caught.value.allowed for name in (*EFFECTS, "auto", "all", "none", "audit"))
+
+
+def test_a_choice_does_not_stand_among_names():
+    for text in ("auto,jitter", "jitter,audit", "all,none"):
+        with pytest.raises(ConfigError, match="stands among effects"):
+            parse_effects(text)
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, float("nan"), float("inf")])

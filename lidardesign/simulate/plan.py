@@ -34,6 +34,9 @@ Choice = Literal["auto", "all", "none"] | frozenset[str]
 TOLERATED_BIN_SHARE = 0.1
 TOLERATED_RANGE_M = 0.001
 TOLERATED_RETURNS = 0.001
+CHOICES = ("auto", "all", "none")
+# What `--effects` takes besides names; the audit is not a choice of effects.
+WORDS = (*CHOICES, "audit")
 # Scenes that move are looked at in so many frames, evenly spread: bounds are means over time.
 MOST_FRAMES = 16
 # What these change depends on first hits alone, behind mirrors and glass too.
@@ -196,15 +199,22 @@ def parse_effects(text: str) -> Choice:
     Raises:
         ConfigError: An unknown effect; all are listed.
     """
-    if text in ("auto", "all", "none"):
-        return text
     names = [name.strip() for name in text.split(",")]
+    if names[0] in CHOICES and len(names) == 1:
+        return names[0]  # type: ignore[return-value]
+    if not all(names):
+        raise ConfigError(f"{text!r} leaves an effect unnamed", where="--effects", allowed=_allowed())
     for name in names:
+        if name in WORDS:
+            raise ConfigError(f"{name!r} stands among effects", where="--effects", allowed=f"{name} alone, or names")
         if name not in EFFECTS:
-            allowed = "auto, all, none, audit, or any of " + ", ".join(EFFECTS)
-            hint = suggest(name, [*EFFECTS, "auto", "all", "none", "audit"])
-            raise ConfigError(f"unknown effect {name!r}", where="--effects", allowed=allowed, hint=hint)
+            hint = suggest(name.lower(), [*EFFECTS, *WORDS])
+            raise ConfigError(f"unknown effect {name!r}", where="--effects", allowed=_allowed(), hint=hint)
     return frozenset(names)
+
+
+def _allowed() -> str:
+    return f"{', '.join(WORDS)}, or any of {', '.join(EFFECTS)}"
 
 
 def found_here(detector: Detector) -> frozenset[str]:
