@@ -47,8 +47,7 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     found = _detours(sight, rows)
     moved_m = np.minimum(found.shift_m, sight.width_m[rows][found.chosen])
     squared_m2 = np.mean(moved_m**2)
-    if _is_flood(sight):
-        squared_m2 = max(squared_m2, np.mean(moved_by_spots_m(sight) ** 2))
+    by_spots_m2 = np.mean(moved_by_spots_m(sight) ** 2) if _is_flood(sight) else 0.0
     alone = _hidden(sight, rows[found.chosen]) & (found.seen > 0)
     outweighed = np.mean((found.apart > 1) | alone)
     reason = (
@@ -56,7 +55,9 @@ def stake(sight: Sight, counts: Counts) -> Stake:
         f"late light is at most {100 * found.share.mean():.2g} %"
         + (f", and all there is of {alone.mean():.1%} of returns" if alone.any() else "")
     )
-    return Stake(np.full(len(sight), squared_m2), np.where(sight.returned, outweighed, 0.0), reason)
+    if by_spots_m2 > squared_m2:
+        reason = f"the spots of a flood light each other, {reason}"
+    return Stake(np.full(len(sight), max(squared_m2, by_spots_m2)), np.where(sight.returned, outweighed, 0.0), reason)
 
 
 def _hidden(sight: Sight, rows: np.ndarray) -> np.ndarray:
