@@ -16,7 +16,7 @@ import numpy as np
 from lidardesign.numerics import safe_divide
 from lidardesign.simulate.bounds.sight import Sight
 
-MOST_POINTS = 64
+MOST_POINTS, AT_ONCE = 64, 8
 # Bounces between white walls all around never end; a share this close to 1 stands for theirs.
 WHITEST = 0.999
 
@@ -28,7 +28,8 @@ def moved_by_spots_m(sight: Sight) -> np.ndarray:
         rays = np.flatnonzero((sight.row == row) & (sight.hits.body >= 0))
         own = np.flatnonzero((sight.row == row) & sight.returned)
         own = own[np.unique(np.linspace(0, len(own) - 1, MOST_POINTS).astype(int))]
-        found.append(_moved_m(sight, own, rays))
+        # a few at a time, so that memory stays small beside long lists
+        found += [_moved_m(sight, some, rays) for some in np.array_split(own, max(len(own) // AT_ONCE, 1))]
     return np.concatenate(found)
 
 
