@@ -283,6 +283,16 @@ def test_shares_of_light_that_leads_elsewhere_are_counted():
     assert bound("specular", room(wall={"transmission": 0.2}), TIMED).lost == pytest.approx(1 - share)
 
 
+def test_beams_that_meet_what_lies_between_rays_call_for_their_width():
+    poles = tuple(Body(Capsule(0.004, 2.0), "pole", poses=rigid(translation_m=(1, y, 0))) for y in (-0.1, 0.0, 0.1))
+    scene, rays = Scene(poles), grid(side=12, half_rad=0.3)
+    wide = replace(TIMED, divergence_rad=0.03, footprint_rays=19)
+    assert (sight(scene, wide, rays).hits.body < 0).all()
+    assert "footprint" in Planner(wide).plan(scene, [rays]).effects
+    far = Scene((Body(Sphere(0.1), "ball", poses=rigid(translation_m=(-1, 0, 0))),))
+    assert "footprint" not in Planner(wide).plan(far, [rays]).effects
+
+
 MOVERS = {
     "sphere": Sphere(0.1),
     "box": Box((0.1, 0.05, 0.2)),
