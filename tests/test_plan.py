@@ -19,6 +19,7 @@ from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
 from lidardesign.simulate.returns import Rays
 from lidardesign.simulate.simulate import build_casters
 from lidardesign.space import direction
+from lidardesign.task import Metric
 
 SINGLE, CONSUMER = load_detector("single-photon"), load_detector("consumer-8x8")
 TIMED = Detector("timed", jitter_sigma_s=1e-11)
@@ -191,6 +192,14 @@ def test_tolerances_are_finite_and_above_zero(bad):
 def test_tolerances_follow_the_bins():
     assert Tolerance.of(IDEAL) == Tolerance(0.001, 0.001)
     assert Tolerance.of(CONSUMER).range_m == pytest.approx(0.1 * 299792458 * 250e-12 / 2)
+
+
+def test_no_more_is_tolerated_than_the_metric_does():
+    coarse = Tolerance.of(CONSUMER)
+    assert coarse.within(Metric("Chamfer", "mm", "lower", 100.0, 0.5)) == Tolerance(0.0005, 0.001)
+    assert coarse.within(Metric("Frechet", "m", "lower", 1.0, 0.5)) == coarse
+    assert coarse.within(Metric("miss rate", "%", "lower", 100.0, 0.5)) == coarse
+    assert coarse.within(Metric("exact", "mm", "lower", 100.0, 0.0)) == coarse
 
 
 def test_costs_are_predicted_for_every_effect_and_grow_with_the_rays():

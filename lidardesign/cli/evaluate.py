@@ -101,6 +101,8 @@ def evaluate(
         planner, audit = planner_of(effects, detector, range_tolerance_mm, return_tolerance)
         entries, runs = _collect(targets)
         run = _common_run(_named_apart(entries), runs)
+        if range_tolerance_mm is None:
+            planner = replace(planner, tolerance=planner.tolerated.within(run.task.metric))
         request = replace(_request(run, entries, rays, baseline or [], seed), planner=planner, audit=audit)
         evaluation = _evaluate(request, console)
         written = _write_files(evaluation, request, report, plots, csv)

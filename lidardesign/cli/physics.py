@@ -37,7 +37,7 @@ RangeTolerance = Annotated[
         "--range-tolerance-mm",
         metavar="MM",
         help="What all skipped effects together may change of ranges, rms.",
-        show_default="a tenth of a bin; 1 without bins",
+        show_default="a tenth of a bin, or 1, and at most the metric's tolerance where it is a length",
     ),
 ]
 ReturnTolerance = Annotated[

@@ -28,12 +28,15 @@ from lidardesign.simulate.physics import EFFECTS, Physics
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.returns import Rays
 from lidardesign.simulate.simulate import build_casters
+from lidardesign.task import Metric
 
 Choice = Literal["auto", "all", "none"] | frozenset[str]
 # Ranges may be off by this share of a bin, or by this where there are none [m].
 TOLERATED_BIN_SHARE = 0.1
 TOLERATED_RANGE_M = 0.001
 TOLERATED_RETURNS = 0.001
+# Units of metrics that are lengths [m].
+LENGTHS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 CHOICES = ("auto", "all", "none")
 # What `--effects` takes besides names; the audit is not a choice of effects.
 WORDS = (*CHOICES, "audit")
@@ -67,6 +70,11 @@ class Tolerance:
     def of(cls, detector: Detector) -> Tolerance:
         """A tenth of a bin, or 1 mm without bins, and a thousandth of the returns."""
         return cls(TOLERATED_RANGE_M if detector.bin_m is None else TOLERATED_BIN_SHARE * detector.bin_m)
+
+    def within(self, metric: Metric) -> Tolerance:
+        """At most what a metric tolerates, where it is a length: ranges that are off by more could move it by more."""
+        limit_m = metric.tolerance * LENGTHS_M.get(metric.unit, math.inf)
+        return replace(self, range_m=min(self.range_m, limit_m)) if limit_m > 0 else self
 
 
 @dataclass(frozen=True)
