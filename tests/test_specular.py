@@ -10,7 +10,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from lidardesign.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
+from lidardesign.simulate.detector import Detector
 from lidardesign.simulate.echoes import Beams
+from lidardesign.simulate.effects import specular
+from lidardesign.simulate.effects.footprint import split
 from lidardesign.simulate.effects.specular import MAXIMUM_TURNS, detours
 from lidardesign.simulate.physics import direct_echoes
 from lidardesign.simulate.raycast import SceneCaster
@@ -241,3 +244,18 @@ def test_a_receiver_at_the_emitter_hears_the_same_detours_as_none():
     inside = np.abs(np.arctan2(looking[:, 1], looking[:, 0])) <= 0.1
     assert 0 < len(seen) < len(alone)
     assert np.array_equal(seen.ray, alone.ray[inside[alone.ray]])
+
+
+@pytest.mark.parametrize("at_once", [1, 7, 50])
+def test_beams_that_are_followed_in_groups_have_the_echoes_that_they_have_together(monkeypatch, at_once):
+    scene = Scene((slab(1.0, specular=0.3, transmission=0.6), slab(2.0, specular=0.4, reflectance=0.5)))
+    generator = np.random.default_rng(2)
+    rays = beams_along(direction(*generator.uniform(-0.5, 0.5, (2, 40))))
+    beams = split(rays, Detector("wide", divergence_rad=0.2, footprint_rays=3))
+    _, together = traced(scene, beams)
+    monkeypatch.setattr(specular, "BEAMS_AT_ONCE", at_once)
+    _, apart = traced(scene, beams)
+    assert len(apart) == len(together) > 100
+    order = np.argsort(together.ray, kind="stable"), np.argsort(apart.ray, kind="stable")
+    for name in ("ray", "path_m", "gain", "body"):
+        assert np.array_equal(getattr(together, name)[order[0]], getattr(apart, name)[order[1]])

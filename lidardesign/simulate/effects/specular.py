@@ -12,6 +12,8 @@ taken for an echo.
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +29,8 @@ from lidardesign.simulate.receiver_view import in_view
 MAXIMUM_TURNS = 8
 # Beams of less than this share of their light are given up: both ways, a millionth of it comes back.
 FAINTEST_SHARE = 1e-3
+# Beams that are followed at once: each may become 2^8, at 200 bytes and more.
+BEAMS_AT_ONCE = 1 << 14
 # Where a beam grazes a surface, it is followed from at most this many clearances further on.
 GRAZING_STEPS = 10.0
 
@@ -66,10 +70,25 @@ def detours(scene: Scene, beams: Beams, hits: Hits, tracer: Tracer) -> Echoes:
         hits: Their first hits.
         tracer: First hits of any rays at any time within the frame.
     """
+    return Echoes.joined([*(_detours_of(scene, beams, hits, rows, tracer) for rows in _groups(beams)), _no_echoes()])
+
+
+def _groups(beams: Beams) -> Iterator[slice]:
+    """The beams of so many whole rays that what they split into fits into memory."""
+    rays = beams.ray[-1] + 1 if len(beams) else 0
+    step = max(BEAMS_AT_ONCE * rays // max(len(beams), 1), 1)
+    edges = np.searchsorted(beams.ray, np.arange(0, rays + step, step))
+    yield from (slice(begin, end) for begin, end in itertools.pairwise(edges) if end > begin)
+
+
+def _detours_of(scene: Scene, beams: Beams, hits: Hits, rows: slice, tracer: Tracer) -> Echoes:
+    """The detours of some of the beams."""
     mirrored = np.array([body.specular for body in scene.bodies])
     passing = np.array([body.transmission for body in scene.bodies])
-    front = _Front(beams, np.arange(len(beams)), np.ones(len(beams)), hits)
-    echoes = []
+    number = np.arange(len(beams))[rows]
+    mine = Beams(*(column[rows] for column in _columns(beams)))
+    front = _Front(mine, number, np.ones(len(mine)), Hits(hits.range_m[rows], hits.body[rows], hits.normal[rows]))
+    echoes = [_no_echoes()]
     for _ in range(MAXIMUM_TURNS):
         turned = _followed(scene, front, mirrored, _mirrored(front), tracer)
         straight = _followed(scene, front, passing, front.beams.direction, tracer)
@@ -77,7 +96,7 @@ def detours(scene: Scene, beams: Beams, hits: Hits, tracer: Tracer) -> Echoes:
         if not len(front.beams):
             break
         echoes.append(_heard(scene, beams, front, tracer))
-    return Echoes.joined([*echoes, _no_echoes()])
+    return Echoes.joined(echoes)
 
 
 def _mirrored(front: _Front) -> np.ndarray:
