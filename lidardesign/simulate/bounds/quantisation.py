@@ -1,7 +1,7 @@
 """Rounding to bins: an error spread evenly over a bin.
 
-Its rms is bin / sqrt(12), as ranges lie anywhere in a bin; a single return is off by at most half a bin, which bounds
-strictly even ranges that all lie at one place of their bin.
+Its rms is bin / sqrt(12), as ranges lie anywhere in a bin: an estimate where all of them lie at one place of their bin,
+which may be half a bin off.
 """
 
 from __future__ import annotations
