@@ -247,6 +247,14 @@ def test_false_peaks_stay_below_their_union_bound_and_grow_with_the_gate():
     assert shares[0] < shares[1] < shares[2]
 
 
+def test_a_surface_that_sends_nothing_back_explains_no_return():
+    detector = counting_detector(RAYS, bin_s=BIN_S, false_alarm=0.5)
+    light = background(RAYS, 1 / PULSES)
+    found = detected(windows(RAYS, 2.0, 2.1), single_echoes(np.full(RAYS, 2.05), 0.0), light, detector, PHOTON_EFFECTS)
+    assert np.isfinite(found.path_m).any()
+    assert (found.body == -1).all()
+
+
 def test_a_range_that_no_echo_explains_is_nobody_s():
     detector = counting_detector(RAYS, bin_s=BIN_S, pulse_sigma_s=SIGMA_S)
     edges = np.tile([1.4, 1.41], (RAYS, 1))

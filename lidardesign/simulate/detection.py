@@ -155,7 +155,7 @@ def _explained(
     """The body of the strongest echo near each detected half path, -1 where there is none."""
     tolerance = EXPLAINED_SIGMAS * metres(physics.detector.timing_sigma_s) + width_m / 2
     with np.errstate(invalid="ignore"):
-        near = np.flatnonzero(np.abs(echoes.path_m - path_m[echoes.ray]) <= tolerance)
+        near = np.flatnonzero((np.abs(echoes.path_m - path_m[echoes.ray]) <= tolerance) & (echoes.gain > 0))
     rising = near[np.argsort(echoes.gain[near], kind="stable")]
     body = np.full(len(windows_m), -1)
     body[echoes.ray[rising]] = echoes.body[rising]
