@@ -22,6 +22,9 @@ Sign = Literal["auto", "solid", "winding", "unsigned"]
 ROLES = ("target", "occluder", "both")
 # How far a pose's rotation may be from orthogonal: poses are often written with seven digits.
 RIGID_TOLERANCE = 1e-6
+SPEED_OF_LIGHT_M_S = 299_792_458.0
+# Light that fades over a nanometre has entered a solid.
+DENSEST = 1e9
 # Shares of light that were meant to add up to 1 may exceed it by rounding.
 SHARE_ROUNDING = 1e-9
 
@@ -148,8 +151,8 @@ class Medium:
     def __post_init__(self) -> None:
         for name in ("extinction_per_m", "backscatter_per_m_sr"):
             value = getattr(self, name)
-            if not math.isfinite(value) or value < 0:
-                raise DataError(f"medium: {name} is {value}", allowed="finite, 0 or more")
+            if not 0 <= value <= DENSEST:
+                raise DataError(f"medium: {name} is {value}", allowed=f"0 to {DENSEST:g}")
 
 
 @dataclass(frozen=True)
@@ -192,7 +195,7 @@ class Receiver:
     def __post_init__(self) -> None:
         numbers = (*self.origin_m, self.azimuth_rad, self.elevation_rad, *self.range_m)
         if len(self.origin_m) != 3 or not all(math.isfinite(value) for value in numbers):
-            raise DataError(f"receiver: {self} has numbers that are not finite", allowed="finite numbers")
+            raise DataError(f"receiver: {self}", allowed="three finite coordinates, finite angles and ranges")
         for name in ("horizontal_rad", "vertical_rad"):
             if not 0 < getattr(self, name) < math.pi:
                 raise DataError(f"receiver: {name} is {getattr(self, name)}", allowed="above 0 and below pi")
@@ -250,6 +253,8 @@ class Body:
         velocity = tuple(float(value) for value in self.velocity_m_s)
         if len(velocity) != 3 or not all(math.isfinite(value) for value in velocity):
             raise DataError(f"body {self.name!r}: velocity_m_s is {self.velocity_m_s}", allowed="three finite numbers")
+        if math.hypot(*velocity) >= SPEED_OF_LIGHT_M_S:
+            raise DataError(f"body {self.name!r}: velocity_m_s is {self.velocity_m_s}", allowed="slower than light")
         if any(velocity) and poses.ndim == 3:
             raise DataError(
                 f"body {self.name!r} has a velocity and poses per frame", allowed="one of them: poses are its motion"
@@ -302,6 +307,12 @@ class Scene:
         counts = {len(body.poses) for body in self.bodies if body.poses.ndim == 3}
         if len(counts) > 1:
             raise DataError(f"scene {self.name!r}: bodies have different numbers of frames {sorted(counts)}")
+        for name, kind in (("medium", Medium), ("ambient", Ambient), ("receiver", Receiver)):
+            if not isinstance(getattr(self, name), kind | None):
+                found = repr(getattr(self, name))
+                raise DataError(f"scene {self.name!r}: {name} is {found}", allowed=f"{kind.__name__}(...) or None")
+        if not (math.isfinite(self.frame_rate_hz) and self.frame_rate_hz > 0):
+            raise DataError(f"scene {self.name!r}: frame_rate_hz is {self.frame_rate_hz}", allowed="finite, above 0")
 
     @cached_property
     def frames(self) -> int:

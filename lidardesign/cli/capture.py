@@ -137,7 +137,14 @@ def _settings(
 
 
 def _rays(path: Path, count: int | None, at: dict[str, float], seed: int, console: Console) -> Rays:
-    """The rays of a design file, or of what was exported of it for a scanner."""
+    """The rays of a design file, or of what was exported of it for a scanner, at least one."""
+    rays = _listed_rays(path, count, at, seed, console)
+    if not len(rays):
+        raise DataError("fires no ray", where=str(path), hint="give --rays N" if not count else None)
+    return rays
+
+
+def _listed_rays(path: Path, count: int | None, at: dict[str, float], seed: int, console: Console) -> Rays:
     from lidardesign.cli.export import design_and_rays
     from lidardesign.design.files import load_design
     from lidardesign.export.galvo import is_galvo_file, read

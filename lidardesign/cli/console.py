@@ -157,6 +157,7 @@ def report_error(error: BaseException, console: Console) -> int:
 
 def describe_error(error: BaseException, console: Console) -> tuple[dict[str, Any], int, str]:
     """The JSON form of an error, its exit code, and its text for people."""
+    error = _interruption(error) or error
     if isinstance(error, LidardesignError):
         return error.as_dict(), error.exit_code, f"{error.kind} error: {error}"
     if isinstance(error, KeyboardInterrupt):
@@ -177,6 +178,16 @@ def describe_error(error: BaseException, console: Console) -> tuple[dict[str, An
         EXIT_INTERNAL,
         f"internal error: {text}\n  {hint}",
     )
+
+
+def _interruption(error: BaseException) -> KeyboardInterrupt | None:
+    """The interruption that an error came of: compiled kernels that return into one make it a SystemError."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, KeyboardInterrupt):
+            return cause
+        cause = cause.__cause__
+    return None
 
 
 def _describe_system_error(error: OSError) -> tuple[dict[str, Any], int, str]:

@@ -17,6 +17,7 @@ from lidardesign.density.independent import independent_points
 from lidardesign.density.losses import Pool, draw_conditions
 from lidardesign.density.objective import Coordinates
 from lidardesign.density.prepare import prepare_target
+from lidardesign.density.receiver import common_receiver
 from lidardesign.density.target import Target
 from lidardesign.density.training import PROGRESS, LearnProgress, Trainer
 from lidardesign.design.samples import Samples, save_samples
@@ -26,7 +27,8 @@ from lidardesign.run.checkpoint import save_arrays
 from lidardesign.run.config import RunConfig
 from lidardesign.run.manifest import note, record
 from lidardesign.scene import Scene
-from lidardesign.space import AZIMUTH, DesignSpace
+from lidardesign.simulate.receiver_view import in_view
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 from lidardesign.task import Task, random_generator, scenes_of
 
 FLOW = "flow.safetensors"
@@ -176,7 +178,19 @@ def _pool(target: Target, scenes: Sequence[Scene], config: RunConfig) -> Pool:
             where="space",
             hint="widen the angles or the range, or move the origin",
         )
+    _refuse_blind_receiver(scenes, points)
     return Pool.of(config.space.to_unit(points), target.log_density(points), log_density)
+
+
+def _refuse_blind_receiver(scenes: Sequence[Scene], points: np.ndarray) -> None:
+    receiver = common_receiver(scenes)
+    reached = points[:, :3] + points[:, RANGE, None] * direction(points[:, AZIMUTH], points[:, ELEVATION])
+    if receiver is not None and not in_view(receiver, reached).any():
+        raise DataError(
+            "its field of view and range hold no surface that a ray of the design space reaches",
+            where="receiver",
+            hint="turn it, widen its field of view or its range, or move it",
+        )
 
 
 def draw_samples(trainer: Trainer, count: int) -> Samples:

@@ -15,6 +15,7 @@ A capture is a `.npz` or MATLAB `.mat` file with these keys; the pixels are a li
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -35,6 +36,8 @@ KEYS = (*REQUIRED, "direction", *GALVO, *OPTIONAL)
 BIN_LIMITS_PS = (1e-3, 1e6)
 # Light that was under way for a tenth of a second came back from beyond the horizon.
 LATEST_PS = 1e11
+# The Earth is smaller; coordinates beyond are no metres.
+FURTHEST_M = 1e8
 # Directions of float32 are unit vectors to 1e-7; further ones are no directions.
 UNIT_TOLERANCE = 1e-3
 # Pixels that look the same way to so many decimals are one place, captured more than once.
@@ -114,19 +117,29 @@ class Capture:
 
     @cached_property
     def background_per_bin(self) -> float:
-        """The usual background of a bin: the median over pixels of the median of 16 stretches' means."""
+        """The usual background of a bin: the median over pixels of the median of 16 stretches' means.
+
+        Where that is 0 it follows from how many stretches are empty, which e^-mean of them are.
+        """
         edges = np.linspace(0, self.bins, min(STRETCHES, self.bins) + 1).astype(np.int64)
         rows = max(1, CHUNK // self.bins)
-        middles = [
-            np.median(_stretch_means(self.counts[first : first + rows], edges), axis=1)
-            for first in range(0, len(self), rows)
+        means = [
+            _stretch_means(self.counts[first : first + rows], edges) for first in range(0, len(self), rows)
         ]
-        return float(np.median(np.concatenate(middles)))
+        found = float(np.median(np.concatenate([np.median(part, axis=1) for part in means])))
+        return found or _rare_background(np.concatenate(means)) * (len(edges) - 1) / self.bins
 
 
 def _stretch_means(counts: np.ndarray, edges: np.ndarray) -> np.ndarray:
     sums = np.add.reduceat(counts, edges[:-1], axis=1, dtype=np.float64)
     return sums / np.diff(edges)
+
+
+def _rare_background(means: np.ndarray) -> float:
+    """Mean counts of a stretch where most are empty, (P, S): without each pixel's fullest and its neighbours."""
+    # a surface fills the fullest, and its pulse may reach into the next
+    away = np.abs(np.arange(means.shape[1]) - means.argmax(axis=1)[:, None]) > 1
+    return -math.log(float((means[away] == 0).mean())) if away.any() else 0.0
 
 
 def load_capture(path: Path) -> Capture:
@@ -263,6 +276,10 @@ def _check_values(capture: Capture, where: str) -> None:
     for name, value in (("bin_width_ps", capture.bin_ps), ("pulse_fwhm_ps", capture.pulse_fwhm_ps)):
         if value is not None and not low <= value <= high:
             raise DataError(f"{name} is {value:g}", where=where, allowed=f"{low:g} to {high:g} ps")
+    if np.abs(capture.origin_m).max() > FURTHEST_M:
+        raise DataError(
+            f"origin_m is {capture.origin_m.tolist()}", where=where, allowed=f"within {FURTHEST_M:g} m of the origin"
+        )
     end_ps = capture.start_ps + capture.bins * capture.bin_ps
     if not (end_ps.min() > 0 and end_ps.max() <= LATEST_PS):
         raise DataError(

@@ -101,7 +101,7 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
         raise DataError("is no .npz file, or one cut short", where=where, hint="write it with numpy.savez")
     with zipfile.ZipFile(path) as archive:
         members = archive.infolist()
-        _check_size(sum(member.file_size for member in members), "its arrays", where)
+        _check_size(sum(member.file_size for member in members), "all data", where)
         for member in members:
             _check_member(archive, member, where)
     with np.load(path, allow_pickle=False) as arrays:
@@ -131,7 +131,7 @@ def _read_matlab(path: Path) -> dict[str, np.ndarray]:
     listed = whosmat(path, appendmat=False)
     for name, _, kind in listed:
         _check_class(name, kind, where)
-    _check_size(sum(math.prod(shape) * MATLAB_NUMBERS[kind] for _, shape, kind in listed), "its arrays", where)
+    _check_size(sum(math.prod(shape) * MATLAB_NUMBERS[kind] for _, shape, kind in listed), "all data", where)
     found = loadmat(path, appendmat=False)
     arrays = {name: np.asarray(found[name]) for name, _, _ in listed}
     for name, array in arrays.items():
@@ -161,7 +161,7 @@ def _read_hdf5(path: Path) -> dict[str, np.ndarray]:
         datasets = {name: file[name] for name in links}
         for name, dataset in datasets.items():
             _check_dataset(name, dataset, str(path))
-        _check_size(sum(dataset.nbytes for dataset in datasets.values()), "its arrays", str(path))
+        _check_size(sum(dataset.nbytes for dataset in datasets.values()), "all data", str(path))
         return {name: np.asarray(dataset[()]).T for name, dataset in datasets.items()}
 
 

@@ -61,7 +61,9 @@ class CapturedScan:
         return np.isfinite(self.range_m)
 
 
-def scan(capture: Capture, rays: Rays, within_rad: float, estimation: Estimation) -> CapturedScan:
+def scan(
+    capture: Capture, rays: Rays, within_rad: float, estimation: Estimation, name: str | None = None
+) -> CapturedScan:
     """What a list of rays measures in a capture.
 
     Arguments:
@@ -69,6 +71,7 @@ def scan(capture: Capture, rays: Rays, within_rad: float, estimation: Estimation
         rays: The rays; their gates are one-way ranges.
         within_rad: The largest angle between a ray and the pixel that it takes [rad].
         estimation: How ranges follow from histograms.
+        name: Whose rays they are, for the message.
 
     Raises:
         DataError: Not one ray was captured.
@@ -81,7 +84,7 @@ def scan(capture: Capture, rays: Rays, within_rad: float, estimation: Estimation
     captured[last <= first] = Captured.OUT_OF_WINDOW
     captured[away > within_rad] = Captured.OUT_OF_FIELD
     captured[offset > SAME_PLACE_M] = Captured.OTHER_PLACE
-    _refuse_nothing_captured(capture, rays, captured, away, offset)
+    _refuse_nothing_captured(capture, rays, captured, away, offset, name)
     pixel = np.where(captured == Captured.YES, nearest, -1)
     return _measured(capture, captured, pixel, away, first, last, estimation)
 
@@ -160,7 +163,7 @@ def _measured(
 
 
 def _refuse_nothing_captured(
-    capture: Capture, rays: Rays, captured: np.ndarray, away: np.ndarray, offset: np.ndarray
+    capture: Capture, rays: Rays, captured: np.ndarray, away: np.ndarray, offset: np.ndarray, name: str | None
 ) -> None:
     """Refuse rays of which none was captured: the two are of other places or in other frames."""
     if not len(rays) or (captured == Captured.YES).any():
@@ -174,5 +177,6 @@ def _refuse_nothing_captured(
     }[max((Captured.OTHER_PLACE, Captured.OUT_OF_FIELD, Captured.OUT_OF_WINDOW), key=lambda reason: counts[reason])]
     raise DataError(
         f"none of the {len(rays)} rays was captured: {text}",
+        where=name,
         hint="give the capture's origin_m and directions in the design's frame, and start_ps from the scanner",
     )

@@ -158,7 +158,7 @@ def evaluate_capture(
     surface, surface_from = _reference_surface(capture, settings.reference)
 
     def row(name: str, gate: str, rays: Rays, baseline: bool = False) -> CaptureRow:
-        found = scan(capture, rays, settings.within_rad, settings.estimation)
+        found = scan(capture, rays, settings.within_rad, settings.estimation, name)
         wanted = np.where(found.pixel >= 0, reference_m[found.pixel], np.nan)
         off = np.abs(found.range_m - wanted) > settings.outlier_m
         # where a true range says that nothing is, every return is wrong

@@ -38,9 +38,14 @@ COLUMNS = (
     "step", "position", "origin_x_m", "origin_y_m", "origin_z_m", "boresight_azimuth_deg", "boresight_elevation_deg",
     "x_deg", "y_deg", "gate_start_ps", "gate_width_ps", "sensor", "ray",
 )  # fmt: skip
+LONGEST_SHOWN = 200
+# What spreadsheets put in front of UTF-8.
+BOM = b"\xef\xbb\xbf"
 # Angles at the limit come out of sines and cosines a few units in the last place off.
 ROUNDING_DEG = 1e-9
 MOST_ROWS = 1_000_000
+# Whole numbers up to here are exact as float64; light takes 104 days for so many picoseconds.
+MOST_WHOLE = 2**53
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +71,11 @@ def write(design: Design, rays: Rays, path: Path) -> list[str]:
     """Write the file, atomically; returns what it came to and notes of what the format cannot hold.
 
     Raises:
-        ConfigError: Rays of one sensor start at several places, or look beyond what the mirrors reach.
+        ConfigError: Rays of one sensor start at several places, look beyond what the mirrors reach, or are gated
+            later than a whole number of picoseconds says.
     """
     positions = plan(design, rays)
+    _refuse_late_gates(design, rays)
     gates = gate_ps(rays.gate_m)
     lines = [",".join(COLUMNS)]
     for number, one in enumerate(positions):
@@ -127,7 +134,7 @@ def is_galvo_file(path: Path) -> bool:
     header = ",".join(COLUMNS).encode()
     try:
         with Path(path).open("rb") as file:
-            return file.read(len(header)) == header
+            return file.read(len(BOM) + len(header)).removeprefix(BOM).startswith(header)
     except OSError:
         return False
 
@@ -171,6 +178,15 @@ def _refuse_far_rays(design: Design, rays: Rays, positions: list[Position]) -> N
     )
 
 
+def _refuse_late_gates(design: Design, rays: Rays) -> None:
+    latest_m = float(gate_m(np.array([[MOST_WHOLE, 0]]))[0, 1])
+    end_m = rays.gate_m[:, 1].max(initial=0.0)
+    if end_m > latest_m:
+        raise ConfigError(
+            f"a gate ends at {end_m:.4g} m", where=design.name, allowed=f"at most {latest_m:.4g} m, in picoseconds"
+        )
+
+
 def _summary(positions: list[Position]) -> list[str]:
     if not positions:
         return []
@@ -194,7 +210,7 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
     """The table of a file by column, whole numbers where they must be."""
     where = str(path)
     try:
-        with Path(path).open(encoding="utf-8", newline="") as file:
+        with Path(path).open(encoding="utf-8-sig", newline="") as file:
             rows = [row for row, _ in zip(csv.reader(file), range(MOST_ROWS + 1), strict=False)]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"cannot be read as a table ({error})", where=where) from error
@@ -211,16 +227,20 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
     }
 
 
+def _short(text: str) -> str:
+    return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
+
+
 def _numbers(row: list[str], where: str) -> list[float]:
     """The values of a row: finite, and whole and not negative where they count or time something."""
     try:
         found = [float(cell) for cell in row]
     except ValueError as error:
-        raise DataError(f"{error}", where=where, allowed="numbers") from error
+        raise DataError(_short(str(error)), where=where, allowed="numbers") from error
     if len(found) != len(COLUMNS) or not all(map(math.isfinite, found)):
-        raise DataError(f"holds {row}", where=where, allowed=f"{len(COLUMNS)} finite numbers")
+        raise DataError(f"holds {_short(str(row))}", where=where, allowed=f"{len(COLUMNS)} finite numbers")
     for name, value in zip(COLUMNS, found, strict=True):
-        if name in WHOLE and (value < 0 or value != int(value) or value > 2**53):
+        if name in WHOLE and (value < 0 or value != int(value) or value > MOST_WHOLE):
             raise DataError(f"{name} is {value:g}", where=where, allowed="whole numbers, 0 or more")
         if name in ("x_deg", "y_deg") and abs(value) > LIMIT_DEG + ROUNDING_DEG:
             raise DataError(f"{name} is {value:g}", where=where, allowed=f"+-{LIMIT_DEG:g} degrees")

@@ -102,13 +102,24 @@ def _explain(
         hint = suggest(str(path[-1]), allowed) or _elsewhere(model, str(path[-1]))
         return ConfigError(f"unknown key {name!r}", where=where, allowed=", ".join(allowed), hint=hint)
     if detail["type"] == "missing":
+        if isinstance(detail["loc"][-1], int):
+            length = 1 + max(other["loc"][-1] for other in details if other["loc"][:-1] == detail["loc"][:-1])
+            found = _short(detail["input"])
+            return ConfigError(f"{name}: found {found}", where=where, allowed=f"a list of {length} values")
         return ConfigError(f"{name} is missing", where=where, hint=f"--set {name.removeprefix('task.')}=VALUE")
     text = detail["msg"].removeprefix("Value error, ")
     found = "" if detail["type"] == "value_error" and not path else f": found {_short(detail['input'])}"
     more = f" (and {len(details) - 1} more)" if len(details) > 1 and not _is_union(detail["loc"], path) else ""
     if detail["type"] in ("value_error", "assertion_error"):
         return ConfigError(f"{name}: {text}{found if path else ''}{more}", where=where)
-    return ConfigError(f"{name}{found}{more}", where=where, allowed=_lower(text.removeprefix("Input should be ")))
+    return ConfigError(f"{name}{found}{more}", where=where, allowed=_allowed(detail["type"], text))
+
+
+def _allowed(kind: str, text: str) -> str:
+    """What pydantic would have taken, in the words of YAML."""
+    if kind == "model_type":
+        return "keys and values, as `{key: value}`"
+    return _lower(text.removeprefix("Input should be "))
 
 
 def _real_path(location: tuple[Any, ...], values: Any) -> KeyPath:

@@ -7,6 +7,7 @@ or not at all: without them every light is enough, and no photon is counted.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,12 +99,16 @@ def load_detector(name_or_path: str | Path) -> Detector:
     if text in detector_names():
         return _detector(load_yaml(FOLDER / f"{text}.yaml"), text)
     path = Path(text)
-    if not path.exists():
+    # an empty path is the current folder, and a name that is too long for a file is no file
+    if not text.strip() or not os.path.exists(path):
         names = detector_names()
         hint = suggest(text, names) or "docs/detectors.md says how to write one"
         allowed = f"{', '.join(names)}, or the path of a detector file"
         raise ConfigError(f"there is no detector {text!r}", where="--detector", allowed=allowed, hint=hint)
-    return _detector(load_yaml(path), path.stem)
+    document = load_yaml(path)
+    if not document.mapping:
+        raise ConfigError("says nothing about a detector", where=str(path), hint="--detector ideal needs no file")
+    return _detector(document, path.stem)
 
 
 def _detector(document: Document, fallback: str) -> Detector:

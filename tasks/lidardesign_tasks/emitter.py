@@ -49,6 +49,13 @@ class EmitterConfig(HeadConfig):
             raise ValueError("the shortest range is 0 m or more, and the longest above it")
         return value
 
+    @field_validator("emitter_box_m")
+    @classmethod
+    def _not_negative(cls, value: float | Vector) -> float | Vector:
+        if np.min(value) < 0:
+            raise ValueError("half sizes are 0 m or more")
+        return value
+
     @field_validator("field_of_view_deg")
     @classmethod
     def _below_a_half_turn(cls, value: tuple[float, float]) -> tuple[float, float]:
@@ -84,7 +91,7 @@ class EmitterTask:
 
     def space(self, config: EmitterConfig) -> DesignSpace:
         """Emitter places in a box around the detector, directions around where it looks."""
-        half = np.broadcast_to(np.abs(np.asarray(config.emitter_box_m, dtype=np.float64)), 3)
+        half = np.broadcast_to(np.asarray(config.emitter_box_m, dtype=np.float64), 3)
         centre, angle = np.array(config.detector_m), math.radians(config.half_angle_deg)
         azimuth, elevation = math.radians(config.detector_azimuth_deg), math.radians(config.detector_elevation_deg)
         bottom, top = max(elevation - angle, -math.pi / 2), min(elevation + angle, math.pi / 2)
