@@ -165,6 +165,21 @@ def test_background_alone_is_seldom_taken_for_a_return():
         assert share < 0.03
 
 
+@pytest.mark.parametrize("per_bin", [0.003, 0.01, 0.03])
+def test_rare_background_in_a_gate_is_seldom_taken_for_a_return(per_bin):
+    generator = np.random.default_rng(9)
+    looks = scan_directions(degree_frame(0.0, 0.0), generator.uniform(-10, 10, (3000, 2)))
+    counts = generator.poisson(per_bin, (3000, 800))
+    # a surface in every pixel, outside of the gates
+    counts[np.arange(3000)[:, None], generator.integers(300, 790, 3000)[:, None] + np.arange(5)] += 20
+    dark = Capture(counts, BIN_PS, START_PS, np.zeros(3), looks, pulse_fwhm_ps=60.0)
+    assert dark.background_per_bin == pytest.approx(per_bin, rel=0.3)
+    gates = np.tile(dark.start_m[0] + np.array([100, 140]) * dark.bin_m, (3000, 1))
+    rays = Rays(np.zeros((3000, 3)), looks, gates, np.zeros(3000), np.zeros(3000))
+    for estimation in ESTIMATIONS:
+        assert scan(dark, rays, default_within_rad(dark), estimation).returned.mean() < 0.02
+
+
 # --- what is not captured
 
 

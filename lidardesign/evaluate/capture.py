@@ -123,9 +123,7 @@ class Capture:
         """
         edges = np.linspace(0, self.bins, min(STRETCHES, self.bins) + 1).astype(np.int64)
         rows = max(1, CHUNK // self.bins)
-        means = [
-            _stretch_means(self.counts[first : first + rows], edges) for first in range(0, len(self), rows)
-        ]
+        means = [_stretch_means(self.counts[first : first + rows], edges) for first in range(0, len(self), rows)]
         found = float(np.median(np.concatenate([np.median(part, axis=1) for part in means])))
         return found or _rare_background(np.concatenate(means)) * (len(edges) - 1) / self.bins
 
@@ -139,7 +137,8 @@ def _rare_background(means: np.ndarray) -> float:
     """Mean counts of a stretch where most are empty, (P, S): without each pixel's fullest and its neighbours."""
     # a surface fills the fullest, and its pulse may reach into the next
     away = np.abs(np.arange(means.shape[1]) - means.argmax(axis=1)[:, None]) > 1
-    return -math.log(float((means[away] == 0).mean())) if away.any() else 0.0
+    empty = means[away] == 0
+    return -math.log(float(empty.mean())) if empty.any() else 0.0
 
 
 def load_capture(path: Path) -> Capture:
