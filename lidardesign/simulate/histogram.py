@@ -85,7 +85,7 @@ def bins_of(windows_m: np.ndarray, echoes: Echoes, detector: Detector, quantised
         from lidardesign.simulate.effects.quantisation import bins_start
 
         return Bins.over(windows_m, bins_start(windows_m, detector), own)
-    width_m = own or max(metres(detector.timing_sigma_s) / BINS_PER_SIGMA, FINEST_BIN_M)
+    width_m = bin_width_m(detector)
     starts = windows_m[:, 0].copy()
     inside = np.flatnonzero((echoes.path_m >= starts[echoes.ray]) & (echoes.path_m < windows_m[echoes.ray, 1]))
     # ascending in gain: of several assignments to one ray the last, strongest one stays
@@ -138,6 +138,11 @@ def check_windows(windows_m: np.ndarray, detector: Detector) -> None:
 
 
 _NARROWER = "narrower gates, or a detector file with a longer histogram and a lower repetition rate"
+
+
+def bin_width_m(detector: Detector) -> float:
+    """A detector's bins, or where it has none the finer ones that its photons are sorted into [m]."""
+    return detector.bin_m or max(metres(detector.timing_sigma_s) / BINS_PER_SIGMA, FINEST_BIN_M)
 
 
 def resolution_m(detector: Detector) -> float:

@@ -15,8 +15,9 @@ import numpy as np
 
 from lidardesign.numerics import safe_divide
 from lidardesign.simulate.bounds.light import ambient_per_metre, haze_per_pulse
-from lidardesign.simulate.bounds.sight import BINS_PER_SIGMA, Sight
+from lidardesign.simulate.bounds.sight import Sight
 from lidardesign.simulate.detector import FWHM_PER_SIGMA, Detector, metres
+from lidardesign.simulate.histogram import bin_width_m
 
 # Steps of the logarithm, 1 % each, in which levels of background are told apart.
 LEVELS_PER_UNIT = 100
@@ -190,15 +191,6 @@ def _rounded_up(values: np.ndarray) -> np.ndarray:
 def counted(number: float) -> str:
     """An expected count for people."""
     return f"{number:,.0f}" if number >= MANY else f"{number:.2g}"
-
-
-def bin_width_m(detector: Detector) -> float:
-    """A histogram's bins: the detector's own, or a share of a photon's timing error [m].
-
-    A detector without either has one bin per nanometre: ranges are then exact.
-    """
-    own = detector.bin_m or metres(detector.timing_sigma_s) / BINS_PER_SIGMA
-    return own or 1e-9
 
 
 def share_in_bins(count: int, bin_m: float, sigma_m: np.ndarray) -> np.ndarray:

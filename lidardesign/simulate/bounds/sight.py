@@ -10,8 +10,9 @@ import numpy as np
 
 from lidardesign.scene import Scene
 from lidardesign.simulate.bistatic import path_of_range, path_windows
-from lidardesign.simulate.detector import FWHM_PER_SIGMA, Detector, metres
+from lidardesign.simulate.detector import Detector, metres
 from lidardesign.simulate.echoes import Beams
+from lidardesign.simulate.histogram import resolution_m
 from lidardesign.simulate.hits import Hits
 from lidardesign.simulate.physics import direct_echoes
 from lidardesign.simulate.raycast import SceneCaster
@@ -24,8 +25,6 @@ FLATTEST_COSINE = 0.02
 NEIGHBOURS = 4
 # The matched filter takes photons up to so many standard deviations from its pulse's centre into account.
 PULSE_REACH = 4.0
-# Without bins of its own a detector's histogram has bins of this share of a photon's timing error.
-BINS_PER_SIGMA = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +178,6 @@ class Sight:
         The matched filter averages over all of a pulse, far into its tails.
         """
         detector = self.detector
-        told_apart = max(detector.bin_m or 0.0, metres(FWHM_PER_SIGMA * detector.pulse_sigma_s))
+        told_apart = resolution_m(detector)
         averages = detector.photons is not None and detector.estimator == "matched"
         return max(told_apart, PULSE_REACH * metres(detector.timing_sigma_s)) if averages else told_apart
