@@ -247,3 +247,16 @@ def test_mistakes_are_named_before_anything_is_scored(lidardesign, run, tmp_path
 def test_tolerances_are_those_that_are_asked_for():
     planner = Planner(SINGLE, tolerance=Tolerance(0.002, 0.05))
     assert evaluate(make_request(test=sunny(1), planner=planner)).effects[0].tolerance == Tolerance(0.002, 0.05)
+
+
+def test_the_program_judges_by_other_surroundings_than_were_learned(lidardesign, fitted):
+    options = ("evaluate", fitted, "--rays", 8, "--detector", "single-photon", "--effects", "auto")
+    room = lidardesign(*options, "--json").json
+    sunny = lidardesign(*options, "--set", "illuminance_lux=100000", "--set", "light=sun")
+    assert sunny.code == 0
+    assert "illuminance_lux=100000, light=sun" in sunny.out
+    assert "100,000 lux (sun)" in sunny.out
+    assert room["set"] == []
+    assert "300 lux (indoor)" in next(one["reason"] for one in room["effects"] if one["name"] == "ambient")
+    other = lidardesign("evaluate", fitted, "--rays", 8, "--set", "density.sigma_m=1")
+    assert (other.code, "what was learned cannot be changed" in other.err) == (2, True)

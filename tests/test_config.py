@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from lidardesign.density.settings import DensitySettings, LearningSettings
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run import config as config_module
-from lidardesign.run.config import load_run_config, resolve, save_run_config
+from lidardesign.run.config import judged_by, load_run_config, resolve, save_run_config
 from lidardesign.run.manifest import start_manifest
 from lidardesign.run.overrides import parse_override
 from lidardesign.space import DIMENSIONS, DesignSpace
@@ -239,3 +239,27 @@ def test_no_validation_warns(write):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         resolve(TASK, config_file=write("task: {model: a}"), overrides=["count=2"]).as_document()
+
+
+def test_a_run_is_judged_by_other_values_of_its_task_and_keeps_the_rest():
+    config = resolve(TASK, overrides=["label=b", "density.sigma_m=0.02"])
+    judged = judged_by(TASK, config, ["jitter.angle_rad=0.5"])
+    assert judged.task == config.task.model_copy(update={"jitter": Jitter(angle_rad=0.5)})
+    assert (judged.density, judged.learning, judged.space) == (config.density, config.learning, config.space)
+    assert judged_by(TASK, config, []) == config
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("count=4", "design space"),
+        ("density.sigma_m=0.03", "what was learned cannot be changed"),
+        ("space.x_m=0", "what was learned cannot be changed"),
+        ("lable=b", "unknown key"),
+        ("jitter.angle_rad=-1", "jitter.angle_rad"),
+    ],
+)
+def test_what_was_learned_stays_when_a_run_is_judged(override, message):
+    with pytest.raises(ConfigError, match=message) as caught:
+        judged_by(TASK, resolve(TASK), [override])
+    assert override in str(caught.value.where)

@@ -65,6 +65,16 @@ Plots = Annotated[
     typer.Option("--plots", metavar="DIR", help="Write PNG curves into this folder.", show_default=False),
 ]
 Csv = Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write the rows as CSV.", show_default=False)]
+Surroundings = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Judge by other scenes than were learned: a key of the task, as illuminance_lux=100000 or test=10, that "
+        "leaves the design space as it is; repeatable.",
+        show_default=False,
+    ),
+]
 FailAbove = Annotated[
     float | None,
     typer.Option(
@@ -84,6 +94,7 @@ def evaluate(
     detector: Detector = "ideal",
     range_tolerance_mm: RangeTolerance = None,
     return_tolerance: ReturnTolerance = None,
+    overrides: Surroundings = None,
     report: Report = None,
     plots: Plots = None,
     csv: Csv = None,
@@ -97,16 +108,20 @@ def evaluate(
     with command(json=json, quiet=quiet, debug=debug) as console:
         if fail_above is not None and not math.isfinite(fail_above):
             raise ConfigError(f"{fail_above}", where="--fail-above", allowed="a finite number")
+        from lidardesign.run.config import judged_by
+
         _check_baselines(baseline or [])
         planner, audit = planner_of(effects, detector, range_tolerance_mm, return_tolerance)
         entries, runs = _collect(targets)
         run = _common_run(_named_apart(entries), runs)
+        if overrides:
+            run = replace(run, config=judged_by(run.task, run.config, overrides))
         if range_tolerance_mm is None:
             planner = replace(planner, tolerance=planner.tolerated.within(run.task.metric))
         request = replace(_request(run, entries, rays, baseline or [], seed), planner=planner, audit=audit)
         evaluation = _evaluate(request, console)
         written = _write_files(evaluation, request, report, plots, csv)
-        document = {**evaluation.as_dict(), "files": [str(path) for path in written]}
+        document = {**evaluation.as_dict(), "set": overrides or [], "files": [str(path) for path in written]}
         console.result(document, lambda rich: show_evaluation(document, written, rich))
         _check_threshold(evaluation, fail_above)
         _check_audit(evaluation)

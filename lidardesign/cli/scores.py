@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.cli.designs import number
+from lidardesign.cli.grids import print_table
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
 Entry = dict[str, Any]
 MILLIMETRES = 1000.0
+# Differences of an audit are shown to hundredths of what is tolerated, and to so many decimals where nothing is.
+FINER = 2
+SHORT_S = 0.01
+DECIMALS = 4
 
 
 def show_evaluation(document: dict[str, Any], written: Sequence[Path], rich: RichConsole) -> None:
@@ -21,7 +27,8 @@ def show_evaluation(document: dict[str, Any], written: Sequence[Path], rich: Ric
 
     metric = document["metric"]
     figure = f"{metric['name']} [{metric['unit']}], {metric['better']} is better"
-    _show_rows(document["rows"], escape(f"{figure}, over {document['scenes']} held-out scenes"), rich)
+    scenes = f"over {document['scenes']} held-out scenes" + "".join(f", {text}" for text in document.get("set", []))
+    _show_rows(document["rows"], escape(f"{figure}, {scenes}"), rich)
     designs = {row["design"] for row in document["rows"]} - {row["design"] for row in document["equal_bandwidth"]}
     against = [pair for pair in document["paired"] if pair["b"] not in designs]
     unit = escape(metric["unit"])
@@ -39,21 +46,16 @@ def show_evaluation(document: dict[str, Any], written: Sequence[Path], rich: Ric
 
 
 def _show_rows(rows: Sequence[Entry], title: str, rich: RichConsole) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    rich.print(f"[italic]{title}[/italic]", soft_wrap=True)
-    table = Table()
     detail = next((name for row in rows for name in row["details"]), None)
-    further = [] if detail is None else [escape(detail.replace("_", " "))]
-    for heading in ("design", "rays", "value", "95 % interval", "failures", *further, "Mbit/s", "seconds"):
-        table.add_column(heading, justify="left" if heading == "design" else "right")
+    further = [] if detail is None else [detail.replace("_", " ")]
+    headings = ("design", "rays", "value", "95 % interval", "failures", *further, "Mbit/s", "seconds")
+    lines = []
     for row in rows:
         interval = f"{number(row['ci_low'])} - {number(row['ci_high'])}"
         extra = [] if detail is None else [row["details"].get(detail)]
         cells = (row["rays"], row["value"], interval, row["failures"], *extra, row["bandwidth_mbps"])
-        table.add_row(escape(row["design"]), *(number(cell) for cell in cells), number(row["seconds"], 2))
-    rich.print(table)
+        lines.append([row["design"], *(number(cell) for cell in cells), number(row["seconds"], 2)])
+    print_table(title, headings, lines, rich)
 
 
 def _show_grid(
@@ -65,23 +67,14 @@ def _show_grid(
     rich: RichConsole,
 ) -> None:
     """One line per design and number of rays, one column per baseline."""
-    from rich.markup import escape
-    from rich.table import Table
-
     if not entries:
         return
     columns = list(dict.fromkeys(entry[column] for entry in entries))
     lines: dict[tuple[Any, ...], dict[str, str]] = {}
     for entry in entries:
         lines.setdefault(tuple(entry[key] for key in keys), {})[entry[column]] = cell(entry)
-    # a table's own title would wrap at the table's width
-    rich.print(f"[italic]{title}[/italic]", soft_wrap=True)
-    table = Table("design")
-    for heading in ("rays", *columns):
-        table.add_column(escape(heading), justify="right")
-    for (name, rays), cells in lines.items():
-        table.add_row(escape(name), str(rays), *(cells.get(heading, "-") for heading in columns))
-    rich.print(table)
+    rows = [[name, str(rays), *(line.get(other, "-") for other in columns)] for (name, rays), line in lines.items()]
+    print_table(title, ("design", "rays", *columns), rows, rich)
 
 
 def _difference(pair: Entry) -> str:
@@ -95,7 +88,8 @@ def _value(row: Entry) -> str:
 def _show_effects(document: Entry, rich: RichConsole) -> None:
     """What was simulated and why; one line where nothing is called for."""
     from rich.markup import escape
-    from rich.table import Table
+
+    from lidardesign.evaluate.verdicts import plain
 
     detector, effects = escape(document["detector"]), document["effects"]
     if not any(effect["on"] or effect["bound"] or effect["lost"] for effect in effects):
@@ -104,42 +98,50 @@ def _show_effects(document: Entry, rich: RichConsole) -> None:
     first = effects[0]
     allowed = f"{MILLIMETRES * first['tolerance']:.3g} mm and {first['lost_tolerance']:.2g} of returns"
     title = f"effects with the detector {detector}; all that are skipped may change {allowed} together"
-    rich.print(f"[italic]{title}[/italic]", soft_wrap=True)
-    table = Table("effect", "on")
-    for heading in ("range \\[mm]", "returns", "cost \\[s]"):
-        table.add_column(heading, justify="right")
-    table.add_column("reason")
+    lines = []
     for effect in effects:
-        cells = (f"{MILLIMETRES * effect['bound']:.3g}", f"{effect['lost']:.2g}", f"{effect['seconds']:.2g}")
-        table.add_row(effect["name"].replace("_", " "), _where_on(effect), *cells, escape(effect["reason"]))
-    rich.print(table)
+        bounds = [plain(MILLIMETRES * effect["bound"], 3), plain(effect["lost"], 2)]
+        cost = plain(effect["seconds"], 2, tiny=SHORT_S)
+        lines.append([_words(effect["name"]), _where_on(effect), *bounds, cost, effect["reason"]])
+    headings = ("effect", "on", "range [mm]", "returns", "cost [s]", "reason")
+    print_table(title, headings, lines, rich, text=("effect", "on", "reason"))
 
 
 def _where_on(effect: Entry) -> str:
     if not effect["on"]:
         return "no" if effect["missing"] is None else "missing"
-    return "yes" if effect["scenes_on"] == 1 else f"in {effect['scenes_on']:.0%}"
+    return "yes" if effect["scenes_on"] == 1 else f"in {100 * effect['scenes_on']:.0f} %"
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
 
 
 def _show_audit(document: Entry, rich: RichConsole) -> None:
     from rich.markup import escape
-    from rich.table import Table
 
     audit = document["audit"]
-    unit = escape(audit["unit"])
+    unit = audit["unit"]
     there = {effect["name"] for effect in document["effects"] if effect["bound"] or effect["lost"]}
-    skipped = ", ".join(name for name in audit["skipped"] if name in there) or "nothing that is there"
+    skipped = ", ".join(_words(name) for name in audit["skipped"] if name in there) or "nothing that is there"
     verdict = "passed" if audit["passed"] else "failed"
     title = f"audit {verdict}: the plan skips {skipped}; rows may move by {audit['tolerance']:g} {unit}"
-    rich.print(f"[italic]{title}[/italic]", soft_wrap=True)
-    table = Table("design", "matched to")
-    for heading in ("rays", f"planned \\[{unit}]", f"all \\[{unit}]", "difference (95 % interval)", "seconds", "all"):
-        table.add_column(heading, justify="right")
+    planned, everything = f"planned\n[{unit}]", f"all effects\n[{unit}]"
+    moves = "difference (95 % interval)"
+    headings = ("design", "bandwidth\nof", "rays", planned, everything, moves, "seconds\nof both")
+    decimals = _decimals(audit["tolerance"])
+    lines = []
     for row in audit["rows"]:
-        cells = (row["planned"], row["everything"])
-        times = (number(row["seconds"], 2), number(row["seconds_everything"], 2))
-        matched = escape(row.get("matched_to", "-"))
-        table.add_row(
-            escape(row["design"]), matched, str(row["rays"]), *map(number, cells), _difference(row), *times
-        )
-    rich.print(table)
+        # adding zero takes the sign from a rounded -0
+        figures = (round(row[name], decimals) + 0.0 for name in ("difference", "ci_low", "ci_high"))
+        moved, low, high = (f"{value:.{decimals}f}" for value in figures)
+        times = f"{number(row['seconds'], 2)}, {number(row['seconds_everything'], 2)}"
+        scores = (number(row["planned"]), number(row["everything"]))
+        matched = row.get("matched_to", "-")
+        lines.append([row["design"], matched, str(row["rays"]), *scores, f"{moved} ({low} to {high})", times])
+    print_table(escape(title), headings, lines, rich, text=headings[:2])
+
+
+def _decimals(tolerance: float) -> int:
+    """As many decimals as tell hundredths of a tolerance."""
+    return max(0, FINER - math.floor(math.log10(tolerance))) if tolerance > 0 else DECIMALS

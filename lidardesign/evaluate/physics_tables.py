@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from lidardesign.evaluate.audit import Audit, AuditRow
 from lidardesign.evaluate.effects import EffectSummary
 from lidardesign.evaluate.results import Evaluation
-from lidardesign.evaluate.verdicts import figure, table
+from lidardesign.evaluate.verdicts import figure, plain, table
 
 MILLIMETRES = 1000.0
+SHORT_S = 0.01  # costs from here on are shown as their limit
 
 
 def effects_section(evaluation: Evaluation) -> str:
@@ -62,12 +63,13 @@ def _starts(rows: Sequence[AuditRow], index: int) -> bool:
 
 def _effect_cells(effect: EffectSummary) -> list[str]:
     shown = [_words(effect.name), _simulated(effect), effect.reason]
-    return [*shown, f"{MILLIMETRES * effect.range_m:.3g}", f"{effect.lost:.2g}", f"{effect.seconds:.2g}"]
+    bounds = (plain(MILLIMETRES * effect.range_m, 3), plain(effect.lost, 2))
+    return [*shown, *bounds, plain(effect.seconds, 2, tiny=SHORT_S)]
 
 
 def _simulated(effect: EffectSummary) -> str:
     if effect.on:
-        return "yes" if effect.scenes_on == 1 else f"in {effect.scenes_on:.0%} of scenes"
+        return "yes" if effect.scenes_on == 1 else f"in {100 * effect.scenes_on:.0f} % of scenes"
     return "no" if effect.missing is None else "not possible here"
 
 

@@ -10,12 +10,21 @@ from lidardesign.design.sensor import Design
 from lidardesign.evaluate.results import Evaluation, Paired, Row, leading_detail
 
 MOST_SENSORS = 60  # listed in a table
+TINY = 1e-4  # from here on the limit is shown
 VERDICTS = {"better": "better", "worse": "worse", "open": "not clear"}
 
 
 def figure(value: float) -> str:
     """A number with four digits for people."""
     return f"{value:#.4g}".removesuffix(".")
+
+
+def plain(value: float, digits: int, tiny: float = TINY) -> str:
+    """A number of at least 0 without an exponent; what is tiny as its upper limit."""
+    if 0 < value < tiny:
+        return f"<{tiny:g}"
+    rounded = float(f"{value:.{digits}g}")
+    return f"{rounded:,.0f}" if rounded >= 10 ** (digits - 1) else f"{rounded:g}"
 
 
 def verdict(evaluation: Evaluation, pair: Paired) -> str:

@@ -153,6 +153,32 @@ def resolve(
     return _build(task, header, layers)
 
 
+def judged_by(task: Task, config: RunConfig, overrides: Sequence[str]) -> RunConfig:
+    """A run's configuration with other values of the task's own keys, to judge its designs by.
+
+    Raises:
+        ConfigError: At the `--set` option; also where the value would change the design space.
+    """
+    layers = _Layers({section: {} for section in SECTIONS})
+    layers.merge("task", config.task.model_dump(mode="json"), FILE_NAME)
+    for text in overrides:
+        override = parse_override(text)
+        if override.path[0] in SECTIONS[1:] and len(override.path) > 1:
+            allowed = f"keys of the task {task.name}"
+            raise ConfigError("what was learned cannot be changed", where=override.where, allowed=allowed)
+        _lay_override(layers, task, override)
+    judged = check_model(task.Config, layers.values["task"], layers.origin, "task")
+    with plugin_guard(task.name):
+        same = task.space(judged).as_dict() == task.space(config.task).as_dict()
+    if not same:
+        raise ConfigError(
+            "changes the design space that the run was learned in",
+            where="--set " + ", ".join(overrides),
+            hint=f"learn another run with it: lidardesign learn {task.name} --set KEY=VALUE",
+        )
+    return replace(config, task=judged)
+
+
 def load_run_config(run: Path) -> tuple[Task, RunConfig]:
     """The task and configuration of a run folder, checked against the manifest.
 

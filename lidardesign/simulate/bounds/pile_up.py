@@ -14,7 +14,7 @@ import numpy as np
 
 from lidardesign.scene import Scene
 from lidardesign.simulate.bounds.blindness import Blindness, missed_behind, unevenness, variance_of_missing
-from lidardesign.simulate.bounds.counts import Counts
+from lidardesign.simulate.bounds.counts import Counts, counted
 from lidardesign.simulate.bounds.sight import Sight, Stake
 from lidardesign.simulate.detector import Detector
 from lidardesign.simulate.returns import Rays
@@ -35,7 +35,7 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     lost = np.where(sight.returned, _beaten(counts, blind, sigma_m), _invented(counts, blind))
     typical = float(np.median(blind.per_pulse[sight.returned] if sight.returned.any() else blind.per_pulse))
     dead_ns = 1e9 * sight.detector.photons.dead_s
-    return Stake(squared, lost, f"{typical:.2g} counts a pulse, {dead_ns:.3g} ns blind after each")
+    return Stake(squared, lost, f"{counted(typical)} counts a pulse, {dead_ns:.3g} ns blind after each")
 
 
 def _beaten(counts: Counts, blind: Blindness, sigma_m: np.ndarray) -> np.ndarray:

@@ -1,0 +1,44 @@
+"""Tables of figures stay whole at any width: they lose their lines first, and brackets go below last."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+
+from lidardesign.cli.grids import print_table
+from lidardesign.evaluate.verdicts import plain
+
+HEADINGS = ("design", "rays", "difference (95 % interval)", "seconds")
+LINES = (["free", "196", "-0.013 (-0.021 to -0.004)", "1.4, 2.6"], ["(own)", "36", "0.002 (-0.010 to 0.012)", "3, 3"])
+
+
+def printed(width):
+    console = Console(file=io.StringIO(), width=width, highlight=False)
+    print_table("scores", HEADINGS, LINES, console)
+    return console.file.getvalue()
+
+
+@pytest.mark.parametrize("width", [46, 56, 120])
+def test_no_figure_is_broken_and_no_line_is_too_wide(width):
+    text = printed(width)
+    assert all(len(line) <= width for line in text.splitlines())
+    for piece in ("-0.013", "(-0.021 to -0.004)", "(95 % interval)", "1.4, 2.6", "(own)"):
+        assert piece in text
+
+
+def test_wide_terminals_have_one_line_per_row():
+    assert "-0.013 (-0.021 to -0.004)" in printed(120)
+    assert "-0.013 (-0.021 to -0.004)" in printed(56)
+    assert "│" in printed(120)
+    assert "│" not in printed(56)
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "shown"),
+    [(0.0, 2, "0"), (1300.0, 2, "1,300"), (99.9, 2, "100"), (14.71, 3, "14.7"), (0.0036, 2, "0.0036"),
+     (1.7e-7, 2, "<0.0001"), (1.0, 2, "1"), (1.5, 2, "1.5")],
+)  # fmt: skip
+def test_figures_have_no_exponents(value, digits, shown):
+    assert plain(value, digits) == shown
