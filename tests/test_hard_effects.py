@@ -10,7 +10,9 @@ import pytest
 from lidardesign.scene import Ambient, Body, Medium, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.detector import IDEAL
 from lidardesign.simulate.detector_files import load_detector
-from lidardesign.simulate.physics import EFFECTS, Physics
+from lidardesign.simulate.echoes import Beams
+from lidardesign.simulate.physics import EFFECTS, Physics, direct_echoes
+from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.returns import Outcome, Rays
 from lidardesign.simulate.simulate import simulate
 
@@ -78,3 +80,12 @@ def test_a_scene_of_mirrors_alone_returns_nothing():
     (returns,) = simulate(Scene(mirrors), rays, physics=Physics(IDEAL, frozenset({"specular"})))
     assert not returns.returned.any()
     assert (returns.outcome[:2] == Outcome.NOT_DETECTED).all()
+
+
+@pytest.mark.parametrize(("reflectance", "gain"), [(0.0, 0.0), (0.5, np.finfo(float).max)])
+def test_a_surface_that_touches_the_sensor_blinds_it_unless_it_is_black(reflectance, gain):
+    floor = Scene((Body(Plane(), reflectance=reflectance),))
+    down = Rays(np.zeros((1, 3)), np.array([[0.0, 0.0, -1.0]]), np.array([[0.0, 1.0]]), np.zeros(1), np.zeros(1))
+    hits = SceneCaster(floor).first_hit(down.origin_m, down.direction)
+    assert hits.range_m == 0
+    assert direct_echoes(floor, Beams.of(down), hits).gain == gain

@@ -131,8 +131,8 @@ def direct_echoes(scene: Scene, beams: Beams, hits: Hits) -> Echoes:
     with np.errstate(divide="ignore", invalid="ignore"):
         cosine = np.maximum(np.einsum("nk,nk->n", hits.normal[seen], back) / back_m, 0.0)
         gain = beams.share[seen] * reflectance * cosine / (np.pi * back_m**2)
-    # a surface that touches the receiver blinds it: finite, and stronger than anything else
-    gain = np.nan_to_num(gain, nan=np.finfo(float).max, posinf=np.finfo(float).max)
+    # a surface that touches the receiver blinds it, unless it is black: finite, and stronger than anything else
+    gain = np.nan_to_num(gain, nan=np.finfo(float).max, posinf=np.finfo(float).max) * (reflectance > 0)
     return Echoes(beams.ray[seen], (hits.range_m[seen] + back_m) / 2, gain, hits.body[seen])
 
 
