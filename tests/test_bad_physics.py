@@ -6,7 +6,9 @@ import math
 
 import numpy as np
 import pytest
+import trimesh
 from command_line import caller, files_under, make_run
+from lidardesign_tasks.emitter import winding_number
 from lidardesign_tasks.flatland import FlatlandTask
 from test_bad_input import GARBAGE, GOOD, check_one_clear_message
 
@@ -14,7 +16,8 @@ from lidardesign.cli.console import EXIT_INTERRUPTED, Console, describe_error
 from lidardesign.density.learn import _refuse_blind_receiver
 from lidardesign.errors import DataError, PluginError
 from lidardesign.registry import plugin_guard
-from lidardesign.scene import Ambient, Body, Medium, Receiver, Scene, Sphere
+from lidardesign.scene import Ambient, Body, Medium, Mesh, Receiver, Scene, Sphere
+from lidardesign.simulate import light_transport_process
 
 LONG = "x" * 300
 BILLION_LAUGHS = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
@@ -231,6 +234,30 @@ def test_a_receiver_that_sees_nothing_that_is_lit_is_refused_before_learning():
     for blind in (away, short):
         with pytest.raises(DataError, match="receiver: its field of view and range hold no surface"):
             _refuse_blind_receiver([Scene((ball,), receiver=blind)], points)
+
+
+@pytest.mark.parametrize("place", ["[-0.05,0,0]", "[-0.1,0.02,0.01]"])
+def test_a_detector_inside_of_a_head_is_refused(ready, place):
+    result = ready("learn", "emitter", "--set", f"detector_m={place}", "--set", "train=2", "--json")
+    check_one_clear_message(result, 2, "is inside the train head 0")
+    assert "task.detector_m" in result.err
+
+
+def test_meshes_wind_once_round_what_is_inside_of_them():
+    corners = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
+    cube = trimesh.convex.convex_hull(corners)
+    mesh = Mesh(cube.vertices, cube.faces)
+    inside = [winding_number(mesh, point) for point in np.random.default_rng(0).uniform(0.01, 0.99, (20, 3))]
+    outside = [winding_number(mesh, point) for point in np.random.default_rng(1).uniform(1.01, 3.0, (20, 3))]
+    np.testing.assert_allclose(inside, 1.0, atol=1e-9)
+    np.testing.assert_allclose(outside, 0.0, atol=1e-9)
+
+
+def test_a_library_that_cannot_be_is_named_where_it_comes_from(monkeypatch, tmp_path):
+    monkeypatch.setattr(light_transport_process, "PACKAGES", {})
+    for wrong in (tmp_path, tmp_path / "absent.so"):
+        monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(wrong))
+        assert light_transport_process.missing().startswith(f"DRJIT_LIBLLVM_PATH names {wrong}, which is no LLVM")
 
 
 def interrupted_kernel():

@@ -63,6 +63,9 @@ def missing() -> str | None:
         if tuple(int(part) for part in re.findall(r"\d+", found)[:2]) < oldest:
             return f"{name} {found} is too old: {'.'.join(map(str, oldest))} or newer is needed"
     if llvm_library() is None:
+        named = os.environ.get(LLVM_VARIABLE)
+        if named:
+            return f"{LLVM_VARIABLE} names {named}, which is no LLVM library of version {OLDEST_LLVM} or newer"
         return f"no LLVM library of version {OLDEST_LLVM} or newer was found"
     return None
 
@@ -72,7 +75,7 @@ def llvm_library() -> str | None:
     named = os.environ.get(LLVM_VARIABLE)
     if named:
         version = llvm_version(Path(named).name)
-        usable = Path(named).exists() and (version is None or version >= OLDEST_LLVM)
+        usable = Path(named).is_file() and (version is None or version >= OLDEST_LLVM)
         return named if usable else None
     return _newest_installed()
 

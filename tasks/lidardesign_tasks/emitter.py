@@ -15,7 +15,8 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field, field_validator
 
-from lidardesign.scene import Receiver, Scene
+from lidardesign.errors import ConfigError
+from lidardesign.scene import Mesh, Receiver, Scene, inverse_rigid
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Score, Split
@@ -103,9 +104,37 @@ class EmitterTask:
     def scenes(
         self, config: EmitterConfig, split: Split, seed: int, space: DesignSpace | None = None
     ) -> Sequence[Scene]:
-        """The heads of the task `face` with the detector in front of them, see `head_scenes`."""
-        return head_scenes(config, space or self.space(config), split, seed, config.receiver)
+        """The heads of the task `face` with the detector in front of them, see `head_scenes`.
+
+        Raises:
+            ConfigError: The detector is inside a head.
+        """
+        scenes = head_scenes(config, space or self.space(config), split, seed, config.receiver)
+        for scene in scenes:
+            head = scene.bodies[0]
+            place = inverse_rigid(head.pose()) @ (*config.detector_m, 1.0)
+            if winding_number(head.shape, place[:3]) > 0.5:
+                raise ConfigError(
+                    f"the detector at {list(config.detector_m)} is inside the {scene.name}",
+                    where="task.detector_m",
+                    allowed="a place in front of all heads, whose nose tips are at 0 and look along x",
+                )
+        return scenes
 
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """Chamfer distance [mm] between the reconstruction and the part of the face that could be heard."""
         return surface_score(self.metric, scene, returns)
+
+
+def winding_number(mesh: Mesh, point: np.ndarray) -> float:
+    """How often a mesh winds round a point (3,) [m]: 1 inside of a closed one, 0 outside.
+
+    The solid angles of its triangles by van Oosterom and Strackee (1983), added up over 4 pi.
+    """
+    a, b, c = np.moveaxis((mesh.vertices - point)[mesh.faces], 1, 0)
+    length_a, length_b, length_c = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
+    volume = np.einsum("nk,nk->n", a, np.cross(b, c))
+    around = length_a * length_b * length_c
+    for one, other, length in ((a, b, length_c), (b, c, length_a), (c, a, length_b)):
+        around += np.einsum("nk,nk->n", one, other) * length
+    return float(np.arctan2(volume, around).sum() / (2 * math.pi))
