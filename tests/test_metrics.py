@@ -81,6 +81,15 @@ def directions_around_x(count, spread=0.5):
     return offset / np.linalg.norm(offset, axis=1, keepdims=True)
 
 
+def test_one_place_in_a_thousand_is_further_from_all_points_than_their_gap():
+    corners = 2 * np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    cloud = surface_cloud(corners, np.array([[0, 1, 2], [0, 2, 3]]), 5000, generator(3))
+    places = np.column_stack([generator(4).uniform(0.2, 1.8, (40_000, 2)), np.zeros(40_000)])
+    beyond = (cloud.tree.query(places)[0] > cloud.gap_m).mean()
+    # some 20 places of one gap are beyond together, so that the share has a standard error of about 0.0003
+    assert beyond == pytest.approx(0.001, abs=0.001)
+
+
 def test_the_reconstruction_does_not_depend_on_the_order_of_returns():
     y, z = np.meshgrid(np.linspace(-0.3, 0.3, 7), np.linspace(-0.3, 0.3, 7))
     points = np.column_stack([np.ones(49), y.ravel(), z.ravel()])

@@ -6,21 +6,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from lidardesign_tasks.arm import ArmTask
 from lidardesign_tasks.emitter import EmitterTask
 from lidardesign_tasks.face import FaceTask
 from lidardesign_tasks.flatland import FlatlandTask
 from lidardesign_tasks.meshes import MeshesTask
+from lidardesign_tasks.surface import surface_score, with_visible_truth
 from lidardesign_tasks.warehouse import WarehouseTask
 from test_tasks import write_ball
 
+from lidardesign.evaluate.placement import rays_at
 from lidardesign.evaluate.scoring import checked_score, score_lists
-from lidardesign.scene import Body, Box, Scene, rigid
+from lidardesign.scene import Body, Box, Mesh, Scene, rigid
 from lidardesign.simulate.detector import Detector
 from lidardesign.simulate.physics import Physics
 from lidardesign.simulate.returns import Outcome, Rays
 from lidardesign.simulate.simulate import build_casters, simulate
-from lidardesign.space import DIMENSIONS, RANGE, direction
+from lidardesign.space import DIMENSIONS, RANGE, DesignSpace, direction
 from lidardesign.task import Metric, Score, conditions_of, scenes_of
 
 TASKS = {
@@ -88,6 +91,24 @@ def test_invented_returns_are_scored_as_returns_of_no_body(measured):
     assert sign * score.value >= sign * clean.value or not clean.failed
     invented = [turned(one, True, 0, one.rays.gate_m[:, 1] * 0.999) for one in returns]
     assert sign * checked_score(task, scene, invented).value >= sign * clean.value
+
+
+@pytest.mark.parametrize("radius_m", [0.1, 3.0])
+def test_outliers_are_returns_off_the_surface_however_large_it_is(radius_m):
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=radius_m)
+    space = DesignSpace(
+        (4 * radius_m, 0, 0, np.pi - 0.25, -0.25, 0.0), (4 * radius_m, 0, 0, np.pi + 0.25, 0.25, 5 * radius_m)
+    )
+    scene = Scene((Body(Mesh(ball.vertices, ball.faces), "ball"),))
+    scene = with_visible_truth(scene, space, 5000, np.random.default_rng(0))
+    (found,) = simulate(scene, rays_at(space.sample(400, np.random.default_rng(1)), np.array([0.0, 5 * radius_m])))
+    metric = MeshesTask.metric
+    assert surface_score(metric, scene, [found]).details["outliers_percent"] == 0.0
+    wrong = np.flatnonzero(found.returned)[::4]
+    off_m = np.zeros(len(found.rays))
+    off_m[wrong] = -radius_m
+    score = surface_score(metric, scene, [replace(found, range_m=found.range_m + off_m)])
+    assert score.details["outliers_percent"] == pytest.approx(100 * len(wrong) / found.returned.sum())
 
 
 class Remembering:

@@ -25,6 +25,8 @@ HIT_TOLERANCE = 1e-4
 RANDOM_ORIGINS = 7  # beside the corners and the centre of a free origin box
 LARGEST_DRAW = 200_000  # candidates per round; bounds memory
 DRAW_ROUNDS = 12
+# One place in a thousand is so many mean spacings of a cloud's points from all of them: 2 sqrt(ln(1000) / pi)
+GAP_SPACINGS = 2.97
 
 
 def chamfer_m(first: np.ndarray, second: np.ndarray) -> float:
@@ -94,6 +96,16 @@ class SurfaceCloud:
         from scipy.spatial import cKDTree
 
         return cKDTree(self.points)
+
+    @cached_property
+    def gap_m(self) -> float:
+        """One place of the surface in a thousand is further than this from all points [m].
+
+        Beyond r there is no point with the probability exp(-pi n r^2), and neighbours are 0.5 / sqrt(n) apart.
+        """
+        if len(self.points) < 2:
+            return 0.0
+        return GAP_SPACINGS * float(self.tree.query(self.points, k=2)[0][:, 1].mean())
 
     def distance_m(self, queries: np.ndarray) -> np.ndarray:
         """Distances to the surface [m], (N, 3) to (N,): exact for the triangle of the nearest point."""

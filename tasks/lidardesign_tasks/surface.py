@@ -17,7 +17,8 @@ from lidardesign.task import Metric, Score, random_generator
 MILLIMETRES = 1000.0
 RECONSTRUCTION_POINTS = 4000
 COVERED_M = 0.010
-OUTLIER_M = 0.010  # a return further than this from the surface is none of it
+# a return further than this from the surface is none of it, unless the surface is known by points further apart
+OUTLIER_M = 0.010
 STEEPEST_DEG = 85.0  # flatter triangles bridge depth steps: with dense rays they made up half of the error
 
 
@@ -87,15 +88,16 @@ def surface_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> S
 
     Where a fixed receiver hears all rays, neighbours are those that it sees side by side.
 
-    Details: `returns`, `outliers_percent`, the returns further than 10 mm from the visible surface, and `coverage`, the
-    share of the visible surface with the reconstruction within 10 mm.
+    Details: `returns`, `outliers_percent`, the returns further than 10 mm from the visible surface (than the gaps
+    between its points, where those are wider), and `coverage`, the share of the visible surface with the
+    reconstruction within 10 mm.
     """
     details = {"returns": float(sum(int(frame.returned.sum()) for frame in returns))}
     viewpoint_m = None if scene.receiver is None else np.array(scene.receiver.origin_m)
     estimate, truth = reconstruct(returns, viewpoint_m), scene.truth["surface"]
     if details["returns"]:
         away_m = truth.distance_m(np.concatenate([frame.points_m for frame in returns]))
-        details["outliers_percent"] = 100.0 * float((away_m > OUTLIER_M).mean())
+        details["outliers_percent"] = 100.0 * float((away_m > max(OUTLIER_M, truth.gap_m)).mean())
     if estimate is None:
         return Score(metric.worst, failed=True, details={**details, "coverage": 0.0})
     missed, wrong = estimate.distance_m(truth.points), truth.distance_m(estimate.points)
