@@ -288,7 +288,7 @@ def _stakes(counts: Counts, present: Sequence[str]) -> dict[str, Stake]:
     led = stakes["specular"].lost if "specular" in stakes else np.zeros(0)
     if not led.any():
         return stakes
-    unknown = f"; mirrors or glass lead {led.mean():.1%} of rays elsewhere"
+    unknown = "; unknown behind mirrors and glass"
     return {
         name: stake
         if name in OF_FIRST_HITS

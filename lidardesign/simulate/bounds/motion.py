@@ -49,7 +49,7 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     lost = np.maximum(edge, ((sight.gate_edge_m <= moved_m) & (moved_m > 0)) | entered)
     reason = f"surfaces move by up to {1000 * step_m.max(initial=0.0):.3g} mm within a frame"
     if entered.any():
-        reason += f", and into {entered.mean():.1%} of rays"
+        reason += f", and into {100 * entered.mean():.3g} % of rays"
     return Stake(squared, lost, reason)
 
 

@@ -26,6 +26,8 @@ from lidardesign.simulate.returns import Rays
 
 # What lies in the way by less than this share of it is the surface itself: rays are traced to float32.
 CLEARANCE_SHARE = 1e-4
+# Shares of late light below this are not told apart [%].
+TINY_PERCENT = 0.01
 
 
 def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
@@ -50,10 +52,11 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     by_spots_m2 = np.mean(moved_by_spots_m(sight) ** 2) if _is_flood(sight) else 0.0
     alone = _hidden(sight, rows[found.chosen]) & (found.seen > 0)
     outweighed = np.mean((found.apart > 1) | alone)
+    late = 100 * found.share.mean()
     reason = (
-        f"surfaces fill {found.seen.mean():.2g} of what others see; "
-        f"late light is at most {100 * found.share.mean():.2g} %"
-        + (f", and all there is of {alone.mean():.1%} of returns" if alone.any() else "")
+        f"other surfaces fill {100 * found.seen.mean():.2g} % of what a surface sees; "
+        + (f"late light is at most {late:.2g} %" if late >= TINY_PERCENT else f"late light is below {TINY_PERCENT} %")
+        + (f", and all there is of {100 * alone.mean():.3g} % of returns" if alone.any() else "")
     )
     if by_spots_m2 > squared_m2:
         reason = f"the spots of a flood light each other, {reason}"

@@ -29,5 +29,6 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     together = (rays.origin_m == np.asarray(receiver.origin_m)).all(axis=1)
     points = rays.origin_m + sight.range_m[:, None] * rays.direction
     lost = np.where(together, ~in_view(receiver, points), True) & sight.returned
-    reason = f"{(~together).mean():.1%} of rays start away from the receiver, {lost.mean():.1%} may not be seen by it"
+    away, hidden = (f"{100 * share.mean():.3g} %" for share in (~together, lost))
+    reason = f"{away} of rays start away from the receiver, {hidden} may not be seen by it"
     return Stake(np.zeros(len(sight)), lost.astype(float), reason)

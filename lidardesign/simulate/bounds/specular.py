@@ -29,7 +29,7 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     met = np.where(sight.hits.body >= 0, leading[sight.hits.body], False)
     names = ", ".join(dict.fromkeys(body.name for body in sight.scene.bodies if _leads(body)))
     moved_m = np.minimum(sight.resolution_m, sight.width_m) * met
-    return Stake(moved_m**2, met.astype(float), f"{met.mean():.1%} of rays meet mirrors or glass: {names}")
+    return Stake(moved_m**2, met.astype(float), f"{100 * met.mean():.3g} % of rays meet mirrors or glass: {names}")
 
 
 def _leads(body: object) -> bool:
