@@ -278,6 +278,20 @@ def test_medians_of_neighbours_stand_in_for_true_ranges(files, noisy):
     assert whole.chamfer_mm is None
 
 
+def test_what_is_counted_before_the_pulse_left_is_no_range_of_a_pixel():
+    generator = np.random.default_rng(10)
+    looks = scan_directions(degree_frame(0.0, 0.0), generator.uniform(-10, 10, (300, 2)))
+    counts = generator.poisson(0.2, (300, 400))
+    counts[:, 30] += 200  # the trigger's own light, 100 bins before the pulse
+    counts[:, 300] += 50
+    early = Capture(counts, BIN_PS, -130 * BIN_PS, np.zeros(3), looks)
+    whole = whole_window(looking([[0, 0]]), early)
+    for found in (scan_pixels(early, Estimation()), scan(early, whole, 1.0, Estimation())):
+        assert found.range_m == pytest.approx(170.5 * BIN_M)
+    judged = evaluate_capture(early, [("one", looking([[0, 0]], gate=(0.1, 2.0)))], settings(early, within_rad=0.1))
+    assert not any(row.outlier.any() for row in judged.rows)
+
+
 def test_a_return_where_truly_nothing_is_counts_as_an_outlier(clean):
     known = clean.true_range_m.copy()
     known[480] = np.nan
