@@ -17,7 +17,7 @@ from scipy.special import expit, log_expit
 from lidardesign.density.visibility import Optics, RayBatch, RayGradient, Transmittance, Visibility
 from lidardesign.errors import ConfigError
 from lidardesign.scene import Receiver, Scene
-from lidardesign.space import direction
+from lidardesign.simulate.receiver_view import receiver_axes
 
 # The width of the soft edge of the view, in sigmas.
 EDGE_SIGMAS = 0.25
@@ -113,10 +113,7 @@ class HeardVisibility:
 
 def _view_planes(receiver: Receiver) -> tuple[np.ndarray, np.ndarray]:
     """Inward unit normals of the field of view's four sides, shape (4, 3), and the boresight, shape (3,)."""
-    azimuth, elevation = receiver.azimuth_rad, receiver.elevation_rad
-    ahead = direction(np.array(azimuth), np.array(elevation))
-    left = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    up = np.cross(ahead, left)
+    ahead, left, up = receiver_axes(receiver)
     sides = []
     for across, whole in ((left, receiver.horizontal_rad), (up, receiver.vertical_rad)):
         sides += [np.sin(whole / 2) * ahead + sign * np.cos(whole / 2) * across for sign in (1.0, -1.0)]
