@@ -20,6 +20,8 @@ BITS_PER_MEGABIT = 1e6
 # A width of exactly k bins that passed through a mean and a spread comes back a few ulp off; this share of
 # the width may be rounding, far below what any receiver resolves.
 BIN_ROUNDING = 1e-9
+# More are counted as so many, which no read-out takes: whole numbers stay exact.
+MOST_BINS = 1e15
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class Bandwidth:
             raise ConfigError(
                 "a gate width is negative or not finite", where="bandwidth", allowed="0 m or more"
             )
-        exact = width / self.bin_m
+        exact = np.minimum(width / self.bin_m, MOST_BINS)
         return np.maximum(np.ceil(exact * (1 - BIN_ROUNDING)), 1.0).astype(np.int64)
 
     def mbps(self, rays: Rays) -> float:

@@ -14,11 +14,14 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.errors import ConfigError
 from lidardesign.evaluate.placement import opened_gate, rays_at
 from lidardesign.simulate.returns import Rays
 from lidardesign.space import RANGE, DesignSpace
 
 CENTRAL_SHARE = 0.99
+# Their returns fill some 100 MB per scene; a design of the task's own ranges compares with far fewer.
+MOST_RAYS = 1_000_000
 
 Positions = tuple[Rays, ...]  # one list of rays per condition value, in the task's order
 
@@ -74,11 +77,22 @@ class Layout:
         return tuple(rays_at(self.place(count, spot), self.gate_m) for spot in spots)
 
     def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
-        """See `Candidate`."""
+        """See `Candidate`.
+
+        Raises:
+            ConfigError: More rays than any sensor fires fit in.
+        """
         width_m = self.gate_m[1] - self.gate_m[0]
         single = bandwidth.mbps_of_widths(np.array([width_m]))
         # the ratio of two multiples of one bin may lie an ulp below a whole number
         count = math.floor(limit_mbps / single * (1 + np.finfo(float).eps))
+        if count > MOST_RAYS:
+            raise ConfigError(
+                f"a design of {limit_mbps:.3g} Mbit/s compares with baselines of {count:.3g} rays",
+                where="bandwidth",
+                allowed=f"at most {MOST_RAYS:,} rays",
+                hint="narrow the design's gates: they are far longer than the task's ranges",
+            )
         while count and bandwidth.mbps_of_widths(np.array([width_m]), count) > limit_mbps:
             count -= 1
         return self.positions(spaces, count)
