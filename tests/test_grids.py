@@ -20,12 +20,23 @@ def printed(width):
     return console.file.getvalue()
 
 
-@pytest.mark.parametrize("width", [46, 56, 120])
+@pytest.mark.parametrize("width", [30, 46, 56, 120])
 def test_no_figure_is_broken_and_no_line_is_too_wide(width):
     text = printed(width)
     assert all(len(line) <= width for line in text.splitlines())
     for piece in ("-0.013", "(-0.021 to -0.004)", "(95 % interval)", "1.4, 2.6", "(own)"):
         assert piece in text
+
+
+def test_very_narrow_terminals_get_columns_in_parts_with_the_names_in_each():
+    text = printed(30)
+    assert text.count("free") == text.count("(own)") == text.count("design") == 3
+
+
+def test_sentences_wrap_instead():
+    console = Console(file=io.StringIO(), width=40, highlight=False)
+    print_table(None, ("effect", "reason"), [["jitter", "photons are timed to 16.6 ps " * 3]], console, wraps=True)
+    assert console.file.getvalue().count("jitter") == 1
 
 
 def test_wide_terminals_have_one_line_per_row():

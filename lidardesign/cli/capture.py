@@ -11,6 +11,7 @@ import typer
 from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
 from lidardesign.cli.designs import number
+from lidardesign.cli.grids import print_table
 from lidardesign.cli.runs import check_choice, parse_at
 from lidardesign.errors import ConfigError, DataError
 
@@ -28,7 +29,7 @@ COLUMNS = {
     "returns": "returns",
     "outliers": "outliers",
     "outliers_percent": "outliers\n[%]",
-    "range_error_mm": "range error\n[mm]",
+    "range_error_mm": "range\nerror [mm]",
     "chamfer_mm": "Chamfer\n[mm]",
     "bins_per_ray": "bins\nper ray",
     "photons_per_ray": "photons\nper ray",
@@ -177,7 +178,6 @@ def _named_apart(found: list[tuple[Path, Rays]]) -> list[tuple[str, Rays]]:
 
 def _show(document: dict[str, Any], found: CaptureEvaluation, rich: RichConsole) -> None:
     from rich.markup import escape
-    from rich.table import Table
 
     start, end = document["window_m"]
     rich.print(
@@ -188,11 +188,8 @@ def _show(document: dict[str, Any], found: CaptureEvaluation, rich: RichConsole)
     rich.print(f"outliers: more than {number(document['outlier_mm'])} mm from {found.ranges_from}", soft_wrap=True)
     if found.surface_from is not None:
         rich.print(escape(f"Chamfer distance: to {found.surface_from}"), soft_wrap=True)
-    table = Table()
-    for heading in ("design", "gate", *COLUMNS.values()):
-        table.add_column(escape(heading), justify="left" if heading in ("design", "gate") else "right")
-    for row in document["rows"]:
-        table.add_row(escape(row["design"]), row["gate"], *(number(row[name]) for name in COLUMNS))
-    rich.print(table)
+    text = ("design", "gate")
+    lines = [[row["design"], row["gate"], *(number(row[name]) for name in COLUMNS)] for row in document["rows"]]
+    print_table(None, (*text, *COLUMNS.values()), lines, rich, text=text)
     for path in document["files"]:
         rich.print(f"wrote {escape(path)}", soft_wrap=True)

@@ -46,7 +46,8 @@ def show_design(design: Design, rich: RichConsole) -> None:
         show_track(design, design.track, rich)
         return
     rays = f"{design.rays} rays per frame" if design.rays else "rays per frame left open"
-    title = f"{escape(design.name)}: {len(design.sensors)} sensors, layout {design.layout}, {rays}"
+    sensors = "1 sensor" if len(design.sensors) == 1 else f"{len(design.sensors)} sensors"
+    title = f"{escape(design.name)}: {sensors}, layout {design.layout}, {rays}"
     if design.at:
         title += ", at " + escape(", ".join(f"{name}={value:g}" for name, value in design.at.items()))
     places = [_place(sensor) for sensor in design.sensors]

@@ -14,23 +14,26 @@ UNBOUNDED = 10_000
 
 
 def print_table(
-    title: str,
+    title: str | None,
     headings: Sequence[str],
     lines: Sequence[Sequence[str]],
     rich: RichConsole,
     text: Sequence[str] = ("design",),
+    wraps: bool = False,
 ) -> None:
-    """Print a table; where it is too wide it loses its lines, and then what is in brackets goes below.
+    """Print a table; where it is too wide it loses its lines, then brackets go below, then columns follow in parts.
 
     Arguments:
-        title: Rich markup, above the table.
+        title: Rich markup, above the table, if there is one.
         headings: One per column.
         lines: The cells of each line, plain text.
         rich: Where it is printed.
-        text: Headings of the columns that are no figures.
+        text: Headings of the columns that are no figures, the first ones.
+        wraps: Whether a last column holds sentences, which may wrap.
     """
     # a table's own title would wrap at the table's width
-    rich.print(f"[italic]{title}[/italic]", soft_wrap=True)
+    if title is not None:
+        rich.print(f"[italic]{title}[/italic]", soft_wrap=True)
     table = _table(headings, lines, text)
     if not _fits(table, rich):
         _lighten(table)
@@ -38,7 +41,25 @@ def print_table(
             folded = [_folded(line, headings, text) for line in (headings, *lines)]
             table = _table(folded[0], folded[1:], text)
             _lighten(table)
+            if not wraps and not _fits(table, rich):
+                _print_parts(folded, text, rich)
+                return
     rich.print(table)
+
+
+def _print_parts(lines: Sequence[Sequence[str]], text: Sequence[str], rich: RichConsole) -> None:
+    """As many columns beside each other as fit; the texts in front stand in each part."""
+    names = [column for column, heading in enumerate(lines[0]) if heading in text]
+    rest = [column for column in range(len(lines[0])) if column not in names]
+    while rest:
+        for count in range(len(rest), 0, -1):
+            shown = [[line[column] for column in names + rest[:count]] for line in lines]
+            table = _table(shown[0], shown[1:], text)
+            _lighten(table)
+            if _fits(table, rich):
+                break
+        rich.print(table)
+        rest = rest[count:]
 
 
 def _folded(line: Sequence[str], headings: Sequence[str], text: Sequence[str]) -> list[str]:

@@ -104,7 +104,7 @@ def _show_effects(document: Entry, rich: RichConsole) -> None:
         cost = plain(effect["seconds"], 2, tiny=SHORT_S)
         lines.append([_words(effect["name"]), _where_on(effect), *bounds, cost, effect["reason"]])
     headings = ("effect", "on", "range [mm]", "returns", "cost [s]", "reason")
-    print_table(title, headings, lines, rich, text=("effect", "on", "reason"))
+    print_table(title, headings, lines, rich, text=("effect", "on", "reason"), wraps=True)
 
 
 def _where_on(effect: Entry) -> str:
