@@ -17,7 +17,8 @@ def tracked_places(returns: Sequence[Returns], target: int, radius_m: float) -> 
     """Frames with a return on the ball and the ball's place in each, (K,) and (K, 3) [m].
 
     A place is the mean, over the frame's returns on the ball, of the measured point moved along its ray by the
-    depth at which the centre is expected.
+    depth at which the centre is expected. A robot knows where its own links are, so their returns are told apart; what
+    a detector made of noise is not, and counts as the ball.
 
     Arguments:
         returns: One per frame.
@@ -26,7 +27,7 @@ def tracked_places(returns: Sequence[Returns], target: int, radius_m: float) -> 
     """
     frames, places = [], []
     for frame in returns:
-        hit = np.flatnonzero(frame.returned & (frame.body == target))
+        hit = np.flatnonzero(frame.returned & ((frame.body == target) | (frame.body < 0)))
         if len(hit):
             rays = frame.rays
             depth = frame.range_m[hit] + MEAN_DEPTH * radius_m
