@@ -64,7 +64,11 @@ def files_under(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+# A suite that runs in the background of a shell hands on that interruptions are ignored.
+LISTENING = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+
+
 def program(*arguments, before="", **options) -> subprocess.Popen:
     """The program in a process of its own; `before` is Python that runs first."""
-    code = f"{before}\nfrom lidardesign.cli.main import run\nrun({[str(a) for a in arguments]!r})"
+    code = f"{LISTENING}\n{before}\nfrom lidardesign.cli.main import run\nrun({[str(a) for a in arguments]!r})"
     return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
