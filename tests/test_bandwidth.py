@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidardesign.design.bandwidth import SPEED_OF_LIGHT_M_PER_S, Bandwidth
+from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.errors import ConfigError
+from lidardesign.scene import SPEED_OF_LIGHT_M_S
 from lidardesign.simulate.returns import Rays
 
 
@@ -37,7 +38,7 @@ def test_a_metre_of_gate_is_67_bins_of_100_picoseconds():
 )
 def test_a_gate_of_exactly_k_bins_costs_k_bins_after_a_trip_through_mean_and_spread(bins, bin_ps, start):
     model = Bandwidth(bin_ps=bin_ps)
-    width = bins * SPEED_OF_LIGHT_M_PER_S * bin_ps * 1e-12 / 2
+    width = bins * SPEED_OF_LIGHT_M_S * bin_ps * 1e-12 / 2
     assert model.bins(width) == bins
     mean, half = start + width / 2, width / 2
     if width > 1e-6 * mean:

@@ -145,10 +145,11 @@ def test_every_key_is_in_the_documentation():
             assert f"`{option}`" in text, (name, option)
 
 
-def test_the_documentation_s_example_is_a_detector(tmp_path):
+def test_the_documentation_s_examples_are_detectors_with_and_without_photons(tmp_path):
     text = (ROOT / "docs" / "detectors.md").read_text(encoding="utf-8")
-    for block in re.findall(r"```yaml\n(.*?)```", text, re.DOTALL):
-        load(tmp_path, block)
+    found = [load(tmp_path, block) for block in re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)]
+    assert all(detector.bin_s for detector in found)
+    assert {detector.photons is None for detector in found} == {True, False}
 
 
 STRANGE = ["-1", "0", "1e308", "-1e308", "1e-308", "x", "''", "~", "true", "[]", "{}", ".nan", "-.inf", "1:30", "0x10"]

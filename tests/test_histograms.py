@@ -13,9 +13,9 @@ from references import STANDARD_ERRORS
 from synthetic_light import PHOTON_EFFECTS
 
 from lidardesign.errors import ConfigError
-from lidardesign.scene import Ambient, Body, Box, Plane, Scene, Sphere, rigid
+from lidardesign.scene import SPEED_OF_LIGHT_M_S, Ambient, Body, Box, Plane, Scene, Sphere, rigid
 from lidardesign.simulate.daylight import FIRST_NM, LED_AT_1_LUX, STEP_NM, SUN_AT_100_KLUX, spectral_irradiance
-from lidardesign.simulate.detector import PLANCK_J_S, SPEED_OF_LIGHT_M_S, metres
+from lidardesign.simulate.detector import PLANCK_J_S, metres
 from lidardesign.simulate.detector_files import load_detector
 from lidardesign.simulate.photon_histograms import photon_histograms
 from lidardesign.simulate.physics import Physics, followed_light

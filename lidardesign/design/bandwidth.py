@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.scene import SPEED_OF_LIGHT_M_S
 from lidardesign.simulate.returns import Rays
 
-SPEED_OF_LIGHT_M_PER_S = 299792458.0
 SECONDS_PER_PICOSECOND = 1e-12
 BITS_PER_MEGABIT = 1e6
 # A width of exactly k bins that passed through a mean and a spread comes back a few ulp off; this share of
@@ -52,7 +52,7 @@ class Bandwidth:
     @property
     def bin_m(self) -> float:
         """The one-way distance that one bin covers, c * bin / 2 [m]."""
-        return SPEED_OF_LIGHT_M_PER_S * self.bin_ps * SECONDS_PER_PICOSECOND / 2
+        return SPEED_OF_LIGHT_M_S * self.bin_ps * SECONDS_PER_PICOSECOND / 2
 
     def bins(self, width_m: float | np.ndarray) -> np.ndarray:
         """Bins per gate, ceil(2 * width / (c * bin)), at least 1: widths [m], shape (...), to int64 (...).

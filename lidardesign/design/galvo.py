@@ -17,10 +17,11 @@ from __future__ import annotations
 import numpy as np
 
 from lidardesign.design.sensor import boresight_frame
+from lidardesign.scene import SPEED_OF_LIGHT_M_S
 from lidardesign.space import angles
 
 LIMIT_DEG = 20.0
-SPEED_OF_LIGHT_M_PER_PS = 299_792_458.0 * 1e-12
+SPEED_OF_LIGHT_M_PER_PS = SPEED_OF_LIGHT_M_S * 1e-12
 # Times of whole picoseconds come back from metres a few units in the last place off (1e-8 ps at 10 km).
 ROUNDING_PS = 1e-6
 # Boresights are given in so many decimals of a degree, which moves no ray by more than a microdegree.

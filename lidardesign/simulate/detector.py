@@ -11,7 +11,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-SPEED_OF_LIGHT_M_S = 299_792_458.0
+from lidardesign.scene import SPEED_OF_LIGHT_M_S
+
 PLANCK_J_S = 6.62607015e-34
 # Full width at half maximum over standard deviation of a Gaussian.
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))

@@ -17,6 +17,7 @@ from lidardesign.errors import ConfigError
 from lidardesign.run.validation import suggest
 from lidardesign.run.yaml import Document, load_yaml
 from lidardesign.simulate.detector import FWHM_PER_SIGMA, Detector, Photons
+from lidardesign.simulate.histogram import MOST_BINS
 
 FOLDER = Path(__file__).parent / "detectors"
 TIMES = {"ps": 1e-12, "ns": 1e-9}
@@ -24,7 +25,6 @@ FREQUENCIES = {"hz": 1.0, "khz": 1e3, "mhz": 1e6}
 ENERGIES = {"fj": 1e-15, "pj": 1e-12, "nj": 1e-9, "uj": 1e-6, "mj": 1e-3}
 LENGTHS = {"nm": 1e-9, "um": 1e-6}
 MOST_FOOTPRINT_RAYS = 1024
-MOST_BINS = 1_000_000
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidardesign.errors import ConfigError
-from lidardesign.simulate.detector import FWHM_PER_SIGMA, SPEED_OF_LIGHT_M_S, Detector, metres
+from lidardesign.scene import SPEED_OF_LIGHT_M_S
+from lidardesign.simulate.detector import FWHM_PER_SIGMA, Detector, metres
 from lidardesign.simulate.echoes import Echoes
 
 # Where a detector has no bins, or times are not rounded, they are this share of a photon's timing error wide: too

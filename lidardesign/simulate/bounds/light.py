@@ -7,10 +7,10 @@ import math
 import numpy as np
 
 from lidardesign.numerics import safe_divide
+from lidardesign.scene import SPEED_OF_LIGHT_M_S
 from lidardesign.simulate.bistatic import range_of_path
 from lidardesign.simulate.bounds.sight import Sight
 from lidardesign.simulate.daylight import spectral_irradiance
-from lidardesign.simulate.detector import SPEED_OF_LIGHT_M_S
 
 # Rays pass a receiver no nearer than this share of their way: differences of arctangents are then exact to 1e-9.
 NEAREST_SHARE = 1e-6

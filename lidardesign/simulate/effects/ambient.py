@@ -15,9 +15,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidardesign.scene import Scene
+from lidardesign.scene import SPEED_OF_LIGHT_M_S, Scene
 from lidardesign.simulate.daylight import spectral_irradiance
-from lidardesign.simulate.detector import SPEED_OF_LIGHT_M_S, Detector
+from lidardesign.simulate.detector import Detector
 from lidardesign.simulate.echoes import Background, Beams
 from lidardesign.simulate.hits import Hits
 from lidardesign.simulate.returns import Rays
