@@ -1,0 +1,192 @@
+"""Ladders: what a numerical choice costs at each of its settings, in error and in seconds.
+
+A ladder has one rung per setting, the roughest first. Each rung's error is taken against a closed form or the finest
+rung, and has an uncertainty of its own; the cheapest rung inside the ladder's tolerance is the one to choose.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+Value = TypeVar("Value")
+
+# Rungs whose times differ by less than this ratio cost the same: timings of one machine repeat no better.
+SAME_COST = 1.15
+# Errors that differ by less than so many standard errors of their difference do not differ.
+STANDARD_ERRORS = 2.0
+# A call is repeated until it took so long together, at most so often; its median counts.
+TIMED_SECONDS = 0.2
+MOST_REPEATS = 5
+_STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+_RESET_PEAK = "5"
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One setting of a numerical choice.
+
+    Arguments:
+        setting: As a user would write it, for example "64" or "raycast".
+        error: Against the ladder's reference, in the ladder's unit; 0 for the reference itself.
+        uncertainty: Standard error of `error`, in the same unit.
+        seconds: Median time of the ladder's work at this setting [s].
+        memory_bytes: The most memory that the work took beyond what was there before; None where it was not measured.
+        default: Whether the run uses this setting.
+        reference: Whether errors are taken against this rung.
+        values: Further figures of the rung by name, with their unit in the name.
+    """
+
+    setting: str
+    error: float
+    uncertainty: float
+    seconds: float
+    memory_bytes: int | None = None
+    default: bool = False
+    reference: bool = False
+    values: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """All settings of one numerical choice that were measured.
+
+    Arguments:
+        knob: The key that sets it, for example "density.quadrature_points", or a name where no key does.
+        error_of: What the error is, in a few words.
+        unit: Of errors and the tolerance; "" for shares.
+        against: What errors are taken against.
+        tolerance: Errors up to this one do not matter, for the reason in `because`.
+        because: Why the tolerance is what it is.
+        work: What the seconds are the time of.
+        rungs: The roughest first, 1 or more.
+        note: What a reader should know, one line, or "".
+    """
+
+    knob: str
+    error_of: str
+    unit: str
+    against: str
+    tolerance: float
+    because: str
+    work: str
+    rungs: Sequence[Rung]
+    note: str = ""
+
+    @property
+    def chosen(self) -> Rung:
+        """The cheapest rung inside the tolerance; of rungs that cost the same, the most accurate one.
+
+        Where none is inside the tolerance, the most accurate one.
+        """
+        inside = [rung for rung in self.rungs if rung.error <= self.tolerance]
+        if not inside:
+            return min(self.rungs, key=lambda rung: (rung.error, rung.seconds))
+        least = min(rung.seconds for rung in inside)
+        cheap = [rung for rung in inside if rung.seconds <= SAME_COST * least]
+        # where cost and error are the same, what the run does already
+        return min(cheap, key=lambda rung: (rung.error, not rung.default, rung.seconds))
+
+    @property
+    def default(self) -> Rung | None:
+        """The rung that the run uses, where it is among those measured."""
+        return next((rung for rung in self.rungs if rung.default), None)
+
+    @property
+    def falls(self) -> bool:
+        """Whether errors fall from rung to rung, within their own uncertainty."""
+        pairs = zip(self.rungs, self.rungs[1:], strict=False)
+        return all(
+            finer.error <= rougher.error + STANDARD_ERRORS * math.hypot(finer.uncertainty, rougher.uncertainty)
+            for rougher, finer in pairs
+        )
+
+    @property
+    def verdict(self) -> str:
+        """How the chosen rung compares with the run's own setting, in one line."""
+        chosen, default = self.chosen, self.default
+        if chosen.error > self.tolerance:
+            return f"no setting is within {self.tolerance:g} {self.unit}".rstrip() + f"; {chosen.setting} is closest"
+        if default is None:
+            return f"{chosen.setting} suffices"
+        if chosen is default:
+            return f"{chosen.setting}, the setting of this run, is the one to choose"
+        ratio = default.seconds / max(chosen.seconds, 1e-12)
+        if default.error > self.tolerance:
+            return f"{chosen.setting} is needed: {default.setting}, the setting of this run, is outside the tolerance"
+        if ratio <= SAME_COST:
+            return f"{chosen.setting} costs the same as {default.setting}, the setting of this run, and errs less"
+        return f"{chosen.setting} suffices, {ratio:.2g} times cheaper than {default.setting}, the setting of this run"
+
+    def as_rows(self) -> list[dict[str, Any]]:
+        """The contract's JSON form: one object per rung."""
+        chosen = self.chosen
+        return [
+            {
+                "knob": self.knob,
+                "setting": rung.setting,
+                "error": rung.error,
+                "uncertainty": rung.uncertainty,
+                "unit": self.unit,
+                "seconds": rung.seconds,
+                "memory_bytes": rung.memory_bytes,
+                "tolerance": self.tolerance,
+                "chosen": rung is chosen,
+                "default": rung.default,
+                "reference": rung.reference,
+                "values": dict(rung.values),
+            }
+            for rung in self.rungs
+        ]
+
+
+def timed(call: Callable[[], Value]) -> tuple[Value, float, int | None]:
+    """A call's value, the median of its times [s], and the memory that its first run took at most [bytes].
+
+    It is called once to warm up and to measure memory, then until `TIMED_SECONDS` have passed.
+    """
+    started = time.perf_counter()
+    value, memory = with_memory(call)
+    first = time.perf_counter() - started
+    if first > 10 * TIMED_SECONDS:
+        return value, first, memory
+    taken: list[float] = []
+    while len(taken) < MOST_REPEATS and sum(taken) < TIMED_SECONDS:
+        started = time.perf_counter()
+        call()
+        taken.append(time.perf_counter() - started)
+    return value, float(np.median(taken)), memory
+
+
+def with_memory(call: Callable[[], Value]) -> tuple[Value, int | None]:
+    """A call's value and by how much its peak of resident memory lay above what was resident before [bytes].
+
+    None where the system does not tell (it does on Linux).
+    """
+    before = _resident("VmRSS") if _peak_was_reset() else None
+    value = call()
+    peak = None if before is None else _resident("VmHWM")
+    return value, None if before is None or peak is None else max(peak - before, 0)
+
+
+def _peak_was_reset() -> bool:
+    with contextlib.suppress(OSError):
+        _CLEAR.write_text(_RESET_PEAK, encoding="ascii")
+        return True
+    return False
+
+
+def _resident(name: str) -> int | None:
+    """A size of this process from the system's status, in bytes."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        for line in _STATUS.read_text(encoding="ascii").splitlines():
+            if line.startswith(f"{name}:"):
+                return 1024 * int(line.split()[1])
+    return None
