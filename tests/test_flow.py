@@ -10,8 +10,9 @@ import pytest
 import references
 import torch
 
-from lidardesign.density.flow import BoundedSpline, DesignFlow
+from lidardesign.density.flow import DesignFlow
 from lidardesign.density.objective import Coordinates
+from lidardesign.density.splines import BoundedSpline
 from lidardesign.space import DesignSpace
 
 # name -> (blocks, context, periodic): adding a flow to every law below is adding a line

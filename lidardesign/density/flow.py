@@ -7,9 +7,10 @@ mass can move between directions without relearning the surface.
 Sampling with its log determinant costs one network pass per layer; the density of foreign points inverts the layers
 and costs one pass per layer and dimension of its block. Coordinates are the free dimensions scaled to [-1, 1].
 
-Splines are zuko's, with two differences: all knot slopes are learned, the outer ones too, and for an azimuth that spans
-the full turn the outer slopes are tied and the spline starts half a turn away, so that the density is continuous
-across 0 / 2 pi; such an azimuth is a block of its own, and later blocks see its sine and cosine.
+Networks are zuko's; splines as well, with two differences (`splines`): all knot slopes are learned, the outer ones
+too, and for an azimuth that spans the full turn the outer slopes are tied and the spline starts half a turn away, so
+that the density is continuous across 0 / 2 pi; such an azimuth is a block of its own, and later blocks see its sine and
+cosine.
 
 References:
     Neural Spline Flows, Durkan et al. 2019. Normalizing Flows on Tori and Spheres, Rezende et al. 2020.
@@ -22,65 +23,13 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import linear
 from zuko.flows.autoregressive import MaskedAutoregressiveTransform
-from zuko.transforms import MonotonicRQSTransform
 
-BOUND = 1.0
-# Base samples and foreign points are kept this far inside the box, where splines are smooth.
-EDGE = 1e-7
+from lidardesign.density.splines import BOUND, BoundedSpline, spline
+
 # How far the networks' last layer is scaled down at the start, so that the flow begins near the identity.
 INITIAL_SCALE = 0.1
-# Half the logarithm of the steepest slope that a spline may take; e^9 resolves a 0.1 mm shell in a 1 m range.
-MINIMUM_SLOPE = 1e-4
-
-
-class BoundedSpline(MonotonicRQSTransform):
-    """A rational-quadratic spline of [-1, 1] onto itself whose outer slopes are learned as well.
-
-    Arguments:
-        widths: Unconstrained bin widths, with shape (*, K).
-        heights: Unconstrained bin heights, with shape (*, K).
-        derivatives: Unconstrained knot slopes, with shape (*, K + 1).
-        periodic: Mask of the dimensions on a circle, with shape (D,), or None.
-    """
-
-    def __init__(self, widths: Tensor, heights: Tensor, derivatives: Tensor, periodic: Tensor | None = None) -> None:
-        super().__init__(widths, heights, derivatives[..., 1:-1], bound=BOUND, slope=MINIMUM_SLOPE)
-        softened = derivatives / (1 + abs(derivatives / math.log(MINIMUM_SLOPE)))
-        slopes = torch.exp(softened)
-        if periodic is not None:
-            outer = torch.exp((softened[..., :1] + softened[..., -1:]) / 2)
-            tied = torch.cat([outer, slopes[..., 1:-1], outer], dim=-1)
-            slopes = torch.where(periodic[:, None], tied, slopes)
-        self.derivatives = slopes
-        self.periodic = periodic
-        # accumulated widths can pass the bound by rounding; the last knots are exact
-        self.horizontal = torch.cat([self.horizontal[..., :-1], torch.full_like(self.horizontal[..., :1], BOUND)], -1)
-        self.vertical = torch.cat([self.vertical[..., :-1], torch.full_like(self.vertical[..., :1], BOUND)], -1)
-
-    def _turned(self, values: Tensor) -> Tensor:
-        """The periodic dimensions half a turn on."""
-        if self.periodic is None:
-            return values
-        return torch.where(self.periodic, torch.where(values >= 0, values - BOUND, values + BOUND), values)
-
-    def call_and_ladj(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """The spline's values and log slopes at x, with shape (*, D); rounding never leaves [-1, 1]."""
-        y, log_slope = super().call_and_ladj(self._turned(x).clamp(-BOUND + EDGE, BOUND - EDGE))
-        return y.clamp(-BOUND, BOUND), log_slope
-
-    def _call(self, x: Tensor) -> Tensor:
-        return super()._call(self._turned(x).clamp(-BOUND + EDGE, BOUND - EDGE)).clamp(-BOUND, BOUND)
-
-    def _inverse(self, y: Tensor) -> Tensor:
-        """The root inside the bin; its discriminant is positive, but rounding may say otherwise."""
-        y = y.clamp(-BOUND + EDGE, BOUND - EDGE)
-        _, x0, x1, y0, y1, d0, d1, s = self.bin(self.searchsorted(self.vertical, y) - 1)
-        bend = (y - y0) * (d0 + d1 - 2 * s)
-        a, b, c = (y1 - y0) * (s - d0) + bend, (y1 - y0) * d0 - bend, -s * (y - y0)
-        discriminant = (b**2 - 4 * a * c).clamp(min=torch.finfo(y.dtype).tiny)
-        share = (2 * c / (-b - discriminant.sqrt())).clamp(0.0, 1.0)
-        return self._turned(x0 + share * (x1 - x0))
 
 
 class _Block(nn.Module):
@@ -97,45 +46,76 @@ class _Block(nn.Module):
     ) -> None:
         super().__init__()
         self.dimensions = list(dimensions)
-        mask = torch.tensor(list(periodic), dtype=torch.bool) if any(periodic) else None
-        self.register_buffer("periodic", mask, persistent=False)
-        features = len(self.dimensions)
+        self.register_buffer("periodic", torch.tensor(list(periodic), dtype=torch.bool), persistent=False)
+        features, self.parameters_each = len(self.dimensions), 3 * bins + 1
         rank = torch.arange(features)
+        self.orders = [rank if layer % 2 == 0 else rank.flip(0) for layer in range(layers)]
         self.layers = nn.ModuleList(
             MaskedAutoregressiveTransform(
                 features,
                 context,
-                order=rank if layer % 2 == 0 else rank.flip(0),
-                univariate=self._spline,
+                order=order,
+                univariate=BoundedSpline,
                 shapes=[(bins,), (bins,), (bins + 1,)],
                 hidden_features=(hidden, hidden),
             )
-            for layer in range(layers)
+            for order in self.orders
         )
-
-    def _spline(self, widths: Tensor, heights: Tensor, derivatives: Tensor) -> BoundedSpline:
-        return BoundedSpline(widths, heights, derivatives, self.periodic)
 
     def forward(self, values: Tensor, context: Tensor | None) -> tuple[Tensor, Tensor]:
         """Outputs and the summed log slope: (N, d) to (N, d) and (N,)."""
         total = torch.zeros_like(values[:, 0])
         for layer in self.layers:
-            values, log_slope = layer(context).call_and_ladj(values)
-            total = total + _summed(log_slope)
+            values, log_slope = spline(values, self._of_splines(layer, values, context), self.periodic)
+            total = total + log_slope.sum(dim=-1)
         return values, total
 
     def log_slope(self, values: Tensor, context: Tensor | None) -> Tensor:
         """The summed log slope at the base points of outputs: (N, d) to (N,)."""
         total = torch.zeros_like(values[:, 0])
-        for layer in reversed(self.layers):
-            transform = layer(context)
-            values = transform.inv(values)
-            total = total + _summed(transform.call_and_ladj(values)[1])
+        for layer, order in zip(reversed(self.layers), reversed(self.orders), strict=True):
+            values, log_slope = self._inverted(layer, order, values, context)
+            total = total + log_slope
         return total
 
+    def _of_splines(self, layer: nn.Module, values: Tensor, context: Tensor | None) -> Tensor:
+        """The unconstrained parameters of a layer's splines, shape (N, d, parameters of one)."""
+        if len(self.dimensions) > 1:
+            return layer.hyper(_joined(values, context)).unflatten(-1, (-1, self.parameters_each))
+        if context is not None:
+            return layer.hyper(context)[:, None]
+        return torch.cat(list(layer.phi), dim=-1).expand(len(values), 1, -1)
 
-def _summed(log_slope: Tensor) -> Tensor:
-    return log_slope.sum(dim=-1) if log_slope.ndim == 2 else log_slope
+    def _inverted(
+        self, layer: nn.Module, order: Tensor, outputs: Tensor, context: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """A layer's inputs, shape (N, d), and its summed log slope there, shape (N,): dimension after dimension."""
+        if len(self.dimensions) == 1:
+            parameters = self._of_splines(layer, outputs, context)
+            inputs, log_slope = spline(outputs, parameters, self.periodic, inverted=True)
+            return inputs, log_slope[:, 0]
+        columns = list(torch.zeros_like(outputs).split(1, dim=-1))
+        total = torch.zeros_like(outputs[:, 0])
+        for dimension in order.argsort().tolist():
+            parameters = self._of_dimension(dimension, layer, _joined(torch.cat(columns, dim=-1), context))
+            column = slice(dimension, dimension + 1)
+            columns[dimension], log_slope = spline(
+                outputs[:, column], parameters, self.periodic[column], inverted=True
+            )
+            total = total + log_slope[:, 0]
+        return torch.cat(columns, dim=-1), total
+
+    def _of_dimension(self, dimension: int, layer: nn.Module, inputs: Tensor) -> Tensor:
+        """The parameters of one dimension's splines alone, shape (N, 1, parameters of one)."""
+        *modules, last = layer.hyper
+        for module in modules:
+            inputs = module(inputs)
+        rows = slice(dimension * self.parameters_each, (dimension + 1) * self.parameters_each)
+        return linear(inputs, last.mask[rows] * last.weight[rows], last.bias[rows])[:, None]
+
+
+def _joined(values: Tensor, context: Tensor | None) -> Tensor:
+    return values if context is None else torch.cat([values, context], dim=-1)
 
 
 class DesignFlow(nn.Module):
