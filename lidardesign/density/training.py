@@ -26,6 +26,7 @@ from lidardesign.density.flow import DesignFlow
 from lidardesign.density.losses import Pool, balancing_loss, pathwise_loss
 from lidardesign.density.objective import Coordinates
 from lidardesign.density.settings import LearningSettings
+from lidardesign.density.snapshots import clear_snapshots, save_snapshot, snapshot_steps
 from lidardesign.density.target import Target
 from lidardesign.errors import DataError, DivergenceError, NumericalError
 from lidardesign.run.checkpoint import load_arrays, save_arrays
@@ -138,6 +139,8 @@ class Trainer:
                     self._save(self._snapshot)
                     checkpointed = time.perf_counter()
             loss, ess = self._advance()
+            if self.step in snapshot_steps(self.settings.steps):
+                self._keep()
             if self.step % PROGRESS_STEPS == 0 or self.step == self.settings.steps:
                 self._report(loss, ess, progress)
 
@@ -250,13 +253,17 @@ class Trainer:
         if (self.run / PROGRESS).exists():
             record(self.run, [PROGRESS])
 
+    def _keep(self) -> None:
+        save_snapshot(self.flow, self.run, self.step)
+
     def resume(self) -> None:
-        """Take the state of the run's checkpoint; progress.jsonl is cut back to it."""
+        """Take the state of the run's checkpoint; progress.jsonl and snapshots are cut back to it."""
         arrays, state = load_arrays(self.run, CHECKPOINT)
         self._restore_arrays(arrays, with_generator=True)
         self.step, self.skipped = state["step"], state["skipped"]
         self.skipped_in_a_row, self.halvings = state["skipped_in_a_row"], state["halvings"]
         self.seconds_before, self._started = state["seconds"], time.perf_counter()
+        clear_snapshots(self.run, beyond=self.step)
         path = self.run / PROGRESS
         if path.exists():
             kept = [line for line in path.read_text(encoding="utf-8").splitlines() if _step_of(line) <= self.step]

@@ -89,6 +89,19 @@ def record(run: Path, names: Iterable[str]) -> None:
     write_manifest(run, manifest)
 
 
+def forget(run: Path, names: Iterable[str]) -> None:
+    """Remove files of a run and then their entries; those that are gone already are only no longer listed."""
+    run, names = Path(run), list(names)
+    if not names:
+        return
+    for name in names:
+        (run / name).unlink(missing_ok=True)
+    manifest = read_manifest(run)
+    for name in names:
+        manifest["files"].pop(Path(name).as_posix(), None)
+    write_manifest(run, manifest)
+
+
 def announce(run: Path, name: str, content: bytes) -> None:
     """Enter the hash of a file's next content before it is written; its present content stays valid as well.
 
