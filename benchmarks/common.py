@@ -8,6 +8,8 @@ machine: it prints what it measured.
 from __future__ import annotations
 
 import argparse
+import functools
+import importlib.util
 import json
 import os
 import platform
@@ -62,6 +64,15 @@ def interleaved(contestants: Mapping[str, Callable[[], object]], rounds: int) ->
                 wall[name].append(time.perf_counter() - started)
                 cpu[name].append(time.process_time() - spent)
     return {name: Timing(tuple(wall[name]), tuple(cpu[name])) for name in contestants}
+
+
+@functools.cache
+def installed(library: str) -> bool:
+    """Whether a library that is compared with is there; said where it is not."""
+    found = importlib.util.find_spec(library) is not None
+    if not found:
+        print(f"{library} is not installed, its rows are left out: see benchmarks/requirements.txt", file=sys.stderr)
+    return found
 
 
 def median_ratio(first: Sequence[float], second: Sequence[float]) -> float:

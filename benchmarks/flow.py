@@ -13,9 +13,7 @@ weights, and those with one exponential for each of their outputs.
 
 from __future__ import annotations
 
-import importlib.util
 import math
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -23,7 +21,7 @@ from functools import partial
 import common  # noqa: F401 (before torch: it limits the thread pools)
 import torch
 import zuko
-from common import Timing, interleaved, median_ratio, parser, report
+from common import Timing, installed, interleaved, median_ratio, parser, report
 from torch import Tensor, nn
 from zuko.lazy import LazyInverse
 from zuko.transforms import MonotonicRQSTransform
@@ -150,9 +148,7 @@ def contestants(sizes: Sizes, compiled: bool) -> dict[str, nn.Module]:
         "zuko, inverted": lambda: Zuko(sizes, inverted=True),
     }
     for name, maker in (("nflows", nflows), ("normflows", normflows)):
-        if importlib.util.find_spec(name) is None:
-            print(f"{name} is not installed and left out: see benchmarks/requirements.txt", file=sys.stderr)
-        else:
+        if installed(name):
             makers[f"{name}, one pass"] = partial(maker, sizes)
     made = {}
     for name, make in makers.items():

@@ -12,14 +12,12 @@ origin, where float32 coordinates lose their digits.
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections.abc import Callable
 from functools import partial
 
 import common  # noqa: F401 (before numpy: it limits the thread pools)
 import numpy as np
-from common import face_scenes, interleaved, median_ratio, model_option, parser, report
+from common import face_scenes, installed, interleaved, median_ratio, model_option, parser, report
 
 from lidardesign.scene import Body, Mesh, Scene
 from lidardesign.simulate.raycast import SceneCaster
@@ -127,9 +125,7 @@ def open3d(mesh: Mesh) -> Cast:
 def ways() -> dict[str, Callable[[Mesh], Cast]]:
     """All that are installed, ours first."""
     found: dict[str, Callable[[Mesh], Cast]] = {"lidardesign": ours, "trimesh": trimesh}
-    if importlib.util.find_spec("open3d") is None:
-        print("open3d is not installed and left out: see benchmarks/requirements.txt", file=sys.stderr)
-    else:
+    if installed("open3d"):
         found["open3d"] = open3d
     return found | {"floor: Embree, float32 rays": embree}
 
