@@ -13,6 +13,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from lidardesign.errors import ConfigError, LidardesignError, PluginError
+from lidardesign.run.clock import phase
 from lidardesign.task import API_VERSION, Defaults, Metric, Task, TaskConfig
 
 GROUP = "lidardesign.tasks"
@@ -37,6 +38,7 @@ class TaskListing:
     error: str | None = None
 
 
+@phase("tasks")
 def list_tasks() -> list[TaskListing]:
     """Every installed task by name, broken ones with their reason."""
     listings = []
@@ -51,6 +53,7 @@ def list_tasks() -> list[TaskListing]:
     return listings
 
 
+@phase("tasks")
 def load_task(name: str) -> Task:
     """The task of a name, ready to use.
 

@@ -10,6 +10,7 @@ import references
 
 from lidardesign.density.diagnostics import coverage, quality
 from lidardesign.errors import NumericalError
+from lidardesign.estimates import Estimate
 
 COUNT = 200_000
 LOG_Z = 3.7
@@ -80,13 +81,51 @@ def test_coverage_sees_a_dropped_mode_that_the_ess_cannot():
     assert found.ess > 0.99
     proposed = generator.uniform(-12, 12, 50_000)
     covered = coverage(gaussian(proposed, -5, 1), two_modes(proposed), np.zeros(50_000), LOG_Z)
-    assert covered == pytest.approx(0.7, abs=0.02)
+    assert covered.value == pytest.approx(0.7, abs=4 * covered.error)
+    assert 0 < covered.error < 0.01
     whole = coverage(two_modes(proposed) - LOG_Z, two_modes(proposed), np.zeros(50_000), LOG_Z)
-    assert whole == 1.0
+    assert whole.value == 1.0
+    assert whole.error == pytest.approx(0.0, abs=1e-12)
 
 
 def test_coverage_takes_a_log_z_per_proposal_and_nothing_covers_nothing():
     log_target = np.array([0.0, 10.0])
-    assert coverage(np.zeros(2), log_target, log_target, np.array([0.0, 10.0])) == 1.0
-    assert coverage(np.zeros(2), log_target, log_target, 0.0) == 0.5
-    assert coverage(np.zeros(0), np.zeros(0), np.zeros(0), 0.0) == 0.0
+    assert coverage(np.zeros(2), log_target, log_target, np.array([0.0, 10.0])).value == 1.0
+    assert coverage(np.zeros(2), log_target, log_target, 0.0).value == 0.5
+    assert coverage(np.zeros(0), np.zeros(0), np.zeros(0), 0.0) == Estimate(0.0, None)
+
+
+def test_standard_errors_are_the_spread_over_other_samples():
+    # log weights of a normal distribution with variance 1/4: all moments of the weights are finite
+    generator = np.random.default_rng(5)
+    found = [quality(np.zeros(2000), generator.normal(0, 0.5, 2000)) for _ in range(400)]
+    for figure, error in (("ess", "ess_error"), ("kl_nats", "kl_error_nats"), ("log_z", "log_z_error")):
+        spread = np.std([getattr(one, figure) for one in found])
+        stated = np.mean([getattr(one, error) for one in found])
+        # a standard deviation of 400 values is known to 3.5 %
+        assert stated == pytest.approx(spread, rel=4 * 0.035), figure
+
+
+def test_standard_errors_of_groups_are_those_of_their_mean():
+    generator = np.random.default_rng(6)
+    log_weights = generator.normal(0, 0.5, 4000)
+    alone = quality(np.zeros(4000), log_weights)
+    groups = np.arange(4000) % 4
+    grouped = quality(np.zeros(4000), log_weights, groups)
+    assert grouped.log_z_error == pytest.approx(alone.log_z_error, rel=0.05)
+    assert grouped.ess_error == pytest.approx(alone.ess_error, rel=0.05)
+    # four groups of the same samples know nothing more of each other
+    same = quality(np.zeros(4000), np.tile(log_weights[:1000], 4), np.repeat(np.arange(4), 1000))
+    one = quality(np.zeros(1000), log_weights[:1000])
+    assert same.kl_error_nats == pytest.approx(one.kl_error_nats / 2)
+
+
+def test_the_error_of_coverage_is_its_spread_over_other_proposals():
+    generator = np.random.default_rng(7)
+    found = []
+    for _ in range(300):
+        x = generator.uniform(-12, 12, 2000)
+        found.append(coverage(gaussian(x, -5, 1), two_modes(x), np.zeros(2000), LOG_Z))
+    assert np.mean([one.error for one in found]) == pytest.approx(
+        np.std([one.value for one in found]), rel=4 * 0.041
+    )

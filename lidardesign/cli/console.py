@@ -17,7 +17,9 @@ from typing import TYPE_CHECKING, Any, TextIO
 import typer
 
 from lidardesign.cli.environment import TerminatedError
+from lidardesign.cli.times import show_times
 from lidardesign.errors import LidardesignError
+from lidardesign.run.clock import Clock, running
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
@@ -59,6 +61,7 @@ class Console:
         output: Where the result goes: the program's stdout.
         when_interrupted: What to tell the user after Ctrl-C or SIGTERM.
         answered: Whether the one JSON document was printed; an error after it adds none.
+        clock: Where the command's time goes.
     """
 
     json: bool = False
@@ -67,6 +70,7 @@ class Console:
     output: TextIO = field(default_factory=lambda: sys.stdout)
     when_interrupted: Callable[[], str | None] = field(default=lambda: None)
     answered: bool = False
+    clock: Clock = field(default_factory=Clock)
 
     def rich(self, *, stderr: bool = False) -> RichConsole:
         """A rich console; it honours NO_COLOR and prints plain text where there is no terminal."""
@@ -81,13 +85,25 @@ class Console:
         if not self.quiet:
             print(text, file=sys.stderr)
 
-    def result(self, document: dict[str, Any], show: Callable[[RichConsole], None]) -> None:
-        """Give the result: as JSON, or shown for people."""
+    def result(
+        self, document: dict[str, Any], show: Callable[[RichConsole], None], *, show_costs: bool = True
+    ) -> None:
+        """Give the result, as JSON or shown for people, and where the time went until now.
+
+        Arguments:
+            document: The JSON form; `timings` is added.
+            show: Prints the result for people.
+            show_costs: Whether people are shown the times: not by commands that only look something up.
+        """
+        timings = self.clock.timings()
         if self.json:
             self.answered = True
-            print_json(document, self.output)
-        else:
-            show(self.rich())
+            print_json({**document, "timings": timings}, self.output)
+            return
+        rich = self.rich()
+        show(rich)
+        if show_costs and not self.quiet:
+            show_times(timings, rich)
 
     @contextlib.contextmanager
     def progress(self, *columns: str) -> Iterator[Progress | None]:
@@ -117,7 +133,7 @@ def command(*, json: bool, quiet: bool, debug: bool) -> Iterator[Console]:
     """
     console = Console(json=json, quiet=quiet, debug=debug, output=sys.stdout)
     try:
-        with contextlib.redirect_stdout(sys.stderr) if json else contextlib.nullcontext():
+        with contextlib.redirect_stdout(sys.stderr) if json else contextlib.nullcontext(), running(console.clock):
             yield console
         console.output.flush()
     except typer.Exit:

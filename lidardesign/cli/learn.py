@@ -15,6 +15,7 @@ from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
 from lidardesign.cli.runs import check_choice
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.run.clock import keep_timings, phase
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
@@ -65,8 +66,9 @@ def learn(
     """Learn where rays are worth firing for TASK, into a run folder."""
     with command(json=json, quiet=quiet, debug=debug) as console:
         check_choice(device, "--device", DEVICES)
-        from lidardesign.registry import load_task
-        from lidardesign.run.config import load_run_config, resolve
+        with phase("libraries"):
+            from lidardesign.registry import load_task
+            from lidardesign.run.config import load_run_config, resolve
 
         plugin = load_task(task)
         run = out if out is not None else Path("runs") / task
@@ -82,6 +84,7 @@ def learn(
             _check_can_start(run)
             settings = resolve(plugin, **choices)
         result = _learn_in_folder(plugin, settings, run, resume, device, console)
+        keep_timings(run, "learn", console.clock)
         result = replace(result, notes=(*result.notes, *_advice(result)))
         console.result(_document(result), lambda rich: _show(result, rich))
 
@@ -136,7 +139,8 @@ def _learn_in_folder(
             save_run_config(settings, run)
         console.when_interrupted = lambda: _interruption(task.name, run)
         with _progress(console) as progress:
-            from lidardesign.density.learn import learn as learn_density
+            with phase("libraries"):
+                from lidardesign.density.learn import learn as learn_density
 
             return learn_density(task, settings, run, resume=resume, device=device, progress=progress)
 
@@ -229,7 +233,7 @@ def _document(result: LearnResult) -> dict[str, Any]:
         "log_z": result.log_z,
         "coverage": result.coverage,
         "notes": list(result.notes),
-        "timings": dict(result.timings),
+        "error_estimates": result.as_dict()["error_estimates"],
     }
 
 
@@ -237,12 +241,18 @@ def _show(result: LearnResult, rich: RichConsole) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table("", "value", "", title=f"learned {escape(str(result.task))}", title_justify="left")
-    table.add_row("ESS", f"{result.ess:.3f}", "share of the samples that count")
-    table.add_row("KL", f"{result.kl_nats:.3f} nats", "from the learned density to the target")
-    table.add_row("log Z", f"{result.log_z:.3f}", "of the target density")
-    table.add_row("coverage", f"{result.coverage:.3f}", "share of the target's mass that the density reaches")
-    table.add_row("time", f"{result.seconds:.1f} s", f"{result.steps} steps")
+    def row(name: str, key: str, unit: str, what: str) -> None:
+        estimate = result.error_estimates[key]
+        error = "unknown" if estimate.error is None else f"{estimate.error:.2g}"
+        table.add_row(name, f"{estimate.value:.3f}{unit}", error, what)
+
+    title = f"learned {escape(str(result.task))}"
+    table = Table("", "value", "standard error", "", title=title, title_justify="left")
+    row("ESS", "ess", "", "share of the samples that count")
+    row("KL", "kl_nats", " nats", "from the learned density to the target")
+    row("log Z", "log_z", "", "of the target density")
+    row("coverage", "coverage", "", "share of the target's mass that the density reaches")
+    table.add_row("time", f"{result.seconds:.1f} s", "", f"{result.steps} steps")
     rich.print(table)
     for note in result.notes:
         rich.print(f"note: {escape(note)}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -18,12 +17,15 @@ from lidardesign.density.losses import Pool, draw_conditions
 from lidardesign.density.objective import Coordinates
 from lidardesign.density.prepare import prepare_target
 from lidardesign.density.receiver import common_receiver
+from lidardesign.density.snapshots import clear_snapshots
 from lidardesign.density.target import Target
 from lidardesign.density.training import PROGRESS, LearnProgress, Trainer
 from lidardesign.design.samples import Samples, save_samples
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.estimates import Estimate
 from lidardesign.registry import plugin_guard
 from lidardesign.run.checkpoint import save_arrays
+from lidardesign.run.clock import phase, running
 from lidardesign.run.config import RunConfig
 from lidardesign.run.manifest import note, record
 from lidardesign.scene import Scene
@@ -39,7 +41,10 @@ DEVICES = ("auto", "cpu", "cuda")
 
 @dataclass(frozen=True)
 class LearnResult:
-    """What learning reached; `timings` are seconds by phase, `notes` what the user should know."""
+    """What learning reached; `timings` are seconds by phase, `notes` what the user should know.
+
+    `error_estimates` has the standard errors of ess, kl_nats, log_z and coverage.
+    """
 
     run: str
     task: str
@@ -51,23 +56,11 @@ class LearnResult:
     coverage: float
     notes: tuple[str, ...] = ()
     timings: dict[str, float] = field(default_factory=dict)
+    error_estimates: dict[str, Estimate] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """The contract's JSON form."""
         return {**asdict(self), "notes": list(self.notes)}
-
-
-class _Clock:
-    """Seconds by phase."""
-
-    def __init__(self) -> None:
-        self.started = self._mark = time.perf_counter()
-        self.timings: dict[str, float] = {}
-
-    def lap(self, phase: str) -> None:
-        now = time.perf_counter()
-        self.timings[phase] = round(now - self._mark, 3)
-        self._mark = now
 
 
 def learn(
@@ -93,42 +86,44 @@ def learn(
         ConfigError, DataError: Unusable settings or scenes.
         DivergenceError: Learning stayed non-finite; the last good checkpoint is kept.
     """
-    clock = _Clock()
     place = choose_device(device)
+    with running() as clock:
+        scenes = _training_scenes(task, config)
+        target, notes = prepare_target(scenes, config)
+        trainer = _trainer(target, scenes, config, run, place)
+        if resume:
+            trainer.resume()
+        else:
+            (run / PROGRESS).unlink(missing_ok=True)
+            clear_snapshots(run)
+        with phase("learning"):
+            trainer.train(progress)
+        # float32 steps train as well and 2.4 times faster, but float32 splines give wrong densities: measure in float64
+        trainer.flow.double()
+        samples, figures = _measure(trainer, scenes, config, notes)
+        if trainer.skipped:
+            notes.append(f"{trainer.skipped} steps were not finite and skipped")
+        _store(trainer, samples, config, run)
+    result = LearnResult(
+        run=str(run),
+        task=config.task_name,
+        seconds=round(clock.seconds, 3),
+        steps=trainer.step,
+        notes=tuple(notes),
+        timings=clock.timings(),
+        **figures,
+    )
+    note(run, learn=result.as_dict(), visibility=target.visibility.name)
+    return result
+
+
+@phase("scenes")
+def _training_scenes(task: Task, config: RunConfig) -> list[Scene]:
     with plugin_guard(config.task_name):
         scenes = list(scenes_of(task, config.task, "train", config.seed, config.space))
     if not scenes:
         raise DataError(f"the task {config.task_name!r} gave no training scenes", where="task")
-    clock.lap("scenes")
-    target, notes = prepare_target(scenes, config)
-    clock.lap("fields")
-    trainer = _trainer(target, scenes, config, run, place)
-    clock.lap("proposals")
-    if resume:
-        trainer.resume()
-    else:
-        (run / PROGRESS).unlink(missing_ok=True)
-    trainer.train(progress)
-    # float32 steps train as well and 2.4 times faster, but float32 splines give wrong densities: measure in float64
-    trainer.flow.double()
-    clock.lap("learning")
-    samples, figures = _measure(trainer, scenes, config, notes)
-    clock.lap("measuring")
-    if trainer.skipped:
-        notes.append(f"{trainer.skipped} steps were not finite and skipped")
-    _store(trainer, samples, config, run)
-    clock.lap("writing")
-    result = LearnResult(
-        run=str(run),
-        task=config.task_name,
-        seconds=round(time.perf_counter() - clock.started, 3),
-        steps=trainer.step,
-        notes=tuple(notes),
-        timings=clock.timings,
-        **figures,
-    )
-    note(run, learn=result.as_dict(), timings=clock.timings, visibility=target.visibility.name)
-    return result
+    return scenes
 
 
 def choose_device(name: str) -> torch.device:
@@ -167,6 +162,7 @@ def _trainer(
     return Trainer(flow, target, coordinates, settings, run, generator, _pool(target, scenes, config))
 
 
+@phase("proposals")
 def _pool(target: Target, scenes: Sequence[Scene], config: RunConfig) -> Pool:
     """Proposals for balancing, independent of those that coverage is measured on."""
     count = config.learning.balance_proposals
@@ -230,22 +226,24 @@ def log_density_of(trainer: Trainer, points: np.ndarray) -> np.ndarray:
     return log_prob + coordinates.log_condition_density - coordinates.log_unit_volume
 
 
+@phase("measuring")
 def _measure(
     trainer: Trainer, scenes: Sequence[Scene], config: RunConfig, notes: list[str]
-) -> tuple[Samples, dict[str, float]]:
+) -> tuple[Samples, dict[str, Any]]:
     samples = draw_samples(trainer, config.learning.samples)
     groups = _condition_groups(config.space, samples.points)
     found = quality(samples.log_prob, samples.log_target, groups)
     count = config.learning.coverage_proposals
     generator = random_generator(config.seed, "coverage")
     points, log_density = independent_points(trainer.target, scenes, count, generator)
-    covered = 0.0
+    covered = Estimate(0.0, None)
     if len(points):
         log_z = _log_z_at(points, samples, groups, found.log_z)
         covered = coverage(log_density_of(trainer, points), trainer.target.log_density(points), log_density, log_z)
     else:
         notes.append("coverage could not be measured and counts as 0: no independently drawn ray fits in the space")
-    return samples, {"ess": found.ess, "kl_nats": found.kl_nats, "log_z": found.log_z, "coverage": covered}
+    estimates = {**found.estimates(), "coverage": covered}
+    return samples, {**{name: one.value for name, one in estimates.items()}, "error_estimates": estimates}
 
 
 def _condition_groups(space: DesignSpace, points: np.ndarray) -> np.ndarray | None:
@@ -267,6 +265,7 @@ def _log_z_at(points: np.ndarray, samples: Samples, groups: np.ndarray | None, m
     return by_group[_condition_groups(samples.space, points)]
 
 
+@phase("writing")
 def _store(trainer: Trainer, samples: Samples, config: RunConfig, run: Path) -> None:
     weights = {name: value.detach().cpu().numpy() for name, value in trainer.flow.state_dict().items()}
     save_arrays(run, FLOW, weights, {"features": trainer.flow.features, "context": trainer.flow.context})

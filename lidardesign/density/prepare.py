@@ -9,6 +9,7 @@ from lidardesign.density.proposals import occluded_share, propose
 from lidardesign.density.refinement import refine_quadrature
 from lidardesign.density.target import Target, build_target
 from lidardesign.density.visibility import Optics
+from lidardesign.run.clock import phase
 from lidardesign.run.config import RunConfig
 from lidardesign.scene import Scene
 from lidardesign.task import random_generator
@@ -18,6 +19,7 @@ OCCLUDED_SHARE_TO_CARE = 1e-3
 HIDDEN_SHARE_TO_WARN = 0.99
 
 
+@phase("fields")
 def prepare_target(
     scenes: Sequence[Scene], config: RunConfig, *, visibility: str | None = None, compiled: bool = True
 ) -> tuple[Target, list[str]]:
@@ -45,6 +47,7 @@ def prepare_target(
     return target, notes
 
 
+@phase("visibility")
 def _choose_visibility(scenes: Sequence[Scene], config: RunConfig) -> tuple[str, str]:
     generator = random_generator(config.seed, "visibility")
     optics = Optics.of(config.density)

@@ -16,6 +16,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from lidardesign.density.settings import PRESET_LEARNING, PRESETS, DensitySettings, LearningSettings
 from lidardesign.errors import ConfigError
 from lidardesign.registry import load_task, plugin_guard
+from lidardesign.run.clock import phase
 from lidardesign.run.files import write_atomic
 from lidardesign.run.manifest import record, verify
 from lidardesign.run.overrides import Override, apply_override, parse_override
@@ -121,6 +122,7 @@ class _Layers:
         return held[0] if held else ".".join(map(str, path))
 
 
+@phase("configuration")
 def resolve(
     task: Task,
     *,
@@ -179,6 +181,7 @@ def judged_by(task: Task, config: RunConfig, overrides: Sequence[str]) -> RunCon
     return replace(config, task=judged)
 
 
+@phase("configuration")
 def load_run_config(run: Path) -> tuple[Task, RunConfig]:
     """The task and configuration of a run folder, checked against the manifest.
 

@@ -1,0 +1,76 @@
+"""How far a figure may be off: an error beside every figure that a command returns.
+
+Standard errors follow from the influence of single samples (delta method; Owen 2013, "Monte Carlo theory, methods and
+examples", ch. 9.2): the figure moves by the mean of what each sample moves it by. They hold for samples whose weights
+have a finite variance; of weights with heavy tails they are too small, as the ESS then is too large.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+# Kinds of errors, as `Estimate.kind` has them.
+STANDARD_ERROR = "standard error"
+HALF_INTERVAL = "half of the 95 % interval"
+ROUNDING = "rounding"
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A figure and its error.
+
+    Arguments:
+        value: The figure, in `unit`.
+        error: How far it may be off, in `unit`; None where it cannot be known.
+        unit: "" for shares and counts.
+        kind: What the error is: a standard error, half an interval, or the most that rounding takes.
+    """
+
+    value: float
+    error: float | None
+    unit: str = ""
+    kind: str = STANDARD_ERROR
+
+    def as_dict(self) -> dict[str, Any]:
+        """The JSON form."""
+        return asdict(self)
+
+
+def as_documents(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
+    """The JSON form of named estimates: `error_estimates` of every command that has any."""
+    return {name: estimate.as_dict() for name, estimate in estimates.items()}
+
+
+def standard_error(influence: np.ndarray) -> float:
+    """The standard error of a figure that sample i moves by influence_i / N, shape (N,): sqrt(mean of squares / N)."""
+    if not len(influence):
+        return 0.0
+    return float(np.sqrt(np.square(influence).mean() / len(influence)))
+
+
+def effective_share_error(weights: np.ndarray) -> float:
+    """The standard error of the ESS (sum w)^2 / (N sum w^2) of N independent weights, shape (N,), not all 0.
+
+    Its influence is ESS (2 w / mean(w) - w^2 / mean(w^2) - 1).
+    """
+    # only ratios of weights count
+    scaled = np.asarray(weights, dtype=np.float64) / np.max(weights)
+    mean, square = scaled.mean(), np.square(scaled).mean()
+    ess = mean**2 / square
+    return standard_error(ess * (2 * scaled / mean - np.square(scaled) / square - 1))
+
+
+def log_mean_error(weights: np.ndarray) -> float:
+    """The standard error of log mean(w) of N independent weights, shape (N,), not all 0; influence w / mean(w) - 1."""
+    scaled = np.asarray(weights, dtype=np.float64) / np.max(weights)
+    return standard_error(scaled / scaled.mean() - 1)
+
+
+def weighted_mean_error(values: np.ndarray, weights: np.ndarray) -> float:
+    """The standard error of sum(w v) / sum(w), shapes (N,); influence N w (v - mean) / sum(w)."""
+    share = np.asarray(weights, dtype=np.float64) / np.sum(weights)
+    return standard_error(len(share) * share * (values - share @ values))

@@ -1,0 +1,105 @@
+"""Where a command's time goes: seconds by phase, phases inside of phases.
+
+A clock runs for as long as a command, or a library call that reports its own times. Code anywhere below marks what it
+does with `phase`, as a context or a decorator; where no clock runs, that does nothing. Clocks that run inside of each
+other all count the same phases, each from its own beginning.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Iterator
+from contextvars import ContextVar
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from lidardesign.run.lock import run_lock
+from lidardesign.run.manifest import read_manifest, write_manifest
+
+# Between the name of a phase and that of one inside of it.
+INSIDE = "/"
+# What passed outside of all phases.
+OTHER = "other"
+# Commands that write one entry hold the lock for an instant.
+WAIT_S = 10.0
+_RUNNING: ContextVar[tuple[Clock, ...]] = ContextVar("clocks that run", default=())
+
+
+class Clock:
+    """Wall time by phase, from its making on."""
+
+    def __init__(self) -> None:
+        self._started = time.perf_counter()
+        self._seconds: dict[str, float] = {}
+        self._within: tuple[str, ...] = ()
+
+    @property
+    def seconds(self) -> float:
+        """Wall time since the clock was made [s]."""
+        return time.perf_counter() - self._started
+
+    @contextlib.contextmanager
+    def phase(self, name: str) -> Iterator[None]:
+        """Count the time inside towards a phase; a phase directly inside of one of its name is the same one."""
+        before = self._within
+        if before[-1:] == (name,):
+            yield
+            return
+        self._within = (*before, name)
+        key = INSIDE.join(self._within)
+        # entered in the order of beginning, so that phases come in the order of the work
+        self._seconds.setdefault(key, 0.0)
+        started = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._seconds[key] += time.perf_counter() - started
+            self._within = before
+
+    def timings(self) -> dict[str, float]:
+        """Finished phases and their seconds, in milliseconds' steps, as {"learning": 12.3, "learning/target": 8.1}.
+
+        Names without a stroke add up, with `other`, to the time since the clock was made.
+        """
+        found = {key: round(seconds, 3) for key, seconds in self._seconds.items()}
+        counted = sum(seconds for key, seconds in self._seconds.items() if INSIDE not in key)
+        return {**found, OTHER: round(max(self.seconds - counted, 0.0), 3)}
+
+
+@contextlib.contextmanager
+def running(clock: Clock | None = None) -> Iterator[Clock]:
+    """Let a clock count the phases inside; those of clocks that run already go on."""
+    clock = Clock() if clock is None else clock
+    token = _RUNNING.set((*_RUNNING.get(), clock))
+    try:
+        yield clock
+    finally:
+        _RUNNING.reset(token)
+
+
+@contextlib.contextmanager
+def phase(name: str) -> Iterator[None]:
+    """Count the time inside towards a phase of every clock that runs; also a decorator."""
+    with contextlib.ExitStack() as stack:
+        for clock in _RUNNING.get():
+            stack.enter_context(clock.phase(name))
+        yield
+
+
+def keep_timings(run: Path, command: str, clock: Clock) -> None:
+    """Enter a command's times in a run's manifest, in place of those of the last time, under the run's lock.
+
+    Raises:
+        ConfigError, DataError: The run is being written, or cannot be.
+    """
+    entry: dict[str, Any] = {
+        "when": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "seconds": round(clock.seconds, 3),
+        "phases": clock.timings(),
+    }
+    with run_lock(run, wait_s=WAIT_S):
+        manifest = read_manifest(run)
+        commands = {name: times for name, times in manifest.get("timings", {}).items() if isinstance(times, dict)}
+        write_manifest(run, {**manifest, "timings": {**commands, command: entry}})
