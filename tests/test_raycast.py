@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from lidardesign.errors import ConfigError
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.simulate import raycast
-from lidardesign.simulate.raycast import SceneCaster, mesh_caster, shared_caster
+from lidardesign.simulate.raycast import SceneCaster, mesh_caster, shared_caster, trace_each
 
 PRIMITIVES = {"sphere": Sphere(0.7), "box": Box((0.3, 0.5, 0.9)), "capsule": Capsule(0.3, 0.8), "plane": Plane()}
 SOLIDS = {name: shape for name, shape in PRIMITIVES.items() if name != "plane"}
@@ -390,3 +390,22 @@ def test_a_caster_lives_as_long_as_its_mesh():
     del mesh
     gc.collect()
     assert caster() is None
+
+
+@pytest.mark.parametrize("with_a_sphere", [False, True])
+def test_casting_for_many_scenes_at_once_is_casting_for_each(with_a_sphere):
+    sphere = (Body(Sphere(0.4), poses=POSE),) if with_a_sphere else ()
+    balls = [solid_mesh(trimesh.creation.icosphere(subdivisions=2, radius=0.3 * n)) for n in range(1, 5)]
+    meshes = [Body(ball, poses=rigid(translation_m=(0.1 * n, 0, 0))) for n, ball in enumerate(balls)]
+    casters = [SceneCaster(Scene((mesh, *sphere))) for mesh in meshes]
+    counts = [0, 200, 7, 300]
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    origins, directions = rays_towards(starts[-1], 3, distance=5.0)
+    origins[::3] *= 1e5  # some start where float32 cannot tell them apart
+    limit_m = np.where(np.arange(len(origins)) % 2, np.inf, 4.0)
+    found = trace_each(casters, starts, origins, directions, limit_m)
+    assert 0.05 < (found.body >= 0).mean() < 0.95
+    for caster, begin, end in zip(casters, starts[:-1], starts[1:], strict=True):
+        part = caster.trace(origins[begin:end], directions[begin:end], limit_m[begin:end])
+        for name in ("range_m", "body", "normal"):
+            np.testing.assert_array_equal(getattr(found, name)[begin:end], getattr(part, name))

@@ -17,7 +17,7 @@ import numpy as np
 from lidardesign.density.fields import Field, TableField, scene_columns
 from lidardesign.density.settings import DensitySettings
 from lidardesign.scene import Scene
-from lidardesign.simulate.raycast import shared_caster
+from lidardesign.simulate.raycast import shared_caster, trace_each
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction
 
 # A grazing hit moves without bound when its ray turns; its derivative is capped at this cosine.
@@ -169,10 +169,13 @@ class _Blocked:
 
     def gradient(self, weights: np.ndarray) -> RayGradient:
         out = RayGradient.zeros(len(self.log_values))
+        count = len(out.ranges)
         pull = self.attenuation_per_m * weights[self.rows, self.columns]
-        np.add.at(out.ranges, self.rows, -pull)
-        np.add.at(out.origins, self.rows, -pull[:, None] * self.plane)
-        np.add.at(out.directions, self.rows, -(pull * self.hit_m)[:, None] * self.plane)
+        out.ranges -= np.bincount(self.rows, pull, minlength=count)
+        for axis in range(3):
+            force = pull * self.plane[:, axis]
+            out.origins[:, axis] -= np.bincount(self.rows, force, minlength=count)
+            out.directions[:, axis] -= np.bincount(self.rows, force * self.hit_m, minlength=count)
         return out
 
 
@@ -192,23 +195,16 @@ class Raycast:
     ) -> Transmittance:
         """See `Visibility`."""
         log_values = np.zeros(active.shape)
-        found = [self._blocked(column, rays, active, optics) for column in range(active.shape[1])]
-        rows, hit_m, plane, excess = (np.concatenate([part[k] for part in found]) for k in range(4))
-        columns = np.repeat(np.arange(active.shape[1]), [len(part[0]) for part in found])
-        log_values[rows, columns] = -optics.attenuation_per_m * excess
-        return _Blocked(log_values, rows, columns, hit_m, plane, optics.attenuation_per_m)
-
-    def _blocked(
-        self, column: int, rays: RayBatch, active: np.ndarray, optics: Optics
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        rows = np.flatnonzero(active[:, column])
+        columns, rows = np.nonzero(active.T)
+        starts = np.concatenate([[0], np.cumsum(active.sum(axis=0))])
         limit_m = rays.ranges[rows] - optics.margin_m
-        hits = self._casters[column].trace(rays.origins[rows], rays.directions[rows], limit_m)
+        hits = trace_each(self._casters, starts, rays.origins[rows], rays.directions[rows], limit_m)
         blocked = np.flatnonzero(hits.body >= 0)
-        rows, normal, excess = rows[blocked], hits.normal[blocked], (limit_m - hits.range_m)[blocked]
+        rows, columns, hit_m, normal = rows[blocked], columns[blocked], hits.range_m[blocked], hits.normal[blocked]
+        log_values[rows, columns] = -optics.attenuation_per_m * (limit_m[blocked] - hit_m)
         # normals face the origin, so the cosine with the direction is negative
         cosine = np.minimum(np.einsum("nk,nk->n", normal, rays.directions[rows]), -MINIMUM_COSINE)
-        return rows, hits.range_m[blocked], normal / cosine[:, None], excess
+        return _Blocked(log_values, rows, columns, hit_m, normal / cosine[:, None], optics.attenuation_per_m)
 
 
 @dataclass(frozen=True, eq=False)

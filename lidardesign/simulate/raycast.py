@@ -47,6 +47,11 @@ class SceneCaster:
             for kind in sorted(kinds, key=lambda kind: kind.__name__)
         ]
 
+    @property
+    def resting(self) -> _AtRest | None:
+        """Its meshes at rest, where it casts at nothing else."""
+        return None if self._groups or self._meshes.moving else self._meshes.resting
+
     def first_hit(self, origins: np.ndarray, directions: np.ndarray) -> Hits:
         """The nearest hit of every ray, shapes (N, 3) and (N, 3); directions are normalised here.
 
@@ -64,8 +69,7 @@ class SceneCaster:
         for group in self._groups:
             group.keep_nearer(hits, origins, directions, limit_m)
         rows = np.flatnonzero(hits.body >= 0)
-        facing = np.einsum("nk,nk->n", hits.normal[rows], directions[rows]) > 0
-        hits.normal[rows[facing]] *= -1
+        hits.normal[rows] = _facing(hits.normal[rows], directions[rows])
         return hits
 
     def crossings(
@@ -78,6 +82,29 @@ class SceneCaster:
         parts = [self._meshes.crossings(origins, directions, start_m, limit_m)]
         parts += [group.crossings(origins, directions, start_m, limit_m) for group in self._groups]
         return Crossings(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def trace_each(
+    casters: Sequence[SceneCaster],
+    starts: np.ndarray,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    limit_m: np.ndarray,
+) -> Hits:
+    """First hits of many casters' rays at once: caster c traces the rays from starts[c] to starts[c + 1].
+
+    Rays are as those of `SceneCaster.trace`, and so are hits. Casters of meshes at rest, of which there are many in
+    learning, only share Embree's own calls out.
+    """
+    resting = [caster.resting for caster in casters]
+    if any(one is None for one in resting):
+        parts = [
+            caster.trace(origins[begin:end], directions[begin:end], limit_m[begin:end])
+            for caster, begin, end in zip(casters, starts[:-1], starts[1:], strict=True)
+        ]
+        columns = zip(*((part.range_m, part.body, part.normal) for part in parts), strict=True)
+        return Hits(*(np.concatenate(column) for column in columns))
+    return _traced_at_rest(resting, starts, origins, directions, limit_m)
 
 
 def _chosen(scene: Scene, only: Only) -> list[tuple[int, Body]]:
@@ -127,25 +154,28 @@ class _Triangles:
         self, local: np.ndarray, directions: np.ndarray, limit_m: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """First hits of rays relative to the centre: rows (K,), their ranges (K,), meshes (K,) and normals (K, 3)."""
-        local, advance_m = self._advanced(local, directions)
-        found = self._scene.run(
-            local.astype(np.float32),
+        advance_m = _advance_m(local, directions, self.radius_m)
+        found = self.run(
+            (local + advance_m[:, None] * directions).astype(np.float32),
             directions.astype(np.float32),
-            dists=np.clip(limit_m - advance_m, 0.0, FARTHEST_M).astype(np.float32),
-            output=True,
+            np.clip(limit_m - advance_m, 0.0, FARTHEST_M).astype(np.float32),
         )
         range_m = found["tfar"] + advance_m
         rows = np.flatnonzero((found["primID"] >= 0) & (range_m < limit_m))
         return rows, range_m[rows], found["geomID"][rows], _unit(found["Ng"][rows].astype(np.float64))
 
-    def _advanced(self, local: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Starts moved towards the meshes where float32 could not tell them apart, and by how much (N,)."""
-        far = np.einsum("nk,nk->n", local, local) > (FAR_RADII * self.radius_m) ** 2
-        if not far.any():
-            return local, np.zeros(len(local))
-        closest = -np.einsum("nk,nk->n", local, directions)
-        advance_m = np.where(far, np.maximum(closest - 2 * self.radius_m, 0.0), 0.0)
-        return local + advance_m[:, None] * directions, advance_m
+    def run(self, local: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> dict[str, np.ndarray]:
+        """Embree's own answer for float32 rays."""
+        return self._scene.run(local, directions, dists=limit_m, output=True)
+
+
+def _advance_m(local: np.ndarray, directions: np.ndarray, radius_m: np.ndarray | float) -> np.ndarray:
+    """How far starts are moved towards meshes around 0 where float32 could not tell them apart, shape (N,)."""
+    far = np.einsum("nk,nk->n", local, local) > (FAR_RADII * radius_m) ** 2
+    if not far.any():
+        return np.zeros(len(local))
+    closest = -np.einsum("nk,nk->n", local, directions)
+    return np.where(far, np.maximum(closest - 2 * radius_m, 0.0), 0.0)
 
 
 class MeshCaster:
@@ -197,17 +227,46 @@ class _AtRest:
     """All meshes of a scene that do not move, in one Embree scene."""
 
     def __init__(self, bodies: Sequence[tuple[int, Body]]) -> None:
-        self._body_of_geometry = np.array([index for index, _ in bodies], dtype=np.int64)
-        self._triangles = _Triangles([body.shape.transformed(body.poses) for _, body in bodies])
-        self.radius_m = self._triangles.radius_m
+        self.body_of_geometry = np.array([index for index, _ in bodies], dtype=np.int64)
+        self.triangles = _Triangles([body.shape.transformed(body.poses) for _, body in bodies])
+        self.radius_m = self.triangles.radius_m
 
     def trace(self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Hits:
         hits = _no_hits(len(origins))
         if len(origins):
-            local = origins - self._triangles.centre
-            rows, range_m, geometry, normal = self._triangles.trace(local, directions, limit_m)
-            hits.range_m[rows], hits.body[rows], hits.normal[rows] = range_m, self._body_of_geometry[geometry], normal
+            local = origins - self.triangles.centre
+            rows, range_m, geometry, normal = self.triangles.trace(local, directions, limit_m)
+            hits.range_m[rows], hits.body[rows], hits.normal[rows] = range_m, self.body_of_geometry[geometry], normal
         return hits
+
+
+def _traced_at_rest(
+    meshes: Sequence[_AtRest], starts: np.ndarray, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray
+) -> Hits:
+    """`trace_each` for meshes at rest: everything but Embree's calls is done for all rays together."""
+    counts = np.diff(starts)
+    local = origins - np.repeat([one.triangles.centre for one in meshes], counts, axis=0)
+    advance_m = _advance_m(local, directions, np.repeat([one.radius_m for one in meshes], counts))
+    local = (local + advance_m[:, None] * directions).astype(np.float32)
+    toward, limit = directions.astype(np.float32), np.clip(limit_m - advance_m, 0.0, FARTHEST_M).astype(np.float32)
+    hits = _no_hits(len(origins))
+    rows, ranges, normals = [], [], []
+    for one, begin, end in zip(meshes, starts[:-1], starts[1:], strict=True):
+        if begin == end:
+            continue
+        found = one.triangles.run(local[begin:end], toward[begin:end], limit[begin:end])
+        hit = np.flatnonzero(found["primID"] >= 0)
+        rows.append(begin + hit)
+        ranges.append(found["tfar"][hit])
+        normals.append(found["Ng"][hit])
+        hits.body[begin + hit] = one.body_of_geometry[found["geomID"][hit]]
+    if rows:
+        hit = np.concatenate(rows)
+        hits.range_m[hit] = np.concatenate(ranges) + advance_m[hit]
+        hits.normal[hit] = _facing(_unit(np.concatenate(normals).astype(np.float64)), directions[hit])
+    beyond = hits.range_m >= limit_m
+    hits.range_m[beyond], hits.body[beyond], hits.normal[beyond] = np.inf, -1, 0.0
+    return hits
 
 
 _at_rest: WeakKeyDictionary[Scene, dict[tuple[int, ...], _AtRest]] = WeakKeyDictionary()
@@ -267,20 +326,20 @@ class _Meshes:
     def __init__(self, scene: Scene, bodies: list[tuple[int, Body]], frame: int) -> None:
         resting = [(index, body) for index, body in bodies if body.poses.ndim == 2]
         moving = [(index, body) for index, body in bodies if body.poses.ndim == 3]
-        self._resting = _shared_at_rest(scene, resting) if resting else None
-        self._moving = _Moving(moving, frame) if moving else None
+        self.resting = _shared_at_rest(scene, resting) if resting else None
+        self.moving = _Moving(moving, frame) if moving else None
 
     def trace(self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Hits:
-        hits = self._resting.trace(origins, directions, limit_m) if self._resting else _no_hits(len(origins))
-        if self._moving:
-            self._moving.keep_nearer(hits, origins, directions, limit_m)
+        hits = self.resting.trace(origins, directions, limit_m) if self.resting else _no_hits(len(origins))
+        if self.moving:
+            self.moving.keep_nearer(hits, origins, directions, limit_m)
         return hits
 
     def crossings(
         self, origins: np.ndarray, directions: np.ndarray, start_m: np.ndarray, limit_m: np.ndarray
     ) -> Crossings:
         parts = [Crossings(np.empty(0, int), np.empty(0), np.empty(0))]
-        if self._resting or self._moving:
+        if self.resting or self.moving:
             alive, start, step_m = np.arange(len(origins)), start_m.copy(), self._step_m(limit_m)
             for _ in range(MAXIMUM_LAYERS):
                 ahead, toward = start[alive], directions[alive]
@@ -297,7 +356,7 @@ class _Meshes:
 
     def _step_m(self, limit_m: np.ndarray) -> float:
         reach = limit_m[np.isfinite(limit_m)].max(initial=0.0)
-        return STEP_SHARE * max(float(reach), *(part.radius_m for part in (self._resting, self._moving) if part))
+        return STEP_SHARE * max(float(reach), *(part.radius_m for part in (self.resting, self.moving) if part))
 
 
 def _no_hits(count: int) -> Hits:
@@ -308,6 +367,11 @@ def _turned(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Rotated vectors (N, 3); unlike a matrix product, to the same bits in whatever batch."""
     x, y, z = (vectors[:, [axis]] * rotation[:, axis] for axis in range(3))
     return x + y + z
+
+
+def _facing(normals: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Normals (N, 3) turned against the directions (N, 3) of the rays that hit there."""
+    return np.where((np.einsum("nk,nk->n", normals, directions) > 0)[:, None], -normals, normals)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
