@@ -13,6 +13,7 @@ import torch
 from lidardesign.density import learn as learning
 from lidardesign.density import training
 from lidardesign.density.learn import learn
+from lidardesign.density.measure import log_density_of
 from lidardesign.density.settings import DensitySettings, LearningSettings
 from lidardesign.density.target import Target
 from lidardesign.design.samples import load_samples
@@ -201,19 +202,19 @@ def test_an_analytic_scene_is_learned_well(tmp_path):
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_samples_carry_the_density_that_the_flow_has_there(tmp_path, monkeypatch, dtype):
     kept = {}
-    measure = learning._measure
+    measure = learning.measure
 
     def keep(trainer, *rest):
         kept["trainer"] = trainer
         return measure(trainer, *rest)
 
-    monkeypatch.setattr(learning, "_measure", keep)
+    monkeypatch.setattr(learning, "measure", keep)
     learn(BallTask(), config_of(dtype=dtype), tmp_path)
     samples = load_samples(tmp_path).subset(np.arange(500))
-    again = learning.log_density_of(kept["trainer"], samples.points)
+    again = log_density_of(kept["trainer"], samples.points)
     np.testing.assert_allclose(again, samples.log_prob, atol=1e-6)
     outside = samples.points + np.array([0, 0, 0, 0, 0, 5.0])
-    assert (learning.log_density_of(kept["trainer"], outside) == -np.inf).all()
+    assert (log_density_of(kept["trainer"], outside) == -np.inf).all()
 
 
 def test_a_conditioned_dimension_stays_uniform(tmp_path):

@@ -232,6 +232,7 @@ def _document(result: LearnResult) -> dict[str, Any]:
         "kl_nats": result.kl_nats,
         "log_z": result.log_z,
         "coverage": result.coverage,
+        "misplaced": result.misplaced,
         "notes": list(result.notes),
         "error_estimates": result.as_dict()["error_estimates"],
     }
@@ -252,6 +253,7 @@ def _show(result: LearnResult, rich: RichConsole) -> None:
     row("KL", "kl_nats", " nats", "from the learned density to the target")
     row("log Z", "log_z", "", "of the target density")
     row("coverage", "coverage", "", "share of the target's mass that the density reaches")
+    row("misplaced", "misplaced", "", "share of the density's mass in the wrong place")
     table.add_row("time", f"{result.seconds:.1f} s", "", f"{result.steps} steps")
     rich.print(table)
     for note in result.notes:

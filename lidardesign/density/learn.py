@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from lidardesign.density.diagnostics import coverage, quality, quality_by_group
 from lidardesign.density.flow import DesignFlow
 from lidardesign.density.independent import independent_points
-from lidardesign.density.losses import Pool, draw_conditions
+from lidardesign.density.losses import Pool
+from lidardesign.density.measure import Measured, draw_probes, measure
 from lidardesign.density.objective import Coordinates
 from lidardesign.density.prepare import prepare_target
 from lidardesign.density.receiver import common_receiver
@@ -30,12 +30,10 @@ from lidardesign.run.config import RunConfig
 from lidardesign.run.manifest import note, record
 from lidardesign.scene import Scene
 from lidardesign.simulate.receiver_view import in_view
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction
 from lidardesign.task import Task, random_generator, scenes_of
 
 FLOW = "flow.safetensors"
-SAMPLE_CHUNK = 16384
-CONDITION_GROUPS = 32
 DEVICES = ("auto", "cpu", "cuda")
 
 
@@ -43,7 +41,8 @@ DEVICES = ("auto", "cpu", "cuda")
 class LearnResult:
     """What learning reached; `timings` are seconds by phase, `notes` what the user should know.
 
-    `error_estimates` has the standard errors of ess, kl_nats, log_z and coverage.
+    `misplaced` is the share of the density's mass in the wrong place. `error_estimates` has the standard errors of ess,
+    kl_nats, log_z, coverage and misplaced.
     """
 
     run: str
@@ -54,6 +53,7 @@ class LearnResult:
     kl_nats: float
     log_z: float
     coverage: float
+    misplaced: float
     notes: tuple[str, ...] = ()
     timings: dict[str, float] = field(default_factory=dict)
     error_estimates: dict[str, Estimate] = field(default_factory=dict)
@@ -100,10 +100,11 @@ def learn(
             trainer.train(progress)
         # float32 steps train as well and 2.4 times faster, but float32 splines give wrong densities: measure in float64
         trainer.flow.double()
-        samples, figures = _measure(trainer, scenes, config, notes)
+        measured = _measured(trainer, scenes, config)
+        notes += measured.notes
         if trainer.skipped:
             notes.append(f"{trainer.skipped} steps were not finite and skipped")
-        _store(trainer, samples, config, run)
+        _store(trainer, measured.samples, config, run)
     result = LearnResult(
         run=str(run),
         task=config.task_name,
@@ -111,7 +112,8 @@ def learn(
         steps=trainer.step,
         notes=tuple(notes),
         timings=clock.timings(),
-        **figures,
+        error_estimates=measured.estimates,
+        **{name: estimate.value for name, estimate in measured.estimates.items()},
     )
     note(run, learn=result.as_dict(), visibility=target.visibility.name)
     return result
@@ -189,80 +191,11 @@ def _refuse_blind_receiver(scenes: Sequence[Scene], points: np.ndarray) -> None:
         )
 
 
-def draw_samples(trainer: Trainer, count: int) -> Samples:
-    """Fresh samples of the flow with their log density and log target, in chunks."""
-    points, log_prob = [], []
-    with torch.no_grad():
-        for start in range(0, count, SAMPLE_CHUNK):
-            size = min(SAMPLE_CHUNK, count - start)
-            conditions = draw_conditions(trainer.flow, size, trainer.generator)
-            learned, log_density = trainer.flow(trainer.flow.draw_base(size, trainer.generator), conditions)
-            unit = trainer.coordinates.join(learned, conditions)
-            points.append(trainer.coordinates.space.from_unit(unit.cpu().double().numpy()))
-            log_prob.append(log_density.cpu().double().numpy())
-    points = np.concatenate(points)
-    offset = trainer.coordinates.log_condition_density - trainer.coordinates.log_unit_volume
-    return Samples(
-        points, np.concatenate(log_prob) + offset, trainer.target.log_density(points), trainer.coordinates.space
-    )
-
-
-def log_density_of(trainer: Trainer, points: np.ndarray) -> np.ndarray:
-    """The flow's log density per chart volume at any design points, (N, 6) to (N,); -inf outside the space."""
-    coordinates = trainer.coordinates
-    like = next(trainer.flow.parameters())
-    # points on the space's faces may leave it by rounding
-    unit = torch.as_tensor(coordinates.space.to_unit(points).clip(-1.0, 1.0)).to(like)
-    conditions = unit[:, coordinates.conditions] if coordinates.conditions else None
-    with torch.no_grad():
-        parts = [
-            trainer.flow.log_prob(
-                unit[rows][:, coordinates.learned], None if conditions is None else conditions[rows]
-            )
-            for rows in torch.arange(len(unit)).split(SAMPLE_CHUNK)
-        ]
-    log_prob = torch.cat(parts).cpu().double().numpy()
-    log_prob = np.where(coordinates.space.contains(points), log_prob, -np.inf)
-    return log_prob + coordinates.log_condition_density - coordinates.log_unit_volume
-
-
-@phase("measuring")
-def _measure(
-    trainer: Trainer, scenes: Sequence[Scene], config: RunConfig, notes: list[str]
-) -> tuple[Samples, dict[str, Any]]:
-    samples = draw_samples(trainer, config.learning.samples)
-    groups = _condition_groups(config.space, samples.points)
-    found = quality(samples.log_prob, samples.log_target, groups)
-    count = config.learning.coverage_proposals
+def _measured(trainer: Trainer, scenes: Sequence[Scene], config: RunConfig) -> Measured:
     generator = random_generator(config.seed, "coverage")
-    points, log_density = independent_points(trainer.target, scenes, count, generator)
-    covered = Estimate(0.0, None)
-    if len(points):
-        log_z = _log_z_at(points, samples, groups, found.log_z)
-        covered = coverage(log_density_of(trainer, points), trainer.target.log_density(points), log_density, log_z)
-    else:
-        notes.append("coverage could not be measured and counts as 0: no independently drawn ray fits in the space")
-    estimates = {**found.estimates(), "coverage": covered}
-    return samples, {**{name: one.value for name, one in estimates.items()}, "error_estimates": estimates}
-
-
-def _condition_groups(space: DesignSpace, points: np.ndarray) -> np.ndarray | None:
-    """Which part of the first conditioning dimension's bounds points (N, 6) lie in, shape (N,)."""
-    if not space.conditioned:
-        return None
-    first = space.conditioned[0]
-    share = (points[:, first] - space.low[first]) / (space.high[first] - space.low[first])
-    return np.clip((share * CONDITION_GROUPS).astype(int), 0, CONDITION_GROUPS - 1)
-
-
-def _log_z_at(points: np.ndarray, samples: Samples, groups: np.ndarray | None, mean_log_z: float) -> np.ndarray | float:
-    """log Z of the condition group of each point; the mean where there are no conditions or no samples."""
-    if groups is None:
-        return mean_log_z
-    by_group = np.full(CONDITION_GROUPS, mean_log_z)
-    for group, part in quality_by_group(samples.log_weights, groups).items():
-        by_group[group] = part.log_z
-    return by_group[_condition_groups(samples.space, points)]
+    with phase("measuring"):
+        probes = draw_probes(trainer.target, scenes, config.learning.coverage_proposals, generator)
+    return measure(trainer, probes, config.learning.samples)
 
 
 @phase("writing")

@@ -1,0 +1,151 @@
+"""What a learned density is worth, measured on fresh samples of it and on points that know nothing of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from lidardesign.density.diagnostics import coverage, quality, quality_by_group
+from lidardesign.density.flow import DesignFlow
+from lidardesign.density.independent import independent_points
+from lidardesign.density.losses import draw_conditions
+from lidardesign.density.objective import Coordinates
+from lidardesign.density.overlap import Sides, overlap
+from lidardesign.density.target import Target
+from lidardesign.design.samples import Samples
+from lidardesign.estimates import Estimate
+from lidardesign.run.clock import phase
+from lidardesign.scene import Scene
+from lidardesign.space import DesignSpace
+
+SAMPLE_CHUNK = 16384
+CONDITION_GROUPS = 32
+
+
+class Learned(Protocol):
+    """A flow, the target that it was learned for, and the stream that its samples are drawn from."""
+
+    flow: DesignFlow
+    target: Target
+    coordinates: Coordinates
+    generator: torch.Generator
+
+
+@dataclass(frozen=True, eq=False)
+class Probes:
+    """Points that know nothing of a flow.
+
+    Arguments:
+        points: Design points inside the space, shape (N, 6).
+        log_proposal: log of the density that they were drawn from, up to a constant, shape (N,).
+        log_target: log p* at them, shape (N,).
+    """
+
+    points: np.ndarray
+    log_proposal: np.ndarray
+    log_target: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Fresh samples of a flow, and its figures with their errors.
+
+    Arguments:
+        samples: The samples with both log densities.
+        estimates: ess, kl_nats, log_z, coverage, and misplaced: the share of the mass in the wrong place.
+        notes: What the user should know.
+    """
+
+    samples: Samples
+    estimates: dict[str, Estimate]
+    notes: tuple[str, ...] = ()
+
+
+def draw_probes(target: Target, scenes: Sequence[Scene], count: int, generator: np.random.Generator) -> Probes:
+    """At most `count` probes of a target; none where no ray of the space comes near a surface."""
+    points, log_proposal = independent_points(target, scenes, count, generator)
+    return Probes(points, log_proposal, target.log_density(points) if len(points) else log_proposal)
+
+
+@phase("measuring")
+def measure(learned: Learned, probes: Probes, count: int) -> Measured:
+    """The figures of a flow from `count` fresh samples and from probes.
+
+    Raises:
+        NumericalError: A sample has no finite weight.
+    """
+    samples = draw_samples(learned, count)
+    space = samples.space
+    groups = condition_groups(space, samples.points)
+    found = quality(samples.log_prob, samples.log_target, groups)
+    covered, notes = Estimate(0.0, None), ()
+    sides = Sides(samples.log_weights, samples.log_weights, samples.log_weights, groups, groups)
+    if len(probes.points):
+        log_prob = log_density_of(learned, probes.points)
+        log_z = _log_z_at(probes.points, samples, groups, found.log_z)
+        covered = coverage(log_prob, probes.log_target, probes.log_proposal, log_z)
+        log_weights = probes.log_target - probes.log_proposal
+        theirs = condition_groups(space, probes.points)
+        sides = Sides(samples.log_weights, probes.log_target - log_prob, log_weights, groups, theirs)
+    else:
+        notes = ("coverage could not be measured and counts as 0: no independently drawn ray fits in the space",)
+    apart = overlap(sides)
+    misplaced = Estimate(apart.misplaced, apart.error)
+    return Measured(samples, {**found.estimates(), "coverage": covered, "misplaced": misplaced}, notes)
+
+
+def draw_samples(learned: Learned, count: int) -> Samples:
+    """Fresh samples of the flow with their log density and log target, in chunks."""
+    points, log_prob = [], []
+    flow, coordinates = learned.flow, learned.coordinates
+    with torch.no_grad():
+        for start in range(0, count, SAMPLE_CHUNK):
+            size = min(SAMPLE_CHUNK, count - start)
+            conditions = draw_conditions(flow, size, learned.generator)
+            values, log_density = flow(flow.draw_base(size, learned.generator), conditions)
+            unit = coordinates.join(values, conditions)
+            points.append(coordinates.space.from_unit(unit.cpu().double().numpy()))
+            log_prob.append(log_density.cpu().double().numpy())
+    points = np.concatenate(points)
+    offset = coordinates.log_condition_density - coordinates.log_unit_volume
+    return Samples(points, np.concatenate(log_prob) + offset, learned.target.log_density(points), coordinates.space)
+
+
+def log_density_of(learned: Learned, points: np.ndarray) -> np.ndarray:
+    """The flow's log density per chart volume at any design points, (N, 6) to (N,); -inf outside the space."""
+    flow, coordinates = learned.flow, learned.coordinates
+    like = next(flow.parameters())
+    # points on the space's faces may leave it by rounding
+    unit = torch.as_tensor(coordinates.space.to_unit(points).clip(-1.0, 1.0)).to(like)
+    conditions = unit[:, coordinates.conditions] if coordinates.conditions else None
+    with torch.no_grad():
+        parts = [
+            flow.log_prob(unit[rows][:, coordinates.learned], None if conditions is None else conditions[rows])
+            for rows in torch.arange(len(unit)).split(SAMPLE_CHUNK)
+        ]
+    log_prob = torch.cat(parts).cpu().double().numpy()
+    log_prob = np.where(coordinates.space.contains(points), log_prob, -np.inf)
+    return log_prob + coordinates.log_condition_density - coordinates.log_unit_volume
+
+
+def condition_groups(space: DesignSpace, points: np.ndarray) -> np.ndarray | None:
+    """Which part of the first conditioning dimension's bounds points (N, 6) lie in, shape (N,)."""
+    if not space.conditioned:
+        return None
+    first = space.conditioned[0]
+    share = (points[:, first] - space.low[first]) / (space.high[first] - space.low[first])
+    return np.clip((share * CONDITION_GROUPS).astype(int), 0, CONDITION_GROUPS - 1)
+
+
+def _log_z_at(points: np.ndarray, samples: Samples, groups: np.ndarray | None, mean_log_z: float) -> np.ndarray | float:
+    """log Z of the condition group of each point; the mean where there are no conditions or no samples."""
+    if groups is None:
+        return mean_log_z
+    by_group = np.full(CONDITION_GROUPS, mean_log_z)
+    for group, part in quality_by_group(samples.log_weights, groups).items():
+        by_group[group] = part.log_z
+    return by_group[condition_groups(samples.space, points)]
