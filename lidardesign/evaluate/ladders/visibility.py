@@ -1,0 +1,208 @@
+"""What visibility costs: none, quadrature or ray casting against opaque geometry; and midpoints of the quadrature."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidardesign.density.fields import Field, build_field
+from lidardesign.density.frames import FramesTarget
+from lidardesign.density.occlusion import NoOcclusion
+from lidardesign.density.opaque import opaque_target
+from lidardesign.density.receiver import HeardVisibility, common_receiver
+from lidardesign.density.settings import DensitySettings
+from lidardesign.density.target import PADDING_SIGMAS, Target, build_target
+from lidardesign.density.visibility import NoVisibility, Quadrature, Visibility
+from lidardesign.evaluate.accuracy import AccuracyRequest
+from lidardesign.evaluate.ladders.probes import (
+    BECAUSE,
+    ERROR_OF,
+    TOLERANCE,
+    Probes,
+    draw_probes,
+    few_columns,
+    run_target,
+    run_visibility,
+)
+from lidardesign.evaluate.rungs import Ladder, Rung, timed
+from lidardesign.scene import Mesh, Scene
+from lidardesign.space import DesignSpace
+
+LABEL = "visibility"
+POINTS = (16, 32, 64, 128, 256)
+REFERENCE_POINTS = 512
+# Errors of cheap ways, of the quadrature on a common table, and of that over bodies one by one.
+PROBES, TABLE_PROBES, BODY_PROBES = 32_768, 8192, 1024
+# A quadrature over bodies without a common table evaluates every body at every midpoint of every probe.
+MOST_BODIES = 120
+# Compiled loops are loaded before anything is timed.
+WARM_UP_PROBES = 32
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Scenes and what visibility is measured on there.
+
+    Arguments:
+        scenes: What p* is the density of.
+        off, cast: The target without visibility and with ray casting.
+        integrated: The target with quadrature.
+        probes: Points that know nothing of the flow.
+        few: How many of these a quadrature is evaluated at.
+        batch: How many of them are timed.
+    """
+
+    scenes: list[Scene]
+    off: Target
+    cast: Target
+    integrated: Target
+    probes: Probes
+    few: int
+    batch: int
+
+    @classmethod
+    def of(
+        cls, scenes: list[Scene], space: DesignSpace, settings: DensitySettings, seed: int, batch: int = 1024
+    ) -> Case:
+        """The targets of scenes, and probes.
+
+        Arguments:
+            scenes: All are used: see `affordable_scenes`.
+            space: The design space.
+            settings: Of the density.
+            seed: The root of the probes.
+            batch: The number of points that is timed.
+        """
+        cast = build_target(scenes, space, settings, "raycast")
+        if isinstance(cast, FramesTarget):
+            off = replace(cast, visibility=NoOcclusion())
+            integrated, few = build_target(scenes, space, settings, "quadrature"), BODY_PROBES
+        else:
+            off = replace(cast, visibility=_heard(NoVisibility(), scenes))
+            way = Quadrature(_occluders(cast, scenes, settings), settings.quadrature_points)
+            integrated, few = replace(cast, visibility=_heard(way, scenes)), TABLE_PROBES
+        return cls(scenes, off, cast, integrated, draw_probes(cast, scenes, PROBES, seed, "visibility"), few, batch)
+
+    def quadrature(self, points: int) -> Target:
+        """The target with so many midpoints."""
+        field = one_way(self.integrated.visibility).field
+        return replace(self.integrated, visibility=_heard(Quadrature(field, points), self.scenes))
+
+    def rung(self, setting: str, target: Target, exact: np.ndarray, *, default: bool) -> Rung:
+        """A target's error at as many probes as there are exact values (N,), and its time for a batch."""
+        probes, batch = self.probes.first(len(exact)), self.probes.points[: self.batch]
+        target.log_density_and_gradient(batch[:WARM_UP_PROBES])
+        _, seconds, memory = timed(lambda: target.log_density_and_gradient(batch))
+        error, uncertainty = probes.misplaced(target.log_density(probes.points), exact)
+        return Rung(setting, error, uncertainty, seconds, memory, default=default)
+
+    @property
+    def work(self) -> str:
+        """What is timed."""
+        return f"log p* with its gradient at {min(self.batch, len(self.probes.points))} design points"
+
+
+def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
+    """Ways against opaque geometry, and points of the quadrature against many; empty where no ray meets a target."""
+    scenes, config = list(request.request.train), request.config
+    few = affordable_scenes(scenes)
+    case = Case.of(few, config.space, config.density, config.seed, config.learning.batch)
+    if not len(case.probes.points):
+        return []
+    default, points = _own_setting(request)
+    part = _part(few, scenes)
+    unused = "" if default == "quadrature" else f"this run's visibility is {default}"
+    return [
+        replace(visibility_ladder(case, points, default), note=part),
+        replace(points_ladder(case, points if default == "quadrature" else None), note=_joined(unused, part)),
+    ]
+
+
+def visibility_ladder(case: Case, points: int, default: str) -> Ladder:
+    """No visibility, the quadrature with its own points, and ray casting.
+
+    Arguments:
+        case: What they are measured on.
+        points: Of the quadrature.
+        default: off, quadrature or raycast: what the run uses.
+    """
+    exact = opaque_target(case.cast, case.scenes).log_density(case.probes.points)
+    quadrature = case.quadrature(points)
+    rungs = [
+        case.rung("off", case.off, exact, default=default == "off"),
+        case.rung("quadrature", quadrature, exact[: case.few], default=default == "quadrature"),
+        case.rung("raycast", case.cast, exact, default=default == "raycast"),
+    ]
+    return Ladder(
+        "density.visibility", ERROR_OF, "", "opaque geometry, by exact first hits", TOLERANCE, BECAUSE, case.work, rungs
+    )
+
+
+def points_ladder(case: Case, default: int | None) -> Ladder:
+    """Midpoints of the quadrature against many of them; `default` is what the run uses, None without quadrature."""
+    probes = case.probes.first(case.few).points
+    exact = case.quadrature(REFERENCE_POINTS).log_density(probes)
+    rungs = [
+        case.rung(str(count), case.quadrature(count), exact, default=count == default)
+        for count in sorted({*POINTS, *([default] if default else [])})
+    ]
+    return Ladder(
+        knob="density.quadrature_points",
+        error_of=ERROR_OF,
+        unit="",
+        against=f"the integral with {REFERENCE_POINTS} points",
+        tolerance=TOLERANCE,
+        because=BECAUSE,
+        work=case.work,
+        rungs=rungs,
+    )
+
+
+def one_way(visibility: Visibility) -> Visibility:
+    """The way from the ray's origin, also where light comes back to a receiver."""
+    return visibility.one_way if isinstance(visibility, HeardVisibility) else visibility
+
+
+def _part(few: list[Scene], scenes: list[Scene]) -> str:
+    """Which part of the scenes was measured; "" where it was all of them."""
+    if few is scenes:
+        return ""
+    frames = f", {few[0].frames} frames of each" if scenes[0].frames > few[0].frames else ""
+    return f"measured on {len(few)} of {len(scenes)} training scenes{frames}"
+
+
+def _joined(*notes: str) -> str:
+    return "; ".join(note for note in notes if note)
+
+
+def _heard(way: Visibility, scenes: list[Scene]) -> Visibility:
+    """A way from the ray's origin, and back to the receiver where there is one."""
+    receiver = common_receiver(scenes)
+    return way if receiver is None else HeardVisibility(way, receiver)
+
+
+def _occluders(target: Target, scenes: list[Scene], settings: DensitySettings) -> Field:
+    """Distances to the occluders: those to the targets where they are the same bodies."""
+    if all(body.role == "both" for scene in scenes for body in scene.bodies):
+        return target.field
+    padding_m = PADDING_SIGMAS * settings.sigma_m
+    return build_field(scenes, lambda body: body.is_occluder, resolution=settings.field_resolution, padding_m=padding_m)
+
+
+def affordable_scenes(scenes: list[Scene]) -> list[Scene]:
+    """All scenes where their occluders share a table, else as many as a fine quadrature can evaluate."""
+    occluders = [body for scene in scenes for body in scene.bodies if body.is_occluder]
+    if all(isinstance(body.shape, Mesh) and body.poses.ndim == 2 for body in occluders):
+        return scenes
+    per_column = max(sum(body.is_occluder for body in scene.bodies) for scene in scenes)
+    return few_columns(scenes, max(MOST_BODIES // max(per_column, 1), 1))
+
+
+def _own_setting(request: AccuracyRequest) -> tuple[str, int]:
+    """What the run's probe decided, and the points of its quadrature, refined as they were."""
+    name = run_visibility(request) or request.config.density.visibility
+    if name != "quadrature":
+        return name, request.config.density.quadrature_points
+    return name, one_way(run_target(request).visibility).points
