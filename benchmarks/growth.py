@@ -1,7 +1,8 @@
 """How cost grows: learning with the number of scenes, simulation with rays, EM with sensors, all with free dimensions.
 
-Every table has a column `exponent`: the slope of the logarithm of the processor time between a row and the one above it, so that
-1 is growth in proportion and 0 none. Learning is a whole process with an empty field cache, at a small number of steps.
+Every table has a column `exponent`: the slope of the logarithm of the processor time between a row and the one above
+it, so that 1 is growth in proportion and 0 none. Learning is a whole process with an empty field cache, at a small
+number of steps.
 
     python benchmarks/growth.py [--of scenes] [--of rays] [--of sensors] [--of dimensions]
 """
