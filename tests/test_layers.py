@@ -60,6 +60,8 @@ HOMES = {
     "rich": ("lidardesign.cli.",),
     "plotly": ("lidardesign.evaluate.report",),
     "matplotlib": ("lidardesign.evaluate.plots",),
+    "distributed": ("lidardesign.evaluate.worker_cluster",),
+    "dask": (),
     # it can abort its process: only the one of its own imports it
     "mitsuba": ("lidardesign.simulate.light_transport_worker",),
     "mitransient": ("lidardesign.simulate.light_transport_worker",),

@@ -84,6 +84,15 @@ FailAbove = Annotated[
         show_default=False,
     ),
 ]
+Workers = Annotated[
+    str,
+    typer.Option(
+        "--workers",
+        metavar="N|tcp://HOST:PORT",
+        help="What scores held-out scenes: so many processes of this machine, or the workers of a dask scheduler "
+        "(extra: cluster). The scores are the same.",
+    ),
+]
 
 
 def evaluate(
@@ -99,6 +108,7 @@ def evaluate(
     plots: Plots = None,
     csv: Csv = None,
     fail_above: FailAbove = None,
+    workers: Workers = "1",
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -108,8 +118,10 @@ def evaluate(
     with command(json=json, quiet=quiet, debug=debug) as console:
         if fail_above is not None and not math.isfinite(fail_above):
             raise ConfigError(f"{fail_above}", where="--fail-above", allowed="a finite number")
+        from lidardesign.evaluate.workers import check_workers
         from lidardesign.run.config import judged_by
 
+        wanted = check_workers(workers)
         _check_baselines(baseline or [])
         planner, audit = planner_of(effects, detector, range_tolerance_mm, return_tolerance)
         entries, runs = _collect(targets)
@@ -119,7 +131,7 @@ def evaluate(
         if range_tolerance_mm is None:
             planner = replace(planner, tolerance=planner.tolerated.within(run.task.metric))
         request = replace(_request(run, entries, rays, baseline or [], seed), planner=planner, audit=audit)
-        evaluation = _evaluate(request, console)
+        evaluation = _evaluate_with(wanted, request, console)
         written = _write_files(evaluation, request, report, plots, csv)
         document = {**evaluation.as_dict(), "set": overrides or [], "files": [str(path) for path in written]}
         console.result(document, lambda rich: show_evaluation(document, written, rich))
@@ -231,6 +243,17 @@ def _request(
         lay_out=layouts,
         without_visibility=(lambda: twin_without_visibility(*made[0], layouts)) if made else None,
     )
+
+
+def _evaluate_with(wanted: int | str, request: EvaluationRequest, console: Console) -> Evaluation:
+    """The evaluation, its scenes scored by the workers that were asked for."""
+    from lidardesign.evaluate.workers import workers_of
+
+    with workers_of(wanted, most=len(request.test)) as scorer:
+        if scorer is None:
+            return _evaluate(request, console)
+        scorer.prepare(request)
+        return _evaluate(replace(request, scorer=scorer), console)
 
 
 def _evaluate(request: EvaluationRequest, console: Console) -> Evaluation:

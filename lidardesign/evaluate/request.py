@@ -14,6 +14,7 @@ from lidardesign.design.sensor import Design
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.evaluate.ablation import LayOut
 from lidardesign.evaluate.baselines import BASELINES
+from lidardesign.evaluate.passes import Scorer, score_here
 from lidardesign.scene import Scene
 from lidardesign.simulate.plan import Planner
 from lidardesign.space import DesignSpace
@@ -41,6 +42,7 @@ class EvaluationRequest:
             fitted to; called when that is asked for.
         planner: The detector, and how the effects that are simulated are chosen.
         audit: Whether all rows are scored under all effects too.
+        scorer: What scores the held-out scenes: this process, or workers (`evaluate.workers`) to the same numbers.
     """
 
     task: Task
@@ -59,6 +61,7 @@ class EvaluationRequest:
     without_visibility: Callable[[], tuple[Design, Samples]] | None = None
     planner: Planner = field(default_factory=Planner)
     audit: bool = False
+    scorer: Scorer = score_here
 
     def check(self) -> None:
         """Refuse what makes no sense.

@@ -9,8 +9,7 @@ same rays are scored once. All rows of a scene meet the same effects: those that
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -19,12 +18,12 @@ import numpy as np
 from lidardesign.evaluate.audit import Audit, audit_rows
 from lidardesign.evaluate.effects import effect_notes, summaries
 from lidardesign.evaluate.entries import Entry, entries_of
+from lidardesign.evaluate.passes import Progress, ScenePass
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.results import Evaluation, Paired, Row, worse_than_threshold
-from lidardesign.evaluate.scoring import score_lists, score_scene
+from lidardesign.evaluate.scoring import score_scene
 from lidardesign.evaluate.statistics import bootstrap_interval, paired_difference
 from lidardesign.simulate.plan import Plan, Planner
-from lidardesign.simulate.simulate import build_casters
 
 __all__ = [
     "Evaluation",
@@ -35,8 +34,6 @@ __all__ = [
     "score_scene",
     "worse_than_threshold",
 ]
-
-Progress = Callable[[int, int, str], None]
 
 
 @dataclass(eq=False)
@@ -126,28 +123,18 @@ def _score_all(
     progress: Progress | None,
     known: Sequence[Plan] = (),
 ) -> _Scored:
-    """Scene by scene, so that only one scene's casters are held at a time; plans that are known are not made again."""
+    """All scenes, here or by workers; plans that are known are not made again."""
     jobs = {entry.key: entry for entry in entries}
     tallies = {key: _Tally() for key in jobs}
-    plans, planning_seconds = [], 0.0
-    for done, scene in enumerate(request.test):
-        if progress:
-            progress(done, len(request.test), scene.name)
-        casters = build_casters(scene)
-        fired = [jobs[key].drawn(done) for key in jobs]
-        started = time.perf_counter()
-        lists = [rays for positions in fired for rays in positions]
-        plans.append(known[done] if known else planner.plan(scene, lists, casters))
-        planning_seconds += time.perf_counter() - started
-        scores = score_lists(request.task, scene, fired, casters, planner.physics(plans[-1], request.seed))
-        for tally, (score, seconds) in zip(tallies.values(), scores, strict=True):
+    scene_pass = ScenePass(lambda number: [entry.drawn(number) for entry in jobs.values()], planner, known)
+    scenes = request.scorer(request, scene_pass, progress)
+    for scene in scenes:
+        for tally, (score, seconds) in zip(tallies.values(), scene.scores, strict=True):
             tally.seconds += seconds
             tally.values.append(score.value)
             tally.details.append(score.details)
             tally.failures += score.failed
-    if progress:
-        progress(len(request.test), len(request.test), "")
-    return _Scored(tallies, plans, planning_seconds)
+    return _Scored(tallies, [scene.plan for scene in scenes], sum(scene.planning_seconds for scene in scenes))
 
 
 def _rows(request: EvaluationRequest, entries: Sequence[Entry], scored: _Scored) -> list[Row]:
