@@ -9,7 +9,7 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.console import command
-from lidardesign.cli.fit import GATES, LAYOUTS, check_level, check_sensors, fit_and_write, usual_layout
+from lidardesign.cli.fit import GATES, LAYOUTS, check_level, check_sensors, fit_and_write, load_libraries, usual_layout
 from lidardesign.cli.runs import check_choice, check_name, need_run, open_target, parse_at, sensor_count
 
 if TYPE_CHECKING:
@@ -50,6 +50,7 @@ def constrain(
     """Fit sensors again under constraints: seconds, nothing is learned again."""
     with command(json=json, quiet=quiet, debug=debug) as console:
         check_name(name)
+        load_libraries()
         if gates is not None:
             check_choice(gates, "--gates", GATES)
         if layout is not None:

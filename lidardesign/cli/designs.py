@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from lidardesign.design.sensor import Design, Sensor, Track
 
 MAX_SHOWN = 20
+ERROR_DIGITS = 2
+# Relative errors below what `number` shows of a figure are left out.
+SMALLEST_ERROR = 1e-4
 # Several designs may be fitted to one run at once; each holds the lock for an instant.
 WAIT_S = 10.0
 SPACE_MARK = ".space."
@@ -35,6 +38,15 @@ def number(value: Any, digits: int = 4) -> str:
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "-"
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
+
+
+def with_error(estimate: dict[str, Any]) -> str:
+    """A figure and its error as far as the error reaches, as `-3.142 +- 0.005`."""
+    value, error = estimate["value"], estimate["error"]
+    if not error or error < SMALLEST_ERROR * abs(value):
+        return number(value)
+    decimals = max(0, ERROR_DIGITS - 1 - math.floor(math.log10(error)))
+    return f"{value:.{decimals}f} +- {error:.{decimals}f}"
 
 
 def show_design(design: Design, rich: RichConsole) -> None:
@@ -154,10 +166,13 @@ def show_fit(document: dict[str, Any], design: Design, checks: Sequence[Any], ri
 
     show_design(design, rich)
     show_constraints(checks, rich)
-    figures = [f"log-likelihood {number(document['log_likelihood'])}", f"ESS {number(document['ess'], 3)}"]
-    if document["admissible_mass"] is not None:
-        figures.append(f"admissible mass {number(document['admissible_mass'], 3)}")
-    rich.print(f"{', '.join(figures)}, {number(document['seconds'], 3)} s")
+    figures = {"log-likelihood": "log_likelihood", "ESS": "ess", "admissible mass": "admissible_mass"}
+    estimates = document["error_estimates"]
+    known = [f"{name} {with_error(estimates[key])}" for name, key in figures.items() if key in estimates]
+    rich.print(f"{', '.join(known)}, {number(document['seconds'], 3)} s (+- are standard errors)")
+    rays = estimates.get("rays")
+    if rays is not None and rays["error"] > 0:
+        rich.print(f"whole rays: {number(rays['error'], 2)} of {rays['value']:.0f} are not where the weights say")
     rich.print(f"design: {escape(str(document['design']))}", soft_wrap=True)
 
 

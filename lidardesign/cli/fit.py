@@ -12,6 +12,7 @@ from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
 from lidardesign.cli.runs import check_choice, check_name, open_run, parse_at, provenance, sensor_count
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.run.clock import keep_timings, phase
 
 if TYPE_CHECKING:
     from lidardesign.cli.layouts import RunTarget
@@ -44,6 +45,7 @@ def fit(
     """Fit sensors to the density of RUN."""
     with command(json=json, quiet=quiet, debug=debug) as console:
         check_name(name)
+        load_libraries()
         if layout is not None:
             check_choice(layout, "--layout", LAYOUTS)
         if gates is not None:
@@ -67,6 +69,15 @@ def fit(
             level=check_level(opened.task.defaults.level if level is None else level),
             at=condition,
         )
+
+
+@phase("libraries")
+def load_libraries() -> None:
+    """Import what every fit needs, so that no other phase seems to take that long."""
+    import lidardesign.cli.layouts
+    import lidardesign.design.conditions
+    import lidardesign.design.fit
+    import lidardesign.run.config  # noqa: F401
 
 
 def check_level(level: float) -> float:
@@ -136,29 +147,33 @@ def fit_and_write(
 
     path, target = run.design_path(name), RunTarget(run)
     samples = _samples_at(run, at or {}, seed, choices.get("rays"), target, console)
-    result: FitResult = fit_design(
-        samples,
-        constraints=constraints,
-        seed=seed,
-        name=name,
-        retarget=target,
-        **choices,
-    )
+    with phase("fitting"):
+        result: FitResult = fit_design(
+            samples,
+            constraints=constraints,
+            seed=seed,
+            name=name,
+            retarget=target,
+            **choices,
+        )
     for note in result.notes:
         console.note(f"note: {note}")
     made_by = provenance(run, path, command_name, seed)
     design = replace(result.design, provenance={**result.design.provenance, **made_by})
-    checks = check_written(design, constraints, run.config.space)
-    write_design(design, run.folder, path)
+    with phase("writing"):
+        checks = check_written(design, constraints, run.config.space)
+        write_design(design, run.folder, path)
     document = {
         **result.as_dict(),
         "design": str(path),
         "constraints": [_check_dict(check) for check in checks],
     }
     document["satisfied"] = all(check.satisfied for check in checks)
+    keep_timings(run.folder, command_name, console.clock)
     console.result(document, lambda rich: show_fit(document, design, checks, rich))
 
 
+@phase("samples")
 def _samples_at(
     run: Run, at: Mapping[str, float], seed: int, rays: int | None, target: RunTarget, console: Console
 ) -> Samples:

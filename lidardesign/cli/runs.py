@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
     from lidardesign.design.sensor import Design
@@ -57,7 +58,8 @@ def open_run(folder: Path) -> Run:
     Raises:
         DataError: There is none, or it is damaged.
     """
-    from lidardesign.run.config import load_run_config
+    with phase("libraries"):
+        from lidardesign.run.config import load_run_config
 
     task, config = load_run_config(folder)
     return Run(folder, task, config)

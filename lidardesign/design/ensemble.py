@@ -14,6 +14,7 @@ from lidardesign.design.mixture import Mixture, expect, log_density
 from lidardesign.design.mstep import maximise
 from lidardesign.design.resolve import Group, mean_azimuth
 from lidardesign.design.sensor import Sensor
+from lidardesign.run.clock import phase
 from lidardesign.space import DesignSpace
 from lidardesign.task import random_generator
 
@@ -100,6 +101,7 @@ class Ensemble:
         return mean, variance**0.5
 
 
+@phase("mixture")
 def fit_parts(parts: Sequence[Part], seed: int, restarts: int) -> Ensemble:
     """Fit every group."""
     traces = [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +17,7 @@ from lidardesign.design.coupling import couplings
 from lidardesign.design.ensemble import Ensemble, Part, fit_parts, heaviest_first, sensors_of
 from lidardesign.design.feasibility import check_feasible, least_sensors
 from lidardesign.design.features import Axes, Features
+from lidardesign.design.fit_result import FitResult
 from lidardesign.design.mount_choice import at_mounts
 from lidardesign.design.mounts import is_mounted, most_mounted, placement_notes
 from lidardesign.design.quantise import SAMPLES_PER_RAY
@@ -27,8 +28,11 @@ from lidardesign.design.scan import fit_scan, rays_of
 from lidardesign.design.sensor import DEFAULT_LEVEL, Design, Layout, Sensor, interval_factor
 from lidardesign.design.support import Retarget, Support, check_support, pinned, restricted
 from lidardesign.design.track_fit import fit_track
+from lidardesign.design.uncertainty import fit_estimates, likelihood_error
 from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.estimates import Estimate
 from lidardesign.numerics import systematic_draw
+from lidardesign.run.clock import phase
 from lidardesign.space import DIMENSIONS
 from lidardesign.task import random_generator
 
@@ -41,44 +45,6 @@ MOST_SENSORS = 12
 # It stops after this many counts in a row that gain less than one standard error.
 PATIENCE = 2
 HELD_OUT_SHARE = 1 / 3
-
-
-@dataclass(frozen=True, eq=False)
-class FitResult:
-    """A fitted design and how good it is.
-
-    Arguments:
-        design: The design; its provenance is for the caller to fill.
-        log_likelihood: Weighted mean log density of the samples [nats].
-        admissible_mass: The share of the density inside the constraints; None with pinned origins.
-        ess: Effective share of the samples that were admitted, 0 to 1.
-        satisfied: Whether every constraint holds on the finished design.
-        constraints: The independent checks.
-        seconds: Wall time [s].
-        notes: What happened to sensors, one line each.
-    """
-
-    design: Design
-    log_likelihood: float
-    admissible_mass: float | None
-    ess: float
-    satisfied: bool
-    constraints: list[ConstraintCheck]
-    seconds: float
-    notes: tuple[str, ...] = field(default=())
-
-    def as_dict(self) -> dict[str, Any]:
-        """The contract's JSON keys; the path of the design is for the caller to fill."""
-        return {
-            "design": self.design.name,
-            "sensors": [sensor.as_dict() for sensor in self.design.sensors],
-            "log_likelihood": self.log_likelihood,
-            "admissible_mass": self.admissible_mass,
-            "ess": self.ess,
-            "satisfied": self.satisfied,
-            "constraints": [check.as_dict() for check in self.constraints],
-            "seconds": self.seconds,
-        }
 
 
 @dataclass(frozen=True)
@@ -142,18 +108,20 @@ def fit(
         return _along_condition(samples, constraints, rays, level, seed, name)
     request = _Request(samples, constraints, seed, restarts, em_samples, level, retarget)
     read_out = ReadOut.of(constraints.budget, rays)
-    supports, fitted, total, score, notes = _solved(request, read_out, sensors, layout)
+    supports, fitted, total, ensemble = _solved(request, read_out, sensors, layout)
     design = _design(fitted, layout, total, request, name, gates or own_gates(layout))
-    checks = check_design(_document(design), constraints, samples.space)
+    checks = _checked(design, constraints, samples)
+    score = Estimate(ensemble.log_likelihood, likelihood_error(ensemble, supports), "nats")
     return FitResult(
         design=design,
-        log_likelihood=score,
+        log_likelihood=score.value,
         admissible_mass=_mass(supports),
         ess=sum(s.effective for s in supports) / max(sum(len(s.points) for s in supports), 1),
         satisfied=all(check.satisfied for check in checks),
         constraints=checks,
         seconds=time.perf_counter() - started,
-        notes=(*placement_notes(constraints), *notes),
+        notes=(*placement_notes(constraints), *ensemble.notes),
+        error_estimates=fit_estimates(score, supports, samples, design.sensors),
     )
 
 
@@ -163,7 +131,8 @@ def _along_condition(
     """A track: the rays of a scan for every value of the samples' condition."""
     started = time.perf_counter()
     fitted = fit_track(samples, rays=rays, constraints=constraints, level=level, seed=seed, name=name)
-    checks = check_design(_document(fitted.design), constraints, samples.space)
+    checks = _checked(fitted.design, constraints, samples)
+    score = Estimate(fitted.log_likelihood, fitted.log_likelihood_error, "nats")
     return FitResult(
         design=fitted.design,
         log_likelihood=fitted.log_likelihood,
@@ -173,26 +142,32 @@ def _along_condition(
         constraints=checks,
         seconds=time.perf_counter() - started,
         notes=placement_notes(constraints),
+        error_estimates=fit_estimates(score, [fitted.support], samples, fitted.design.sensors),
     )
+
+
+@phase("checks")
+def _checked(design: Design, constraints: Constraints, samples: Samples) -> list[ConstraintCheck]:
+    return check_design(_document(design), constraints, samples.space)
 
 
 def _solved(
     request: _Request, read_out: ReadOut, sensors: int | str | None, layout: Layout
-) -> tuple[list[Support], tuple[Sensor, ...], int | None, float, tuple[str, ...]]:
-    """Samples, sensors, rays per frame, log-likelihood and notes of the fit that keeps its budget."""
+) -> tuple[list[Support], tuple[Sensor, ...], int | None, Ensemble]:
+    """Samples, sensors, rays per frame, and the fit that keeps its budget."""
     constraints, space = request.constraints, request.samples.space
     if layout == "scan":
         request = replace(request, em_samples=max(request.em_samples, SAMPLES_PER_RAY * rays_of(read_out)))
         supports = _supports(request, 1)
         part = _features(request, supports, 1)[0]
-        beams, score = fit_scan(part.features, space, constraints, part.group, read_out, request.level, request.seed)
-        return supports, beams, len(beams), score, ()
+        beams, fit = fit_scan(part.features, space, constraints, part.group, read_out, request.level, request.seed)
+        return supports, beams, len(beams), fit
     supports, ensemble = _fitted(request, sensors)
     ensemble, total = within_budget(ensemble, Ensemble.narrowed, lambda e: (e.widths_m, e.weights), read_out)
     fitted = couplings(ensemble, sensors_of(ensemble, space, request.level))
     if not constraints.each:
         fitted = heaviest_first(fitted)
-    return supports, fitted, total, ensemble.log_likelihood, ensemble.notes
+    return supports, fitted, total, ensemble
 
 
 def _check_options(
@@ -266,6 +241,7 @@ def _fitted(request: _Request, sensors: int | str | None) -> tuple[list[Support]
     return supports, fit_parts(_features(request, supports, count), request.seed, request.restarts)
 
 
+@phase("support")
 def _supports(request: _Request, count: int) -> list[Support]:
     """The samples of each group of sensors, refused where they are too few."""
     found = []
@@ -291,6 +267,7 @@ def _mass(supports: list[Support]) -> float | None:
     return None if any(mass is None for mass in masses) else float(max(m for m in masses if m is not None))
 
 
+@phase("features")
 def _features(request: _Request, supports: list[Support], count: int) -> list[Part]:
     """Features, bounds and shares of each group of sensors.
 

@@ -29,6 +29,7 @@ from lidardesign.design.support import Retarget
 from lidardesign.design.track import moved, placed
 from lidardesign.errors import ConfigError
 from lidardesign.numerics import systematic_draw
+from lidardesign.run.clock import phase
 from lidardesign.simulate.returns import Rays
 from lidardesign.space import DesignSpace, angles, direction
 from lidardesign.task import random_generator
@@ -201,6 +202,7 @@ def _distributed_rays(
     return Rays(origin, looking, gate, sensor, fire_times(int(shares.sum()), rate_hz))
 
 
+@phase("rays")
 def make_ray_table(
     design: Design, count: int, samples: Samples | None = None, gates: Gates | None = None, *, seed: int = 0
 ) -> RayTable:

@@ -34,6 +34,7 @@ from lidardesign.design.quantise import lloyd
 from lidardesign.design.resolve import Group, bounds_of
 from lidardesign.design.sensor import Sensor, interval_factor
 from lidardesign.errors import ConfigError
+from lidardesign.run.clock import phase
 from lidardesign.space import DesignSpace, direction, observed_point
 from lidardesign.task import random_generator
 
@@ -43,6 +44,7 @@ LLOYD_ITERATIONS = 15
 FEWEST_PER_RAY = 4
 
 
+@phase("scan")
 def fit_scan(
     features: Features,
     space: DesignSpace,
@@ -51,8 +53,8 @@ def fit_scan(
     read_out: ReadOut,
     level: float,
     seed: int,
-) -> tuple[tuple[Sensor, ...], float]:
-    """One sensor per ray, and the mean log-likelihood of the samples in their own cells [nats].
+) -> tuple[tuple[Sensor, ...], Ensemble]:
+    """One sensor per ray, and the components that they are of, in another order.
 
     Arguments:
         features: Weighted samples.
@@ -95,7 +97,7 @@ def fit_scan(
     sensors = sensors_of(fitted, space, level)
     order = sorted(sensors, key=lambda s: (round(s.elevation_rad, 9), s.azimuth_rad, s.range_m))
     named = tuple(replace(sensor, name=f"s{index}") for index, sensor in enumerate(order))
-    return named, fitted.log_likelihood
+    return named, fitted
 
 
 def rays_of(read_out: ReadOut) -> int:

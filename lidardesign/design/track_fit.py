@@ -30,9 +30,10 @@ from lidardesign.design.origins import free_boxes, origin_box
 from lidardesign.design.resolve import Group, bounds_of
 from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import DEFAULT_LEVEL, Design, Sensor, Track, interval_factor
-from lidardesign.design.support import check_support, restricted
+from lidardesign.design.support import Support, check_support, restricted
 from lidardesign.design.track import TRAVELLED, boresight_azimuth, interpolated
 from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.run.clock import phase
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace, angles, direction, observed_point
 from lidardesign.task import random_generator
 
@@ -53,14 +54,19 @@ class FittedTrack(NamedTuple):
         log_likelihood: Weighted mean log density of the samples, given their condition [nats].
         admissible_mass: The share of the density inside the constraints.
         ess: Effective share of the samples that were admitted, 0 to 1.
+        log_likelihood_error: Its standard error over other samples [nats].
+        support: The samples that were admitted.
     """
 
     design: Design
     log_likelihood: float
     admissible_mass: float
     ess: float
+    log_likelihood_error: float
+    support: Support
 
 
+@phase("track")
 def fit_track(
     samples: Samples,
     *,
@@ -94,6 +100,7 @@ def fit_track(
     group = Group((None, None, None), tuple(range(read_out.rays)))
     ends = _ends(samples.space, constraints, dimension, level)
     support = restricted(samples, constraints, group)
+    support = replace(support, mass=support.total)
     check_support(support, group, mass=support.total, several=False)
     places = _knots(*ends, support.effective, read_out.rays, knots)
     used = support.weights > 0
@@ -102,13 +109,13 @@ def fit_track(
     centres, labels = aimed_rays(along, read_out.rays, random_generator(seed, "track"))
     azimuth, elevation = _admitted(centres, along, bounds)
     track = _with_gates(along, labels, azimuth, elevation, bounds, level, read_out)
-    sensors, score = _sensors(along, labels, track, bounds, level)
+    sensors, score, error = _sensors(along, labels, track, bounds, level)
     design = Design(
         name=name, sensors=sensors, layout="scan", rays=read_out.rays, constraints=constraints.as_document(),
         level=level, track=track, at=fixed_conditions(samples.space),
     )  # fmt: skip
     ess = support.effective / max(len(support.points), 1)
-    return FittedTrack(design, score, float(support.total), float(ess))
+    return FittedTrack(design, score, float(support.total), float(ess), error, support)
 
 
 def _travelled(space: DesignSpace) -> int:
@@ -291,14 +298,21 @@ def _bridged(gates: np.ndarray) -> np.ndarray:
 
 def _sensors(
     along: Along, labels: np.ndarray, track: Track, bounds: Bounds, level: float
-) -> tuple[tuple[Sensor, ...], float]:
-    """One sensor per ray, the ray in the middle of its travel; and the log-likelihood of the samples [nats]."""
+) -> tuple[tuple[Sensor, ...], float, float]:
+    """One sensor per ray, the ray in the middle of its travel; the samples' log-likelihood and its error [nats]."""
     middle = float(along.knots[0] + along.knots[-1]) / 2
     seen = [knot for knot in range(len(along.knots)) if along.near(knot)[1].sum() > 0]
     found = {knot: _components(along, labels, track, knot, bounds) for knot in seen}
-    score = sum(share * float(near.weights @ log_density(rays, near)) for share, rays, near in found.values())
+    values = {knot: log_density(rays, near) for knot, (_, rays, near) in found.items()}
+    score = sum(share * float(near.weights @ values[knot]) for knot, (share, _, near) in found.items())
+    # a sample between two knots counts at both
+    influence = np.zeros(len(along.points))
+    for knot, of_knot in values.items():
+        chosen, weights = along.near(knot)
+        influence[chosen] += weights * (of_knot - score)
+    error = float(np.linalg.norm(influence))
     _, mixture, features = found[min(seen, key=lambda knot: abs(along.knots[knot] - middle))]
-    return _in_the_middle(track, middle, along, mixture, features.axes, level), score
+    return _in_the_middle(track, middle, along, mixture, features.axes, level), score, error
 
 
 def _components(
