@@ -8,7 +8,7 @@ import pytest
 from command_line import caller
 
 import lidardesign.density.learn as density_learn
-from lidardesign.density import training
+from lidardesign.density import measure, training
 
 SETTINGS = (
     "size=small", "train=2", "test=1", "frames=6", "learning.steps=40", "learning.batch=64", "learning.samples=1000",
@@ -76,14 +76,13 @@ def test_a_space_too_narrow_for_any_ray_is_refused_before_learning(lidardesign):
 
 
 def test_coverage_that_cannot_be_measured_counts_as_none_and_is_said(lidardesign, monkeypatch):
-    draw, calls = density_learn.independent_points, []
+    draw = measure.independent_points
 
-    def second_draw_is_empty(*arguments):
-        calls.append(1)
+    def none_is_drawn(*arguments):
         points, log_density = draw(*arguments)
-        return (points, log_density) if len(calls) == 1 else (points[:0], log_density[:0])
+        return points[:0], log_density[:0]
 
-    monkeypatch.setattr(density_learn, "independent_points", second_draw_is_empty)
+    monkeypatch.setattr(measure, "independent_points", none_is_drawn)
     done = learn(lidardesign, "run", "--set", "learning.steps=3")
     assert done.code == 0
     assert done.json["coverage"] == 0

@@ -14,6 +14,7 @@ from lidardesign.density import learn as learning
 from lidardesign.density import training
 from lidardesign.density.learn import learn
 from lidardesign.density.measure import log_density_of
+from lidardesign.density.prepare import prepare_target
 from lidardesign.density.settings import DensitySettings, LearningSettings
 from lidardesign.density.target import Target
 from lidardesign.design.samples import load_samples
@@ -194,7 +195,7 @@ def test_an_analytic_scene_is_learned_well(tmp_path):
     assert result.coverage > 0.9
     # log Z by plain Monte Carlo over the box
     points = space.sample(100_000, np.random.default_rng(0))
-    target, _ = learning.prepare_target(BallTask().scenes(None, "train", 0), config)
+    target, _ = prepare_target(BallTask().scenes(None, "train", 0), config)
     plain = math.log(np.exp(target.log_density(points)).mean()) + space.log_volume
     assert result.log_z == pytest.approx(plain, abs=0.1)
 

@@ -7,31 +7,24 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from lidardesign.density.flow import DesignFlow
-from lidardesign.density.independent import independent_points
-from lidardesign.density.losses import Pool
+from lidardesign.density.ground import Ground, prepare_ground
 from lidardesign.density.measure import Measured, draw_probes, measure
 from lidardesign.density.objective import Coordinates
-from lidardesign.density.prepare import prepare_target
-from lidardesign.density.receiver import common_receiver
 from lidardesign.density.snapshots import clear_snapshots
-from lidardesign.density.target import Target
 from lidardesign.density.training import PROGRESS, LearnProgress, Trainer
 from lidardesign.design.samples import Samples, save_samples
-from lidardesign.errors import ConfigError, DataError
+from lidardesign.errors import ConfigError
 from lidardesign.estimates import Estimate
-from lidardesign.registry import plugin_guard
 from lidardesign.run.checkpoint import save_arrays
 from lidardesign.run.clock import phase, running
 from lidardesign.run.config import RunConfig
 from lidardesign.run.manifest import note, record
 from lidardesign.scene import Scene
-from lidardesign.simulate.receiver_view import in_view
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction
-from lidardesign.task import Task, random_generator, scenes_of
+from lidardesign.space import AZIMUTH
+from lidardesign.task import Task, random_generator
 
 FLOW = "flow.safetensors"
 DEVICES = ("auto", "cpu", "cuda")
@@ -71,6 +64,7 @@ def learn(
     resume: bool = False,
     device: str = "auto",
     progress: Callable[[LearnProgress], None] | None = None,
+    ground: Ground | None = None,
 ) -> LearnResult:
     """Learn the density of a task into a run folder.
 
@@ -81,6 +75,7 @@ def learn(
         resume: Continue from the run's checkpoint; the result is that of an uninterrupted run, bit for bit.
         device: auto, cpu or cuda: where the flow lives. The target is always evaluated on the CPU.
         progress: Called about every tenth step.
+        ground: What `prepare_ground` made of the same task and configuration, to be learned on again.
 
     Raises:
         ConfigError, DataError: Unusable settings or scenes.
@@ -88,9 +83,9 @@ def learn(
     """
     place = choose_device(device)
     with running() as clock:
-        scenes = _training_scenes(task, config)
-        target, notes = prepare_target(scenes, config)
-        trainer = _trainer(target, scenes, config, run, place)
+        ground = prepare_ground(task, config) if ground is None else ground
+        notes = list(ground.notes)
+        trainer = make_trainer(ground, config, run, place)
         if resume:
             trainer.resume()
         else:
@@ -100,7 +95,7 @@ def learn(
             trainer.train(progress)
         # float32 steps train as well and 2.4 times faster, but float32 splines give wrong densities: measure in float64
         trainer.flow.double()
-        measured = _measured(trainer, scenes, config)
+        measured = _measured(trainer, ground.scenes, config)
         notes += measured.notes
         if trainer.skipped:
             notes.append(f"{trainer.skipped} steps were not finite and skipped")
@@ -115,17 +110,8 @@ def learn(
         error_estimates=measured.estimates,
         **{name: estimate.value for name, estimate in measured.estimates.items()},
     )
-    note(run, learn=result.as_dict(), visibility=target.visibility.name)
+    note(run, learn=result.as_dict(), visibility=ground.target.visibility.name)
     return result
-
-
-@phase("scenes")
-def _training_scenes(task: Task, config: RunConfig) -> list[Scene]:
-    with plugin_guard(config.task_name):
-        scenes = list(scenes_of(task, config.task, "train", config.seed, config.space))
-    if not scenes:
-        raise DataError(f"the task {config.task_name!r} gave no training scenes", where="task")
-    return scenes
 
 
 def choose_device(name: str) -> torch.device:
@@ -143,16 +129,19 @@ def choose_device(name: str) -> torch.device:
     return torch.device(name)
 
 
-def _trainer(
-    target: Target, scenes: Sequence[Scene], config: RunConfig, run: Path, device: torch.device
-) -> Trainer:
-    coordinates = Coordinates(config.space)
-    if not coordinates.learned:
-        raise ConfigError("every dimension of the design space is fixed", where="space", hint="free at least one")
-    settings = config.learning
+def make_trainer(ground: Ground, config: RunConfig, run: Path, device: torch.device) -> Trainer:
+    """A trainer at its first step."""
     generator = torch.Generator().manual_seed(config.seed)
+    flow = make_flow(config, generator).to(device=device, dtype=getattr(torch, config.learning.dtype))
+    coordinates = Coordinates(config.space)
+    return Trainer(flow, ground.target, coordinates, config.learning, run, generator, ground.pool)
+
+
+def make_flow(config: RunConfig, generator: torch.Generator) -> DesignFlow:
+    """The flow of a configuration with its initial weights."""
+    coordinates, settings = Coordinates(config.space), config.learning
     circular = [config.space.free[n] == AZIMUTH and config.space.full_azimuth for n in coordinates.learned]
-    flow = DesignFlow(
+    return DesignFlow(
         coordinates.blocks,
         len(coordinates.conditions),
         layers=settings.layers,
@@ -160,35 +149,7 @@ def _trainer(
         bins=settings.bins,
         periodic=circular,
         generator=generator,
-    ).to(device=device, dtype=getattr(torch, settings.dtype))
-    return Trainer(flow, target, coordinates, settings, run, generator, _pool(target, scenes, config))
-
-
-@phase("proposals")
-def _pool(target: Target, scenes: Sequence[Scene], config: RunConfig) -> Pool:
-    """Proposals for balancing, independent of those that coverage is measured on."""
-    count = config.learning.balance_proposals
-    generator = random_generator(config.seed, "balancing")
-    points, log_density = independent_points(target, scenes, count, generator)
-    if not len(points):
-        raise DataError(
-            "no ray of the design space reaches a target surface in any training scene",
-            where="space",
-            hint="widen the angles or the range, or move the origin",
-        )
-    _refuse_blind_receiver(scenes, points)
-    return Pool.of(config.space.to_unit(points), target.log_density(points), log_density)
-
-
-def _refuse_blind_receiver(scenes: Sequence[Scene], points: np.ndarray) -> None:
-    receiver = common_receiver(scenes)
-    reached = points[:, :3] + points[:, RANGE, None] * direction(points[:, AZIMUTH], points[:, ELEVATION])
-    if receiver is not None and not in_view(receiver, reached).any():
-        raise DataError(
-            "its field of view and range hold no surface that a ray of the design space reaches",
-            where="receiver",
-            hint="turn it, widen its field of view or its range, or move it",
-        )
+    )
 
 
 def _measured(trainer: Trainer, scenes: Sequence[Scene], config: RunConfig) -> Measured:

@@ -1,0 +1,82 @@
+"""What learning stands on, however many steps it takes: scenes, the target, and proposals for balancing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidardesign.density.independent import independent_points
+from lidardesign.density.losses import Pool
+from lidardesign.density.prepare import prepare_target
+from lidardesign.density.receiver import common_receiver
+from lidardesign.density.target import Target
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.registry import plugin_guard
+from lidardesign.run.clock import phase
+from lidardesign.run.config import RunConfig
+from lidardesign.scene import Scene
+from lidardesign.simulate.receiver_view import in_view
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction
+from lidardesign.task import Task, random_generator, scenes_of
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """The training scenes of a task, their target, notes about it, and the proposals that balancing draws from."""
+
+    scenes: Sequence[Scene]
+    target: Target
+    notes: tuple[str, ...]
+    pool: Pool
+
+
+def prepare_ground(task: Task, config: RunConfig) -> Ground:
+    """The ground of a task; it does not depend on the steps, the flow or its optimiser.
+
+    Raises:
+        ConfigError, DataError: Unusable settings or scenes.
+        PluginError: The task's own code failed.
+    """
+    if not set(config.space.free) - set(config.space.conditioned):
+        raise ConfigError("every dimension of the design space is fixed", where="space", hint="free at least one")
+    scenes = _training_scenes(task, config)
+    target, notes = prepare_target(scenes, config)
+    return Ground(scenes, target, tuple(notes), _pool(target, scenes, config))
+
+
+@phase("scenes")
+def _training_scenes(task: Task, config: RunConfig) -> list[Scene]:
+    with plugin_guard(config.task_name):
+        scenes = list(scenes_of(task, config.task, "train", config.seed, config.space))
+    if not scenes:
+        raise DataError(f"the task {config.task_name!r} gave no training scenes", where="task")
+    return scenes
+
+
+@phase("proposals")
+def _pool(target: Target, scenes: Sequence[Scene], config: RunConfig) -> Pool:
+    """Proposals for balancing, independent of those that coverage is measured on."""
+    count = config.learning.balance_proposals
+    generator = random_generator(config.seed, "balancing")
+    points, log_density = independent_points(target, scenes, count, generator)
+    if not len(points):
+        raise DataError(
+            "no ray of the design space reaches a target surface in any training scene",
+            where="space",
+            hint="widen the angles or the range, or move the origin",
+        )
+    _refuse_blind_receiver(scenes, points)
+    return Pool.of(config.space.to_unit(points), target.log_density(points), log_density)
+
+
+def _refuse_blind_receiver(scenes: Sequence[Scene], points: np.ndarray) -> None:
+    receiver = common_receiver(scenes)
+    reached = points[:, :3] + points[:, RANGE, None] * direction(points[:, AZIMUTH], points[:, ELEVATION])
+    if receiver is not None and not in_view(receiver, reached).any():
+        raise DataError(
+            "its field of view and range hold no surface that a ray of the design space reaches",
+            where="receiver",
+            hint="turn it, widen its field of view or its range, or move it",
+        )
