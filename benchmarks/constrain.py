@@ -1,7 +1,8 @@
-"""`lidardesign constrain` as a whole process over constraint sets of every kind, and `lidardesign --help`.
+"""`lidardesign constrain` as a whole process over constraint sets of every kind, against learning again.
 
 The run has its origin free in a box of 10 cm, so that origins can be pinned; it is learned first, with the preset
-that is named, unless one is given.
+that is named, unless one is given. Without `constrain`, another set of constraints would take learning again and a fit,
+which is measured with the run's own settings and its fields in the cache. `lidardesign --help` is timed as well.
 
     python benchmarks/constrain.py [--run RUN]
 """
@@ -45,6 +46,21 @@ def constrain(run: Path, name: str) -> ProcessResult:
     return run_process(lidardesign(*words))
 
 
+def again(run: Path, folder: Path) -> dict[str, ProcessResult]:
+    """Learning with the settings of a run once more, and a fit."""
+    from lidardesign.run.yaml import dump_yaml, load_yaml
+
+    recorded = load_yaml(run / "config.yaml").value
+    settings = folder / "again.yaml"
+    sections = {name: recorded[name] for name in ("task", "space", "density", "learning")}
+    settings.write_text(dump_yaml(sections), encoding="utf-8")
+    words = ["learn", recorded["task_name"], "--config", settings, "--seed", str(recorded["seed"])]
+    words += ["--preset", recorded["preset"], "--out", folder / "again", "--json"]
+    found = {"learn again": run_process(lidardesign(*words))}
+    found["fit"] = run_process(lidardesign("fit", folder / "again", "--name", "benchmark", "--json"))
+    return found
+
+
 def learned(folder: Path, preset: str, model: str, settings: list[str]) -> Path:
     """A run with a free origin."""
     words = ["learn", "face", "--preset", preset, "--set", "origin_box_m=0.05", "--out", folder / "run", "--json"]
@@ -67,6 +83,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         run = options.run or learned(Path(folder), options.preset, options.model, options.set)
         results = {name: [constrain(run, name) for _ in range(options.rounds)] for name in names}
+        anew = again(run, Path(folder))
     helps = [run_process(lidardesign("--help")) for _ in range(options.rounds)]
     rows = []
     for name, found in results.items():
@@ -77,13 +94,20 @@ def main() -> None:
             answer, ess = f"satisfied: {document['satisfied']}", document["ess"]
         walls, cpus, peaks = zip(*((one.wall, one.cpu, one.peak_mib) for one in found), strict=True)
         rows.append([name, *map(statistics.median, (walls, cpus)), max(peaks), answer, ess])
+    renewed = anew["learn again"].document()
+    for name, one in anew.items():
+        rows.append([name, one.wall, one.cpu, one.peak_mib, "", renewed["ess"] if name == "learn again" else ""])
     everything = [one.wall for found in results.values() for one in found]
+    renewal = sum(one.wall for one in anew.values())
     cpu = [one.cpu for found in results.values() for one in found]
     report(
         "lidardesign constrain: whole processes",
         {"Medians": (["constraints", "wall s", "CPU s", "peak MiB", "answer", "ESS"], rows)},
         [
             f"constrain: median {statistics.median(everything):.2f} s, slowest {max(everything):.2f} s",
+            f"learning again and fitting: {renewal:.1f} s (fields {renewed['timings'].get('fields', 0.0):.1f} s), "
+            f"{renewal / statistics.median(everything):.0f} times the median, {renewal / max(everything):.0f} times "
+            "the slowest",
             f"--help: median {statistics.median(one.wall for one in helps):.2f} s",
             f"CPU / wall: {median_ratio(cpu, everything):.2f} (below 1: the machine was shared)",
         ],
