@@ -96,8 +96,11 @@ class _Block(nn.Module):
             return inputs, log_slope[:, 0]
         columns = list(torch.zeros_like(outputs).split(1, dim=-1))
         total = torch.zeros_like(outputs[:, 0])
-        for dimension in order.argsort().tolist():
-            parameters = self._of_dimension(dimension, layer, _joined(torch.cat(columns, dim=-1), context))
+        for turn, dimension in enumerate(order.argsort().tolist()):
+            known = _joined(torch.cat(columns, dim=-1), context)
+            # the first one depends on the context alone: without one, all points share its parameters
+            seen = known[:1] if turn == 0 and context is None else known
+            parameters = self._of_dimension(dimension, layer, seen).expand(len(outputs), -1, -1)
             column = slice(dimension, dimension + 1)
             columns[dimension], log_slope = spline(
                 outputs[:, column], parameters, self.periodic[column], inverted=True
