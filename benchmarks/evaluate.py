@@ -1,4 +1,6 @@
-"""`lidardesign evaluate` on designs of 2, 4 and 10 sensors: time of the whole process, and all that it found.
+"""`lidardesign evaluate` on designs of 2, 4 and 10 sensors: throughput, time by phase, and all that it found.
+
+Numbers of workers take turns, and their rows are compared.
 
 python benchmarks/evaluate.py [--run RUN]
 """
@@ -10,8 +12,20 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from common import face_settings, lidardesign, model_option, parser, report, run_process
+from common import (
+    ProcessResult,
+    face_settings,
+    lidardesign,
+    median_ratio,
+    model_option,
+    parser,
+    report,
+    run_process,
+    verdict,
+)
 
+# The phase of `evaluate` that casts rays at held-out scenes and scores what returns.
+SCORING = "held-out scenes"
 BASELINES = ("uniform", "random", "bounding")
 
 
@@ -81,6 +95,40 @@ def bandwidth_lines(found: dict[str, Any]) -> list[str]:
     return lines
 
 
+def rays_scored(found: dict[str, Any]) -> int:
+    """Rays that were simulated and scored, over all designs, budgets and held-out scenes."""
+    return found["scenes"] * sum(row["rays"] for row in (*found["rows"], *found["equal_bandwidth"]))
+
+
+def throughput_rows(results: dict[int, list[ProcessResult]]) -> list[list[object]]:
+    """One row per number of workers: medians of the whole process, rays per second, ratio to the first."""
+    first, rows = next(iter(results.values())), []
+    for workers, found in results.items():
+        walls, cpus, peaks = zip(*((one.wall, one.cpu, one.peak_mib) for one in found), strict=True)
+        scoring = [one.document()["timings"][SCORING] for one in found]
+        per_second = rays_scored(found[0].document()) / statistics.median(scoring)
+        faster = median_ratio([one.document()["timings"][SCORING] for one in first], scoring)
+        medians = (*map(statistics.median, (walls, cpus)), max(peaks), statistics.median(scoring))
+        rows.append([workers, *medians, per_second, faster])
+    return rows
+
+
+def phase_rows(found: dict[str, Any]) -> list[list[object]]:
+    """Seconds of every phase."""
+    total = sum(seconds for name, seconds in found["timings"].items() if "/" not in name)
+    return [[name, seconds, 100 * seconds / total] for name, seconds in found["timings"].items()]
+
+
+def same_rows(results: dict[int, list[ProcessResult]]) -> bool:
+    """Whether every run found the same scores; the seconds that rows report may differ."""
+    kept = [
+        [{key: value for key, value in row.items() if key != "seconds"} for row in one.document()["rows"]]
+        for found in results.values()
+        for one in found
+    ]
+    return all(rows == kept[0] for rows in kept)
+
+
 def main() -> None:
     """Measure and print."""
     made = parser(__doc__, rounds=1)
@@ -91,17 +139,25 @@ def main() -> None:
     made.add_argument("--sensors", type=int, nargs="+", default=[2, 4, 10])
     made.add_argument("--layout", default="grid", choices=["grid", "density", "distributed"])
     made.add_argument("--rays", type=int, nargs="+", default=[36, 100, 196, 361, 576])
+    made.add_argument("--workers", type=int, nargs="+", default=[1, 2], help="tried one after the other")
     options = made.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         _, designs = prepared(Path(folder), options)
         words = ["evaluate", *designs, "--json"]
         for rays in options.rays:
             words += ["--rays", str(rays)]
-        results = [run_process(lidardesign(*words)) for _ in range(options.rounds)]
-        found = results[0].document()
+        results: dict[int, list[ProcessResult]] = {workers: [] for workers in options.workers}
+        for _ in range(options.rounds):
+            for workers, done in results.items():
+                done.append(run_process(lidardesign(*words, "--workers", str(workers))))
+        found = results[options.workers[0]][0].document()
     unit = found["metric"]["unit"]
     tables = {
-        "Whole process": (["wall s", "CPU s", "peak MiB"], [[one.wall, one.cpu, one.peak_mib] for one in results]),
+        f"Whole process, {rays_scored(found)} rays scored": (
+            ["workers", "wall s", "CPU s", "peak MiB", "scoring s", "rays per s", "times as fast"],
+            throughput_rows(results),
+        ),
+        f"Phases with {options.workers[0]} worker(s)": (["phase", "s", "%"], phase_rows(found)),
         f"Scores on {found['scenes']} held-out scenes": (
             ["design", "rays", f"{found['metric']['name']} {unit}", "95 % interval", "failures", "Mbit/s"],
             score_rows(found),
@@ -116,7 +172,8 @@ def main() -> None:
         tables["At equal bandwidth"] = (columns, equal_bandwidth_rows(found))
         columns = ["design", "baseline", "design's rays", f"difference {unit}", "95 % interval", "design is"]
         tables["Paired differences at equal bandwidth"] = (columns, paired_rows(found, "paired_equal_bandwidth"))
-    report("lidardesign evaluate: faces", tables, bandwidth_lines(found), options.json)
+    lines = [*bandwidth_lines(found), verdict("the same scores", {"all runs": same_rows(results)})]
+    report("lidardesign evaluate: faces", tables, lines, options.json)
 
 
 if __name__ == "__main__":
