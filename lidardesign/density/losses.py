@@ -23,6 +23,7 @@ from torch import Tensor
 
 from lidardesign.density.flow import DesignFlow
 from lidardesign.density.objective import Coordinates, log_target
+from lidardesign.density.parallel import Ranks
 from lidardesign.density.target import Target
 
 # Log weights further than this from the mean pull no harder.
@@ -57,12 +58,22 @@ def pathwise_loss(
     eta: float,
     generator: torch.Generator,
 ) -> tuple[Tensor, float, float]:
-    """mean of (1 + eta) log p(d) - log p*(d) over flow samples; also its value for reports and the batch's ESS."""
-    conditions = draw_conditions(flow, count, generator)
-    learned, log_prob = flow(flow.draw_base(count, generator), conditions)
+    """mean of (1 + eta) log p(d) - log p*(d) over flow samples; also its value for reports and the batch's ESS.
+
+    Over several ranks each gets its own samples' part of the loss; the value and the ESS are of the whole batch.
+    """
+    ranks = target.ranks
+    conditions = _part(draw_conditions(flow, count, generator), ranks)
+    learned, log_prob = flow(ranks.part(flow.draw_base(count, generator)), conditions)
     log_p_star = log_target(coordinates.join(learned, conditions), target, coordinates, sigma_m)
-    loss = ((1 + eta) * log_prob - log_p_star).mean()
-    return loss, float(loss.detach()), effective_share(log_p_star - log_prob)
+    loss = ((1 + eta) * log_prob - log_p_star).sum() / count
+    every = ranks.gather(torch.stack([log_prob, log_p_star], dim=1).detach())
+    value = ((1 + eta) * every[:, 0] - every[:, 1]).mean()
+    return loss, float(value), effective_share(every[:, 1] - every[:, 0])
+
+
+def _part(rows: Tensor | None, ranks: Ranks) -> Tensor | None:
+    return None if rows is None else ranks.part(rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,27 +108,32 @@ class Pool:
 def balancing_loss(
     flow: DesignFlow, target: Target, coordinates: Coordinates, count: int, pool: Pool, generator: torch.Generator
 ) -> tuple[Tensor, float, float]:
-    """A loss whose gradient balances mass by values of p*; also the reverse KL loss and the batch's ESS."""
-    conditions = draw_conditions(flow, count, generator)
-    base = flow.draw_base(count, generator)
+    """A loss whose gradient balances mass by values of p*; also the reverse KL loss and the batch's ESS.
+
+    Over several ranks each gets its own samples' part of the loss; the other two are of the whole batch.
+    """
+    ranks = target.ranks
+    conditions = _part(draw_conditions(flow, count, generator), ranks)
+    base = ranks.part(flow.draw_base(count, generator))
     with torch.no_grad():
         learned, log_prob = flow(base, conditions)
     unit = coordinates.join(learned, conditions)
     points = coordinates.space.from_unit(unit.cpu().double().numpy())
     log_p_star = torch.as_tensor(target.log_density(points)).to(log_prob)
-    log_weights = log_p_star - log_prob
+    log_weights = ranks.gather(log_p_star - log_prob)
     log_z = log_weights.logsumexp(0) - np.log(count)
     centred = log_weights - log_z
     pull = centred.clamp(-LARGEST_PULL_NATS, LARGEST_PULL_NATS)
     pull = pull - pull.mean()
-    proposed, proposed_target = pool.draw(count, generator, learned)
+    proposed, proposed_target = map(ranks.part, pool.draw(count, generator, learned))
     foreign = proposed[:, coordinates.learned]
     contexts = None if conditions is None else torch.cat([conditions, proposed[:, coordinates.conditions]])
     both = flow.log_prob(torch.cat([learned, foreign]), contexts)
-    starved = (proposed_target - both[count:].detach() - log_z).clamp(max=np.log(LARGEST_EMPHASIS)).exp()
-    loss = -(pull * both[:count]).mean() - FORWARD_SHARE * (starved * both[count:]).mean()
-    leaked = centred < -LARGEST_PULL_NATS
-    if leaked.any():
+    own, others = both[: len(learned)], both[len(learned) :]
+    starved = (proposed_target - others.detach() - log_z).clamp(max=np.log(LARGEST_EMPHASIS)).exp()
+    loss = -(ranks.part(pull) * own).sum() / count - FORWARD_SHARE * (starved * others).sum() / count
+    leaked = ranks.part(centred) < -LARGEST_PULL_NATS
+    if (centred < -LARGEST_PULL_NATS).any():
         cost = _leak_cost(flow, target, coordinates, base[leaked], None if conditions is None else conditions[leaked])
         loss = loss + LEAK_WEIGHT * cost / count
     return loss, float(-log_weights.mean()), effective_share(log_weights)

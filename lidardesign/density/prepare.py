@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lidardesign.density.fields import TableField
+from lidardesign.density.parallel import ALONE, Ranks
+from lidardesign.density.parallel_target import SharedTarget, build_shared_target
 from lidardesign.density.proposals import occluded_share, propose
 from lidardesign.density.refinement import refine_quadrature
-from lidardesign.density.target import Target, build_target
+from lidardesign.density.target import Target
 from lidardesign.density.visibility import Optics
 from lidardesign.run.clock import phase
 from lidardesign.run.config import RunConfig
@@ -21,7 +23,12 @@ HIDDEN_SHARE_TO_WARN = 0.99
 
 @phase("fields")
 def prepare_target(
-    scenes: Sequence[Scene], config: RunConfig, *, visibility: str | None = None, compiled: bool = True
+    scenes: Sequence[Scene],
+    config: RunConfig,
+    *,
+    visibility: str | None = None,
+    compiled: bool = True,
+    ranks: Ranks = ALONE,
 ) -> tuple[Target, list[str]]:
     """The target of training scenes, and notes on what was decided or is doubtful.
 
@@ -30,13 +37,14 @@ def prepare_target(
         config: The run's configuration; visibility `auto` is decided here by a probe.
         visibility: What an earlier probe of the same run decided, to take instead.
         compiled: See `build_target`.
+        ranks: Who shares the scenes.
     """
     settings, notes = config.density, []
     visibility = visibility or settings.visibility
     if visibility == "auto":
         visibility, reason = _choose_visibility(scenes, config)
         notes.append(reason)
-    target = build_target(scenes, config.space, settings, visibility, compiled=compiled)
+    target = build_shared_target(scenes, config.space, settings, visibility, ranks, compiled=compiled)
     if visibility == "quadrature":
         target, refined = _refine_quadrature(target, scenes, config)
         notes.extend(refined)
@@ -66,10 +74,13 @@ def _choose_visibility(scenes: Sequence[Scene], config: RunConfig) -> tuple[str,
 def _refine_quadrature(target: Target, scenes: Sequence[Scene], config: RunConfig) -> tuple[Target, list[str]]:
     generator = random_generator(config.seed, "quadrature")
     proposals = propose(scenes, config.space, PROBES, config.density.sigma_m, generator)
+    if isinstance(target, SharedTarget):
+        return target.refined(proposals.points)
     return refine_quadrature(target, scenes, proposals.points)
 
 
 def _resolution_notes(target: Target, sigma_m: float) -> list[str]:
+    target = target.own if isinstance(target, SharedTarget) else target
     if not isinstance(target.field, TableField) or sigma_m >= target.field.grid.step / 2:
         return []
     grid = target.field.grid

@@ -10,10 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
 from lidardesign.density.fields import Field, TableField, build_field, scene_columns
+from lidardesign.density.parallel import ALONE, Ranks
 from lidardesign.density.receiver import HeardVisibility, common_receiver
 from lidardesign.density.settings import DensitySettings
 from lidardesign.density.visibility import (
@@ -28,6 +30,7 @@ from lidardesign.density.visibility import (
 )
 from lidardesign.errors import ConfigError, NumericalError
 from lidardesign.numerics import logsumexp
+from lidardesign.run.clock import phase
 from lidardesign.scene import Mesh, Scene
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, observed_point
 
@@ -56,6 +59,12 @@ class Target:
     optics: Optics
     space: DesignSpace
     surface_tolerance_nats: float = 16.0
+    ranks: ClassVar[Ranks] = ALONE  # who shares the columns
+
+    @property
+    def columns(self) -> int:
+        """The number of scenes and frames."""
+        return len(self.log_column_weights)
 
     @property
     def rows_at_once(self) -> int:
@@ -63,8 +72,10 @@ class Target:
         return self.visibility.rows_at_once
 
     def drawn(self, columns: np.ndarray) -> Target:
-        """A target in which some columns stand for all; tables hold scenes, which are not thinned: all of them stay."""
-        return self
+        """An estimate of p* from some columns alone, weighted to stand for all: of the others no visibility is computed."""
+        weights = np.full(self.columns, -np.inf)
+        weights[columns] = self.log_column_weights[columns] + np.log(self.columns / len(columns))
+        return replace(self, log_column_weights=weights)
 
     def log_proximity(self, points: np.ndarray, sigma_m: float | None = None) -> np.ndarray:
         """log of the sum of surface terms at the scene points that design points (N, 6) observe, shape (N,)."""
@@ -86,6 +97,7 @@ class Target:
         """log p* and its gradient by the chart coordinates of `space`: (N, 6) to (N,) and (N, 6)."""
         return self._in_chunks(points, sigma_m, gradient=True)
 
+    @phase("target")
     def _in_chunks(
         self, points: np.ndarray, sigma_m: float | None, gradient: bool
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -107,20 +119,28 @@ class Target:
         observed = rays.observed
         distances = self.field.distances(observed).astype(np.float64)
         surface = self.log_column_weights - np.square(distances / optics.sigma_m) / 2
-        active = surface >= surface.max(axis=1, keepdims=True) - self.surface_tolerance_nats
+        active = surface >= self._best(surface) - self.surface_tolerance_nats
         passed = self.visibility.transmittance(rays, active, optics, differentiable=gradient)
         terms = np.where(active, surface + passed.log_values, -np.inf)
-        peak = terms.max(axis=1, keepdims=True)
-        shares = np.exp(terms - peak)
-        total = shares.sum(axis=1, keepdims=True)
-        values = (peak + np.log(total))[:, 0]
+        values, shares = self._log_sums(terms)
         if not gradient:
             return values, None
-        shares /= total
         by_point = self.field.gradient(observed, -shares * distances / optics.sigma_m**2)
         by_ray = passed.gradient(shares)
         by_ray.add_by_point(by_point, rays)
         return values, self._by_chart(points, by_ray)
+
+    def _best(self, surface: np.ndarray) -> np.ndarray:
+        """The largest surface term of each point, (N, columns) to (N, 1)."""
+        return surface.max(axis=1, keepdims=True, initial=-np.inf)
+
+    def _log_sums(self, terms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """log of the sum of exp(terms) of each point (N,), and the share of each term in it (N, columns)."""
+        peak = terms.max(axis=1, keepdims=True)
+        shares = np.exp(terms - peak)
+        total = shares.sum(axis=1, keepdims=True)
+        shares /= total
+        return (peak + np.log(total))[:, 0], shares
 
     def _by_chart(self, points: np.ndarray, by_ray: RayGradient) -> np.ndarray:
         sin_a, cos_a = np.sin(points[:, AZIMUTH]), np.cos(points[:, AZIMUTH])
@@ -138,8 +158,9 @@ class Target:
 
 
 def build_target(
-    scenes: Sequence[Scene], space: DesignSpace, settings: DensitySettings, visibility: str, *, compiled: bool = True
-) -> Target:
+    scenes: Sequence[Scene], space: DesignSpace, settings: DensitySettings, visibility: str, *,
+    compiled: bool = True, around: Sequence[Scene] | None = None,
+) -> Target:  # fmt: skip
     """The target of scenes.
 
     Arguments:
@@ -148,6 +169,7 @@ def build_target(
         settings: Its numbers.
         visibility: raycast, quadrature or off; `prepare_target` decides auto.
         compiled: False for a few evaluations without gradient, which are not worth loading the kernels.
+        around: Scenes that one grid of distances must hold, more than these where other ranks have the others.
 
     Raises:
         ConfigError: A quadrature over too many moving bodies, or scenes with different receivers.
@@ -157,16 +179,17 @@ def build_target(
     frames = [scenes[index].frames for index, _ in scene_columns(scenes)]
     log_column_weights = -np.log(np.array(frames, dtype=np.float64))
     receiver = common_receiver(scenes)
-    if receiver is None and visibility != "quadrature" and not any(_has_mesh_at_rest(scene) for scene in scenes):
+    if is_of_frames(scenes, visibility):
         # frames builds on this module
         from lidardesign.density.frames import build_frames_target
 
         return build_frames_target(scenes, space, settings, visibility, log_column_weights, **fields)
-    _check_quadrature(scenes, visibility)
-    field = build_field(scenes, lambda body: body.is_target, **fields)
+    around = around or scenes
+    check_quadrature(around, visibility)
+    field = build_field(scenes, lambda body: body.is_target, around=around, **fields)
     if isinstance(field, TableField):
         field = replace(field, compiled=compiled)
-    way = _build_visibility(scenes, settings, visibility, field, fields)
+    way = _build_visibility(scenes, settings, visibility, field, {**fields, "around": around})
     return Target(
         field=field,
         visibility=way if receiver is None else HeardVisibility(way, receiver),
@@ -177,7 +200,16 @@ def build_target(
     )
 
 
-def _check_quadrature(scenes: Sequence[Scene], visibility: str) -> None:
+def is_of_frames(scenes: Sequence[Scene], visibility: str) -> bool:
+    """Whether scenes are best evaluated body by body, frame by frame (`frames`)."""
+    return (
+        common_receiver(scenes) is None
+        and visibility != "quadrature"
+        and not any(_has_mesh_at_rest(scene) for scene in scenes)
+    )
+
+
+def check_quadrature(scenes: Sequence[Scene], visibility: str) -> None:
     """Refuse a quadrature that would evaluate every body of thousands of frames at every midpoint."""
     moving = sum(scene.frames * len(scene.bodies) for scene in scenes if scene.frames > 1)
     if visibility == "quadrature" and moving > MOST_QUADRATURE_BODIES:
@@ -201,6 +233,6 @@ def _build_visibility(
         return NoVisibility()
     if visibility == "raycast":
         return Raycast(scenes)
-    same = all(body.role == "both" for scene in scenes for body in scene.bodies)
+    same = all(body.role == "both" for scene in fields["around"] for body in scene.bodies)
     occluders = field if same else build_field(scenes, lambda body: body.is_occluder, **fields)
     return Quadrature(occluders, settings.quadrature_points)

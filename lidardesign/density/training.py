@@ -28,7 +28,7 @@ from lidardesign.density.objective import Coordinates
 from lidardesign.density.settings import LearningSettings
 from lidardesign.density.snapshots import clear_snapshots, save_snapshot, snapshot_steps
 from lidardesign.density.target import Target
-from lidardesign.errors import DataError, DivergenceError, NumericalError
+from lidardesign.errors import DataError, DivergenceError, LostRankError, NumericalError
 from lidardesign.run.checkpoint import load_arrays, save_arrays
 from lidardesign.run.manifest import record
 
@@ -124,11 +124,19 @@ class Trainer:
         """Run the remaining steps, with checkpoints, one of them when it is interrupted; raises DivergenceError."""
         try:
             self._run_steps(progress)
-        except KeyboardInterrupt:
-            if self._snapshot is not None:
-                self._save(self._snapshot)
+        except (KeyboardInterrupt, LostRankError):
+            self._save_last()
             raise
         self._save(self._taken())
+
+    def _save_last(self) -> None:
+        if self._snapshot is None:
+            return
+        try:
+            self._save(self._snapshot)
+        except KeyboardInterrupt:  # a launcher ends the ranks that are left while this one saves what they did
+            self._save(self._snapshot)
+            raise
 
     def _run_steps(self, progress: Callable[[LearnProgress], None] | None) -> None:
         checkpointed = time.perf_counter()
@@ -151,6 +159,7 @@ class Trainer:
         loss, value, ess = self._loss()
         if torch.isfinite(loss):
             loss.backward()
+        self.target.ranks.sum_gradients(self.flow.parameters(), valid=bool(torch.isfinite(loss)))
         norm = torch.nn.utils.clip_grad_norm_(self.flow.parameters(), self.settings.clip_norm)
         if torch.isfinite(loss) and torch.isfinite(norm):
             self.optimiser.step()
@@ -176,10 +185,9 @@ class Trainer:
 
         Balancing needs the values of p* and sees all frames; at the final sigma few of them matter.
         """
-        columns = len(self.target.log_column_weights)
-        if columns <= self.settings.frames:
+        if self.target.columns <= self.settings.frames:
             return self.target
-        chosen = torch.randperm(columns, generator=self.generator)[: self.settings.frames]
+        chosen = torch.randperm(self.target.columns, generator=self.generator)[: self.settings.frames]
         return self.target.drawn(np.sort(chosen.numpy()))
 
     def _skip(self) -> None:
@@ -199,6 +207,8 @@ class Trainer:
         self._restore_arrays(self._snapshot.arrays)
 
     def _report(self, loss: float, ess: float, progress: Callable[[LearnProgress], None] | None) -> None:
+        if not self.target.ranks.first:
+            return
         seconds = self.seconds
         left = seconds / self.step * (self.settings.steps - self.step)
         row = {
@@ -249,20 +259,26 @@ class Trainer:
         return _Snapshot(self._state_arrays(), {**counters, "seconds": self.seconds})
 
     def _save(self, snapshot: _Snapshot) -> None:
+        if not self.target.ranks.first:
+            return
         save_arrays(self.run, CHECKPOINT, snapshot.arrays, snapshot.state)
         if (self.run / PROGRESS).exists():
             record(self.run, [PROGRESS])
 
     def _keep(self) -> None:
-        save_snapshot(self.flow, self.run, self.step)
+        if self.target.ranks.first:
+            save_snapshot(self.flow, self.run, self.step)
 
     def resume(self) -> None:
         """Take the state of the run's checkpoint; progress.jsonl and snapshots are cut back to it."""
-        arrays, state = load_arrays(self.run, CHECKPOINT)
+        ranks = self.target.ranks
+        arrays, state = ranks.state_of_first(lambda: load_arrays(self.run, CHECKPOINT))
         self._restore_arrays(arrays, with_generator=True)
         self.step, self.skipped = state["step"], state["skipped"]
         self.skipped_in_a_row, self.halvings = state["skipped_in_a_row"], state["halvings"]
         self.seconds_before, self._started = state["seconds"], time.perf_counter()
+        if not ranks.first:
+            return
         clear_snapshots(self.run, beyond=self.step)
         path = self.run / PROGRESS
         if path.exists():

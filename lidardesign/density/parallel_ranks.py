@@ -1,0 +1,146 @@
+"""Several ranks connected by torch.distributed: gloo between processes, nccl between their GPUs.
+
+`torchrun`, and whatever else sets RANK, WORLD_SIZE, MASTER_ADDR and MASTER_PORT, starts them. When a rank dies, the
+sockets to it close, and whatever the others wait for ends in a `LostRankError`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, distributed
+
+from lidardesign.density.parallel import ALONE, Ranks, Rows
+from lidardesign.errors import ConfigError, LostRankError
+
+# The longest that a rank may keep the others waiting: building the fields of its scenes can take minutes.
+PATIENCE = timedelta(minutes=30)
+# Another rank's message arrives on the launcher's own store within a fraction of this.
+TOLD_WITHIN = timedelta(seconds=2)
+
+
+def join_ranks(environment: dict[str, str] | os._Environ[str] = os.environ) -> Ranks:
+    """Meet the other ranks that a launcher's environment tells of; this process alone where it tells of none.
+
+    Raises:
+        ConfigError: The environment is not one that a launcher makes.
+        LostRankError: The others cannot be reached.
+    """
+    size = _number(environment, "WORLD_SIZE", 1)
+    if size == 1:
+        return ALONE
+    rank, local_rank = _number(environment, "RANK", 0), _number(environment, "LOCAL_RANK", 0)
+    if not distributed.is_available():
+        raise ConfigError("this torch was built without torch.distributed", where="WORLD_SIZE", allowed="1")
+    store, _, _ = _reached(lambda: next(distributed.rendezvous("env://", rank, size, timeout=PATIENCE)))
+    backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and distributed.is_nccl_available() else "gloo"
+    own = distributed.PrefixStore("lidardesign", store)
+    _reached(
+        lambda: distributed.init_process_group(backend, store=own, rank=rank, world_size=size, timeout=PATIENCE)
+    )
+    return ConnectedRanks(rank, size, local_rank, store=distributed.PrefixStore("messages", store))
+
+
+def _number(environment: Any, name: str, lowest: int) -> int:
+    text = environment.get(name, str(lowest))
+    if not text.isdecimal() or int(text) < lowest:
+        raise ConfigError(f"{text!r}", where=f"environment variable {name}", allowed=f"a whole number from {lowest}")
+    return int(text)
+
+
+def _reached(call: Callable[[], Any]) -> Any:
+    """The result of a call that waits for other ranks.
+
+    Raises:
+        LostRankError: One of them ended, or does not answer.
+    """
+    try:
+        return call()
+    except (RuntimeError, ConnectionError, TimeoutError) as error:
+        raise LostRankError(
+            f"another rank ended or does not answer ({str(error).splitlines()[0]})",
+            where="torchrun",
+            hint="look at that rank's own message; learning continues from the last checkpoint with --resume",
+        ) from None
+
+
+@dataclass(frozen=True)
+class ConnectedRanks(Ranks):
+    """One of several ranks.
+
+    Arguments:
+        store: Where ranks leave notes that outlive them.
+    """
+
+    store: Any = None
+
+    def gather(self, rows: Rows) -> Rows:
+        """See `Ranks`."""
+        if isinstance(rows, np.ndarray):
+            return self.gathered(rows)[0]
+        return self._gathered(rows)[0]
+
+    def gathered(self, rows: np.ndarray) -> tuple[np.ndarray, slice]:
+        """See `Ranks`."""
+        every, mine = self._gathered(torch.as_tensor(np.ascontiguousarray(rows)))
+        return every.numpy(), mine
+
+    def _gathered(self, rows: Tensor) -> tuple[Tensor, slice]:
+        counts = torch.zeros(self.size, dtype=torch.int64)
+        counts[self.rank] = len(rows)
+        _reached(lambda: distributed.all_reduce(counts))
+        longest, rows = int(counts.max()), rows.detach()
+        padded = rows.new_zeros(longest, *rows.shape[1:])
+        padded[: len(rows)] = rows
+        found = [torch.empty_like(padded) for _ in range(self.size)]
+        _reached(lambda: distributed.all_gather(found, padded))
+        every = torch.cat([part[:count] for part, count in zip(found, counts.tolist(), strict=True)])
+        start = int(counts[: self.rank].sum())
+        return every, slice(start, start + len(rows))
+
+    def _reduced(self, values: np.ndarray, operation: Any) -> np.ndarray:
+        # one type on all ranks, also where numpy found nothing to add up and made it an integer
+        total = torch.tensor(values, dtype=torch.float64)
+        _reached(lambda: distributed.all_reduce(total, operation))
+        return total.numpy()
+
+    def sum(self, values: np.ndarray) -> np.ndarray:
+        """See `Ranks`."""
+        return self._reduced(values, distributed.ReduceOp.SUM)
+
+    def max(self, values: np.ndarray) -> np.ndarray:
+        """See `Ranks`."""
+        return self._reduced(values, distributed.ReduceOp.MAX)
+
+    def share(self, content: bytes) -> bytes:
+        """See `Ranks`."""
+        length = torch.tensor([len(content)])
+        _reached(lambda: distributed.broadcast(length, 0))
+        sent = np.frombuffer(content, dtype=np.uint8) if self.first else np.zeros(int(length), dtype=np.uint8)
+        values = torch.tensor(sent)
+        _reached(lambda: distributed.broadcast(values, 0))
+        return values.numpy().tobytes()
+
+    def sum_gradients(self, parameters: Iterable[torch.nn.Parameter], *, valid: bool) -> None:
+        """See `Ranks`."""
+        parameters = list(parameters)
+        parts = [p.grad if p.grad is not None else torch.zeros_like(p) for p in parameters]
+        total = torch.cat([part.detach().reshape(-1) for part in parts])
+        if not valid:
+            total.fill_(torch.nan)
+        _reached(lambda: distributed.all_reduce(total))
+        start = 0
+        for parameter in parameters:
+            parameter.grad = total[start : start + parameter.numel()].view_as(parameter)
+            start += parameter.numel()
+
+    def leave(self) -> None:
+        """See `Ranks`."""
+        _reached(distributed.barrier)
+        distributed.destroy_process_group()
