@@ -1,0 +1,193 @@
+"""Fitting sensors: how many samples expectation maximisation works on, and how many seeds it tries."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from lidardesign.design.bounds import Bounds
+from lidardesign.design.conditions import MOVED_SAMPLES, at_condition, shown
+from lidardesign.design.constraints import Constraints
+from lidardesign.design.em import fit_mixture
+from lidardesign.design.features import Axes, Features
+from lidardesign.design.fit import EM_SAMPLES, HELD_OUT_SHARE, RESTARTS
+from lidardesign.design.mixture import log_density
+from lidardesign.design.resolve import bounds_of, groups
+from lidardesign.design.samples import FILE_NAME, Samples, load_samples
+from lidardesign.design.sensor import Design, interval_factor
+from lidardesign.evaluate.accuracy import AccuracyRequest
+from lidardesign.evaluate.rungs import Ladder, Rung, with_memory
+from lidardesign.numerics import systematic_draw
+from lidardesign.task import random_generator
+
+LABEL = "samples and seeds of the fit"
+SAMPLE_COUNTS = (1000, 2000, 5000, 10_000, 20_000)
+RESTART_COUNTS = (1, 2, 4, 8, 12)
+# Each setting is fitted so often, on another split and with other seeds. Few seeds are what luck decides most, and
+# are cheap.
+REPEATS = 6
+REPEATS_OF_RESTARTS = {1: 20, 2: 12, 4: 8}
+TOLERANCE_NATS = 0.01
+BECAUSE = "log densities that are 0.01 nats lower have one ray in a hundred fewer everywhere"
+
+
+def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
+    """Two ladders for the fit of the first design whose sensors are Gaussian; none for scans."""
+    design = next((one for one in request.request.designs if one.layout != "scan" and one.track is None), None)
+    if design is None:
+        return []
+    samples = _samples(request, design)
+    if samples is None:
+        return []
+    bench = FitBench(samples, len(design.sensors), design.level, request.request.seed)
+    counts = [*(count for count in SAMPLE_COUNTS if count < bench.pool), bench.pool]
+    usual = min(EM_SAMPLES, bench.pool)
+    # a single sensor has one best fit, which every seed finds
+    restarts = RESTART_COUNTS if bench.sensors > 1 else ()
+    for one in counts:
+        for repeat in range(REPEATS):
+            bench.fitted(repeat, one, RESTARTS)
+    for one in restarts:
+        for repeat in range(REPEATS_OF_RESTARTS.get(one, REPEATS)):
+            bench.fitted(repeat, usual, one)
+    names = {count: f"all {count}" if count == bench.pool else str(count) for count in counts}
+    of_samples = [bench.rung(names[one], one, RESTARTS, default=one == usual) for one in counts]
+    of_restarts = [bench.rung(str(one), usual, one, default=one == RESTARTS) for one in restarts]
+    found = [_ladder("samples of the fit", f"{RESTARTS} seeds", of_samples, design)]
+    return found + ([_ladder("seeds of the fit", f"{usual} samples", of_restarts, design)] if of_restarts else [])
+
+
+def _ladder(knob: str, beside: str, rungs: Sequence[Rung], design: Design) -> Ladder:
+    fitted = f"{len(design.sensors)} sensors, as {design.name} has"
+    held = "; without its constraints" if design.constraints else ""
+    where = f", at {shown(design.at)}" if design.at else ""
+    return Ladder(
+        knob=knob,
+        error_of="log density of held-out samples that is lost",
+        unit="nats",
+        against="the best fit of all settings to the same samples",
+        tolerance=TOLERANCE_NATS,
+        because=BECAUSE,
+        work=f"one fit of {fitted}{where}, with {beside}",
+        rungs=rungs,
+        note=f"{fitted}{where}{held}",
+    )
+
+
+def _samples(request: AccuracyRequest, design: Design) -> Samples | None:
+    """The samples that a design was fitted to, at its condition where it has one; None without any."""
+    samples = request.request.samples.get(design.name)
+    if samples is None and (request.run / FILE_NAME).exists():
+        samples = load_samples(request.run)
+    if samples is None or not samples.space.conditioned:
+        return samples
+    from lidardesign.density.prepare import prepare_target
+    from lidardesign.run.manifest import read_manifest
+
+    decided = read_manifest(request.run).get("visibility")
+    target = prepare_target(request.request.train, request.config, visibility=decided, compiled=False)[0]
+    generator = random_generator(request.request.seed, "mixture ladder")
+    return at_condition(samples, design.at, target.log_density, MOVED_SAMPLES, generator)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A fit: mean log density of the split's held-out samples [nats], time [s] and memory [bytes]."""
+
+    log_likelihood: float
+    seconds: float
+    memory_bytes: int | None
+
+
+@dataclass(eq=False)
+class FitBench:
+    """Fits of unconstrained sensors to one part of the samples, judged on the other, remembered.
+
+    Arguments:
+        samples: Weighted samples.
+        sensors: How many are fitted.
+        level: The share that their intervals hold.
+        seed: Root of splits, draws and seeds.
+    """
+
+    samples: Samples
+    sensors: int
+    level: float
+    seed: int
+    _known: dict[tuple[int, int, int], Fitted] = field(default_factory=dict)
+
+    @cached_property
+    def bounds(self) -> Bounds:
+        """What the space alone asks of the sensors."""
+        space, free = self.samples.space, Constraints()
+        group = groups(free, space, self.sensors)[0]
+        return bounds_of(free, space, group.sensors, interval_factor(self.level))
+
+    @property
+    def pool(self) -> int:
+        """Samples that are left to fit to."""
+        return len(self.samples) - round(HELD_OUT_SHARE * len(self.samples))
+
+    def fitted(self, repeat: int, count: int, restarts: int) -> Fitted:
+        """A fit to `count` of the pool's samples with so many seeds.
+
+        Repeats differ in their draws and seeds, and take one split after the other; of one repeat, fits with more
+        seeds also try those with fewer.
+        """
+        key = repeat, count, restarts
+        if key not in self._known:
+            self._known[key] = self._fit(*key)
+        return self._known[key]
+
+    def _fit(self, repeat: int, count: int, restarts: int) -> Fitted:
+        order = random_generator(self.seed, "mixture split", repeat % REPEATS).permutation(len(self.samples))
+        pool, held = order[: self.pool], order[self.pool :]
+        generator = random_generator(self.seed, "mixture fit", repeat)
+        started = time.perf_counter()
+        trace, memory = with_memory(
+            lambda: fit_mixture(self._drawn(pool, count, generator), self.bounds, generator, restarts=restarts)
+        )
+        seconds = time.perf_counter() - started
+        judged = self._features(self.samples.points[held], self.samples.weights[held])
+        return Fitted(float(judged.weights @ log_density(trace.mixture, judged)), seconds, memory)
+
+    def _drawn(self, pool: np.ndarray, count: int, generator: np.random.Generator) -> Features:
+        """So many of the pool's samples, of equal weight; all of them as they are."""
+        weights = self.samples.weights[pool]
+        if count >= len(pool):
+            return self._features(self.samples.points[pool], weights)
+        chosen = systematic_draw(weights / weights.sum(), count, generator)
+        return self._features(self.samples.points[pool[generator.permutation(chosen)]], np.ones(count))
+
+    def _features(self, points: np.ndarray, weights: np.ndarray) -> Features:
+        return Features.of(points, weights, Axes.of(self.samples.space), self.samples.space)
+
+    def lost(self, count: int, restarts: int) -> list[float]:
+        """What every fit of a setting lost against the best fit of its split, of all settings [nats]."""
+        best: dict[int, float] = {}
+        for (repeat, _, _), fit in self._known.items():
+            best[repeat % REPEATS] = max(best.get(repeat % REPEATS, -math.inf), fit.log_likelihood)
+        return [best[repeat % REPEATS] - fit.log_likelihood for repeat, fit in self._of(count, restarts)]
+
+    def rung(self, setting: str, count: int, restarts: int, *, default: bool) -> Rung:
+        """A setting, once all settings have been fitted."""
+        lost = np.array(self.lost(count, restarts))
+        fits = [fit for _, fit in self._of(count, restarts)]
+        memory = [fit.memory_bytes for fit in fits if fit.memory_bytes is not None]
+        return Rung(
+            setting,
+            error=float(lost.mean()),
+            uncertainty=float(lost.std(ddof=1) / math.sqrt(len(lost))),
+            seconds=float(np.median([fit.seconds for fit in fits])),
+            memory_bytes=max(memory, default=None),
+            default=default,
+            values={"worst_nats": float(lost.max())},
+        )
+
+    def _of(self, count: int, restarts: int) -> list[tuple[int, Fitted]]:
+        return [(key[0], fit) for key, fit in self._known.items() if key[1:] == (count, restarts)]
