@@ -105,9 +105,7 @@ def against_others(mesh: Mesh, grid: Grid, rounds: int, trimesh_points: int) -> 
     times = interleaved(runs, rounds)
     rows: list[list[object]] = []
     for name, way in contestants.items():
-        wall, cpu = (
-            tuple(value / way.share for value in column) for column in (times[name].wall, times[name].cpu)
-        )
+        wall, cpu = (tuple(value / way.share for value in column) for column in (times[name].wall, times[name].cpu))
         exact = libigl_distances(mesh, taken[name])
         error = 1e3 * np.abs(way.distances(taken[name]) - exact)
         near = np.abs(exact) < BAND_CELLS * grid.step
