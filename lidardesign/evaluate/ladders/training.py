@@ -1,0 +1,212 @@
+"""What learning costs: the misplaced share after a part of the steps, and with other presets."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from lidardesign.density.ladder import Reached, load_flow, remeasured
+from lidardesign.density.learn import FLOW
+from lidardesign.density.measure import Probes, draw_probes, measure
+from lidardesign.density.settings import PRESETS
+from lidardesign.density.target import Target
+from lidardesign.design.constraints import Constraints
+from lidardesign.design.fit import fit
+from lidardesign.design.rays import gates_of
+from lidardesign.design.samples import Samples
+from lidardesign.design.sensor import Design
+from lidardesign.errors import LidardesignError
+from lidardesign.estimates import Estimate
+from lidardesign.evaluate.accuracy import AccuracyRequest
+from lidardesign.evaluate.candidates import Positions
+from lidardesign.evaluate.ladders.probes import ERROR_OF, run_target
+from lidardesign.evaluate.rungs import Ladder, Rung
+from lidardesign.evaluate.scoring import score_lists
+from lidardesign.registry import plugin_guard
+from lidardesign.run.config import RunConfig, load_run_config
+from lidardesign.run.manifest import read_manifest, verify
+from lidardesign.scene import Scene
+from lidardesign.simulate.raycast import SceneCaster
+from lidardesign.simulate.simulate import build_casters
+from lidardesign.task import conditions_of, random_generator
+
+LABEL = "training"
+# A misplaced share of a tenth is then known to 5 %.
+SAMPLES = 8192
+PROBES = 8192
+TOLERANCE = 0.1
+BECAUSE = (
+    "a tenth of the rays in the wrong place is at worst a tenth fewer rays: 5 % of an error that falls like their root"
+)
+AGAINST = "the target density"
+# A quick fit shows what a density's errors are worth in the metric; a careful one would take the ladder's time.
+SCORED_SCENES = 8
+RESTARTS = 2
+EM_SAMPLES = 4000
+PRESET_NOTE = "runs of the same task, space and density beside this one"
+STEPS_NOTE = (
+    "fewer steps are what this run had reached then, on its way; a run that is planned for as many does better"
+)
+
+
+def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
+    """The run's own snapshots, and the runs of other presets beside it where there are any."""
+    seed, target = request.config.seed, run_target(request)
+    generator = random_generator(seed, "accuracy", "training")
+    probes = draw_probes(target, list(request.request.train), PROBES, generator)
+    reached = remeasured(request.run, request.config, target, probes, count=SAMPLES, seed=seed)
+    found = [_steps_ladder(request, reached)]
+    others = _presets(request)
+    if others:
+        found.append(_preset_ladder(request, others, reached[-1], target, probes))
+    return found
+
+
+def _steps_ladder(request: AccuracyRequest, reached: Sequence[Reached]) -> Ladder:
+    judge = _Judge(request)
+    scores = [judge.scores(one.samples) for one in reached]
+    rungs = [
+        _rung(str(one.step), one.estimates, one.seconds, judge.values(own, scores[-1]), default=one is reached[-1])
+        for one, own in zip(reached, scores, strict=True)
+    ]
+    notes = [STEPS_NOTE] if len(rungs) > 1 else ["this run kept no snapshots; learned again, it keeps some"]
+    return _ladder("learning.steps", "learning up to there", rungs, "; ".join([*notes, *judge.notes]))
+
+
+def _preset_ladder(
+    request: AccuracyRequest,
+    others: Sequence[tuple[Path, RunConfig]],
+    own: Reached,
+    target: Target,
+    probes: Probes,
+) -> Ladder:
+    """Runs of other presets against the same target, in the order of effort."""
+    rungs = [_rung(request.config.preset, own.estimates, _seconds(request.run), {}, default=True)]
+    for run, config in others:
+        learned = load_flow(run, FLOW, config, target, request.config.seed)
+        found = measure(learned, probes, SAMPLES)
+        rungs.append(_rung(config.preset, found.estimates, _seconds(run), {}, default=False))
+    rungs.sort(key=lambda rung: PRESETS.index(rung.setting))
+    return _ladder("preset", "the whole of learn", rungs, PRESET_NOTE)
+
+
+def _presets(request: AccuracyRequest) -> list[tuple[Path, RunConfig]]:
+    """The finished runs beside this one that learned the same density by other presets, one of each."""
+    mine, found = request.config, {}
+    for folder in sorted(request.run.absolute().parent.iterdir()):
+        config = _config_of(folder)
+        if config is None or config.preset == mine.preset or config.preset in found:
+            continue
+        if (config.task_name, config.task, config.space, config.density) == (
+            mine.task_name, mine.task, mine.space, mine.density
+        ):  # fmt: skip
+            found[config.preset] = (folder, config)
+    return list(found.values())
+
+
+def _config_of(folder: Path) -> RunConfig | None:
+    """The configuration of a finished and sound run; None for anything else that lies there."""
+    if not (folder / FLOW).is_file():
+        return None
+    try:
+        verify(folder, FLOW)
+        return load_run_config(folder)[1]
+    except LidardesignError:
+        return None
+
+
+def _seconds(run: Path) -> float:
+    return float(read_manifest(run)["learn"]["seconds"])
+
+
+def _rung(
+    setting: str, estimates: Mapping[str, Estimate], seconds: float, further: Mapping[str, float], *, default: bool
+) -> Rung:
+    misplaced = estimates["misplaced"]
+    values = {name: estimates[name].value for name in ("ess", "kl_nats", "coverage")}
+    errors = {f"{name}_error": estimates[name].error or 0.0 for name in values}
+    return Rung(
+        setting,
+        misplaced.value,
+        misplaced.error or 0.0,
+        seconds,
+        default=default,
+        values={**values, **errors, **further},
+    )
+
+
+def _ladder(knob: str, work: str, rungs: Sequence[Rung], note: str) -> Ladder:
+    return Ladder(knob, ERROR_OF, "", AGAINST, TOLERANCE, BECAUSE, work, rungs, note)
+
+
+class _Judge:
+    """Scores quick fits of the run's first design to samples of its flow at other times.
+
+    Arguments:
+        request: What is evaluated.
+    """
+
+    def __init__(self, request: AccuracyRequest) -> None:
+        asked = self._asked = request.request
+        self._retarget = run_target(request).log_density
+        self._design = next((design for design in asked.designs if not design.at), None)
+        self._rays = sorted(asked.rays)[len(asked.rays) // 2]
+        with plugin_guard(asked.task.name):
+            self._conditions = conditions_of(asked.task, asked.config, asked.space)
+        self._scenes = [(scene, build_casters(scene)) for scene in asked.test[:SCORED_SCENES]] if self._design else []
+
+    @property
+    def notes(self) -> list[str]:
+        """What the scores are of."""
+        if self._design is None:
+            return []
+        scored = f"scores of quick fits like {self._design.name} with {self._rays} rays on {len(self._scenes)} scenes"
+        return [scored]
+
+    def scores(self, samples: Samples) -> np.ndarray | None:
+        """Per scene; None where the samples carry no such design."""
+        if self._design is None:
+            return None
+        try:
+            positions = self._laid_out(self._design, samples)
+        except LidardesignError:  # a rough density may leave too few samples, or constraints may fix the rays
+            return None
+        return np.array([self._score(scene, casters, positions) for scene, casters in self._scenes])
+
+    def values(self, scores: np.ndarray | None, last: np.ndarray | None) -> dict[str, float]:
+        """The mean score, and its standard error beside the last rung's, on the same scenes."""
+        if scores is None or last is None:
+            return {}
+        apart = scores - last
+        error = float(apart.std(ddof=1) / math.sqrt(len(apart))) if len(apart) > 1 else 0.0
+        unit = re.sub(r"\W+", "", self._asked.task.metric.unit)
+        name = f"score_{unit}" if unit else "score"
+        return {name: float(scores.mean()), f"{name}_difference_error": error}
+
+    def _laid_out(self, design: Design, samples: Samples) -> Positions:
+        one_per_ray = design.layout == "scan" or design.track is not None
+        found = fit(
+            samples,
+            sensors=None if one_per_ray else len(design.sensors),
+            layout=design.layout,
+            rays=None if design.layout == "grid" and design.ray_table is None else self._rays,
+            constraints=Constraints.from_mapping(dict(design.constraints), where=f"constraints of {design.name}"),
+            seed=self._asked.seed,
+            restarts=RESTARTS,
+            em_samples=EM_SAMPLES,
+            level=design.level,
+            name=design.name,
+            gates=None if one_per_ray else gates_of(design, samples),
+            retarget=self._retarget,
+        ).design
+        return tuple(self._asked.lay_out(found, self._rays, samples, at=place) for place in self._conditions)
+
+    def _score(self, scene: Scene, casters: Sequence[SceneCaster], positions: Positions) -> float:
+        planner = self._asked.planner
+        physics = planner.physics(planner.plan(scene, list(positions), casters), self._asked.seed)
+        ((score, _),) = score_lists(self._asked.task, scene, [positions], casters, physics)
+        return score.value
