@@ -49,7 +49,7 @@ class Cluster:
 
         rest = enumerate(questions)
         numbers: dict[Any, int] = {}
-        running = as_completed(())
+        running = as_completed(loop=self._client.loop)
         for number, message in itertools.islice(rest, self._capacity()):
             running.add(self._asked(numbers, number, message))
         for future in running:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from lidardesign.errors import NumericalError
 from lidardesign.evaluate.worker import receive, send
 
+WORKER = "lidardesign.evaluate.worker"
 # A scene whose worker dies so many times is the cause of it.
 MOST_TRIES = 3
 # A process that dies closes its pipe just before it is gone.
@@ -39,7 +40,7 @@ class _Process:
 
     def __post_init__(self) -> None:
         # modules are found where this process finds them, and a folder's own files are not mistaken for libraries
-        code = f"import sys; sys.path[:] = {sys.path!r}; from lidardesign.evaluate.worker import main; main()"
+        code = f"import sys; sys.path[:] = {sys.path!r}; from {WORKER} import main; main()"
         self._popen = subprocess.Popen(
             [sys.executable, "-c", code],
             stdin=subprocess.PIPE,
