@@ -13,14 +13,16 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
+from lidardesign.cli.ranks import joined_ranks
 from lidardesign.cli.runs import check_choice
-from lidardesign.errors import ConfigError, DataError
+from lidardesign.errors import ConfigError, DataError, LostRankError
 from lidardesign.run.clock import keep_timings, phase
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
     from lidardesign.density.learn import LearnProgress, LearnResult
+    from lidardesign.density.parallel import Ranks
     from lidardesign.run.config import RunConfig
     from lidardesign.task import Task
 
@@ -64,7 +66,7 @@ def learn(
     debug: options.Debug = False,
 ) -> None:
     """Learn where rays are worth firing for TASK, into a run folder."""
-    with command(json=json, quiet=quiet, debug=debug) as console:
+    with command(json=json, quiet=quiet, debug=debug) as console, joined_ranks(console) as ranks:
         check_choice(device, "--device", DEVICES)
         with phase("libraries"):
             from lidardesign.registry import load_task
@@ -83,7 +85,7 @@ def learn(
         else:
             _check_can_start(run)
             settings = resolve(plugin, **choices)
-        result = _learn_in_folder(plugin, settings, run, resume, device, console)
+        result = _learn_in_folder(plugin, settings, run, resume, device, console, ranks)
         keep_timings(run, "learn", console.clock)
         result = replace(result, notes=(*result.notes, *_advice(result)))
         console.result(_document(result), lambda rich: _show(result, rich))
@@ -127,7 +129,7 @@ def _check_same(stored: RunConfig, task: Task, choices: dict[str, Any], run: Pat
 
 
 def _learn_in_folder(
-    task: Task, settings: RunConfig, run: Path, resume: bool, device: str, console: Console
+    task: Task, settings: RunConfig, run: Path, resume: bool, device: str, console: Console, ranks: Ranks
 ) -> LearnResult:
     from lidardesign.run.config import save_run_config
     from lidardesign.run.lock import run_lock
@@ -142,7 +144,13 @@ def _learn_in_folder(
             with phase("libraries"):
                 from lidardesign.density.learn import learn as learn_density
 
-            return learn_density(task, settings, run, resume=resume, device=device, progress=progress)
+            try:
+                return learn_density(
+                    task, settings, run, resume=resume, device=device, progress=progress, ranks=ranks
+                )
+            except LostRankError as error:
+                hint = f"{error.hint}; {_interruption(task.name, run)}"
+                raise LostRankError(error.message, where=error.where, hint=hint) from None
 
 
 @contextlib.contextmanager

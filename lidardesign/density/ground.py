@@ -9,6 +9,7 @@ import numpy as np
 
 from lidardesign.density.independent import independent_points
 from lidardesign.density.losses import Pool
+from lidardesign.density.parallel import ALONE, Ranks
 from lidardesign.density.prepare import prepare_target
 from lidardesign.density.receiver import common_receiver
 from lidardesign.density.target import Target
@@ -32,8 +33,13 @@ class Ground:
     pool: Pool
 
 
-def prepare_ground(task: Task, config: RunConfig) -> Ground:
+def prepare_ground(task: Task, config: RunConfig, ranks: Ranks = ALONE) -> Ground:
     """The ground of a task; it does not depend on the steps, the flow or its optimiser.
+
+    Arguments:
+        task: The plugin.
+        config: The resolved configuration.
+        ranks: Who shares the scenes; `parallel_learn.follow` prepares the others' parts.
 
     Raises:
         ConfigError, DataError: Unusable settings or scenes.
@@ -41,8 +47,9 @@ def prepare_ground(task: Task, config: RunConfig) -> Ground:
     """
     if not set(config.space.free) - set(config.space.conditioned):
         raise ConfigError("every dimension of the design space is fixed", where="space", hint="free at least one")
+    ranks.announce({"job": "ground", "config": config.as_document()})
     scenes = _training_scenes(task, config)
-    target, notes = prepare_target(scenes, config)
+    target, notes = prepare_target(scenes, config, ranks=ranks)
     return Ground(scenes, target, tuple(notes), _pool(target, scenes, config))
 
 
@@ -60,7 +67,7 @@ def _pool(target: Target, scenes: Sequence[Scene], config: RunConfig) -> Pool:
     """Proposals for balancing, independent of those that coverage is measured on."""
     count = config.learning.balance_proposals
     generator = random_generator(config.seed, "balancing")
-    points, log_density = independent_points(target, scenes, count, generator)
+    points, log_density = map(target.ranks.of_first, independent_points(target, scenes, count, generator))
     if not len(points):
         raise DataError(
             "no ray of the design space reaches a target surface in any training scene",
@@ -68,7 +75,8 @@ def _pool(target: Target, scenes: Sequence[Scene], config: RunConfig) -> Pool:
             hint="widen the angles or the range, or move the origin",
         )
     _refuse_blind_receiver(scenes, points)
-    return Pool.of(config.space.to_unit(points), target.log_density(points), log_density)
+    log_target = target.ranks.spread(target.log_density, points)
+    return Pool.of(config.space.to_unit(points), log_target, log_density)
 
 
 def _refuse_blind_receiver(scenes: Sequence[Scene], points: np.ndarray) -> None:

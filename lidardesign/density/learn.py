@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -13,6 +14,7 @@ from lidardesign.density.flow import DesignFlow
 from lidardesign.density.ground import Ground, prepare_ground
 from lidardesign.density.measure import Measured, draw_probes, measure
 from lidardesign.density.objective import Coordinates
+from lidardesign.density.parallel import ALONE, Ranks
 from lidardesign.density.snapshots import clear_snapshots
 from lidardesign.density.training import PROGRESS, LearnProgress, Trainer
 from lidardesign.design.samples import Samples, save_samples
@@ -21,7 +23,7 @@ from lidardesign.estimates import Estimate
 from lidardesign.run.checkpoint import save_arrays
 from lidardesign.run.clock import phase, running
 from lidardesign.run.config import RunConfig
-from lidardesign.run.manifest import note, record
+from lidardesign.run.manifest import note, record, versions
 from lidardesign.scene import Scene
 from lidardesign.space import AZIMUTH
 from lidardesign.task import Task, random_generator
@@ -65,6 +67,7 @@ def learn(
     device: str = "auto",
     progress: Callable[[LearnProgress], None] | None = None,
     ground: Ground | None = None,
+    ranks: Ranks = ALONE,
 ) -> LearnResult:
     """Learn the density of a task into a run folder.
 
@@ -76,19 +79,22 @@ def learn(
         device: auto, cpu or cuda: where the flow lives. The target is always evaluated on the CPU.
         progress: Called about every tenth step.
         ground: What `prepare_ground` made of the same task and configuration, to be learned on again.
+        ranks: Who learns together; see `parallel_learn`. The first one alone writes.
 
     Raises:
         ConfigError, DataError: Unusable settings or scenes.
         DivergenceError: Learning stayed non-finite; the last good checkpoint is kept.
     """
-    place = choose_device(device)
+    place = own_device(choose_device(device), ranks)
     with running() as clock:
-        ground = prepare_ground(task, config) if ground is None else ground
+        ground = prepare_ground(task, config, ranks) if ground is None else ground
+        ranks.announce({"job": "learn", "config": config.as_document(), "device": device, "resume": resume})
         notes = list(ground.notes)
         trainer = make_trainer(ground, config, run, place)
+        ranks.agree("scenes, settings or versions", _started_from(trainer, config))
         if resume:
             trainer.resume()
-        else:
+        elif ranks.first:
             (run / PROGRESS).unlink(missing_ok=True)
             clear_snapshots(run)
         with phase("learning"):
@@ -99,7 +105,8 @@ def learn(
         notes += measured.notes
         if trainer.skipped:
             notes.append(f"{trainer.skipped} steps were not finite and skipped")
-        _store(trainer, measured.samples, config, run)
+        if ranks.first:
+            _store(trainer, measured.samples, config, run)
     result = LearnResult(
         run=str(run),
         task=config.task_name,
@@ -110,8 +117,16 @@ def learn(
         error_estimates=measured.estimates,
         **{name: estimate.value for name, estimate in measured.estimates.items()},
     )
-    note(run, learn=result.as_dict(), visibility=ground.target.visibility.name)
+    if ranks.first:
+        note(run, learn=result.as_dict(), visibility=ground.target.visibility.name, ranks=ranks.size)
     return result
+
+
+def _started_from(trainer: Trainer, config: RunConfig) -> bytes:
+    """What all ranks must have in common before the first step."""
+    document = {"config": config.as_document(), "versions": versions(), "columns": trainer.target.columns}
+    weights = [value.detach().cpu().numpy().tobytes() for value in trainer.flow.state_dict().values()]
+    return json.dumps(document, sort_keys=True).encode() + b"".join(weights)
 
 
 def choose_device(name: str) -> torch.device:
@@ -127,6 +142,23 @@ def choose_device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise ConfigError("no CUDA device is available", where="--device", allowed="auto, cpu")
     return torch.device(name)
+
+
+def own_device(device: torch.device, ranks: Ranks) -> torch.device:
+    """The GPU of a rank; the CPU is everyone's.
+
+    Raises:
+        ConfigError: There are more ranks than GPUs on this computer.
+    """
+    if device.type != "cuda" or ranks.size == 1:
+        return device
+    if ranks.local_rank >= torch.cuda.device_count():
+        raise ConfigError(
+            f"rank {ranks.rank} has no GPU of its own",
+            where="--device",
+            allowed=f"at most {torch.cuda.device_count()} ranks on this computer, or --device cpu",
+        )
+    return torch.device("cuda", ranks.local_rank)
 
 
 def make_trainer(ground: Ground, config: RunConfig, run: Path, device: torch.device) -> Trainer:

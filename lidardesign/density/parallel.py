@@ -92,7 +92,12 @@ class Ranks:
         """The rows of the first rank, on all ranks: what may differ by the rounding of other processors."""
         if self.size == 1:
             return rows
-        return np.frombuffer(self.share(rows.tobytes()), dtype=rows.dtype).reshape(-1, *rows.shape[1:])
+        return np.frombuffer(self.share(rows.tobytes()), dtype=rows.dtype).reshape(-1, *rows.shape[1:]).copy()
+
+    def announce(self, job: dict[str, Any]) -> None:
+        """Let the first rank tell the others what comes next; they wait for it in `parallel_learn.follow`."""
+        if self.first and self.size > 1:
+            self.share(json.dumps(job).encode())
 
     def agree(self, what: str, content: bytes) -> None:
         """Check that all ranks hold the same.
@@ -108,6 +113,13 @@ class Ranks:
                 where="torchrun",
                 hint="start all ranks with the same command, files and versions of the packages",
             )
+
+    def tell(self) -> None:
+        """Note for the others that this rank says what went wrong."""
+
+    def is_told(self) -> bool:
+        """Whether the first rank says what went wrong, after the moment that it may need for it."""
+        return False
 
     def leave(self) -> None:
         """Part from the others, when all is done."""

@@ -6,6 +6,7 @@ sockets to it close, and whatever the others wait for ends in a `LostRankError`.
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ from lidardesign.errors import ConfigError, LostRankError
 PATIENCE = timedelta(minutes=30)
 # Another rank's message arrives on the launcher's own store within a fraction of this.
 TOLD_WITHIN = timedelta(seconds=2)
+
+TOLD = "told"
 
 
 def join_ranks(environment: dict[str, str] | os._Environ[str] = os.environ) -> Ranks:
@@ -66,7 +69,7 @@ def _reached(call: Callable[[], Any]) -> Any:
         raise LostRankError(
             f"another rank ended or does not answer ({str(error).splitlines()[0]})",
             where="torchrun",
-            hint="look at that rank's own message; learning continues from the last checkpoint with --resume",
+            hint="look at that rank's own message",
         ) from None
 
 
@@ -139,6 +142,18 @@ class ConnectedRanks(Ranks):
         for parameter in parameters:
             parameter.grad = total[start : start + parameter.numel()].view_as(parameter)
             start += parameter.numel()
+
+    def tell(self) -> None:
+        """See `Ranks`."""
+        with contextlib.suppress(RuntimeError):  # whoever kept the notes is gone, too
+            self.store.set(TOLD, b"1")
+
+    def is_told(self) -> bool:
+        """See `Ranks`."""
+        with contextlib.suppress(RuntimeError):
+            self.store.wait([TOLD], TOLD_WITHIN)
+            return True
+        return False
 
     def leave(self) -> None:
         """See `Ranks`."""

@@ -192,7 +192,16 @@ def load_run_config(run: Path) -> tuple[Task, RunConfig]:
     """
     run = Path(run)
     verify(run, FILE_NAME)
-    document = load_yaml(run / FILE_NAME)
+    return config_of(load_yaml(run / FILE_NAME))
+
+
+def config_of(document: Document) -> tuple[Task, RunConfig]:
+    """The task and configuration of a whole document, as `RunConfig.as_document` makes it.
+
+    Raises:
+        ConfigError: It is of another version of this program.
+        PluginError: The task is installed but broken.
+    """
     task = load_task(str(document.mapping.get("task_name")))
     layers = _Layers({section: {} for section in SECTIONS})
     header = _header(task, document, None, None)

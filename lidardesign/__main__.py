@@ -1,0 +1,6 @@
+"""`python -m lidardesign` and `torchrun -m lidardesign`: the program."""
+
+from lidardesign.cli.main import run
+
+if __name__ == "__main__":
+    run()

@@ -1,0 +1,78 @@
+"""Several processes that a launcher (`torchrun -m lidardesign learn ...`) started as one command.
+
+The first one is the command: it reads the options, writes the run and prints. The others follow it, and speak only of
+what the first one cannot know.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import typer
+
+from lidardesign.cli.console import EXIT_INTERRUPTED, Console
+from lidardesign.errors import ConfigError, LidardesignError, LostRankError
+
+if TYPE_CHECKING:
+    from lidardesign.density.parallel import Ranks
+
+# torchrun sets the first of these; it, mpirun wrappers and clusters set the others, which torch.distributed needs.
+LAUNCHER = "TORCHELASTIC_RUN_ID"
+NEEDED = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
+
+
+def refuse_ranks(subcommand: str) -> None:
+    """Refuse to run a command many times at once that does not know of ranks.
+
+    Raises:
+        ConfigError: torchrun started several.
+    """
+    if LAUNCHER in os.environ and os.environ.get("WORLD_SIZE", "1") != "1":
+        raise ConfigError(f"{subcommand} does not run on several ranks", where="torchrun", allowed="learn")
+
+
+@contextlib.contextmanager
+def joined_ranks(console: Console) -> Iterator[Ranks]:
+    """The ranks of this command. The others than the first one follow it inside and leave the command here.
+
+    Raises:
+        LostRankError: Another rank ended, or cannot be reached.
+    """
+    if not all(name in os.environ for name in NEEDED):
+        from lidardesign.density.parallel import ALONE
+
+        yield ALONE
+        return
+    from lidardesign.density.parallel_learn import finish
+    from lidardesign.density.parallel_ranks import join_ranks
+
+    ranks = join_ranks()
+    if not ranks.first:
+        _follow(ranks, console)
+        raise typer.Exit
+    try:
+        yield ranks
+        with contextlib.suppress(LostRankError):  # all is written: nothing is lost with a rank that ends now
+            finish(ranks)
+    except BaseException:
+        ranks.tell()
+        raise
+
+
+def _follow(ranks: Ranks, console: Console) -> None:
+    """Learn along; an error is told on stderr unless the first rank tells of it, or of its own."""
+    from lidardesign.density.parallel_learn import follow
+
+    console.json, console.quiet = False, True
+    try:
+        follow(ranks)
+    except KeyboardInterrupt:
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    except LidardesignError as error:
+        if not ranks.is_told():
+            print(f"rank {ranks.rank}: {error.kind} error: {error}", file=sys.stderr)
+        raise typer.Exit(error.exit_code) from None
