@@ -152,8 +152,10 @@ def contestants(sizes: Sizes, compiled: bool) -> dict[str, nn.Module]:
             makers[f"{name}, one pass"] = partial(maker, sizes)
     made = {}
     for name, make in makers.items():
-        torch.manual_seed(0)
-        made[name] = make().to(sizes.dtype)
+        # the libraries draw their first weights from torch's global stream
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            made[name] = make().to(sizes.dtype)
         if compiled and name != "zuko, default direction":
             made[f"{name}, compiled"] = torch.compile(made[name])
     return made

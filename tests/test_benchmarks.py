@@ -10,7 +10,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
+
+from lidardesign.scene import Mesh
 
 ROOT = Path(__file__).parents[1]
 SCRIPTS = sorted(path for path in (ROOT / "benchmarks").glob("*.py") if path.stem != "common")
@@ -172,6 +176,75 @@ def test_positions_between_are_held_against_the_worst_of_the_papers(script):
     assert said([*paper, [0.37, 0.5, 2.0, math.nan, 20.0]]).startswith("does not hold")
 
 
+def test_the_exponent_of_a_power_law_is_its_power(script):
+    sizes = (10, 30, 100, 1000)
+    first, *others = script("growth").exponents(sizes, [5 * size**1.5 for size in sizes])
+    assert math.isnan(first)
+    assert others == pytest.approx([1.5, 1.5, 1.5])
+
+
+def test_the_reference_of_ray_casting_meets_a_box_where_planes_do(script):
+    corners = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    box = Mesh(corners, np.array([face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))]))
+    generator = np.random.default_rng(0)
+    origins = np.column_stack([np.full(200, 3.0), generator.uniform(-2, 2, (200, 2))])
+    targets = np.column_stack([np.full(200, 1.0), generator.uniform(-2, 2, (200, 2))])
+    directions = (targets - origins) / np.linalg.norm(targets - origins, axis=1, keepdims=True)
+    with np.errstate(divide="ignore"):
+        low, high = ((side - origins) / directions for side in (-1.0, 1.0))
+    enters, leaves = np.minimum(low, high).max(axis=1), np.maximum(low, high).min(axis=1)
+    expected = np.where((enters <= leaves) & (enters > 0), enters, np.inf)
+    found = script("raycasting").reference(box, origins, directions)
+    assert 50 < np.isfinite(expected).sum() < 150
+    assert found == pytest.approx(expected, abs=1e-12)
+
+
+def test_the_log_density_of_every_flow_that_is_compared_is_that_of_its_jacobian(script):
+    flow = script("flow")
+    sizes = flow.Sizes(batch=8, layers=2, bins=4, hidden=8, dtype=torch.float64)
+    base = 1.9 * torch.rand(8, flow.FEATURES, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.95
+    for name, contestant in flow.contestants(sizes, compiled=False).items():
+        assert flow.jacobian_error(contestant, base) < 1e-9, name
+
+
+def test_rays_are_counted_over_designs_budgets_and_scenes(script):
+    found = {"scenes": 3, "rows": [{"rays": 10}, {"rays": 20}], "equal_bandwidth": [{"rays": 5}]}
+    assert script("evaluate").rays_scored(found) == 3 * 35
+
+
+@pytest.fixture
+def fill_benchmarks():
+    spec = importlib.util.spec_from_file_location("fill_benchmarks", ROOT / "tools" / "fill_benchmarks.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    yield module
+    sys.modules.pop(module.SHARED, None)
+
+
+def test_figures_replace_what_stood_between_the_marks_and_nothing_else(fill_benchmarks):
+    page = "before\n\n<!-- flow -->\n\nold\n\n<!-- flow -->\n\nafter\n"
+    once = fill_benchmarks.filled(page, "flow", "new")
+    assert once == page.replace("old", "new")
+    assert fill_benchmarks.filled(once, "flow", "new") == once
+    with pytest.raises(SystemExit, match=r"em.* 0 times"):
+        fill_benchmarks.filled(page, "em", "new")
+
+
+def test_figures_name_their_date_their_machine_and_their_tables(fill_benchmarks):
+    machine = {"processor": "one", "cores": 2, "threads": 1, "python": "3.11", "load_at_start": 0.1}
+    tables = {"First": [{"a": 1, "b": 0.12345}], "Second": [{"c": "x"}]}
+    document = {"title": "Flow", "machine": machine, "tables": tables, "conclusions": ["that is so"]}
+    text = fill_benchmarks.markdown(document, "2026-01-02", ["First"])
+    assert "2026-01-02" in text
+    assert "2 cores, 1 thread," in text
+    assert "| 1 | 0.123 |" in text
+    assert "Second" not in text
+    assert text.endswith("- that is so")
+    with pytest.raises(SystemExit, match="there are: First; Second"):
+        fill_benchmarks.markdown(document, "2026-01-02", ["Third"])
+
+
 def run_script(name, tmp_path, *words):
     """What a script writes as JSON."""
     file = tmp_path / "found.json"
@@ -198,6 +271,29 @@ def test_frames_are_measured_and_culling_keeps_its_bound(tmp_path):
     errors = next(rows for caption, rows in found["tables"].items() if caption.startswith("Culled"))
     assert all(0 <= row["error, max"] <= row["bound"] for row in errors)
     assert {row["way"] for row in found["tables"]["Time per evaluation"]} >= {"full sum", "caster per frame"}
+
+
+@pytest.mark.slow
+def test_growth_is_measured(tmp_path):
+    words = ["--of", "rays", "--of", "sensors", "--of", "dimensions", "--rays", "100", "200", "--sensors", "1", "2"]
+    found = run_script("growth", tmp_path, "--model", "embedded", *words, "--samples", "2000", "--heads", "2")
+    assert [len(rows) for rows in found["tables"].values()] == [2, 2, 6]
+
+
+@pytest.mark.slow
+def test_ray_casting_is_measured_and_stays_exact_far_from_the_origin(tmp_path):
+    found = run_script("raycasting", tmp_path, "--model", "embedded", "--rays", "2000", "--checked", "100")
+    ours = [row for row in found["tables"]["100 rays against float64"] if row["way"] == "lidardesign"]
+    assert {row["offset m"] for row in ours} == {0.0, 1000.0}
+    assert all(row["hit or miss differs"] == 0 and row["99 % um"] < 1 for row in ours)
+
+
+@pytest.mark.slow
+def test_a_field_is_measured_and_exact_near_its_surface(tmp_path):
+    words = ["--scenes", "2", "--resolution", "24", "--trimesh-points", "50"]
+    found = run_script("fields", tmp_path, "--model", "embedded", *words)
+    ours = list(found["tables"].values())[1][0]
+    assert ours["error near mm"] < 1e-4
 
 
 @pytest.mark.slow
