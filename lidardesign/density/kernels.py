@@ -15,6 +15,15 @@ import math
 import numpy as np
 from numba import njit
 
+# exp(x) = 2^n p(r) in float32: x = n ln 2 + r, |r| <= ln 2 / 2; Cody and Waite's two-part ln 2, p from Cephes expf.
+LOG2_E = np.float32(1.44269504088896341)
+LN2_HIGH, LN2_LOW = np.float32(0.693359375), np.float32(-2.12194440e-4)
+EXP_POLYNOMIAL = tuple(
+    np.float32(c)
+    for c in (1.9875691500e-4, 1.3981999507e-3, 8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1)
+)
+EXPONENT_LIMIT = np.float32(60.0)
+FLOAT32_BIAS, FLOAT32_MANTISSA_BITS = 127, 23
 # Reassociation vectorises the sums; NaN and infinity keep their meaning (no `nnan`, no `ninf`).
 FAST = {"reassoc", "contract", "nsz", "arcp"}
 
@@ -61,9 +70,8 @@ def _blend(table, index, weight, out):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, inline="always")
-def _contract(table, index, column_weight, fraction, inverse_step, out):  # noqa: ANN001, ANN202
-    """Gradient of sum_c weight_c * d_c inside one cell, added to out (3,)."""
-    dots = np.zeros(8)
+def _contract(table, index, column_weight, fraction, inverse_step, dots, out):  # noqa: ANN001, ANN202
+    """Gradient of sum_c weight_c * d_c inside one cell, added to out (3,); `dots` (8,) is room to work in."""
     for corner in range(8):
         row = table[index[corner]]
         total = 0.0
@@ -107,7 +115,7 @@ def table_gradient(table, counts, low, inverse_step, points, weights, out):  # n
     cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
     index, corner_weight = np.zeros(8, np.int64), np.zeros(8, table.dtype)
     row, column_weight = np.zeros(columns, table.dtype), np.zeros(columns)
-    gradient = np.zeros(3)
+    gradient, dots = np.zeros(3), np.zeros(8)
     for n in range(points.shape[0]):
         squared = locate(counts, low, inverse_step, points[n], cell, fraction, excess)
         corners(counts, cell, fraction, index, corner_weight)
@@ -122,7 +130,7 @@ def table_gradient(table, counts, low, inverse_step, points, weights, out):  # n
                 share = column_weight[c] / math.sqrt(squared + inner * inner)
                 outward += share
                 column_weight[c] = share * inner
-        _contract(table, index, column_weight, fraction, inverse_step, gradient)
+        _contract(table, index, column_weight, fraction, inverse_step, dots, gradient)
         for k in range(3):
             out[n, k] = outward * excess[k] if excess[k] != 0.0 else gradient[k]
 
@@ -149,6 +157,24 @@ def cell_minimum(table, counts, out):  # noqa: ANN001, ANN201
                 out[(i * counts[1] + j) * counts[2] + k] = value
 
 
+@njit(cache=True, nogil=True, fastmath=FAST, inline="always")
+def _insides(distance, sharpness, bits, powers, out):  # noqa: ANN001, ANN202
+    """sigmoid(-sharpness * distance) of float32 distances (C,), to float32 rounding: `math.exp` does not vectorise.
+
+    `bits` (int32) and `powers` (float32) are the same memory: 2^n is written as bits and read as a number.
+    """
+    c0, c1, c2, c3, c4, c5 = EXP_POLYNOMIAL
+    one, half = np.float32(1.0), np.float32(0.5)
+    for c in range(distance.shape[0]):
+        x = min(max(sharpness * distance[c], -EXPONENT_LIMIT), EXPONENT_LIMIT)
+        n = np.floor(x * LOG2_E + half)
+        r = x - n * LN2_HIGH - n * LN2_LOW
+        out[c] = ((((((c0 * r + c1) * r + c2) * r + c3) * r + c4) * r + c5) * r * r + r) + one
+        bits[c] = (np.int32(n) + FLOAT32_BIAS) << FLOAT32_MANTISSA_BITS
+    for c in range(distance.shape[0]):
+        out[c] = one / (one + powers[c] * out[c])
+
+
 @njit(cache=True, nogil=True, fastmath=FAST)
 def table_quadrature(
     table, clear, counts, low, inverse_step, shell, origins, directions, lengths, points_per_ray,  # noqa: ANN001
@@ -169,11 +195,13 @@ def table_quadrature(
     columns = table.shape[1]
     cell, fraction, excess, p = np.zeros(3, np.int64), np.zeros(3), np.zeros(3), np.zeros(3)
     index, weight, row = np.zeros(8, np.int64), np.zeros(8, table.dtype), np.zeros(columns, table.dtype)
+    inside, bits = np.zeros(columns, np.float32), np.zeros(columns, np.int32)
+    powers, total = bits.view(np.float32), np.zeros(columns, np.float32)
+    steepness, one, thickness = np.float32(sharpness), np.float32(1.0), shell.astype(np.float32)
     keep = slope.shape[0] > 0
     for n in range(origins.shape[0]):
         step = lengths[n] / points_per_ray
-        for c in range(columns):
-            depth[n, c] = 0.0
+        total[:] = 0.0
         for m in range(points_per_ray):
             along = (m + 0.5) * step
             for k in range(3):
@@ -184,16 +212,21 @@ def table_quadrature(
                 continue
             corners(counts, cell, fraction, index, weight)
             _blend(table, index, weight, row)
-            for c in range(columns):
-                distance = row[c] - shell[c]
-                if squared > 0.0:
+            if squared > 0.0:
+                for c in range(columns):
                     inner = max(row[c], 0.0)
-                    distance = math.sqrt(squared + inner * inner) - shell[c]
-                exponent = min(max(sharpness * distance, -60.0), 60.0)
-                inside = 1.0 / (1.0 + math.exp(exponent))
-                depth[n, c] += attenuation * step * inside
-                if keep:
-                    slope[n, m, c] = -attenuation * step * sharpness * inside * (1.0 - inside)
+                    row[c] = math.sqrt(squared + inner * inner)
+            for c in range(columns):
+                row[c] -= thickness[c]
+            _insides(row, steepness, bits, powers, inside)
+            for c in range(columns):
+                total[c] += inside[c]
+            if keep:
+                factor = np.float32(-attenuation * step * sharpness)
+                for c in range(columns):
+                    slope[n, m, c] = factor * inside[c] * (one - inside[c])
+        for c in range(columns):
+            depth[n, c] = attenuation * step * total[c]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
@@ -209,9 +242,12 @@ def table_quadrature_gradient(
     points_per_ray = slope.shape[1]
     cell, fraction, excess, p = np.zeros(3, np.int64), np.zeros(3), np.zeros(3), np.zeros(3)
     index, corner_weight = np.zeros(8, np.int64), np.zeros(8, table.dtype)
-    row, column_weight, gradient = np.zeros(columns, table.dtype), np.zeros(columns), np.zeros(3)
+    row, column_weight = np.zeros(columns, table.dtype), np.zeros(columns, table.dtype)
+    share, gradient, dots = np.zeros(columns, table.dtype), np.zeros(3), np.zeros(8)
     for n in range(origins.shape[0]):
         step = lengths[n] / points_per_ray
+        for c in range(columns):
+            share[c] = weights[n, c]
         for m in range(points_per_ray):
             along = (m + 0.5) * step
             for k in range(3):
@@ -221,18 +257,18 @@ def table_quadrature_gradient(
             if squared > cutoff * cutoff or clear[first] > cutoff:
                 continue
             for c in range(columns):
-                column_weight[c] = weights[n, c] * slope[n, m, c]
+                column_weight[c] = share[c] * slope[n, m, c]
             corners(counts, cell, fraction, index, corner_weight)
             outward = 0.0
             if squared > 0.0:
                 _blend(table, index, corner_weight, row)
                 for c in range(columns):
                     inner = max(row[c], 0.0)
-                    share = column_weight[c] / math.sqrt(squared + inner * inner)
-                    outward += share
-                    column_weight[c] = share * inner
+                    pull = column_weight[c] / math.sqrt(squared + inner * inner)
+                    outward += pull
+                    column_weight[c] = pull * inner
             gradient[:] = 0.0
-            _contract(table, index, column_weight, fraction, inverse_step, gradient)
+            _contract(table, index, column_weight, fraction, inverse_step, dots, gradient)
             for k in range(3):
                 value = outward * excess[k] if excess[k] != 0.0 else gradient[k]
                 by_origin[n, k] += value

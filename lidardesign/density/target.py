@@ -15,6 +15,7 @@ from typing import ClassVar
 import numpy as np
 
 from lidardesign.density.fields import Field, TableField, build_field, scene_columns
+from lidardesign.density.locality import nearby_order
 from lidardesign.density.parallel import ALONE, Ranks
 from lidardesign.density.receiver import HeardVisibility, common_receiver
 from lidardesign.density.settings import DensitySettings
@@ -72,7 +73,7 @@ class Target:
         return self.visibility.rows_at_once
 
     def drawn(self, columns: np.ndarray) -> Target:
-        """An estimate of p* from some columns alone, weighted to stand for all: of the others no visibility is computed."""
+        """An estimate of p* from some columns alone, weighted to stand for all; the others need no visibility."""
         weights = np.full(self.columns, -np.inf)
         weights[columns] = self.log_column_weights[columns] + np.log(self.columns / len(columns))
         return replace(self, log_column_weights=weights)
@@ -106,9 +107,9 @@ class Target:
             raise NumericalError("design points are not finite", where="target density")
         optics = self.optics if sigma_m is None else self.optics.widened(sigma_m)
         values, gradients = np.empty(len(points)), np.empty((len(points) if gradient else 0, 6))
-        size = self.rows_at_once
+        size, order = self.rows_at_once, nearby_order(observed_point(points))
         for start in range(0, len(points), size):
-            rows = slice(start, start + size)
+            rows = order[start : start + size]
             values[rows], by_chart = self._evaluate(points[rows], optics, gradient)
             if gradient:
                 gradients[rows] = by_chart
