@@ -91,12 +91,7 @@ def learn(
         ranks.announce({"job": "learn", "config": config.as_document(), "device": device, "resume": resume})
         notes = list(ground.notes)
         trainer = make_trainer(ground, config, run, place)
-        ranks.agree("scenes, settings or versions", _started_from(trainer, config))
-        if resume:
-            trainer.resume()
-        elif ranks.first:
-            (run / PROGRESS).unlink(missing_ok=True)
-            clear_snapshots(run)
+        _start(trainer, config, resume)
         with phase("learning"):
             trainer.train(progress)
         # float32 steps train as well and 2.4 times faster, but float32 splines give wrong densities: measure in float64
@@ -122,11 +117,17 @@ def learn(
     return result
 
 
-def _started_from(trainer: Trainer, config: RunConfig) -> bytes:
-    """What all ranks must have in common before the first step."""
+def _start(trainer: Trainer, config: RunConfig, resume: bool) -> None:
+    """Take the run's checkpoint or clear what an earlier start left, on ranks that have all in common."""
+    ranks, run = trainer.target.ranks, trainer.run
     document = {"config": config.as_document(), "versions": versions(), "columns": trainer.target.columns}
     weights = [value.detach().cpu().numpy().tobytes() for value in trainer.flow.state_dict().values()]
-    return json.dumps(document, sort_keys=True).encode() + b"".join(weights)
+    ranks.agree("scenes, settings or versions", json.dumps(document, sort_keys=True).encode() + b"".join(weights))
+    if resume:
+        trainer.resume()
+    elif ranks.first:
+        (run / PROGRESS).unlink(missing_ok=True)
+        clear_snapshots(run)
 
 
 def choose_device(name: str) -> torch.device:

@@ -91,7 +91,7 @@ class ConnectedRanks(Ranks):
 
     def gathered(self, rows: np.ndarray) -> tuple[np.ndarray, slice]:
         """See `Ranks`."""
-        every, mine = self._gathered(torch.as_tensor(np.ascontiguousarray(rows)))
+        every, mine = self._gathered(torch.tensor(np.ascontiguousarray(rows)))
         return every.numpy(), mine
 
     def _gathered(self, rows: Tensor) -> tuple[Tensor, slice]:
