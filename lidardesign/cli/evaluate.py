@@ -7,7 +7,7 @@ import shlex
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -17,9 +17,13 @@ from lidardesign.cli.designs import number
 from lidardesign.cli.physics import Detector, Effects, RangeTolerance, ReturnTolerance, planner_of
 from lidardesign.cli.runs import open_run, run_of
 from lidardesign.cli.scores import show_evaluation
+from lidardesign.cli.times import keep_times
 from lidardesign.errors import ConfigError, DataError, ThresholdError
+from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
+    from rich.console import Console as RichConsole
+
     from lidardesign.cli.runs import Run
     from lidardesign.design.sensor import Design
     from lidardesign.evaluate.score import Evaluation, EvaluationRequest
@@ -84,6 +88,14 @@ FailAbove = Annotated[
         show_default=False,
     ),
 ]
+WithAccuracy = Annotated[
+    bool,
+    typer.Option(
+        "--accuracy",
+        help="Also measure what accuracy costs in time here: errors and seconds of every numerical choice, for this "
+        "task and run, and the cheapest setting that is good enough. Takes minutes.",
+    ),
+]
 Workers = Annotated[
     str,
     typer.Option(
@@ -109,6 +121,7 @@ def evaluate(
     csv: Csv = None,
     fail_above: FailAbove = None,
     workers: Workers = "1",
+    accuracy: WithAccuracy = False,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -118,8 +131,10 @@ def evaluate(
     with command(json=json, quiet=quiet, debug=debug) as console:
         if fail_above is not None and not math.isfinite(fail_above):
             raise ConfigError(f"{fail_above}", where="--fail-above", allowed="a finite number")
-        from lidardesign.evaluate.workers import check_workers
-        from lidardesign.run.config import judged_by
+        with phase("libraries"):
+            import lidardesign.evaluate.score  # noqa: F401
+            from lidardesign.evaluate.workers import check_workers
+            from lidardesign.run.config import judged_by
 
         wanted = check_workers(workers)
         _check_baselines(baseline or [])
@@ -132,11 +147,22 @@ def evaluate(
             planner = replace(planner, tolerance=planner.tolerated.within(run.task.metric))
         request = replace(_request(run, entries, rays, baseline or [], seed), planner=planner, audit=audit)
         evaluation = _evaluate_with(wanted, request, console)
+        if accuracy:
+            evaluation = _with_accuracy(evaluation, request, run, console)
         written = _write_files(evaluation, request, report, plots, csv)
         document = {**evaluation.as_dict(), "set": overrides or [], "files": [str(path) for path in written]}
-        console.result(document, lambda rich: show_evaluation(document, written, rich))
+        keep_times(run.folder, "evaluate", console)
+        console.result(document, lambda rich: _show(evaluation, document, written, rich))
         _check_threshold(evaluation, fail_above)
         _check_audit(evaluation)
+
+
+def _show(evaluation: Evaluation, document: dict[str, Any], written: list[Path], rich: RichConsole) -> None:
+    if evaluation.accuracy is not None:
+        from lidardesign.cli.ladders import show_accuracy
+
+        show_accuracy(evaluation.accuracy, rich)
+    show_evaluation(document, written, rich)
 
 
 def _check_baselines(names: list[str]) -> None:
@@ -147,6 +173,7 @@ def _check_baselines(names: list[str]) -> None:
         raise ConfigError(f"unknown baseline {unknown[0]!r}", where="--baseline", allowed=", ".join(BASELINES))
 
 
+@phase("designs")
 def _collect(targets: list[Path]) -> tuple[list[_Entry], list[Run]]:
     """The designs that were named, and the runs: of folders all designs, of files the file."""
     from lidardesign.design.files import load_design
@@ -267,6 +294,23 @@ def _evaluate(request: EvaluationRequest, console: Console) -> Evaluation:
                 bar.update(line, completed=done, total=total, row=row)
 
         return score(request, progress=show)
+
+
+@phase("writing")
+def _with_accuracy(evaluation: Evaluation, request: EvaluationRequest, run: Run, console: Console) -> Evaluation:
+    with phase("accuracy"), console.progress("ladder") as bar:
+        from lidardesign.evaluate.accuracy import AccuracyRequest, measure_accuracy
+
+        line = bar.add_task("measuring accuracy", total=None, ladder="") if bar else None
+
+        def show(done: int, total: int, ladder: str) -> None:
+            if bar is not None and line is not None:
+                bar.update(line, completed=done, total=total, ladder=ladder)
+            elif ladder:
+                console.note(f"accuracy: {ladder} ...")
+
+        asked = AccuracyRequest(run.config, run.folder, request, evaluation)
+        return replace(evaluation, accuracy=measure_accuracy(asked, progress=show))
 
 
 def _write_files(

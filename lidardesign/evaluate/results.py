@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lidardesign.estimates import HALF_INTERVAL, Estimate, as_documents
 from lidardesign.task import Metric
 
 if TYPE_CHECKING:
+    from lidardesign.evaluate.accuracy import Accuracy
     from lidardesign.evaluate.audit import Audit
     from lidardesign.evaluate.effects import EffectSummary
 
@@ -52,14 +54,20 @@ class Row:
     matched_rays: int | None = None
     details: Mapping[str, float] = field(default_factory=dict)
 
+    @property
+    def half_width(self) -> float:
+        """Half of the interval: how far the value may be off over other scenes, in the metric's unit."""
+        return (self.ci_high - self.ci_low) / 2
+
     def as_dict(self) -> dict[str, Any]:
-        """The contract's keys and `details`; a row at equal bandwidth also says which design it was matched to."""
+        """The contract's keys, `half_width`, `details`, and at equal bandwidth the design that it was matched to."""
         values: dict[str, Any] = {
             "design": self.design,
             "rays": self.rays,
             "value": self.value,
             "ci_low": self.ci_low,
             "ci_high": self.ci_high,
+            "half_width": self.half_width,
             "failures": self.failures,
             "bandwidth_mbps": self.bandwidth_mbps,
             "seconds": self.seconds,
@@ -90,9 +98,14 @@ class Paired:
     ci_high: float
     rays_b: int | None = None
 
+    @property
+    def half_width(self) -> float:
+        """Half of the interval, in the metric's unit."""
+        return (self.ci_high - self.ci_low) / 2
+
     def as_dict(self) -> dict[str, Any]:
-        """The contract's keys, with `rays_b` at equal bandwidth."""
-        names = ("a", "b", "rays", "difference", "ci_low", "ci_high")
+        """The contract's keys and `half_width`, with `rays_b` at equal bandwidth."""
+        names = ("a", "b", "rays", "difference", "ci_low", "ci_high", "half_width")
         values = {name: getattr(self, name) for name in names}
         return values if self.rays_b is None else {**values, "rays_b": self.rays_b}
 
@@ -113,6 +126,7 @@ class Evaluation:
         effects: What was simulated, and why.
         planning_seconds: Time to find that out [s].
         audit: The same rows under all effects, where that was asked for.
+        accuracy: What accuracy costs in time, where that was asked for.
     """
 
     metric: Metric
@@ -126,6 +140,20 @@ class Evaluation:
     effects: Sequence[EffectSummary] = ()
     planning_seconds: float = 0.0
     audit: Audit | None = None
+    accuracy: Accuracy | None = None
+
+    def estimates(self) -> dict[str, Estimate]:
+        """The designs' values and their differences to the baselines with half of their intervals, by what they are."""
+        unit, rows = self.metric.unit, [row for row in self.rows if not row.baseline]
+        values = {
+            f"{row.design} at {row.rays} rays": Estimate(row.value, row.half_width, unit, HALF_INTERVAL)
+            for row in rows
+        }
+        differences = {
+            f"{pair.a} - {pair.b} at {pair.rays} rays": Estimate(pair.difference, pair.half_width, unit, HALF_INTERVAL)
+            for pair in self.paired
+        }
+        return {**values, **differences}
 
     def as_dict(self) -> dict[str, Any]:
         """The contract's JSON form of `evaluate`.
@@ -150,8 +178,9 @@ class Evaluation:
             "detector": self.detector,
             "effects": [effect.as_dict() for effect in self.effects],
             "planning_seconds": self.planning_seconds,
-            "accuracy": [],
+            "accuracy": [] if self.accuracy is None else self.accuracy.as_rows(),
             "notes": list(self.notes),
+            "error_estimates": as_documents(self.estimates()),
         }
         return values if self.audit is None else {**values, "audit": self.audit.as_dict()}
 
