@@ -100,7 +100,7 @@ def rays_scored(found: dict[str, Any]) -> int:
     return found["scenes"] * sum(row["rays"] for row in (*found["rows"], *found["equal_bandwidth"]))
 
 
-def throughput_rows(results: dict[int, list[ProcessResult]]) -> list[list[object]]:
+def throughput_rows(results: dict[str, list[ProcessResult]]) -> list[list[object]]:
     """One row per number of workers: medians of the whole process, rays per second, ratio to the first."""
     first, rows = next(iter(results.values())), []
     for workers, found in results.items():
@@ -119,7 +119,7 @@ def phase_rows(found: dict[str, Any]) -> list[list[object]]:
     return [[name, seconds, 100 * seconds / total] for name, seconds in found["timings"].items()]
 
 
-def same_rows(results: dict[int, list[ProcessResult]]) -> bool:
+def same_rows(results: dict[str, list[ProcessResult]]) -> bool:
     """Whether every run found the same scores; the seconds that rows report may differ."""
     kept = [
         [{key: value for key, value in row.items() if key != "seconds"} for row in one.document()["rows"]]
@@ -139,17 +139,17 @@ def main() -> None:
     made.add_argument("--sensors", type=int, nargs="+", default=[2, 4, 10])
     made.add_argument("--layout", default="grid", choices=["grid", "density", "distributed"])
     made.add_argument("--rays", type=int, nargs="+", default=[36, 100, 196, 361, 576])
-    made.add_argument("--workers", type=int, nargs="+", default=[1, 2], help="tried one after the other")
+    made.add_argument("--workers", nargs="+", default=["1", "2"], help="numbers or dask schedulers, tried in turns")
     options = made.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         _, designs = prepared(Path(folder), options)
         words = ["evaluate", *designs, "--json"]
         for rays in options.rays:
             words += ["--rays", str(rays)]
-        results: dict[int, list[ProcessResult]] = {workers: [] for workers in options.workers}
+        results: dict[str, list[ProcessResult]] = {workers: [] for workers in options.workers}
         for _ in range(options.rounds):
             for workers, done in results.items():
-                done.append(run_process(lidardesign(*words, "--workers", str(workers))))
+                done.append(run_process(lidardesign(*words, "--workers", workers)))
         found = results[options.workers[0]][0].document()
     unit = found["metric"]["unit"]
     tables = {
