@@ -24,13 +24,13 @@ class Estimate:
     """A figure and its error.
 
     Arguments:
-        value: The figure, in `unit`.
+        value: The figure, in `unit`; None where the error is that of many figures, the largest.
         error: How far it may be off, in `unit`; None where it cannot be known.
         unit: "" for shares and counts.
         kind: What the error is: a standard error, half an interval, or the most that rounding takes.
     """
 
-    value: float
+    value: float | None
     error: float | None
     unit: str = ""
     kind: str = STANDARD_ERROR

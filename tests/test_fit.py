@@ -242,3 +242,44 @@ def test_options_that_make_no_sense_are_config_errors(options):
 def test_fewer_rays_than_sensors_is_infeasible():
     with pytest.raises(InfeasibleError):
         fit(FIXED, sensors=4, rays=3)
+
+
+def test_errors_of_a_fit_are_its_spread_over_other_samples():
+    rules = constrained(gate={"end_m": {"max": 0.65}})
+    repeats = 60
+    found = [
+        fit(blob(FACE, 1500, seed), sensors=1, restarts=1, constraints=rules).error_estimates for seed in range(repeats)
+    ]
+    for name in ("log_likelihood", "ess", "admissible_mass"):
+        spread = np.std([one[name].value for one in found])
+        stated = np.mean([one[name].error for one in found])
+        # a standard deviation of so many values is known to 9 %
+        assert stated == pytest.approx(spread, rel=4 / math.sqrt(2 * repeats)), name
+
+
+def test_a_fit_on_fewer_samples_knows_its_likelihood_less_well():
+    errors = [
+        fit(FIXED, sensors=2, em_samples=count, restarts=1).error_estimates["log_likelihood"].error
+        for count in (500, 2000)
+    ]
+    assert errors[0] == pytest.approx(2 * errors[1], rel=0.2)
+
+
+@pytest.mark.parametrize("rays", [7, 100])
+def test_whole_rays_are_off_by_less_than_half_a_ray_per_sensor(rays):
+    result = fit(FIXED, sensors=3, rays=rays, em_samples=2000, restarts=1)
+    estimate = result.error_estimates["rays"]
+    assert estimate.value == rays
+    counts = np.array([sensor.rays for sensor in result.design.sensors])
+    weights = np.array([sensor.weight for sensor in result.design.sensors])
+    assert estimate.error == pytest.approx(np.maximum(counts - rays * weights, 0).sum())
+    assert estimate.error <= 3 / 2
+    assert fit(FIXED, sensors=3, em_samples=2000, restarts=1).error_estimates.keys().isdisjoint({"rays"})
+
+
+@pytest.mark.parametrize("layout", ["scan", "density"])
+def test_every_layout_states_the_error_of_its_likelihood(layout):
+    estimates = fit(FIXED, layout=layout, rays=20, em_samples=2000, restarts=1).error_estimates
+    assert 0 < estimates["log_likelihood"].error < 0.1
+    if layout == "scan":
+        assert estimates["rays"].error == pytest.approx(0.0, abs=1e-9)

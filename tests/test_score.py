@@ -182,10 +182,13 @@ def test_the_document_has_the_keys_of_the_contract_and_is_plain_json():
     assert json.loads(json.dumps(document, allow_nan=False)) == document
     keys = {"metric", "scenes", "rows", "paired", "equal_bandwidth", "effects", "accuracy"}
     assert keys <= set(document)
-    row = {"design", "rays", "value", "ci_low", "ci_high", "failures", "bandwidth_mbps", "seconds", "details"}
+    row = {
+        "design", "rays", "value", "ci_low", "ci_high", "half_width", "failures", "bandwidth_mbps", "seconds",
+        "details",
+    }  # fmt: skip
     assert all(set(entry) == row for entry in document["rows"])
     assert all(set(entry) == {*row, "matched_to", "matched_rays"} for entry in document["equal_bandwidth"])
-    pair = {"a", "b", "rays", "difference", "ci_low", "ci_high"}
+    pair = {"a", "b", "rays", "difference", "ci_low", "ci_high", "half_width"}
     assert all(set(entry) == pair for entry in document["paired"])
     assert document["metric"] == {"name": "misses", "unit": "%", "better": "lower", "worst": 150.0}
 

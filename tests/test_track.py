@@ -605,3 +605,11 @@ def test_the_checked_bandwidth_is_that_of_the_dearest_position(widths):
     # never more than rays that were each the dearest of two neighbouring knots
     worst = np.maximum(gate[:-1, :, 1], gate[1:, :, 1])
     assert found <= max(Bandwidth().mbps_of_widths(row) for row in worst) + 1e-9
+
+
+def test_the_error_of_a_tracks_likelihood_is_its_spread_over_other_samples():
+    repeats = 24
+    found = [fit_track(shelves(1500, seed), rays=2, knots=3) for seed in range(repeats)]
+    stated = np.mean([one.log_likelihood_error for one in found])
+    spread = np.std([one.log_likelihood for one in found])
+    assert stated == pytest.approx(spread, rel=4 / math.sqrt(2 * repeats))

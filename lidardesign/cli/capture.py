@@ -12,8 +12,10 @@ from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
 from lidardesign.cli.designs import number
 from lidardesign.cli.grids import print_table
-from lidardesign.cli.runs import check_choice, parse_at
+from lidardesign.cli.runs import check_choice, folder_of, parse_at
+from lidardesign.cli.times import keep_times
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
@@ -94,20 +96,28 @@ def capture(
     with command(json=json, quiet=quiet, debug=debug) as console:
         _check_numbers(false_alarm, within_deg, outlier_mm)
         check_choice(estimator, "--estimator", ESTIMATORS)
-        from lidardesign.evaluate.capture import load_capture
-        from lidardesign.evaluate.capture_score import evaluate_capture
+        with phase("libraries"):
+            import lidardesign.cli.layouts
+            import lidardesign.design.rays  # noqa: F401
+            from lidardesign.evaluate.capture import load_capture
+            from lidardesign.evaluate.capture_score import evaluate_capture
 
         place = parse_at(at)
         named = _named_apart([(path, _rays(path, rays, place, seed or 0, console)) for path in designs])
-        captured = load_capture(file)
+        with phase("capture"):
+            captured = load_capture(file)
         settings = _settings(captured, estimator, false_alarm, within_deg, outlier_mm, reference)
-        found = evaluate_capture(captured, named, settings)
+        with phase("scoring"):
+            found = evaluate_capture(captured, named, settings)
         for note in found.notes:
             console.note(f"note: {note}")
         if csv is not None:
             from lidardesign.evaluate.capture_table import write_csv
 
-            write_csv(found, csv)
+            with phase("writing"):
+                write_csv(found, csv)
+        for folder in _folders(designs):
+            keep_times(folder, "capture", console)
         document = {"capture": str(file), **found.as_dict(), "files": [] if csv is None else [str(csv)]}
         console.result(document, lambda rich: _show(document, found, rich))
 
@@ -162,6 +172,15 @@ def _listed_rays(path: Path, count: int | None, at: dict[str, float], seed: int,
             )
         return read(path)
     return design_and_rays(load_design(path), path, "galvo", count, at, seed, console)[1]
+
+
+def _folders(designs: list[Path]) -> list[Path]:
+    """The folders of the runs that design files came from; an exported file names none."""
+    from lidardesign.design.files import load_design
+    from lidardesign.export.galvo import is_galvo_file
+
+    found = [folder_of(load_design(path), path) for path in designs if not is_galvo_file(path)]
+    return list(dict.fromkeys(folder for folder in found if folder is not None))
 
 
 def _named_apart(found: list[tuple[Path, Rays]]) -> list[tuple[str, Rays]]:

@@ -10,8 +10,10 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
-from lidardesign.cli.runs import parse_at
+from lidardesign.cli.runs import folder_of, parse_at
+from lidardesign.cli.times import keep_times
 from lidardesign.errors import ConfigError
+from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from lidardesign.design.samples import Samples
     from lidardesign.design.sensor import Design
     from lidardesign.design.support import Retarget
+    from lidardesign.estimates import Estimate
     from lidardesign.simulate.returns import Rays
 
 
@@ -69,7 +72,7 @@ def _list(console: Console) -> None:
             table.add_row(*(escape(entry[key]) for key in ("name", "suffix", "summary")))
         rich.print(table)
 
-    console.result({"formats": formats}, show)
+    console.result({"formats": formats}, show, show_costs=False)
 
 
 def _export(
@@ -81,8 +84,12 @@ def _export(
     seed: int,
     console: Console,
 ) -> None:
-    from lidardesign.design.files import load_design
-    from lidardesign.export.registry import EXPORTERS
+    with phase("libraries"):
+        import lidardesign.cli.layouts
+        import lidardesign.design.rays  # noqa: F401
+        from lidardesign.design.files import load_design
+        from lidardesign.estimates import as_documents
+        from lidardesign.export.registry import EXPORTERS
 
     if path is None:
         raise ConfigError("no design was given", where="DESIGN", hint="lidardesign export --list shows the formats")
@@ -94,18 +101,42 @@ def _export(
     target = out if out is not None else path.with_suffix(exporter.suffix)
     if target.exists() and path.exists() and target.samefile(path):
         raise ConfigError("would overwrite the design itself", where=str(target), hint="give another --out")
+    folder = folder_of(design, path)
     design, laid_out = design_and_rays(design, path, exporter.name, rays, at, seed, console)
-    notes = list(exporter.write(design, laid_out, target))
+    with phase("writing"):
+        notes = list(exporter.write(design, laid_out, target))
+    with phase("reading back"):
+        rounding = exporter.rounding(design, laid_out, target)
     for note in notes:
         console.note(f"note: {note}")
     document = {
         "design": str(path), "format": name, "out": str(target), "rays": len(laid_out),
         "bytes": target.stat().st_size if target.is_file() else None, "notes": notes,
+        "error_estimates": as_documents(rounding),
     }  # fmt: skip
     content = f"{len(laid_out)} rays" if len(laid_out) else f"{len(design.sensors)} sensors"
-    console.result(document, lambda rich: rich.print(f"wrote {target} ({content})", soft_wrap=True, markup=False))
+
+    if folder is not None:
+        keep_times(folder, "export", console)
+
+    def show(rich: RichConsole) -> None:
+        rich.print(f"wrote {target} ({content})", soft_wrap=True, markup=False)
+        rich.print(_shown_rounding(rounding), soft_wrap=True, markup=False)
+
+    console.result(document, show)
 
 
+def _shown_rounding(rounding: Mapping[str, Estimate]) -> str:
+    """What reading the file back showed, in one line."""
+    lost = [
+        f"{name.removesuffix(f'_{estimate.unit}')} {estimate.error:.2g} {estimate.unit}".rstrip()
+        for name, estimate in rounding.items()
+        if estimate.error
+    ]
+    return f"read back: off by at most {', '.join(lost)}" if lost else "read back: exact"
+
+
+@phase("rays")
 def design_and_rays(
     design: Design, path: Path, name: str, count: int | None, at: Mapping[str, float], seed: int, console: Console
 ) -> tuple[Design, Rays]:

@@ -86,7 +86,8 @@ def learn(
             _check_can_start(run)
             settings = resolve(plugin, **choices)
         result = _learn_in_folder(plugin, settings, run, resume, device, console, ranks)
-        keep_timings(run, "learn", console.clock)
+        if ranks.first:
+            keep_timings(run, "learn", console.clock)
         result = replace(result, notes=(*result.notes, *_advice(result)))
         console.result(_document(result), lambda rich: _show(result, rich))
 

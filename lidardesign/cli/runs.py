@@ -35,6 +35,7 @@ class Run:
         """Where a design of this run is written."""
         return self.folder / DESIGN_FOLDER / f"{name}.yaml"
 
+    @phase("scenes")
     def scenes(self, split: Split, seed: int) -> list[Scene]:
         """The scenes of a split, judged by the run's own design space.
 
@@ -85,13 +86,19 @@ def open_target(path: Path) -> tuple[Run | None, Design | None]:
 
 
 def run_of(design: Design, path: Path) -> Run | None:
-    """The run that a design came from, if it is there: its provenance names it relative to its file."""
+    """The run that a design came from, if it is there."""
+    folder = folder_of(design, path)
+    return None if folder is None else open_run(folder)
+
+
+def folder_of(design: Design, path: Path) -> Path | None:
+    """The folder of the run that a design came from, if it is there: its provenance names it relative to its file."""
     named = design.provenance.get("run")
     if not isinstance(named, str):
         return None
     folder = Path(os.path.normpath(path.parent / named))
     # a design that was copied elsewhere names a folder that is none of its run's
-    return open_run(folder) if (folder / MANIFEST).is_file() else None
+    return folder if (folder / MANIFEST).is_file() else None
 
 
 def need_run(run: Run | None, path: Path) -> Run:

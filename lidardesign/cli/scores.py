@@ -29,6 +29,7 @@ def show_evaluation(document: dict[str, Any], written: Sequence[Path], rich: Ric
     figure = f"{metric['name']} [{metric['unit']}], {metric['better']} is better"
     scenes = f"over {document['scenes']} held-out scenes" + "".join(f", {text}" for text in document.get("set", []))
     _show_rows(document["rows"], escape(f"{figure}, {scenes}"), rich)
+    _show_errors(document, rich)
     designs = {row["design"] for row in document["rows"]} - {row["design"] for row in document["equal_bandwidth"]}
     against = [pair for pair in document["paired"] if pair["b"] not in designs]
     unit = escape(metric["unit"])
@@ -56,6 +57,22 @@ def _show_rows(rows: Sequence[Entry], title: str, rich: RichConsole) -> None:
         cells = (row["rays"], row["value"], interval, row["failures"], *extra, row["bandwidth_mbps"])
         lines.append([row["design"], *(number(cell) for cell in cells), number(row["seconds"], 2)])
     print_table(title, headings, lines, rich)
+
+
+def _show_errors(document: Entry, rich: RichConsole) -> None:
+    """How far designs' scores and their differences may be off, the widest of each."""
+    designs = {pair["a"] for pair in document["paired"]}
+    values = [row["half_width"] for row in document["rows"] if row["design"] in designs]
+    differences = [pair["half_width"] for pair in document["paired"]]
+    if not differences:
+        return
+    unit = document["metric"]["unit"]
+    rich.print(
+        f"over other scenes, designs' values may be off by up to {number(max(values), 2)} {unit}, "
+        f"their differences by up to {number(max(differences), 2)} {unit} (half of the 95 % intervals)",
+        soft_wrap=True,
+        markup=False,
+    )
 
 
 def _show_grid(

@@ -9,6 +9,7 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.console import command
+from lidardesign.run.clock import phase
 
 
 def show(
@@ -21,11 +22,12 @@ def show(
 ) -> None:
     """Print a design for people (or, with --json, for scripts), all of it or its rays at a condition."""
     with command(json=json, quiet=quiet, debug=debug) as console:
-        from lidardesign.cli.designs import show_design
-        from lidardesign.cli.runs import parse_at
-        from lidardesign.design.files import load_design
-        from lidardesign.design.track import placed
-        from lidardesign.design.track_document import track_document
+        with phase("libraries"):
+            from lidardesign.cli.designs import show_design
+            from lidardesign.cli.runs import parse_at
+            from lidardesign.design.files import load_design
+            from lidardesign.design.track import placed
+            from lidardesign.design.track_document import track_document
 
         condition = parse_at(at)
         loaded = load_design(design)
@@ -42,4 +44,4 @@ def show(
             "constraints": loaded.constraints,
             "provenance": loaded.provenance,
         }
-        console.result(document, lambda rich: show_design(loaded, rich))
+        console.result(document, lambda rich: show_design(loaded, rich), show_costs=False)

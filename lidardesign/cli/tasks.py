@@ -11,6 +11,7 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.console import command
+from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -48,7 +49,8 @@ def list_(
 ) -> None:
     """List the installed tasks; a broken one with its reason."""
     with command(json=json, quiet=quiet, debug=debug) as console:
-        from lidardesign.registry import list_tasks
+        with phase("libraries"):
+            from lidardesign.registry import list_tasks
 
         listings = list_tasks()
         entries = [
@@ -60,7 +62,7 @@ def list_(
             }
             for item in listings
         ]
-        console.result({"tasks": entries}, lambda rich: _show_list(listings, rich))
+        console.result({"tasks": entries}, lambda rich: _show_list(listings, rich), show_costs=False)
 
 
 def _show_list(listings: list[TaskListing], rich: RichConsole) -> None:
@@ -84,11 +86,12 @@ def show(
 ) -> None:
     """Show a task: its metric, its design space and the keys of its configuration."""
     with command(json=json, quiet=quiet, debug=debug) as console:
-        from lidardesign.registry import load_task
+        with phase("libraries"):
+            from lidardesign.registry import load_task
 
         task = load_task(name)
         document = _describe(task)
-        console.result(document, lambda rich: _show_task(document, rich))
+        console.result(document, lambda rich: _show_task(document, rich), show_costs=False)
 
 
 def _describe(task: Task) -> dict[str, Any]:

@@ -6,14 +6,21 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from lidardesign.cli.grids import print_table
-from lidardesign.run.clock import INSIDE, OTHER
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.run.clock import INSIDE, OTHER, keep_timings
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rich.console import Console as RichConsole
+
+    from lidardesign.cli.console import Console
 
 # Phases of a smaller share are left to --json; `other` shows what they took.
 LEAST_SHARE = 0.005
 INDENT = "  "
+# Commands that only read a run wait for its writer no longer than this.
+SHORT_WAIT_S = 0.5
 
 
 def show_times(timings: Mapping[str, float], rich: RichConsole) -> None:
@@ -30,3 +37,12 @@ def show_times(timings: Mapping[str, float], rich: RichConsole) -> None:
 def _line(key: str, seconds: float, total: float) -> tuple[str, str, str]:
     *outside, name = key.split(INSIDE)
     return f"{INDENT * len(outside)}{name}", f"{seconds:.2f}", f"{100 * seconds / total:.0f} %"
+
+
+def keep_times(run: Path, name: str, console: Console) -> None:
+    """Enter the times of a command that only reads a run in its manifest; where that cannot be, a note says so."""
+    try:
+        keep_timings(run, name, console.clock, wait_s=SHORT_WAIT_S)
+    except (ConfigError, DataError, OSError) as error:
+        message = error.message if isinstance(error, ConfigError | DataError) else error.strerror or error
+        console.note(f"note: the times of {name} are not kept in {run}: {message}")

@@ -30,6 +30,7 @@ from lidardesign.design.sensor import (
 from lidardesign.design.sensor_csv import looks_like_sensor_csv, read_sensor_csv
 from lidardesign.design.track_document import MOST_TRACK_RAYS, read_at, read_track, track_document
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.run.clock import phase
 from lidardesign.run.files import write_atomic
 from lidardesign.run.yaml import Document, dump_yaml, load_yaml
 
@@ -133,6 +134,7 @@ def save_design(design: Design, path: Path) -> None:
     write_atomic(Path(path), dump_yaml(design_document(design)))
 
 
+@phase("designs")
 def load_design(path: Path) -> Design:
     """Read a design from a design file or from the research code's sensor CSV, told apart by content.
 

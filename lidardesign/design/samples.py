@@ -12,6 +12,7 @@ import numpy as np
 
 from lidardesign.errors import DataError
 from lidardesign.numerics import normalised_weights, systematic_draw
+from lidardesign.run.clock import phase
 from lidardesign.run.files import write_atomic
 from lidardesign.run.manifest import record, verify
 from lidardesign.space import DesignSpace
@@ -79,6 +80,7 @@ def save_samples(samples: Samples, run: Path) -> None:
     record(run, [FILE_NAME])
 
 
+@phase("samples")
 def load_samples(run: Path) -> Samples:
     """Read the samples of a run folder.
 

@@ -29,6 +29,7 @@ from lidardesign.evaluate.candidates import Candidate, Layout, Positions, Spot, 
 from lidardesign.evaluate.observed import TrainingViews
 from lidardesign.evaluate.occupancy import occupancy
 from lidardesign.evaluate.placement import RAY_AXES, even_placement
+from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
 from lidardesign.simulate.returns import Rays
 from lidardesign.space import DesignSpace
@@ -105,6 +106,7 @@ class Baselines:
             self._candidates[name] = BASELINES[name](self)
         return self._candidates[name]
 
+    @phase("baselines")
     def best(self, choices: Sequence[tuple[str, list[Option]]]) -> list[Option]:
         """Of each baseline's options the one that is worth most on training scenes, the first of equals.
 

@@ -18,6 +18,7 @@ from lidardesign.evaluate.candidates import Candidate, Positions, mean_mbps
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.scoring import score_lists
 from lidardesign.registry import plugin_guard
+from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
 from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import conditions_of
@@ -68,6 +69,7 @@ class Entry:
         return (self.name, *(array.tobytes() for array in arrays))
 
 
+@phase("rays")
 def entries_of(request: EvaluationRequest) -> list[Entry]:
     """All rows to be: designs, baselines, then baselines at each design's bandwidth."""
     _check_tracks(request)

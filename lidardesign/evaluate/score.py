@@ -23,6 +23,7 @@ from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.results import Evaluation, Paired, Row, worse_than_threshold
 from lidardesign.evaluate.scoring import score_scene
 from lidardesign.evaluate.statistics import bootstrap_interval, paired_difference
+from lidardesign.run.clock import phase
 from lidardesign.simulate.plan import Plan, Planner
 
 __all__ = [
@@ -98,6 +99,7 @@ def _part(progress: Progress | None, number: int, passes: int) -> Progress | Non
     return lambda done, total, name: progress(number * total + done, passes * total, name)
 
 
+@phase("audit")
 def _audit(
     request: EvaluationRequest,
     entries: Sequence[Entry],
@@ -116,6 +118,7 @@ def _audit(
     return Audit(metric.tolerance, metric.unit, found, skipped, unavailable)
 
 
+@phase("held-out scenes")
 def _score_all(
     request: EvaluationRequest,
     entries: Sequence[Entry],
@@ -137,6 +140,7 @@ def _score_all(
     return _Scored(tallies, [scene.plan for scene in scenes], sum(scene.planning_seconds for scene in scenes))
 
 
+@phase("intervals")
 def _rows(request: EvaluationRequest, entries: Sequence[Entry], scored: _Scored) -> list[Row]:
     return [_row(request, entry, scored.tallies[entry.key]) for entry in entries]
 
@@ -174,6 +178,7 @@ def _pair(first: Row, second: Row, seed: int, rays_b: int | None = None) -> Pair
     return Paired(first.design, second.design, first.rays, mean, low, high, rays_b)
 
 
+@phase("intervals")
 def _pairs(rows: Sequence[Row], seed: int) -> list[Paired]:
     """Every design against every baseline and every later design, at equal numbers of rays."""
     return [
@@ -185,6 +190,7 @@ def _pairs(rows: Sequence[Row], seed: int) -> list[Paired]:
     ]
 
 
+@phase("intervals")
 def _bandwidth_pairs(rows: Sequence[Row], matched: Sequence[Row], seed: int) -> list[Paired]:
     designs = {(row.design, row.rays): row for row in rows if not row.baseline}
     return [_pair(designs[row.matched_to, row.matched_rays], row, seed, row.rays) for row in matched]

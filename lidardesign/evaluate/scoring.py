@@ -11,6 +11,7 @@ import numpy as np
 from lidardesign.errors import PluginError
 from lidardesign.evaluate.candidates import Positions
 from lidardesign.registry import plugin_guard
+from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
 from lidardesign.simulate.physics import Physics
 from lidardesign.simulate.raycast import SceneCaster
@@ -78,6 +79,7 @@ def score_scene(task: Task, scene: Scene, rays: Rays, casters: Sequence[SceneCas
     return checked_score(task, scene, simulate(scene, rays, casters=casters))
 
 
+@phase("metric")
 def checked_score(task: Task, scene: Scene, returns: Sequence[Returns]) -> Score:
     """What a task makes of returns in a scene; a failure has the metric's worst value.
 

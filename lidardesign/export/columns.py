@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
+
 import numpy as np
 
 from lidardesign.design.sensor import Design
+from lidardesign.errors import ConfigError, DataError
 from lidardesign.simulate.returns import Rays
 from lidardesign.space import angles
 
@@ -26,6 +30,23 @@ def ray_columns(rays: Rays) -> dict[str, np.ndarray]:
         "sensor": rays.sensor,
         "time_s": rays.time_s,
     }
+
+
+def rays_of(columns: Mapping[str, np.ndarray], path: Path) -> Rays:
+    """The ray list of columns that were read from a file.
+
+    Raises:
+        DataError: A column is missing, or its values are none that rays have.
+    """
+    try:
+        origin, ray = (
+            np.stack([columns[f"{name}_{axis}"] for axis in axes], axis=1)
+            for name, axes in (("origin", ("x_m", "y_m", "z_m")), ("direction", ("x", "y", "z")))
+        )
+        gate = np.stack([columns["gate_start_m"], columns["gate_end_m"]], axis=1)
+        return Rays(origin, ray, gate, columns["sensor"], columns["time_s"])
+    except (KeyError, ValueError, ConfigError) as error:
+        raise DataError(f"holds no ray list: {error}", where=str(path)) from error
 
 
 def losses(design: Design) -> list[str]:

@@ -28,7 +28,9 @@ from lidardesign.design.galvo import (
 from lidardesign.design.rays import fire_times
 from lidardesign.design.sensor import Design
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.estimates import Estimate
 from lidardesign.export.columns import losses
+from lidardesign.export.read_back import rays_rounding
 from lidardesign.export.steering import short_tour, travel
 from lidardesign.run.files import write_atomic
 from lidardesign.simulate.returns import Rays
@@ -86,6 +88,11 @@ def write(design: Design, rays: Rays, path: Path) -> list[str]:
             lines.append(",".join(map(str, row)))
     write_atomic(path, "\n".join(lines) + "\n")
     return [*_summary(positions), *losses(design), "firing times follow from the order of the rows"]
+
+
+def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+    """What the written numbers lose: gates open outward to whole picoseconds; firing times are not held."""
+    return rays_rounding(rays, read(path), path, times=False)
 
 
 def plan(design: Design, rays: Rays) -> list[Position]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from lidardesign.design.sensor import Design
 from lidardesign.errors import ConfigError
+from lidardesign.estimates import Estimate
 from lidardesign.simulate.returns import Rays
 
 
@@ -19,7 +20,8 @@ class Exporter:
         name: As `export --format` takes it.
         suffix: Of the file that it writes, with the dot.
         summary: One line for `export --list`.
-        module: Where its `write(design, rays, path) -> list[str]` is.
+        module: Where its `write(design, rays, path) -> list[str]` is, and `rounding(design, rays, path)`, which reads
+            the file back and says what its numbers lose.
     """
 
     name: str
@@ -34,6 +36,14 @@ class Exporter:
             DataError: The file cannot be written.
         """
         return import_module(self.module).write(design, rays, Path(path))
+
+    def rounding(self, design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+        """What the numbers in a file that was just written lose, by reading it back: the largest error of each kind.
+
+        Raises:
+            DataError: The file does not hold what was written.
+        """
+        return import_module(self.module).rounding(design, rays, Path(path))
 
 
 EXPORTERS: dict[str, Exporter] = {

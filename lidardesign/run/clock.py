@@ -88,7 +88,7 @@ def phase(name: str) -> Iterator[None]:
         yield
 
 
-def keep_timings(run: Path, command: str, clock: Clock) -> None:
+def keep_timings(run: Path, command: str, clock: Clock, *, wait_s: float = WAIT_S) -> None:
     """Enter a command's times in a run's manifest, in place of those of the last time, under the run's lock.
 
     Raises:
@@ -99,7 +99,7 @@ def keep_timings(run: Path, command: str, clock: Clock) -> None:
         "seconds": round(clock.seconds, 3),
         "phases": clock.timings(),
     }
-    with run_lock(run, wait_s=WAIT_S):
+    with run_lock(run, wait_s=wait_s):
         manifest = read_manifest(run)
         commands = {name: times for name, times in manifest.get("timings", {}).items() if isinstance(times, dict)}
         write_manifest(run, {**manifest, "timings": {**commands, command: entry}})

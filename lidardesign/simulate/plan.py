@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.run.clock import phase
 from lidardesign.run.validation import suggest
 from lidardesign.scene import Scene
 from lidardesign.simulate.bistatic import path_windows
@@ -153,6 +154,7 @@ class Planner:
         """Of what `auto` skips."""
         return self.tolerance or Tolerance.of(self.detector)
 
+    @phase("planning")
     def plan(self, scene: Scene, lists: Sequence[Rays], casters: Sequence[SceneCaster] | None = None) -> Plan:
         """Which effects are on for lists of rays in a scene.
 

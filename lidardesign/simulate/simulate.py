@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.returns import Outcome, Rays, Returns
@@ -41,6 +42,7 @@ def simulate(
     return simulate_many(scene, [rays], casters=casters, physics=physics)[0]
 
 
+@phase("tracing")
 def simulate_many(
     scene: Scene,
     lists: Sequence[Rays],
@@ -96,6 +98,7 @@ def simulate_many(
     return found
 
 
+@phase("casters")
 def build_casters(scene: Scene) -> list[SceneCaster]:
     """One caster per time frame of a scene, to be shared by all designs that are simulated in it."""
     return [SceneCaster(scene, frame) for frame in range(scene.frames)]
