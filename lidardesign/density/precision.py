@@ -1,0 +1,201 @@
+"""What torch has to measure of a learned flow: gradients of its steps beside their own noise, float32 beside float64.
+
+A step's gradient is an estimate: another batch gives another one. What arithmetic or fewer scenes change in it matters
+only beside that noise, sqrt(E |g - E g|^2) over batches.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from lidardesign.density.flow import DesignFlow
+from lidardesign.density.learn import FLOW
+from lidardesign.density.losses import Pool, balancing_loss, draw_conditions, pathwise_loss
+from lidardesign.density.objective import Coordinates
+from lidardesign.density.parallel import ALONE, Ranks
+from lidardesign.density.settings import LearningSettings
+from lidardesign.density.target import Target
+from lidardesign.density.training import SIGMA_START_RATIO
+from lidardesign.density.visibility import Optics
+from lidardesign.run.checkpoint import load_arrays
+from lidardesign.run.config import RunConfig
+from lidardesign.space import AZIMUTH, DesignSpace
+
+Loss = Callable[[DesignFlow, torch.Generator], torch.Tensor]
+DTYPES = ("float32", "float64")
+
+
+def load_flow(run: Path, config: RunConfig) -> DesignFlow:
+    """The flow that a run learned, in float64.
+
+    Raises:
+        DataError: The run has none, or it is damaged.
+    """
+    coordinates, settings = Coordinates(config.space), config.learning
+    flow = DesignFlow(
+        coordinates.blocks,
+        len(coordinates.conditions),
+        layers=settings.layers,
+        hidden=settings.hidden,
+        bins=settings.bins,
+        periodic=[config.space.free[n] == AZIMUTH and config.space.full_azimuth for n in coordinates.learned],
+        generator=torch.Generator().manual_seed(config.seed),
+    )
+    arrays, _ = load_arrays(run, FLOW)
+    flow.double().load_state_dict({name: torch.as_tensor(values) for name, values in arrays.items()})
+    return flow
+
+
+@dataclass(frozen=True, eq=False)
+class FlatTarget:
+    """p* = 1 at no cost: what remains of a step's time is the flow's own."""
+
+    optics: Optics
+    space: DesignSpace
+    ranks: Ranks = ALONE
+
+    def log_density(self, points: np.ndarray) -> np.ndarray:
+        """See `Target`."""
+        return np.zeros(len(points))
+
+    def log_density_and_gradient(
+        self, points: np.ndarray, sigma_m: float | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See `Target`."""
+        return np.zeros(len(points)), np.zeros(points.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """The two kinds of steps of learning, at a flow.
+
+    Arguments:
+        flow: Where the gradients are taken.
+        target: The target density.
+        settings: Of learning.
+        pool: Proposals for balancing.
+    """
+
+    flow: DesignFlow
+    target: Target | FlatTarget
+    settings: LearningSettings
+    pool: Pool
+
+    def without_target(self) -> Steps:
+        """The same steps with a target that costs nothing, to be timed."""
+        return replace(self, target=FlatTarget(self.target.optics, self.target.space))
+
+    @property
+    def sigma_m(self) -> float:
+        """The middle of the annealing on its geometric scale [m]."""
+        final = self.target.optics.sigma_m
+        start = max(self.settings.sigma_start_m or SIGMA_START_RATIO * final, final)
+        return float(np.sqrt(start * final))
+
+    def pathwise(self, target: Target | None = None) -> Loss:
+        """The loss of a path-wise step, with a thinned target where one is given."""
+        target, coordinates = target or self.target, Coordinates(self.target.space)
+        return lambda flow, generator: pathwise_loss(
+            flow, target, coordinates, self.settings.batch, self.sigma_m, 0.0, generator
+        )[0]
+
+    def balancing(self) -> Loss:
+        """The loss of a balancing step."""
+        coordinates = Coordinates(self.target.space)
+        return lambda flow, generator: balancing_loss(
+            flow, self.target, coordinates, self.settings.batch, self.pool, generator
+        )[0]
+
+
+def gradient(flow: DesignFlow, loss: Loss, seed: int, clip_norm: float) -> np.ndarray:
+    """The gradient that a step takes, by all parameters, flat float64; zeros where it is not finite and skipped.
+
+    Arguments:
+        flow: Its arithmetic is the step's.
+        loss: Draws its batch from the generator that it is given.
+        seed: Of the batch: the same one gives the same batch in any arithmetic.
+        clip_norm: The length that steps are clipped to.
+    """
+    parameters = list(flow.parameters())
+    found = torch.autograd.grad(loss(flow, torch.Generator().manual_seed(seed)), parameters, allow_unused=True)
+    parts = [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, found, strict=True)]
+    flat = torch.cat([part.detach().double().reshape(-1) for part in parts]).cpu().numpy()
+    if not np.isfinite(flat).all():
+        return np.zeros_like(flat)
+    return flat * min(1.0, clip_norm / max(np.linalg.norm(flat), np.finfo(float).tiny))
+
+
+def in_arithmetic(flow: DesignFlow, dtype: str) -> DesignFlow:
+    """A copy of a flow in float32 or float64."""
+    return copy.deepcopy(flow).to(dtype=getattr(torch, dtype))
+
+
+def beside_noise(gradients: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> tuple[float, float]:
+    """The error of gradients as a share of the noise that the exact ones have anyway, and its standard error.
+
+    Arguments:
+        gradients: Of several batches, shape (P,) each; the standard error is the jackknife's over batches.
+        exact: Of the same batches, 3 or more.
+    """
+    exact = np.asarray(exact)
+    apart = np.square(np.asarray(gradients) - exact).sum(axis=1)
+    products = exact @ exact.T
+    left_out = [_share(apart, products, np.delete(np.arange(len(apart)), n)) for n in range(len(apart))]
+    count = len(apart)
+    error = np.sqrt((count - 1) * np.var(left_out))
+    return _share(apart, products, np.arange(count)), float(error)
+
+
+def _share(apart: np.ndarray, products: np.ndarray, rows: np.ndarray) -> float:
+    """sqrt(mean |difference|^2 / variance) over some batches, from the products of all gradients (K, K)."""
+    products = products[np.ix_(rows, rows)]
+    variance = (np.trace(products) - products.sum() / len(rows)) / (len(rows) - 1)
+    return float(np.sqrt(apart[rows].mean() / variance)) if variance > 0 else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """Samples of a flow in float64, to be evaluated in any arithmetic.
+
+    Arguments:
+        base: Base points, shape (N, D).
+        values: The points that they become, shape (N, D).
+        conditions: Shape (N, context), or None.
+        log_prob: Their exact log density, shape (N,).
+    """
+
+    base: torch.Tensor
+    values: torch.Tensor
+    conditions: torch.Tensor | None
+    log_prob: np.ndarray
+
+    @classmethod
+    def of(cls, flow: DesignFlow, count: int, seed: int) -> Drawn:
+        """Samples of a float64 flow."""
+        generator = torch.Generator().manual_seed(seed)
+        conditions, base = draw_conditions(flow, count, generator), flow.draw_base(count, generator)
+        with torch.no_grad():
+            values, log_prob = flow(base, conditions)
+        return cls(base, values, conditions, log_prob.numpy())
+
+    def log_densities(self, flow: DesignFlow) -> np.ndarray:
+        """log density of the points in a flow's own arithmetic, shape (N,)."""
+        with torch.no_grad():
+            return flow.log_prob(*self._like(flow, self.values)).double().numpy()
+
+    def round_trip_nats(self, flow: DesignFlow) -> float:
+        """The largest difference of log densities from base to point and back, in a flow's own arithmetic [nats]."""
+        base, conditions = self._like(flow, self.base)
+        with torch.no_grad():
+            values, drawn = flow(base, conditions)
+            return float((drawn - flow.log_prob(values, conditions)).abs().max())
+
+    def _like(self, flow: DesignFlow, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+        like = next(flow.parameters())
+        return values.to(like), None if self.conditions is None else self.conditions.to(like)
