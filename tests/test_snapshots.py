@@ -24,23 +24,29 @@ def contents(run):
 
 
 @pytest.mark.parametrize(
-    ("steps", "kept"), [(1000, (125, 250, 500)), (290, (36, 72, 145)), (3, (1,)), (2, (1,)), (1, ())]
+    ("first", "steps", "kept"),
+    [(500, 1000, (500, 562, 625, 750)), (145, 290, (145, 163, 181, 217)), (0, 8, (1, 2, 4)), (1, 2, (1,)), (1, 1, ())],
 )
-def test_snapshots_are_kept_at_an_eighth_a_quarter_and_half_of_the_steps(steps, kept):
-    assert snapshot_steps(steps) == kept
+def test_snapshots_are_kept_when_the_last_phase_begins_and_at_an_eighth_a_quarter_and_half_of_it(first, steps, kept):
+    assert snapshot_steps(first, steps) == kept
+
+
+def test_nothing_is_kept_before_sigma_has_its_final_value(tmp_path):
+    learn(BallTask(), config_of(steps=40, balance=0.0, anneal=0.5), tmp_path)
+    assert list(kept_snapshots(tmp_path)) == [20, 22, 25, 30]
 
 
 def test_a_run_lists_its_snapshots_with_their_hashes(finished):
-    assert kept_snapshots(finished) == {step: snapshot_name(step) for step in (15, 30, 60)}
+    assert kept_snapshots(finished) == {step: snapshot_name(step) for step in (60, 67, 75, 90)}
     for name in kept_snapshots(finished).values():
         verify(finished, name)
 
 
 def test_snapshots_hold_the_weights_of_the_flow_on_the_way_to_its_last_ones(finished):
     last, _ = load_arrays(finished, "flow.safetensors")
-    early, state = load_arrays(finished, snapshot_name(15))
-    late, _ = load_arrays(finished, snapshot_name(60))
-    assert state["step"] == 15
+    early, state = load_arrays(finished, snapshot_name(60))
+    late, _ = load_arrays(finished, snapshot_name(90))
+    assert state["step"] == 60
     assert early.keys() == last.keys()
 
     def distance(weights):
@@ -49,7 +55,7 @@ def test_snapshots_hold_the_weights_of_the_flow_on_the_way_to_its_last_ones(fini
     assert distance(early) > distance(late) > 0
 
 
-@pytest.mark.parametrize("step", [20, 70])
+@pytest.mark.parametrize("step", [70, 110])
 def test_a_resumed_run_keeps_the_same_snapshots_bit_for_bit(finished, tmp_path, step):
     with pytest.raises(KeyboardInterrupt):
         learn(BallTask(), config_of(), tmp_path, progress=Interrupter(step))
@@ -59,10 +65,10 @@ def test_a_resumed_run_keeps_the_same_snapshots_bit_for_bit(finished, tmp_path, 
 
 def test_clearing_keeps_earlier_snapshots_and_removes_what_a_killed_process_left(tmp_path):
     learn(BallTask(), config_of(), tmp_path)
-    (tmp_path / FOLDER / ".step-000015.safetensors.1.aa.tmp").write_bytes(b"half")
-    clear_snapshots(tmp_path, beyond=30)
-    assert sorted(contents(tmp_path)) == ["step-000015.safetensors", "step-000030.safetensors"]
-    assert list(kept_snapshots(tmp_path)) == [15, 30]
+    (tmp_path / FOLDER / ".step-000060.safetensors.1.aa.tmp").write_bytes(b"half")
+    clear_snapshots(tmp_path, beyond=70)
+    assert sorted(contents(tmp_path)) == ["step-000060.safetensors", "step-000067.safetensors"]
+    assert list(kept_snapshots(tmp_path)) == [60, 67]
     clear_snapshots(tmp_path)
     assert not contents(tmp_path)
     assert not kept_snapshots(tmp_path)

@@ -1,6 +1,7 @@
 """The flow as it was at a few steps of learning, kept in the run: what more steps bought can then be measured.
 
-Snapshots lie at an eighth, a quarter and half of the steps; after the last step the flow itself is there.
+Snapshots lie where the target is the final one: when balancing begins, and at an eighth, a quarter and half of it.
+Before that, steps sharpen the target instead of reducing an error. After the last step the flow itself is there.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ from lidardesign.run.files import remove_stray_temporaries
 from lidardesign.run.manifest import forget, read_manifest
 
 FOLDER = "snapshots"
-# Error over steps falls like a power of them: doublings show it best, and three are enough to see it.
-SHARES = (8, 4, 2)
+# The error falls by a power of the steps: doublings show it best, and three are enough to see it.
+SHARES = (0.0, 1 / 8, 1 / 4, 1 / 2)
 _NAME = re.compile(rf"{FOLDER}/step-(\d+)\.safetensors")
 
 
-def snapshot_steps(steps: int) -> tuple[int, ...]:
-    """The steps of a training of `steps` steps after which a snapshot is kept, ascending; none of fewer than 2."""
-    return tuple(sorted({steps // share for share in SHARES} - {0, steps}))
+def snapshot_steps(first: int, steps: int) -> tuple[int, ...]:
+    """The steps after which a snapshot is kept, ascending, where the last phase begins after `first` of the steps."""
+    return tuple(sorted({first + int(share * (steps - first)) for share in SHARES} - {0, steps}))
 
 
 def snapshot_name(step: int) -> str:

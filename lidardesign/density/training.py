@@ -75,7 +75,10 @@ class _Snapshot:
 
 @dataclass
 class Trainer:
-    """The state of training: flow, optimiser, random stream and counters."""
+    """The state of training: flow, optimiser, random stream and counters.
+
+    `replan` is asked for other settings once, when balancing begins; they may differ in the number of balancing steps.
+    """
 
     flow: DesignFlow
     target: Target
@@ -89,6 +92,7 @@ class Trainer:
     skipped_in_a_row: int = 0
     halvings: int = 0
     seconds_before: float = 0.0
+    replan: Callable[[Trainer], LearningSettings] | None = None
     _snapshot: _Snapshot | None = None
 
     def __post_init__(self) -> None:
@@ -104,6 +108,12 @@ class Trainer:
     def pathwise_steps(self) -> int:
         """Steps before balancing begins."""
         return round((1 - self.settings.balance) * self.settings.steps)
+
+    @property
+    def kept_steps(self) -> tuple[int, ...]:
+        """The steps after which a snapshot is kept; none before sigma has its final value."""
+        settings, pathwise = self.settings, self.pathwise_steps
+        return snapshot_steps(pathwise if settings.balance else math.ceil(settings.anneal * pathwise), settings.steps)
 
     def sigma_m(self, step: int) -> float:
         """The annealed sigma of a step [m]."""
@@ -146,8 +156,10 @@ class Trainer:
                 if time.perf_counter() - checkpointed > self.settings.checkpoint_seconds:
                     self._save(self._snapshot)
                     checkpointed = time.perf_counter()
+            if self.replan is not None and self.step == self.pathwise_steps:
+                self.settings, self.replan = self.replan(self), None
             loss, ess = self._advance()
-            if self.step in snapshot_steps(self.settings.steps):
+            if self.step in self.kept_steps:
                 self._keep()
             if self.step % PROGRESS_STEPS == 0 or self.step == self.settings.steps:
                 self._report(loss, ess, progress)
@@ -155,12 +167,7 @@ class Trainer:
     def _advance(self) -> tuple[float, float]:
         for group in self.optimiser.param_groups:
             group["lr"] = self._rate()
-        self.optimiser.zero_grad(set_to_none=True)
-        loss, value, ess = self._loss()
-        if torch.isfinite(loss):
-            loss.backward()
-        self.target.ranks.sum_gradients(self.flow.parameters(), valid=bool(torch.isfinite(loss)))
-        norm = torch.nn.utils.clip_grad_norm_(self.flow.parameters(), self.settings.clip_norm)
+        loss, norm, value, ess = self.find_gradient()
         if torch.isfinite(loss) and torch.isfinite(norm):
             self.optimiser.step()
             self.skipped_in_a_row = 0
@@ -168,6 +175,15 @@ class Trainer:
             self._skip()
         self.step += 1
         return value, ess
+
+    def find_gradient(self) -> tuple[torch.Tensor, torch.Tensor, float, float]:
+        """Fill the gradients of a step without taking it: the loss, their norm, the loss and the ESS for reports."""
+        self.optimiser.zero_grad(set_to_none=True)
+        loss, value, ess = self._loss()
+        if torch.isfinite(loss):
+            loss.backward()
+        self.target.ranks.sum_gradients(self.flow.parameters(), valid=bool(torch.isfinite(loss)))
+        return loss, torch.nn.utils.clip_grad_norm_(self.flow.parameters(), self.settings.clip_norm), value, ess
 
     def _loss(self) -> tuple[torch.Tensor, float, float]:
         count = self.settings.batch
