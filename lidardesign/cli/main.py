@@ -16,6 +16,7 @@ from lidardesign.cli.evaluate import evaluate
 from lidardesign.cli.export import export
 from lidardesign.cli.fit import fit
 from lidardesign.cli.learn import learn
+from lidardesign.cli.ranks import refuse_ranks
 from lidardesign.cli.show import show
 from lidardesign.cli.tasks import tasks_app
 
@@ -36,6 +37,7 @@ app.add_typer(tasks_app, name="tasks")
 EXAMPLES = {
     learn: (
         "lidardesign learn face --preset draft --out runs/face",
+        "torchrun --nproc-per-node 2 -m lidardesign learn face --out runs/face",
         "lidardesign learn meshes --set folder=scans --set scale=0.001 --out runs/scans",
         "lidardesign learn face --out runs/face --resume",
     ),
@@ -79,11 +81,14 @@ def _print_version(wanted: bool) -> None:
 
 @app.callback()
 def program(
+    context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """Declare the options of the program itself; the typer object carries its help."""
+    if context.invoked_subcommand != "learn":
+        refuse_ranks(context.invoked_subcommand or "this")
 
 
 def run(arguments: list[str] | None = None) -> None:

@@ -29,10 +29,13 @@ def refuse_ranks(subcommand: str) -> None:
     """Refuse to run a command many times at once that does not know of ranks.
 
     Raises:
-        ConfigError: torchrun started several.
+        ConfigError: torchrun started several; the first one says so.
     """
-    if LAUNCHER in os.environ and os.environ.get("WORLD_SIZE", "1") != "1":
-        raise ConfigError(f"{subcommand} does not run on several ranks", where="torchrun", allowed="learn")
+    if LAUNCHER not in os.environ or os.environ.get("WORLD_SIZE", "1") == "1":
+        return
+    if os.environ.get("RANK", "0") != "0":
+        raise typer.Exit(ConfigError.exit_code)
+    raise ConfigError(f"{subcommand} does not run on several ranks", where="torchrun", allowed="learn")
 
 
 @contextlib.contextmanager
