@@ -296,7 +296,6 @@ def _evaluate(request: EvaluationRequest, console: Console) -> Evaluation:
         return score(request, progress=show)
 
 
-@phase("writing")
 def _with_accuracy(evaluation: Evaluation, request: EvaluationRequest, run: Run, console: Console) -> Evaluation:
     with phase("accuracy"), console.progress("ladder") as bar:
         from lidardesign.evaluate.accuracy import AccuracyRequest, measure_accuracy
@@ -313,6 +312,7 @@ def _with_accuracy(evaluation: Evaluation, request: EvaluationRequest, run: Run,
         return replace(evaluation, accuracy=measure_accuracy(asked, progress=show))
 
 
+@phase("writing")
 def _write_files(
     evaluation: Evaluation,
     request: EvaluationRequest,

@@ -16,6 +16,7 @@ import typer
 
 from lidardesign.cli.console import EXIT_INTERRUPTED, Console
 from lidardesign.errors import ConfigError, LidardesignError, LostRankError
+from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
     from lidardesign.density.parallel import Ranks
@@ -46,7 +47,8 @@ def joined_ranks(console: Console) -> Iterator[Ranks]:
         LostRankError: Another rank ended, or cannot be reached.
     """
     if not all(name in os.environ for name in NEEDED):
-        from lidardesign.density.parallel import ALONE
+        with phase("libraries"):
+            from lidardesign.density.parallel import ALONE
 
         yield ALONE
         return

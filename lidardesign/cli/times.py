@@ -19,12 +19,15 @@ if TYPE_CHECKING:
 # Phases of a smaller share are left to --json; `other` shows what they took.
 LEAST_SHARE = 0.005
 INDENT = "  "
+# People are shown phases and those directly inside of them.
+DEEPEST = 2
 # Commands that only read a run wait for its writer no longer than this.
 SHORT_WAIT_S = 0.5
 
 
 def show_times(timings: Mapping[str, float], rich: RichConsole) -> None:
     """Print the phases of a clock's timings with their seconds and shares, phases inside of phases indented."""
+    timings = {key: seconds for key, seconds in timings.items() if key.count(INSIDE) < DEEPEST}
     total = sum(seconds for key, seconds in timings.items() if INSIDE not in key)
     if total <= 0:
         return

@@ -12,6 +12,7 @@ from typing import Any
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.results import Evaluation
 from lidardesign.evaluate.rungs import Ladder
+from lidardesign.run.clock import phase
 from lidardesign.run.config import RunConfig
 
 # In the order of the pipeline. Each module has `ladders(request) -> Sequence[Ladder]`, empty where the choice does not
@@ -64,7 +65,8 @@ def measure_accuracy(
         if progress:
             progress(done, len(LADDERS), module.LABEL)
         started = time.perf_counter()
-        found += module.ladders(request)
+        with phase(name):
+            found += module.ladders(request)
         seconds[name] = round(time.perf_counter() - started, 3)
     if progress:
         progress(len(LADDERS), len(LADDERS), "")
