@@ -84,15 +84,17 @@ class Ladder:
     def chosen(self) -> Rung:
         """The cheapest rung inside the tolerance; of rungs that cost the same, the most accurate one.
 
-        Where none is inside the tolerance, the most accurate one.
+        Where errors do not differ within their uncertainty either, what the run does already. Where none is inside
+        the tolerance, the most accurate one.
         """
         inside = [rung for rung in self.rungs if rung.error <= self.tolerance]
         if not inside:
             return min(self.rungs, key=lambda rung: (rung.error, rung.seconds))
         least = min(rung.seconds for rung in inside)
         cheap = [rung for rung in inside if rung.seconds <= SAME_COST * least]
-        # where cost and error are the same, what the run does already
-        return min(cheap, key=lambda rung: (rung.error, not rung.default, rung.seconds))
+        best = min(cheap, key=lambda rung: (rung.error, rung.seconds))
+        equal = [rung for rung in cheap if rung.error - best.error <= _sure_difference(rung, best)]
+        return min(equal, key=lambda rung: (not rung.default, rung.error, rung.seconds))
 
     @property
     def default(self) -> Rung | None:
@@ -104,7 +106,7 @@ class Ladder:
         """Whether errors fall from rung to rung, within their own uncertainty."""
         pairs = zip(self.rungs, self.rungs[1:], strict=False)
         return all(
-            finer.error <= rougher.error + STANDARD_ERRORS * math.hypot(finer.uncertainty, rougher.uncertainty)
+            finer.error <= rougher.error + _sure_difference(finer, rougher)
             for rougher, finer in pairs
         )
 
@@ -145,6 +147,11 @@ class Ladder:
             }
             for rung in self.rungs
         ]
+
+
+def _sure_difference(first: Rung, second: Rung) -> float:
+    """Errors of two rungs that differ by less than this do not differ."""
+    return STANDARD_ERRORS * math.hypot(first.uncertainty, second.uncertainty)
 
 
 def timed(call: Callable[[], Value]) -> tuple[Value, float, int | None]:

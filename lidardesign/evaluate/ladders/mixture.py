@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
@@ -15,7 +18,7 @@ from lidardesign.design.conditions import MOVED_SAMPLES, at_condition, shown
 from lidardesign.design.constraints import Constraints
 from lidardesign.design.em import fit_mixture
 from lidardesign.design.features import Axes, Features
-from lidardesign.design.fit import EM_SAMPLES, HELD_OUT_SHARE, RESTARTS
+from lidardesign.design.fit import EM_SAMPLES, HELD_OUT_SHARE, RESTARTS, fit
 from lidardesign.design.mixture import log_density
 from lidardesign.design.resolve import bounds_of, groups
 from lidardesign.design.samples import FILE_NAME, Samples, load_samples
@@ -28,10 +31,14 @@ from lidardesign.task import random_generator
 LABEL = "samples and seeds of the fit"
 SAMPLE_COUNTS = (1000, 2000, 5000, 10_000, 20_000)
 RESTART_COUNTS = (1, 2, 4, 8, 12)
-# Each setting is fitted so often, on another split and with other seeds. Few seeds are what luck decides most, and
-# are cheap.
+# Each setting is fitted so often, on other splits and with other seeds; more often where luck decides more.
 REPEATS = 6
-REPEATS_OF_RESTARTS = {1: 20, 2: 12, 4: 8}
+REPEATS_OF_RESTARTS = {1: 16, 2: 10, 4: 8}
+START = (
+    "import sys; from pathlib import Path; import lidardesign.design.fit; "
+    "from lidardesign.design.samples import load_samples; load_samples(Path(sys.argv[1]))"
+)
+STARTS = 2
 TOLERANCE_NATS = 0.01
 BECAUSE = "log densities that are 0.01 nats lower have one ray in a hundred fewer everywhere"
 
@@ -39,10 +46,8 @@ BECAUSE = "log densities that are 0.01 nats lower have one ray in a hundred fewe
 def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
     """Two ladders for the fit of the first design whose sensors are Gaussian; none for scans."""
     design = next((one for one in request.request.designs if one.layout != "scan" and one.track is None), None)
-    if design is None:
-        return []
-    samples = _samples(request, design)
-    if samples is None:
+    samples = None if design is None else _samples(request, design)
+    if design is None or samples is None:
         return []
     bench = FitBench(samples, len(design.sensors), design.level, request.request.seed)
     counts = [*(count for count in SAMPLE_COUNTS if count < bench.pool), bench.pool]
@@ -55,17 +60,21 @@ def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
     for one in restarts:
         for repeat in range(REPEATS_OF_RESTARTS.get(one, REPEATS)):
             bench.fitted(repeat, usual, one)
-    names = {count: f"all {count}" if count == bench.pool else str(count) for count in counts}
-    of_samples = [bench.rung(names[one], one, RESTARTS, default=one == usual) for one in counts]
-    of_restarts = [bench.rung(str(one), usual, one, default=one == RESTARTS) for one in restarts]
-    found = [_ladder("samples of the fit", f"{RESTARTS} seeds", of_samples, design)]
-    return found + ([_ladder("seeds of the fit", f"{usual} samples", of_restarts, design)] if of_restarts else [])
+    besides = _start_seconds(request.run) + _other_seconds(bench, design)
+    of_samples = [bench.rung(one, RESTARTS, besides, default=one == usual) for one in counts]
+    of_restarts = [bench.rung(usual, one, besides, default=one == RESTARTS) for one in restarts]
+    named = [replace(rung, setting=f"{count:,}") for rung, count in zip(of_samples, counts, strict=True)]
+    found = [_ladder("samples of the fit", f"{RESTARTS} seeds", named, design)]
+    if not restarts:
+        return found
+    seeds = [replace(rung, setting=str(count)) for rung, count in zip(of_restarts, restarts, strict=True)]
+    return [*found, _ladder("seeds of the fit", f"{usual:,} samples", seeds, design)]
 
 
 def _ladder(knob: str, beside: str, rungs: Sequence[Rung], design: Design) -> Ladder:
     fitted = f"{len(design.sensors)} sensors, as {design.name} has"
-    held = "; without its constraints" if design.constraints else ""
     where = f", at {shown(design.at)}" if design.at else ""
+    held = ", without its constraints" if design.constraints else ""
     return Ladder(
         knob=knob,
         error_of="log density of held-out samples that is lost",
@@ -73,10 +82,39 @@ def _ladder(knob: str, beside: str, rungs: Sequence[Rung], design: Design) -> La
         against="the best fit of all settings to the same samples",
         tolerance=TOLERANCE_NATS,
         because=BECAUSE,
-        work=f"one fit of {fitted}{where}, with {beside}",
+        work="the command `fit`: its start, reading the samples and the whole fit",
         rungs=rungs,
-        note=f"{fitted}{where}{held}",
+        note=f"{fitted}{where}{held}, with {beside}",
     )
+
+
+def _start_seconds(run: Path) -> float:
+    """How long a program takes to start and to read a run's samples, which every fit begins with [s]."""
+    command = [sys.executable, "-c", START, str(run.resolve())]
+    taken = []
+    for _ in range(STARTS):
+        started = time.perf_counter()
+        if subprocess.run(command, check=False, capture_output=True).returncode:
+            return 0.0
+        taken.append(time.perf_counter() - started)
+    return min(taken)
+
+
+def _other_seconds(bench: FitBench, design: Design) -> float:
+    """What a fit takes besides expectation maximisation: choosing samples, sensors and rays [s]."""
+    started = time.perf_counter()
+    fit(
+        bench.samples,
+        sensors=bench.sensors,
+        layout=design.layout,
+        rays=design.rays,
+        level=design.level,
+        seed=bench.seed,
+        em_samples=SAMPLE_COUNTS[0],
+        restarts=1,
+    )
+    whole = time.perf_counter() - started
+    return max(whole - bench.fitted(0, SAMPLE_COUNTS[0], 1).seconds, 0.0)
 
 
 def _samples(request: AccuracyRequest, design: Design) -> Samples | None:
@@ -170,24 +208,25 @@ class FitBench:
     def lost(self, count: int, restarts: int) -> list[float]:
         """What every fit of a setting lost against the best fit of its split, of all settings [nats]."""
         best: dict[int, float] = {}
-        for (repeat, _, _), fit in self._known.items():
-            best[repeat % REPEATS] = max(best.get(repeat % REPEATS, -math.inf), fit.log_likelihood)
-        return [best[repeat % REPEATS] - fit.log_likelihood for repeat, fit in self._of(count, restarts)]
+        for (repeat, _, _), one in self._known.items():
+            best[repeat % REPEATS] = max(best.get(repeat % REPEATS, -math.inf), one.log_likelihood)
+        return [best[repeat % REPEATS] - one.log_likelihood for repeat, one in self._of(count, restarts)]
 
-    def rung(self, setting: str, count: int, restarts: int, *, default: bool) -> Rung:
-        """A setting, once all settings have been fitted."""
+    def rung(self, count: int, restarts: int, besides: float, *, default: bool) -> Rung:
+        """A setting, once all settings have been fitted; `besides`: what a fit takes besides [s]."""
         lost = np.array(self.lost(count, restarts))
-        fits = [fit for _, fit in self._of(count, restarts)]
-        memory = [fit.memory_bytes for fit in fits if fit.memory_bytes is not None]
+        fits = [one for _, one in self._of(count, restarts)]
+        maximising = float(np.median([one.seconds for one in fits]))
+        memory = [one.memory_bytes for one in fits if one.memory_bytes is not None]
         return Rung(
-            setting,
+            "",
             error=float(lost.mean()),
             uncertainty=float(lost.std(ddof=1) / math.sqrt(len(lost))),
-            seconds=float(np.median([fit.seconds for fit in fits])),
+            seconds=besides + maximising,
             memory_bytes=max(memory, default=None),
             default=default,
-            values={"worst_nats": float(lost.max())},
+            values={"worst_nats": float(lost.max()), "maximisation_seconds": maximising},
         )
 
     def _of(self, count: int, restarts: int) -> list[tuple[int, Fitted]]:
-        return [(key[0], fit) for key, fit in self._known.items() if key[1:] == (count, restarts)]
+        return [(key[0], one) for key, one in self._known.items() if key[1:] == (count, restarts)]
