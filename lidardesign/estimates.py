@@ -17,6 +17,8 @@ import numpy as np
 STANDARD_ERROR = "standard error"
 HALF_INTERVAL = "half of the 95 % interval"
 ROUNDING = "rounding"
+# So many of either kind are added to a share's counts (Agresti and Coull), so that none of a few is not known exactly.
+ADDED = 2
 
 
 @dataclass(frozen=True)
@@ -74,3 +76,18 @@ def weighted_mean_error(values: np.ndarray, weights: np.ndarray) -> float:
     """The standard error of sum(w v) / sum(w), shapes (N,); influence N w (v - mean) / sum(w)."""
     share = np.asarray(weights, dtype=np.float64) / np.sum(weights)
     return standard_error(len(share) * share * (values - share @ values))
+
+
+def share_error(count: int, total: int) -> float:
+    """The standard error of a share count / total; not 0 where none or all count (Agresti and Coull 1998)."""
+    size = total + 2 * ADDED
+    share = (count + ADDED) / size
+    return float(np.sqrt(share * (1 - share) / size))
+
+
+def median_error(values: np.ndarray) -> float:
+    """The standard error of a median: half of what lies between the ranks n / 2 -+ sqrt(n) / 2, shape (N,), N >= 1."""
+    half = np.sqrt(len(values)) / 2
+    ranks = np.array([-half, half]) + (len(values) - 1) / 2
+    low, high = np.interp(ranks, np.arange(len(values)), np.sort(values))
+    return float(high - low) / 2

@@ -12,6 +12,8 @@ from lidardesign.estimates import (
     as_documents,
     effective_share_error,
     log_mean_error,
+    median_error,
+    share_error,
     standard_error,
     weighted_mean_error,
 )
@@ -37,6 +39,24 @@ def test_errors_are_the_spread_over_other_samples(figure, error):
     spread = np.std([figure(w, v) for w, v in drawn])
     stated = np.mean([error(w, v) for w, v in drawn])
     assert stated == pytest.approx(spread, rel=FOUR_ERRORS)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.5])
+def test_the_error_of_a_share_is_its_spread(share):
+    counts = np.random.default_rng(4).binomial(200, share, 5000)
+    stated = np.mean([share_error(count, 200) for count in counts])
+    assert stated == pytest.approx(np.std(counts / 200), rel=0.1)
+    assert 0 < share_error(0, 200) == pytest.approx(share_error(200, 200))
+
+
+def test_the_error_of_a_median_is_its_spread():
+    generator = np.random.default_rng(5)
+    drawn = generator.normal(size=(REPEATS, 401))
+    stated = np.mean([median_error(values) for values in drawn])
+    # sqrt(pi / 2n) for a normal distribution
+    assert stated == pytest.approx(math.sqrt(math.pi / 2 / 401), rel=0.05)
+    assert stated == pytest.approx(np.median(drawn, axis=1).std(), rel=FOUR_ERRORS)
+    assert median_error(np.array([3.0])) == 0.0
 
 
 def test_only_ratios_of_weights_count():

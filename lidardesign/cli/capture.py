@@ -210,5 +210,18 @@ def _show(document: dict[str, Any], found: CaptureEvaluation, rich: RichConsole)
     text = ("design", "gate")
     lines = [[row["design"], row["gate"], *(number(row[name]) for name in COLUMNS)] for row in document["rows"]]
     print_table(None, (*text, *COLUMNS.values()), lines, rich, text=text)
+    rich.print(_shown_errors(found), soft_wrap=True)
     for path in document["files"]:
         rich.print(f"wrote {escape(path)}", soft_wrap=True)
+
+
+def _shown_errors(found: CaptureEvaluation) -> str:
+    """The largest standard errors of the designs' figures, in one line."""
+    designs = [row.estimates() for row in found.rows if not row.baseline]
+    parts = []
+    for name, words in (("outliers_percent", "outliers"), ("range_error_mm", "range errors")):
+        known = [row[name] for row in designs if name in row]
+        if known:
+            worst = max(estimate.error or 0.0 for estimate in known)
+            parts.append(f"{words} up to {number(worst, 2)} {known[0].unit}")
+    return f"standard errors over other rays: {', '.join(parts) or 'none, as no return can be judged'}"

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from lidardesign.design.galvo import degree_frame, middle_boresight_deg
 from lidardesign.errors import DataError
+from lidardesign.estimates import Estimate, median_error, share_error
 from lidardesign.evaluate.capture import Capture
 from lidardesign.evaluate.capture_ranges import Estimation
 from lidardesign.evaluate.capture_scan import Captured, CapturedScan, scan, scan_pixels, uniform_rays, whole_window
@@ -76,12 +77,31 @@ class CaptureRow:
     chamfer_mm: float | None
     baseline: bool = False
 
+    @property
+    def judged(self) -> int:
+        """How many returns can be told to be outliers or not."""
+        return int((self.scan.returned & (self.outlier | ~np.isnan(self.reference_m))).sum())
+
+    @property
+    def range_errors_m(self) -> np.ndarray:
+        """How far the ranges of returns that are no outliers are off [m], shape (R,)."""
+        right = self.scan.returned & ~self.outlier & ~np.isnan(self.reference_m)
+        return np.abs(self.scan.range_m - self.reference_m)[right]
+
+    def estimates(self) -> dict[str, Estimate]:
+        """The figures that are means or medians over rays, with their standard errors over other rays."""
+        found, outliers, errors = {}, int(self.outlier.sum()), self.range_errors_m
+        if self.judged:
+            percent = 100.0 * outliers / self.judged
+            found["outliers_percent"] = Estimate(percent, 100.0 * share_error(outliers, self.judged), "%")
+        if len(errors):
+            median = MILLIMETRES * float(np.median(errors))
+            found["range_error_mm"] = Estimate(median, MILLIMETRES * median_error(errors), "mm")
+        return found
+
     def as_dict(self) -> dict[str, Any]:
         """The row for `--json`; figures of which there are none are None."""
-        scan, returned = self.scan, self.scan.returned
-        judged = int((returned & (self.outlier | ~np.isnan(self.reference_m))).sum())
-        right = returned & ~self.outlier & ~np.isnan(self.reference_m)
-        error = np.abs(scan.range_m - self.reference_m)[right]
+        scan, returned, judged, error = self.scan, self.scan.returned, self.judged, self.range_errors_m
         taken = scan.captured == Captured.YES
         return {
             "design": self.design,
@@ -138,6 +158,11 @@ class CaptureEvaluation:
             "reference": {"ranges": self.ranges_from, "surface": self.surface_from},
             "rows": [row.as_dict() for row in self.rows],
             "notes": list(self.notes),
+            "error_estimates": {
+                f"{row.design}, gate {row.gate}: {name}": estimate.as_dict()
+                for row in self.rows
+                for name, estimate in row.estimates().items()
+            },
         }
 
 
