@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import pytest
 from test_learn import BallTask, Interrupter, config_of, result_bytes
 
@@ -111,16 +109,3 @@ def test_a_run_without_a_tolerance_has_none(tmp_path):
     start_manifest(tmp_path, command=[], seed=0)
     save_run_config(config_of(), tmp_path)
     assert goal_of(tmp_path) is None
-
-
-def test_ranks_that_are_not_the_first_write_nothing(tmp_path):
-    start_manifest(tmp_path, command=[], seed=0)
-    before = {path.name for path in tmp_path.iterdir()}
-
-    def once(config, resume):
-        return SimpleNamespace(misplaced=0.0, error_estimates={"misplaced": SimpleNamespace(error=0.0)}, seconds=1.0)
-
-    config, second = config_of(), SimpleNamespace(first=False)
-    _, goal = learn_to_tolerance(config, tmp_path, ToleranceGoal(0.1, 120), once, ranks=second)
-    assert goal.met
-    assert {path.name for path in tmp_path.iterdir()} == before

@@ -13,6 +13,7 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
+from lidardesign.cli.goals import GOAL, Goal, Learner, TimeBudget, Tolerance, check_met, checked_goal, resumed_goal
 from lidardesign.cli.ranks import joined_ranks
 from lidardesign.cli.runs import check_choice
 from lidardesign.errors import ConfigError, DataError, LostRankError
@@ -61,6 +62,8 @@ def learn(
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted run from its last checkpoint.")
     ] = False,
+    tolerance: Tolerance = None,
+    time_budget: TimeBudget = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
     debug: options.Debug = False,
@@ -68,6 +71,7 @@ def learn(
     """Learn where rays are worth firing for TASK, into a run folder."""
     with command(json=json, quiet=quiet, debug=debug) as console, joined_ranks(console) as ranks:
         check_choice(device, "--device", DEVICES)
+        goal = checked_goal(tolerance, time_budget, overrides or (), ranks)
         with phase("libraries"):
             from lidardesign.registry import load_task
             from lidardesign.run.config import load_run_config, resolve
@@ -78,6 +82,7 @@ def learn(
         if resume:
             _check_can_resume(run)
             plugin, settings = load_run_config(run)
+            goal = resumed_goal(goal, run)
             resume = any(run.glob(CHECKPOINTS))
             if not resume:
                 console.note("the run has no checkpoint yet; it starts from the beginning")
@@ -85,11 +90,12 @@ def learn(
         else:
             _check_can_start(run)
             settings = resolve(plugin, **choices)
-        result = _learn_in_folder(plugin, settings, run, resume, device, console, ranks)
+        result = _learn_in_folder(plugin, settings, run, resume, goal, device, console, ranks)
         if ranks.first:
             keep_timings(run, "learn", console.clock)
         result = replace(result, notes=(*result.notes, *_advice(result)))
         console.result(_document(result), lambda rich: _show(result, rich))
+        check_met(result, goal)
 
 
 def _check_can_start(run: Path) -> None:
@@ -130,25 +136,23 @@ def _check_same(stored: RunConfig, task: Task, choices: dict[str, Any], run: Pat
 
 
 def _learn_in_folder(
-    task: Task, settings: RunConfig, run: Path, resume: bool, device: str, console: Console, ranks: Ranks
+    task: Task, settings: RunConfig, run: Path, resume: bool, goal: Goal, device: str, console: Console, ranks: Ranks
 ) -> LearnResult:
     from lidardesign.run.config import save_run_config
     from lidardesign.run.lock import run_lock
-    from lidardesign.run.manifest import start_manifest
+    from lidardesign.run.manifest import note, start_manifest
 
     with _undone_on_failure(run), run_lock(run):
-        if not resume:
+        if not (run / "manifest.json").exists():
             start_manifest(run, command=["lidardesign", *sys.argv[1:]], seed=settings.seed)
             save_run_config(settings, run)
+            if not goal.is_none:
+                note(run, **{GOAL: goal.as_dict()})
         console.when_interrupted = lambda: _interruption(task.name, run)
         with _progress(console) as progress:
-            with phase("libraries"):
-                from lidardesign.density.learn import learn as learn_density
-
+            learner = Learner(task, run, device, progress, ranks, console)
             try:
-                return learn_density(
-                    task, settings, run, resume=resume, device=device, progress=progress, ranks=ranks
-                )
+                return learner.learn(settings, goal, resume=resume)
             except LostRankError as error:
                 hint = f"{error.hint}; {_interruption(task.name, run)}"
                 raise LostRankError(error.message, where=error.where, hint=hint) from None
@@ -242,6 +246,7 @@ def _document(result: LearnResult) -> dict[str, Any]:
         "log_z": result.log_z,
         "coverage": result.coverage,
         "misplaced": result.misplaced,
+        "goal": result.goal,
         "notes": list(result.notes),
         "error_estimates": result.as_dict()["error_estimates"],
     }

@@ -15,6 +15,7 @@ from lidardesign.density.ground import Ground, prepare_ground
 from lidardesign.density.measure import Measured, draw_probes, measure
 from lidardesign.density.objective import Coordinates
 from lidardesign.density.parallel import ALONE, Ranks
+from lidardesign.density.settings import LearningSettings
 from lidardesign.density.snapshots import clear_snapshots
 from lidardesign.density.training import PROGRESS, LearnProgress, Trainer
 from lidardesign.design.samples import Samples, save_samples
@@ -37,7 +38,7 @@ class LearnResult:
     """What learning reached; `timings` are seconds by phase, `notes` what the user should know.
 
     `misplaced` is the share of the density's mass in the wrong place. `error_estimates` has the standard errors of ess,
-    kl_nats, log_z, coverage and misplaced.
+    kl_nats, log_z, coverage and misplaced. `goal` is what decided the number of steps, where the configuration did not.
     """
 
     run: str
@@ -52,6 +53,7 @@ class LearnResult:
     notes: tuple[str, ...] = ()
     timings: dict[str, float] = field(default_factory=dict)
     error_estimates: dict[str, Estimate] = field(default_factory=dict)
+    goal: dict[str, Any] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """The contract's JSON form."""
@@ -68,6 +70,7 @@ def learn(
     progress: Callable[[LearnProgress], None] | None = None,
     ground: Ground | None = None,
     ranks: Ranks = ALONE,
+    replan: Callable[[Trainer], LearningSettings] | None = None,
 ) -> LearnResult:
     """Learn the density of a task into a run folder.
 
@@ -80,6 +83,7 @@ def learn(
         progress: Called about every tenth step.
         ground: What `prepare_ground` made of the same task and configuration, to be learned on again.
         ranks: Who learns together; see `parallel_learn`. The first one alone writes.
+        replan: Asked for the settings anew when balancing begins; see `Trainer`.
 
     Raises:
         ConfigError, DataError: Unusable settings or scenes.
@@ -91,6 +95,7 @@ def learn(
         ranks.announce({"job": "learn", "config": config.as_document(), "device": device, "resume": resume})
         notes = list(ground.notes)
         trainer = make_trainer(ground, config, run, place)
+        trainer.replan = replan
         _start(trainer, config, resume)
         with phase("learning"):
             trainer.train(progress)
@@ -162,6 +167,7 @@ def own_device(device: torch.device, ranks: Ranks) -> torch.device:
     return torch.device("cuda", ranks.local_rank)
 
 
+@phase("flow")
 def make_trainer(ground: Ground, config: RunConfig, run: Path, device: torch.device) -> Trainer:
     """A trainer at its first step."""
     generator = torch.Generator().manual_seed(config.seed)

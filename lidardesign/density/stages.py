@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from lidardesign.density.learn import FLOW, LearnResult
-from lidardesign.density.parallel import ALONE, Ranks
 from lidardesign.density.snapshots import clear_snapshots
 from lidardesign.density.training import CHECKPOINT, PROGRESS
 from lidardesign.design.samples import FILE_NAME as SAMPLES
@@ -98,7 +97,7 @@ def stage_steps(planned: int) -> tuple[int, ...]:
 def goal_of(run: Path) -> ToleranceGoal | None:
     """The tolerance that a run was started with, if it was."""
     found = read_manifest(run).get(GOAL) or {}
-    if "tolerance" not in found:
+    if "planned_steps" not in found:
         return None
     stages = tuple(Stage(**stage) for stage in found["stages"])
     return ToleranceGoal(found["tolerance"], found["planned_steps"], stages)
@@ -116,7 +115,6 @@ def learn_to_tolerance(
     learn_once: Callable[[RunConfig, bool], LearnResult],
     *,
     resume: bool = False,
-    ranks: Ranks = ALONE,
 ) -> tuple[LearnResult, ToleranceGoal]:
     """Learn in stages until one is within the tolerance, or no further one would be.
 
@@ -126,19 +124,17 @@ def learn_to_tolerance(
         goal: The tolerance, and the stages that were finished before.
         learn_once: Learns a configuration in the run's folder, or continues it.
         resume: Continue the stage of the configuration from its checkpoint.
-        ranks: Who learns together; the first one writes.
     """
     first = config.learning.steps if resume or goal.stages else 0
     for steps in _remaining(goal.planned_steps, first):
         staged = with_steps(config, steps)
-        if not resume and ranks.first:
+        if not resume:
             _begin(run, staged, goal)
         result = learn_once(staged, resume)
         resume = False
         error = result.error_estimates["misplaced"].error or 0.0
         goal = goal.with_stage(Stage(steps, result.misplaced, error, result.seconds))
-        if ranks.first:
-            note(run, **{GOAL: goal.as_dict()})
+        note(run, **{GOAL: goal.as_dict()})
         if goal.met or goal.hopeless:
             break
     return result, goal

@@ -1,0 +1,178 @@
+"""Learning within a time budget: as many steps as fit, planned from this run's own first steps.
+
+The first plan comes from a few steps of the untrained flow. What balancing steps and the measurement at the end take is
+only known once the flow has found the surfaces, so their number is planned anew when balancing begins. The path-wise
+phase knows nothing of it: the run is then the one that the new numbers of steps would have given from the start, and
+config.yaml has them.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+
+from lidardesign.density.ground import Ground
+from lidardesign.density.learn import make_trainer
+from lidardesign.density.measure import draw_probes, draw_samples, log_density_of
+from lidardesign.density.settings import LearningSettings
+from lidardesign.density.training import Trainer
+from lidardesign.errors import ConfigError
+from lidardesign.run.config import RunConfig, save_run_config
+from lidardesign.run.manifest import note
+from lidardesign.task import random_generator
+
+Value = TypeVar("Value")
+
+GOAL = "goal"
+WHERE = "--time-budget"
+# Fewer steps than this anneal so fast that the flow cannot follow; the least budget is the one that they take.
+LEAST_STEPS = 100
+# The share of the time that is left unplanned: steps of a shared machine repeat no better.
+RESERVE = 0.1
+TIMED_STEPS = 6
+TIMED_POINTS = 2048
+# Writing the flow and the samples, and printing the result.
+WRITING_S = 1.0
+
+
+@dataclass(frozen=True)
+class TimePlan:
+    """How a time budget is spent.
+
+    Arguments:
+        time_budget_s: The whole command's.
+        pathwise_s, balancing_s: What one step of each phase was measured to take.
+        finishing_s: What is foreseen for measuring and writing.
+        pathwise_steps, balancing_steps: What fits.
+        settled: Whether balancing steps were planned by the trained flow.
+    """
+
+    time_budget_s: float
+    pathwise_s: float
+    balancing_s: float
+    finishing_s: float
+    pathwise_steps: int
+    balancing_steps: int
+    settled: bool = False
+
+    @property
+    def steps(self) -> int:
+        """Of both phases."""
+        return self.pathwise_steps + self.balancing_steps
+
+    def applied(self, settings: LearningSettings) -> LearningSettings:
+        """Settings with the planned numbers of steps."""
+        update = {"steps": self.steps, "balance": self.balancing_steps / self.steps}
+        return settings.model_copy(update=update)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The form that the manifest has."""
+        return {key: round(value, 4) if isinstance(value, float) else value for key, value in asdict(self).items()}
+
+
+@dataclass(eq=False)
+class Timekeeper:
+    """Plans the steps of one command.
+
+    Arguments:
+        time_budget_s: From the command's beginning to its end [s].
+        elapsed_s: How long the command has been running.
+        config: The configuration before it is planned.
+        run: The run's folder.
+    """
+
+    time_budget_s: float
+    elapsed_s: Callable[[], float]
+    config: RunConfig
+    run: Path
+    planned: TimePlan | None = None
+
+    @property
+    def left_s(self) -> float:
+        """What can be planned with."""
+        return (self.time_budget_s - self.elapsed_s()) * (1 - RESERVE)
+
+    def plan(self, ground: Ground, device: torch.device) -> RunConfig:
+        """The configuration with as many steps as fit.
+
+        Raises:
+            ConfigError: Not even `LEAST_STEPS` fit; it says what would be enough.
+        """
+        trainer = make_trainer(ground, self.config, self.run, device)
+        last = max(trainer.pathwise_steps - 1, 0)
+        pathwise = max(_seconds_per_step(trainer, 0), _seconds_per_step(trainer, last)) if trainer.pathwise_steps else 0
+        share = self.config.learning.balance
+        balancing = _seconds_per_step(trainer, trainer.pathwise_steps) if share > 0 else 0.0
+        finishing, left = _finishing_s(trainer, ground, self.config), self.left_s
+        per_step = (1 - share) * pathwise + share * balancing
+        steps = math.floor((left - finishing) / per_step)
+        if steps < LEAST_STEPS:
+            least = self.elapsed_s() + (LEAST_STEPS * per_step + finishing) / (1 - RESERVE)
+            raise ConfigError(
+                f"{self.time_budget_s:g} s are over before anything worth having is learned",
+                where=WHERE,
+                allowed=f"at least {math.ceil(least)} s for this task on this machine",
+                hint="a smaller learning.samples, or fewer training scenes, also leave more time for steps",
+            )
+        before = round((1 - share) * steps)
+        self.planned = TimePlan(
+            self.time_budget_s, pathwise, balancing, finishing, before, steps - before, settled=share == 0
+        )
+        return self._apply()
+
+    def replan(self, trainer: Trainer, ground: Ground) -> LearningSettings:
+        """The settings with as many balancing steps as fit now that the flow is trained; config.yaml follows."""
+        balancing, finishing = _seconds_per_step(trainer, trainer.step), _finishing_s(trainer, ground, self.config)
+        steps = max(math.floor((self.left_s - finishing) / balancing), 1)
+        self.planned = replace(
+            self.planned, balancing_s=balancing, finishing_s=finishing, balancing_steps=steps, settled=True
+        )
+        return self._apply().learning
+
+    def _apply(self) -> RunConfig:
+        self.config = replace(self.config, learning=self.planned.applied(self.config.learning))
+        save_run_config(self.config, self.run)
+        note(self.run, **{GOAL: self.planned.as_dict()})
+        return self.config
+
+
+def _seconds_per_step(trainer: Trainer, step: int) -> float:
+    """What a step takes at a step of the schedule; the trainer is left as it was."""
+    before, stream = trainer.step, trainer.generator.get_state()
+    trainer.step, taken = step, []
+    for _ in range(1 + TIMED_STEPS):
+        started = time.perf_counter()
+        trainer.find_gradient()
+        taken.append(time.perf_counter() - started)
+    trainer.step = before
+    trainer.generator.set_state(stream)
+    return float(np.mean(taken[1:]))  # the first one may have to compile
+
+
+def _finishing_s(trainer: Trainer, ground: Ground, config: RunConfig) -> float:
+    """What measuring and writing will take, from a few points [s]; the trainer is left as it was."""
+    settings, stream = config.learning, trainer.generator.get_state()
+    dtype = next(trainer.flow.parameters()).dtype
+    trainer.flow.double()
+    generator = random_generator(config.seed, "time budget")
+    few = min(TIMED_POINTS, settings.coverage_proposals)
+    probes, drawing = _timed(lambda: draw_probes(ground.target, ground.scenes, few, generator))
+    _, sampling = _timed(lambda: draw_samples(trainer, TIMED_POINTS))
+    _, inverting = _timed(lambda: log_density_of(trainer, probes.points)) if len(probes.points) else (None, 0.0)
+    trainer.flow.to(dtype)
+    trainer.generator.set_state(stream)
+    probing = (drawing + inverting) * settings.coverage_proposals / few
+    return sampling * settings.samples / TIMED_POINTS + probing + WRITING_S
+
+
+def _timed(call: Callable[[], Value]) -> tuple[Value, float]:
+    started = time.perf_counter()
+    value = call()
+    return value, time.perf_counter() - started
