@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import timedelta
@@ -22,6 +23,7 @@ from lidardesign.errors import ConfigError, LostRankError
 
 # The longest that a rank may keep the others waiting: building the fields of its scenes can take minutes.
 PATIENCE = timedelta(minutes=30)
+MEETING = timedelta(minutes=10)
 # Another rank's message arrives on the launcher's own store within a fraction of this.
 TOLD_WITHIN = timedelta(seconds=2)
 
@@ -41,7 +43,7 @@ def join_ranks(environment: dict[str, str] | os._Environ[str] = os.environ) -> R
     rank, local_rank = _number(environment, "RANK", 0), _number(environment, "LOCAL_RANK", 0)
     if not distributed.is_available():
         raise ConfigError("this torch was built without torch.distributed", where="WORLD_SIZE", allowed="1")
-    store, _, _ = _reached(lambda: next(distributed.rendezvous("env://", rank, size, timeout=PATIENCE)))
+    store, _, _ = _reached(lambda: next(distributed.rendezvous("env://", rank, size, timeout=MEETING)))
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and distributed.is_nccl_available() else "gloo"
     own = distributed.PrefixStore("lidardesign", store)
     _reached(
@@ -66,8 +68,10 @@ def _reached(call: Callable[[], Any]) -> Any:
     try:
         return call()
     except (RuntimeError, ConnectionError, TimeoutError) as error:
+        # gloo's first sentence, without the place in its source
+        reason = re.sub(r"^\[[^]]*\] ", "", str(error)).split(". ")[0].splitlines()[0]
         raise LostRankError(
-            f"another rank ended or does not answer ({str(error).splitlines()[0]})",
+            f"another rank ended or does not answer ({reason})",
             where="torchrun",
             hint="look at that rank's own message",
         ) from None

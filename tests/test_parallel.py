@@ -1,0 +1,92 @@
+"""Several ranks learn what one process learns, to rounding; a lost one ends all, and the last checkpoint continues."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from parallel_cases import CASES, STEPS, TRAINED, everything
+from ranks import finished, start_ranks
+
+from lidardesign.density.parallel import ALONE, Ranks
+from lidardesign.density.parallel_ranks import join_ranks
+from lidardesign.errors import ConfigError
+
+RANKS = 2
+# Sums in another order: float64 rounds at 1e-16 and float32 at 6e-8, and ten steps of Adam carry that on.
+ROUNDING = {"float64": 1e-9, "float32": 2e-3}
+
+
+@given(st.integers(0, 1000), st.integers(1, 40))
+def test_every_row_belongs_to_one_rank_and_shares_differ_by_one_at_most(count, size):
+    parts = [np.arange(count)[Ranks(rank, size).rows_of(count)] for rank in range(size)]
+    np.testing.assert_array_equal(np.concatenate(parts), np.arange(count))
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+
+
+def test_one_process_alone_does_everything_itself():
+    rows = np.arange(5.0)
+    assert ALONE.first
+    assert ALONE.gather(rows) is rows
+    assert ALONE.part(rows) is rows
+    assert ALONE.sum(rows) is rows
+    assert ALONE.mean(rows) == 2.0
+    assert ALONE.mean(rows[:0]) == 0.0
+    assert join_ranks({}) is ALONE
+    assert join_ranks({"WORLD_SIZE": "1"}) is ALONE
+
+
+@pytest.mark.parametrize(
+    "environment", [{"WORLD_SIZE": "many"}, {"WORLD_SIZE": "0"}, {"WORLD_SIZE": "2", "RANK": "-1"}]
+)
+def test_an_environment_that_no_launcher_makes_is_refused(environment):
+    with pytest.raises(ConfigError, match="environment variable"):
+        join_ranks(environment)
+
+
+@pytest.fixture(scope="module")
+def alone():
+    return everything(ALONE)
+
+
+@pytest.fixture(scope="module")
+def together(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("ranks")
+    ended = finished(start_ranks(RANKS, "parallel_cases.py", str(folder)))
+    assert [status for status, _, _ in ended] == [0] * RANKS, "\n".join(err for _, _, err in ended)
+    return [dict(np.load(folder / f"rank-{rank}.npz")) for rank in range(RANKS)]
+
+
+def apart(one, other):
+    """The largest difference beside the largest value."""
+    return np.abs(one - other).max() / np.abs(one).max()
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_targets_that_ranks_share_are_those_of_one_process(alone, together, case):
+    names = [name for name in alone if name.startswith(case) and "float" not in name]
+    assert len(names) == 14
+    for name in names:
+        for rank in together:
+            assert apart(alone[name], rank[name]) < ROUNDING["float64"], name
+
+
+@pytest.mark.parametrize("dtype", ROUNDING)
+@pytest.mark.parametrize("case", TRAINED)
+def test_gradients_of_two_ranks_are_those_of_one_over_ten_steps(alone, together, case, dtype):
+    for step in range(STEPS):
+        name = f"{case} {dtype} step {step}"
+        assert np.isfinite(alone[name]).all()
+        assert apart(alone[name], together[0][name]) < ROUNDING[dtype], name
+        np.testing.assert_array_equal(together[0][name], together[1][name])
+
+
+def test_collectives_give_the_same_on_every_rank(together):
+    for found in together:
+        np.testing.assert_array_equal(found["gather"], [0, 10, 11])
+        assert (found["sum"], found["max"], found["mean"]) == (10, 10, 7)
+        assert found["share"].tobytes() == b"first"
+        np.testing.assert_array_equal(found["gradients"], [1, 1])
+        assert np.isnan(found["invalid"]).all()
+        assert "rank 1 has other scenes than rank 0" in str(found["disagreement"])
