@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import asyncio
+import importlib.metadata
 import itertools
 import logging
+import queue
+import time
 import uuid
 import warnings
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+from lidardesign import __version__
 from lidardesign.errors import ConfigError, NumericalError
 from lidardesign.evaluate.worker import answer
 
 HINT = "docs/cluster.md has the commands that start a scheduler and its workers"
+SAME_EVERYWHERE = "install the same versions of lidardesign and of the task for the scheduler and all workers"
 # A scheduler that listens answers at once; workers of a batch system may still be waiting for their machines.
 SCHEDULER_SECONDS = 10.0
 WORKER_SECONDS = 60.0
+# How often somebody looks whether there is still a worker, while none answers.
+LOOK_SECONDS = 2.0
 # Messages beyond what runs, so that no worker waits for this process.
 AHEAD = 2
 
@@ -24,16 +31,27 @@ AHEAD = 2
 class Cluster:
     """The workers of a scheduler that is running already.
 
+    While it is open, what dask.distributed would log about lost connections is left to the errors of this class.
+
     Arguments:
         address: As tcp://HOST:PORT.
 
     Raises:
-        ConfigError: dask.distributed is not installed, no scheduler answers there, or it has no workers.
+        ConfigError: dask.distributed is not installed, no scheduler answers there, it has no workers, or they lack
+            this version of this program.
     """
 
     def __init__(self, address: str) -> None:
         self._address = address
-        self._client = _connected(address)
+        self._logger = logging.getLogger("distributed")
+        self._level = self._logger.level
+        client_class = _client_class()
+        self._logger.setLevel(logging.CRITICAL)
+        try:
+            self._client = _connected(client_class, address)
+        except ConfigError:
+            self._logger.setLevel(self._level)
+            raise
 
     def prepare(self, message: bytes) -> None:
         """Workers come and go: each makes the scenes when it is first asked about one."""
@@ -42,36 +60,51 @@ class Cluster:
         """The number and the answer of each message, as they come.
 
         Raises:
-            ConfigError: The workers lack this package, or the scheduler was lost.
+            ConfigError: The scheduler or all workers were lost, or cannot load this program.
             NumericalError: The workers of one message died, one after the other.
         """
-        from distributed import as_completed
-
         rest = enumerate(questions)
         numbers: dict[Any, int] = {}
-        running = as_completed(loop=self._client.loop)
-        for number, message in itertools.islice(rest, self._capacity()):
-            running.add(self._asked(numbers, number, message))
-        for future in running:
+        done: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        while True:
+            for number, message in itertools.islice(rest, max(AHEAD + self._threads() - len(numbers), 0)):
+                # the message is part of the task, so that whoever loses it can have it again
+                future = self._client.submit(answer, message, key=f"lidardesign-{uuid.uuid4()}", pure=False)
+                numbers[future] = number
+                future.add_done_callback(done.put)
+            if not numbers:
+                return
+            future = self._next(done)
             number = numbers.pop(future)
-            reply = self._result(future, number)
-            for following, message in itertools.islice(rest, max(self._capacity() - len(numbers), 0)):
-                running.add(self._asked(numbers, following, message))
-            yield number, reply
+            yield number, self._result(future, number)
 
     def close(self) -> None:
         """Leave the scheduler, which forgets what nobody waits for; a scene that a worker is at is finished there."""
         self._client.close()
+        self._logger.setLevel(self._level)
 
-    def _asked(self, numbers: dict[Any, int], number: int, message: bytes) -> Any:
-        # the message is part of the task, so that whoever loses it can have it again
-        future = self._client.submit(answer, message, key=f"lidardesign-{uuid.uuid4()}", pure=False)
-        numbers[future] = number
-        return future
+    def _next(self, done: queue.SimpleQueue[Any]) -> Any:
+        """The next future that is done; gives up where there has been no worker for a while."""
+        last_seen = time.monotonic()
+        while True:
+            try:
+                return done.get(timeout=LOOK_SECONDS)
+            except queue.Empty:
+                now = time.monotonic()
+                last_seen = now if self._threads() else last_seen
+                if now - last_seen > WORKER_SECONDS:
+                    raise ConfigError(
+                        f"the scheduler at {self._address} has had no worker for {WORKER_SECONDS:g} s",
+                        where="--workers",
+                        hint="the logs of the workers say why they ended",
+                    ) from None
 
-    def _capacity(self) -> int:
-        """Messages that may be out: those that run at a time, as of now, and some that wait."""
-        return AHEAD + sum(self._client.nthreads().values())
+    def _threads(self) -> int:
+        """Messages that workers can take at a time, as of now."""
+        try:
+            return sum(self._client.nthreads().values())
+        except (OSError, RuntimeError) as error:
+            raise self._lost() from error
 
     def _result(self, future: Any, number: int) -> bytes:
         from distributed import CancelledError, KilledWorker
@@ -85,19 +118,25 @@ class Cluster:
                 hint="their logs say why; memory is the usual cause",
             ) from error
         except (CancelledError, OSError) as error:
-            raise ConfigError(f"the scheduler at {self._address} was lost", where="--workers", hint=HINT) from error
-        except ImportError as error:
-            raise ConfigError(
-                f"a worker cannot load this program: {error}",
-                where="--workers",
-                hint="install the same version of lidardesign and of the task everywhere",
-            ) from error
+            raise self._lost() from error
+        except Exception as error:
+            # `answer` itself never raises: the cluster could not load or run it
+            raise _unusable(f"{type(error).__name__}: {error}") from error
+
+    def _lost(self) -> ConfigError:
+        return ConfigError(f"the scheduler at {self._address} was lost", where="--workers", hint=HINT)
 
 
-def _connected(address: str) -> Any:
+def _unusable(found: str) -> ConfigError:
+    return ConfigError(
+        f"the cluster cannot run this program: {' '.join(found.split())}", where="--workers", hint=SAME_EVERYWHERE
+    )
+
+
+def _client_class() -> Any:
     try:
         with warnings.catch_warnings():
-            # packages that differ are told by the answers, where it matters
+            # packages announce their own removals
             warnings.simplefilter("ignore")
             from distributed import Client
     except ImportError:
@@ -106,18 +145,36 @@ def _connected(address: str) -> Any:
             where="--workers",
             hint="pip install 'lidardesign[cluster]'",
         ) from None
-    # what it logs about connections that fail is told by the errors below
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    return Client
+
+
+def _connected(client_class: Any, address: str) -> Any:
     try:
-        client = Client(address, timeout=SCHEDULER_SECONDS, set_as_default=False)
+        client = client_class(address, timeout=SCHEDULER_SECONDS, set_as_default=False)
     except (OSError, ValueError) as error:
         found = " ".join(str(error).split())
         raise ConfigError(f"no scheduler answers at {address}: {found}", where="--workers", hint=HINT) from None
     try:
         client.wait_for_workers(1, timeout=WORKER_SECONDS)
+        _check_versions(client)
     except asyncio.TimeoutError:
         client.close()
         raise ConfigError(
             f"the scheduler at {address} had no worker within {WORKER_SECONDS:g} s", where="--workers", hint=HINT
         ) from None
+    except ConfigError:
+        client.close()
+        raise
     return client
+
+
+def _check_versions(client: Any) -> None:
+    """Refuse a scheduler or workers without this version of this program; they would only die of it."""
+    asked = (importlib.metadata.version, "lidardesign")
+    try:
+        found = {"the scheduler": client.run_on_scheduler(*asked), **client.run(*asked)}
+    except importlib.metadata.PackageNotFoundError as error:
+        raise _unusable("the scheduler or a worker does not have it") from error
+    for place, version in found.items():
+        if version != __version__:
+            raise _unusable(f"{place} has version {version} of it, not {__version__}")
