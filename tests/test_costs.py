@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
+from pathlib import Path
 
 import pytest
 from command_line import caller, files_under, make_run
@@ -180,3 +182,13 @@ def test_the_table_of_times_indents_what_is_inside_and_leaves_out_what_is_next_t
         ("other", "2.00", "20 %"),
     ]
     assert rows_of({"other": 0.0}) == []
+
+
+def test_every_phase_is_explained():
+    root = Path(__file__).parents[1]
+    page = (root / "docs" / "costs.md").read_text(encoding="utf-8")
+    explained = set(re.findall(r"`([a-z -]+)`", "".join(re.findall(r"^\| (.*?) \|", page, re.MULTILINE))))
+    sources = [path.read_text(encoding="utf-8") for path in (root / "lidardesign").rglob("*.py")]
+    used = {name for text in sources for name in re.findall(r'phase\("([^"]+)"\)', text)}
+    assert used <= explained, f"docs/costs.md does not explain {used - explained}"
+    assert explained - used <= {"learn", "fit", "constrain", "evaluate", "export"}, explained - used
