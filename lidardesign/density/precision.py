@@ -137,26 +137,41 @@ def in_arithmetic(flow: DesignFlow, dtype: str) -> DesignFlow:
 
 
 def beside_noise(gradients: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> tuple[float, float]:
-    """The error of gradients as a share of the noise that the exact ones have anyway, and its standard error.
+    """The rms error of gradients as a share of the noise that the exact ones have anyway, and its standard error.
 
     Arguments:
         gradients: Of several batches, shape (P,) each; the standard error is the jackknife's over batches.
         exact: Of the same batches, 3 or more.
     """
-    exact = np.asarray(exact)
-    apart = np.square(np.asarray(gradients) - exact).sum(axis=1)
-    products = exact @ exact.T
-    left_out = [_share(apart, products, np.delete(np.arange(len(apart)), n)) for n in range(len(apart))]
+    apart, products = _apart(gradients, exact)
     count = len(apart)
-    error = np.sqrt((count - 1) * np.var(left_out))
-    return _share(apart, products, np.arange(count)), float(error)
+    left_out = [_share(apart, products, np.delete(np.arange(count), n)) for n in range(count)]
+    return _share(apart, products, np.arange(count)), float(np.sqrt((count - 1) * np.var(left_out)))
+
+
+def each_beside_noise(gradients: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> np.ndarray:
+    """The error of every batch's gradient as a share of the noise of exact ones, shape (batches,)."""
+    apart, products = _apart(gradients, exact)
+    variance = _variance(products)
+    return np.sqrt(apart / variance) if variance > 0 else np.zeros(len(apart))
+
+
+def _apart(gradients: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Squared differences by batch (K,), and the products of all exact gradients (K, K)."""
+    exact = np.asarray(exact)
+    return np.square(np.asarray(gradients) - exact).sum(axis=1), exact @ exact.T
 
 
 def _share(apart: np.ndarray, products: np.ndarray, rows: np.ndarray) -> float:
-    """sqrt(mean |difference|^2 / variance) over some batches, from the products of all gradients (K, K)."""
-    products = products[np.ix_(rows, rows)]
-    variance = (np.trace(products) - products.sum() / len(rows)) / (len(rows) - 1)
+    """sqrt(mean |difference|^2 / variance) over some batches."""
+    variance = _variance(products[np.ix_(rows, rows)])
     return float(np.sqrt(apart[rows].mean() / variance)) if variance > 0 else 0.0
+
+
+def _variance(products: np.ndarray) -> float:
+    """E |g - E g|^2 from the products of gradients (K, K)."""
+    count = len(products)
+    return float((np.trace(products) - products.sum() / count) / (count - 1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,7 +39,7 @@ class LearningSettings(BaseModel):
     batch: int = Field(1024, ge=2, description="design points per step")
     rate: float = Field(1e-2, gt=0, description="initial Adam step size")
     frames: int = Field(
-        256, ge=1, description="frames of moving scenes that stand for all in each path-wise step, drawn anew"
+        256, ge=1, description="scenes and frames that stand for all in each path-wise step, drawn anew"
     )
     layers: int = Field(3, ge=1, le=32, description="autoregressive spline layers per block of the chain")
     hidden: int = Field(96, ge=4, description="hidden width of each layer's network")
