@@ -318,7 +318,7 @@ def test_what_libraries_print_does_not_spoil_the_document(capsys):
         console.result({"value": 1}, lambda rich: None)
     captured = capsys.readouterr()
     document = json.loads(captured.out)
-    assert set(document) == {"schema_version", "value", "timings"}
+    assert set(document) == {"schema_version", "value", "timings", "peak_memory_bytes"}
     assert document["value"] == 1
     assert "hello" in captured.err
 

@@ -64,7 +64,9 @@ def test_learning_says_what_it_cost_and_how_far_its_figures_may_be_off(lidardesi
         assert estimate["error"] >= 0
         assert estimate["kind"] == "standard error"
     kept = read_manifest(tmp_path / "run")["timings"]["learn"]
-    assert set(kept) == {"when", "seconds", "phases"}
+    assert set(kept) == {"when", "seconds", "phases", "peak_memory_bytes"}
+    # numpy and torch alone take some 100 MB
+    assert 5e7 < kept["peak_memory_bytes"] <= document["peak_memory_bytes"] < 1e11
     assert kept["phases"]["learning"] == document["timings"]["learning"]
 
 
@@ -167,7 +169,7 @@ class Page:
 
 def rows_of(timings):
     page = Page()
-    show_times(timings, page)
+    show_times(timings, None, page)
     if not page.printed:
         return []
     table = page.printed[-1]

@@ -19,7 +19,7 @@ import typer
 from lidardesign.cli.environment import TerminatedError
 from lidardesign.cli.times import show_times
 from lidardesign.errors import LidardesignError
-from lidardesign.run.clock import Clock, running
+from lidardesign.run.clock import Clock, peak_memory_bytes, running
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
@@ -91,19 +91,19 @@ class Console:
         """Give the result, as JSON or shown for people, and where the time went until now.
 
         Arguments:
-            document: The JSON form; `timings` is added.
+            document: The JSON form; `timings` and `peak_memory_bytes` are added.
             show: Prints the result for people.
             show_costs: Whether people are shown the times: not by commands that only look something up.
         """
         timings = self.clock.timings()
         if self.json:
             self.answered = True
-            print_json({**document, "timings": timings}, self.output)
+            print_json({**document, "timings": timings, "peak_memory_bytes": peak_memory_bytes()}, self.output)
             return
         rich = self.rich()
         show(rich)
         if show_costs and not self.quiet:
-            show_times(timings, rich)
+            show_times(timings, peak_memory_bytes(), rich)
 
     @contextlib.contextmanager
     def progress(self, *columns: str) -> Iterator[Progress | None]:

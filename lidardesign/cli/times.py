@@ -19,13 +19,14 @@ if TYPE_CHECKING:
 # Phases of a smaller share are left to --json; `other` shows what they took.
 LEAST_SHARE = 0.005
 INDENT = "  "
+MEBIBYTE = 1024**2
 # People are shown phases and those directly inside of them.
 DEEPEST = 2
 # Commands that only read a run wait for its writer no longer than this.
 SHORT_WAIT_S = 0.5
 
 
-def show_times(timings: Mapping[str, float], rich: RichConsole) -> None:
+def show_times(timings: Mapping[str, float], memory_bytes: int | None, rich: RichConsole) -> None:
     """Print the phases of a clock's timings with their seconds and shares, phases inside of phases indented."""
     timings = {key: seconds for key, seconds in timings.items() if key.count(INSIDE) < DEEPEST}
     total = sum(seconds for key, seconds in timings.items() if INSIDE not in key)
@@ -34,7 +35,8 @@ def show_times(timings: Mapping[str, float], rich: RichConsole) -> None:
     kept = {key: seconds for key, seconds in timings.items() if key != OTHER and seconds >= LEAST_SHARE * total}
     kept[OTHER] = total - sum(seconds for key, seconds in kept.items() if INSIDE not in key)
     lines = [_line(key, seconds, total) for key, seconds in kept.items()]
-    print_table("where the time went", ("phase", "seconds", "share"), lines, rich, text=("phase",))
+    memory = "" if memory_bytes is None else f"; the most memory that it took: {memory_bytes / MEBIBYTE:.0f} MiB"
+    print_table(f"where the time went{memory}", ("phase", "seconds", "share"), lines, rich, text=("phase",))
 
 
 def _line(key: str, seconds: float, total: float) -> tuple[str, str, str]:

@@ -8,6 +8,7 @@ other all count the same phases, each from its own beginning.
 from __future__ import annotations
 
 import contextlib
+import sys
 import time
 from collections.abc import Iterator
 from contextvars import ContextVar
@@ -24,6 +25,7 @@ INSIDE = "/"
 OTHER = "other"
 # Commands that write one entry hold the lock for an instant.
 WAIT_S = 10.0
+KIBIBYTE = 1024
 _RUNNING: ContextVar[tuple[Clock, ...]] = ContextVar("clocks that run", default=())
 
 
@@ -88,6 +90,16 @@ def phase(name: str) -> Iterator[None]:
         yield
 
 
+def peak_memory_bytes() -> int | None:
+    """The most memory that this process held at once; None where the system does not tell."""
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * KIBIBYTE
+
+
 def keep_timings(run: Path, command: str, clock: Clock, *, wait_s: float = WAIT_S) -> None:
     """Enter a command's times in a run's manifest, in place of those of the last time, under the run's lock.
 
@@ -97,6 +109,7 @@ def keep_timings(run: Path, command: str, clock: Clock, *, wait_s: float = WAIT_
     entry: dict[str, Any] = {
         "when": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "seconds": round(clock.seconds, 3),
+        "peak_memory_bytes": peak_memory_bytes(),
         "phases": clock.timings(),
     }
     with run_lock(run, wait_s=wait_s):
