@@ -16,9 +16,6 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from lidardesign.run.lock import run_lock
-from lidardesign.run.manifest import read_manifest, write_manifest
-
 # Between the name of a phase and that of one inside of it.
 INSIDE = "/"
 # What passed outside of all phases.
@@ -106,6 +103,10 @@ def keep_timings(run: Path, command: str, clock: Clock, *, wait_s: float = WAIT_
     Raises:
         ConfigError, DataError: The run is being written, or cannot be.
     """
+    # every command has a clock, `--help` too: what only some need is not imported for all
+    from lidardesign.run.lock import run_lock
+    from lidardesign.run.manifest import read_manifest, write_manifest
+
     entry: dict[str, Any] = {
         "when": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "seconds": round(clock.seconds, 3),
