@@ -29,6 +29,8 @@ STEPS_KEY = "learning.steps"
 GOAL = "goal"
 # What passes before the command's clock runs, where the system does not tell: the program's own imports take 0.3 s.
 STARTUP_S = 0.5
+# A process that is older than this did something else before.
+MOST_STARTUP_S = 30.0
 # Where Linux says when a process began, in ticks since the computer was started; the fields after its name in brackets.
 _STATUS, _STARTED_FIELD = Path("/proc/self/stat"), 19
 
@@ -180,9 +182,9 @@ class Learner:
         from lidardesign.density.learn import learn as learn_density
 
         place = choose_device(self.device)
-        before = _age_s() or STARTUP_S + self.console.clock.seconds
-        begun = time.perf_counter()
-        keeper = Timekeeper(time_budget_s, lambda: before + time.perf_counter() - begun, config, self.run)
+        clock, age = self.console.clock, _age_s()
+        startup = STARTUP_S if age is None or age - clock.seconds > MOST_STARTUP_S else age - clock.seconds
+        keeper = Timekeeper(time_budget_s, lambda: clock.seconds + startup, config, self.run)
         ground = prepare_ground(self.task, config)
         with phase("planning"):
             planned = keeper.plan(ground, place)

@@ -13,6 +13,7 @@ from lidardesign.density.ladder import Reached, load_flow, remeasured
 from lidardesign.density.learn import FLOW
 from lidardesign.density.measure import Probes, draw_probes, measure
 from lidardesign.density.settings import PRESETS
+from lidardesign.density.stages import goal_of
 from lidardesign.density.target import Target
 from lidardesign.design.constraints import Constraints
 from lidardesign.design.fit import fit
@@ -54,12 +55,12 @@ STEPS_NOTE = (
 
 
 def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
-    """The run's own snapshots, and the runs of other presets beside it where there are any."""
+    """The run's own snapshots; the stages of a tolerance, and runs of other presets beside it, where there are any."""
     seed, target = request.config.seed, run_target(request)
     generator = random_generator(seed, "accuracy", "training")
     probes = draw_probes(target, list(request.request.train), PROBES, generator)
     reached = remeasured(request.run, request.config, target, probes, count=SAMPLES, seed=seed)
-    found = [_steps_ladder(request, reached)]
+    found = [_steps_ladder(request, reached), *_stages_ladder(request)]
     others = _presets(request)
     if others:
         found.append(_preset_ladder(request, others, reached[-1], target, probes))
@@ -67,7 +68,7 @@ def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
 
 
 def _steps_ladder(request: AccuracyRequest, reached: Sequence[Reached]) -> Ladder:
-    judge = _Judge(request)
+    judge = _Judge(request, reached[-1].samples)
     scores = [judge.scores(one.samples) for one in reached]
     rungs = [
         _rung(str(one.step), one.estimates, one.seconds, judge.values(own, scores[-1]), default=one is reached[-1])
@@ -75,6 +76,19 @@ def _steps_ladder(request: AccuracyRequest, reached: Sequence[Reached]) -> Ladde
     ]
     notes = [STEPS_NOTE] if len(rungs) > 1 else ["this run kept no snapshots; learned again, it keeps some"]
     return _ladder("learning.steps", "learning up to there", rungs, "; ".join([*notes, *judge.notes]))
+
+
+def _stages_ladder(request: AccuracyRequest) -> Sequence[Ladder]:
+    """What `learn --tolerance` measured on its way to this run, if it was."""
+    goal = goal_of(request.run)
+    if goal is None or len(goal.stages) < 2:
+        return []
+    rungs = [
+        Rung(str(stage.steps), stage.misplaced, stage.error, stage.seconds, default=stage is goal.stages[-1])
+        for stage in goal.stages
+    ]
+    note = f"measured when the run was learned to a tolerance of {goal.tolerance:g}"
+    return [_ladder("learning.steps, each anew", "learning and measuring", rungs, note)]
 
 
 def _preset_ladder(
@@ -144,19 +158,21 @@ def _ladder(knob: str, work: str, rungs: Sequence[Rung], note: str) -> Ladder:
 
 
 class _Judge:
-    """Scores quick fits of the run's first design to samples of its flow at other times.
+    """Scores quick fits, like the first of the run's designs that allows one, to samples of its flow at other times.
 
     Arguments:
         request: What is evaluated.
+        samples: Of the flow as it is.
     """
 
-    def __init__(self, request: AccuracyRequest) -> None:
+    def __init__(self, request: AccuracyRequest, samples: Samples) -> None:
         asked = self._asked = request.request
         self._retarget = run_target(request).log_density
-        self._design = next((design for design in asked.designs if not design.at), None)
         self._rays = sorted(asked.rays)[len(asked.rays) // 2]
         with plugin_guard(asked.task.name):
             self._conditions = conditions_of(asked.task, asked.config, asked.space)
+        allowing = (one for one in asked.designs if not one.at and self._laid_out(one, samples) is not None)
+        self._design = next(allowing, None)
         self._scenes = [(scene, build_casters(scene)) for scene in asked.test[:SCORED_SCENES]] if self._design else []
 
     @property
@@ -169,11 +185,8 @@ class _Judge:
 
     def scores(self, samples: Samples) -> np.ndarray | None:
         """Per scene; None where the samples carry no such design."""
-        if self._design is None:
-            return None
-        try:
-            positions = self._laid_out(self._design, samples)
-        except LidardesignError:  # a rough density may leave too few samples, or constraints may fix the rays
+        positions = self._laid_out(self._design, samples) if self._design else None
+        if positions is None:
             return None
         return np.array([self._score(scene, casters, positions) for scene, casters in self._scenes])
 
@@ -187,9 +200,17 @@ class _Judge:
         name = f"score_{unit}" if unit else "score"
         return {name: float(scores.mean()), f"{name}_difference_error": error}
 
-    def _laid_out(self, design: Design, samples: Samples) -> Positions:
+    def _laid_out(self, design: Design, samples: Samples) -> Positions | None:
+        """The rays of a quick fit; None where its constraints fix other rays, or the samples are too few for it."""
+        try:
+            found = self._fitted(design, samples)
+            return tuple(self._asked.lay_out(found, self._rays, samples, at=place) for place in self._conditions)
+        except LidardesignError:
+            return None
+
+    def _fitted(self, design: Design, samples: Samples) -> Design:
         one_per_ray = design.layout == "scan" or design.track is not None
-        found = fit(
+        return fit(
             samples,
             sensors=None if one_per_ray else len(design.sensors),
             layout=design.layout,
@@ -203,7 +224,6 @@ class _Judge:
             gates=None if one_per_ray else gates_of(design, samples),
             retarget=self._retarget,
         ).design
-        return tuple(self._asked.lay_out(found, self._rays, samples, at=place) for place in self._conditions)
 
     def _score(self, scene: Scene, casters: Sequence[SceneCaster], positions: Positions) -> float:
         planner = self._asked.planner

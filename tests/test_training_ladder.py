@@ -1,0 +1,195 @@
+"""The ladder of training: what a run had reached at its snapshots, and what runs of other presets beside it reach."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from command_line import caller
+
+from lidardesign.density import budget
+from lidardesign.density.ladder import load_flow, remeasured, seconds_at
+from lidardesign.density.learn import learn
+from lidardesign.density.measure import draw_probes
+from lidardesign.density.stages import Stage, ToleranceGoal
+from lidardesign.design.fit import fit
+from lidardesign.design.samples import load_samples
+from lidardesign.errors import DataError
+from lidardesign.evaluate.accuracy import AccuracyRequest
+from lidardesign.evaluate.ladders import training
+from lidardesign.evaluate.ladders.probes import run_target
+from lidardesign.evaluate.request import EvaluationRequest
+from lidardesign.registry import load_task
+from lidardesign.run.config import load_run_config, resolve, save_run_config
+from lidardesign.run.manifest import note, start_manifest
+from lidardesign.task import random_generator, scenes_of
+
+SMALL = (
+    "learning.batch=128", "learning.layers=1", "learning.hidden=16", "learning.bins=8", "learning.samples=2000",
+    "learning.balance_proposals=1024", "learning.coverage_proposals=512", "train=4", "test=3",
+)  # fmt: skip
+
+
+def learned(folder, preset, steps, *further):
+    task = load_task("flatland")
+    overrides = [*SMALL, f"learning.steps={steps}", *further]
+    config = resolve(task, preset=preset, overrides=overrides, seed=1)
+    folder.mkdir()
+    start_manifest(folder, command=[], seed=1)
+    save_run_config(config, folder)
+    learn(task, config, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    place = tmp_path_factory.mktemp("runs")
+    mine = learned(place / "mine", "draft", 64)
+    learned(place / "longer", "standard", 96)
+    learned(place / "other_density", "fine", 8, "density.sigma_m=0.08")
+    (place / "nothing").mkdir()
+    return mine
+
+
+def request_for(run, designs=()):
+    task, config = load_run_config(run)
+    train, test = (scenes_of(task, config.task, split, config.seed, config.space) for split in ("train", "test"))
+    asked = EvaluationRequest(
+        task=task, config=config.task, space=config.space, seed=config.seed, designs=designs, rays=[12],
+        train=list(train), test=list(test),
+    )  # fmt: skip
+    return AccuracyRequest(config, run, asked, None)
+
+
+@pytest.fixture(scope="module")
+def ladders(runs):
+    return training.ladders(request_for(runs, [fit(load_samples(runs), sensors=2, restarts=1).design]))
+
+
+def test_every_snapshot_and_the_flow_itself_are_rungs_with_errors_and_seconds(ladders):
+    steps = ladders[0]
+    assert steps.knob == "learning.steps"
+    assert [rung.setting for rung in steps.rungs] == ["32", "36", "40", "48", "64"]
+    assert [rung.default for rung in steps.rungs] == [False] * 4 + [True]
+    assert all(0 < rung.error < 1 and 0 < rung.uncertainty < 0.1 for rung in steps.rungs)
+    seconds = [rung.seconds for rung in steps.rungs]
+    assert seconds == sorted(seconds)
+    assert steps.falls
+
+
+def test_rungs_carry_ess_kl_coverage_and_the_score_of_a_quick_fit(ladders):
+    values = ladders[0].rungs[-1].values
+    assert {"ess", "kl_nats", "coverage", "ess_error", "kl_nats_error"} <= values.keys()
+    assert any(name.startswith("score") for name in values)
+    differences = [v for name, v in values.items() if name.endswith("difference_error")]
+    assert differences == [0.0]
+    assert "quick fits" in ladders[0].note
+
+
+def test_runs_of_other_presets_are_rungs_and_runs_of_other_densities_are_not(ladders):
+    presets = ladders[1]
+    assert presets.knob == "preset"
+    assert [rung.setting for rung in presets.rungs] == ["draft", "standard"]
+    assert [rung.default for rung in presets.rungs] == [True, False]
+    assert presets.rungs[0].error == ladders[0].rungs[-1].error
+
+
+def test_errors_repeat_within_their_uncertainty_on_other_samples_and_probes(runs, ladders):
+    request = request_for(runs)
+    config, target = request.config, run_target(request)
+    probes = draw_probes(target, list(request.request.train), 8192, random_generator(99, "others"))
+    again = remeasured(runs, config, target, probes, count=8192, seed=99)
+    for rung, reached in zip(ladders[0].rungs, again, strict=True):
+        found = reached.estimates["misplaced"]
+        assert abs(found.value - rung.error) < 4 * np.hypot(found.error, rung.uncertainty)
+
+
+def test_a_snapshot_is_measured_as_the_flow_that_was_learned(runs):
+    request = request_for(runs)
+    flow = load_flow(runs, "flow.safetensors", request.config, run_target(request), 0)
+    assert next(flow.flow.parameters()).dtype.is_floating_point
+    wide = replace(request.config, learning=request.config.learning.model_copy(update={"hidden": 32}))
+    with pytest.raises(DataError, match="another flow"):
+        load_flow(runs, "flow.safetensors", wide, run_target(request), 0)
+
+
+def test_seconds_between_rows_of_the_progress_are_interpolated(runs):
+    seconds = seconds_at(runs, [20, 25, 30])
+    assert seconds[25] == pytest.approx((seconds[20] + seconds[30]) / 2)
+
+
+def test_stages_of_a_tolerance_are_a_ladder_of_their_own(runs, tmp_path, ladders):
+    goal = ToleranceGoal(0.4, 64, (Stage(32, 0.6, 0.01, 1.0), Stage(64, 0.3, 0.01, 2.0)))
+    request = request_for(runs)
+    note(runs, goal=goal.as_dict())
+    found = training._stages_ladder(request)
+    assert [(rung.setting, rung.error) for rung in found[0].rungs] == [("32", 0.6), ("64", 0.3)]
+    assert "tolerance of 0.4" in found[0].note
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+def flatland(lidardesign, out, *options):
+    small = [word for setting in SMALL for word in ("--set", setting)]
+    return lidardesign("learn", "flatland", "--preset", "draft", "--out", out, *small, *options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--tolerance", "0.1", "--time-budget", "60"), "both decide"),
+        (("--tolerance", "0"), "between 0 and 1"),
+        (("--tolerance", "nan"), "between 0 and 1"),
+        (("--time-budget", "-3"), "above 0"),
+        (("--time-budget", "inf"), "above 0"),
+        (("--time-budget", "60", "--set", "learning.steps=7"), "the time decides learning.steps"),
+    ],
+)
+def test_goals_that_make_no_sense_are_config_errors(lidardesign, tmp_path, options, message):
+    done = flatland(lidardesign, "run", *options)
+    assert done.code == 2
+    assert message in done.err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_tolerance_that_is_missed_exits_1_with_what_was_reached_and_a_usable_run(lidardesign, tmp_path):
+    done = flatland(lidardesign, "run", "--set", "learning.steps=8", "--tolerance", "1e-6", "--json")
+    assert done.code == 1
+    document = done.json
+    assert [stage["steps"] for stage in document["goal"]["stages"]][:4] == [1, 2, 4, 8]
+    assert not document["goal"]["met"]
+    assert f"{document['misplaced']:.3g}" in done.err
+    assert "--tolerance" in done.err
+    assert lidardesign("fit", "run", "--sensors", "2").code == 0
+    again = lidardesign("learn", "flatland", "--out", "run", "--resume", "--tolerance", "0.3")
+    assert again.code == 2
+    assert "started with tolerance = 1e-06" in again.err
+
+
+def test_a_tolerance_that_is_met_stops_there_and_resuming_changes_nothing(lidardesign, tmp_path):
+    done = flatland(lidardesign, "run", "--set", "learning.steps=64", "--tolerance", "0.95", "--json")
+    assert done.code == 0
+    assert done.json["goal"]["met"]
+    assert done.json["steps"] == done.json["goal"]["stages"][-1]["steps"] < 64
+    before = (tmp_path / "run" / "flow.safetensors").read_bytes()
+    assert lidardesign("learn", "flatland", "--out", "run", "--resume").code == 0
+    assert (tmp_path / "run" / "flow.safetensors").read_bytes() == before
+
+
+def test_a_time_budget_writes_its_steps_into_the_configuration(lidardesign, tmp_path, monkeypatch):
+    # steps that pretend to be slow: the plan then depends on no machine
+    monkeypatch.setattr(budget, "_seconds_per_step", lambda *_: 600.0)
+    done = flatland(lidardesign, "run", "--time-budget", "100000", "--json")
+    assert done.code == 0
+    plan = done.json["goal"]
+    assert done.json["steps"] == pytest.approx(150, abs=1)
+    assert done.json["steps"] == plan["pathwise_steps"] + plan["balancing_steps"]
+    assert load_run_config(tmp_path / "run")[1].learning.steps == done.json["steps"]
+    soon = flatland(lidardesign, "soon", "--time-budget", "0.01")
+    assert soon.code == 2
+    assert "at least" in soon.err
+    assert not (tmp_path / "soon").exists()
