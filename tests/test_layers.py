@@ -60,7 +60,7 @@ HOMES = {
     "typer": ("lidardesign.cli.",),
     "rich": ("lidardesign.cli.",),
     "plotly": ("lidardesign.evaluate.report",),
-    "matplotlib": ("lidardesign.evaluate.plots",),
+    "matplotlib": ("lidardesign.evaluate.plots", "lidardesign.evaluate.pareto"),
     "distributed": ("lidardesign.evaluate.worker_cluster",),
     "dask": (),
     # it can abort its process: only the one of its own imports it

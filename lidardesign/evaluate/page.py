@@ -18,10 +18,12 @@ body { margin: 0; background: #fff; color: var(--ink);
 main { max-width: 1080px; margin: 0 auto; padding: 28px 24px 64px; }
 h1 { font-size: 1.75rem; line-height: 1.25; margin: 0 0 4px; overflow-wrap: anywhere; }
 h2 { font-size: 1.15rem; margin: 0 0 10px; overflow-wrap: anywhere; }
+h3 { font-size: 1rem; margin: 20px 0 6px; overflow-wrap: anywhere; }
 section { border-top: 1px solid var(--line); padding-top: 20px; margin-top: 28px; }
 p { margin: 0 0 8px; max-width: 75ch; overflow-wrap: anywhere; }
 .note { background: #fff8e6; border-left: 3px solid #e69f00; padding: 6px 10px; }
 .scroll { overflow-x: auto; }
+.panels { min-width: 680px; }
 table { border-collapse: collapse; width: 100%; font-size: 0.9rem; font-variant-numeric: tabular-nums; }
 th, td { padding: 5px 12px; border-bottom: 1px solid var(--line); text-align: right; white-space: nowrap; }
 th { background: var(--tint); font-weight: 600; color: var(--soft); }

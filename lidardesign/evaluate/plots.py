@@ -26,9 +26,18 @@ FILES: dict[Against, str] = {"rays": "score_against_rays.png", "bandwidth": "sco
 
 
 def write_plots(evaluation: Evaluation, directory: Path) -> list[Path]:
-    """Write both curves into a folder, which is made where it is missing; returns the files."""
+    """Write both curves, and what accuracy costs where that was measured; returns the files.
+
+    The folder is made where it is missing.
+    """
     directory = Path(directory)
-    return [_write(evaluation, against, directory / name) for against, name in FILES.items()]
+    written = [_write(evaluation, against, directory / name) for against, name in FILES.items()]
+    if evaluation.accuracy is not None:
+        # it draws with this module's looks
+        from lidardesign.evaluate.pareto import write_pareto
+
+        written += write_pareto(evaluation.accuracy.ladders, directory)
+    return written
 
 
 def curve_png(evaluation: Evaluation, against: Against) -> bytes:
@@ -74,7 +83,7 @@ def _draw(axes: Axes, curve: Series, against: Against) -> None:
         linestyle=curve.dash,
         linewidth=1.4 if curve.baseline else 2.0,
         markersize=5.5,
-        label=_plain(curve.name),
+        label=plain_label(curve.name),
     )
 
 
@@ -83,20 +92,20 @@ def _dress(axes: Axes, evaluation: Evaluation, curves: list[Series], against: Ag
     rows = [row for curve in curves for row in curve.rows]
     scenes = f"{evaluation.scenes} held-out scene{'s' if evaluation.scenes != 1 else ''}"
     axes.set_xlabel(across)
-    axes.set_ylabel(_plain(up, longest=80))
+    axes.set_ylabel(plain_label(up, longest=80))
     axes.set_title(f"{scenes}, bands are 95 % bootstrap intervals", fontsize=9, loc="left", color="#444444")
     if logarithmic([position(row, against) for row in rows]):
         axes.set_xscale("log")
-        _label_ticks(axes.xaxis, sorted({row.rays for row in rows}) if against == "rays" else None)
+        label_ticks(axes.xaxis, sorted({row.rays for row in rows}) if against == "rays" else None)
     if logarithmic([row.value for row in rows]):
         axes.set_yscale("log")
-        _label_ticks(axes.yaxis, None)
+        label_ticks(axes.yaxis, None)
     axes.grid(True, which="major", color="#dddddd", linewidth=0.7)
     axes.spines[["top", "right"]].set_visible(False)
     axes.figure.legend(loc="outside right upper", frameon=False)
 
 
-def _label_ticks(axis: Any, at: list[int] | None) -> None:
+def label_ticks(axis: Any, at: list[int] | None) -> None:
     """Plain numbers instead of powers of ten; at the given places where there are any."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 
@@ -109,7 +118,7 @@ def _label_ticks(axis: Any, at: list[int] | None) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
-def _plain(text: str, longest: int = LONGEST_LABEL) -> str:
+def plain_label(text: str, longest: int = LONGEST_LABEL) -> str:
     """Text that matplotlib draws as it is: no formulas, no hidden legend entries, not too long."""
     shortened = text if len(text) <= longest else f"{text[: longest - 1]}…"
     shown = shortened.replace("$", r"\$")

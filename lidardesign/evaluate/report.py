@@ -16,8 +16,10 @@ from lidardesign.design.sensor import Design
 from lidardesign.evaluate.drawing import MOST_FACES, drawn_share
 from lidardesign.evaluate.figures import curve_figure, scene_figure
 from lidardesign.evaluate.page import page
+from lidardesign.evaluate.pareto_figure import accuracy_tables, pareto_figure, pareto_height_px
 from lidardesign.evaluate.physics_tables import audit_section, effects_section
 from lidardesign.evaluate.results import Evaluation
+from lidardesign.evaluate.rungs import Ladder
 from lidardesign.evaluate.verdicts import (
     bandwidth_table,
     paired_table,
@@ -30,6 +32,7 @@ from lidardesign.scene import Scene
 from lidardesign.simulate.returns import Rays
 
 SCENE_ID, RAYS_ID, BANDWIDTH_ID = "view-scene", "curve-rays", "curve-bandwidth"
+ACCURACY_ID = "accuracy"
 
 
 def write_report(
@@ -72,6 +75,7 @@ def report_html(
     heading = title or f"{metric.name} on {evaluation.scenes} held-out scenes"
     frame = scene.frames // 2
     figure, masks = scene_figure(scene, designs, rays_by_design, frame)
+    ladders = evaluation.accuracy.ladders if evaluation.accuracy else ()
     sections = [
         _section("Result", _paragraphs(summary_sentences(evaluation)) + _notes(evaluation.notes)),
         _section("Score against rays", _figure(curve_figure(evaluation, "rays"), RAYS_ID, 440)),
@@ -89,10 +93,24 @@ def report_html(
         _section("At equal bandwidth", bandwidth_table(evaluation)) if evaluation.equal_bandwidth else "",
         _section("Physics", effects_section(evaluation)) if evaluation.effects else "",
         _section("Audit of the physics", audit_section(evaluation, evaluation.audit)) if evaluation.audit else "",
+        _section("What accuracy costs", _accuracy(ladders)) if ladders else "",
         *(_section(f"Sensors of {design.name}", sensors_table(design)) for design in designs),
         _section("How to reproduce", _definitions(reproduce)) if reproduce else "",
     ]
     return page(heading, "\n".join(section for section in sections if section), _plotly_source())
+
+
+def _accuracy(ladders: Sequence[Ladder]) -> str:
+    """The figure of all ladders, how to read it, and their tables."""
+    read = (
+        "Error against seconds on this machine, one panel per numerical choice. Orange is the cheapest setting inside "
+        "the tolerance (dashed), a ring the one of this run; pale settings are beaten in both; triangles on the lower "
+        "edge have no error to show, references among them."
+    )
+    height = pareto_height_px(ladders)
+    picture = _figure(pareto_figure(ladders), ACCURACY_ID, height) if height else ""
+    wide = f'<div class="scroll"><div class="panels">{picture}</div></div>'
+    return f"<p>{read}</p>{wide}{accuracy_tables(ladders)}"
 
 
 def _drawn(scene: Scene, frame: int, at: Mapping[str, float]) -> str:

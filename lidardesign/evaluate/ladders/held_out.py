@@ -83,7 +83,7 @@ def _rung(differences: np.ndarray, count: int, seconds: float, seed: int) -> Run
         uncertainty=math.hypot(float(halves.mean()) * relative_error_of_spread(differences), float(drawn)),
         seconds=seconds * count,
         default=count == total,
-        values={"share_of_draws_that_tell_them_apart": float(agree)},
+        values={"told_apart_share": float(agree)},
     )
 
 
