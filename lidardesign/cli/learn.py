@@ -91,8 +91,7 @@ def learn(
             _check_can_start(run)
             settings = resolve(plugin, **choices)
         result = _learn_in_folder(plugin, settings, run, resume, goal, device, console, ranks)
-        if ranks.first:
-            keep_timings(run, "learn", console.clock)
+        keep_timings(run, "learn", console.clock)
         result = replace(result, notes=(*result.notes, *_advice(result)))
         console.result(_document(result), lambda rich: _show(result, rich))
         check_met(result, goal)
