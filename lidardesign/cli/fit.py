@@ -11,8 +11,9 @@ import typer
 from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
 from lidardesign.cli.runs import check_choice, check_name, open_run, parse_at, provenance, sensor_count
+from lidardesign.cli.times import keep_times
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.run.clock import keep_timings, phase
+from lidardesign.run.clock import WAIT_S, phase
 
 if TYPE_CHECKING:
     from lidardesign.cli.layouts import RunTarget
@@ -169,7 +170,7 @@ def fit_and_write(
         "constraints": [_check_dict(check) for check in checks],
     }
     document["satisfied"] = all(check.satisfied for check in checks)
-    keep_timings(run.folder, command_name, console.clock)
+    keep_times(run.folder, command_name, console, wait_s=WAIT_S)
     console.result(document, lambda rich: show_fit(document, design, checks, rich))
 
 

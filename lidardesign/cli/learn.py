@@ -16,8 +16,9 @@ from lidardesign.cli.console import Console, command
 from lidardesign.cli.goals import GOAL, Goal, Learner, TimeBudget, Tolerance, check_met, checked_goal, resumed_goal
 from lidardesign.cli.ranks import joined_ranks
 from lidardesign.cli.runs import check_choice
+from lidardesign.cli.times import keep_times
 from lidardesign.errors import ConfigError, DataError, LostRankError
-from lidardesign.run.clock import keep_timings, phase
+from lidardesign.run.clock import WAIT_S, phase
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
@@ -91,7 +92,7 @@ def learn(
             _check_can_start(run)
             settings = resolve(plugin, **choices)
         result = _learn_in_folder(plugin, settings, run, resume, goal, device, console, ranks)
-        keep_timings(run, "learn", console.clock)
+        keep_times(run, "learn", console, wait_s=WAIT_S)
         result = replace(result, notes=(*result.notes, *_advice(result)))
         console.result(_document(result), lambda rich: _show(result, rich))
         check_met(result, goal)

@@ -44,10 +44,13 @@ def _line(key: str, seconds: float, total: float) -> tuple[str, str, str]:
     return f"{INDENT * len(outside)}{name}", f"{seconds:.2f}", f"{100 * seconds / total:.0f} %"
 
 
-def keep_times(run: Path, name: str, console: Console) -> None:
-    """Enter the times of a command that only reads a run in its manifest; where that cannot be, a note says so."""
+def keep_times(run: Path, name: str, console: Console, *, wait_s: float = SHORT_WAIT_S) -> None:
+    """Enter the times of a command in the manifest of its run; where that cannot be, a note says so.
+
+    The work is done by then: that its times are not kept is no reason to fail.
+    """
     try:
-        keep_timings(run, name, console.clock, wait_s=SHORT_WAIT_S)
+        keep_timings(run, name, console.clock, wait_s=wait_s)
     except (ConfigError, DataError, OSError) as error:
         message = error.message if isinstance(error, ConfigError | DataError) else error.strerror or error
         console.note(f"note: the times of {name} are not kept in {run}: {message}")
