@@ -140,7 +140,8 @@ def beside_noise(gradients: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -
     """The rms error of gradients as a share of the noise that the exact ones have anyway, and its standard error.
 
     Arguments:
-        gradients: Of several batches, shape (P,) each; the standard error is the jackknife's over batches.
+        gradients: Of several batches, shape (P,) each, or (draws, P) of several draws for each batch; the standard
+            error is the jackknife's over batches.
         exact: Of the same batches, 3 or more.
     """
     apart, products = _apart(gradients, exact)
@@ -157,9 +158,13 @@ def each_beside_noise(gradients: Sequence[np.ndarray], exact: Sequence[np.ndarra
 
 
 def _apart(gradients: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Squared differences by batch (K,), and the products of all exact gradients (K, K)."""
+    """Mean squared differences by batch (K,), and the products of all exact gradients (K, K)."""
+    apart = [
+        np.square(np.atleast_2d(found) - wanted).sum(axis=1).mean()
+        for found, wanted in zip(gradients, exact, strict=True)
+    ]
     exact = np.asarray(exact)
-    return np.square(np.asarray(gradients) - exact).sum(axis=1), exact @ exact.T
+    return np.array(apart), exact @ exact.T
 
 
 def _share(apart: np.ndarray, products: np.ndarray, rows: np.ndarray) -> float:

@@ -16,14 +16,15 @@ LABEL = "scenes per step"
 # The error of few scenes is noise like that of few design points; half as much adds a quarter to its variance.
 TOLERANCE = 0.5
 BECAUSE = "it adds a quarter to the variance that gradients have anyway, as a batch a fifth smaller would"
-FEWEST, RATIO, MOST = 4, 2, 2048
-BATCHES = 12
+POWERS = (4, 16, 64, 256, 1024)
+# Batches, and how often scenes are drawn for each.
+BATCHES, DRAWS = 20, 2
 
 
 def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
     """One ladder; empty for a few scenes, or where no ray meets a target."""
     steps = run_steps(request)
-    if steps is None or steps.target.columns <= FEWEST:
+    if steps is None or steps.target.columns <= POWERS[0]:
         return []
     return [scenes_ladder(steps, request.config.seed)]
 
@@ -49,9 +50,8 @@ def scenes_ladder(steps: Steps, seed: int) -> Ladder:
 
 
 def counts(columns: int, default: int) -> list[int]:
-    """How many scenes and frames are tried: powers up to all of them, and the run's own number."""
-    powers = FEWEST * RATIO ** np.arange(int(np.log(MOST / FEWEST) / np.log(RATIO)) + 1)
-    return sorted({*(int(count) for count in powers if count < columns), default, columns})
+    """How many scenes and frames are tried: powers of four up to all of them, and the run's own number."""
+    return sorted({*(count for count in POWERS if count < columns), default, columns})
 
 
 def _rung(count: int, steps: Steps, exact: list[np.ndarray], seeds: Sequence[int], default: int) -> Rung:
@@ -66,5 +66,6 @@ def _rung(count: int, steps: Steps, exact: list[np.ndarray], seeds: Sequence[int
     _, seconds, memory = timed(lambda: drawn(seeds[0]))
     if count == columns:
         return Rung(str(count), 0.0, 0.0, seconds, memory, default == count, reference=True)
-    error, uncertainty = beside_noise([drawn(number) for number in seeds], exact)
+    found = [np.stack([drawn(number) for _ in range(DRAWS)]) for number in seeds]
+    error, uncertainty = beside_noise(found, exact)
     return Rung(str(count), error, uncertainty, seconds, memory, default == count)
