@@ -34,7 +34,7 @@ FOOTPRINT_RAYS = (1, 4, 16, 64, 256)
 RAYS_PER_SCENE = 20_000
 # Scenes that are simulated: as many as these rays are enough for, within these numbers. Differences are paired, so
 # that few scenes tell much.
-RAYS, FEWEST_SCENES, MOST_SCENES = 60_000, 3, 24
+RAYS, FEWEST_SCENES, MOST_SCENES = 60_000, 3, 16
 # Thin rays of all beams in all scenes: seconds, and not minutes, for the finest footprint.
 MOST_THIN_RAYS = 6_000_000
 # Effects that take longer than this in one pass over the scenes are left out of all passes [s].

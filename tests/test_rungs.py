@@ -1,0 +1,58 @@
+"""Which rung of a ladder is chosen, and what its verdict says."""
+
+import numpy as np
+import pytest
+
+from lidardesign.evaluate.rungs import Ladder, Rung, timed
+
+
+def ladder(*rungs, tolerance=0.1):
+    return Ladder("knob", "the error", "mm", "the finest", tolerance, "a reason", "some work", rungs)
+
+
+def rung(setting, error, seconds, **changes):
+    return Rung(setting, error, changes.pop("uncertainty", 0.0), seconds, **changes)
+
+
+def test_the_cheapest_rung_inside_the_tolerance_is_chosen():
+    found = ladder(rung("a", 0.5, 1.0), rung("b", 0.05, 2.0), rung("c", 0.01, 4.0, default=True))
+    assert found.chosen.setting == "b"
+    assert found.verdict == "b suffices, 2 times cheaper than c, the setting of this run"
+
+
+def test_of_rungs_that_cost_the_same_the_most_accurate_is_chosen():
+    found = ladder(rung("a", 0.05, 1.0), rung("b", 0.01, 1.1), rung("c", 0.0, 2.0))
+    assert found.chosen.setting == "b"
+
+
+@pytest.mark.parametrize("uncertainty, chosen", [(0.0, "b"), (0.02, "a")])
+def test_of_rungs_that_cost_and_err_the_same_the_runs_own_is_chosen(uncertainty, chosen):
+    found = ladder(rung("a", 0.05, 1.0, uncertainty=uncertainty, default=True), rung("b", 0.02, 1.1))
+    assert found.chosen.setting == chosen
+
+
+def test_outside_the_tolerance_the_most_accurate_is_closest():
+    found = ladder(rung("a", 0.5, 1.0), rung("b", 0.3, 2.0, default=True))
+    assert found.chosen.setting == "b"
+    assert found.verdict == "no setting is within 0.1 mm; b is closest"
+
+
+def test_errors_fall_within_their_uncertainty():
+    assert ladder(rung("a", 0.5, 1.0), rung("b", 0.3, 1.0)).falls
+    assert not ladder(rung("a", 0.3, 1.0), rung("b", 0.5, 1.0)).falls
+    assert ladder(rung("a", 0.3, 1.0, uncertainty=0.1), rung("b", 0.5, 1.0, uncertainty=0.1)).falls
+
+
+def test_a_row_has_the_keys_of_the_contract():
+    (row,) = ladder(rung("a", 0.05, 1.0, values={"worst_mm": 1.0})).as_rows()
+    assert {"knob", "setting", "error", "unit", "seconds", "chosen"} <= set(row)
+    assert row["chosen"] is True
+    assert row["values"] == {"worst_mm": 1.0}
+
+
+def test_a_timed_call_gives_its_value_and_the_memory_of_what_it_held():
+    size = 50_000_000
+    value, seconds, memory = timed(lambda: float(np.ones(size // 8).sum()))
+    assert value == size // 8
+    assert seconds > 0
+    assert memory is None or memory > 0.8 * size
