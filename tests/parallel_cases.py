@@ -15,7 +15,7 @@ from lidardesign.density.parallel import Ranks
 from lidardesign.density.parallel_ranks import join_ranks
 from lidardesign.density.parallel_target import build_shared_target
 from lidardesign.density.settings import DensitySettings, LearningSettings
-from lidardesign.errors import ConfigError
+from lidardesign.errors import ConfigError, NumericalError
 from lidardesign.run.config import RunConfig
 from lidardesign.scene import Body, Box, Mesh, Receiver, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
@@ -113,6 +113,13 @@ def operations(ranks: Ranks) -> dict[str, np.ndarray]:
     found["gradients"] = parameter.grad.numpy().copy()
     ranks.sum_gradients([parameter], valid=ranks.first)
     found["invalid"] = parameter.grad.numpy().copy()
+    for case in ("frames", "meshes"):
+        target = build_shared_target(scenes_of_case(case), SPACE, SETTINGS, "raycast", ranks)
+        points = np.full((3, 6), 0.3 if ranks.first else np.nan)
+        try:
+            target.log_density(points)
+        except NumericalError as error:
+            found[f"{case} not finite"] = np.array(str(error))
     ranks.agree("scenes", b"the same")
     try:
         ranks.agree("scenes", bytes([ranks.rank]))

@@ -89,4 +89,6 @@ def test_collectives_give_the_same_on_every_rank(together):
         assert found["share"].tobytes() == b"first"
         np.testing.assert_array_equal(found["gradients"], [1, 1])
         assert np.isnan(found["invalid"]).all()
+        for case in ("frames", "meshes"):
+            assert "design points are not finite" in str(found[f"{case} not finite"])
         assert "rank 1 has other scenes than rank 0" in str(found["disagreement"])

@@ -63,11 +63,8 @@ class FramesTarget(Target):
             rows = slice(start, min(start + self.rows_at_once, len(points)))
             pairs = self._pairs(observed[rows], sigma_m)
             surface = self.log_column_weights[pairs.columns] - np.square(pairs.distances / sigma_m) / 2
-            values[rows] = self._row_sums(surface, pairs)[0]
+            values[rows] = row_log_sums(surface, pairs)[0]
         return values
-
-    def _row_sums(self, terms: np.ndarray, pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
-        return row_log_sums(terms, pairs)
 
     def _pairs(self, observed: np.ndarray, sigma_m: float) -> Pairs:
         return near_pairs(self.field, observed, self.log_column_weights, sigma_m, self.surface_tolerance_nats)
@@ -78,7 +75,7 @@ class FramesTarget(Target):
         pairs = self._pairs(observed, optics.sigma_m)
         surface = self.log_column_weights[pairs.columns] - np.square(pairs.distances / optics.sigma_m) / 2
         passed = self.visibility.blocked(rays, pairs, optics)
-        values, shares = self._row_sums(surface + passed.log_values, pairs)
+        values, shares = row_log_sums(surface + passed.log_values, pairs)
         if not gradient:
             return values, None
         by_point = self._surface_gradient(observed, pairs, -shares * pairs.distances / optics.sigma_m**2)

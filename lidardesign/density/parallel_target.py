@@ -1,30 +1,32 @@
-"""The target density with its columns shared out over ranks.
+"""The target density over several ranks.
 
-Each rank holds the distance fields and occluders of its own columns (of every size-th scene, or frame of moving
-scenes), so memory and building time fall with the number of ranks. Points of all ranks are gathered; each rank adds up
-its own columns; the parts are combined by logsumexp. Which columns matter at a point depends on the best one, so the
-best surface terms are compared over ranks first: all ranks together leave out what one process would leave out.
+Scenes at rest are shared out: each rank holds the distance fields and occluders of every size-th scene, so memory and
+building time fall with the number of ranks. Points of all ranks are gathered; each rank adds up its own columns; the
+parts are combined by logsumexp. Which columns matter at a point depends on the best one, so the best surface terms are
+compared over ranks first: all ranks together leave out what one process would leave out. A rank that no scene is left
+for carries the first one with the weight zero.
 
-log p* of a shared target is collective: all ranks ask for it, each at points of its own (any number of them). A rank
-that no column is left for carries the first one with the weight zero.
+Frames of moving scenes are poses of a few shapes: every rank holds all of them, and evaluates its own points alone.
+
+log p* of a shared target is collective: all ranks ask for it, each at points of its own (any number of them).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from lidardesign.density.fields import Field
 from lidardesign.density.frames import FramesTarget
-from lidardesign.density.occlusion import Pairs
 from lidardesign.density.parallel import ALONE, Ranks
 from lidardesign.density.receiver import common_receiver
 from lidardesign.density.refinement import refine_quadrature
 from lidardesign.density.settings import DensitySettings
 from lidardesign.density.target import Target, build_target, is_of_frames
 from lidardesign.density.visibility import Optics
+from lidardesign.errors import NumericalError
 from lidardesign.scene import Scene
 from lidardesign.space import DesignSpace
 
@@ -80,57 +82,8 @@ class OwnColumns(Target):
         return (peak + np.log(total))[:, 0], shares / total
 
 
-@dataclass(frozen=True, eq=False)
-class OwnFrames(FramesTarget):
-    """The frames of one rank: part of the sum that is p*, at points that all ranks share."""
-
-    ranks: Ranks = ALONE
-
-    def _pairs(self, observed: np.ndarray, sigma_m: float) -> Pairs:
-        """Of the columns that matter among this rank's, those that matter among all."""
-        pairs = super()._pairs(observed, sigma_m)
-        surface = self.log_column_weights[pairs.columns] - np.square(pairs.distances / sigma_m) / 2
-        best = self.ranks.max(_row_largest(surface, pairs))
-        kept = surface >= best[pairs.rows] - self.surface_tolerance_nats
-        ends = np.concatenate([[0], np.cumsum(kept)])[pairs.row_starts]
-        return Pairs(ends, pairs.columns[kept], pairs.distances[kept], pairs.bodies[kept])
-
-    def _row_sums(self, terms: np.ndarray, pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
-        peak = self.ranks.max(_row_largest(terms, pairs))
-        shares, rows = np.exp(terms - peak[pairs.rows]), pairs.rows
-        total = self.ranks.sum(np.bincount(rows, shares, minlength=len(peak)))
-        return peak + np.log(total), shares / total[rows]
-
-
-def _row_largest(values: np.ndarray, pairs: Pairs) -> np.ndarray:
-    """The largest value of each row's pairs, shape (N,); -inf for a row without any."""
-    largest = np.full(len(pairs.row_starts) - 1, -np.inf)
-    held = np.flatnonzero(np.diff(pairs.row_starts))
-    if len(held):
-        largest[held] = np.maximum.reduceat(values, pairs.row_starts[held])
-    return largest
-
-
-class _OverRanks:
-    """Points of all ranks, evaluated by each in its own columns."""
-
-    own: Target
-    ranks: Ranks
-
-    def _in_chunks(
-        self, points: np.ndarray, sigma_m: float | None, gradient: bool
-    ) -> tuple[np.ndarray, np.ndarray]:
-        every, mine = self.ranks.gathered(np.asarray(points, dtype=np.float64))
-        values, gradients = super()._in_chunks(every, sigma_m, gradient)
-        return values[mine], gradients[mine]
-
-    def _evaluate(self, points: np.ndarray, optics: Optics, gradient: bool) -> tuple[np.ndarray, np.ndarray | None]:
-        values, by_chart = self.own._evaluate(points, optics, gradient)
-        return values, None if by_chart is None else self.ranks.sum(by_chart)
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SharedTarget(_OverRanks, Target):
+class SharedTarget(Target):
     """A target whose scenes are shared out over ranks.
 
     Arguments:
@@ -165,33 +118,35 @@ class SharedTarget(_OverRanks, Target):
         own, notes = refine_quadrature(self.own, self.scenes, probes, self.ranks.mean)
         return replace(self, own=own, visibility=own.visibility, rows=_fewest(own.rows_at_once, self.ranks)), notes
 
+    def _in_chunks(
+        self, points: np.ndarray, sigma_m: float | None, gradient: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        every, mine = self.ranks.gathered(np.asarray(points, dtype=np.float64))
+        values, gradients = super()._in_chunks(every, sigma_m, gradient)
+        return values[mine], gradients[mine]
+
+    def _evaluate(self, points: np.ndarray, optics: Optics, gradient: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        values, by_chart = self.own._evaluate(points, optics, gradient)
+        return values, None if by_chart is None else self.ranks.sum(by_chart)
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SharedFrames(_OverRanks, FramesTarget):
-    """A target of moving frames that are shared out over ranks; proposals know all bodies, which are poses only.
+class SharedFrames(FramesTarget):
+    """A target of moving frames, of which every rank holds all and evaluates them at its own points.
 
     Arguments:
-        own: The columns of this rank.
-        ranks: Who has the others.
+        ranks: Who evaluates the other points.
     """
 
-    own: OwnFrames
     ranks: Ranks
 
-    @classmethod
-    def of(cls, target: FramesTarget, ranks: Ranks) -> SharedFrames:
-        """A target shared out: every size-th column."""
-        owned = np.arange(ranks.rank, target.columns, ranks.size)
-        held = owned if len(owned) else np.zeros(1, dtype=np.int64)
-        common = {"optics": target.optics, "space": target.space}
-        common["surface_tolerance_nats"] = target.surface_tolerance_nats
-        weights = _weights(target.log_column_weights, owned, len(held))
-        own = OwnFrames(target.field.take(held), target.visibility.take(held), weights, ranks=ranks, **common)
-        return cls(target.field, target.visibility, target.log_column_weights, own=own, ranks=ranks, **common)
-
-    def drawn(self, columns: np.ndarray) -> SharedFrames:
-        """See `Target`."""
-        return SharedFrames.of(super().drawn(columns), self.ranks)
+    def _in_chunks(
+        self, points: np.ndarray, sigma_m: float | None, gradient: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        # what one rank finds out about its points ends the step of all
+        if self.ranks.max(np.array([not np.isfinite(points).all()]))[0]:
+            raise NumericalError("design points are not finite", where="target density")
+        return super()._in_chunks(points, sigma_m, gradient)
 
 
 def _weights(log_weights: np.ndarray, owned: np.ndarray, held: int) -> np.ndarray:
@@ -222,7 +177,8 @@ def build_shared_target(
     if ranks.size == 1:
         return build_target(scenes, space, settings, visibility, compiled=compiled)
     if is_of_frames(scenes, visibility):
-        return SharedFrames.of(build_target(scenes, space, settings, visibility), ranks)
+        whole = build_target(scenes, space, settings, visibility)
+        return SharedFrames(**{one.name: getattr(whole, one.name) for one in fields(FramesTarget)}, ranks=ranks)
     common_receiver(scenes)
     chosen = range(ranks.rank, len(scenes), ranks.size)
     mine = tuple(scenes[index] for index in chosen) or (scenes[0],)
