@@ -1,5 +1,6 @@
 """Pictures of error against seconds: every rung has its place, whatever its figures and its name are."""
 
+import itertools
 import math
 import subprocess
 import sys
@@ -72,7 +73,7 @@ def test_settings_that_would_meet_are_written_above_each_other():
         for mark, (_, up, _) in zip(panel.marks, label_places(panel, height, line), strict=True)
     ]
     ordered = sorted(places)
-    assert min(b - a for a, b in zip(ordered, ordered[1:], strict=False)) >= line * (1 - 1e-9)
+    assert min(b - a for a, b in itertools.pairwise(ordered)) >= line * (1 - 1e-9)
 
 
 def test_ladders_of_one_rung_have_tables_and_no_panel(tmp_path):

@@ -25,7 +25,7 @@ def test_of_rungs_that_cost_the_same_the_most_accurate_is_chosen():
     assert found.chosen.setting == "b"
 
 
-@pytest.mark.parametrize("uncertainty, chosen", [(0.0, "b"), (0.02, "a")])
+@pytest.mark.parametrize(("uncertainty", "chosen"), [(0.0, "b"), (0.02, "a")])
 def test_of_rungs_that_cost_and_err_the_same_the_runs_own_is_chosen(uncertainty, chosen):
     found = ladder(rung("a", 0.05, 1.0, uncertainty=uncertainty, default=True), rung("b", 0.02, 1.1))
     assert found.chosen.setting == chosen
