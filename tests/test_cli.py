@@ -162,7 +162,7 @@ def test_every_command_explains_itself_and_has_the_common_options(lidardesign, n
 
 def test_options_of_later_parts_are_absent(lidardesign):
     text = "".join(lidardesign(name, "--help").out for name in ("fit", "constrain", "evaluate", "export", "learn"))
-    for option in ("--refine", "--accuracy", "--workers"):
+    for option in ("--refine",):
         assert option not in text
 
 
