@@ -55,6 +55,7 @@ EXAMPLES = {
         "lidardesign evaluate runs/face/designs/free.yaml --rays 100 --rays 576 --fail-above 8",
         "lidardesign evaluate runs/face --detector single-photon --effects audit",
         "lidardesign evaluate runs/arm --baseline occupancy --baseline no-visibility",
+        "lidardesign evaluate runs/face --workers 8",
     ),
     export: (
         "lidardesign export runs/face/designs/free.yaml --format csv --rays 576 --out rays.csv",
