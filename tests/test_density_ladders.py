@@ -430,4 +430,4 @@ class TestScenesLadder:
 
     def test_settings_beyond_all_scenes_are_all_scenes(self):
         assert scenes.counts(50, 50) == [4, 16, 50]
-        assert scenes.counts(2000, 256) == [4, 16, 64, 256, 1024, 2000]
+        assert scenes.counts(2000, 256) == [4, 16, 64, 256, 2000]

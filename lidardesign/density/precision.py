@@ -9,13 +9,11 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
 
 from lidardesign.density.flow import DesignFlow
-from lidardesign.density.learn import FLOW
 from lidardesign.density.losses import Pool, balancing_loss, draw_conditions, pathwise_loss
 from lidardesign.density.objective import Coordinates
 from lidardesign.density.parallel import ALONE, Ranks
@@ -23,33 +21,10 @@ from lidardesign.density.settings import LearningSettings
 from lidardesign.density.target import Target
 from lidardesign.density.training import SIGMA_START_RATIO
 from lidardesign.density.visibility import Optics
-from lidardesign.run.checkpoint import load_arrays
-from lidardesign.run.config import RunConfig
-from lidardesign.space import AZIMUTH, DesignSpace
+from lidardesign.space import DesignSpace
 
 Loss = Callable[[DesignFlow, torch.Generator], torch.Tensor]
 DTYPES = ("float32", "float64")
-
-
-def load_flow(run: Path, config: RunConfig) -> DesignFlow:
-    """The flow that a run learned, in float64.
-
-    Raises:
-        DataError: The run has none, or it is damaged.
-    """
-    coordinates, settings = Coordinates(config.space), config.learning
-    flow = DesignFlow(
-        coordinates.blocks,
-        len(coordinates.conditions),
-        layers=settings.layers,
-        hidden=settings.hidden,
-        bins=settings.bins,
-        periodic=[config.space.free[n] == AZIMUTH and config.space.full_azimuth for n in coordinates.learned],
-        generator=torch.Generator().manual_seed(config.seed),
-    )
-    arrays, _ = load_arrays(run, FLOW)
-    flow.double().load_state_dict({name: torch.as_tensor(values) for name, values in arrays.items()})
-    return flow
 
 
 @dataclass(frozen=True, eq=False)

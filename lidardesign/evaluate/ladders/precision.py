@@ -8,6 +8,8 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from lidardesign.density.ladder import load_flow
+from lidardesign.density.learn import FLOW
 from lidardesign.density.losses import Pool
 from lidardesign.density.misplaced import misplaced_share
 from lidardesign.density.precision import (
@@ -18,7 +20,6 @@ from lidardesign.density.precision import (
     each_beside_noise,
     gradient,
     in_arithmetic,
-    load_flow,
 )
 from lidardesign.evaluate.accuracy import AccuracyRequest
 from lidardesign.evaluate.ladders.probes import draw_probes, run_target
@@ -57,7 +58,8 @@ def _steps(request: AccuracyRequest) -> Steps | None:
         return None
     unit = config.space.to_unit(probes.points)
     pool = Pool.of(unit, target.log_density(probes.points), probes.log_proposal)
-    return Steps(load_flow(request.run, config), target, config.learning, pool)
+    flow = load_flow(request.run, FLOW, config, target, config.seed).flow
+    return Steps(flow, target, config.learning, pool)
 
 
 def steps_ladder(steps: Steps, seed: int) -> Ladder:

@@ -16,9 +16,9 @@ LABEL = "scenes per step"
 # The error of few scenes is noise like that of few design points; half as much adds a quarter to its variance.
 TOLERANCE = 0.5
 BECAUSE = "it adds a quarter to the variance that gradients have anyway, as a batch a fifth smaller would"
-POWERS = (4, 16, 64, 256, 1024)
+POWERS = (4, 16, 64, 256)
 # Batches, and how often scenes are drawn for each.
-BATCHES, DRAWS = 20, 2
+BATCHES, DRAWS = 16, 2
 
 
 def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
