@@ -297,6 +297,39 @@ def test_a_field_is_measured_and_exact_near_its_surface(tmp_path):
 
 
 @pytest.mark.slow
+def test_learning_is_measured_with_fields_built_and_cached_and_up_to_a_divergence(tmp_path):
+    words = ["--model", "embedded", "--preset", "draft", *settings("train=3"), "--steps", "40", "--kl", "1000"]
+    found = run_script("learn", tmp_path, *words)
+    presets, steps = found["tables"].values()
+    assert [row["fields"] for row in presets] == ["built", "in the cache"]
+    assert [row["steps"] for row in steps] == [40]
+    assert presets[0]["KL nats"] == presets[1]["KL nats"]
+    assert any("the paper's code" in line for line in found["conclusions"])
+
+
+@pytest.mark.slow
+def test_constraining_is_measured_against_learning_again(tmp_path):
+    words = ["--model", "embedded", *settings("train=3"), "--only", "none", "--only", "10 sensors"]
+    found = run_script("constrain", tmp_path, *words)
+    (rows,) = found["tables"].values()
+    assert [row["constraints"] for row in rows] == ["none", "10 sensors", "learn again", "fit"]
+
+
+@pytest.mark.slow
+def test_the_flow_is_measured_beside_what_is_installed(tmp_path):
+    found = run_script("flow", tmp_path, "--batch", "64", "--layers", "2", "--bins", "4", "--hidden", "8")
+    (rows,) = found["tables"].values()
+    assert all(row["log q error, nats"] < 1e-9 for row in rows if not row["flow"].startswith("floor"))
+
+
+@pytest.mark.slow
+def test_the_target_is_measured_and_agrees_with_the_plain_way(tmp_path):
+    words = ["--model", "embedded", "--scenes", "2", "--batch", "128", "--points", "8", "--resolution", "24"]
+    agreement = list(run_script("target", tmp_path, *words)["tables"].values())[1]
+    assert all(row["value, max nats"] < 1e-4 for row in agreement)
+
+
+@pytest.mark.slow
 def test_the_arm_is_measured(tmp_path):
     found = run_script("arm", tmp_path, "--preset", "draft", *SMALL_ARM, "--sensors", "2", "--rays", "40")
     rows = next(rows for caption, rows in found["tables"].items() if caption.startswith("Scores"))
