@@ -89,7 +89,7 @@ def short(monkeypatch):
     monkeypatch.setattr(mixture, "SAMPLE_COUNTS", (100, 400))
     monkeypatch.setattr(mixture, "RESTART_COUNTS", (1, 12))
     monkeypatch.setattr(mixture, "REPEATS", 3)
-    monkeypatch.setattr(mixture, "REPEATS_OF_RESTARTS", {})
+    monkeypatch.setattr(mixture, "MORE_REPEATS", {})
 
 
 def of_fit(tmp_path, sensors=2, **changes):
@@ -140,6 +140,12 @@ def scored(request, effects):
     return next(row.per_scene for row in found.rows if row.design == "aimed")
 
 
+def with_footprint(request, count):
+    """Scores per scene of beams of so many rays, without any other effect."""
+    planner = replace(request.planner, detector=replace(request.planner.detector, footprint_rays=count))
+    return scored(replace(request, planner=planner), ["footprint"])
+
+
 def test_changes_of_effects_are_those_of_evaluations_under_them():
     asked = of_light("single-photon")
     ladder = next(one for one in physics.ladders(asked) if one.knob == "effects")
@@ -179,9 +185,22 @@ def test_the_finest_footprint_is_the_reference_and_bounded_by_what_it_takes(monk
     assert [rung.setting for rung in footprint.rungs] == ["1", "4", "7", "16", "64", "256"]
     assert footprint.rungs[-1].reference
     assert footprint.rungs[-1].error == 0
+    single, finest = (with_footprint(of_light("single-photon").request, count) for count in (1, 256))
+    assert footprint.rungs[0].error == pytest.approx(np.abs(single - finest).mean())
     monkeypatch.setattr(physics, "MOST_THIN_RAYS", 20 * 25 * 4)
     footprint, _ = physics.ladders(of_light("single-photon"))
     assert [rung.setting for rung in footprint.rungs] == ["1", "4", "7", "16"]
+
+
+def test_gates_beyond_what_the_stand_in_hears_have_no_ladders():
+    far = make_request([design("far", range_m=18.0)], space=DesignSpace((0,) * 6, (0, 0, 0, 0.5, 0.5, 40.0)))
+    assert physics.ladders(AccuracyRequest(None, None, far, None)) == []
+
+
+def test_a_single_scene_says_that_its_uncertainty_is_unknown():
+    asked = of_light("single-photon")
+    alone = replace(asked, request=replace(asked.request, test=asked.request.test[:1]))
+    assert all("in 1 scene, so that differences" in ladder.note for ladder in physics.ladders(alone))
 
 
 def test_without_designs_nothing_is_measured():

@@ -23,17 +23,19 @@ from lidardesign.design.mixture import log_density
 from lidardesign.design.resolve import bounds_of, groups
 from lidardesign.design.samples import FILE_NAME, Samples, load_samples
 from lidardesign.design.sensor import Design, interval_factor
+from lidardesign.design.support import LEAST_SAMPLES
 from lidardesign.evaluate.accuracy import AccuracyRequest
 from lidardesign.evaluate.rungs import Ladder, Rung, with_memory
-from lidardesign.numerics import systematic_draw
+from lidardesign.numerics import effective_count, systematic_draw
 from lidardesign.task import random_generator
 
 LABEL = "samples and seeds of the fit"
 SAMPLE_COUNTS = (1000, 2000, 5000, 10_000, 20_000)
 RESTART_COUNTS = (1, 2, 4, 8, 12)
-# Each setting is fitted so often, on other splits and with other seeds; more often where luck decides more.
-REPEATS = 5
-REPEATS_OF_RESTARTS = {1: 15, 2: 10, 4: 8}
+# Each setting is fitted so often, on other splits and with other seeds; more often where luck decides more. Fits take
+# in proportion to their sensors: of many, fewer are made, but no fewer than the least.
+REPEATS, LEAST_REPEATS, SENSORS_FITTED = 5, 2, 40
+MORE_REPEATS = {1: 3, 2: 2, 4: 2}
 START = (
     "import sys; from pathlib import Path; import lidardesign.design.fit; "
     "from lidardesign.design.samples import load_samples; load_samples(Path(sys.argv[1]))"
@@ -47,7 +49,7 @@ def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
     """Two ladders for the fit of the first design whose sensors are Gaussian; none for scans."""
     design = next((one for one in request.request.designs if one.layout != "scan" and one.track is None), None)
     samples = None if design is None else _samples(request, design)
-    if design is None or samples is None:
+    if design is None or samples is None or effective_count(samples.weights) < LEAST_SAMPLES:
         return []
     bench = FitBench(samples, len(design.sensors), design.level, request.request.seed)
     counts = [*(count for count in SAMPLE_COUNTS if count < bench.pool), bench.pool]
@@ -55,10 +57,10 @@ def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
     # a single sensor has one best fit, which every seed finds
     restarts = RESTART_COUNTS if bench.sensors > 1 else ()
     for one in counts:
-        for repeat in range(REPEATS):
+        for repeat in range(bench.splits):
             bench.fitted(repeat, one, RESTARTS)
     for one in restarts:
-        for repeat in range(REPEATS_OF_RESTARTS.get(one, REPEATS)):
+        for repeat in range(bench.splits * MORE_REPEATS.get(one, 1)):
             bench.fitted(repeat, usual, one)
     besides = _start_seconds(request.run) + _other_seconds(bench, design)
     of_samples = [bench.rung(one, RESTARTS, besides, default=one == usual) for one in counts]
@@ -167,6 +169,11 @@ class FitBench:
         return bounds_of(free, space, group.sensors, interval_factor(self.level))
 
     @property
+    def splits(self) -> int:
+        """Into how many pairs of parts the samples are split, one after the other."""
+        return min(REPEATS, max(LEAST_REPEATS, SENSORS_FITTED // self.sensors))
+
+    @property
     def pool(self) -> int:
         """Samples that are left to fit to."""
         return len(self.samples) - round(HELD_OUT_SHARE * len(self.samples))
@@ -183,7 +190,7 @@ class FitBench:
         return self._known[key]
 
     def _fit(self, repeat: int, count: int, restarts: int) -> Fitted:
-        order = random_generator(self.seed, "mixture split", repeat % REPEATS).permutation(len(self.samples))
+        order = random_generator(self.seed, "mixture split", repeat % self.splits).permutation(len(self.samples))
         pool, held = order[: self.pool], order[self.pool :]
         generator = random_generator(self.seed, "mixture fit", repeat)
         started = time.perf_counter()
@@ -209,8 +216,8 @@ class FitBench:
         """What every fit of a setting lost against the best fit of its split, of all settings [nats]."""
         best: dict[int, float] = {}
         for (repeat, _, _), one in self._known.items():
-            best[repeat % REPEATS] = max(best.get(repeat % REPEATS, -math.inf), one.log_likelihood)
-        return [best[repeat % REPEATS] - one.log_likelihood for repeat, one in self._of(count, restarts)]
+            best[repeat % self.splits] = max(best.get(repeat % self.splits, -math.inf), one.log_likelihood)
+        return [best[repeat % self.splits] - one.log_likelihood for repeat, one in self._of(count, restarts)]
 
     def rung(self, count: int, restarts: int, besides: float, *, default: bool) -> Rung:
         """A setting, once all settings have been fitted; `besides`: what a fit takes besides [s]."""

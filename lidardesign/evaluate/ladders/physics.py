@@ -11,15 +11,18 @@ from functools import cached_property
 import numpy as np
 
 from lidardesign.design.sensor import Design
+from lidardesign.errors import ConfigError
 from lidardesign.evaluate.accuracy import AccuracyRequest
 from lidardesign.evaluate.candidates import Positions
 from lidardesign.evaluate.rungs import Ladder, Rung, timed, with_memory
 from lidardesign.evaluate.scoring import score_lists
 from lidardesign.registry import plugin_guard
 from lidardesign.scene import Scene
+from lidardesign.simulate.bistatic import path_windows
 from lidardesign.simulate.cost import predicted_seconds
 from lidardesign.simulate.detector import Detector
 from lidardesign.simulate.detector_files import load_detector
+from lidardesign.simulate.histogram import check_windows
 from lidardesign.simulate.physics import EFFECTS, Physics
 from lidardesign.simulate.plan import Plan, Planner
 from lidardesign.simulate.raycast import SceneCaster
@@ -32,9 +35,9 @@ STAND_IN = "single-photon"
 FOOTPRINT_RAYS = (1, 4, 16, 64, 256)
 # Rays in all frames and positions of a scene: the largest number of rays below this is simulated, else the smallest.
 RAYS_PER_SCENE = 20_000
-# Scenes that are simulated: as many as these rays are enough for, within these numbers. Differences are paired, so
+# Scenes that are simulated: as many as these rays are enough for, and no more than these. Differences are paired, so
 # that few scenes tell much.
-RAYS, FEWEST_SCENES, MOST_SCENES = 60_000, 3, 16
+RAYS, MOST_SCENES = 60_000, 20
 # Thin rays of all beams in all scenes: seconds, and not minutes, for the finest footprint.
 MOST_THIN_RAYS = 6_000_000
 # Effects that take longer than this in one pass over the scenes are left out of all passes [s].
@@ -97,13 +100,27 @@ def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
         planner = replace(planner, tolerance=planner.tolerated.within(request.request.task.metric))
     count, positions = _rays(request, design)
     frames = request.request.test[0].frames
-    most = max(FEWEST_SCENES, RAYS // max(sum(len(rays) for rays in positions) * frames, 1))
+    most = max(RAYS // max(sum(len(rays) for rays in positions) * frames, 1), 1)
     bench = Bench(request, planner, positions, request.request.test[: min(most, MOST_SCENES)])
-    note = f"{design.name} with {count} rays in {len(bench.scenes)} scenes"
+    several = len(bench.scenes) > 1
+    note = f"{design.name} with {count} rays in {len(bench.scenes)} scene{'s' if several else ''}"
+    note += "" if several else ", so that differences between scenes are not known"
     if planner.detector is not own:
         note += f", measured by {STAND_IN}: the detector of this evaluation, {own.name}, asks for nothing"
+        if not _heard(positions, request.request.test[0], planner.detector):
+            return []
     found = [_footprint(bench, note, own)] if planner.detector.divergence_rad > 0 else []
     return [*found, *_effects(bench, note, own)]
+
+
+def _heard(positions: Positions, scene: Scene, detector: Detector) -> bool:
+    """Whether a detector's histogram covers the gates of all rays."""
+    try:
+        for rays in positions:
+            check_windows(path_windows(rays, scene.receiver), detector)
+    except ConfigError:
+        return False
+    return True
 
 
 def asks_nothing(detector: Detector) -> bool:
@@ -130,9 +147,14 @@ def _rays(request: AccuracyRequest, design: Design) -> tuple[int, Positions]:
 
 def _paired(values: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
     """The size of the mean difference over scenes, and its standard error."""
-    differences = values - reference
-    spread = differences.std(ddof=1) if len(differences) > 1 else 0.0
-    return abs(float(differences.mean())), float(spread / math.sqrt(len(differences)))
+    mean, error = _mean(values - reference)
+    return abs(mean), error
+
+
+def _mean(values: np.ndarray) -> tuple[float, float]:
+    """A mean and its standard error, 0 for a single value."""
+    spread = values.std(ddof=1) if len(values) > 1 else 0.0
+    return float(values.mean()), float(spread / math.sqrt(len(values)))
 
 
 def _footprint(bench: Bench, note: str, own: Detector) -> Ladder:
@@ -147,7 +169,7 @@ def _footprint(bench: Bench, note: str, own: Detector) -> Ladder:
     bench.score(0, planned, detector)
     rungs = []
     for count in counts:
-        error, uncertainty = _paired(alone[count], alone[counts[-1]])
+        error, uncertainty = _mean(np.abs(alone[count] - alone[counts[-1]]))
         changed = replace(detector, footprint_rays=count)
         _, seconds, memory = timed(lambda changed=changed: bench.score(0, planned, changed))
         rungs.append(
@@ -163,7 +185,7 @@ def _footprint(bench: Bench, note: str, own: Detector) -> Ladder:
         )
     return Ladder(
         knob="footprint_rays",
-        error_of=f"change of the {metric.name}, of the beams' width alone",
+        error_of=f"change of a scene's {metric.name}, of the beams' width alone, mean over scenes",
         unit=metric.unit,
         against=f"{counts[-1]} rays per beam",
         tolerance=metric.tolerance,
@@ -188,7 +210,7 @@ def _effects(bench: Bench, note: str, own: Detector) -> list[Ladder]:
     return [
         Ladder(
             knob="effects",
-            error_of=f"change of the {metric.name}, where an effect is left out of all or alone, whichever is more",
+            error_of=f"change of the mean {metric.name} where an effect is left out of all or alone, whichever is more",
             unit=metric.unit,
             against="all effects that the scenes have",
             tolerance=metric.tolerance / len(there),
