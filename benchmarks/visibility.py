@@ -63,7 +63,7 @@ def verdict(rows: list[list[object]]) -> str:
     best = min((row for row in rows if str(row[1]).startswith("quadrature")), key=lambda row: row[2])
     return (
         f"{rows[0][0]}: beaten by none in both error and time: {', '.join(map(str, front))}; {best[1]} errs least of "
-        f"all quadratures, {best[2] / cast[2]:.3g} times as much as ray casting in {best[4] / cast[4]:.3g} times its time"
+        f"all quadratures, {best[2] / cast[2]:.3g} times ray casting in {best[4] / cast[4]:.3g} times its time"
     )
 
 

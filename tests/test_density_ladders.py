@@ -312,8 +312,7 @@ class TestDrawnScenes:
         points = draw_probes(target, every, 200, 0, "test").points
         # culled by other best terms, scenes that are left out add less than exp(-16) of the largest term
         means = [
-            np.exp(target.drawn(np.array(chosen)).log_density(points))
-            for chosen in itertools.combinations(range(4), 2)
+            np.exp(target.drawn(np.array(chosen)).log_density(points)) for chosen in itertools.combinations(range(4), 2)
         ]
         assert np.mean(means, axis=0) == pytest.approx(np.exp(target.log_density(points)), rel=1e-5, abs=1e-7)
 
