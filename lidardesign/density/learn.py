@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from lidardesign.density.device_target import on_device, stays_on
 from lidardesign.density.flow import DesignFlow
 from lidardesign.density.ground import Ground, prepare_ground
 from lidardesign.density.measure import Measured, draw_probes, measure
@@ -30,6 +31,10 @@ from lidardesign.space import AZIMUTH
 from lidardesign.task import Task, random_generator
 
 FLOW = "flow.safetensors"
+ON_PROCESSOR = (
+    "the target is evaluated on the processor, a round trip a step: on the GPU stay only meshes at rest, with "
+    "density.visibility=quadrature or off"
+)
 DEVICES = ("auto", "cpu", "cuda")
 
 
@@ -79,7 +84,7 @@ def learn(
         config: The resolved configuration.
         run: The run folder; its config.yaml is written by the caller.
         resume: Continue from the run's checkpoint; the result is that of an uninterrupted run, bit for bit.
-        device: auto, cpu or cuda: where the flow lives. The target is always evaluated on the CPU.
+        device: auto, cpu or cuda: where the flow lives, and what of the target can (`device_target`).
         progress: Called about every tenth step.
         ground: What `prepare_ground` made of the same task and configuration, to be learned on again.
         ranks: Who learns together; see `parallel_learn`. The first one alone writes.
@@ -95,6 +100,8 @@ def learn(
         ranks.announce({"job": "learn", "config": config.as_document(), "device": device, "resume": resume})
         notes = list(ground.notes)
         trainer = make_trainer(ground, config, run, place)
+        if not stays_on(trainer.target, place):
+            notes.append(ON_PROCESSOR)
         trainer.replan = replan
         _start(trainer, config, resume)
         with phase("learning"):
@@ -173,7 +180,8 @@ def make_trainer(ground: Ground, config: RunConfig, run: Path, device: torch.dev
     generator = torch.Generator().manual_seed(config.seed)
     flow = make_flow(config, generator).to(device=device, dtype=getattr(torch, config.learning.dtype))
     coordinates = Coordinates(config.space)
-    return Trainer(flow, ground.target, coordinates, config.learning, run, generator, ground.pool)
+    target = ground.target if device.type == "cpu" else on_device(ground.target, device)
+    return Trainer(flow, target, coordinates, config.learning, run, generator, ground.pool.to(device))
 
 
 def make_flow(config: RunConfig, generator: torch.Generator) -> DesignFlow:

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from lidardesign.density.flow import DesignFlow
-from lidardesign.density.objective import Coordinates, log_target
+from lidardesign.density.objective import Coordinates, log_target, log_target_values
 from lidardesign.density.parallel import Ranks
 from lidardesign.density.target import Target
 
@@ -100,9 +100,13 @@ class Pool:
 
     def draw(self, count: int, generator: torch.Generator, like: Tensor) -> tuple[Tensor, Tensor]:
         """Unit points distributed as p*, shape (count, free), and log p* at them, shape (count,)."""
-        places = torch.rand(count, generator=generator, dtype=torch.float64)
+        places = torch.rand(count, generator=generator, dtype=torch.float64).to(self.cumulated.device)
         chosen = torch.searchsorted(self.cumulated, places).clamp(max=len(self.unit) - 1)
         return self.unit[chosen].to(like), self.log_target[chosen].to(like)
+
+    def to(self, device: torch.device) -> Pool:
+        """The same on a device."""
+        return Pool(self.unit.to(device), self.log_target.to(device), self.cumulated.to(device))
 
 
 def balancing_loss(
@@ -118,8 +122,7 @@ def balancing_loss(
     with torch.no_grad():
         learned, log_prob = flow(base, conditions)
     unit = coordinates.join(learned, conditions)
-    points = coordinates.space.from_unit(unit.cpu().double().numpy())
-    log_p_star = torch.as_tensor(target.log_density(points)).to(log_prob)
+    log_p_star = log_target_values(unit, target, coordinates)
     log_weights = ranks.gather(log_p_star - log_prob)
     log_z = log_weights.logsumexp(0) - np.log(count)
     centred = log_weights - log_z

@@ -10,7 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lidardesign.density.device_target import DeviceTarget
 from lidardesign.density.target import Target
+from lidardesign.errors import NumericalError
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, X, Y, Z
 
 
@@ -88,4 +90,26 @@ class _LogTarget(torch.autograd.Function):
 
 def log_target(unit: Tensor, target: Target, coordinates: Coordinates, sigma_m: float) -> Tensor:
     """log p* of unit points at a sigma, differentiable: (N, len(free)) to (N,)."""
+    if isinstance(target, DeviceTarget):
+        return target.log_density_of_unit(_finite(unit), sigma_m)
     return _LogTarget.apply(unit, target, coordinates, sigma_m)
+
+
+@torch.no_grad()
+def log_target_values(unit: Tensor, target: Target, coordinates: Coordinates) -> Tensor:
+    """log p* of unit points at the final sigma, without a gradient: (N, len(free)) to (N,)."""
+    if isinstance(target, DeviceTarget):
+        return target.log_density_of_unit(_finite(unit))
+    points = coordinates.space.from_unit(unit.cpu().double().numpy())
+    return torch.as_tensor(target.log_density(points)).to(unit)
+
+
+def _finite(unit: Tensor) -> Tensor:
+    """Points as they are.
+
+    Raises:
+        NumericalError: One is not finite.
+    """
+    if not torch.isfinite(unit).all():
+        raise NumericalError("design points are not finite", where="target density")
+    return unit

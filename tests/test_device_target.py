@@ -1,0 +1,120 @@
+"""The target as tensors is the target as compiled loops, and learns the same."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from lidardesign.density.device_target import DeviceTarget, on_device, stays_on
+from lidardesign.density.flow import DesignFlow
+from lidardesign.density.losses import Pool, balancing_loss, pathwise_loss
+from lidardesign.density.objective import Coordinates, log_target, log_target_values
+from lidardesign.density.settings import DensitySettings
+from lidardesign.density.target import build_target
+from lidardesign.errors import NumericalError
+from lidardesign.scene import Body, Mesh, Scene, rigid
+from lidardesign.space import DesignSpace
+
+CPU = torch.device("cpu")
+FIXED = DesignSpace((0, 0, 0, -0.4, -0.4, 0.5), (0, 0, 0, 0.4, 0.4, 3.0))
+FREE = DesignSpace((-0.2, -0.2, -0.2, -0.4, -0.4, 0.5), (0.2, 0.2, 0.2, 0.4, 0.4, 3.0), measure="angles")
+
+
+def scenes(count=3):
+    made = []
+    for n in range(count):
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=0.3)
+        slab = trimesh.creation.box((0.1, 0.3, 0.3))
+        made.append(
+            Scene(
+                (
+                    Body(Mesh(ball.vertices, ball.faces), "target", "both", rigid(translation_m=(2.0 + 0.1 * n, 0, 0))),
+                    Body(Mesh(slab.vertices, slab.faces), "slab", "occluder", rigid(translation_m=(1.2, 0.1 * n, 0))),
+                ),
+                f"scene {n}",
+            )
+        )
+    return made
+
+
+def targets(space, visibility, sigma_m=0.03):
+    settings = DensitySettings(sigma_m=sigma_m, field_resolution=24, quadrature_points=32)
+    host = replace(build_target(scenes(), space, settings, visibility), surface_tolerance_nats=200.0)
+    return host, on_device(host, CPU)
+
+
+@pytest.mark.parametrize("visibility", ["off", "quadrature"])
+@pytest.mark.parametrize("space", [FIXED, FREE], ids=["fixed origin", "free origin, in angles"])
+@pytest.mark.parametrize("sigma_m", [None, 0.1])
+def test_values_and_gradients_are_those_of_the_compiled_loops(space, visibility, sigma_m):
+    host, device = targets(space, visibility)
+    assert isinstance(device, DeviceTarget)
+    coordinates = Coordinates(space)
+    generator = torch.Generator().manual_seed(0)
+    unit = 2 * torch.rand(500, len(space.free), generator=generator, dtype=torch.float64) - 1
+    found, expected = [], []
+    for target, kept in ((host, expected), (device, found)):
+        leaf = unit.clone().requires_grad_()
+        values = log_target(leaf, target, coordinates, sigma_m or target.optics.sigma_m)
+        kept += [values.detach(), torch.autograd.grad(values.sum(), leaf)[0]]
+    near = expected[0] > expected[0].max() - 50
+    assert near.sum() > 50
+    torch.testing.assert_close(found[0][near], expected[0][near], rtol=1e-4, atol=1e-3)
+    size = expected[1][near].abs().max()
+    assert ((found[1] - expected[1])[near].abs().max(dim=1).values < 1e-3 * size).double().mean() > 0.99
+    if sigma_m is None:
+        values = log_target_values(unit, device, coordinates)
+        torch.testing.assert_close(values, found[0])
+
+
+def flow_of(space):
+    coordinates = Coordinates(space)
+    generator = torch.Generator().manual_seed(1)
+    flow = DesignFlow(coordinates.blocks, 0, layers=2, hidden=16, bins=8, generator=generator)
+    return flow.double(), coordinates
+
+
+@pytest.mark.parametrize("loss", ["along paths", "by values"])
+def test_a_step_has_the_same_loss_and_gradient(loss):
+    losses, gradients = [], []
+    for target in targets(FIXED, "quadrature"):
+        flow, coordinates = flow_of(FIXED)
+        generator = torch.Generator().manual_seed(2)
+        if loss == "along paths":
+            value = pathwise_loss(flow, target, coordinates, 256, 0.1, 0.1, generator)[0]
+        else:
+            points = FIXED.sample(512, np.random.default_rng(3))
+            pool = Pool.of(FIXED.to_unit(points), target.log_density(points), np.zeros(512)).to(CPU)
+            value = balancing_loss(flow, target, coordinates, 256, pool, generator)[0]
+        value.backward()
+        losses.append(float(value.detach()))
+        gradients.append(torch.cat([parameter.grad.ravel() for parameter in flow.parameters()]))
+    assert losses[1] == pytest.approx(losses[0], rel=1e-3)
+    assert (gradients[1] - gradients[0]).norm() < 2e-3 * gradients[0].norm()
+
+
+def test_columns_that_are_drawn_stand_for_all_on_the_device_too():
+    host, device = targets(FIXED, "quadrature")
+    chosen, unit = np.array([0, 2]), torch.zeros(4, 3, dtype=torch.float64)
+    few = device.drawn(chosen)
+    assert isinstance(few, DeviceTarget)
+    points = FIXED.from_unit(unit.numpy())
+    np.testing.assert_allclose(few.log_density_of_unit(unit), host.drawn(chosen).log_density(points), rtol=1e-4)
+
+
+def test_what_needs_rays_cast_stays_on_the_processor():
+    host, _ = targets(FIXED, "raycast")
+    assert on_device(host, CPU) is host
+    assert stays_on(host, CPU)
+    assert not stays_on(host, torch.device("cuda"))
+
+
+def test_points_that_are_not_finite_are_refused_as_on_the_processor():
+    _, device = targets(FIXED, "off")
+    unit = torch.full((2, 3), torch.nan, dtype=torch.float64)
+    with pytest.raises(NumericalError, match="not finite"):
+        log_target_values(unit, device, Coordinates(FIXED))
