@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
-from lidardesign.errors import NumericalError
+from lidardesign.errors import ConfigError, NumericalError
 from lidardesign.evaluate.worker import receive, send
 
 WORKER = "lidardesign.evaluate.worker"
@@ -83,13 +83,23 @@ class Processes:
 
     Arguments:
         count: How many, at least 1.
+
+    Raises:
+        ConfigError: The system does not allow so many.
     """
 
     def __init__(self, count: int) -> None:
         self._events: queue.SimpleQueue[tuple[_Process, bytes | None]] = queue.SimpleQueue()
         self._running: list[_Process] = []
-        for _ in range(count):
-            self._running.append(_Process(self._events))
+        try:
+            for _ in range(count):
+                self._running.append(_Process(self._events))
+        except OSError as error:
+            started = len(self._running)
+            self.close()
+            raise ConfigError(
+                f"only {started} of {count} processes could be started: {error.strerror}", where="--workers"
+            ) from error
 
     def prepare(self, message: bytes) -> None:
         """Tell every worker something whose answer nobody waits for."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate import messages
@@ -78,7 +78,7 @@ class WorkerScorer:
         """As `score_here`; of several errors, that of the first scene is raised."""
         total = len(request.test)
         found: dict[int, SceneScores] = {}
-        failed: dict[int, dict] = {}
+        failed: dict[int, dict[str, Any]] = {}
         if progress:
             progress(0, total, request.test[0].name)
         asked = _Asked(request, scene_pass)
