@@ -48,13 +48,19 @@ def prepare_ground(task: Task, config: RunConfig, ranks: Ranks = ALONE) -> Groun
     if not set(config.space.free) - set(config.space.conditioned):
         raise ConfigError("every dimension of the design space is fixed", where="space", hint="free at least one")
     ranks.announce({"job": "ground", "config": config.as_document()})
-    scenes = _training_scenes(task, config)
+    scenes = training_scenes(task, config)
     target, notes = prepare_target(scenes, config, ranks=ranks)
     return Ground(scenes, target, tuple(notes), _pool(target, scenes, config))
 
 
 @phase("scenes")
-def _training_scenes(task: Task, config: RunConfig) -> list[Scene]:
+def training_scenes(task: Task, config: RunConfig) -> list[Scene]:
+    """The scenes that a density is learned from.
+
+    Raises:
+        DataError: There are none.
+        PluginError: The task's own code failed.
+    """
     with plugin_guard(config.task_name):
         scenes = list(scenes_of(task, config.task, "train", config.seed, config.space))
     if not scenes:
@@ -74,12 +80,12 @@ def _pool(target: Target, scenes: Sequence[Scene], config: RunConfig) -> Pool:
             where="space",
             hint="widen the angles or the range, or move the origin",
         )
-    _refuse_blind_receiver(scenes, points)
+    refuse_blind_receiver(scenes, points)
     log_target = target.ranks.spread(target.log_density, points)
     return Pool.of(config.space.to_unit(points), log_target, log_density)
 
 
-def _refuse_blind_receiver(scenes: Sequence[Scene], points: np.ndarray) -> None:
+def refuse_blind_receiver(scenes: Sequence[Scene], points: np.ndarray) -> None:
     receiver = common_receiver(scenes)
     reached = points[:, :3] + points[:, RANGE, None] * direction(points[:, AZIMUTH], points[:, ELEVATION])
     if receiver is not None and not in_view(receiver, reached).any():
