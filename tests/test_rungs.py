@@ -31,6 +31,13 @@ def test_of_rungs_that_cost_and_err_the_same_the_runs_own_is_chosen(uncertainty,
     assert found.chosen.setting == chosen
 
 
+def test_what_the_run_does_stays_where_nothing_is_cheaper_by_more_than_can_be_told():
+    found = ladder(rung("a", 0.08, 1.0), rung("b", 0.05, 1.1), rung("c", 0.01, 1.2, default=True))
+    assert found.chosen.setting == "c"
+    slower = ladder(rung("a", 0.08, 1.0), rung("b", 0.05, 1.1), rung("c", 0.01, 1.3, default=True))
+    assert slower.chosen.setting == "b"
+
+
 def test_outside_the_tolerance_the_most_accurate_is_closest():
     found = ladder(rung("a", 0.5, 1.0), rung("b", 0.3, 2.0, default=True))
     assert found.chosen.setting == "b"

@@ -84,8 +84,8 @@ class Ladder:
     def chosen(self) -> Rung:
         """The cheapest rung inside the tolerance; of rungs that cost the same, the most accurate one.
 
-        Where errors do not differ within their uncertainty either, what the run does already. Where none is inside
-        the tolerance, the most accurate one.
+        Where errors do not differ within their uncertainty either, what the run does already, and also where that
+        costs the same as the one found and errs no more. Where none is inside the tolerance, the most accurate one.
         """
         inside = [rung for rung in self.rungs if rung.error <= self.tolerance]
         if not inside:
@@ -94,7 +94,8 @@ class Ladder:
         cheap = [rung for rung in inside if rung.seconds <= SAME_COST * least]
         best = min(cheap, key=lambda rung: (rung.error, rung.seconds))
         equal = [rung for rung in cheap if rung.error - best.error <= _sure_difference(rung, best)]
-        return min(equal, key=lambda rung: (not rung.default, rung.error, rung.seconds))
+        found = min(equal, key=lambda rung: (not rung.default, rung.error, rung.seconds))
+        return next((rung for rung in inside if rung.default and _no_worse(rung, found)), found)
 
     @property
     def default(self) -> Rung | None:
@@ -147,6 +148,11 @@ class Ladder:
             }
             for rung in self.rungs
         ]
+
+
+def _no_worse(rung: Rung, other: Rung) -> bool:
+    """Whether a rung costs the same as another one, or less, and errs no more, as far as can be told."""
+    return rung.seconds <= SAME_COST * other.seconds and rung.error - other.error <= _sure_difference(rung, other)
 
 
 def _sure_difference(first: Rung, second: Rung) -> float:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -18,7 +20,7 @@ from lidardesign.design.conditions import MOVED_SAMPLES, at_condition, shown
 from lidardesign.design.constraints import Constraints
 from lidardesign.design.em import fit_mixture
 from lidardesign.design.features import Axes, Features
-from lidardesign.design.fit import EM_SAMPLES, HELD_OUT_SHARE, RESTARTS, fit
+from lidardesign.design.fit import EM_SAMPLES, HELD_OUT_SHARE, RESTARTS
 from lidardesign.design.mixture import log_density
 from lidardesign.design.resolve import bounds_of, groups
 from lidardesign.design.samples import FILE_NAME, Samples, load_samples
@@ -27,6 +29,8 @@ from lidardesign.design.support import LEAST_SAMPLES
 from lidardesign.evaluate.accuracy import AccuracyRequest
 from lidardesign.evaluate.rungs import Ladder, Rung, with_memory
 from lidardesign.numerics import effective_count, systematic_draw
+from lidardesign.run.config import FILE_NAME as CONFIG_FILE
+from lidardesign.run.manifest import FILE_NAME as MANIFEST_FILE
 from lidardesign.task import random_generator
 
 LABEL = "samples and seeds of the fit"
@@ -36,11 +40,7 @@ RESTART_COUNTS = (1, 2, 4, 8, 12)
 # in proportion to their sensors: of many, fewer are made, but no fewer than the least.
 REPEATS, LEAST_REPEATS, SENSORS_FITTED = 5, 2, 40
 MORE_REPEATS = {1: 3, 2: 2, 4: 2}
-START = (
-    "import sys; from pathlib import Path; import lidardesign.design.fit; "
-    "from lidardesign.design.samples import load_samples; load_samples(Path(sys.argv[1]))"
-)
-STARTS = 2
+COMMANDS = 2
 TOLERANCE_NATS = 0.01
 BECAUSE = "log densities that are 0.01 nats lower have one ray in a hundred fewer everywhere"
 
@@ -56,24 +56,28 @@ def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
     usual = min(EM_SAMPLES, bench.pool)
     # a single sensor has one best fit, which every seed finds
     restarts = RESTART_COUNTS if bench.sensors > 1 else ()
-    for one in counts:
-        for repeat in range(bench.splits):
-            bench.fitted(repeat, one, RESTARTS)
-    for one in restarts:
-        for repeat in range(bench.splits * MORE_REPEATS.get(one, 1)):
-            bench.fitted(repeat, usual, one)
-    besides = _start_seconds(request.run) + _other_seconds(bench, design)
+    settings = [(one, RESTARTS, bench.splits) for one in counts]
+    settings += [(usual, one, bench.splits * MORE_REPEATS.get(one, 1)) for one in restarts]
+    # one repeat of all after the other, so that whatever else the machine does slows all alike
+    for repeat in range(max(repeats for _, _, repeats in settings)):
+        for count, seeds, repeats in settings:
+            if repeat < repeats:
+                bench.fitted(repeat, count, seeds)
+    whole = _command_seconds(request.run, design)
+    # what the command does besides is the same for all settings
+    besides = 0.0 if whole is None else max(whole - bench.seconds(usual, RESTARTS), 0.0)
     of_samples = [bench.rung(one, RESTARTS, besides, default=one == usual) for one in counts]
     of_restarts = [bench.rung(usual, one, besides, default=one == RESTARTS) for one in restarts]
     named = [replace(rung, setting=f"{count:,}") for rung, count in zip(of_samples, counts, strict=True)]
-    found = [_ladder("samples of the fit", f"{RESTARTS} seeds", named, design)]
+    work = "expectation maximisation" if whole is None else "the command `fit`, from its start to its end"
+    found = [_ladder("samples of the fit", f"{RESTARTS} seeds", named, design, work)]
     if not restarts:
         return found
-    seeds = [replace(rung, setting=str(count)) for rung, count in zip(of_restarts, restarts, strict=True)]
-    return [*found, _ladder("seeds of the fit", f"{usual:,} samples", seeds, design)]
+    named = [replace(rung, setting=str(count)) for rung, count in zip(of_restarts, restarts, strict=True)]
+    return [*found, _ladder("seeds of the fit", f"{usual:,} samples", named, design, work)]
 
 
-def _ladder(knob: str, beside: str, rungs: Sequence[Rung], design: Design) -> Ladder:
+def _ladder(knob: str, beside: str, rungs: Sequence[Rung], design: Design, work: str) -> Ladder:
     fitted = f"{len(design.sensors)} sensors, as {design.name} has"
     where = f", at {shown(design.at)}" if design.at else ""
     held = ", without its constraints" if design.constraints else ""
@@ -84,39 +88,34 @@ def _ladder(knob: str, beside: str, rungs: Sequence[Rung], design: Design) -> La
         against="the best fit of all settings to the same samples",
         tolerance=TOLERANCE_NATS,
         because=BECAUSE,
-        work="the command `fit`: its start, reading the samples and the whole fit",
+        work=work,
         rungs=rungs,
         note=f"{fitted}{where}{held}, with {beside}",
     )
 
 
-def _start_seconds(run: Path) -> float:
-    """How long a program takes to start and to read a run's samples, which every fit begins with [s]."""
-    command = [sys.executable, "-c", START, str(run.resolve())]
+def _command_seconds(run: Path, design: Design) -> float | None:
+    """How long the command takes that fits such a design, from its start to its end [s]; None where it fails.
+
+    It works on a copy of what it reads of the run, so that the run stays as it is.
+    """
+    needed = [run / name for name in (CONFIG_FILE, MANIFEST_FILE, FILE_NAME)]
+    if not all(path.exists() for path in needed):
+        return None
+    options = ["--sensors", str(len(design.sensors)), "--layout", design.layout, "--level", str(design.level)]
+    options += [] if design.rays is None else ["--rays", str(design.rays)]
+    options += [option for name, value in design.at.items() for option in ("--at", f"{name}={value}")]
     taken = []
-    for _ in range(STARTS):
-        started = time.perf_counter()
-        if subprocess.run(command, check=False, capture_output=True).returncode:
-            return 0.0
-        taken.append(time.perf_counter() - started)
+    with tempfile.TemporaryDirectory() as folder:
+        for path in needed:
+            shutil.copy(path, folder)
+        for _ in range(COMMANDS):
+            command = [sys.executable, "-m", "lidardesign", "fit", folder, "--quiet", *options]
+            started = time.perf_counter()
+            if subprocess.run(command, check=False, capture_output=True).returncode:
+                return None
+            taken.append(time.perf_counter() - started)
     return min(taken)
-
-
-def _other_seconds(bench: FitBench, design: Design) -> float:
-    """What a fit takes besides expectation maximisation: choosing samples, sensors and rays [s]."""
-    started = time.perf_counter()
-    fit(
-        bench.samples,
-        sensors=bench.sensors,
-        layout=design.layout,
-        rays=design.rays,
-        level=design.level,
-        seed=bench.seed,
-        em_samples=SAMPLE_COUNTS[0],
-        restarts=1,
-    )
-    whole = time.perf_counter() - started
-    return max(whole - bench.fitted(0, SAMPLE_COUNTS[0], 1).seconds, 0.0)
 
 
 def _samples(request: AccuracyRequest, design: Design) -> Samples | None:
@@ -219,11 +218,15 @@ class FitBench:
             best[repeat % self.splits] = max(best.get(repeat % self.splits, -math.inf), one.log_likelihood)
         return [best[repeat % self.splits] - one.log_likelihood for repeat, one in self._of(count, restarts)]
 
+    def seconds(self, count: int, restarts: int) -> float:
+        """The median time of a setting's fits [s]."""
+        return float(np.median([one.seconds for _, one in self._of(count, restarts)]))
+
     def rung(self, count: int, restarts: int, besides: float, *, default: bool) -> Rung:
         """A setting, once all settings have been fitted; `besides`: what a fit takes besides [s]."""
         lost = np.array(self.lost(count, restarts))
         fits = [one for _, one in self._of(count, restarts)]
-        maximising = float(np.median([one.seconds for one in fits]))
+        maximising = self.seconds(count, restarts)
         memory = [one.memory_bytes for one in fits if one.memory_bytes is not None]
         return Rung(
             "",
