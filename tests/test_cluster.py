@@ -15,7 +15,7 @@ import pytest
 from test_workers import make_request, results
 
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate import worker_cluster
+from lidardesign.evaluate import messages, worker_cluster
 from lidardesign.evaluate.score import evaluate
 from lidardesign.evaluate.workers import WorkerScorer, workers_of
 
@@ -139,3 +139,14 @@ def test_a_cluster_that_lost_its_last_worker_is_given_up(scheduler, monkeypatch)
 
         with pytest.raises(ConfigError, match="has had no worker for 1 s"):
             evaluate(replace(request, scorer=scorer), progress=kill)
+
+
+def test_long_messages_are_sent_and_nonsense_is_answered(scheduler):
+    scheduler.add_worker()
+    cluster = worker_cluster.Cluster(scheduler.address)
+    try:
+        answers = dict(cluster.answers([bytes(12_000_000), b""]))
+    finally:
+        cluster.close()
+    for reply in answers.values():
+        assert "error" in messages.unpack(reply)[0]

@@ -68,8 +68,7 @@ class Cluster:
         done: queue.SimpleQueue[Any] = queue.SimpleQueue()
         while True:
             for number, message in itertools.islice(rest, max(AHEAD + self._threads() - len(numbers), 0)):
-                # the message is part of the task, so that whoever loses it can have it again
-                future = self._client.submit(answer, message, key=f"lidardesign-{uuid.uuid4()}", pure=False)
+                future = self._asked(message)
                 numbers[future] = number
                 future.add_done_callback(done.put)
             if not numbers:
@@ -77,6 +76,13 @@ class Cluster:
             future = self._next(done)
             number = numbers.pop(future)
             yield number, self._result(future, number)
+
+    def _asked(self, message: bytes) -> Any:
+        """A future of the answer; the message is part of its task, so that whoever loses it can have it again."""
+        with warnings.catch_warnings():
+            # many rays make a long message, which the work on them outweighs
+            warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
+            return self._client.submit(answer, message, key=f"lidardesign-{uuid.uuid4()}", pure=False)
 
     def close(self) -> None:
         """Leave the scheduler, which forgets what nobody waits for; a scene that a worker is at is finished there."""
