@@ -276,7 +276,9 @@ def test_frames_are_measured_and_culling_keeps_its_bound(tmp_path):
 @pytest.mark.slow
 def test_growth_is_measured(tmp_path):
     words = ["--of", "rays", "--of", "sensors", "--of", "dimensions", "--rays", "100", "200", "--sensors", "1", "2"]
-    found = run_script("growth", tmp_path, "--model", "embedded", *words, "--samples", "2000", "--heads", "2", "--batch", "64")
+    found = run_script(
+        "growth", tmp_path, "--model", "embedded", *words, "--samples", "2000", "--heads", "2", "--batch", "64"
+    )
     assert [len(rows) for rows in found["tables"].values()] == [2, 2, 6]
 
 
