@@ -105,7 +105,7 @@ def broken(task, config):
     raise DataError("this computer has no scans", where="scans")
 
 if os.environ["RANK"] == "1":
-    ground._training_scenes = broken
+    ground.training_scenes = broken
 from lidardesign.cli.main import run
 run(sys.argv[1:])
 """

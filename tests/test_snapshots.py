@@ -4,10 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from test_learn import BallTask, Interrupter, config_of
 
 from lidardesign.density.learn import learn
-from lidardesign.density.snapshots import FOLDER, clear_snapshots, kept_snapshots, snapshot_name, snapshot_steps
+from lidardesign.density.settings import LearningSettings
+from lidardesign.density.snapshots import (
+    FOLDER,
+    clear_snapshots,
+    kept_snapshots,
+    rung_steps,
+    snapshot_name,
+    snapshot_steps,
+    twin_step,
+)
 from lidardesign.run.checkpoint import load_arrays
 from lidardesign.run.manifest import verify
 
@@ -24,20 +35,38 @@ def contents(run):
 
 
 @pytest.mark.parametrize(
-    ("first", "steps", "kept"),
-    [(500, 1000, (500, 562, 625, 750)), (145, 290, (145, 163, 181, 217)), (0, 8, (1, 2, 4)), (1, 2, (1,)), (1, 1, ())],
+    ("steps", "balance", "kept"),
+    [
+        (1000, 0.5, (500, 609, 625, 734, 750)),
+        (290, 0.5, (145, 176, 181, 212, 217)),
+        (8, 1.0, (2, 3, 4)),
+        (2, 0.5, (1,)),
+        (1, 0.5, ()),
+    ],
 )
-def test_snapshots_are_kept_when_the_last_phase_begins_and_at_an_eighth_a_quarter_and_half_of_it(first, steps, kept):
-    assert snapshot_steps(first, steps) == kept
+def test_snapshots_are_kept_when_balancing_begins_and_twins_at_a_quarter_and_half_of_it(steps, balance, kept):
+    assert snapshot_steps(LearningSettings(steps=steps, balance=balance)) == kept
+
+
+@given(st.integers(1, 5000), st.floats(0, 1), st.floats(0, 1))
+def test_rungs_ascend_to_the_last_step_and_twins_lie_between_the_first_rung_and_their_own(steps, balance, anneal):
+    settings = LearningSettings(steps=steps, balance=balance, anneal=anneal)
+    rungs = rung_steps(settings)
+    assert list(rungs) == sorted(set(rungs))
+    assert rungs[-1] == steps
+    for step in rungs:
+        twin = twin_step(settings, step)
+        assert twin is None or rungs[0] < twin < step < steps
+    assert all(0 < step < steps for step in snapshot_steps(settings))
 
 
 def test_nothing_is_kept_before_sigma_has_its_final_value(tmp_path):
     learn(BallTask(), config_of(steps=40, balance=0.0, anneal=0.5), tmp_path)
-    assert list(kept_snapshots(tmp_path)) == [20, 22, 25, 30]
+    assert list(kept_snapshots(tmp_path)) == [20, 24, 25, 29, 30]
 
 
 def test_a_run_lists_its_snapshots_with_their_hashes(finished):
-    assert kept_snapshots(finished) == {step: snapshot_name(step) for step in (60, 67, 75, 90)}
+    assert kept_snapshots(finished) == {step: snapshot_name(step) for step in (60, 73, 75, 88, 90)}
     for name in kept_snapshots(finished).values():
         verify(finished, name)
 
@@ -66,9 +95,9 @@ def test_a_resumed_run_keeps_the_same_snapshots_bit_for_bit(finished, tmp_path, 
 def test_clearing_keeps_earlier_snapshots_and_removes_what_a_killed_process_left(tmp_path):
     learn(BallTask(), config_of(), tmp_path)
     (tmp_path / FOLDER / ".step-000060.safetensors.1.aa.tmp").write_bytes(b"half")
-    clear_snapshots(tmp_path, beyond=70)
-    assert sorted(contents(tmp_path)) == ["step-000060.safetensors", "step-000067.safetensors"]
-    assert list(kept_snapshots(tmp_path)) == [60, 67]
+    clear_snapshots(tmp_path, beyond=74)
+    assert sorted(contents(tmp_path)) == ["step-000060.safetensors", "step-000073.safetensors"]
+    assert list(kept_snapshots(tmp_path)) == [60, 73]
     clear_snapshots(tmp_path)
     assert not contents(tmp_path)
     assert not kept_snapshots(tmp_path)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,11 +21,12 @@ if TYPE_CHECKING:
 
     from lidardesign.density.learn import LearnProgress, LearnResult
     from lidardesign.density.parallel import Ranks
+    from lidardesign.density.stages import ToleranceGoal
     from lidardesign.run.config import RunConfig
     from lidardesign.task import Task
 
 TOLERANCE, TIME_BUDGET = "--tolerance", "--time-budget"
-STEPS_KEY = "learning.steps"
+STEPS_KEY, FIELDS_KEY = "learning.steps", "density.field_resolution"
 GOAL = "goal"
 # What passes before the command's clock runs, where the system does not tell: the program's own imports take 0.3 s.
 STARTUP_S = 0.5
@@ -62,10 +63,12 @@ class Goal:
     Arguments:
         tolerance: The misplaced share to reach.
         time_budget_s: The time to end within.
+        fixed_fields: Whether the resolution of distance fields is the user's own choice.
     """
 
     tolerance: float | None = None
     time_budget_s: float | None = None
+    fixed_fields: bool = field(default=False, compare=False)
 
     @property
     def is_none(self) -> bool:
@@ -80,9 +83,14 @@ class Goal:
 
 
 def checked_goal(
-    tolerance: float | None, time_budget_s: float | None, overrides: Sequence[str], ranks: Ranks
+    tolerance: float | None, time_budget_s: float | None, given: Mapping[str, Any], ranks: Ranks
 ) -> Goal:
     """The goal of the two options.
+
+    Arguments:
+        tolerance, time_budget_s: The options.
+        given: The other options of the configuration.
+        ranks: Who learns together.
 
     Raises:
         ConfigError: Both, a value that is none, or a number of steps beside a time.
@@ -91,11 +99,12 @@ def checked_goal(
         raise ConfigError("both decide the number of steps", where=f"{TOLERANCE}, {TIME_BUDGET}", allowed="one of them")
     if tolerance is not None and not 0 < tolerance < 1:
         raise ConfigError(f"{tolerance:g}", where=TOLERANCE, allowed="a share between 0 and 1, as 0.1")
+    keys = {text.partition("=")[0].strip() for text in given["overrides"]}
     if time_budget_s is None:
-        return Goal(tolerance)
+        return Goal(tolerance, fixed_fields=given["config_file"] is not None or FIELDS_KEY in keys)
     if not (math.isfinite(time_budget_s) and time_budget_s > 0):
         raise ConfigError(f"{time_budget_s:g}", where=TIME_BUDGET, allowed="a number of seconds above 0")
-    if any(text.partition("=")[0].strip() == STEPS_KEY for text in overrides):
+    if STEPS_KEY in keys:
         raise ConfigError(f"the time decides {STEPS_KEY}", where=TIME_BUDGET, hint=f"leave out --set {STEPS_KEY}")
     if ranks.size > 1:
         raise ConfigError("plans steps for one rank", where=TIME_BUDGET, hint=f"--set {STEPS_KEY}=N, or {TOLERANCE}")
@@ -151,29 +160,47 @@ class Learner:
 
         options: dict[str, Any] = {"device": self.device, "progress": self.progress, "ranks": self.ranks}
         if goal.tolerance is not None:
-            return self._to_tolerance(config, goal.tolerance, resume, options)
+            return self._to_tolerance(config, goal, resume, options)
         if goal.time_budget_s is not None and not resume:
             return self._within(config, goal.time_budget_s, options)
         result = learn_density(self.task, config, self.run, resume=resume, **options)
         return result if goal.is_none else replace(result, goal=read_manifest(self.run)[GOAL])
 
-    def _to_tolerance(
-        self, config: RunConfig, tolerance: float, resume: bool, options: dict[str, Any]
-    ) -> LearnResult:
+    def _to_tolerance(self, config: RunConfig, goal: Goal, resume: bool, options: dict[str, Any]) -> LearnResult:
         from lidardesign.density.ground import prepare_ground
         from lidardesign.density.learn import learn as learn_density
-        from lidardesign.density.stages import ToleranceGoal, goal_of, learn_to_tolerance
+        from lidardesign.density.stages import goal_of, learn_to_tolerance
 
+        begun, note = goal_of(self.run), ""
+        if begun is None:
+            config, begun, note = self._begun(config, goal)
         ground = prepare_ground(self.task, config, self.ranks)
-        goal = goal_of(self.run) or ToleranceGoal(tolerance, config.learning.steps)
 
         def once(staged: RunConfig, going_on: bool) -> LearnResult:
             return learn_density(self.task, staged, self.run, resume=going_on, ground=ground, **options)
 
-        result, goal = learn_to_tolerance(config, self.run, goal, once, resume=resume)
-        tried = ", ".join(f"{stage.misplaced:.3g} with {stage.steps}" for stage in goal.stages)
-        told = f"misplaced {tried} steps; the tolerance is {goal.tolerance:g}"
-        return self._whole(result, told, goal.as_dict())
+        result, reached = learn_to_tolerance(config, self.run, begun, once, resume=resume)
+        tried = ", ".join(f"{stage.misplaced:.3g} with {stage.steps}" for stage in reached.stages)
+        told = f"misplaced {tried} steps; the tolerance is {reached.tolerance:g}"
+        return self._whole(result, "; ".join(filter(None, [told, note])), reached.as_dict())
+
+    def _begun(self, config: RunConfig, goal: Goal) -> tuple[RunConfig, ToleranceGoal, str]:
+        """The configuration with fields for the tolerance, and what they leave of it to learning."""
+        from lidardesign.density.ground import training_scenes
+        from lidardesign.density.stages import ToleranceGoal
+        from lidardesign.evaluate.target_settings import fields_within
+
+        scenes = training_scenes(self.task, config)
+        chosen = fields_within(scenes, config, goal.tolerance, fixed=goal.fixed_fields)
+        if chosen.misplaced >= goal.tolerance:
+            raise ConfigError(
+                f"{chosen.note}, which leaves nothing to learning",
+                where=TOLERANCE,
+                allowed=f"above {chosen.misplaced:.2g}",
+                hint=f"a larger {FIELDS_KEY}, or a larger tolerance",
+            )
+        begun = ToleranceGoal(goal.tolerance, config.learning.steps, (), chosen.misplaced)
+        return replace(config, density=chosen.density), begun, chosen.note
 
     def _within(self, config: RunConfig, time_budget_s: float, options: dict[str, Any]) -> LearnResult:
         from lidardesign.density.budget import Timekeeper
@@ -219,10 +246,13 @@ def check_met(result: LearnResult, goal: Goal) -> None:
     Raises:
         ThresholdError: With what was reached.
     """
-    if goal.tolerance is None or result.misplaced <= goal.tolerance:
+    if goal.tolerance is None or result.goal["met"]:
         return
     error = result.error_estimates["misplaced"].error
     doubt = "" if error is None else f" +- {error:.2g}"
+    fields = result.goal["target_misplaced"]
+    if fields:
+        doubt += f", and {fields:.2g} of the target's by its distance fields,"
     raise ThresholdError(
         f"{result.misplaced:.3g}{doubt} of the density's mass is in the wrong place after {result.steps} steps",
         where=TOLERANCE,

@@ -72,14 +72,14 @@ def learn(
     """Learn where rays are worth firing for TASK, into a run folder."""
     with command(json=json, quiet=quiet, debug=debug) as console, joined_ranks(console) as ranks:
         check_choice(device, "--device", DEVICES)
-        goal = checked_goal(tolerance, time_budget, overrides or (), ranks)
+        choices = {"preset": preset, "config_file": config, "overrides": overrides or (), "seed": seed}
+        goal = checked_goal(tolerance, time_budget, choices, ranks)
         with phase("libraries"):
             from lidardesign.registry import load_task
             from lidardesign.run.config import load_run_config, resolve
 
         plugin = load_task(task)
         run = out if out is not None else Path("runs") / task
-        choices = {"preset": preset, "config_file": config, "overrides": overrides or (), "seed": seed}
         if resume:
             _check_can_resume(run)
             plugin, settings = load_run_config(run)

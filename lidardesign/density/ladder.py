@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from lidardesign.density.flow import DesignFlow
 from lidardesign.density.learn import FLOW, make_flow
 from lidardesign.density.measure import Probes, measure
 from lidardesign.density.objective import Coordinates
-from lidardesign.density.snapshots import kept_snapshots
+from lidardesign.density.snapshots import kept_snapshots, rung_steps, twin_step
 from lidardesign.density.target import Target
 from lidardesign.density.training import PROGRESS
 from lidardesign.design.samples import Samples
@@ -44,12 +45,23 @@ class Reached:
         seconds: What they took [s].
         estimates: ess, kl_nats, log_z, coverage and misplaced, with standard errors.
         samples: The samples that these were measured on.
+        twin: The misplaced share of the snapshot shortly before, where one was kept.
     """
 
     step: int
     seconds: float
     estimates: Mapping[str, Estimate]
     samples: Samples
+    twin: Estimate | None = None
+
+    @property
+    def misplaced(self) -> Estimate:
+        """The share that flows around this step misplace: the mean of the twins, with half of what they are apart."""
+        own = self.estimates["misplaced"]
+        if self.twin is None:
+            return own
+        error = max(own.error or 0.0, self.twin.error or 0.0)
+        return Estimate((own.value + self.twin.value) / 2, math.hypot(error, (own.value - self.twin.value) / 2))
 
 
 def remeasured(run: Path, config: RunConfig, target: Target, probes: Probes, *, count: int, seed: int) -> list[Reached]:
@@ -69,11 +81,15 @@ def remeasured(run: Path, config: RunConfig, target: Target, probes: Probes, *, 
         DataError: The run is unfinished or damaged.
     """
     files = {**kept_snapshots(run), config.learning.steps: FLOW}
-    seconds = seconds_at(run, list(files))
-    return [
-        _reached(load_flow(run, name, config, target, seed), probes, count, step, seconds[step])
-        for step, name in files.items()
-    ]
+    rungs = [step for step in rung_steps(config.learning) if step in files]
+    seconds, found = seconds_at(run, rungs), []
+    for step in rungs:
+        reached = measure(load_flow(run, files[step], config, target, seed), probes, count)
+        twin = files.get(twin_step(config.learning, step))
+        other = measure(load_flow(run, twin, config, target, seed), probes, count) if twin else None
+        apart = None if other is None else other.estimates["misplaced"]
+        found.append(Reached(step, seconds[step], reached.estimates, reached.samples, apart))
+    return found
 
 
 def load_flow(run: Path, name: str, config: RunConfig, target: Target, seed: int) -> LoadedFlow:
@@ -100,7 +116,3 @@ def seconds_at(run: Path, steps: list[int]) -> dict[int, float]:
     done, taken = [0, *(row["step"] for row in rows)], [0.0, *(row["seconds"] for row in rows)]
     return {step: float(np.interp(step, done, taken)) for step in steps}
 
-
-def _reached(learned: LoadedFlow, probes: Probes, count: int, step: int, seconds: float) -> Reached:
-    found = measure(learned, probes, count)
-    return Reached(step, seconds, found.estimates, found.samples)

@@ -1,30 +1,57 @@
 """The flow as it was at a few steps of learning, kept in the run: what more steps bought can then be measured.
 
-Snapshots lie where the target is the final one: when balancing begins, and at an eighth, a quarter and half of it.
-Before that, steps sharpen the target instead of reducing an error. After the last step the flow itself is there.
+Snapshots lie where the target is the final one: when balancing begins, and at a quarter and half of it. Before that,
+steps sharpen the target instead of reducing an error. Within it the error jitters from step to step while steps are
+long, so those two have a twin shortly before: how far twins are apart tells by how much. After the last step the flow
+itself is there.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
 import numpy as np
 
 from lidardesign.density.flow import DesignFlow
+from lidardesign.density.settings import LearningSettings
 from lidardesign.run.checkpoint import save_arrays
 from lidardesign.run.files import remove_stray_temporaries
 from lidardesign.run.manifest import forget, read_manifest
 
 FOLDER = "snapshots"
-# The error falls by a power of the steps: doublings show it best, and three are enough to see it.
-SHARES = (0.0, 1 / 8, 1 / 4, 1 / 2)
+# Of the last phase. Error falls by a power of the steps: doublings show it best.
+SHARES = (0.0, 1 / 4, 1 / 2)
+# Twins lie this share of the last phase apart: far enough for the flow to have moved, too near to have learned much.
+TWIN_SHARE = 1 / 32
 _NAME = re.compile(rf"{FOLDER}/step-(\d+)\.safetensors")
 
 
-def snapshot_steps(first: int, steps: int) -> tuple[int, ...]:
-    """The steps after which a snapshot is kept, ascending, where the last phase begins after `first` of the steps."""
-    return tuple(sorted({first + int(share * (steps - first)) for share in SHARES} - {0, steps}))
+def last_phase_begins(settings: LearningSettings) -> int:
+    """The step from which on the target is the final one."""
+    pathwise = round((1 - settings.balance) * settings.steps)
+    return pathwise if settings.balance else math.ceil(settings.anneal * pathwise)
+
+
+def rung_steps(settings: LearningSettings) -> tuple[int, ...]:
+    """The steps that a training is judged after, ascending; the last one is its end."""
+    first, steps = last_phase_begins(settings), settings.steps
+    return tuple(sorted({*(first + int(share * (steps - first)) for share in SHARES), steps} - {0}))
+
+
+def twin_step(settings: LearningSettings, step: int) -> int | None:
+    """The step of a rung's twin; None for the first rung, the last one, and where there is no room for one."""
+    twin = step - max(round(TWIN_SHARE * (settings.steps - last_phase_begins(settings))), 1)
+    before = max((rung for rung in rung_steps(settings) if rung < step), default=step)
+    return twin if before < twin and step < settings.steps else None
+
+
+def snapshot_steps(settings: LearningSettings) -> tuple[int, ...]:
+    """The steps after which a snapshot is kept, ascending."""
+    rungs = [step for step in rung_steps(settings) if step < settings.steps]
+    twins = (twin_step(settings, step) for step in rungs)
+    return tuple(sorted({*rungs, *(twin for twin in twins if twin is not None)}))
 
 
 def snapshot_name(step: int) -> str:

@@ -52,16 +52,23 @@ class ToleranceGoal:
         tolerance: The largest misplaced share that is good enough.
         planned_steps: The steps that the configuration asked for; stages are multiples of them.
         stages: What was reached, in the order of steps.
+        target_misplaced: What the target's own distance fields misplace; shares add up at most.
     """
 
     tolerance: float
     planned_steps: int
     stages: tuple[Stage, ...] = ()
+    target_misplaced: float = 0.0
+
+    @property
+    def left(self) -> float:
+        """What learning may misplace."""
+        return self.tolerance - self.target_misplaced
 
     @property
     def met(self) -> bool:
         """Whether the last stage is within the tolerance."""
-        return bool(self.stages) and self.stages[-1].misplaced <= self.tolerance
+        return bool(self.stages) and self.stages[-1].misplaced <= self.left
 
     @property
     def hopeless(self) -> bool:
@@ -69,15 +76,15 @@ class ToleranceGoal:
 
         Judged from the planned steps on: shorter trainings fall by another law.
         """
-        left = [steps for steps in stage_steps(self.planned_steps) if steps > self.stages[-1].steps]
-        if not left:
+        further = [steps for steps in stage_steps(self.planned_steps) if steps > self.stages[-1].steps]
+        if not further:
             return True
         if len(self.stages) < 2 or self.stages[-1].steps < self.planned_steps:
             return False
         before, last = self.stages[-2:]
         low = max(last.misplaced - STANDARD_ERRORS * last.error, 0.0)
         fall = min(low / (before.misplaced + STANDARD_ERRORS * before.error), 1.0) if before.misplaced else 1.0
-        return low * fall ** len(left) > self.tolerance
+        return low * fall ** len(further) > self.left
 
     def with_stage(self, stage: Stage) -> ToleranceGoal:
         """The goal after a stage, in place of an earlier one of the same steps."""
@@ -100,7 +107,7 @@ def goal_of(run: Path) -> ToleranceGoal | None:
     if "planned_steps" not in found:
         return None
     stages = tuple(Stage(**stage) for stage in found["stages"])
-    return ToleranceGoal(found["tolerance"], found["planned_steps"], stages)
+    return ToleranceGoal(found["tolerance"], found["planned_steps"], stages, found["target_misplaced"])
 
 
 def with_steps(config: RunConfig, steps: int) -> RunConfig:

@@ -111,12 +111,6 @@ class Trainer:
         """Steps before balancing begins."""
         return round((1 - self.settings.balance) * self.settings.steps)
 
-    @property
-    def kept_steps(self) -> tuple[int, ...]:
-        """The steps after which a snapshot is kept; none before sigma has its final value."""
-        settings, pathwise = self.settings, self.pathwise_steps
-        return snapshot_steps(pathwise if settings.balance else math.ceil(settings.anneal * pathwise), settings.steps)
-
     def sigma_m(self, step: int) -> float:
         """The annealed sigma of a step [m]."""
         final = self.target.optics.sigma_m
@@ -161,7 +155,7 @@ class Trainer:
             if self.replan is not None and self.step == self.pathwise_steps:
                 self.settings, self.replan = self.replan(self), None
             loss, ess = self._advance()
-            if self.step in self.kept_steps:
+            if self.step in snapshot_steps(self.settings):
                 self._keep()
             if self.step % PROGRESS_STEPS == 0 or self.step == self.settings.steps:
                 self._report(loss, ess, progress)

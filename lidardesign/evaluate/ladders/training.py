@@ -71,11 +71,16 @@ def _steps_ladder(request: AccuracyRequest, reached: Sequence[Reached]) -> Ladde
     judge = _Judge(request, reached[-1].samples)
     scores = [judge.scores(one.samples) for one in reached]
     rungs = [
-        _rung(str(one.step), one.estimates, one.seconds, judge.values(own, scores[-1]), default=one is reached[-1])
+        _rung(str(one.step), _around(one), one.seconds, judge.values(own, scores[-1]), default=one is reached[-1])
         for one, own in zip(reached, scores, strict=True)
     ]
     notes = [STEPS_NOTE] if len(rungs) > 1 else ["this run kept no snapshots; learned again, it keeps some"]
     return _ladder("learning.steps", "learning up to there", rungs, "; ".join([*notes, *judge.notes]))
+
+
+def _around(reached: Reached) -> dict[str, Estimate]:
+    """The figures of a rung, its error with the jitter from step to step."""
+    return {**reached.estimates, "misplaced": reached.misplaced}
 
 
 def _stages_ladder(request: AccuracyRequest) -> Sequence[Ladder]:

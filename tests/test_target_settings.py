@@ -1,0 +1,63 @@
+"""Distance fields for a tolerance: the coarsest that are good enough, or what the user asked for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_fields import icosphere
+from test_learn import config_of
+
+from lidardesign.evaluate.ladders.fields import RESOLUTIONS
+from lidardesign.evaluate.target_settings import FIELD_SHARE, fields_within
+from lidardesign.scene import Body, Scene, Sphere, rigid
+from lidardesign.space import DesignSpace
+
+SPACE = DesignSpace((0, 0, 0, -0.4, -0.4, 0.2), (0, 0, 0, 0.4, 0.4, 2.5))
+
+
+@pytest.fixture(scope="module")
+def meshes():
+    return [Scene((Body(icosphere(centre=(1.5, 0.05 * n, 0)), poses=np.eye(4)),)) for n in range(2)]
+
+
+@pytest.fixture(scope="module")
+def choices(meshes):
+    config = config_of(SPACE)
+    return {tolerance: fields_within(meshes, config, tolerance, fixed=False) for tolerance in (0.9, 0.01)}
+
+
+def test_the_coarsest_fields_within_a_fifth_of_the_tolerance_are_taken(choices):
+    rough, fine = choices[0.9], choices[0.01]
+    assert rough.density.field_resolution <= fine.density.field_resolution
+    for tolerance, choice in choices.items():
+        assert choice.misplaced <= FIELD_SHARE * tolerance
+        assert choice.density.field_resolution in RESOLUTIONS
+        assert str(choice.density.field_resolution) in choice.note
+
+
+def test_a_coarser_field_would_not_have_done(meshes, choices):
+    chosen = choices[0.01].density.field_resolution
+    coarser = [resolution for resolution in RESOLUTIONS if resolution < chosen]
+    config = config_of(SPACE)
+    for resolution in coarser[-1:]:
+        density = config.density.model_copy(update={"field_resolution": resolution})
+        held = fields_within(meshes, replace(config, density=density), 0.01, fixed=True)
+        assert held.misplaced > FIELD_SHARE * 0.01
+
+
+def test_a_resolution_of_the_users_own_is_kept_and_measured(meshes):
+    config = config_of(SPACE)
+    density = config.density.model_copy(update={"field_resolution": 17})
+    choice = fields_within(meshes, replace(config, density=density), 1e-6, fixed=True)
+    assert choice.density.field_resolution == 17
+    assert choice.misplaced > 1e-6
+
+
+def test_primitives_have_exact_distances_and_nothing_to_choose():
+    scenes = [Scene((Body(Sphere(0.5), poses=rigid(translation_m=(1.5, 0, 0))),))]
+    config = config_of(SPACE)
+    choice = fields_within(scenes, config, 0.1, fixed=False)
+    assert choice.density == config.density
+    assert (choice.misplaced, choice.note) == (0.0, "")
