@@ -16,7 +16,6 @@ import common  # noqa: F401 (before numpy: it limits the thread pools)
 import numpy as np
 from common import face_scenes, interleaved, model_option, parser, report
 
-from lidardesign.density.opaque import opaque_target
 from lidardesign.density.settings import DensitySettings
 from lidardesign.evaluate.ladders.visibility import POINTS, REFERENCE_POINTS, Case
 from lidardesign.scene import Body, Box, Scene, rigid
@@ -47,11 +46,10 @@ def measure(name: str, case: Case, points: tuple[int, ...], rounds: int) -> list
     timings = interleaved(
         {way: lambda target=target: target.log_density_and_gradient(batch) for way, target in ways.items()}, rounds
     )
-    exact = opaque_target(case.cast, case.scenes).log_density(case.probes.points)
     rows = []
     for way, target in ways.items():
-        probes = case.probes.first(case.few if way.startswith("quadrature") else len(exact))
-        error, spread = probes.misplaced(target.log_density(probes.points), exact[: len(probes.points)])
+        probes = case.probes.first(case.few if way.startswith("quadrature") else len(case.exact))
+        error, spread = probes.misplaced(target.log_density(probes.points), case.exact[: len(probes.points)])
         rows.append([name, way, error, spread, 1e3 * timings[way].wall_median])
     return rows
 

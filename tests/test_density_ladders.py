@@ -199,6 +199,13 @@ class TestVisibilityLadder:
         ladder = visibility.points_ladder(cases[Mesh], 100)
         assert ladder.default.setting == "100"
 
+    def test_where_nothing_is_seen_there_is_nothing_to_choose(self, monkeypatch):
+        monkeypatch.setattr(visibility, "PROBES", 512)
+        wall, _ = hidden_wall((1.5, 0, 0)).bodies
+        screen = Body(Box((0.01, 5.0, 5.0)), "screen", "occluder", rigid(translation_m=(1.0, 0, 0)))
+        assert visibility.Case.of([Scene((wall, screen))], SPACE, SETTINGS, 0).is_blind
+        assert not visibility.Case.of([hidden_wall((1.5, 0, 0))], SPACE, SETTINGS, 0).is_blind
+
     def test_bodies_one_by_one_are_measured_on_few_scenes(self):
         every = [hidden_wall((1.5, 0, 0)) for _ in range(100)]
         assert len(visibility.affordable_scenes(every)) == visibility.MOST_BODIES // 2

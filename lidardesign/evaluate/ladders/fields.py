@@ -150,10 +150,16 @@ def _resolution_rung(case: Case, resolution: int) -> Rung:
 
 
 def _bytes(field: Field, case: Case) -> int:
-    """The memory of the fields of all scenes; moving scenes share the grids of their meshes."""
+    """The memory of the fields of all scenes; moving meshes have one each, however many scenes they are in."""
     if isinstance(field, TableField):
         return field.table.nbytes // field.columns * len(scene_columns(case.scenes))
-    return field.bodies.grids.values.nbytes
+    return field.bodies.grids.values.nbytes * _meshes(case.scenes) // max(_meshes(case.few), 1)
+
+
+def _meshes(scenes: list[Scene]) -> int:
+    """How many different target meshes scenes have."""
+    shapes = (body.shape for scene in scenes for body in scene.bodies if body.is_target)
+    return len({shape.content_hash for shape in shapes if isinstance(shape, Mesh)})
 
 
 def interpolation_ladder(case: Case) -> Ladder:

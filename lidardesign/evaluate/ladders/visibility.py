@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from lidardesign.density.fields import Field, build_field
+from lidardesign.density.fields import Field, TableField, build_field
 from lidardesign.density.frames import FramesTarget
 from lidardesign.density.occlusion import NoOcclusion
-from lidardesign.density.opaque import opaque_target
+from lidardesign.density.opaque import LOG_OPAQUE, opaque_target
 from lidardesign.density.receiver import HeardVisibility, common_receiver
 from lidardesign.density.settings import DensitySettings
 from lidardesign.density.target import PADDING_SIGMAS, Target, build_target
@@ -34,7 +35,8 @@ LABEL = "visibility"
 POINTS = (16, 32, 64, 128, 256)
 REFERENCE_POINTS = 512
 # Errors of cheap ways, of the quadrature on a common table, and of that over bodies one by one.
-PROBES, TABLE_PROBES, BODY_PROBES = 32_768, 8192, 1024
+PROBES, TABLE_PROBES, BODY_PROBES = 32_768, 8192, 2048
+BODY_BATCH = 256
 # A quadrature over bodies without a common table evaluates every body at every midpoint of every probe.
 MOST_BODIES = 120
 # Compiled loops are loaded before anything is timed.
@@ -73,17 +75,29 @@ class Case:
             space: The design space.
             settings: Of the density.
             seed: The root of the probes.
-            batch: The number of points that is timed.
+                batch: The number of points that is timed, fewer where bodies are evaluated one by one.
         """
         cast = build_target(scenes, space, settings, "raycast")
         if isinstance(cast, FramesTarget):
             off = replace(cast, visibility=NoOcclusion())
-            integrated, few = build_target(scenes, space, settings, "quadrature"), BODY_PROBES
+            integrated = build_target(scenes, space, settings, "quadrature")
         else:
             off = replace(cast, visibility=_heard(NoVisibility(), scenes))
             way = Quadrature(_occluders(cast, scenes, settings), settings.quadrature_points)
-            integrated, few = replace(cast, visibility=_heard(way, scenes)), TABLE_PROBES
+            integrated = replace(cast, visibility=_heard(way, scenes))
+        shared = isinstance(one_way(integrated.visibility).field, TableField)
+        few, batch = (TABLE_PROBES, batch) if shared else (BODY_PROBES, min(BODY_BATCH, batch))
         return cls(scenes, off, cast, integrated, draw_probes(cast, scenes, PROBES, seed, "visibility"), few, batch)
+
+    @cached_property
+    def exact(self) -> np.ndarray:
+        """log p* at the probes where occluders are opaque, shape (N,)."""
+        return opaque_target(self.cast, self.scenes).log_density(self.probes.points)
+
+    @property
+    def is_blind(self) -> bool:
+        """Whether no probe reaches a surface, or none sees one."""
+        return bool(self.exact.max(initial=LOG_OPAQUE) < LOG_OPAQUE / 2)
 
     def quadrature(self, points: int) -> Target:
         """The target with so many midpoints."""
@@ -105,11 +119,11 @@ class Case:
 
 
 def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
-    """Ways against opaque geometry, and points of the quadrature against many; empty where no ray meets a target."""
+    """Ways against opaque geometry, and points of the quadrature against many; empty where no ray sees a target."""
     scenes, config = list(request.request.train), request.config
     few = affordable_scenes(scenes)
     case = Case.of(few, config.space, config.density, config.seed, config.learning.batch)
-    if not len(case.probes.points):
+    if case.is_blind:
         return []
     default, points = _own_setting(request)
     part = _part(few, scenes)
@@ -128,8 +142,7 @@ def visibility_ladder(case: Case, points: int, default: str) -> Ladder:
         points: Of the quadrature.
         default: off, quadrature or raycast: what the run uses.
     """
-    exact = opaque_target(case.cast, case.scenes).log_density(case.probes.points)
-    quadrature = case.quadrature(points)
+    exact, quadrature = case.exact, case.quadrature(points)
     rungs = [
         case.rung("off", case.off, exact, default=default == "off"),
         case.rung("quadrature", quadrature, exact[: case.few], default=default == "quadrature"),
