@@ -17,6 +17,7 @@ from lidardesign.density.compared_fields import ExactField, InterpolatedField, f
 from lidardesign.density.fields import TableField, build_field
 from lidardesign.density.flow import DesignFlow
 from lidardesign.density.grids import Grid
+from lidardesign.density.learn import learn
 from lidardesign.density.losses import Pool
 from lidardesign.density.misplaced import misplaced_share
 from lidardesign.density.objective import Coordinates
@@ -32,10 +33,16 @@ from lidardesign.density.precision import (
 from lidardesign.density.settings import DensitySettings, LearningSettings
 from lidardesign.density.target import build_target
 from lidardesign.errors import NumericalError
+from lidardesign.evaluate.accuracy import AccuracyRequest
 from lidardesign.evaluate.ladders import fields, precision, scenes, visibility
 from lidardesign.evaluate.ladders.probes import draw_probes, few_columns, with_frames
+from lidardesign.evaluate.request import EvaluationRequest
+from lidardesign.registry import load_task
+from lidardesign.run.config import resolve, save_run_config
+from lidardesign.run.manifest import start_manifest
 from lidardesign.scene import Body, Box, Mesh, Receiver, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
+from lidardesign.task import scenes_of
 
 SPACE = DesignSpace((0, 0, 0, -0.35, -0.35, 0.5), (0, 0, 0, 0.35, 0.35, 3.5))
 SETTINGS = DensitySettings(sigma_m=0.02)
@@ -437,3 +444,47 @@ class TestScenesLadder:
     def test_settings_beyond_all_scenes_are_all_scenes(self):
         assert scenes.counts(50, 50) == [4, 16, 50]
         assert scenes.counts(2000, 256) == [4, 16, 64, 256, 2000]
+
+
+class TestRuns:
+    """The ladders of a run from its folder, as `evaluate --accuracy` asks for them."""
+
+    SMALL = (
+        "learning.steps=4", "learning.batch=32", "learning.layers=1", "learning.hidden=8", "learning.bins=4",
+        "learning.samples=1000", "learning.balance_proposals=256", "learning.coverage_proposals=256", "train=6",
+    )  # fmt: skip
+
+    @pytest.fixture(scope="class")
+    @staticmethod
+    def request_of(tmp_path_factory):
+        place = tmp_path_factory.mktemp("run") / "flatland"
+        task = load_task("flatland")
+        config = resolve(task, preset="draft", overrides=TestRuns.SMALL, seed=1)
+        place.mkdir()
+        start_manifest(place, command=[], seed=1)
+        save_run_config(config, place)
+        learn(task, config, place)
+        train = list(scenes_of(task, config.task, "train", config.seed, config.space))
+        asked = EvaluationRequest(task, config.task, config.space, config.seed, (), [12], train=train)
+        return AccuracyRequest(config, place, asked, None)
+
+    @pytest.mark.parametrize("module", [visibility, fields, precision, scenes])
+    def test_have_ladders_whose_errors_fall(self, request_of, module, monkeypatch):
+        monkeypatch.setattr(visibility, "PROBES", 2048)
+        monkeypatch.setattr(visibility, "BODY_PROBES", 256)
+        monkeypatch.setattr(visibility, "REFERENCE_POINTS", 128)
+        monkeypatch.setattr(visibility, "POINTS", (16, 32))
+        for number in (precision, scenes):
+            monkeypatch.setattr(number, "BATCHES", 4)
+        found = module.ladders(request_of)
+        assert len(found) == {visibility: 2, fields: 0, precision: 1, scenes: 1}[module]
+        for ladder in found:
+            assert ladder.falls
+            assert all(rung.seconds > 0 and rung.uncertainty >= 0 for rung in ladder.rungs)
+            assert ladder.as_rows()
+
+    def test_the_same_run_gives_the_same_errors(self, request_of, monkeypatch):
+        monkeypatch.setattr(precision, "BATCHES", 3)
+        again = AccuracyRequest(request_of.config, request_of.run, request_of.request, None)
+        first, second = (precision.ladders(request)[0] for request in (request_of, again))
+        assert [rung.error for rung in first.rungs] == [rung.error for rung in second.rungs]
