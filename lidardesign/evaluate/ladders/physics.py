@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -224,21 +224,31 @@ def _effects(bench: Bench, note: str, own: Detector) -> list[Ladder]:
 
 @dataclass(frozen=True, eq=False)
 class _Pass:
-    """Scores in all scenes, the time of one [s] and the memory [bytes]."""
+    """Scores in all scenes, the median time of one [s] and the most memory [bytes]."""
 
     values: np.ndarray
     seconds: float
     memory_bytes: int | None
 
 
-def _pass(bench: Bench, choices: Sequence[frozenset[str]]) -> _Pass:
-    """One pass over the scenes, each under its own effects."""
-    started = time.perf_counter()
-    detector = bench.planner.detector
-    values, memory = with_memory(
-        lambda: np.array([bench.score(number, effects, detector) for number, effects in enumerate(choices)])
-    )
-    return _Pass(values, (time.perf_counter() - started) / len(choices), memory)
+def _passes(bench: Bench, choices: Mapping[str, Sequence[frozenset[str]]]) -> dict[str, _Pass]:
+    """All scenes under each choice of effects per scene.
+
+    One scene after the other under all choices, so that whatever else the machine does slows all alike.
+    """
+    found: dict[str, list[tuple[float, float, int | None]]] = {name: [] for name in choices}
+    for number in range(len(bench.scenes)):
+        for name, choice in choices.items():
+            started = time.perf_counter()
+            value, memory = with_memory(partial(bench.score, number, choice[number], bench.planner.detector))
+            found[name].append((value, time.perf_counter() - started, memory))
+    return {name: _summed(rows) for name, rows in found.items()}
+
+
+def _summed(rows: Sequence[tuple[float, float, int | None]]) -> _Pass:
+    values, seconds, memory = zip(*rows, strict=True)
+    known = [size for size in memory if size is not None]
+    return _Pass(np.array(values), float(np.median(seconds)), max(known, default=None))
 
 
 def _effect_rungs(bench: Bench, there: Sequence[str], *, marks: bool) -> list[Rung]:
@@ -247,35 +257,31 @@ def _effect_rungs(bench: Bench, there: Sequence[str], *, marks: bool) -> list[Ru
     planned = [plan.effects & everything for plan in bench.plans]
     # compiled before anything is timed
     bench.score(0, everything, bench.planner.detector)
-    full, none = _pass(bench, [everything] * count), _pass(bench, [frozenset()] * count)
-    choices = {"none": [frozenset()] * count} | {f"without {name}": [everything - {name}] * count for name in there}
-    rungs = [_rung("none", none, full, _paired(none.values, full.values))]
-    for name in there:
-        left = none if len(there) == 1 else _pass(bench, choices[f"without {name}"])
-        alone = full if len(there) == 1 else _pass(bench, [frozenset({name})] * count)
-        changes = {"left_out": _paired(left.values, full.values), "alone": _paired(alone.values, none.values)}
-        rungs.append(_rung(f"without {name}", left, full, max(changes.values()), changes))
-    choices["all"] = [everything] * count
-    if planned not in choices.values():
-        asked = bench.planner.choice if isinstance(bench.planner.choice, str) else "those named"
-        choices[asked] = planned
-        chosen = _pass(bench, planned)
-        rungs.append(_rung(asked, chosen, full, _paired(chosen.values, full.values)))
+    settings = {"none": [frozenset()] * count, "all": [everything] * count}
+    settings |= {f"without {name}": [everything - {name}] * count for name in there}
+    if planned not in settings.values():
+        settings[bench.planner.choice if isinstance(bench.planner.choice, str) else "those named"] = planned
+    alone = {f"{name} alone": [frozenset({name})] * count for name in there}
+    found = _passes(bench, settings | alone)
+    full, none = found["all"], found["none"]
+    changes = {
+        f"without {name}": {
+            "left_out": _paired(found[f"without {name}"].values, full.values),
+            "alone": _paired(found[f"{name} alone"].values, none.values),
+        }
+        for name in there
+    }
+    rungs = [_rung(name, found[name], full, changes.get(name, {})) for name in settings if name != "all"]
     rungs.sort(key=lambda rung: -rung.error)
-    rungs.append(replace(_rung("all", full, full, (0.0, 0.0)), reference=True))
-    taken = next(name for name, choice in choices.items() if choice == planned)
+    rungs.append(replace(_rung("all", full, full, {}), reference=True))
+    taken = next(name for name, choice in settings.items() if choice == planned)
     return [replace(rung, default=marks and rung.setting == taken) for rung in rungs]
 
 
-def _rung(
-    setting: str,
-    found: _Pass,
-    full: _Pass,
-    error: tuple[float, float],
-    changes: Mapping[str, tuple[float, float]] | None = None,
-) -> Rung:
-    """A setting with its error and uncertainty; `changes`: of the metric, with theirs."""
-    values = {f"change_{name}": change for name, (change, _) in (changes or {}).items()}
+def _rung(setting: str, found: _Pass, full: _Pass, changes: Mapping[str, tuple[float, float]]) -> Rung:
+    """A setting with its error and uncertainty; `changes`: of the metric where an effect is left out or alone."""
+    error = max(changes.values(), default=_paired(found.values, full.values))
+    values = {f"change_{name}": change for name, (change, _) in changes.items()}
     if changes:
         values["seconds_saved"] = full.seconds - found.seconds
     return Rung(setting, *error, found.seconds, found.memory_bytes, values=values)
