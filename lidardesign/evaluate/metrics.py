@@ -119,28 +119,34 @@ def triangle_distance_m(points: np.ndarray, triangles: np.ndarray) -> np.ndarray
     Over the inside it is the distance to the plane, elsewhere the least of the three edges' distances; a
     triangle without area has no inside.
     """
-    corners = [triangles[:, i] for i in range(3)]
-    squared = np.min(
-        [_segment_squared(points, a, b) for a, b in itertools.pairwise([*corners, corners[0]])], axis=0
-    )
-    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
-    area = np.einsum("nk,nk->n", normal, normal)
-    inside = area > 0
-    for a, b in itertools.pairwise([*corners, corners[0]]):
-        inside &= np.einsum("nk,nk->n", np.cross(b - a, points - a), normal) >= 0
-    height = np.einsum("nk,nk->n", points - corners[0], normal)
+    # one row per axis: a fifth of the time of rows of three
+    at, corners = np.ascontiguousarray(points.T), np.ascontiguousarray(triangles.transpose(1, 2, 0))
+    normal = _cross(corners[1] - corners[0], corners[2] - corners[0])
+    area = _dot(normal, normal)
+    inside, squared = area > 0, np.full(len(points), np.inf)
+    for start, end in itertools.pairwise([*corners, corners[0]]):
+        along, offset = end - start, at - start
+        inside &= _dot(_cross(along, offset), normal) >= 0
+        squared = np.minimum(squared, _segment_squared(along, offset))
+    height = _dot(at - corners[0], normal)
     above = np.divide(height**2, area, out=np.full(len(points), np.inf), where=inside)
     return np.sqrt(np.minimum(squared, above))
 
 
-def _segment_squared(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    along, offset = end - start, points - start
-    length = np.einsum("nk,nk->n", along, along)
-    share = np.divide(
-        np.einsum("nk,nk->n", offset, along), length, out=np.zeros(len(points)), where=length > 0
-    )
-    offset -= np.clip(share, 0.0, 1.0)[:, None] * along
-    return np.einsum("nk,nk->n", offset, offset)
+def _segment_squared(along: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Squared distances to segments of points offset from their starts, (3, N) and (3, N) to (N,)."""
+    length = _dot(along, along)
+    share = np.divide(_dot(offset, along), length, out=np.zeros(len(length)), where=length > 0)
+    away = offset - np.clip(share, 0.0, 1.0) * along
+    return _dot(away, away)
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def delaunay_surface(
