@@ -39,6 +39,7 @@ EXAMPLES = {
         "lidardesign learn face --preset draft --out runs/face",
         "torchrun --nproc-per-node 2 -m lidardesign learn face --out runs/face",
         "lidardesign learn meshes --set folder=scans --set scale=0.001 --out runs/scans",
+        "lidardesign learn face --tolerance 0.15 --out runs/good_enough",
         "lidardesign learn face --out runs/face --resume",
     ),
     fit: (
