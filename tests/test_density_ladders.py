@@ -297,6 +297,13 @@ class TestFieldLadders:
         assert ladder.default.setting == "24"
         assert ladder.rungs[1].memory_bytes == case.target.field.table.nbytes // 2 * 3
 
+    def test_resolutions_that_take_long_are_left_out_beyond_the_runs_own(self, case, monkeypatch):
+        monkeypatch.setattr(fields, "RESOLUTIONS", (8, 12, 48))
+        monkeypatch.setattr(fields, "LONGEST_SECONDS", 0.0)
+        ladder = fields.resolution_ladder(case)
+        assert [rung.setting for rung in ladder.rungs] == ["8", "12", "24"]
+        assert "48 and more points would take long" in ladder.note
+
     def test_splines_err_less_than_lines_and_lines_less_than_steps(self, case):
         ladder = fields.interpolation_ladder(case)
         nearest, trilinear, tricubic, exact = ladder.rungs

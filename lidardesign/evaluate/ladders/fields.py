@@ -38,6 +38,8 @@ RESOLUTIONS = (16, 24, 32, 48, 64, 96, 128)
 # The more scenes, the more their errors average out; so many can be built anew at every resolution.
 COLUMNS = 12
 PROBES = 16_384
+# Resolutions beyond the run's own are measured where building them for all these scenes takes at most so long.
+LONGEST_SECONDS = 20.0
 # A coarse field has its surfaces elsewhere: probes must meet them there too.
 WIDENING = 3.0
 NEAR_SIGMAS = 2.0
@@ -126,7 +128,7 @@ def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
 
 def resolution_ladder(case: Case) -> Ladder:
     """Grid points along the longest side of a field, against exact distances."""
-    own = case.settings.field_resolution
+    rungs, left_out = _resolution_rungs(case)
     return Ladder(
         knob="density.field_resolution",
         error_of=ERROR_OF,
@@ -135,9 +137,24 @@ def resolution_ladder(case: Case) -> Ladder:
         tolerance=TOLERANCE,
         because=BECAUSE,
         work="building the field of one scene",
-        rungs=[_resolution_rung(case, count) for count in sorted({*RESOLUTIONS, own})],
-        note=_part(case, "memory is that of all scenes' fields"),
+        rungs=rungs,
+        note=_part(case, f"memory is that of all scenes' fields{left_out}"),
     )
+
+
+def _resolution_rungs(case: Case) -> tuple[list[Rung], str]:
+    """The rungs that do not take too long beyond the run's own, and what the first one that would is called."""
+    rungs: list[Rung] = []
+    for count in sorted({*RESOLUTIONS, case.settings.field_resolution}):
+        if count > case.settings.field_resolution and _predicted_s(case, rungs[-1], count) > LONGEST_SECONDS:
+            return rungs, f"; {count} and more points would take long to measure"
+        rungs.append(_resolution_rung(case, count))
+    return rungs, ""
+
+
+def _predicted_s(case: Case, last: Rung, resolution: int) -> float:
+    """What building the fields at a resolution will take, growing like their volume [s]."""
+    return last.seconds * (resolution / int(last.setting)) ** 3 * len(case.few)
 
 
 def _resolution_rung(case: Case, resolution: int) -> Rung:
