@@ -84,17 +84,15 @@ class Ladder:
     def chosen(self) -> Rung:
         """The cheapest rung inside the tolerance; of rungs that cost the same, the most accurate one.
 
-        Where errors do not differ within their uncertainty either, what the run does already, and also where that
-        costs the same as the one found and errs no more. Where none is inside the tolerance, the most accurate one.
+        What the run does already stays where it is inside the tolerance and nothing there is cheaper by more than can
+        be told. Where no rung is inside the tolerance, the most accurate one.
         """
         inside = [rung for rung in self.rungs if rung.error <= self.tolerance]
         if not inside:
             return min(self.rungs, key=lambda rung: (rung.error, rung.seconds))
         least = min(rung.seconds for rung in inside)
         cheap = [rung for rung in inside if rung.seconds <= SAME_COST * least]
-        best = min(cheap, key=lambda rung: (rung.error, rung.seconds))
-        equal = [rung for rung in cheap if rung.error - best.error <= _sure_difference(rung, best)]
-        found = min(equal, key=lambda rung: (not rung.default, rung.error, rung.seconds))
+        found = min(cheap, key=lambda rung: (not rung.default, rung.error, rung.seconds))
         return next((rung for rung in inside if rung.default and _no_worse(rung, found)), found)
 
     @property
