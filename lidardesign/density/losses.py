@@ -67,7 +67,7 @@ def pathwise_loss(
     learned, log_prob = flow(ranks.part(flow.draw_base(count, generator)), conditions)
     log_p_star = log_target(coordinates.join(learned, conditions), target, coordinates, sigma_m)
     loss = ((1 + eta) * log_prob - log_p_star).sum() / count
-    every = ranks.gather(torch.stack([log_prob, log_p_star], dim=1).detach())
+    every = ranks.gather(torch.stack([log_prob, log_p_star], dim=1).detach(), of=count)
     value = ((1 + eta) * every[:, 0] - every[:, 1]).mean()
     return loss, float(value), effective_share(every[:, 1] - every[:, 0])
 
@@ -123,7 +123,7 @@ def balancing_loss(
         learned, log_prob = flow(base, conditions)
     unit = coordinates.join(learned, conditions)
     log_p_star = log_target_values(unit, target, coordinates)
-    log_weights = ranks.gather(log_p_star - log_prob)
+    log_weights = ranks.gather(log_p_star - log_prob, of=count)
     log_z = log_weights.logsumexp(0) - np.log(count)
     centred = log_weights - log_z
     pull = centred.clamp(-LARGEST_PULL_NATS, LARGEST_PULL_NATS)

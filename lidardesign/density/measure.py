@@ -111,8 +111,8 @@ def draw_samples(learned: Learned, count: int) -> Samples:
             conditions = None if conditions is None else ranks.part(conditions)
             values, log_density = flow(ranks.part(flow.draw_base(size, learned.generator)), conditions)
             unit = coordinates.join(values, conditions)
-            points.append(ranks.gather(coordinates.space.from_unit(unit.cpu().double().numpy())))
-            log_prob.append(ranks.gather(log_density.cpu().double().numpy()))
+            points.append(ranks.gather(coordinates.space.from_unit(unit.cpu().double().numpy()), of=size))
+            log_prob.append(ranks.gather(log_density.cpu().double().numpy(), of=size))
     points = np.concatenate(points)
     offset = coordinates.log_condition_density - coordinates.log_unit_volume
     log_target = ranks.spread(learned.target.log_density, points)

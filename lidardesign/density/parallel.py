@@ -56,9 +56,18 @@ class Ranks:
         """This rank's block of rows that all ranks hold."""
         return rows if self.size == 1 else rows[self.rows_of(len(rows))]
 
-    def gather(self, rows: Rows) -> Rows:
-        """The rows of all ranks, in order; each may bring any number."""
+    def gather(self, rows: Rows, *, of: int | None = None) -> Rows:
+        """The rows of all ranks, in order.
+
+        Arguments:
+            rows: Any number on each rank.
+            of: How many all have together, where each brings its `part` of them: nobody then has to ask.
+        """
         return rows
+
+    def stacked(self, values: np.ndarray) -> np.ndarray:
+        """The arrays of all ranks, of one shape, one behind the other: shape (size, *)."""
+        return self.gather(values[None], of=self.size)
 
     def gathered(self, rows: np.ndarray) -> tuple[np.ndarray, slice]:
         """The rows of all ranks, in order, and which of them this rank brought."""
@@ -86,7 +95,7 @@ class Ranks:
 
     def spread(self, evaluate: Callable[[np.ndarray], np.ndarray], rows: np.ndarray) -> np.ndarray:
         """What a function makes of rows that all ranks hold, each rank evaluating its part of them."""
-        return self.gather(evaluate(self.part(rows)))
+        return self.gather(evaluate(self.part(rows)), of=len(rows))
 
     def of_first(self, rows: np.ndarray) -> np.ndarray:
         """The rows of the first rank, on all ranks: what may differ by the rounding of other processors."""
@@ -105,7 +114,7 @@ class Ranks:
         Raises:
             ConfigError: They do not.
         """
-        found = self.gather(np.frombuffer(hashlib.sha256(content).digest(), dtype=np.uint8)[None])
+        found = self.stacked(np.frombuffer(hashlib.sha256(content).digest(), dtype=np.uint8))
         others = [rank for rank, row in enumerate(found) if not np.array_equal(row, found[0])]
         if others:
             raise ConfigError(

@@ -87,28 +87,33 @@ class ConnectedRanks(Ranks):
 
     store: Any = None
 
-    def gather(self, rows: Rows) -> Rows:
+    def gather(self, rows: Rows, *, of: int | None = None) -> Rows:
         """See `Ranks`."""
+        counts = None if of is None else [len(range(of)[self.rows_of(of, rank)]) for rank in range(self.size)]
         if isinstance(rows, np.ndarray):
-            return self.gathered(rows)[0]
-        return self._gathered(rows)[0]
+            return self._gathered(torch.tensor(np.ascontiguousarray(rows)), counts)[0].numpy()
+        return self._gathered(rows, counts)[0]
 
     def gathered(self, rows: np.ndarray) -> tuple[np.ndarray, slice]:
         """See `Ranks`."""
         every, mine = self._gathered(torch.tensor(np.ascontiguousarray(rows)))
         return every.numpy(), mine
 
-    def _gathered(self, rows: Tensor) -> tuple[Tensor, slice]:
+    def _counts(self, own: int) -> list[int]:
         counts = torch.zeros(self.size, dtype=torch.int64)
-        counts[self.rank] = len(rows)
+        counts[self.rank] = own
         _reached(lambda: distributed.all_reduce(counts))
-        longest, rows = int(counts.max()), rows.detach()
+        return counts.tolist()
+
+    def _gathered(self, rows: Tensor, counts: list[int] | None = None) -> tuple[Tensor, slice]:
+        counts, rows = counts or self._counts(len(rows)), rows.detach()
+        longest = max(counts)
         padded = rows.new_zeros(longest, *rows.shape[1:])
         padded[: len(rows)] = rows
         found = [torch.empty_like(padded) for _ in range(self.size)]
         _reached(lambda: distributed.all_gather(found, padded))
-        every = torch.cat([part[:count] for part, count in zip(found, counts.tolist(), strict=True)])
-        start = int(counts[: self.rank].sum())
+        every = torch.cat([part[:count] for part, count in zip(found, counts, strict=True)])
+        start = sum(counts[: self.rank])
         return every, slice(start, start + len(rows))
 
     def _reduced(self, values: np.ndarray, operation: Any) -> np.ndarray:

@@ -75,11 +75,13 @@ class OwnColumns(Target):
         return self.ranks.max(super()._best(surface))
 
     def _log_sums(self, terms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        peak = terms.max(axis=1, keepdims=True, initial=-np.inf)
-        peak = self.ranks.max(peak)
-        shares = np.exp(terms - peak)
-        total = self.ranks.sum(shares.sum(axis=1, keepdims=True))
-        return (peak + np.log(total))[:, 0], shares / total
+        own = terms.max(axis=1, initial=-np.inf)
+        # a rank without any term at a point has nothing to add there
+        level = np.where(np.isfinite(own), own, 0.0)
+        every = self.ranks.stacked(np.stack([own, np.exp(terms - level[:, None]).sum(axis=1)]))
+        peak = every[:, 0].max(axis=0)
+        values = peak + np.log((np.exp(every[:, 0] - peak) * every[:, 1]).sum(axis=0))
+        return values, np.exp(terms - values[:, None])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
