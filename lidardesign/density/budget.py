@@ -38,8 +38,8 @@ LEAST_STEPS = 100
 RESERVE = 0.1
 TIMED_STEPS = 6
 TIMED_POINTS = 2048
-# Writing the flow and the samples, and printing the result.
-WRITING_S = 1.0
+# Writing the flow and the samples, printing the result, and ending the process.
+WRITING_S = 2.0
 
 
 @dataclass(frozen=True)
