@@ -52,9 +52,10 @@ def test_the_front_is_what_no_other_rung_beats():
         [Rung("a", 0.0, 0.0, 0.0), Rung("b", 0.0, 0.0, 0.0)],
         [Rung("a", 1e-30, 0.0, 1e-9), Rung("b", 1e9, 1e9, 1e6)],
         [Rung("a", 0.5, 5.0, 1.0), Rung("b", 0.5, 0.0, 1.0)],
+        [Rung("a", math.inf, math.nan, 1.0), Rung("b", 0.5, 0.0, 1.0)],
     ],
 )
-@pytest.mark.parametrize("tolerance", [0.0, 0.02])
+@pytest.mark.parametrize("tolerance", [0.0, 0.02, math.inf])
 def test_figures_without_a_logarithm_are_drawn_too(rungs, tolerance):
     ladder = make_ladder(rungs, tolerance=tolerance)
     (panel,) = panels([ladder])
@@ -123,7 +124,7 @@ def test_tables_name_what_to_choose_and_what_the_run_does():
     text = accuracy_tables([make_ladder(note="in 3 scenes")])
     assert "64 (run)" in text
     assert text.count("to choose</td>") == 1
-    assert "Measured on: in 3 scenes." in text
+    assert "Note: in 3 scenes." in text
     assert "reference" in text
 
 

@@ -84,6 +84,11 @@ class Panel:
     errors: tuple[float, float]
 
     @property
+    def shows_tolerance(self) -> bool:
+        """Whether the tolerance has a place on the axis."""
+        return self.errors[0] <= self.ladder.tolerance <= self.errors[1]
+
+    @property
     def front(self) -> list[Mark]:
         """The marks that no other one beats, the fastest first."""
         return sorted((mark for mark in self.marks if not mark.beaten), key=lambda mark: (mark.x, -mark.y))
@@ -108,8 +113,8 @@ def _panel(ladder: Ladder) -> Panel:
 
 
 def _error_axis(ladder: Ladder) -> tuple[float, float]:
-    known = [rung.error for rung in ladder.rungs if rung.error > 0]
-    tolerance = [ladder.tolerance] if ladder.tolerance > 0 else []
+    known = [rung.error for rung in ladder.rungs if rung.error > 0 and math.isfinite(rung.error)]
+    tolerance = [ladder.tolerance] if ladder.tolerance > 0 and math.isfinite(ladder.tolerance) else []
     largest = max([*known, *tolerance], default=1.0)
     shown = [error for error in [*known, *tolerance] if error >= SHOWN_SHARE * largest]
     low, high = _spanned(min(shown, default=1.0), largest)
@@ -136,8 +141,10 @@ def _beaten(rung: Rung, ladder: Ladder) -> bool:
 def _mark(rung: Rung, least_seconds: float, errors: tuple[float, float], chosen: bool, beaten: bool) -> Mark:
     low, high = errors
     on_edge = rung.error <= low
-    y = low if on_edge else rung.error
-    ends = max(rung.error - rung.uncertainty, low), min(rung.error + rung.uncertainty, high)
+    # what has no finite error stands on the upper edge
+    y = low if on_edge else rung.error if math.isfinite(rung.error) else high
+    uncertainty = rung.uncertainty if math.isfinite(rung.uncertainty) else 0.0
+    ends = max(y - uncertainty, low), min(y + uncertainty, high)
     return Mark(rung, max(rung.seconds, least_seconds), y, min(ends[0], y), max(ends[1], y), on_edge, chosen, beaten)
 
 
@@ -172,10 +179,10 @@ def pareto_png(ladders: Sequence[Ladder]) -> bytes:
 
 
 def _draw(axes: Axes, panel: Panel) -> None:
-    ladder, front = panel.ladder, panel.front
+    front = panel.front
     _dress(axes, panel)
-    if ladder.tolerance > 0:
-        axes.axhline(ladder.tolerance, color=TOLERANCE, linestyle="dashed", linewidth=1.1, zorder=1.5)
+    if panel.shows_tolerance:
+        axes.axhline(panel.ladder.tolerance, color=TOLERANCE, linestyle="dashed", linewidth=1.1, zorder=1.5)
     axes.plot([mark.x for mark in front], [mark.y for mark in front], color=LINE, alpha=PALE, linewidth=1.3, zorder=2)
     for mark in panel.marks:
         _draw_mark(axes, mark)

@@ -69,7 +69,7 @@ def _traces(panel: Panel, name: str) -> list[dict[str, Any]]:
         "opacity": PALE,
         "hoverinfo": "skip",
     }
-    tolerance = [{**where, **_tolerance(panel)}] if panel.ladder.tolerance > 0 else []
+    tolerance = [{**where, **_tolerance(panel)}] if panel.shows_tolerance else []
     return [*tolerance, line, {**where, **_marks(panel)}]
 
 
@@ -198,7 +198,7 @@ def _table(ladder: Ladder) -> str:
     limit = f"{ladder.tolerance:.3g} {ladder.unit}".rstrip()
     about = (
         f"Error: {ladder.error_of}, against {ladder.against}. Tolerance: {limit}, {ladder.because}. Seconds: "
-        f"{ladder.work}." + (f" Measured on: {ladder.note}." if ladder.note else "")
+        f"{ladder.work}." + (f" Note: {ladder.note}." if ladder.note else "")
     )
     headings = ("setting", f"error{unit}", "standard error", "seconds", "MB", "verdict")
     chosen = ladder.chosen
