@@ -208,6 +208,8 @@ class Learner:
         from lidardesign.density.learn import choose_device
         from lidardesign.density.learn import learn as learn_density
 
+        if self.ranks.size > 1:  # also where a run is started anew whose goal is in its manifest
+            raise ConfigError("plans steps for one rank", where=TIME_BUDGET, hint="resume the run on one rank")
         place = choose_device(self.device)
         clock, age = self.console.clock, _age_s()
         startup = STARTUP_S if age is None or age - clock.seconds > MOST_STARTUP_S else age - clock.seconds

@@ -116,7 +116,7 @@ def _invoke(arguments: list[str]) -> int:
     """Run typer without letting it print or exit for errors."""
     console = Console(json="--json" in arguments, debug="--debug" in arguments)
     try:
-        code: Any = app(arguments, standalone_mode=False)
+        code: Any = app(arguments, prog_name="lidardesign", standalone_mode=False)
     except typer.Exit as error:
         code = error.exit_code
     except typer.Abort:

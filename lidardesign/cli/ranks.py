@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from lidardesign.cli.console import EXIT_INTERRUPTED, Console
-from lidardesign.errors import ConfigError, LidardesignError, LostRankError
+from lidardesign.errors import ConfigError, LidardesignError, LostRankError, ThresholdError
 from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
@@ -60,7 +60,11 @@ def joined_ranks(console: Console) -> Iterator[Ranks]:
         _follow(ranks, console)
         raise typer.Exit
     try:
-        yield ranks
+        try:
+            yield ranks
+        except ThresholdError:  # all was learned; it is the user's tolerance that was missed
+            finish(ranks)
+            raise
         with contextlib.suppress(LostRankError):  # all is written: nothing is lost with a rank that ends now
             finish(ranks)
     except BaseException:
