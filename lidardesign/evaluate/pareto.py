@@ -197,7 +197,9 @@ def _draw(axes: Axes, panel: Panel) -> None:
             va="center",
             fontsize=7.5,
             color=CHOSEN if mark.chosen else "#333333",
-            zorder=5,
+            # lines behind the text would strike it through
+            bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.6},
+            zorder=3.5,
         )
 
 

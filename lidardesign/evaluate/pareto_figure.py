@@ -117,6 +117,8 @@ def _settings(panel: Panel, name: str) -> list[dict[str, Any]]:
             "xanchor": side,
             "yanchor": "middle",
             "showarrow": False,
+            "bgcolor": "rgba(255,255,255,0.75)",
+            "borderpad": 0,
             "font": {"size": 10, "color": CHOSEN if mark.chosen else "#333333"},
         }
         for mark, (across, up, side) in zip(panel.marks, places, strict=True)
