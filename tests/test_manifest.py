@@ -121,6 +121,14 @@ def break_run(run, how):
         manifest.write_text("{")
     elif how == "newer":
         write_manifest(run, {**document, "schema_version": 2})
+    elif how in ("timings", "goal", "learn"):
+        write_manifest(run, {**document, how: [5]})
+    elif how == "entry":
+        write_manifest(run, {**document, "files": {"data.bin": 5}})
+    elif how == "empty entry":
+        write_manifest(run, {**document, "files": {"data.bin": {}}})
+    elif how == "replaced entry":
+        write_manifest(run, {**document, "files": {"data.bin": {**document["files"]["data.bin"], "replaces": [1]}}})
 
 
 MESSAGES = {
@@ -132,6 +140,12 @@ MESSAGES = {
     "no manifest": "no run folder",
     "garbage manifest": "cannot be read",
     "newer": "schema version 2",
+    "timings": "the manifest's 'timings' is damaged",
+    "goal": "the manifest's 'goal' is damaged",
+    "learn": "the manifest's 'learn' is damaged",
+    "entry": "entry of data.bin is damaged",
+    "empty entry": "entry of data.bin is damaged",
+    "replaced entry": "entry of data.bin is damaged",
 }
 
 

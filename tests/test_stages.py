@@ -15,8 +15,9 @@ from lidardesign.density.stages import (
     stage_steps,
     with_steps,
 )
+from lidardesign.errors import DataError
 from lidardesign.run.config import save_run_config
-from lidardesign.run.manifest import read_manifest, start_manifest, verify
+from lidardesign.run.manifest import note, read_manifest, start_manifest, verify
 from lidardesign.run.yaml import load_yaml
 
 PLANNED = 40
@@ -109,3 +110,17 @@ def test_a_run_without_a_tolerance_has_none(tmp_path):
     start_manifest(tmp_path, command=[], seed=0)
     save_run_config(config_of(), tmp_path)
     assert goal_of(tmp_path) is None
+
+
+DAMAGES = ({"stages": [{"steps": 1}]}, {"stages": 3}, {"tolerance": "x"}, {"planned_steps": 0.5})
+
+
+@pytest.mark.parametrize("change", DAMAGES)
+def test_a_damaged_word_of_the_tolerance_is_told(tmp_path, change):
+    start_manifest(tmp_path, command=[], seed=0)
+    known = goal_with(0.1, 0.3, 0.2)
+    note(tmp_path, goal=known.as_dict())
+    assert goal_of(tmp_path) == known
+    note(tmp_path, goal=change)
+    with pytest.raises(DataError, match="'goal' is damaged"):
+        goal_of(tmp_path)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lidardesign.cli.console import Console
-from lidardesign.errors import ConfigError, ThresholdError
+from lidardesign.errors import ConfigError, DataError, ThresholdError
 from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
@@ -116,11 +116,14 @@ def resumed_goal(asked: Goal, run: Path) -> Goal:
 
     Raises:
         ConfigError: Another one is asked for.
+        DataError: The manifest's word of it is damaged.
     """
-    from lidardesign.run.manifest import read_manifest
+    from lidardesign.run.manifest import DAMAGED_HINT, FILE_NAME, read_manifest
 
     found = read_manifest(run).get(GOAL) or {}
     stored = Goal(found.get("tolerance"), found.get("time_budget_s"))
+    if not all(isinstance(value, float | int | None) for value in stored.as_dict().values()):
+        raise DataError(f"the manifest's {GOAL!r} is damaged", where=str(run / FILE_NAME), hint=DAMAGED_HINT)
     if asked.is_none or asked == stored:
         return stored
     where = TOLERANCE if asked.tolerance is not None else TIME_BUDGET

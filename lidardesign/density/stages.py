@@ -12,12 +12,15 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter, ValidationError
+
 from lidardesign.density.learn import FLOW, LearnResult
 from lidardesign.density.snapshots import clear_snapshots
 from lidardesign.density.training import CHECKPOINT, PROGRESS
 from lidardesign.design.samples import FILE_NAME as SAMPLES
+from lidardesign.errors import DataError
 from lidardesign.run.config import RunConfig, save_run_config
-from lidardesign.run.manifest import forget, note, read_manifest, write_manifest
+from lidardesign.run.manifest import DAMAGED_HINT, FILE_NAME, forget, note, read_manifest, write_manifest
 
 GOAL = "goal"
 # Stages take these multiples of the planned steps: an eighth shows what is cheap, and beyond four times of them a
@@ -102,12 +105,23 @@ def stage_steps(planned: int) -> tuple[int, ...]:
 
 
 def goal_of(run: Path) -> ToleranceGoal | None:
-    """The tolerance that a run was started with, if it was."""
+    """The tolerance that a run was started with, if it was.
+
+    Raises:
+        DataError: The manifest's word of it is damaged.
+    """
     found = read_manifest(run).get(GOAL) or {}
     if "planned_steps" not in found:
         return None
-    stages = tuple(Stage(**stage) for stage in found["stages"])
-    return ToleranceGoal(found["tolerance"], found["planned_steps"], stages, found["target_misplaced"])
+    try:
+        goal = TypeAdapter(ToleranceGoal).validate_python({key: found[key] for key in found if key != "met"})
+    except ValidationError as error:
+        raise DataError(
+            f"the manifest's {GOAL!r} is damaged: {error.errors()[0]['msg']}",
+            where=str(Path(run) / FILE_NAME),
+            hint=DAMAGED_HINT,
+        ) from None
+    return goal
 
 
 def with_steps(config: RunConfig, steps: int) -> RunConfig:
