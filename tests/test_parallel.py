@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
+import typer
 from hypothesis import given
 from hypothesis import strategies as st
 from parallel_cases import CASES, STEPS, TRAINED, everything
 from ranks import finished, start_ranks
 
+from lidardesign.cli.ranks import refuse_ranks
+from lidardesign.density.learn import own_device
 from lidardesign.density.parallel import ALONE, Ranks
 from lidardesign.density.parallel_ranks import join_ranks
 from lidardesign.errors import ConfigError
@@ -92,3 +96,26 @@ def test_collectives_give_the_same_on_every_rank(together):
         for case in ("frames", "meshes"):
             assert "design points are not finite" in str(found[f"{case} not finite"])
         assert "rank 1 has other scenes than rank 0" in str(found["disagreement"])
+
+
+def test_commands_that_know_of_no_ranks_refuse_to_run_many_times_at_once(monkeypatch):
+    refuse_ranks("fit")
+    for name, value in {"TORCHELASTIC_RUN_ID": "none", "WORLD_SIZE": "2", "RANK": "0"}.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(ConfigError, match="fit does not run on several ranks"):
+        refuse_ranks("fit")
+    monkeypatch.setenv("RANK", "1")  # the first rank has said it
+    with pytest.raises(typer.Exit):
+        refuse_ranks("fit")
+    monkeypatch.setenv("WORLD_SIZE", "1")
+    refuse_ranks("fit")
+
+
+@pytest.mark.parametrize(("local_rank", "seen"), [(0, "cuda:0"), (1, "cuda:1")])
+def test_every_rank_takes_a_gpu_of_its_own_and_the_cpu_is_everyones(monkeypatch, local_rank, seen):
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    ranks = Ranks(local_rank, 3, local_rank)
+    assert str(own_device(torch.device("cuda"), ranks)) == seen
+    assert own_device(torch.device("cpu"), ranks) == torch.device("cpu")
+    with pytest.raises(ConfigError, match="rank 2 has no GPU of its own"):
+        own_device(torch.device("cuda"), Ranks(2, 3, 2))
