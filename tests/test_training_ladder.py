@@ -156,6 +156,14 @@ def test_goals_that_make_no_sense_are_config_errors(lidardesign, tmp_path, optio
     assert not (tmp_path / "run").exists()
 
 
+def test_a_file_that_sets_the_steps_beside_a_time_is_told_where(lidardesign, tmp_path):
+    (tmp_path / "other.yaml").write_text("learning:\n  steps: 30\n")
+    done = flatland(lidardesign, "run", "--time-budget", "60", "--config", "other.yaml")
+    assert done.code == 2
+    assert "other.yaml:2:10: the time decides learning.steps" in done.err
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_tolerance_that_is_missed_exits_1_with_what_was_reached_and_a_usable_run(lidardesign, tmp_path):
     done = flatland(lidardesign, "run", "--set", "learning.steps=8", "--tolerance", "1e-6", "--json")
     assert done.code == 1

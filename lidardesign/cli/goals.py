@@ -106,9 +106,21 @@ def checked_goal(
         raise ConfigError(f"{time_budget_s:g}", where=TIME_BUDGET, allowed="a number of seconds above 0")
     if STEPS_KEY in keys:
         raise ConfigError(f"the time decides {STEPS_KEY}", where=TIME_BUDGET, hint=f"leave out --set {STEPS_KEY}")
+    if given["config_file"] is not None:
+        _refuse_steps_in(given["config_file"])
     if ranks.size > 1:
         raise ConfigError("plans steps for one rank", where=TIME_BUDGET, hint=f"--set {STEPS_KEY}=N, or {TOLERANCE}")
     return Goal(None, time_budget_s)
+
+
+def _refuse_steps_in(path: Path) -> None:
+    """Refuse a configuration file that sets what the time decides."""
+    from lidardesign.run.yaml import leaves, load_yaml
+
+    document, key = load_yaml(path), tuple(STEPS_KEY.split("."))
+    if key in dict(leaves(document.value)):
+        where = f"{TIME_BUDGET}, {document.locate(key)}"
+        raise ConfigError(f"the time decides {STEPS_KEY}", where=where, hint=f"leave out {STEPS_KEY} there")
 
 
 def resumed_goal(asked: Goal, run: Path) -> Goal:

@@ -20,8 +20,8 @@ from lidardesign.evaluate.worker import preparation, question
 from lidardesign.registry import load_task
 
 ADDRESS = re.compile(r"tcp://(\[[0-9a-fA-F:]+\]|[^\s:/\[\]]+):(\d{1,5})")
-ALLOWED = "a whole number from 1, or tcp://HOST:PORT of a dask scheduler"
 MOST_PROCESSES = 1024
+ALLOWED = f"a whole number from 1 to {MOST_PROCESSES}, or tcp://HOST:PORT of a dask scheduler"
 MOST_PORT = 65_535
 
 
