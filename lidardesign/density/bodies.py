@@ -96,8 +96,13 @@ class Bodies:
         return np.stack([b[0] for b in bounds]), np.stack([b[1] for b in bounds])
 
     @cached_property
-    def groups(self) -> tuple[np.ndarray, np.ndarray]:
-        """Boxes around `GROUP_COLUMNS` neighbouring columns each, shape (groups, 3) [m]; empty groups are nowhere."""
+    def edges(self) -> np.ndarray:
+        """The low and then the high sides of the bounding boxes by axis, each beside its neighbours', shape (6, B)."""
+        return np.concatenate([self.low.T, self.high.T])
+
+    @cached_property
+    def group_edges(self) -> np.ndarray:
+        """As `edges`, of boxes around `GROUP_COLUMNS` neighbouring columns each [m]; empty groups are nowhere."""
         first = np.arange(0, self.columns, GROUP_COLUMNS)
         rows = self.starts[first]
         low = np.full((len(first), 3), np.inf)
@@ -106,7 +111,7 @@ class Bodies:
         if held.any():
             low[held] = np.minimum.reduceat(self.low, rows[held])
             high[held] = np.maximum.reduceat(self.high, rows[held])
-        return low, high
+        return np.concatenate([low.T, high.T])
 
     def take(self, columns: np.ndarray) -> Bodies:
         """The bodies of some columns, which become columns 0, 1, ... in this order."""

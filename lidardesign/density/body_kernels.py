@@ -110,56 +110,136 @@ def _distance(kinds, sizes, to_body, grid, values, grid_starts, counts, lows, st
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _outside_squared(low, high, b, points, n):  # noqa: ANN001, ANN202
-    """Squared distance of point n to box b, 0 inside."""
-    x = max(low[b, 0] - points[n, 0], points[n, 0] - high[b, 0], 0.0)
-    y = max(low[b, 1] - points[n, 1], points[n, 1] - high[b, 1], 0.0)
-    z = max(low[b, 2] - points[n, 2], points[n, 2] - high[b, 2], 0.0)
-    return x * x + y * y + z * z
+def _plain_distance(  # noqa: ANN202
+    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, points, n, q, gradient,  # noqa: ANN001
+):  # fmt: skip
+    """`_distance` without a gradient: primitives are written out, since calls and slices cost more than they do."""
+    kind = kinds[b]
+    if kind != SPHERE and kind != BOX and kind != CAPSULE and kind != PLANE:
+        return _distance(
+            kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, points, n, q, gradient
+        )
+    to_frame(to_body, b, points, n, q)
+    if kind == PLANE:
+        return q[2]
+    if kind == BOX:
+        x, y, z = abs(q[0]) - sizes[b, 0], abs(q[1]) - sizes[b, 1], abs(q[2]) - sizes[b, 2]
+        deepest = max(x, y, z)
+        if deepest <= 0.0:
+            return deepest
+        x, y, z = max(x, 0.0), max(y, 0.0), max(z, 0.0)
+        return math.sqrt(x * x + y * y + z * z)
+    above = q[2] - min(max(q[2], -sizes[b, 1]), sizes[b, 1]) if kind == CAPSULE else q[2]
+    return math.sqrt(q[0] * q[0] + q[1] * q[1] + above * above) - sizes[b, 0]
+
+
+# Boxes have no NaN; without it to care for, the three axes of many boxes are compared at once.
+BOXES = {"nnan", "nsz"}
+
+
+@njit(cache=True, nogil=True, fastmath=BOXES)
+def _outside_squared(edges, first, last, points, n, out) -> None:  # noqa: ANN001
+    """Squared distances of point n to boxes `first` to `last`, 0 inside; edges (6, B) are low and then high sides."""
+    x, y, z = points[n, 0], points[n, 1], points[n, 2]
+    for b in range(first, last):
+        along = max(max(edges[0, b] - x, x - edges[3, b]), 0.0)
+        across = max(max(edges[1, b] - y, y - edges[4, b]), 0.0)
+        above = max(max(edges[2, b] - z, z - edges[5, b]), 0.0)
+        out[b] = along * along + across * across + above * above
+
+
+@njit(cache=True, nogil=True, fastmath=BOXES | {"reassoc"})
+def _least(reach, first, last):  # noqa: ANN001, ANN202
+    least = reach[first]
+    for b in range(first + 1, last):
+        least = min(least, reach[b])
+    return least
+
+
+@njit(cache=True, nogil=True, fastmath=BOXES)
+def _within(reach, first, last, limit):  # noqa: ANN001, ANN202
+    """How many of some bodies a point is in the box of, or nearer to it than the root of `limit`."""
+    count = 0
+    for b in range(first, last):
+        count += 1 if reach[b] < limit or reach[b] == 0.0 else 0
+    return count
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _column_distance(  # noqa: ANN202
     kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps,  # noqa: ANN001
-    low, high, first, last, points, n, reach, q, gradient,  # noqa: ANN001
+    first, last, points, n, reach, q, gradient,  # noqa: ANN001
 ):  # fmt: skip
-    """Distance of the nearest of some bodies to point n, and which it is; `reach` (B,) is scratch.
+    """Distance of the nearest of some bodies to point n, and which it is; `reach` (B,) tells how far their boxes are.
 
     The body whose box is nearest goes first; after it hardly any other has to be evaluated.
     """
-    distance, body = np.inf, -1
-    leader, least = first, np.inf
+    if first == last:
+        return np.inf, -1
+    if last == first + 1:
+        return _plain_distance(
+            kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, first, points, n, q, gradient
+        ), first
+    leader, least = first, _least(reach, first, last)
+    while reach[leader] > least:
+        leader += 1
+    distance = _plain_distance(
+        kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, leader, points, n, q, gradient
+    )
+    body, limit = leader, max(distance, 0.0) * max(distance, 0.0)
+    # counting takes all at once, and mostly finds the leader alone
+    if _within(reach, first, last, limit) == (1 if least < limit or least == 0.0 else 0):
+        return distance, body
     for b in range(first, last):
-        reach[b] = _outside_squared(low, high, b, points, n)
-        if reach[b] < least:
-            leader, least = b, reach[b]
-    for turn in range(first - 1, last):
-        b = leader if turn < first else turn
-        if turn == leader or (reach[b] > 0.0 and (distance <= 0.0 or reach[b] >= distance * distance)):
+        if (reach[b] >= limit and reach[b] > 0.0) or b == leader:
             continue
-        value = _distance(
+        value = _plain_distance(
             kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, points, n, q, gradient
         )
         if value < distance:
-            distance, body = value, b
+            distance, body, limit = value, b, max(value, 0.0) * max(value, 0.0)
     return distance, body
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _most_promising(group_low, group_high, group_weights, precision, points, n, hopes):  # noqa: ANN001, ANN202
+def _most_promising(group_edges, group_weights, precision, points, n, hopes):  # noqa: ANN001, ANN202
     """What each group could come to at point n at best, into `hopes`; which group hopes for most."""
-    leader, highest = 0, -np.inf
+    _outside_squared(group_edges, 0, hopes.shape[0], points, n, hopes)
+    leader = 0
     for g in range(hopes.shape[0]):
-        hopes[g] = group_weights[g] - 0.5 * precision * _outside_squared(group_low, group_high, g, points, n)
-        if hopes[g] > highest:
-            leader, highest = g, hopes[g]
+        hopes[g] = group_weights[g] - 0.5 * precision * hopes[g]
+        if hopes[g] > hopes[leader]:
+            leader = g
     return leader
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _add_near(  # noqa: ANN202
+    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, starts, first, last,  # noqa: ANN001
+    points, n, log_weights, precision, tolerance, reach, q, gradient, best, kept, seen, found, nearest,  # noqa: ANN001
+):  # fmt: skip
+    """Append those of columns `first` to `last` that are not yet too far off; the best term and the number by then."""
+    for c in range(first, last):
+        alone = starts[c + 1] == starts[c] + 1
+        if alone and log_weights[c] - 0.5 * precision * reach[starts[c]] < best - tolerance:
+            continue
+        distance, body = _column_distance(
+            kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps,
+            starts[c], starts[c + 1], points, n, reach, q, gradient,
+        )  # fmt: skip
+        term = log_weights[c] - 0.5 * precision * distance * distance
+        if term < best - tolerance:
+            continue
+        best = max(best, term)
+        seen[kept], found[kept], nearest[kept] = c, distance, body
+        kept += 1
+    return best, kept
 
 
 @njit(cache=True, nogil=True)
 def near_columns(  # noqa: ANN201
     kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps,  # noqa: ANN001
-    low, high, starts, group_low, group_high, group_columns,  # noqa: ANN001
+    edges, starts, group_edges, group_columns,  # noqa: ANN001
     points, log_weights, group_weights, precision, tolerance,  # noqa: ANN001
     row_starts, columns, distances, bodies,  # noqa: ANN001
 ):  # fmt: skip
@@ -169,7 +249,8 @@ def near_columns(  # noqa: ANN201
     together), then of columns; only columns that could matter are evaluated, each by its nearest body.
 
     Arguments:
-        group_low, group_high: Boxes around `group_columns` columns each.
+        edges: World bounding boxes of the bodies, low sides and high sides by axis, shape (6, B).
+        group_edges: The same of boxes around `group_columns` columns each.
         points: Shape (N, 3).
         log_weights, group_weights: Per column, and the largest of each group.
         precision: 1 / sigma^2 [1/m^2].
@@ -180,35 +261,26 @@ def near_columns(  # noqa: ANN201
     Returns:
         The number of pairs; where it is above the room, the lists are cut off and the call has to be repeated.
     """
-    count, groups, room = starts.shape[0] - 1, group_low.shape[0], columns.shape[0]
+    count, groups, room = starts.shape[0] - 1, group_edges.shape[1], columns.shape[0]
     q, gradient = np.zeros(3), np.zeros(3)
     hopes, reach = np.empty(groups), np.empty(kinds.shape[0])
     found, nearest, seen = np.empty(count), np.empty(count, np.int64), np.empty(count, np.int64)
     total = 0
     for n in range(points.shape[0]):
         row_starts[n] = total
-        leader = _most_promising(group_low, group_high, group_weights, precision, points, n, hopes)
+        leader = _most_promising(group_edges, group_weights, precision, points, n, hopes)
         best, kept = -np.inf, 0
         for turn in range(groups):
             # the most promising group first: it tells how much the others may miss
             g = leader if turn == 0 else (0 if turn == leader else turn)
             if hopes[g] < best - tolerance:
                 continue
-            for c in range(g * group_columns, min((g + 1) * group_columns, count)):
-                if starts[c + 1] == starts[c] + 1:
-                    squared = _outside_squared(low, high, starts[c], points, n)
-                    if log_weights[c] - 0.5 * precision * squared < best - tolerance:
-                        continue
-                distance, body = _column_distance(
-                    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps,
-                    low, high, starts[c], starts[c + 1], points, n, reach, q, gradient,
-                )  # fmt: skip
-                term = log_weights[c] - 0.5 * precision * distance * distance
-                if term < best - tolerance:
-                    continue
-                best = max(best, term)
-                seen[kept], found[kept], nearest[kept] = c, distance, body
-                kept += 1
+            first, last = g * group_columns, min((g + 1) * group_columns, count)
+            _outside_squared(edges, starts[first], starts[last], points, n, reach)
+            best, kept = _add_near(
+                kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, starts, first, last,
+                points, n, log_weights, precision, tolerance, reach, q, gradient, best, kept, seen, found, nearest,
+            )  # fmt: skip
         for k in range(kept):
             if log_weights[seen[k]] - 0.5 * precision * found[k] * found[k] < best - tolerance:
                 continue

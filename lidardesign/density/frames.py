@@ -128,7 +128,7 @@ def near_pairs(
         columns, nearest = np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int64)
         distances = np.empty(room)
         count = body_kernels.near_columns(
-            *bodies.shapes, bodies.low, bodies.high, bodies.starts, *bodies.groups, GROUP_COLUMNS,
+            *bodies.shapes, bodies.edges, bodies.starts, bodies.group_edges, GROUP_COLUMNS,
             points, log_weights, group_weights, 1.0 / sigma_m**2, tolerance_nats,
             row_starts, columns, distances, nearest,
         )  # fmt: skip
