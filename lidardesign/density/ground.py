@@ -86,6 +86,11 @@ def _pool(target: Target, scenes: Sequence[Scene], config: RunConfig) -> Pool:
 
 
 def refuse_blind_receiver(scenes: Sequence[Scene], points: np.ndarray) -> None:
+    """Refuse scenes whose fixed receiver sees nothing that is lit: none of the points observed by rays (N, 6).
+
+    Raises:
+        DataError: So it is.
+    """
     receiver = common_receiver(scenes)
     reached = points[:, :3] + points[:, RANGE, None] * direction(points[:, AZIMUTH], points[:, ELEVATION])
     if receiver is not None and not in_view(receiver, reached).any():
