@@ -21,11 +21,11 @@ import numpy as np
 from lidardesign.density.fields import Field
 from lidardesign.density.frames import FramesTarget
 from lidardesign.density.parallel import ALONE, Ranks
-from lidardesign.density.receiver import common_receiver
+from lidardesign.density.receiver import HeardVisibility, common_receiver
 from lidardesign.density.refinement import refine_quadrature
 from lidardesign.density.settings import DensitySettings
 from lidardesign.density.target import Target, build_target, is_of_frames
-from lidardesign.density.visibility import Optics
+from lidardesign.density.visibility import Optics, Quadrature, Visibility
 from lidardesign.errors import NumericalError
 from lidardesign.scene import Scene
 from lidardesign.space import DesignSpace
@@ -192,15 +192,26 @@ def build_shared_target(
     return _shared(part, mine, owned, log_weights, columns, ranks)
 
 
+def _with_thickest_shell(visibility: Visibility, ranks: Ranks) -> Visibility:
+    """A quadrature whose margin clears the open surfaces of all ranks; other ways have no margin of the kind."""
+    if isinstance(visibility, HeardVisibility):
+        return HeardVisibility(_with_thickest_shell(visibility.one_way, ranks), visibility.receiver)
+    if not isinstance(visibility, Quadrature):
+        return visibility
+    thickest_m = float(ranks.max(np.array([visibility.thickest_m]))[0])
+    return Quadrature(visibility.field, visibility.points, thickest_m)
+
+
 def _shared(
     part: Target, scenes: tuple[Scene, ...], owned: np.ndarray, log_weights: np.ndarray, columns: int, ranks: Ranks
 ) -> SharedTarget:
     common = {"optics": part.optics, "space": part.space, "surface_tolerance_nats": part.surface_tolerance_nats}
     weights = _weights(log_weights, owned, part.columns)
-    own = OwnColumns(part.field, part.visibility, weights, ranks=ranks, **common)
+    visibility = _with_thickest_shell(part.visibility, ranks)
+    own = OwnColumns(part.field, visibility, weights, ranks=ranks, **common)
     order, shell_m = ranks.gather(owned), np.zeros(columns)
     shell_m[order] = ranks.gather(part.field.shell_m[: len(owned)])
     return SharedTarget(
-        GatheredField(part.field, columns, owned, order, shell_m, ranks), part.visibility, log_weights,
+        GatheredField(part.field, columns, owned, order, shell_m, ranks), visibility, log_weights,
         own=own, owned=owned, scenes=scenes, rows=_fewest(part.rows_at_once, ranks), ranks=ranks, **common,
     )  # fmt: skip

@@ -45,7 +45,7 @@ def refine_quadrature(
         return target, []
     first, passed = visibility.points, _passed(visibility, rays, hidden, target)
     while visibility.points < MAXIMUM_POINTS:
-        finer = Quadrature(visibility.field, 2 * visibility.points)
+        finer = Quadrature(visibility.field, 2 * visibility.points, visibility.thickest_m)
         passed_finer = _passed(finer, rays, hidden, target)
         # seen through, or not opaque only because midpoints are too few
         coarse = (passed > TRANSPARENT) | ((passed > OPAQUE) & (passed_finer <= OPAQUE))

@@ -237,13 +237,14 @@ class Quadrature:
     Arguments:
         field: Distances of the occluders.
         points: Midpoints per ray; what is thinner than range / points can be missed.
+        thickest_m: The thickest shell elsewhere, where this field has a part of the scenes only [m].
     """
 
     name = "quadrature"
 
-    def __init__(self, field: Field, points: int) -> None:
+    def __init__(self, field: Field, points: int, thickest_m: float = 0.0) -> None:
         self.field, self.points = field, points
-        self._shell_m = float(field.shell_m.max(initial=0.0))
+        self.thickest_m = self._shell_m = float(field.shell_m.max(initial=thickest_m))
         if isinstance(field, TableField):
             from lidardesign.density import kernels
 
