@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lidardesign.density.receiver import HeardVisibility
+from lidardesign.density.refinement import refine_quadrature
 from lidardesign.density.settings import DensitySettings
 from lidardesign.density.target import build_target
 from lidardesign.density.visibility import NoVisibility
@@ -69,6 +70,16 @@ def test_the_gradient_agrees_with_differences(visibility):
         # a column more or less within the tolerance, or a silhouette, moves single points
         close = np.isclose(gradient[:, axis], numeric, rtol=2e-3, atol=2e-2)
         assert close.mean() > 0.95
+
+
+def test_too_few_midpoints_are_refined_also_where_a_receiver_listens():
+    scenes = balls(looking(), plate((0.8, 0.0, 0.0), half=(0.02, 0.5, 0.5)))
+    few = DensitySettings(sigma_m=SETTINGS.sigma_m, quadrature_points=4)
+    coarse = build_target(scenes, SPACE, few, "quadrature")
+    finer, notes = refine_quadrature(coarse, scenes, points_near())
+    assert isinstance(finer.visibility, HeardVisibility)
+    assert finer.visibility.one_way.points > 4
+    assert "refined from 4" in notes[0]
 
 
 def test_a_point_in_full_view_keeps_its_density_and_one_behind_a_plate_loses_it():

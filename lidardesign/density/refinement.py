@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from lidardesign.density.receiver import HeardVisibility
 from lidardesign.density.target import Target
 from lidardesign.density.visibility import Quadrature, RayBatch, Raycast
 from lidardesign.scene import Scene
@@ -40,7 +41,8 @@ def refine_quadrature(
     active = np.ones((len(probes), target.field.columns), dtype=bool)
     exact = Raycast(scenes).transmittance(rays, active, target.optics, differentiable=False).log_values
     hidden = exact < np.log(OPAQUE)
-    visibility, reach = target.visibility, float(probes[:, RANGE].max(initial=0.0))
+    heard = target.visibility if isinstance(target.visibility, HeardVisibility) else None
+    visibility, reach = heard.one_way if heard else target.visibility, float(probes[:, RANGE].max(initial=0.0))
     if not mean(hidden):
         return target, []
     first, passed = visibility.points, _passed(visibility, rays, hidden, target)
@@ -63,7 +65,7 @@ def refine_quadrature(
             f"visibility quadrature still sees through {missed:.1%} of the hidden rays: it resolves occluders "
             f"thicker than {thickness_m:.2g} m; use density.visibility=raycast"
         )
-    return replace(target, visibility=visibility), notes
+    return replace(target, visibility=HeardVisibility(visibility, heard.receiver) if heard else visibility), notes
 
 
 def _passed(visibility: Quadrature, rays: RayBatch, hidden: np.ndarray, target: Target) -> np.ndarray:
