@@ -12,6 +12,7 @@ import torch
 
 from lidardesign.density import learn as learning
 from lidardesign.density import training
+from lidardesign.density.ground import prepare_ground
 from lidardesign.density.learn import learn
 from lidardesign.density.measure import log_density_of
 from lidardesign.density.prepare import prepare_target
@@ -121,6 +122,37 @@ def test_a_resume_after_steps_were_skipped_is_bit_identical_too(tmp_path, monkey
     calls["n"] = 50  # the resumed run starts at the snapshot of step 50
     learn(BallTask(), config_of(), tmp_path / "resumed", resume=True)
     assert result_bytes(tmp_path / "resumed") == result_bytes(tmp_path / "straight")
+
+
+def a_trainer(run):
+    config = config_of()
+    return learning.make_trainer(prepare_ground(BallTask(), config), config, run, torch.device("cpu"))
+
+
+def test_weights_taken_back_to_the_start_forget_the_moments_of_later_steps(tmp_path):
+    trainer = a_trainer(tmp_path)
+    start = trainer._state_arrays()
+    trainer._advance()
+    assert len(trainer._state_arrays()) > len(start)
+    trainer._restore_arrays(start, with_generator=True)
+    taken_back = trainer._state_arrays()
+    assert taken_back.keys() == start.keys()
+    for name, value in start.items():
+        np.testing.assert_array_equal(taken_back[name], value)
+
+
+@pytest.mark.filterwarnings("ignore:for .* copying from a non-meta parameter")
+def test_all_of_the_optimisers_state_comes_back_on_the_device_of_its_parameter(tmp_path):
+    trainer = a_trainer(tmp_path)
+    trainer._advance()
+    arrays = trainer._state_arrays()
+    # no values, but a device that is not the CPU on every computer
+    trainer.flow.to("meta")
+    trainer.optimiser.state.clear()
+    trainer._restore_arrays(arrays)
+    kept = [value for state in trainer.optimiser.state.values() for value in state.values()]
+    assert kept
+    assert {value.device.type for value in kept} == {"meta"}
 
 
 def test_resuming_a_finished_run_changes_nothing(finished, tmp_path):

@@ -261,9 +261,7 @@ class Trainer:
         for index, parameter in enumerate(self.flow.parameters()):
             start = f"adam.{index}."
             found = {key[len(start) :]: torch.as_tensor(v) for key, v in arrays.items() if key.startswith(start)}
-            if found:
-                state = {k: v.clone() if k == "step" else v.clone().to(parameter) for k, v in found.items()}
-                self.optimiser.state[parameter] = state
+            self.optimiser.state[parameter] = {name: _moved(name, value, parameter) for name, value in found.items()}
         if with_generator:
             self.generator.set_state(torch.as_tensor(arrays["generator"]))
 
@@ -298,6 +296,11 @@ class Trainer:
         if path.exists():
             kept = [line for line in path.read_text(encoding="utf-8").splitlines() if _step_of(line) <= self.step]
             path.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+
+
+def _moved(name: str, value: torch.Tensor, parameter: torch.Tensor) -> torch.Tensor:
+    """A copy of a part of a parameter's optimiser state beside it: fused steps are counted on its device as well."""
+    return value.to(parameter.device, value.dtype if name == "step" else parameter.dtype, copy=True)
 
 
 def _step_of(line: str) -> float:
