@@ -110,3 +110,27 @@ def test_timing_steps_and_the_end_leaves_the_trainer_as_it_was(tmp_path):
     assert before.keys() == after.keys()
     for key, value in before.items():
         np.testing.assert_array_equal(value, after[key], err_msg=key)
+
+
+def test_what_is_only_compiled_once_is_not_planned_for_every_point(tmp_path, monkeypatch):
+    config = config_of(samples=100_000)
+    ground = prepare_ground(BallTask(), config)
+    trainer = make_trainer(ground, config, tmp_path, CPU)
+    seconds = [0.0]
+    monkeypatch.setattr(budget.time, "perf_counter", lambda: seconds[0])
+
+    def compiling(name):
+        exact, called = getattr(budget, name), []
+
+        def slow_at_first(*arguments):
+            seconds[0] += 0.001 if called else 5.0
+            called.append(name)
+            return exact(*arguments)
+
+        monkeypatch.setattr(budget, name, slow_at_first)
+
+    compiling("draw_samples")
+    compiling("log_density_of")
+    points_per_s = 1000 * budget.TIMED_POINTS
+    planned_s = budget._finishing_s(trainer, ground, config)
+    assert planned_s == pytest.approx(100_000 / points_per_s + 0.001 + budget.WRITING_S)

@@ -38,6 +38,7 @@ LEAST_STEPS = 100
 RESERVE = 0.1
 TIMED_STEPS = 6
 TIMED_POINTS = 2048
+WARMING_POINTS = 2
 # Writing the flow and the samples, printing the result, and ending the process.
 WRITING_S = 2.0
 
@@ -164,6 +165,9 @@ def _finishing_s(trainer: Trainer, ground: Ground, config: RunConfig) -> float:
     generator = random_generator(config.seed, "time budget")
     few = min(TIMED_POINTS, settings.coverage_proposals)
     probes, drawing = _timed(lambda: draw_probes(ground.target, ground.scenes, few, generator))
+    # the first calls in double precision may have to compile
+    draw_samples(trainer, WARMING_POINTS)
+    log_density_of(trainer, probes.points[:WARMING_POINTS])
     _, sampling = _timed(lambda: draw_samples(trainer, TIMED_POINTS))
     _, inverting = _timed(lambda: log_density_of(trainer, probes.points)) if len(probes.points) else (None, 0.0)
     trainer.flow.to(dtype)
