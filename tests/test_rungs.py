@@ -38,6 +38,13 @@ def test_what_the_run_does_stays_where_nothing_is_cheaper_by_more_than_can_be_to
     assert slower.chosen.setting == "b"
 
 
+def test_an_error_that_is_not_known_to_be_inside_the_tolerance_is_not():
+    found = ladder(rung("a", 0.05, 1.0, uncertainty=0.2), rung("b", 0.05, 2.0, uncertainty=0.01))
+    assert found.chosen.setting == "b"
+    unsure = ladder(rung("a", 0.05, 1.0, uncertainty=0.2, default=True), rung("b", 0.05, 2.0))
+    assert "may be outside" in unsure.verdict
+
+
 def test_outside_the_tolerance_the_most_accurate_is_closest():
     found = ladder(rung("a", 0.5, 1.0), rung("b", 0.3, 2.0, default=True))
     assert found.chosen.setting == "b"

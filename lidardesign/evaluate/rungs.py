@@ -82,12 +82,12 @@ class Ladder:
 
     @property
     def chosen(self) -> Rung:
-        """The cheapest rung inside the tolerance; of rungs that cost the same, the most accurate one.
+        """The cheapest rung inside the tolerance, uncertainty included; of rungs that cost the same, the most accurate.
 
         What the run does already stays where it is inside the tolerance and nothing there is cheaper by more than can
         be told. Where no rung is inside the tolerance, the most accurate one.
         """
-        inside = [rung for rung in self.rungs if rung.error <= self.tolerance]
+        inside = [rung for rung in self.rungs if rung.error + rung.uncertainty <= self.tolerance]
         if not inside:
             return min(self.rungs, key=lambda rung: (rung.error, rung.seconds))
         least = min(rung.seconds for rung in inside)
@@ -113,15 +113,15 @@ class Ladder:
     def verdict(self) -> str:
         """How the chosen rung compares with the run's own setting, in one line."""
         chosen, default = self.chosen, self.default
-        if chosen.error > self.tolerance:
+        if chosen.error + chosen.uncertainty > self.tolerance:
             return f"no setting is within {self.tolerance:g} {self.unit}".rstrip() + f"; {chosen.setting} is closest"
         if default is None:
             return f"{chosen.setting} suffices"
         if chosen is default:
             return f"{chosen.setting}, the setting of this run, is the one to choose"
         ratio = default.seconds / max(chosen.seconds, 1e-12)
-        if default.error > self.tolerance:
-            return f"{chosen.setting} is needed: {default.setting}, the setting of this run, is outside the tolerance"
+        if default.error + default.uncertainty > self.tolerance:
+            return f"{chosen.setting} is needed: {default.setting}, as this run has it, may be outside the tolerance"
         if ratio <= SAME_COST:
             return f"{chosen.setting} costs the same as {default.setting}, the setting of this run, and errs less"
         return f"{chosen.setting} suffices, {ratio:.2g} times cheaper than {default.setting}, the setting of this run"
