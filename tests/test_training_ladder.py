@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -16,13 +17,15 @@ from lidardesign.density.stages import Stage, ToleranceGoal
 from lidardesign.design.fit import fit
 from lidardesign.design.samples import load_samples
 from lidardesign.errors import DataError
-from lidardesign.evaluate.accuracy import AccuracyRequest
+from lidardesign.evaluate import accuracy, score
+from lidardesign.evaluate.accuracy import Accuracy, AccuracyRequest
 from lidardesign.evaluate.ladders import training
 from lidardesign.evaluate.ladders.probes import run_target
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.registry import load_task
+from lidardesign.run.checkpoint import save_arrays
 from lidardesign.run.config import load_run_config, resolve, save_run_config
-from lidardesign.run.manifest import note, start_manifest
+from lidardesign.run.manifest import note, read_manifest, start_manifest
 from lidardesign.task import random_generator, scenes_of
 
 SMALL = (
@@ -126,6 +129,51 @@ def test_stages_of_a_tolerance_are_a_ladder_of_their_own(runs, tmp_path, ladders
     found = training._stages_ladder(request)
     assert [(rung.setting, rung.error) for rung in found[0].rungs] == [("32", 0.6), ("64", 0.3)]
     assert "tolerance of 0.4" in found[0].note
+
+
+def test_runs_beside_this_one_that_cannot_be_measured_are_left_out(runs, tmp_path, ladders):
+    place = tmp_path / "runs"
+    shutil.copytree(runs.parent, place)
+    manifest = read_manifest(place / "longer")
+    note(place / "longer", learn=None)
+    assert [ladder.knob for ladder in training.ladders(request_for(place / "mine"))] == ["learning.steps"]
+    note(place / "longer", learn=manifest["learn"])
+    weights = {"weights": np.zeros(3)}
+    save_arrays(place / "longer", "flow.safetensors", weights, {})
+    assert [ladder.knob for ladder in training.ladders(request_for(place / "mine"))] == ["learning.steps"]
+
+
+@pytest.fixture
+def fitted(runs, lidardesign, tmp_path):
+    """A copy of a run, with a design, in the current folder."""
+    shutil.copytree(runs, tmp_path / "run")
+    assert lidardesign("fit", "run", "--sensors", "1", "--name", "one").code == 0
+    return tmp_path / "run"
+
+
+@pytest.mark.parametrize("name", ["flow.safetensors", "progress.jsonl", "snapshots/step-000040.safetensors"])
+def test_accuracy_of_a_damaged_run_is_refused_before_anything_is_evaluated(fitted, lidardesign, name, monkeypatch):
+    monkeypatch.setattr(score, "evaluate", lambda *_, **__: pytest.fail("was evaluated"))
+    (fitted / name).write_bytes(b"{")
+    done = lidardesign("evaluate", "run", "--accuracy", "--json")
+    assert done.code == 3
+    assert name in done.json["error"]["where"]
+    (fitted / name).unlink()
+    assert "missing" in lidardesign("evaluate", "run", "--accuracy", "--json").json["error"]["message"]
+
+
+@pytest.mark.parametrize("judged", [("--seed", "7"), ("--set", "train=2")])
+def test_ladders_are_those_of_the_scenes_that_were_learned_whatever_designs_are_judged_by(
+    fitted, lidardesign, judged, monkeypatch
+):
+    asked = []
+    monkeypatch.setattr(accuracy, "measure_accuracy", lambda request, **_: asked.append(request) or Accuracy([], {}))
+    for options in ((), judged):
+        assert lidardesign("evaluate", "run", "--rays", "12", "--accuracy", *options).code == 0
+    own, other = asked
+    assert other.config == own.config
+    poses = [[body.poses.tolist() for scene in one.request.train for body in scene.bodies] for one in asked]
+    assert poses[0] == poses[1]
 
 
 @pytest.fixture

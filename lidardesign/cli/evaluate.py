@@ -140,7 +140,9 @@ def evaluate(
         _check_baselines(baseline or [])
         planner, audit = planner_of(effects, detector, range_tolerance_mm, return_tolerance)
         entries, runs = _collect(targets)
-        run = _common_run(_named_apart(entries), runs)
+        run = learned = _common_run(_named_apart(entries), runs)
+        if accuracy:
+            _check_measurable(learned)
         if overrides:
             run = replace(run, config=judged_by(run.task, run.config, overrides))
         if range_tolerance_mm is None:
@@ -148,7 +150,7 @@ def evaluate(
         request = replace(_request(run, entries, rays, baseline or [], seed), planner=planner, audit=audit)
         evaluation = _evaluate_with(wanted, request, console)
         if accuracy:
-            evaluation = _with_accuracy(evaluation, request, run, console)
+            evaluation = _with_accuracy(evaluation, request, learned, console)
         written = _write_files(evaluation, request, report, plots, csv)
         document = {**evaluation.as_dict(), "set": overrides or [], "files": [str(path) for path in written]}
         keep_times(run.folder, "evaluate", console)
@@ -296,7 +298,18 @@ def _evaluate(request: EvaluationRequest, console: Console) -> Evaluation:
         return score(request, progress=show)
 
 
+def _check_measurable(run: Run) -> None:
+    """Refuse a run that is unfinished or damaged before it is evaluated, which may take minutes."""
+    with phase("libraries"):
+        from lidardesign.density.ladder import check_kept
+
+    check_kept(run.folder)
+
+
 def _with_accuracy(evaluation: Evaluation, request: EvaluationRequest, run: Run, console: Console) -> Evaluation:
+    """The evaluation with the ladders of the run, whose density is that of its own scenes, whatever it is judged by."""
+    if (request.config, request.seed) != (run.config.task, run.config.seed):
+        request = replace(request, train=run.scenes("train", run.config.seed))
     with phase("accuracy"), console.progress("ladder") as bar:
         from lidardesign.evaluate.accuracy import AccuracyRequest, measure_accuracy
 

@@ -64,6 +64,16 @@ class Reached:
         return Estimate((own.value + self.twin.value) / 2, math.hypot(error, (own.value - self.twin.value) / 2))
 
 
+def check_kept(run: Path) -> None:
+    """Check all that a run is measured anew by: its flow, its snapshots and its progress.
+
+    Raises:
+        DataError: The run is unfinished or damaged.
+    """
+    for name in (FLOW, PROGRESS, *kept_snapshots(run).values()):
+        verify(run, name)
+
+
 def remeasured(run: Path, config: RunConfig, target: Target, probes: Probes, *, count: int, seed: int) -> list[Reached]:
     """The figures of every snapshot of a run and of its flow, in the order of steps.
 

@@ -61,10 +61,7 @@ def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
     probes = draw_probes(target, list(request.request.train), PROBES, generator)
     reached = remeasured(request.run, request.config, target, probes, count=SAMPLES, seed=seed)
     found = [_steps_ladder(request, reached), *_stages_ladder(request)]
-    others = _presets(request)
-    if others:
-        found.append(_preset_ladder(request, others, reached[-1], target, probes))
-    return found
+    return [*found, *_preset_ladder(request, reached[-1], target, probes)]
 
 
 def _steps_ladder(request: AccuracyRequest, reached: Sequence[Reached]) -> Ladder:
@@ -96,21 +93,27 @@ def _stages_ladder(request: AccuracyRequest) -> Sequence[Ladder]:
     return [_ladder("learning.steps, each anew", "learning and measuring", rungs, note)]
 
 
-def _preset_ladder(
-    request: AccuracyRequest,
-    others: Sequence[tuple[Path, RunConfig]],
-    own: Reached,
-    target: Target,
-    probes: Probes,
-) -> Ladder:
-    """Runs of other presets against the same target, in the order of effort."""
-    rungs = [_rung(request.config.preset, own.estimates, _seconds(request.run), {}, default=True)]
-    for run, config in others:
-        learned = load_flow(run, FLOW, config, target, request.config.seed)
-        found = measure(learned, probes, SAMPLES)
-        rungs.append(_rung(config.preset, found.estimates, _seconds(run), {}, default=False))
+def _preset_ladder(request: AccuracyRequest, own: Reached, target: Target, probes: Probes) -> Sequence[Ladder]:
+    """Runs of other presets against the same target, in the order of effort; empty where none lies beside this one."""
+    config, seconds = request.config, _seconds(request.run)
+    beside = [_rung_beside(run, other, target, probes, config.seed) for run, other in _presets(request)]
+    rungs = [rung for rung in beside if rung is not None]
+    if not rungs or seconds is None:
+        return []
+    rungs.append(_rung(config.preset, own.estimates, seconds, {}, default=True))
     rungs.sort(key=lambda rung: PRESETS.index(rung.setting))
-    return _ladder("preset", "the whole of learn", rungs, PRESET_NOTE)
+    return [_ladder("preset", "the whole of learn", rungs, PRESET_NOTE)]
+
+
+def _rung_beside(run: Path, config: RunConfig, target: Target, probes: Probes, seed: int) -> Rung | None:
+    """Another run; None where it cannot be measured: this run's figures do not depend on what lies beside it."""
+    try:
+        seconds, learned = _seconds(run), load_flow(run, FLOW, config, target, seed)
+    except LidardesignError:
+        return None
+    if seconds is None:
+        return None
+    return _rung(config.preset, measure(learned, probes, SAMPLES).estimates, seconds, {}, default=False)
 
 
 def _presets(request: AccuracyRequest) -> list[tuple[Path, RunConfig]]:
@@ -138,8 +141,10 @@ def _config_of(folder: Path) -> RunConfig | None:
         return None
 
 
-def _seconds(run: Path) -> float:
-    return float(read_manifest(run)["learn"]["seconds"])
+def _seconds(run: Path) -> float | None:
+    """What the whole of learn took [s]; None where the manifest has no word of it."""
+    found = (read_manifest(run).get("learn") or {}).get("seconds")
+    return float(found) if isinstance(found, float | int) else None
 
 
 def _rung(
