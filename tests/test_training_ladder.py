@@ -10,10 +10,12 @@ import pytest
 from command_line import caller
 
 from lidardesign.density import budget
+from lidardesign.density import learn as learning
 from lidardesign.density.ladder import load_flow, remeasured, seconds_at
 from lidardesign.density.learn import learn
 from lidardesign.density.measure import draw_probes
 from lidardesign.density.stages import Stage, ToleranceGoal
+from lidardesign.density.training import Trainer
 from lidardesign.design.fit import fit
 from lidardesign.design.samples import load_samples
 from lidardesign.errors import DataError
@@ -234,6 +236,31 @@ def test_a_tolerance_that_is_met_stops_there_and_resuming_changes_nothing(lidard
     before = (tmp_path / "run" / "flow.safetensors").read_bytes()
     assert lidardesign("learn", "flatland", "--out", "run", "--resume").code == 0
     assert (tmp_path / "run" / "flow.safetensors").read_bytes() == before
+
+
+def test_an_interruption_between_stages_keeps_what_the_finished_ones_reached(lidardesign, tmp_path, monkeypatch):
+    made, make_trainer = [], learning.make_trainer
+
+    def interrupted(*arguments):
+        made.append(make_trainer(*arguments))
+        if len(made) == 2:
+            raise KeyboardInterrupt
+        return made[-1]
+
+    monkeypatch.setattr(learning, "make_trainer", interrupted)
+    done = flatland(lidardesign, "run", "--set", "learning.steps=16", "--tolerance", "1e-6")
+    assert done.code == 130
+    assert "keeps what the finished stages reached" in done.err
+    done = lidardesign("learn", "flatland", "--out", "run", "--resume", "--json")
+    assert [stage["steps"] for stage in done.json["goal"]["stages"]][:3] == [2, 4, 8]
+    assert len(made) == 1 + len(done.json["goal"]["stages"])
+
+
+def test_a_failure_before_the_first_checkpoint_leaves_nothing_behind(lidardesign, tmp_path, monkeypatch):
+    monkeypatch.setattr(Trainer, "_save", lambda *_: (tmp_path / "missing" / "file").read_text())
+    done = flatland(lidardesign, "run", "--set", "learning.steps=16")
+    assert done.code == 3
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_time_budget_writes_its_steps_into_the_configuration(lidardesign, tmp_path, monkeypatch):

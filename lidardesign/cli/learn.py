@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
     from lidardesign.task import Task
 
 DEVICES = ("auto", "cpu", "cuda")
-STARTED_FILES = {"config.yaml", "manifest.json", "progress.jsonl", ".lock"}
+# Snapshots are of no use without a checkpoint.
+STARTED_FILES = {"config.yaml", "manifest.json", "progress.jsonl", "snapshots", ".lock"}
 CHECKPOINTS = "checkpoint*"
 # Below these a density is too rough for figures that are meant seriously.
 LOW_ESS = 0.1
@@ -177,23 +179,34 @@ def _undone_on_failure(run: Path) -> Iterator[None]:
 def _take_away(run: Path, made: list[Path], started_empty: bool) -> None:
     entries = list(run.iterdir())
     nothing_learned = all(entry.name in STARTED_FILES or entry.stat().st_size == 0 for entry in entries)
-    if not started_empty or not nothing_learned:
+    if not started_empty or not nothing_learned or _has_stages(run):
         return
     with contextlib.suppress(OSError):
         for entry in entries:
-            entry.unlink()
+            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
         for folder in made:
             folder.rmdir()
 
 
+def _has_stages(run: Path) -> bool:
+    """Whether trainings were finished on the way to a tolerance: what they reached is worth going on from."""
+    from lidardesign.run.manifest import read_manifest
+
+    try:
+        return bool((read_manifest(run).get(GOAL) or {}).get("stages"))
+    except DataError:
+        return False
+
+
 def _interruption(task: str, run: Path) -> str | None:
     checkpoints = sorted(path.name for path in run.glob(CHECKPOINTS))
-    if not checkpoints:
+    if checkpoints:
+        kept = f"the last checkpoint is {run / checkpoints[-1]}"
+    elif _has_stages(run):
+        kept = f"{run} keeps what the finished stages reached"
+    else:
         return "before the first checkpoint; nothing was kept"
-    return (
-        f"the last checkpoint is {run / checkpoints[-1]}\n"
-        f"  continue with: lidardesign learn {task} --out {run} --resume"
-    )
+    return f"{kept}\n  continue with: lidardesign learn {task} --out {run} --resume"
 
 
 @contextlib.contextmanager
