@@ -102,6 +102,8 @@ def test_columns_that_are_drawn_stand_for_all_on_the_device_too():
     chosen, unit = np.array([0, 2]), torch.zeros(4, 3, dtype=torch.float64)
     few = device.drawn(chosen)
     assert isinstance(few, DeviceTarget)
+    # its tables went to the device once, not for every step's columns anew
+    assert (few._table, few._occluders) == (device._table, device._occluders)
     points = FIXED.from_unit(unit.numpy())
     np.testing.assert_allclose(few.log_density_of_unit(unit), host.drawn(chosen).log_density(points), rtol=1e-4)
 

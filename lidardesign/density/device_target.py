@@ -46,6 +46,12 @@ class DeviceTarget(Target):
             return None
         return self._table if self.visibility.field is self.field else _Table(self.visibility.field, self.device)
 
+    def drawn(self, columns: np.ndarray) -> DeviceTarget:
+        """See `Target`; what is on the device stays there."""
+        few = super().drawn(columns)
+        vars(few).update(_table=self._table, _occluders=self._occluders)
+        return few
+
     def log_density_of_unit(self, unit: Tensor, sigma_m: float | None = None) -> Tensor:
         """log p* of unit points on the device, differentiable: (N, len(free)) to (N,)."""
         optics = self.optics if sigma_m is None else self.optics.widened(sigma_m)
