@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
+from lidardesign.density import ground, training
 from lidardesign.density import learn as learning
-from lidardesign.density import training
 from lidardesign.density.ground import prepare_ground
 from lidardesign.density.learn import learn
 from lidardesign.density.measure import log_density_of
@@ -122,6 +122,15 @@ def test_a_resume_after_steps_were_skipped_is_bit_identical_too(tmp_path, monkey
     calls["n"] = 50  # the resumed run starts at the snapshot of step 50
     learn(BallTask(), config_of(), tmp_path / "resumed", resume=True)
     assert result_bytes(tmp_path / "resumed") == result_bytes(tmp_path / "straight")
+
+
+def test_proposals_on_the_faces_of_the_space_are_inside_the_flows_box(monkeypatch):
+    # the space counts what is outside by rounding as inside; the flow's density would be 0 there
+    points = np.array([[0, 0, 0, 0.4 + 1e-10, 0, 1.0], [0, 0, 0, 0.1, 0, 0.2 - 1e-10]])
+    monkeypatch.setattr(ground, "independent_points", lambda *_: (points, np.zeros(2)))
+    pool = prepare_ground(BallTask(), config_of()).pool
+    assert SPACE.contains(points).all()
+    assert float(pool.unit.abs().max()) == 1.0
 
 
 def a_trainer(run):

@@ -82,7 +82,8 @@ def _pool(target: Target, scenes: Sequence[Scene], config: RunConfig) -> Pool:
         )
     refuse_blind_receiver(scenes, points)
     log_target = target.ranks.spread(target.log_density, points)
-    return Pool.of(config.space.to_unit(points), log_target, log_density)
+    # points on the space's faces may leave it by rounding
+    return Pool.of(config.space.to_unit(points).clip(-1.0, 1.0), log_target, log_density)
 
 
 def refuse_blind_receiver(scenes: Sequence[Scene], points: np.ndarray) -> None:
