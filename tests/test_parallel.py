@@ -8,14 +8,17 @@ import torch
 import typer
 from hypothesis import given
 from hypothesis import strategies as st
-from parallel_cases import CASES, STEPS, TRAINED, everything
+from parallel_cases import CASES, SETTINGS, SPACE, STEPS, TRAINED, everything
 from ranks import finished, start_ranks
 
 from lidardesign.cli.ranks import refuse_ranks
 from lidardesign.density.learn import own_device
 from lidardesign.density.parallel import ALONE, Ranks
-from lidardesign.density.parallel_ranks import join_ranks
-from lidardesign.errors import ConfigError
+from lidardesign.density.parallel_ranks import _reached, join_ranks
+from lidardesign.density.parallel_target import _shared
+from lidardesign.density.target import build_target
+from lidardesign.errors import ConfigError, LostRankError
+from lidardesign.scene import Body, Box, Scene, Sphere, rigid
 
 RANKS = 2
 # Sums in another order: float64 rounds at 1e-16 and float32 at 6e-8, and ten steps of Adam carry that on.
@@ -119,3 +122,23 @@ def test_every_rank_takes_a_gpu_of_its_own_and_the_cpu_is_everyones(monkeypatch,
     assert own_device(torch.device("cpu"), ranks) == torch.device("cpu")
     with pytest.raises(ConfigError, match="rank 2 has no GPU of its own"):
         own_device(torch.device("cuda"), Ranks(2, 3, 2))
+
+
+@pytest.mark.parametrize("owned", [1, 0])
+def test_a_scene_that_a_rank_only_carries_does_not_count_in_refining(owned):
+    plate = Body(Box((0.002, 0.5, 0.5)), role="occluder", poses=rigid(translation_m=(0.7, 0, 0)))
+    scenes = (Scene((Body(Sphere(0.3), role="target", poses=rigid(translation_m=(1.5, 0, 0))), plate)),)
+    part = build_target(scenes, SPACE, SETTINGS.model_copy(update={"quadrature_points": 8}), "quadrature")
+    target = _shared(part, scenes, np.arange(owned), np.zeros(owned), owned, ALONE)
+    points = SPACE.sample(500, np.random.default_rng(0))
+    assert bool(target.refined(points)[1]) == bool(owned)
+
+
+@pytest.mark.parametrize("error", [TimeoutError(), RuntimeError("[gloo.cc:1] Connection closed. And more\nlines")])
+def test_a_lost_rank_is_told_of_whatever_the_error_says(error):
+    def lost():
+        raise error
+
+    with pytest.raises(LostRankError, match="another rank ended or does not answer") as caught:
+        _reached(lost)
+    assert "\n" not in caught.value.message

@@ -69,7 +69,7 @@ def _reached(call: Callable[[], Any]) -> Any:
         return call()
     except (RuntimeError, ConnectionError, TimeoutError) as error:
         # gloo's first sentence, without the place in its source
-        reason = re.sub(r"^\[[^]]*\] ", "", str(error)).split(". ")[0].splitlines()[0]
+        reason = re.sub(r"^\[[^]]*\] ", "", str(error)).split(". ")[0].partition("\n")[0]
         raise LostRankError(
             f"another rank ended or does not answer ({reason})",
             where="torchrun",

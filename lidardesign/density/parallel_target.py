@@ -110,14 +110,17 @@ class SharedTarget(Target):
     def drawn(self, columns: np.ndarray) -> SharedTarget:
         """See `Target`."""
         whole = super().drawn(columns)
-        if whole is self:
-            return self
         weights = _weights(whole.log_column_weights, self.owned, self.own.columns)
         return replace(whole, own=replace(self.own, log_column_weights=weights))
 
     def refined(self, probes: np.ndarray) -> tuple[SharedTarget, list[str]]:
         """With enough midpoints of its quadrature; see `refine_quadrature`."""
-        own, notes = refine_quadrature(self.own, self.scenes, probes, self.ranks.mean)
+
+        def mean(values: np.ndarray) -> float:
+            # a scene that is only carried is counted by its owner
+            return self.ranks.mean(values if len(self.owned) else values[:0])
+
+        own, notes = refine_quadrature(self.own, self.scenes, probes, mean)
         return replace(self, own=own, visibility=own.visibility, rows=_fewest(own.rows_at_once, self.ranks)), notes
 
     def _in_chunks(
