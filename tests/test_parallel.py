@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import signal
+import time
+
 import numpy as np
 import pytest
 import torch
@@ -44,12 +47,34 @@ def test_one_process_alone_does_everything_itself():
     assert join_ranks({"WORLD_SIZE": "1"}) is ALONE
 
 
-@pytest.mark.parametrize(
-    "environment", [{"WORLD_SIZE": "many"}, {"WORLD_SIZE": "0"}, {"WORLD_SIZE": "2", "RANK": "-1"}]
-)
+UNLIKELY = (
+    {"WORLD_SIZE": "many"}, {"WORLD_SIZE": "0"}, {"WORLD_SIZE": "2", "RANK": "-1"}, {"WORLD_SIZE": "2", "RANK": "2"},
+    {"WORLD_SIZE": "2", "RANK": "0", "MASTER_PORT": "door"}, {"WORLD_SIZE": "2", "RANK": "0", "MASTER_PORT": "65536"},
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("environment", UNLIKELY)
 def test_an_environment_that_no_launcher_makes_is_refused(environment):
     with pytest.raises(ConfigError, match="environment variable"):
         join_ranks(environment)
+
+
+WAITING = """
+from lidardesign.density.parallel_ranks import join_ranks
+print("waits", flush=True)
+join_ranks()
+"""
+
+
+def test_a_rank_whose_others_never_start_can_be_interrupted():
+    (rank,) = start_ranks(1, "-c", WAITING, WORLD_SIZE="2")
+    assert rank.stdout.readline() == "waits\n"
+    # it is about to call into torch, or has
+    time.sleep(1.0)
+    rank.send_signal(signal.SIGINT)
+    ((code, _, err),) = finished([rank])
+    assert code in (-signal.SIGINT, 128 + signal.SIGINT)
+    assert "KeyboardInterrupt" in err
 
 
 @pytest.fixture(scope="module")

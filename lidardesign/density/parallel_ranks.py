@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import os
+import queue
 import re
+import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import timedelta
@@ -24,6 +26,7 @@ from lidardesign.errors import ConfigError, LostRankError
 # The longest that a rank may keep the others waiting: building the fields of its scenes can take minutes.
 PATIENCE = timedelta(minutes=30)
 MEETING = timedelta(minutes=10)
+MOST_PORT = 65_535
 # Another rank's message arrives on the launcher's own store within a fraction of this.
 TOLD_WITHIN = timedelta(seconds=2)
 
@@ -40,23 +43,47 @@ def join_ranks(environment: dict[str, str] | os._Environ[str] = os.environ) -> R
     size = _number(environment, "WORLD_SIZE", 1)
     if size == 1:
         return ALONE
-    rank, local_rank = _number(environment, "RANK", 0), _number(environment, "LOCAL_RANK", 0)
+    rank, local_rank = _number(environment, "RANK", 0, size - 1), _number(environment, "LOCAL_RANK", 0)
+    _number(environment, "MASTER_PORT", 1, MOST_PORT)
     if not distributed.is_available():
         raise ConfigError("this torch was built without torch.distributed", where="WORLD_SIZE", allowed="1")
-    store, _, _ = _reached(lambda: next(distributed.rendezvous("env://", rank, size, timeout=MEETING)))
+    store, _, _ = _met(lambda: next(distributed.rendezvous("env://", rank, size, timeout=MEETING)))
     backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() and distributed.is_nccl_available() else "gloo"
     own = distributed.PrefixStore("lidardesign", store)
-    _reached(
-        lambda: distributed.init_process_group(backend, store=own, rank=rank, world_size=size, timeout=PATIENCE)
-    )
+    _met(lambda: distributed.init_process_group(backend, store=own, rank=rank, world_size=size, timeout=PATIENCE))
     return ConnectedRanks(rank, size, local_rank, store=distributed.PrefixStore("messages", store))
 
 
-def _number(environment: Any, name: str, lowest: int) -> int:
+def _number(environment: Any, name: str, lowest: int, highest: int | None = None) -> int:
     text = environment.get(name, str(lowest))
-    if not text.isdecimal() or int(text) < lowest:
-        raise ConfigError(f"{text!r}", where=f"environment variable {name}", allowed=f"a whole number from {lowest}")
-    return int(text)
+    if text.isdecimal() and lowest <= int(text) and (highest is None or int(text) <= highest):
+        return int(text)
+    allowed = f"a whole number from {lowest}" + ("" if highest is None else f" to {highest}")
+    raise ConfigError(f"{text!r}", where=f"environment variable {name}", allowed=allowed)
+
+
+def _met(call: Callable[[], Any]) -> Any:
+    """As `_reached`, for calls that wait for ranks that may not even have been started, and hear no signal meanwhile.
+
+    A thread makes the call, so that an interruption ends this process at once.
+    """
+    done: queue.SimpleQueue[tuple[Any, BaseException | None]] = queue.SimpleQueue()
+
+    def work() -> None:
+        try:
+            done.put((call(), None))
+        except BaseException as error:
+            # raised where it was asked for
+            done.put((None, error))
+
+    def result() -> Any:
+        threading.Thread(target=work, daemon=True).start()
+        value, error = done.get()
+        if error is not None:
+            raise error
+        return value
+
+    return _reached(result)
 
 
 def _reached(call: Callable[[], Any]) -> Any:
