@@ -196,6 +196,7 @@ def flatland(lidardesign, out, *options):
         (("--tolerance", "nan"), "between 0 and 1"),
         (("--time-budget", "-3"), "above 0"),
         (("--time-budget", "inf"), "above 0"),
+        (("--time-budget", "1e300"), "a year at most"),
         (("--time-budget", "60", "--set", "learning.steps=7"), "the time decides learning.steps"),
     ],
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import time
 from collections.abc import Mapping
@@ -26,6 +25,8 @@ if TYPE_CHECKING:
     from lidardesign.task import Task
 
 TOLERANCE, TIME_BUDGET = "--tolerance", "--time-budget"
+# More is a mistake in the unit; the numbers of steps that it makes are beyond what a file may hold.
+LONGEST_S = 366 * 24 * 3600.0
 STEPS_KEY, FIELDS_KEY = "learning.steps", "density.field_resolution"
 GOAL = "goal"
 # What passes before the command's clock runs, where the system does not tell: the program's own imports take 0.3 s.
@@ -102,8 +103,8 @@ def checked_goal(
     keys = {text.partition("=")[0].strip() for text in given["overrides"]}
     if time_budget_s is None:
         return Goal(tolerance, fixed_fields=given["config_file"] is not None or FIELDS_KEY in keys)
-    if not (math.isfinite(time_budget_s) and time_budget_s > 0):
-        raise ConfigError(f"{time_budget_s:g}", where=TIME_BUDGET, allowed="a number of seconds above 0")
+    if not 0 < time_budget_s <= LONGEST_S:
+        raise ConfigError(f"{time_budget_s:g}", where=TIME_BUDGET, allowed="a number of seconds above 0, a year at most")
     if STEPS_KEY in keys:
         raise ConfigError(f"the time decides {STEPS_KEY}", where=TIME_BUDGET, hint=f"leave out --set {STEPS_KEY}")
     if given["config_file"] is not None:
