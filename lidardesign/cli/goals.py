@@ -104,7 +104,7 @@ def checked_goal(
     if time_budget_s is None:
         return Goal(tolerance, fixed_fields=given["config_file"] is not None or FIELDS_KEY in keys)
     if not 0 < time_budget_s <= LONGEST_S:
-        raise ConfigError(f"{time_budget_s:g}", where=TIME_BUDGET, allowed="a number of seconds above 0, a year at most")
+        raise ConfigError(f"{time_budget_s:g}", where=TIME_BUDGET, allowed="seconds above 0, a year at most")
     if STEPS_KEY in keys:
         raise ConfigError(f"the time decides {STEPS_KEY}", where=TIME_BUDGET, hint=f"leave out --set {STEPS_KEY}")
     if given["config_file"] is not None:
