@@ -24,6 +24,10 @@ from lidardesign.space import DesignSpace
 
 SAMPLE_CHUNK = 16384
 CONDITION_GROUPS = 32
+NOT_COVERED = (
+    "coverage could not be measured and counts as 0, and misplaced leaves out what the density dropped: "
+    "no independently drawn ray fits in the space"
+)
 
 
 class Learned(Protocol):
@@ -94,7 +98,7 @@ def measure(learned: Learned, probes: Probes, count: int) -> Measured:
         theirs = condition_groups(space, probes.points)
         sides = Sides(samples.log_weights, probes.log_target - log_prob, log_weights, groups, theirs)
     else:
-        notes = ("coverage could not be measured and counts as 0: no independently drawn ray fits in the space",)
+        notes = (NOT_COVERED,)
     apart = overlap(sides)
     misplaced = Estimate(apart.misplaced, apart.error)
     return Measured(samples, {**found.estimates(), "coverage": covered, "misplaced": misplaced}, notes)
