@@ -74,8 +74,7 @@ class ArmTask:
         layout="distributed",
         level=0.99,  # a path is as bad as its worst frame, so a lost return costs more than a bin
         density={"sigma_m": 0.025, "surface_tolerance_nats": 10.0},
-        # 64 of the 2000 frames in each path-wise step leave as little mass misplaced as 256 do, 32 leave more
-        learning={"standard": {"steps": 800, "hidden": 64, "frames": 64}},
+        learning={"standard": {"steps": 800, "hidden": 64}},
     )
 
     def space(self, config: ArmConfig) -> DesignSpace:
