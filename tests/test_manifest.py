@@ -123,6 +123,8 @@ def break_run(run, how):
         write_manifest(run, {**document, "schema_version": 2})
     elif how in ("timings", "goal", "learn"):
         write_manifest(run, {**document, how: [5]})
+    elif how in ("visibility", "number of visibility"):
+        write_manifest(run, {**document, "visibility": "words" if how == "visibility" else [5]})
     elif how == "entry":
         write_manifest(run, {**document, "files": {"data.bin": 5}})
     elif how == "empty entry":
@@ -143,6 +145,8 @@ MESSAGES = {
     "timings": "the manifest's 'timings' is damaged",
     "goal": "the manifest's 'goal' is damaged",
     "learn": "the manifest's 'learn' is damaged",
+    "visibility": "visibility 'words'",
+    "number of visibility": "visibility \\[5\\]",
     "entry": "entry of data.bin is damaged",
     "empty entry": "entry of data.bin is damaged",
     "replaced entry": "entry of data.bin is damaged",

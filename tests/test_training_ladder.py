@@ -27,7 +27,7 @@ from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.registry import load_task
 from lidardesign.run.checkpoint import save_arrays
 from lidardesign.run.config import load_run_config, resolve, save_run_config
-from lidardesign.run.manifest import note, read_manifest, start_manifest
+from lidardesign.run.manifest import note, read_manifest, record, start_manifest
 from lidardesign.task import random_generator, scenes_of
 
 SMALL = (
@@ -122,6 +122,15 @@ def test_a_snapshot_is_measured_as_the_flow_that_was_learned(runs):
 def test_seconds_between_rows_of_the_progress_are_interpolated(runs):
     seconds = seconds_at(runs, [20, 25, 30])
     assert seconds[25] == pytest.approx((seconds[20] + seconds[30]) / 2)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"step": 1}', '{"step": null, "seconds": 1}'])
+def test_progress_that_is_none_is_told(runs, tmp_path, text):
+    shutil.copytree(runs, tmp_path / "run")
+    (tmp_path / "run" / "progress.jsonl").write_text(text)
+    record(tmp_path / "run", ["progress.jsonl"])
+    with pytest.raises(DataError, match=r"progress.jsonl: is no progress"):
+        seconds_at(tmp_path / "run", [20])
 
 
 def test_stages_of_a_tolerance_are_a_ladder_of_their_own(runs, tmp_path, ladders):

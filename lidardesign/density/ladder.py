@@ -120,9 +120,16 @@ def load_flow(run: Path, name: str, config: RunConfig, target: Target, seed: int
 
 
 def seconds_at(run: Path, steps: list[int]) -> dict[int, float]:
-    """How long learning had taken after each step, from the run's progress, interpolated between its rows [s]."""
+    """How long learning had taken after each step, from the run's progress, interpolated between its rows [s].
+
+    Raises:
+        DataError: The progress is missing or damaged.
+    """
     verify(run, PROGRESS)
-    rows = [json.loads(line) for line in (run / PROGRESS).read_text(encoding="utf-8").splitlines()]
-    done, taken = [0, *(row["step"] for row in rows)], [0.0, *(row["seconds"] for row in rows)]
+    try:
+        rows = [json.loads(line) for line in (run / PROGRESS).read_text(encoding="utf-8").splitlines()]
+        done, taken = [0, *(int(row["step"]) for row in rows)], [0.0, *(float(row["seconds"]) for row in rows)]
+    except (ValueError, TypeError, KeyError):
+        raise DataError("is no progress of learning", where=str(run / PROGRESS), hint="learn the run again") from None
     return {step: float(np.interp(step, done, taken)) for step in steps}
 

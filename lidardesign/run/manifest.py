@@ -20,6 +20,8 @@ SCHEMA_VERSION = 1
 PACKAGES = ("numpy", "torch", "zuko", "embreex")
 # What is merged or looked up by key; each may be missing.
 MAPPINGS = ("timings", "learn", "goal")
+# What the run's own probe may have decided, where the configuration left it open.
+VISIBILITIES = ("off", "raycast", "quadrature")
 DAMAGED_HINT = "restore it or learn the run again"
 LEARN_HINT = "lidardesign learn TASK --out RUN makes a run"
 
@@ -84,6 +86,12 @@ def _check_parts(manifest: dict[str, Any], path: Path) -> None:
         versions_of_it = [entry, entry.get("replaces") or entry] if isinstance(entry, dict) else [entry]
         if not all(_is_entry(one) for one in versions_of_it):
             raise DataError(f"the manifest's entry of {name} is damaged", where=str(path), hint=DAMAGED_HINT)
+    decided = manifest.get("visibility")
+    if decided is not None and decided not in VISIBILITIES:
+        raise DataError(
+            f"the manifest has visibility {decided!r}", where=str(path), allowed=", ".join(VISIBILITIES),
+            hint=DAMAGED_HINT,
+        )  # fmt: skip
     for name in MAPPINGS:
         if not isinstance(manifest.get(name) or {}, dict):
             raise DataError(f"the manifest's {name!r} is damaged", where=str(path), hint=DAMAGED_HINT)
