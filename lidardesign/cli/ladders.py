@@ -36,7 +36,9 @@ def _show_ladder(ladder: Ladder, rich: RichConsole) -> None:
     title = f"{ladder.knob}: {ladder.error_of}{unit}, against {ladder.against}; seconds of {ladder.work}"
     further = list(dict.fromkeys(name for rung in ladder.rungs for name in rung.values))
     lines = [(*_cells(rung, ladder), *(_figure(rung.values.get(name)) for name in further)) for rung in ladder.rungs]
-    print_table(escape(title), (*HEADINGS, *further), lines, rich, text=("setting",))
+    # a sentence, which wraps like those below the table
+    rich.print(f"[italic]{escape(title)}[/italic]")
+    print_table(None, (*HEADINGS, *further), lines, rich, text=("setting",))
     rich.print(f"{escape(ladder.verdict)}; tolerance {ladder.tolerance:.3g}{escape(unit)}: {escape(ladder.because)}")
     if ladder.note:
         rich.print(f"note: {escape(ladder.note)}")

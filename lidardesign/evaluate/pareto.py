@@ -204,6 +204,8 @@ def _draw(axes: Axes, panel: Panel) -> None:
 
 
 def _dress(axes: Axes, panel: Panel) -> None:
+    from matplotlib.ticker import NullFormatter
+
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlim(*panel.seconds)
@@ -211,6 +213,9 @@ def _dress(axes: Axes, panel: Panel) -> None:
     for axis, (low, high) in ((axes.xaxis, panel.seconds), (axes.yaxis, panel.errors)):
         if high < FINE_TICKS_SPAN * low:
             label_ticks(axis, None)
+        else:
+            # on axes of one or two powers of ten there would be names at all ticks, which do not fit
+            axis.set_minor_formatter(NullFormatter())
     axes.set_title(plain_label(panel.ladder.knob, 48), fontsize=9.5, loc="left", color="#222222")
     axes.set_xlabel("seconds", fontsize=8)
     axes.set_ylabel(plain_label(panel.error_title, 40), fontsize=8)

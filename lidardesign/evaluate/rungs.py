@@ -104,10 +104,7 @@ class Ladder:
     def falls(self) -> bool:
         """Whether errors fall from rung to rung, within their own uncertainty."""
         pairs = zip(self.rungs, self.rungs[1:], strict=False)
-        return all(
-            finer.error <= rougher.error + _sure_difference(finer, rougher)
-            for rougher, finer in pairs
-        )
+        return all(finer.error <= rougher.error + _sure_difference(finer, rougher) for rougher, finer in pairs)
 
     @property
     def verdict(self) -> str:
@@ -121,7 +118,8 @@ class Ladder:
             return f"{chosen.setting}, the setting of this run, is the one to choose"
         ratio = default.seconds / max(chosen.seconds, 1e-12)
         if default.error + default.uncertainty > self.tolerance:
-            return f"{chosen.setting} is needed: {default.setting}, as this run has it, may be outside the tolerance"
+            told = "is needed" if chosen.seconds > default.seconds else "is good enough"
+            return f"{chosen.setting} {told}: {default.setting}, as this run has it, may be outside the tolerance"
         if ratio <= SAME_COST:
             return f"{chosen.setting} costs the same as {default.setting}, the setting of this run, and errs less"
         return f"{chosen.setting} suffices, {ratio:.2g} times cheaper than {default.setting}, the setting of this run"
