@@ -56,7 +56,7 @@ def test_a_budgeted_run_is_the_run_of_its_own_configuration_bit_for_bit(tmp_path
     keeper = keeper_for(run, 15.0)
     ground = prepare_ground(BallTask(), keeper.config)
     config = keeper.plan(ground, CPU)
-    result = learn(BallTask(), config, run, ground=ground, replan=lambda trainer: keeper.replan(trainer, ground))
+    result = learn(BallTask(), config, run, ground=ground, replan=keeper.replan)
     final = load_yaml(run / "config.yaml").mapping["learning"]
     again = config_of(steps=final["steps"], balance=final["balance"])
     learn(BallTask(), again, plain)
@@ -104,7 +104,7 @@ def test_timing_steps_and_the_end_leaves_the_trainer_as_it_was(tmp_path):
     trainer = make_trainer(ground, config, tmp_path, CPU)
     before, step = trainer._state_arrays(), trainer.step
     assert budget._seconds_per_step(trainer, trainer.pathwise_steps) > 0
-    assert budget._finishing_s(trainer, ground, config) > 0
+    assert budget._finishing_s(trainer, budget._timed_probes(ground, config), config) > 0
     after = trainer._state_arrays()
     assert trainer.step == step
     assert before.keys() == after.keys()
@@ -132,5 +132,19 @@ def test_what_is_only_compiled_once_is_not_planned_for_every_point(tmp_path, mon
     compiling("draw_samples")
     compiling("log_density_of")
     points_per_s = 1000 * budget.TIMED_POINTS
-    planned_s = budget._finishing_s(trainer, ground, config)
+    planned_s = budget._finishing_s(trainer, budget._timed_probes(ground, config), config)
     assert planned_s == pytest.approx(100_000 / points_per_s + 0.001 + budget.WRITING_S)
+
+
+def test_what_drawing_takes_however_few_is_planned_once(monkeypatch):
+    config = config_of(coverage_proposals=8000)
+    ground = prepare_ground(BallTask(), config)
+    seconds, exact = [0.0], budget.draw_probes
+    monkeypatch.setattr(budget.time, "perf_counter", lambda: seconds[0])
+
+    def slow(target, scenes, count, generator):
+        seconds[0] += 4.0 + 1e-4 * count
+        return exact(target, scenes, count, generator)
+
+    monkeypatch.setattr(budget, "draw_probes", slow)
+    assert budget._timed_probes(ground, config).seconds == pytest.approx(4.8)

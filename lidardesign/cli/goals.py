@@ -233,9 +233,7 @@ class Learner:
         ground = prepare_ground(self.task, config)
         with phase("planning"):
             planned = keeper.plan(ground, place)
-        result = learn_density(
-            self.task, planned, self.run, ground=ground, replan=lambda t: keeper.replan(t, ground), **options
-        )
+        result = learn_density(self.task, planned, self.run, ground=ground, replan=keeper.replan, **options)
         plan = keeper.planned
         told = (
             f"{plan.pathwise_steps} + {plan.balancing_steps} steps fit into {time_budget_s:g} s: "

@@ -39,6 +39,8 @@ RESERVE = 0.1
 TIMED_STEPS = 6
 TIMED_POINTS = 2048
 WARMING_POINTS = 2
+# Drawing has a cost of its own besides that of each probe: up to so many are drawn to be timed, not a share of them.
+MOST_PROBES = 8192
 # Writing the flow and the samples, printing the result, and ending the process.
 WRITING_S = 2.0
 
@@ -78,6 +80,21 @@ class TimePlan:
         return {key: round(value, 4) if isinstance(value, float) else value for key, value in asdict(self).items()}
 
 
+@dataclass(frozen=True, eq=False)
+class TimedProbes:
+    """Probes as the measurement at the end draws them; they do not depend on the flow.
+
+    Arguments:
+        points: Those that were drawn, shape (N, 6).
+        scale: How many more the configuration asks for.
+        seconds: What drawing them all takes [s].
+    """
+
+    points: np.ndarray
+    scale: float
+    seconds: float
+
+
 @dataclass(eq=False)
 class Timekeeper:
     """Plans the steps of one command.
@@ -94,6 +111,7 @@ class Timekeeper:
     config: RunConfig
     run: Path
     planned: TimePlan | None = None
+    probes: TimedProbes | None = None
 
     @property
     def left_s(self) -> float:
@@ -111,7 +129,8 @@ class Timekeeper:
         pathwise = max(_seconds_per_step(trainer, 0), _seconds_per_step(trainer, last)) if trainer.pathwise_steps else 0
         share = self.config.learning.balance
         balancing = _seconds_per_step(trainer, trainer.pathwise_steps) if share > 0 else 0.0
-        finishing, left = _finishing_s(trainer, ground, self.config), self.left_s
+        self.probes = _timed_probes(ground, self.config)
+        finishing, left = _finishing_s(trainer, self.probes, self.config), self.left_s
         per_step = (1 - share) * pathwise + share * balancing
         steps = math.floor((left - finishing) / per_step)
         if steps < LEAST_STEPS:
@@ -128,9 +147,9 @@ class Timekeeper:
         )
         return self._apply()
 
-    def replan(self, trainer: Trainer, ground: Ground) -> LearningSettings:
+    def replan(self, trainer: Trainer) -> LearningSettings:
         """The settings with as many balancing steps as fit now that the flow is trained; config.yaml follows."""
-        balancing, finishing = _seconds_per_step(trainer, trainer.step), _finishing_s(trainer, ground, self.config)
+        balancing, finishing = _seconds_per_step(trainer, trainer.step), _finishing_s(trainer, self.probes, self.config)
         steps = max(math.floor((self.left_s - finishing) / balancing), 1)
         self.planned = replace(
             self.planned, balancing_s=balancing, finishing_s=finishing, balancing_steps=steps, settled=True
@@ -157,23 +176,29 @@ def _seconds_per_step(trainer: Trainer, step: int) -> float:
     return float(np.mean(taken[1:]))  # the first one may have to compile
 
 
-def _finishing_s(trainer: Trainer, ground: Ground, config: RunConfig) -> float:
+def _timed_probes(ground: Ground, config: RunConfig) -> TimedProbes:
+    asked = config.learning.coverage_proposals
+    count = min(MOST_PROBES, asked)
+    generator = random_generator(config.seed, "time budget")
+    drawn, seconds = _timed(lambda: draw_probes(ground.target, ground.scenes, count, generator))
+    return TimedProbes(drawn.points, asked / count, seconds * asked / count)
+
+
+def _finishing_s(trainer: Trainer, probes: TimedProbes, config: RunConfig) -> float:
     """What measuring and writing will take, from a few points [s]; the trainer is left as it was."""
     settings, stream = config.learning, trainer.generator.get_state()
     dtype = next(trainer.flow.parameters()).dtype
     trainer.flow.double()
-    generator = random_generator(config.seed, "time budget")
-    few = min(TIMED_POINTS, settings.coverage_proposals)
-    probes, drawing = _timed(lambda: draw_probes(ground.target, ground.scenes, few, generator))
+    few = probes.points[:TIMED_POINTS]
     # the first calls in double precision may have to compile
     draw_samples(trainer, WARMING_POINTS)
-    log_density_of(trainer, probes.points[:WARMING_POINTS])
+    log_density_of(trainer, few[:WARMING_POINTS])
     _, sampling = _timed(lambda: draw_samples(trainer, TIMED_POINTS))
-    _, inverting = _timed(lambda: log_density_of(trainer, probes.points)) if len(probes.points) else (None, 0.0)
+    _, inverting = _timed(lambda: log_density_of(trainer, few))
     trainer.flow.to(dtype)
     trainer.generator.set_state(stream)
-    probing = (drawing + inverting) * settings.coverage_proposals / few
-    return sampling * settings.samples / TIMED_POINTS + probing + WRITING_S
+    inverting *= probes.scale * len(probes.points) / max(len(few), 1)
+    return sampling * settings.samples / TIMED_POINTS + probes.seconds + inverting + WRITING_S
 
 
 def _timed(call: Callable[[], Value]) -> tuple[Value, float]:
