@@ -52,10 +52,11 @@ def joined_ranks(console: Console) -> Iterator[Ranks]:
 
         yield ALONE
         return
-    from lidardesign.density.parallel_learn import finish
-    from lidardesign.density.parallel_ranks import join_ranks
-
-    ranks = join_ranks()
+    with phase("libraries"):
+        from lidardesign.density.parallel_learn import finish
+        from lidardesign.density.parallel_ranks import join_ranks
+    with phase("ranks"):
+        ranks = join_ranks()
     if not ranks.first:
         _follow(ranks, console)
         raise typer.Exit
