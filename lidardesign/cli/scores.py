@@ -70,7 +70,6 @@ def _show_errors(document: Entry, rich: RichConsole) -> None:
     rich.print(
         f"over other scenes, designs' values may be off by up to {number(max(values), 2)} {unit}, "
         f"their differences by up to {number(max(differences), 2)} {unit} (half of the 95 % intervals)",
-        soft_wrap=True,
         markup=False,
     )
 
