@@ -113,6 +113,14 @@ def test_an_address_where_nothing_answers_is_refused(monkeypatch):
         worker_cluster.Cluster(address)
 
 
+def test_an_address_where_something_else_listens_is_refused(monkeypatch):
+    monkeypatch.setattr(worker_cluster, "SCHEDULER_SECONDS", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        with pytest.raises(ConfigError, match="does not speak as a scheduler"):
+            worker_cluster.Cluster(address)
+
+
 def test_without_dask_the_message_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ConfigError, match=r"lidardesign\[cluster\]"):

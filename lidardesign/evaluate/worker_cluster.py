@@ -7,10 +7,11 @@ import importlib.metadata
 import itertools
 import logging
 import queue
+import threading
 import time
 import uuid
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from lidardesign import __version__
@@ -21,6 +22,8 @@ HINT = "docs/cluster.md has the commands that start a scheduler and its workers"
 SAME_EVERYWHERE = "install the same versions of lidardesign and of the task for the scheduler and all workers"
 # A scheduler that listens answers at once; workers of a batch system may still be waiting for their machines.
 SCHEDULER_SECONDS = 10.0
+# What is given a connection, in times of that: it is tried again and again until its own time is over.
+PATIENCE = 1.5
 WORKER_SECONDS = 60.0
 # How often somebody looks whether there is still a worker, while none answers.
 LOOK_SECONDS = 2.0
@@ -156,7 +159,7 @@ def _client_class() -> Any:
 
 def _connected(client_class: Any, address: str) -> Any:
     try:
-        client = client_class(address, timeout=SCHEDULER_SECONDS, set_as_default=False)
+        client = _answered(lambda: client_class(address, timeout=SCHEDULER_SECONDS, set_as_default=False))
     except (OSError, ValueError) as error:
         found = " ".join(str(error).split())
         raise ConfigError(f"no scheduler answers at {address}: {found}", where="--workers", hint=HINT) from None
@@ -171,6 +174,31 @@ def _connected(client_class: Any, address: str) -> Any:
     except ConfigError:
         client.close()
         raise
+    return client
+
+
+def _answered(connect: Callable[[], Any]) -> Any:
+    """What a thread connects to: the client's own time ends with the connection, whatever answers it or does not.
+
+    Raises:
+        TimeoutError: Nothing came of it.
+    """
+    done: queue.SimpleQueue[tuple[Any, Exception | None]] = queue.SimpleQueue()
+
+    def work() -> None:
+        try:
+            done.put((connect(), None))
+        except Exception as error:
+            # raised where it was asked for
+            done.put((None, error))
+
+    threading.Thread(target=work, daemon=True).start()
+    try:
+        client, error = done.get(timeout=PATIENCE * SCHEDULER_SECONDS)
+    except queue.Empty:
+        raise TimeoutError("something listens there, but does not speak as a scheduler of dask does") from None
+    if error is not None:
+        raise error
     return client
 
 
