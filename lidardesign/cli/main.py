@@ -40,6 +40,7 @@ EXAMPLES = {
         "torchrun --nproc-per-node 2 -m lidardesign learn face --out runs/face",
         "lidardesign learn meshes --set folder=scans --set scale=0.001 --out runs/scans",
         "lidardesign learn face --tolerance 0.15 --out runs/good_enough",
+        "lidardesign learn face --time-budget 60 --out runs/minute",
         "lidardesign learn face --out runs/face --resume",
     ),
     fit: (
@@ -57,6 +58,7 @@ EXAMPLES = {
         "lidardesign evaluate runs/face --detector single-photon --effects audit",
         "lidardesign evaluate runs/arm --baseline occupancy --baseline no-visibility",
         "lidardesign evaluate runs/face --workers 8",
+        "lidardesign evaluate runs/face --accuracy --plots pictures",
     ),
     export: (
         "lidardesign export runs/face/designs/free.yaml --format csv --rays 576 --out rays.csv",

@@ -28,7 +28,7 @@ PANEL_INCHES = (3.9, 3.1)
 # Axes span at least so many times their smallest value, and end so far beyond what they show.
 LEAST_SPAN = 4.0
 BEYOND = 1.5
-# Ticks lie at 1, 2 and 5 where an axis spans less than this, else at powers of ten.
+# Ticks lie at 1, 2 and 5 where an axis spans less than this or has one power of ten at most, else at powers of ten.
 FINE_TICKS_SPAN = 60.0
 # Errors below this share of the largest, or of the tolerance, stand on the lower edge: nobody looks there.
 SHOWN_SHARE = 1e-4
@@ -138,6 +138,13 @@ def _beaten(rung: Rung, ladder: Ladder) -> bool:
     )
 
 
+def has_fine_ticks(ends: tuple[float, float]) -> bool:
+    """Whether an axis between these ends needs ticks between the powers of ten."""
+    low, high = ends
+    powers = math.floor(math.log10(high)) - math.ceil(math.log10(low)) + 1
+    return high < FINE_TICKS_SPAN * low or powers < 2
+
+
 def _mark(rung: Rung, least_seconds: float, errors: tuple[float, float], chosen: bool, beaten: bool) -> Mark:
     low, high = errors
     on_edge = rung.error <= low
@@ -210,8 +217,8 @@ def _dress(axes: Axes, panel: Panel) -> None:
     axes.set_yscale("log")
     axes.set_xlim(*panel.seconds)
     axes.set_ylim(*panel.errors)
-    for axis, (low, high) in ((axes.xaxis, panel.seconds), (axes.yaxis, panel.errors)):
-        if high < FINE_TICKS_SPAN * low:
+    for axis, ends in ((axes.xaxis, panel.seconds), (axes.yaxis, panel.errors)):
+        if has_fine_ticks(ends):
             label_ticks(axis, None)
         else:
             # on axes of one or two powers of ten there would be names at all ticks, which do not fit

@@ -10,12 +10,12 @@ from typing import Any
 from lidardesign.evaluate.figures import FONT
 from lidardesign.evaluate.pareto import (
     CHOSEN,
-    FINE_TICKS_SPAN,
     LINE,
     PALE,
     TOLERANCE,
     Mark,
     Panel,
+    has_fine_ticks,
     label_places,
     panels,
 )
@@ -159,7 +159,7 @@ def _axes(panel: Panel, name: str, index: int, rows: int) -> dict[str, Any]:
 
 def _ticks(ends: tuple[float, float]) -> dict[str, Any]:
     low, high = ends
-    spacing = {"dtick": "D2"} if high < FINE_TICKS_SPAN * low else {"dtick": 1}
+    spacing = {"dtick": "D2"} if has_fine_ticks(ends) else {"dtick": 1}
     return {**spacing, "range": [math.log10(low), math.log10(high)], "tickformat": "~g", "tickfont": {"size": 10}}
 
 
