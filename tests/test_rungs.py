@@ -57,6 +57,11 @@ def test_errors_fall_within_their_uncertainty():
     assert ladder(rung("a", 0.3, 1.0, uncertainty=0.1), rung("b", 0.5, 1.0, uncertainty=0.1)).falls
 
 
+def test_the_verdict_says_where_errors_do_not_fall():
+    assert "by chance" in ladder(rung("a", 0.3, 1.0), rung("b", 0.5, 2.0), rung("c", 0.05, 3.0)).verdict
+    assert "by chance" not in ladder(rung("a", 0.5, 1.0), rung("b", 0.05, 3.0)).verdict
+
+
 def test_a_row_has_the_keys_of_the_contract():
     (row,) = ladder(rung("a", 0.05, 1.0, values={"worst_mm": 1.0})).as_rows()
     assert {"knob", "setting", "error", "unit", "seconds", "chosen"} <= set(row)

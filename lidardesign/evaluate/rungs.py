@@ -108,7 +108,11 @@ class Ladder:
 
     @property
     def verdict(self) -> str:
-        """How the chosen rung compares with the run's own setting, in one line."""
+        """How the chosen rung compares with the run's own setting, in one line; whether chance had a part in it."""
+        return self._comparison if self.falls else f"{self._comparison}; but errors do not fall here: by chance, perhaps"
+
+    @property
+    def _comparison(self) -> str:
         chosen, default = self.chosen, self.default
         if chosen.error + chosen.uncertainty > self.tolerance:
             return f"no setting is within {self.tolerance:g} {self.unit}".rstrip() + f"; {chosen.setting} is closest"
