@@ -109,7 +109,8 @@ class Ladder:
     @property
     def verdict(self) -> str:
         """How the chosen rung compares with the run's own setting, in one line; whether chance had a part in it."""
-        return self._comparison if self.falls else f"{self._comparison}; but errors do not fall here: by chance, perhaps"
+        chance = "" if self.falls else "; but errors do not fall here: by chance, perhaps"
+        return self._comparison + chance
 
     @property
     def _comparison(self) -> str:
