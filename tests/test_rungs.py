@@ -32,9 +32,9 @@ def test_of_rungs_that_cost_the_same_and_are_good_enough_the_runs_own_is_chosen(
 
 
 def test_what_the_run_does_stays_where_nothing_is_cheaper_by_more_than_can_be_told():
-    found = ladder(rung("a", 0.08, 1.0), rung("b", 0.05, 1.1), rung("c", 0.01, 1.2, default=True))
+    found = ladder(rung("a", 0.08, 1.0), rung("b", 0.05, 1.1), rung("c", 0.01, 1.25, default=True))
     assert found.chosen.setting == "c"
-    slower = ladder(rung("a", 0.08, 1.0), rung("b", 0.05, 1.1), rung("c", 0.01, 1.3, default=True))
+    slower = ladder(rung("a", 0.08, 1.0), rung("b", 0.05, 1.1), rung("c", 0.01, 1.4, default=True))
     assert slower.chosen.setting == "b"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from lidardesign.density.stages import Stage, ToleranceGoal
 from lidardesign.density.training import Trainer
 from lidardesign.design.fit import fit
 from lidardesign.design.samples import load_samples
-from lidardesign.errors import DataError
+from lidardesign.errors import DataError, NumericalError
 from lidardesign.evaluate import accuracy, score
 from lidardesign.evaluate.accuracy import Accuracy, AccuracyRequest
 from lidardesign.evaluate.ladders import training
@@ -288,3 +289,14 @@ def test_a_time_budget_writes_its_steps_into_the_configuration(lidardesign, tmp_
     assert soon.code == 2
     assert "at least" in soon.err
     assert not (tmp_path / "soon").exists()
+
+
+def test_what_was_scored_is_written_before_accuracy_is_measured(fitted, lidardesign, monkeypatch):
+    def interrupted(*_, **__):
+        assert "one" in Path("rows.csv").read_text(encoding="utf-8")
+        raise NumericalError("interrupted", where="a ladder")
+
+    monkeypatch.setattr(accuracy, "measure_accuracy", interrupted)
+    done = lidardesign("evaluate", "run", "--rays", "8", "--accuracy", "--csv", "rows.csv", "--json")
+    assert done.code == 5
+    assert Path("rows.csv").exists()

@@ -149,9 +149,10 @@ def evaluate(
             planner = replace(planner, tolerance=planner.tolerated.within(run.task.metric))
         request = replace(_request(run, entries, rays, baseline or [], seed), planner=planner, audit=audit)
         evaluation = _evaluate_with(wanted, request, console)
-        if accuracy:
-            evaluation = _with_accuracy(evaluation, request, learned, console)
         written = _write_files(evaluation, request, report, plots, csv)
+        if accuracy:  # it takes minutes: what was scored by then is written already
+            evaluation = _with_accuracy(evaluation, request, learned, console)
+            written = _write_files(evaluation, request, report, plots, csv)
         document = {**evaluation.as_dict(), "set": overrides or [], "files": [str(path) for path in written]}
         keep_times(run.folder, "evaluate", console)
         console.result(document, lambda rich: _show(evaluation, document, written, rich))

@@ -19,7 +19,7 @@ import numpy as np
 Value = TypeVar("Value")
 
 # Rungs whose times differ by less than this ratio cost the same: timings of one machine repeat no better.
-SAME_COST = 1.15
+SAME_COST = 1.2
 # Errors that differ by less than so many standard errors of their difference do not differ.
 STANDARD_ERRORS = 2.0
 # A call is repeated until it took so long together, at most so often; its median counts.
