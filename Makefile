@@ -1,4 +1,4 @@
-# make demo   sets everything up in .venv and runs the whole chain on the built-in face task, about three minutes
+# make demo   sets everything up in .venv and runs the whole chain on the built-in face task, about two minutes
 # make test   sets up, lints and runs the tests, a few minutes; also installs the light-transport simulator, 200 MB
 # make clean  takes all of it away again
 PYTHON ?= python3
