@@ -109,7 +109,9 @@ def test_figures_have_one_pair_of_axes_per_ladder_with_all_its_rungs():
 def test_plotly_knows_every_property_of_the_figure():
     import plotly.graph_objects as go
 
-    go.Figure(pareto_figure([make_ladder(), make_ladder(knob="second")]))
+    # unknown properties raise
+    drawn = go.Figure(pareto_figure([make_ladder(), make_ladder(knob="second")]))
+    assert {trace.mode for trace in drawn.data} >= {"markers"}
 
 
 def test_no_name_becomes_markup():

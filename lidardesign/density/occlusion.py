@@ -62,13 +62,7 @@ class Blocked:
 
     def add_gradient(self, weights: np.ndarray, out: RayGradient) -> None:
         """Add the derivatives of sum_p weights_p log T_p, weights (P,), by each ray's origin, direction and range."""
-        pull = self.attenuation_per_m * weights[self.pairs]
-        count = len(out.ranges)
-        out.ranges -= np.bincount(self.rows, pull, minlength=count)
-        for axis in range(3):
-            force = pull * self.plane[:, axis]
-            out.origins[:, axis] -= np.bincount(self.rows, force, minlength=count)
-            out.directions[:, axis] -= np.bincount(self.rows, force * self.hit_m, minlength=count)
+        out.pull_behind(self.rows, self.attenuation_per_m * weights[self.pairs], self.hit_m, self.plane)
 
 
 class BodyRaycast:

@@ -42,6 +42,14 @@ def _shares(raw, softness, out) -> None:  # noqa: ANN001
 
 
 @njit(cache=True, nogil=True, inline="always")
+def _bins(raw, count, softness, share):  # noqa: ANN001, ANN202
+    """Shares of widths and of heights, written one after the other into `share` (2 K,)."""
+    _shares(raw[:count], softness, share[:count])
+    _shares(raw[count : 2 * count], softness, share[count:])
+    return share[:count], share[count:]
+
+
+@njit(cache=True, nogil=True, inline="always")
 def _softened(value, softness):  # noqa: ANN001, ANN202
     return value / (1.0 + abs(value) * softness)
 
@@ -111,10 +119,8 @@ def forward(parameters, values, periodic, softness, edge, shares, bins, out, log
     count = (parameters.shape[2] - 1) // 3
     for n in range(parameters.shape[0]):
         for d in range(parameters.shape[1]):
-            raw, share = parameters[n, d], shares[n, d]
-            widths, heights = share[:count], share[count:]
-            _shares(raw[:count], softness, widths)
-            _shares(raw[count : 2 * count], softness, heights)
+            raw = parameters[n, d]
+            widths, heights = _bins(raw, count, softness, shares[n, d])
             x = min(max(_turned(values[n, d], periodic[d]), -BOUND + edge), BOUND - edge)
             k, x0 = _bin_of(widths, x)
             first, second = _slopes(raw[2 * count :], k, softness / 2, periodic[d])
@@ -134,10 +140,8 @@ def inverse(parameters, values, periodic, softness, edge, shares, bins, out, log
     count = (parameters.shape[2] - 1) // 3
     for n in range(parameters.shape[0]):
         for d in range(parameters.shape[1]):
-            raw, share = parameters[n, d], shares[n, d]
-            widths, heights = share[:count], share[count:]
-            _shares(raw[:count], softness, widths)
-            _shares(raw[count : 2 * count], softness, heights)
+            raw = parameters[n, d]
+            widths, heights = _bins(raw, count, softness, shares[n, d])
             y = min(max(values[n, d], -BOUND + edge), BOUND - edge)
             k, y0 = _bin_of(heights, y)
             first, second = _slopes(raw[2 * count :], k, softness / 2, periodic[d])

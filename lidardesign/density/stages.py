@@ -1,8 +1,9 @@
 """Learning to a tolerance: trainings of doubled length, until the misplaced share of the density is small enough.
 
 Every stage starts anew with a schedule of its own length, because the schedule is what makes few steps good: sigma
-falls and the mass is balanced within them. All stages together cost less than twice the last one. The run is left as if
-learning had been asked for with the steps of that last one, bit for bit; the manifest keeps what was tried.
+falls and the mass is balanced within them. All stages together take less than twice the steps of the last one. The run
+is left as if learning had been asked for with the steps of that last one, bit for bit; the manifest keeps what was
+tried.
 """
 
 from __future__ import annotations

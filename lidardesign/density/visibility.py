@@ -104,6 +104,20 @@ class RayGradient:
         """All zero, for `count` rays."""
         return cls(np.zeros((count, 3)), np.zeros((count, 3)), np.zeros(count))
 
+    def pull_behind(self, rows: np.ndarray, pull: np.ndarray, hit_m: np.ndarray, plane: np.ndarray) -> None:
+        """Subtract the derivatives of sum pull * (range - hit) over hits: of ray `rows`, at `hit_m`, shapes (P,).
+
+        Arguments:
+            rows, pull, hit_m: Shape (P,); a ray may have many hits.
+            plane: Normals over their product with the direction, minus the hit's derivative by the origin, (P, 3).
+        """
+        count = len(self.ranges)
+        self.ranges -= np.bincount(rows, pull, minlength=count)
+        for axis in range(3):
+            force = pull * plane[:, axis]
+            self.origins[:, axis] -= np.bincount(rows, force, minlength=count)
+            self.directions[:, axis] -= np.bincount(rows, force * hit_m, minlength=count)
+
     def add_by_point(self, by_point: np.ndarray, rays: RayBatch) -> None:
         """Add the derivatives by the observed scene points, shape (N, 3)."""
         self.origins += by_point
@@ -169,13 +183,8 @@ class _Blocked:
 
     def gradient(self, weights: np.ndarray) -> RayGradient:
         out = RayGradient.zeros(len(self.log_values))
-        count = len(out.ranges)
         pull = self.attenuation_per_m * weights[self.rows, self.columns]
-        out.ranges -= np.bincount(self.rows, pull, minlength=count)
-        for axis in range(3):
-            force = pull * self.plane[:, axis]
-            out.origins[:, axis] -= np.bincount(self.rows, force, minlength=count)
-            out.directions[:, axis] -= np.bincount(self.rows, force * self.hit_m, minlength=count)
+        out.pull_behind(self.rows, pull, self.hit_m, self.plane)
         return out
 
 
