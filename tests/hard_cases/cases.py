@@ -1,0 +1,59 @@
+"""The register of hard cases: one class each, from which `tools/stability_table.py` writes docs/stability.md."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+# Design space and density, fields, rays, flow, mixture, files: the forty; MuJoCo; the promises.
+KEYS = (*map(str, range(1, 41)), *(f"M{number}" for number in range(1, 5)), *(f"P{number}" for number in range(1, 8)))
+
+
+@dataclass(frozen=True)
+class HardCase:
+    """One case and the class of its tests.
+
+    Arguments:
+        key: "1" to "40", "M1" to "M4" or "P1" to "P7".
+        title: What comes in.
+        done: What the program does then.
+        tests: The class; its `broke()` says what the plain formula does, measured at that moment.
+    """
+
+    key: str
+    title: str
+    done: str
+    tests: type
+
+    @property
+    def names(self) -> list[str]:
+        """The names of its tests, in the order in which they stand."""
+        return [name for name, value in vars(self.tests).items() if name.startswith("test_") and callable(value)]
+
+    def broke(self) -> str:
+        """What used to break, in one sentence."""
+        return self.tests.broke()
+
+
+CASES: dict[str, HardCase] = {}
+
+
+def hard_case(key: str, title: str, *, done: str) -> Callable[[type], type]:
+    """Register a class of tests as the one of a case.
+
+    Raises:
+        ValueError: There is no such case, another class has it, or it does not say what broke.
+    """
+
+    def register(tests: type) -> type:
+        if key not in KEYS:
+            raise ValueError(f"{tests.__name__}: there is no hard case {key!r}")
+        other = CASES.get(key)
+        if other is not None and other.tests.__qualname__ != tests.__qualname__:
+            raise ValueError(f"{tests.__name__}: hard case {key} is that of {other.tests.__name__}")
+        if not callable(getattr(tests, "broke", None)):
+            raise ValueError(f"{tests.__name__} has no broke(): what does the plain formula do?")
+        CASES[key] = HardCase(key, title, done, tests)
+        return tests
+
+    return register

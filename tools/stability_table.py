@@ -1,0 +1,76 @@
+"""Write the table of docs/stability.md: every hard case, what broke, what is done, the test.
+
+Usage: python tools/stability_table.py
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+CASES_FOLDER = ROOT / "tests" / "hard_cases"
+PAGE = ROOT / "docs" / "stability.md"
+BEGIN = "<!-- table: tools/stability_table.py -->"
+END = "<!-- end of table -->"
+HEADINGS = (
+    ("Design space and density", range(1, 11)),
+    ("Fields and meshes", range(11, 17)),
+    ("Rays and simulation", range(17, 23)),
+    ("Learning the flow", range(23, 29)),
+    ("Mixtures, constraints, designs", range(29, 36)),
+    ("Files, plugins, processes", range(36, 41)),
+)
+
+
+def table(cases: Mapping[str, Any]) -> str:
+    """The tables of all layers as Markdown: cases by key, see tests/hard_cases/cases.py."""
+    parts = [_layer(heading, [cases[str(number)] for number in numbers]) for heading, numbers in HEADINGS]
+    robots = [case for key, case in cases.items() if key.startswith("M")]
+    promises = [case for key, case in cases.items() if key.startswith("P")]
+    parts.append(_layer("Robots (MuJoCo)", sorted(robots, key=lambda case: case.key)))
+    parts.append(_layer("Promises", sorted(promises, key=lambda case: case.key)))
+    return "\n".join(parts)
+
+
+def _layer(heading: str, cases: list[Any]) -> str:
+    lines = [f"## {heading}", "", "| | case | what broke | what is done | tests |", "|---|---|---|---|---|"]
+    lines += [
+        f"| {case.key} | {_cell(case.title)} | {_cell(case.broke())} | {_cell(case.done)} | {_tests(case)} |"
+        for case in cases
+    ]
+    return "\n".join([*lines, ""])
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+def _tests(case: Any) -> str:
+    return f"[`{case.tests.__name__}`](../tests/hard_cases/{case.tests.__module__}.py): {len(case.names)}"
+
+
+def main() -> None:
+    """Collect the cases and write the page."""
+    sys.path[:0] = [str(CASES_FOLDER), str(CASES_FOLDER.parent)]
+    import conftest  # noqa: F401  one thread, as in the tests
+
+    cases = importlib.import_module("cases").CASES
+    for path in sorted(CASES_FOLDER.glob("test_cases_of_*.py")) + [CASES_FOLDER / "test_promises.py"]:
+        importlib.import_module(path.stem)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the plain formulas overflow: that is what is shown
+        written = table(cases)
+    page = PAGE.read_text(encoding="utf-8")
+    head, _, rest = page.partition(BEGIN)
+    _, _, tail = rest.partition(END)
+    PAGE.write_text(f"{head}{BEGIN}\n{written}{END}{tail}", encoding="utf-8")
+    print(f"{PAGE.relative_to(ROOT)}: {len(cases)} cases")
+
+
+if __name__ == "__main__":
+    main()
