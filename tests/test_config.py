@@ -132,7 +132,7 @@ BAD_FILES = {
     "unknown key": ("density:\n  sigma: 0.1\n", "2:3", "did you mean 'sigma_m'"),
     "unknown task key": ("task:\n  cuont: 1\n", "2:3", "did you mean 'count'"),
     "nested unknown key": ("task:\n  jitter:\n    angle: 1\n", "3:5", "angle_rad"),
-    "negative sigma": ("density:\n  sigma_m: -0.1\n", "2:12", "greater than 0"),
+    "negative sigma": ("density:\n  sigma_m: -0.1\n", "2:12", "greater than or equal to 0.000000001"),
     "wrong type": ("learning:\n  steps: many\n", "2:10", "valid integer"),
     "wrong word": ("density: {visibility: perhaps}\n", "1:23", "raycast"),
     "boolean for a word": ("density: {visibility: true}\n", "1:23", "raycast"),
@@ -163,7 +163,7 @@ def test_errors_in_a_file_point_at_line_and_column(write, case):
 
 
 BAD_OVERRIDES = {
-    "density.sigma_m=-1": "greater than 0",
+    "density.sigma_m=-1": "greater than or equal to 0.000000001",
     "density.sigma=1": "did you mean 'sigma_m'",
     "density.sigma_m=": "valid number",
     "density=3": "unknown key 'task.density'",

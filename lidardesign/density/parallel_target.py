@@ -24,7 +24,7 @@ from lidardesign.density.parallel import ALONE, Ranks
 from lidardesign.density.receiver import HeardVisibility, common_receiver
 from lidardesign.density.refinement import refine_quadrature
 from lidardesign.density.settings import DensitySettings
-from lidardesign.density.target import Target, build_target, is_of_frames
+from lidardesign.density.target import Target, build_target, is_of_frames, unusable
 from lidardesign.density.visibility import Optics, Quadrature, Visibility
 from lidardesign.errors import NumericalError
 from lidardesign.scene import Scene
@@ -149,8 +149,9 @@ class SharedFrames(FramesTarget):
         self, points: np.ndarray, sigma_m: float | None, gradient: bool
     ) -> tuple[np.ndarray, np.ndarray]:
         # what one rank finds out about its points ends the step of all
-        if self.ranks.max(np.array([not np.isfinite(points).all()]))[0]:
-            raise NumericalError("design points are not finite", where="target density")
+        wrong = unusable(np.asarray(points, dtype=np.float64))
+        if self.ranks.max(np.array([wrong is not None]))[0]:
+            raise NumericalError(wrong or "design points of another rank are none", where="target density")
         return super()._in_chunks(points, sigma_m, gradient)
 
 

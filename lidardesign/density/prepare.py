@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lidardesign.density.fields import TableField
 from lidardesign.density.parallel import ALONE, Ranks
 from lidardesign.density.parallel_target import SharedTarget, build_shared_target
 from lidardesign.density.proposals import occluded_share, propose
 from lidardesign.density.refinement import refine_quadrature
+from lidardesign.density.resolution import flatness_notes, resolution_notes
 from lidardesign.density.target import Target
 from lidardesign.density.visibility import Optics
 from lidardesign.run.clock import phase
@@ -38,6 +38,9 @@ def prepare_target(
         visibility: What an earlier probe of the same run decided, to take instead.
         compiled: See `build_target`.
         ranks: Who shares the scenes.
+
+    Raises:
+        ConfigError: Sigma is finer than distances are known; see `build_target` too.
     """
     settings, notes = config.density, []
     visibility = visibility or settings.visibility
@@ -48,7 +51,8 @@ def prepare_target(
     if visibility == "quadrature":
         target, refined = _refine_quadrature(target, scenes, config)
         notes.extend(refined)
-    notes.extend(_resolution_notes(target, settings.sigma_m))
+    notes.extend(resolution_notes(target, settings.sigma_m))
+    notes.extend(flatness_notes(target, settings.sigma_m, random_generator(config.seed, "flatness")))
     notes.extend(dict.fromkeys(line for scene in scenes for line in scene.notes))
     shapes = [body.shape for scene in scenes for body in scene.bodies]
     notes.extend(sorted({line for shape in shapes for line in getattr(shape, "notes", ())}))
@@ -77,14 +81,3 @@ def _refine_quadrature(target: Target, scenes: Sequence[Scene], config: RunConfi
     if isinstance(target, SharedTarget):
         return target.refined(proposals.points)
     return refine_quadrature(target, scenes, proposals.points)
-
-
-def _resolution_notes(target: Target, sigma_m: float) -> list[str]:
-    target = target.own if isinstance(target, SharedTarget) else target
-    if not isinstance(target.field, TableField) or sigma_m >= target.field.grid.step / 2:
-        return []
-    grid = target.field.grid
-    return [
-        f"sigma {sigma_m:g} m is below half the field's grid step {grid.step:.3g} m: "
-        "surfaces are blurred more than sigma says; raise density.field_resolution"
-    ]

@@ -9,6 +9,10 @@ from pydantic import BaseModel, ConfigDict, Field
 Visibility = Literal["auto", "raycast", "quadrature", "off"]
 Preset = Literal["draft", "standard", "fine"]
 PRESETS: tuple[str, ...] = ("draft", "standard", "fine")
+# Within these all squares and products that the density is made of are numbers, in float32 too.
+LONGEST_M = 1e9
+SHORTEST_M = 1 / LONGEST_M
+FASTEST_PER_M = 1e12
 
 
 class DensitySettings(BaseModel):
@@ -16,11 +20,15 @@ class DensitySettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    sigma_m: float = Field(0.005, gt=0, description="standard deviation of the surface proximity [m]")
+    sigma_m: float = Field(
+        0.005, ge=SHORTEST_M, le=LONGEST_M, description="standard deviation of the surface proximity [m]"
+    )
     visibility: Visibility = Field("auto", description="how occlusion is computed; auto probes whether it is needed")
-    attenuation_per_m: float | None = Field(None, gt=0, description="beta [1/m]; default max(1000, 5 / sigma)")
+    attenuation_per_m: float | None = Field(
+        None, gt=0, le=FASTEST_PER_M, description="beta [1/m]; default max(1000, 5 / sigma)"
+    )
     sharpness_per_m: float | None = Field(
-        None, gt=0, description="k [1/m] of the quadrature; default max(1000, 5 / sigma)"
+        None, gt=0, le=FASTEST_PER_M, description="k [1/m] of the quadrature; default max(1000, 5 / sigma)"
     )
     margin_m: float | None = Field(None, ge=0, description="m [m]: a surface does not occlude itself; default sigma")
     quadrature_points: int = Field(64, ge=4, le=4096, description="midpoints of the visibility quadrature")
@@ -48,7 +56,9 @@ class LearningSettings(BaseModel):
         "float32", description="arithmetic of training steps; samples and densities are always float64"
     )
     entropy: float = Field(0.0, ge=0, description="eta of the paper; annealed to 0")
-    sigma_start_m: float | None = Field(None, gt=0, description="where sigma's annealing starts; default 6 sigma")
+    sigma_start_m: float | None = Field(
+        None, ge=SHORTEST_M, le=LONGEST_M, description="where sigma's annealing starts; default 6 sigma"
+    )
     anneal: float = Field(0.7, ge=0, le=1, description="share of the path-wise steps over which sigma falls")
     balance: float = Field(0.5, ge=0, le=1, description="share of the steps, the last ones, that balance by values")
     balance_proposals: int = Field(65536, ge=256, description="independent proposals that balancing draws from")

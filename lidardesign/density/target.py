@@ -30,10 +30,10 @@ from lidardesign.density.visibility import (
     Visibility,
 )
 from lidardesign.errors import ConfigError, NumericalError
-from lidardesign.numerics import logsumexp
+from lidardesign.numerics import SLACK, logsumexp
 from lidardesign.run.clock import phase
 from lidardesign.scene import Mesh, Scene
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, observed_point
+from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace, observed_point
 
 PADDING_SIGMAS = 4.0
 MOST_QUADRATURE_BODIES = 2000
@@ -103,8 +103,8 @@ class Target:
         self, points: np.ndarray, sigma_m: float | None, gradient: bool
     ) -> tuple[np.ndarray, np.ndarray]:
         points = np.asarray(points, dtype=np.float64)
-        if not np.isfinite(points).all():
-            raise NumericalError("design points are not finite", where="target density")
+        if wrong := unusable(points):
+            raise NumericalError(wrong, where="target density")
         optics = self.optics if sigma_m is None else self.optics.widened(sigma_m)
         values, gradients = np.empty(len(points)), np.empty((len(points) if gradient else 0, 6))
         size, order = self.rows_at_once, nearby_order(observed_point(points))
@@ -156,6 +156,16 @@ class Target:
         by_chart[:, ELEVATION] = np.einsum("nk,nk->n", by_ray.directions, by_elevation)
         by_chart[:, RANGE] = by_ray.ranges
         return by_chart
+
+
+def unusable(points: np.ndarray) -> str | None:
+    """What makes design points (N, 6) none, by the name of the dimension; a range of 0 is one."""
+    if np.isfinite(points).all() and points[:, RANGE].min(initial=0.0) >= -SLACK:
+        return None
+    for name, values in zip(DIMENSIONS, points.T, strict=True):
+        if not np.isfinite(values).all():
+            return f"{int((~np.isfinite(values)).sum())} design points are not finite in {name}"
+    return f"range_m is {points[:, RANGE].min():g} m, which is negative"
 
 
 def build_target(

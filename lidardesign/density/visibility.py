@@ -4,6 +4,10 @@ Three ways, one interface: `Raycast` (exact first hit per column with Embree; T 
 differentiated through the plane of the hit triangle, so without the term for silhouettes that sweep over a ray),
 `Quadrature` (the transmittance integral by midpoints over the occluders' distances, fully differentiable) and
 `NoVisibility`. All work on columns, one per scene and frame, and only where a column can matter.
+
+Where a ray starts on a surface or in a solid, `Raycast` sees what simulation returns: on a surface it is met at once,
+so T = exp(-beta max(0, range - m)); from inside, its way out is the first hit, and a half space that the ray goes
+deeper into has none. `Quadrature` lets such a ray fade from its start within the solid. Range 0 gives T = 1 in all.
 """
 
 from __future__ import annotations
