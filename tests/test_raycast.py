@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from lidardesign.errors import ConfigError
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
-from lidardesign.simulate import raycast
-from lidardesign.simulate.raycast import SceneCaster, mesh_caster, shared_caster, trace_each
+from lidardesign.simulate import triangles
+from lidardesign.simulate.raycast import SceneCaster, shared_caster, trace_each
+from lidardesign.simulate.triangles import mesh_caster
 
 PRIMITIVES = {"sphere": Sphere(0.7), "box": Box((0.3, 0.5, 0.9)), "capsule": Capsule(0.3, 0.8), "plane": Plane()}
 SOLIDS = {name: shape for name, shape in PRIMITIVES.items() if name != "plane"}
@@ -364,13 +365,13 @@ def test_a_limit_and_the_set_of_bodies_hold_for_moving_meshes():
 
 def test_a_mesh_is_built_once_for_all_frames_scenes_and_copies_of_it(monkeypatch):
     built = []
-    make = raycast._Triangles.__init__
+    make = triangles.Triangles.__init__
 
     def counted(self, meshes):
         built.append(len(meshes))
         make(self, meshes)
 
-    monkeypatch.setattr(raycast._Triangles, "__init__", counted)
+    monkeypatch.setattr(triangles.Triangles, "__init__", counted)
     mesh = solid_mesh(trimesh.creation.icosphere(subdivisions=2, radius=0.123))
     copy = Mesh(mesh.vertices, mesh.faces)
     floor = solid_mesh(trimesh.creation.box((9.0, 9.0, 0.1)))

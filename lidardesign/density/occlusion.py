@@ -15,7 +15,7 @@ import numpy as np
 from lidardesign.density.bodies import Bodies, occluding_bodies
 from lidardesign.density.visibility import MINIMUM_COSINE, Optics, RayBatch, RayGradient
 from lidardesign.scene import Scene
-from lidardesign.simulate.raycast import mesh_caster
+from lidardesign.simulate.triangles import mesh_caster
 
 
 @dataclass(frozen=True, eq=False)

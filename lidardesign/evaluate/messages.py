@@ -19,15 +19,17 @@ from lidardesign import errors
 from lidardesign.errors import LidardesignError
 from lidardesign.evaluate.candidates import Positions
 from lidardesign.evaluate.passes import SceneScores
+from lidardesign.numerics import COARSE_SLACK
 from lidardesign.scene import Mesh, Scene
 from lidardesign.simulate.detector import Detector, Photons
 from lidardesign.simulate.plan import Bound, Decision, Plan, Planner, Tolerance
 from lidardesign.simulate.returns import Rays
+from lidardesign.simulate.triangles import SecondCasts
 from lidardesign.task import Score
 
 RAY_FIELDS = ("origin_m", "direction", "gate_m", "sensor", "time_s")
 # Far more than processors of different makes round differently, far less than any metric tells apart [m].
-OUTLINE_TOLERANCE_M = 1e-6
+OUTLINE_TOLERANCE_M = COARSE_SLACK
 DOCUMENT = "document"
 
 
@@ -102,13 +104,19 @@ def scores_as_document(found: SceneScores) -> dict[str, Any]:
         }
         for score, seconds in found.scores
     ]
-    return {"plan": asdict(found.plan), "planning_seconds": found.planning_seconds, "scores": scores}
+    return {
+        "plan": asdict(found.plan),
+        "planning_seconds": found.planning_seconds,
+        "scores": scores,
+        "second_casts": asdict(found.second_casts),
+    }
 
 
 def scores_from_document(document: dict[str, Any]) -> SceneScores:
     """The inverse of `scores_as_document`."""
     scores = [(Score(one["value"], one["failed"], one["details"]), one["seconds"]) for one in document["scores"]]
-    return SceneScores(plan_from_document(document["plan"]), document["planning_seconds"], scores)
+    second_casts = SecondCasts(**document["second_casts"])
+    return SceneScores(plan_from_document(document["plan"]), document["planning_seconds"], scores, second_casts)
 
 
 def outline(scene: Scene) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 from lidardesign.evaluate.candidates import Positions
@@ -17,6 +17,7 @@ from lidardesign.evaluate.scoring import score_lists
 from lidardesign.scene import Scene
 from lidardesign.simulate.plan import Plan, Planner
 from lidardesign.simulate.simulate import build_casters
+from lidardesign.simulate.triangles import SecondCasts
 from lidardesign.task import Score, Task
 
 if TYPE_CHECKING:
@@ -52,11 +53,13 @@ class SceneScores:
         plan: What was simulated.
         planning_seconds: Time to find that out [s].
         scores: Of every set of rays, in their order, each with its share of the time [s].
+        second_casts: How often meshes had to be asked twice, in planning too.
     """
 
     plan: Plan
     planning_seconds: float
     scores: Sequence[tuple[Score, float]]
+    second_casts: SecondCasts = field(default_factory=SecondCasts)
 
 
 class Scorer(Protocol):
@@ -112,4 +115,6 @@ def score_in_scene(
     started = time.perf_counter()
     plan = known or planner.plan(scene, [rays for positions in lists for rays in positions], casters)
     seconds = time.perf_counter() - started
-    return SceneScores(plan, seconds, list(score_lists(task, scene, lists, casters, planner.physics(plan, seed))))
+    scores = list(score_lists(task, scene, lists, casters, planner.physics(plan, seed)))
+    second_casts = sum((caster.second_casts for caster in casters), SecondCasts())
+    return SceneScores(plan, seconds, scores, second_casts)

@@ -1,29 +1,28 @@
 """First hits and all crossings of rays with a scene: Embree for meshes, closed forms for primitives.
 
-Meshes are recentred in float64 before they become Embree's float32, and rays that start far away are advanced to their
-neighbourhood first, which keeps sub-micrometre accuracy far from the origin; Embree runs in its robust mode, without
-which a quarter of the rays aimed at vertices slip through. Meshes at rest are one Embree scene; a mesh that moves has
-one in its own frame, built once, and rays are brought into that frame where they pass the mesh's ball.
+Meshes at rest are one Embree scene; a mesh that moves has one in its own frame, built once, and rays are brought into
+that frame where they pass the mesh's ball. First hits are asked for twice where a ray may have slipped through a
+mesh (see `triangles`), and how often it had is counted. `trace` and `trace_each`, of which learning asks many more
+rays, cast once: vertices have no share of a density.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Literal
-from weakref import WeakKeyDictionary, WeakValueDictionary
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.numerics import COARSE_SLACK, unit_vectors
 from lidardesign.scene import Body, Mesh, Scene
 from lidardesign.simulate.hits import Crossings, Hits
 from lidardesign.simulate.primitives import BALL_SLACK, PrimitiveGroup
+from lidardesign.simulate.triangles import FARTHEST_M, SecondCasts, Triangles, advances_m, mesh_caster
 
-FARTHEST_M = 1e30  # what Embree takes for an unlimited ray
-# Rays that start further than this many radii from the meshes' ball are advanced to it in float64.
-FAR_RADII = 4.0
 # After a triangle the next one is looked for this share of the scene's reach further on.
-STEP_SHARE = 1e-6
+STEP_SHARE = COARSE_SLACK
 MAXIMUM_LAYERS = 16
 
 Only = Literal["all", "targets", "occluders"]
@@ -40,6 +39,7 @@ class SceneCaster:
 
     def __init__(self, scene: Scene, frame: int = 0, *, only: Only = "all") -> None:
         chosen = _chosen(scene, only)
+        self.second_casts = SecondCasts()
         self._meshes = _Meshes(scene, [(i, body) for i, body in chosen if isinstance(body.shape, Mesh)], frame)
         kinds = {type(body.shape) for _, body in chosen} - {Mesh}
         self._groups = [
@@ -61,11 +61,17 @@ class SceneCaster:
             ConfigError: An origin or direction that is not finite, or a direction of zero length.
         """
         origins, directions = _checked_rays(origins, directions)
-        return self.trace(origins, directions, np.full(len(origins), np.inf))
+        self.second_casts.rays += len(origins)
+        return self._traced(origins, directions, np.full(len(origins), np.inf), self.second_casts)
 
     def trace(self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Hits:
-        """`first_hit` of finite float64 rays of unit length; from its limit (N,) on, a hit counts as a miss."""
-        hits = self._meshes.trace(origins, directions, limit_m)
+        """First hits of finite float64 rays of unit length, cast once; from its limit (N,) on, a hit is a miss."""
+        return self._traced(origins, directions, limit_m, None)
+
+    def _traced(
+        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None
+    ) -> Hits:
+        hits = self._meshes.trace(origins, directions, limit_m, twice)
         for group in self._groups:
             group.keep_nearer(hits, origins, directions, limit_m)
         rows = np.flatnonzero(hits.body >= 0)
@@ -135,107 +141,21 @@ def _checked_rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarr
     return origins, directions / lengths[:, None]
 
 
-class _Triangles:
-    """Meshes in one Embree scene, recentred."""
-
-    def __init__(self, meshes: Sequence[Mesh]) -> None:
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-
-        corners = np.concatenate([mesh.bounds_m for mesh in meshes])
-        self.centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
-        self.radius_m = float(np.linalg.norm(corners.max(axis=0) - corners.min(axis=0))) / 2
-        self._scene = EmbreeScene()
-        self._geometries = [
-            TriangleMesh(self._scene, (mesh.vertices - self.centre).astype(np.float32), mesh.faces) for mesh in meshes
-        ]
-
-    def trace(
-        self, local: np.ndarray, directions: np.ndarray, limit_m: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """First hits of rays relative to the centre: rows (K,), their ranges (K,), meshes (K,) and normals (K, 3)."""
-        advance_m = _advance_m(local, directions, self.radius_m)
-        found = self.run(
-            (local + advance_m[:, None] * directions).astype(np.float32),
-            directions.astype(np.float32),
-            np.clip(limit_m - advance_m, 0.0, FARTHEST_M).astype(np.float32),
-        )
-        range_m = found["tfar"] + advance_m
-        rows = np.flatnonzero((found["primID"] >= 0) & (range_m < limit_m))
-        return rows, range_m[rows], found["geomID"][rows], _unit(found["Ng"][rows].astype(np.float64))
-
-    def run(self, local: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> dict[str, np.ndarray]:
-        """Embree's own answer for float32 rays."""
-        return self._scene.run(local, directions, dists=limit_m, output=True)
-
-
-def _advance_m(local: np.ndarray, directions: np.ndarray, radius_m: np.ndarray | float) -> np.ndarray:
-    """How far starts are moved towards meshes around 0 where float32 could not tell them apart, shape (N,)."""
-    far = np.einsum("nk,nk->n", local, local) > (FAR_RADII * radius_m) ** 2
-    if not far.any():
-        return np.zeros(len(local))
-    closest = -np.einsum("nk,nk->n", local, directions)
-    return np.where(far, np.maximum(closest - 2 * radius_m, 0.0), 0.0)
-
-
-class MeshCaster:
-    """Casts rays at one mesh in its own frame; `mesh_caster` keeps one for every mesh."""
-
-    def __init__(self, mesh: Mesh) -> None:
-        self._triangles = _Triangles([mesh])
-
-    @property
-    def centre_m(self) -> np.ndarray:
-        """The centre of a ball around the mesh, shape (3,)."""
-        return self._triangles.centre
-
-    @property
-    def radius_m(self) -> float:
-        """The radius of that ball."""
-        return self._triangles.radius_m
-
-    def trace(
-        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """First hits of finite float64 rays of unit length in the mesh's frame, shapes (N, 3) and (N, 3).
-
-        From its limit (N,) on, a hit counts as a miss. Ranges (N,) [m] are infinite and unit normals (N, 3), wound as
-        the faces are, zero on a miss.
-        """
-        range_m, normal = np.full(len(origins), np.inf), np.zeros((len(origins), 3))
-        if len(origins):
-            rows, found_m, _, found_normal = self._triangles.trace(origins - self.centre_m, directions, limit_m)
-            range_m[rows], normal[rows] = found_m, found_normal
-        return range_m, normal
-
-
-_mesh_casters: WeakKeyDictionary[Mesh, MeshCaster] = WeakKeyDictionary()
-_casters_by_content: WeakValueDictionary[str, MeshCaster] = WeakValueDictionary()
-
-
-def mesh_caster(mesh: Mesh) -> MeshCaster:
-    """The one caster of a mesh in its own frame, kept as long as the mesh; meshes of equal content share it."""
-    if mesh not in _mesh_casters:
-        known = _casters_by_content.get(mesh.content_hash)
-        if known is None:
-            known = _casters_by_content[mesh.content_hash] = MeshCaster(mesh)
-        _mesh_casters[mesh] = known
-    return _mesh_casters[mesh]
-
-
 class _AtRest:
     """All meshes of a scene that do not move, in one Embree scene."""
 
     def __init__(self, bodies: Sequence[tuple[int, Body]]) -> None:
         self.body_of_geometry = np.array([index for index, _ in bodies], dtype=np.int64)
-        self.triangles = _Triangles([body.shape.transformed(body.poses) for _, body in bodies])
+        self.triangles = Triangles([body.shape.transformed(body.poses) for _, body in bodies])
         self.radius_m = self.triangles.radius_m
 
-    def trace(self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Hits:
+    def trace(
+        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None
+    ) -> Hits:
         hits = _no_hits(len(origins))
         if len(origins):
             local = origins - self.triangles.centre
-            rows, range_m, geometry, normal = self.triangles.trace(local, directions, limit_m)
+            rows, range_m, geometry, normal = self.triangles.trace(local, directions, limit_m, twice)
             hits.range_m[rows], hits.body[rows], hits.normal[rows] = range_m, self.body_of_geometry[geometry], normal
         return hits
 
@@ -246,7 +166,7 @@ def _traced_at_rest(
     """`trace_each` for meshes at rest: everything but Embree's calls is done for all rays together."""
     counts = np.diff(starts)
     local = origins - np.repeat([one.triangles.centre for one in meshes], counts, axis=0)
-    advance_m = _advance_m(local, directions, np.repeat([one.radius_m for one in meshes], counts))
+    advance_m = advances_m(local, directions, np.repeat([one.radius_m for one in meshes], counts))
     local = (local + advance_m[:, None] * directions).astype(np.float32)
     toward, limit = directions.astype(np.float32), np.clip(limit_m - advance_m, 0.0, FARTHEST_M).astype(np.float32)
     hits = _no_hits(len(origins))
@@ -263,7 +183,7 @@ def _traced_at_rest(
     if rows:
         hit = np.concatenate(rows)
         hits.range_m[hit] = np.concatenate(ranges) + advance_m[hit]
-        hits.normal[hit] = _facing(_unit(np.concatenate(normals).astype(np.float64)), directions[hit])
+        hits.normal[hit] = _facing(unit_vectors(np.concatenate(normals).astype(np.float64)), directions[hit])
     beyond = hits.range_m >= limit_m
     hits.range_m[beyond], hits.body[beyond], hits.normal[beyond] = np.inf, -1, 0.0
     return hits
@@ -294,7 +214,14 @@ class _Moving:
         self._radii_m = np.array([caster.radius_m for caster in self._casters])
         self.radius_m = float(self._radii_m.max())
 
-    def keep_nearer(self, hits: Hits, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> None:
+    def keep_nearer(
+        self,
+        hits: Hits,
+        origins: np.ndarray,
+        directions: np.ndarray,
+        limit_m: np.ndarray,
+        twice: SecondCasts | None,
+    ) -> None:
         """Enter the hits that are nearer than what `hits` holds."""
         for number, caster in enumerate(self._casters):
             bound = np.minimum(hits.range_m, limit_m)
@@ -303,7 +230,7 @@ class _Moving:
                 continue
             rotation = self._rotation[number]
             local = _turned(origins[rows] - self._translation[number], rotation.T)
-            range_m, normal = caster.trace(local, _turned(directions[rows], rotation.T), bound[rows])
+            range_m, normal = caster.trace(local, _turned(directions[rows], rotation.T), bound[rows], twice)
             hit = np.isfinite(range_m)
             won = rows[hit]
             hits.range_m[won], hits.body[won] = range_m[hit], self._body[number]
@@ -329,10 +256,12 @@ class _Meshes:
         self.resting = _shared_at_rest(scene, resting) if resting else None
         self.moving = _Moving(moving, frame) if moving else None
 
-    def trace(self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> Hits:
-        hits = self.resting.trace(origins, directions, limit_m) if self.resting else _no_hits(len(origins))
+    def trace(
+        self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None
+    ) -> Hits:
+        hits = self.resting.trace(origins, directions, limit_m, twice) if self.resting else _no_hits(len(origins))
         if self.moving:
-            self.moving.keep_nearer(hits, origins, directions, limit_m)
+            self.moving.keep_nearer(hits, origins, directions, limit_m, twice)
         return hits
 
     def crossings(
@@ -343,7 +272,7 @@ class _Meshes:
             alive, start, step_m = np.arange(len(origins)), start_m.copy(), self._step_m(limit_m)
             for _ in range(MAXIMUM_LAYERS):
                 ahead, toward = start[alive], directions[alive]
-                hits = self.trace(origins[alive] + ahead[:, None] * toward, toward, limit_m[alive] - ahead)
+                hits = self.trace(origins[alive] + ahead[:, None] * toward, toward, limit_m[alive] - ahead, None)
                 hit = hits.body >= 0
                 alive = alive[hit]
                 if not len(alive):
@@ -372,7 +301,3 @@ def _turned(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 def _facing(normals: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Normals (N, 3) turned against the directions (N, 3) of the rays that hit there."""
     return np.where((np.einsum("nk,nk->n", normals, directions) > 0)[:, None], -normals, normals)
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), np.finfo(float).tiny)

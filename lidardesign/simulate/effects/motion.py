@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -20,7 +21,8 @@ from lidardesign.scene import Body, Mesh, Scene, Shape, inverse_rigid
 from lidardesign.simulate.hits import Hits
 from lidardesign.simulate.physics import Tracer
 from lidardesign.simulate.primitives import BALL_SLACK, PrimitiveGroup
-from lidardesign.simulate.raycast import SceneCaster, mesh_caster, shared_caster
+from lidardesign.simulate.raycast import SceneCaster, shared_caster
+from lidardesign.simulate.triangles import SecondCasts, mesh_caster
 
 # Rays (N, 3), (N, 3) in a body's own frame and limits (N,) to ranges (N,), infinite on a miss, and normals (N, 3).
 LocalTracer = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -153,8 +155,8 @@ class _MovingBody:
 def _local_tracer(shape: Shape) -> tuple[LocalTracer, np.ndarray, float]:
     """How rays are traced at a shape in its own frame, with the centre (3,) and radius [m] of a ball around it."""
     if isinstance(shape, Mesh):
-        caster = mesh_caster(shape)
-        return caster.trace, caster.centre_m, caster.radius_m
+        caster, counted = mesh_caster(shape), SecondCasts()
+        return partial(caster.trace, twice=counted), caster.centre_m, caster.radius_m
     group = PrimitiveGroup([(0, Body(shape))], 0)
 
     def trace(origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
