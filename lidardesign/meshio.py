@@ -14,12 +14,13 @@ from typing import Any, Literal
 import numpy as np
 
 from lidardesign.errors import DataError, LidardesignError
+from lidardesign.numerics import ROUNDING
 from lidardesign.scene import Mesh, Sign
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 LARGEST_FILE_BYTES = 2 * 1024**3
 # a triangle whose double area is a smaller share of its longest edge squared has a normal of rounding noise
-FLATTEST_TRIANGLE = 1e-12
+FLATTEST_TRIANGLE = ROUNDING
 
 
 def list_mesh_files(folder: str | Path) -> list[Path]:

@@ -1,65 +1,201 @@
-"""Log-space and safe primitives: every guard against rounding lives here, with its reason."""
+"""Log-space and safe primitives: every guard against rounding lives here, with its reason.
+
+Functions take and give numpy arrays or torch tensors, and keep float32 and float64; everything else becomes float64.
+Where one selects between two formulas, each sees only input that it can bear: a derivative of the formula that is not
+taken would else be NaN times zero.
+"""
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
 import numpy as np
+from array_api_compat import array_namespace, device, is_torch_array
 
 LOG_HALF = -math.log(2.0)
+FULL_TURN = 2 * math.pi
+
+# Guards, from the finest to the coarsest. A module gives one a name of its own where that says more.
+# The smallest float64 that keeps all its digits: what is divided by at least this is finite if it is below 1e308 of it.
+TINY = float(np.finfo(np.float64).tiny)
+TINY_FLOAT32 = float(np.finfo(np.float32).tiny)
+# Numbers below this have squares that are lost.
+SQUARABLE = 1e-150
+# One rounding of a number near 1; what float32 leaves of it is a little more than the second.
+EPSILON = float(np.finfo(np.float64).eps)
+EPSILON_FLOAT32 = float(np.finfo(np.float32).eps)
+FLOAT32_ROUNDING = 1e-7
+# Relative difference of two float64 results that took different ways of some hundred operations.
+ROUNDING = 1e-12
+# Relative slack of conditions that hold by construction: sums, differences and conversions cost a few more digits.
+SLACK = 1e-9
+# Half of the digits: what is left of a difference of squares, or where a cosine stops telling angles apart.
+HALF_DIGITS = 1e-8
+# Relative slack of what went through float32 or through decimals that a person wrote.
+COARSE_SLACK = 1e-6
 
 
 def logsumexp(values: Any, axis: int | None = None, weights: Any | None = None) -> Any:
     r"""Logarithm of a sum of exponentials, $\log \sum_i w_i e^{a_i}$.
 
-    Rows that are all -inf give -inf without a warning; a +inf gives +inf.
+    Rows that are all -inf give -inf without a warning and have derivative 0; a +inf gives +inf, likewise.
 
     Arguments:
         values: Exponents a, any shape.
         axis: The axis that is summed; None sums all.
         weights: Factors w >= 0 that broadcast with `values`.
     """
-    values = np.asarray(values, dtype=np.float64)
-    peak = np.max(values, axis=axis, keepdims=True, initial=-np.inf)
-    shift = np.where(np.isfinite(peak), peak, 0.0)
-    with np.errstate(over="ignore", divide="ignore"):
-        terms = np.exp(values - shift)
-        total = np.sum(terms if weights is None else terms * weights, axis=axis, keepdims=True)
-        result = np.log(total) + shift
-    return result.reshape(())[()] if axis is None else np.squeeze(result, axis=axis)
+    xp, values = _floats(values)
+    if axis is None:
+        weights = None if weights is None else xp.reshape(xp.broadcast_to(_as(weights, values), values.shape), (-1,))
+        values, axis = xp.reshape(values, (-1,)), 0
+    if not values.shape[axis]:
+        return _scalar(xp.sum(values, axis=axis) - math.inf)
+    peak = _constant(xp.max(values, axis=axis, keepdims=True))
+    finite = xp.isfinite(peak)
+    if not bool(xp.all(finite)):
+        values = xp.where(finite, values, xp.zeros_like(values))
+    shift = xp.where(finite, peak, xp.zeros_like(peak))
+    terms = xp.exp(values - shift)
+    if weights is not None:
+        terms = terms * _as(weights, values)
+    total = xp.sum(terms, axis=axis, keepdims=True)
+    some = finite & (total > 0)
+    logarithm = xp.log(xp.where(some, total, xp.ones_like(total))) + shift
+    otherwise = xp.where(finite, xp.full_like(peak, -math.inf), peak)
+    return _scalar(xp.squeeze(xp.where(some, logarithm, otherwise), axis=axis))
 
 
-def log1mexp(values: Any) -> np.ndarray:
+def log1mexp(values: Any) -> Any:
     r"""$\log(1 - e^{a})$ for a <= 0, accurate at both ends (M. Maechler, 2012): -inf at a = 0."""
-    values = np.asarray(values, dtype=np.float64)
+    xp, values = _floats(values)
     near = values > LOG_HALF
+    one = xp.ones_like(values)
     with np.errstate(divide="ignore"):
-        close = np.log(-np.expm1(np.where(near, values, -1.0)))
-        far = np.log1p(-np.exp(np.where(near, -1.0, values)))
-    return np.where(near, close, far)
+        close = xp.log(-xp.expm1(xp.where(near, values, -one)))
+        far = xp.log1p(-xp.exp(xp.where(near, -one, values)))
+    return xp.where(near, close, far)
 
 
-def safe_divide(numerator: Any, denominator: Any, otherwise: float = 0.0) -> np.ndarray:
-    """Quotient, with `otherwise` where the denominator is zero."""
-    numerator, denominator = np.broadcast_arrays(np.asarray(numerator, float), np.asarray(denominator, float))
+def log_sigmoid(values: Any) -> Any:
+    r"""$\log \sigma(a) = -\log(1 + e^{-a})$: a itself far below 0, $-e^{-a}$ far above."""
+    xp, values = _floats(values)
+    negative = values < 0
+    magnitude = xp.where(negative, values, -values)
+    return xp.where(negative, values, xp.zeros_like(values)) - xp.log1p(xp.exp(magnitude))
+
+
+def safe_divide(numerator: Any, denominator: Any, otherwise: float = 0.0) -> Any:
+    """Quotient, with `otherwise` (and derivative 0) where the denominator is zero."""
+    xp, numerator, denominator = _floats(numerator, denominator)
     zero = denominator == 0
-    return np.where(zero, otherwise, numerator / np.where(zero, 1.0, denominator))
+    quotient = numerator / xp.where(zero, xp.ones_like(denominator), denominator)
+    return xp.where(zero, xp.full_like(quotient, otherwise), quotient)
 
 
-def wrap_angle(angle_rad: Any) -> np.ndarray:
+def safe_sqrt(values: Any) -> Any:
+    """Square root, 0 (and derivative 0) where the value is not positive: at 0 the derivative would be infinite."""
+    xp, values = _floats(values)
+    none = values <= 0
+    root = xp.sqrt(xp.where(none, xp.ones_like(values), values))
+    return _scalar(xp.where(none, xp.zeros_like(values), root))
+
+
+def safe_norm(vectors: Any, axis: int = -1) -> Any:
+    """Euclidean lengths that neither overflow nor lose small vectors; derivative 0 at the zero vector."""
+    xp, vectors = _floats(vectors)
+    with np.errstate(over="ignore"):
+        squared = xp.sum(vectors * vectors, axis=axis)
+    information = xp.finfo(vectors.dtype)
+    # squares this large keep their digits
+    kept = (squared > information.smallest_normal / information.eps) & (squared < information.max)
+    if bool(xp.all(kept)):
+        return xp.sqrt(squared)
+    largest = _constant(xp.max(xp.abs(vectors), axis=axis, keepdims=True))
+    scalable = (largest > 0) & xp.isfinite(largest)
+    scale = xp.where(scalable, largest, xp.ones_like(largest))
+    scaled = vectors / scale
+    length = safe_sqrt(xp.sum(scaled * scaled, axis=axis, keepdims=True))
+    return xp.squeeze(length * scale, axis=axis)
+
+
+def unit_vectors(vectors: Any, axis: int = -1) -> Any:
+    """Vectors of length 1 along `axis`; the zero vector stays zero."""
+    xp, vectors = _floats(vectors)
+    return safe_divide(vectors, xp.expand_dims(safe_norm(vectors, axis), axis=axis))
+
+
+def wrap_angle(angle_rad: Any) -> Any:
     """The same angle in [-pi, pi) [rad]."""
-    wrapped = np.mod(np.asarray(angle_rad, dtype=np.float64) + math.pi, 2 * math.pi) - math.pi
+    xp, angle = _floats(angle_rad)
+    wrapped = xp.remainder(angle + math.pi, FULL_TURN) - math.pi
     # the remainder of a tiny negative number rounds to the full turn
-    return np.where(wrapped >= math.pi, -math.pi, wrapped)
+    return _scalar(xp.where(wrapped >= math.pi, wrapped - FULL_TURN, wrapped))
 
 
-def circular_mean(angle_rad: Any, weights: Any | None = None) -> float:
-    """Direction of the weighted mean of unit vectors, in [0, 2 pi) [rad]; 0 where they cancel."""
-    angle = np.asarray(angle_rad, dtype=np.float64)
-    share = np.ones_like(angle) if weights is None else np.asarray(weights, dtype=np.float64)
-    mean = math.atan2(float(np.sum(share * np.sin(angle))), float(np.sum(share * np.cos(angle)))) % (2 * math.pi)
-    return 0.0 if mean >= 2 * math.pi else mean
+def wrap_turn(angle_rad: Any, start_rad: float = 0.0) -> Any:
+    """The same angle in [start, start + 2 pi) [rad]."""
+    xp, angle = _floats(angle_rad)
+    turned = xp.remainder(angle - start_rad, FULL_TURN)
+    return _scalar(start_rad + xp.where(turned >= FULL_TURN, turned - FULL_TURN, turned))
+
+
+def circular_difference(first_rad: Any, second_rad: Any) -> Any:
+    """The turn from the second angle to the first one, in [-pi, pi) [rad]."""
+    _, first, second = _floats(first_rad, second_rad)
+    return wrap_angle(first - second)
+
+
+def circular_mean(angle_rad: Any, weights: Any | None = None) -> Any:
+    """Direction of the weighted mean of unit vectors, in [0, 2 pi) [rad]; 0 where they cancel exactly."""
+    xp, angle = _floats(angle_rad)
+    share = xp.ones_like(angle) if weights is None else _as(weights, angle)
+    along, across = xp.sum(share * xp.cos(angle)), xp.sum(share * xp.sin(angle))
+    cancelled = (along == 0) & (across == 0)
+    mean = xp.atan2(across, xp.where(cancelled, xp.ones_like(along), along))
+    return wrap_turn(mean)
+
+
+def sphere_log(local: Any) -> Any:
+    """Tangent coordinates at the pole (1, 0, 0) of unit vectors: (..., 3) to (..., 2) [rad].
+
+    Their length is the angle from the pole: a plain arc cosine loses half of its digits there. Near it the ratio of
+    angle and sine comes from its series. The antipode has no direction: it is put at (pi, 0), derivative 0.
+    """
+    xp, local = _floats(local)
+    forward, sideways = local[..., 0], local[..., 1:]
+    squared = xp.sum(sideways * sideways, axis=-1)
+    near = (squared < _series_limit(squared)) & (forward > 0)
+    lost = xp.all(sideways == 0, axis=-1) & ~near
+    sine = safe_norm(xp.where((near | lost)[..., None], xp.ones_like(sideways), sideways))
+    ratio = xp.where(near, 1 + squared / 6, xp.atan2(sine, forward) / sine)
+    antipode = xp.stack([xp.full_like(forward, math.pi), xp.zeros_like(forward)], axis=-1)
+    return xp.where(lost[..., None], antipode, sideways * ratio[..., None])
+
+
+def sphere_exp(tangent: Any) -> Any:
+    """Unit vectors at tangent coordinates at the pole (1, 0, 0): (..., 2) [rad] to (..., 3); undoes `sphere_log`."""
+    xp, tangent = _floats(tangent)
+    squared = xp.sum(tangent * tangent, axis=-1)
+    near = squared < _series_limit(squared)
+    angle = xp.sqrt(xp.where(near, xp.ones_like(squared), squared))
+    ratio = xp.where(near, 1 - squared / 6, xp.sin(angle) / angle)
+    cosine = xp.where(near, 1 - squared / 2, xp.cos(angle))
+    return xp.concat([cosine[..., None], tangent * ratio[..., None]], axis=-1)
+
+
+def angle_over_sine(angle_rad: Any) -> Any:
+    """t / sin t for 0 <= t <= pi: the area factor of the sphere's exponential map; 1 at 0, large and finite at pi."""
+    xp, angle = _floats(angle_rad)
+    near = angle * angle < _series_limit(angle)
+    # beyond a right angle the sine of pi - t is the one that keeps its digits
+    folded = xp.where(angle > math.pi / 2, math.pi - angle, angle)
+    sine = xp.sin(xp.where(near, xp.ones_like(angle), folded))
+    least = xp.finfo(angle.dtype).eps
+    far = angle / xp.where(sine < least, xp.full_like(sine, least), sine)
+    return _scalar(xp.where(near, 1 + angle * angle / 6, far))
 
 
 def normalised_weights(log_weights: Any) -> np.ndarray:
@@ -118,9 +254,25 @@ def clipped_eigenvalues(matrices: np.ndarray, low: Any, high: Any = np.inf, smal
     return (rebuilt + np.swapaxes(rebuilt, -1, -2)) / 2
 
 
-def nearest_positive_definite(covariance: np.ndarray, floor: float) -> np.ndarray:
-    """The nearest symmetric matrix (Frobenius norm) whose eigenvalues are at least `floor`, (..., n, n)."""
-    return clipped_eigenvalues(covariance, floor)
+def nearest_positive_definite(covariance: Any, floor: float) -> Any:
+    """The nearest symmetric matrix (Frobenius norm) whose eigenvalues are at least `floor`, (..., n, n).
+
+    The derivative is that of Daleckii and Krein (1965), of the eigenvalues' divided differences: eigenvectors of equal
+    eigenvalues have none, the projection does.
+    """
+    xp, matrices = _floats(covariance)
+    symmetric = (matrices + xp.matrix_transpose(matrices)) / 2
+    values, vectors = xp.linalg.eigh(_constant(symmetric))
+    clipped = xp.where(values < floor, xp.full_like(values, floor), values)
+    gap = values[..., :, None] - values[..., None, :]
+    rise = clipped[..., :, None] - clipped[..., None, :]
+    kept = xp.astype(values >= floor, values.dtype)
+    slope = xp.where(gap == 0, xp.broadcast_to(kept[..., None], gap.shape), safe_divide(rise, gap))
+    turned = xp.matrix_transpose(vectors)
+    # 0 in value, the derivative in its derivative
+    change = turned @ (symmetric - _constant(symmetric)) @ vectors
+    moved = vectors @ (xp.eye(values.shape[-1], dtype=values.dtype) * clipped[..., None, :] + slope * change) @ turned
+    return (moved + xp.matrix_transpose(moved)) / 2
 
 
 def box_quadratic_minimum(
@@ -142,3 +294,41 @@ def box_quadratic_minimum(
         if np.array_equal(before, point):
             break
     return point
+
+
+def _floats(*values: Any) -> tuple[Any, ...]:
+    """The namespace of the arrays, and the values as floating arrays of one dtype on one device."""
+    tensors = [value for value in values if is_torch_array(value)]
+    if tensors:
+        xp = array_namespace(*tensors)
+        dtype = functools.reduce(xp.result_type, [tensor.dtype for tensor in tensors])
+        dtype = dtype if xp.isdtype(dtype, "real floating") else xp.float64
+        like = xp.zeros((), dtype=dtype, device=device(tensors[0]))
+        return xp, *(_as(value, like) for value in values)
+    arrays = [value for value in values if isinstance(value, np.ndarray | np.generic)]
+    single = bool(arrays) and all(value.dtype == np.float32 for value in arrays)
+    dtype = np.float32 if single else np.float64
+    converted = [np.asarray(value, dtype=dtype) for value in values]
+    return array_namespace(converted[0]), *converted
+
+
+def _as(value: Any, like: Any) -> Any:
+    """A value as an array of the dtype and on the device of another."""
+    if is_torch_array(value):
+        return value.to(like)
+    return array_namespace(like).asarray(value, dtype=like.dtype, device=device(like))
+
+
+def _constant(values: Any) -> Any:
+    """The same numbers, without a derivative."""
+    return values.detach() if is_torch_array(values) else values
+
+
+def _scalar(values: Any) -> Any:
+    """A numpy scalar for an array without axes; everything else as it is."""
+    return values[()] if isinstance(values, np.ndarray) else values
+
+
+def _series_limit(values: Any) -> float:
+    """Squares of angles below which two terms of a series in the square are exact to rounding."""
+    return math.sqrt(float(array_namespace(values).finfo(values.dtype).eps))

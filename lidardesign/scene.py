@@ -16,17 +16,18 @@ from typing import Any, Literal
 import numpy as np
 
 from lidardesign.errors import DataError
+from lidardesign.numerics import COARSE_SLACK, SLACK
 
 Role = Literal["target", "occluder", "both"]
 Sign = Literal["auto", "solid", "winding", "unsigned"]
 ROLES = ("target", "occluder", "both")
 # How far a pose's rotation may be from orthogonal: poses are often written with seven digits.
-RIGID_TOLERANCE = 1e-6
+RIGID_TOLERANCE = COARSE_SLACK
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 # Light that fades over a nanometre has entered a solid.
 DENSEST = 1e9
 # Shares of light that were meant to add up to 1 may exceed it by rounding.
-SHARE_ROUNDING = 1e-9
+SHARE_ROUNDING = SLACK
 
 
 def _check_lengths(shape: object, *lengths_m: float, low: float = 0.0, strict: bool = True) -> None:

@@ -19,15 +19,15 @@ from typing import Any, Literal
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.numerics import FULL_TURN, SLACK, wrap_turn
 
 DIMENSIONS = ("x_m", "y_m", "z_m", "azimuth_rad", "elevation_rad", "range_m")
 X, Y, Z, AZIMUTH, ELEVATION, RANGE = range(6)
-FULL_TURN = 2 * math.pi
 
 Measure = Literal["solid_angle", "angles"]
 MEASURES = ("solid_angle", "angles")
 # Bounds such as 2 pi are written with some ten digits.
-ROUNDING_RAD = 1e-9
+ROUNDING_RAD = SLACK
 
 
 def direction(azimuth_rad: Any, elevation_rad: Any) -> np.ndarray:
@@ -40,8 +40,7 @@ def direction(azimuth_rad: Any, elevation_rad: Any) -> np.ndarray:
 def angles(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Azimuth in [0, 2 pi) and elevation in [-pi/2, pi/2] of vectors of any length, shape (..., 3)."""
     x, y, z = np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0)
-    azimuth = np.mod(np.arctan2(y, x), FULL_TURN)
-    return np.where(azimuth >= FULL_TURN, 0.0, azimuth), np.arctan2(z, np.hypot(x, y))
+    return wrap_turn(np.arctan2(y, x)), np.arctan2(z, np.hypot(x, y))
 
 
 def observed_point(points: np.ndarray) -> np.ndarray:
@@ -184,11 +183,11 @@ class DesignSpace:
         azimuth = points[..., AZIMUTH]
         low, high = self.low[AZIMUTH], self.high[AZIMUTH]
         lowest = (low + high) / 2 - math.pi
-        wrapped = lowest + np.mod(azimuth - lowest, FULL_TURN)
+        wrapped = wrap_turn(azimuth, lowest)
         points[..., AZIMUTH] = np.where((azimuth < low) | (azimuth > high), wrapped, azimuth)
         return points
 
-    def contains(self, points: np.ndarray, tolerance: float = 1e-9) -> np.ndarray:
+    def contains(self, points: np.ndarray, tolerance: float = SLACK) -> np.ndarray:
         """Which design points lie in the box, (..., 6) to (...) bool; the azimuth counts modulo a turn."""
         wrapped = self.wrap(points)
         inside = (wrapped >= np.array(self.low) - tolerance) & (wrapped <= np.array(self.high) + tolerance)

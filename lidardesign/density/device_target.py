@@ -19,6 +19,7 @@ from torch.nn.functional import embedding_bag
 from lidardesign.density.fields import TableField
 from lidardesign.density.target import Target
 from lidardesign.density.visibility import NoVisibility, Optics, Quadrature
+from lidardesign.numerics import safe_sqrt
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE
 
 # Beyond so many sharpness lengths a sigmoid is 0 or 1 to every digit, and its exponential would overflow float32.
@@ -76,8 +77,7 @@ class DeviceTarget(Target):
         chart[:, free] = low[free] + (unit + 1) / 2 * (high - low)[free]
         azimuth, elevation = chart[:, AZIMUTH], chart[:, ELEVATION]
         sine = elevation if space.measure == "solid_angle" else torch.sin(elevation)
-        # at the poles the root has no derivative; there the cosine is 0 either way
-        cosine = (1 - sine.square()).clamp(min=torch.finfo(unit.dtype).tiny).sqrt()
+        cosine = safe_sqrt(1 - sine.square())
         toward = torch.stack([cosine * torch.cos(azimuth), cosine * torch.sin(azimuth), sine], dim=1)
         return chart[:, :3], toward, chart[:, RANGE]
 
@@ -116,9 +116,7 @@ class _Table:
         values = embedding_bag(rows, self._table.to(places.dtype), per_sample_weights=weights, mode="sum")
         beyond = ((cells - inside) * self._step).square().sum(dim=-1, keepdim=True)
         outside = beyond > 0
-        # the root has no derivative at 0, so it sees a safe number where it is not taken
-        rooted = torch.where(outside, beyond + values.clamp(min=0).square(), 1.0).sqrt()
-        return torch.where(outside, rooted, values)
+        return torch.where(outside, safe_sqrt(beyond + values.clamp(min=0).square()), values)
 
 
 def on_device(target: Target, device: torch.device) -> Target:

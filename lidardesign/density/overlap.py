@@ -20,14 +20,14 @@ from scipy.optimize import brentq
 from scipy.special import logsumexp
 
 from lidardesign.errors import NumericalError
-from lidardesign.numerics import normalised_weights
+from lidardesign.numerics import SLACK, TINY, normalised_weights
 
 # Where log Z is found to: far below what samples can tell.
-LOG_Z_TOLERANCE_NATS = 1e-9
+LOG_Z_TOLERANCE_NATS = SLACK
 # A group of fewer points than this on either side is judged by the groups that have more.
 LEAST_POINTS = 8
 # Densities that share less than this share nothing, and the division by it is safe.
-LEAST_SHARED = float(np.finfo(np.float64).tiny)
+LEAST_SHARED = TINY
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from lidardesign.density.settings import LearningSettings
 from lidardesign.density.target import Target
 from lidardesign.density.training import SIGMA_START_RATIO
 from lidardesign.density.visibility import Optics
+from lidardesign.numerics import TINY
 from lidardesign.space import DesignSpace
 
 Loss = Callable[[DesignFlow, torch.Generator], torch.Tensor]
@@ -103,7 +104,7 @@ def gradient(flow: DesignFlow, loss: Loss, seed: int, clip_norm: float) -> np.nd
     flat = torch.cat([part.detach().double().reshape(-1) for part in parts]).cpu().numpy()
     if not np.isfinite(flat).all():
         return np.zeros_like(flat)
-    return flat * min(1.0, clip_norm / max(np.linalg.norm(flat), np.finfo(float).tiny))
+    return flat * min(1.0, clip_norm / max(np.linalg.norm(flat), TINY))
 
 
 def in_arithmetic(flow: DesignFlow, dtype: str) -> DesignFlow:

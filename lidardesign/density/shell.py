@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lidardesign.density.fields import Field, scene_columns
-from lidardesign.numerics import logsumexp
+from lidardesign.numerics import TINY, logsumexp
 from lidardesign.scene import Scene
 from lidardesign.space import ELEVATION, RANGE, DesignSpace, aim, observed_point
 from lidardesign.surface import sample_body, target_area_m2
@@ -92,4 +92,4 @@ def log_chart_factor(space: DesignSpace, points: np.ndarray) -> np.ndarray | flo
     """log of solid angle per chart area at design points: 0 where the chart measures solid angle."""
     if space.measure == "solid_angle":
         return 0.0
-    return np.log(np.maximum(np.cos(points[:, ELEVATION]), np.finfo(float).tiny))
+    return np.log(np.maximum(np.cos(points[:, ELEVATION]), TINY))

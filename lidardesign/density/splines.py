@@ -14,9 +14,11 @@ import torch
 from torch import Tensor
 from zuko.transforms import MonotonicRQSTransform
 
+from lidardesign.numerics import FLOAT32_ROUNDING, safe_sqrt
+
 BOUND = 1.0
 # Foreign points and base samples are kept this far inside the box, where splines are smooth.
-EDGE = 1e-7
+EDGE = FLOAT32_ROUNDING
 # The smallest slope that a spline may take; its inverse is the steepest: 1e4 resolves a 0.1 mm shell in a 1 m range.
 MINIMUM_SLOPE = 1e-4
 SOFTNESS = 2 / abs(math.log(MINIMUM_SLOPE))
@@ -66,8 +68,8 @@ class BoundedSpline(MonotonicRQSTransform):
         _, x0, x1, y0, y1, d0, d1, s = self.bin(self.searchsorted(self.vertical, y) - 1)
         bend = (y - y0) * (d0 + d1 - 2 * s)
         a, b, c = (y1 - y0) * (s - d0) + bend, (y1 - y0) * d0 - bend, -s * (y - y0)
-        discriminant = (b**2 - 4 * a * c).clamp(min=torch.finfo(y.dtype).tiny)
-        share = (2 * c / (-b - discriminant.sqrt())).clamp(0.0, 1.0)
+        discriminant = b**2 - 4 * a * c
+        share = (2 * c / (-b - safe_sqrt(discriminant))).clamp(0.0, 1.0)
         return self._turned(x0 + share * (x1 - x0))
 
 

@@ -30,7 +30,7 @@ import numpy as np
 from lidardesign.design.features import Axes, Features
 from lidardesign.design.looks import looks
 from lidardesign.design.quantise import lloyd
-from lidardesign.numerics import effective_count
+from lidardesign.numerics import ROUNDING, SLACK, effective_count
 from lidardesign.space import AZIMUTH, ELEVATION, DesignSpace, angles
 
 # The bending's weight kappa relative to the pull of one ray's samples at one knot.
@@ -43,13 +43,12 @@ STARTS = 12
 # Nearer samples than this share of the mean distance pull no harder.
 SMALLEST_DISTANCE = 0.01
 # Keeps divisions finite where every sample lies on its ray [m].
-TINY = 1e-12
 # Mean elevations closer than this are the same row [rad].
 ORDER_DECIMALS = 9
 # So many distances of samples to rays are held at once.
 BLOCK = 500_000
 # Roughness relative to the mass of a knot that keeps the normal equations solvable where a ray sees nothing.
-SMALLEST_STIFFNESS = 1e-9
+SMALLEST_STIFFNESS = SLACK
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,13 +105,13 @@ def aimed_rays(along: Along, count: int, generator: np.random.Generator) -> tupl
     centres = _started(weighted, surface, count, generator)
     labels, distance = _nearest(along, surface, centres)
     nearest_m = SMALLEST_DISTANCE * float(weighted.weights @ distance)
-    stiffness = ROUGHNESS / max(float(weighted.weights @ distance), TINY) / (count * len(along.knots))
+    stiffness = ROUGHNESS / max(float(weighted.weights @ distance), ROUNDING) / (count * len(along.knots))
     cost = math.inf
     for _ in range(SWEEPS):
         before, cost = cost, _cost(weighted, distance, centres, stiffness)
         if before - cost <= SMALLEST_GAIN * cost:
             break
-        pulls = weighted.weights / np.maximum(distance, max(nearest_m, TINY))
+        pulls = weighted.weights / np.maximum(distance, max(nearest_m, ROUNDING))
         centres = _smoothed(along, surface, pulls, labels, centres, stiffness)
         labels, distance = _nearest(along, surface, centres)
     order = _upwards(centres)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.numerics import SLACK
 from lidardesign.scene import SPEED_OF_LIGHT_M_S
 from lidardesign.simulate.returns import Rays
 
@@ -19,7 +20,7 @@ SECONDS_PER_PICOSECOND = 1e-12
 BITS_PER_MEGABIT = 1e6
 # A width of exactly k bins that passed through a mean and a spread comes back a few ulp off; this share of
 # the width may be rounding, far below what any receiver resolves.
-BIN_ROUNDING = 1e-9
+BIN_ROUNDING = SLACK
 # More are counted as so many, which no read-out takes: whole numbers stay exact.
 MOST_BINS = 1e15
 

@@ -12,13 +12,13 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from lidardesign.design.features import Features
-from lidardesign.numerics import wrap_angle
+from lidardesign.numerics import SLACK, wrap_angle
 
 # Smallest standard deviations relative to the spread of all data: below it a component has collapsed on a
 # duplicate. In angle and range separately, and per origin axis.
 RELATIVE_FLOOR = 1e-4
 # Relative to the extent of the space or a full turn, where the data themselves do not vary.
-ABSOLUTE_FLOOR = 1e-9
+ABSOLUTE_FLOOR = SLACK
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidardesign.numerics import clipped_eigenvalues
+from lidardesign.numerics import SQUARABLE, clipped_eigenvalues
 
 # Alternations of both steps, and rounds over the axes in the first: an iteration of the mixture starts where the one
 # before ended, so the rest follows.
@@ -28,7 +28,7 @@ AXIS_ROUNDS = 1
 # Updates of the Lagrange multipliers of bounded variances: the first is exact where one is bounded.
 FORCE_ROUNDS = 6
 # What rounding may leave of a narrow box counts as this wide, so that its inverse has a finite square [m].
-SMALLEST_WIDTH_M = 1e-100
+SMALLEST_WIDTH_M = SQUARABLE
 
 
 class Box(NamedTuple):

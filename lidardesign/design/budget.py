@@ -12,9 +12,10 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints import Budget
 from lidardesign.design.rays import split_budget
 from lidardesign.errors import InfeasibleError
+from lidardesign.numerics import COARSE_SLACK
 
 # A cap of n bins is this share narrower, so that its width never rounds up to n + 1 bins.
-BIN_MARGIN = 1e-6
+BIN_MARGIN = COARSE_SLACK
 MOST_REFITS = 12
 
 Fitted = TypeVar("Fitted")

@@ -15,14 +15,15 @@ from typing import Any
 import numpy as np
 
 from lidardesign.design.check_excluded import excluded_rows, excluded_starts, excluded_travel
+from lidardesign.numerics import COARSE_SLACK, ROUNDING, SLACK
 
 # Rounding of the checker's own conversions between radians and degrees, as a share of the bound.
-ROUNDING = 1e-12
 # A reported interval may differ from its mean and spread by this share (decimal digits in a file).
-AGREEMENT = 1e-6
+AGREEMENT = COARSE_SLACK
 # The bandwidth model counts a width this share above whole bins as whole bins.
-BIN_ROUNDING = 1e-9
+BIN_ROUNDING = SLACK
 LIGHT_M_PER_S = 299792458.0
+PICOSECOND_S = 1e-12
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,7 @@ def _consistency(name: str, sensor: Mapping[str, Any], z: float) -> list[Constra
         pairs.append(("gate_m.width", end - start, 2 * z * spread["range_m"]))
     size = max(abs(value) for _, *values in pairs for value in values)
     checks = [
-        ConstraintCheck(f"{name}.{key}", expected, found, bool(abs(found - expected) <= AGREEMENT * max(size, 1e-9)))
+        ConstraintCheck(f"{name}.{key}", expected, found, bool(abs(found - expected) <= AGREEMENT * max(size, SLACK)))
         for key, found, expected in pairs
     ]
     # agreement is no news; a contradiction is
@@ -264,7 +265,7 @@ def _widths(document: Mapping[str, Any], budget: Mapping[str, Any]) -> list[tupl
 def _dearest(track: Mapping[str, Any], budget: Mapping[str, Any]) -> list[tuple[float, int]]:
     """Gate widths where a track needs most bins: widths are linear between knots, so bins change only where one
     crosses a whole number, and one place between each two of these tells all."""
-    bin_m = LIGHT_M_PER_S * budget.get("bin_ps", 100.0) * 1e-12 / 2
+    bin_m = LIGHT_M_PER_S * budget.get("bin_ps", 100.0) * PICOSECOND_S / 2
     width = np.array(track["gate_end_m"], dtype=np.float64) - np.array(track["gate_start_m"], dtype=np.float64)
     places = [width]
     for left, right in zip(width[:-1] / bin_m, width[1:] / bin_m, strict=True):
@@ -363,6 +364,6 @@ def _budget(document: Mapping[str, Any], rules: Mapping[str, Any]) -> list[Const
 
 def _mbps(widths: list[tuple[float, int]], budget: Mapping[str, Any]) -> float:
     """Rays times whole bins times bits times frames [Mbit/s]."""
-    bin_m = LIGHT_M_PER_S * budget.get("bin_ps", 100.0) * 1e-12 / 2
+    bin_m = LIGHT_M_PER_S * budget.get("bin_ps", 100.0) * PICOSECOND_S / 2
     bins = sum(count * max(math.ceil(width / bin_m * (1 - BIN_ROUNDING)), 1) for width, count in widths)
     return bins * budget.get("bits_per_bin", 40.0) * budget.get("rate_hz", 10.0) / 1e6

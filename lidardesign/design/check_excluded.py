@@ -10,8 +10,9 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from lidardesign.numerics import ROUNDING
+
 # Rounding of means, spreads and their product, as a share of the bound, or of a metre.
-ROUNDING = 1e-12
 
 Row = tuple[str, Any, Any, bool]
 

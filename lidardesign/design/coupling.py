@@ -16,13 +16,13 @@ import numpy as np
 from lidardesign.design.ensemble import Ensemble
 from lidardesign.design.mixture import responsibilities
 from lidardesign.design.sensor import Coupling, Sensor, tangent_coordinates
-from lidardesign.numerics import effective_count
+from lidardesign.numerics import SLACK, effective_count
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction
 
 # A regression on five covariates means nothing from fewer effective samples.
 LEAST_EFFECTIVE_SAMPLES = 30.0
 # Directions of the standardised covariates with less of their variance than this share carry rounding only.
-SMALLEST_VARIANCE_SHARE = 1e-10
+SMALLEST_VARIANCE_SHARE = SLACK
 
 
 def couplings(ensemble: Ensemble, sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:

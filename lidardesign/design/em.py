@@ -21,7 +21,7 @@ from lidardesign.design.mstep import maximise
 from lidardesign.design.origins import nearest_admitted
 from lidardesign.design.quantise import lloyd
 from lidardesign.errors import NumericalError
-from lidardesign.numerics import effective_count, wrap_angle
+from lidardesign.numerics import ROUNDING, TINY, effective_count, wrap_angle
 
 # Iterations stop when the mean log-likelihood gains less than this per iteration [nats].
 CONVERGENCE_NATS = 1e-5
@@ -31,7 +31,7 @@ RESTART_ITERATIONS = 12
 SCREEN_SAMPLES = 5000
 FINALISTS = 3
 # Falls below this are rounding of a sum over the samples [nats].
-ROUNDING_NATS = 1e-12
+ROUNDING_NATS = ROUNDING
 SEED_SAMPLES = 2000
 SEED_LLOYD_ITERATIONS = 4
 # A component that explains less than this many effective samples has died.
@@ -40,7 +40,7 @@ MOST_REVIVALS = 3
 # Shorter boresight steps than this share are as good as none.
 SMALLEST_STEP = 0.02
 # Mass that stands for an empty cell, so that its mean is finite.
-SMALLEST_CELL = 1e-300
+SMALLEST_CELL = TINY
 
 
 @dataclass(frozen=True, eq=False)

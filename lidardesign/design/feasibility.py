@@ -16,10 +16,11 @@ from lidardesign.design.constraints import Constraints, SensorConstraints
 from lidardesign.design.mounts import most_mounted, mounts_of
 from lidardesign.design.origins import free_boxes
 from lidardesign.errors import InfeasibleError
+from lidardesign.numerics import SLACK
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace
 
 # Bounds that differ by less come from the same number through degrees and radians [m or rad].
-AGREEMENT = 1e-9
+AGREEMENT = SLACK
 
 
 @dataclass(frozen=True)

@@ -17,10 +17,11 @@ from functools import cached_property
 
 import numpy as np
 
+from lidardesign.numerics import SLACK
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 
 # Below this cosine of a fixed elevation the azimuth turns the ray about itself: it is no freedom there.
-POLE_COSINE = 1e-9
+POLE_COSINE = SLACK
 # A free axis on which the data do not vary is scaled by this share of its bounds: nothing divides by 0.
 IDLE_AXIS_SHARE = 1e-3
 

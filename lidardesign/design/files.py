@@ -30,6 +30,7 @@ from lidardesign.design.sensor import (
 from lidardesign.design.sensor_csv import looks_like_sensor_csv, read_sensor_csv
 from lidardesign.design.track_document import MOST_TRACK_RAYS, read_at, read_track, track_document
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.run.clock import phase
 from lidardesign.run.files import write_atomic
 from lidardesign.run.yaml import Document, dump_yaml, load_yaml
@@ -42,11 +43,11 @@ MAX_BYTES = 64_000_000
 # Eight numbers a ray stay below the number of values that the YAML reader accepts in one file.
 MOST_TABLE_RAYS = 60_000
 # How far a written interval may be from the one that the spread gives: digits that a person may have rounded.
-AGREEMENT = 1e-6
+AGREEMENT = COARSE_SLACK
 # Weights that sum to 1 within this are taken as they stand, so that loading changes no bit.
-WEIGHT_SUM_TOLERANCE = 1e-9
+WEIGHT_SUM_TOLERANCE = SLACK
 # How much below zero rounding may push an eigenvalue of a covariance, relative to the largest.
-COVARIANCE_ROUNDING = 1e-9
+COVARIANCE_ROUNDING = SLACK
 
 REQUIRED = ("schema_version", "sensors")
 OPTIONAL = ("name", "layout", "level", "rays", "at", "ray_table", "track", "constraints", "provenance")

@@ -17,13 +17,14 @@ from __future__ import annotations
 import numpy as np
 
 from lidardesign.design.sensor import boresight_frame
+from lidardesign.numerics import COARSE_SLACK, EPSILON
 from lidardesign.scene import SPEED_OF_LIGHT_M_S
 from lidardesign.space import angles
 
 LIMIT_DEG = 20.0
 SPEED_OF_LIGHT_M_PER_PS = SPEED_OF_LIGHT_M_S * 1e-12
 # Times of whole picoseconds come back from metres a few units in the last place off (1e-8 ps at 10 km).
-ROUNDING_PS = 1e-6
+ROUNDING_PS = COARSE_SLACK
 # Boresights are given in so many decimals of a degree, which moves no ray by more than a microdegree.
 BORESIGHT_DECIMALS = 6
 # Centring converges within a few steps for fields of any size below a hemisphere.
@@ -54,7 +55,7 @@ def middle_boresight_deg(directions: np.ndarray) -> tuple[float, float]:
     From the mean direction, the boresight is moved to the middle of the rays' extent in x and y until it stays there.
     """
     mean = directions.mean(axis=0)
-    forward = mean if np.linalg.norm(mean) > np.finfo(float).eps else directions[0]
+    forward = mean if np.linalg.norm(mean) > EPSILON else directions[0]
     found: list[tuple[float, tuple[float, float]]] = []
     for _ in range(CENTRING_STEPS):
         azimuth, elevation = angles(forward)

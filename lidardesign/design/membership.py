@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidardesign.design.sensor import Design, Sensor, angle_over_sine, tangent_coordinates
+from lidardesign.design.sensor import Design, Sensor, tangent_coordinates
+from lidardesign.numerics import ROUNDING, angle_over_sine
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, aim, direction, observed_point
 
 # A direction or range without spread has no density. These smallest spreads, far below any that matters,
@@ -14,7 +15,7 @@ from lidardesign.space import AZIMUTH, ELEVATION, RANGE, aim, direction, observe
 SMALLEST_ANGLE_RAD = 1e-4
 SMALLEST_LENGTH = 1e-4
 # Rays on the field's very edge belong to it: rounding of the tangent map, in radians.
-FIELD_ROUNDING_RAD = 1e-12
+FIELD_ROUNDING_RAD = ROUNDING
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +95,7 @@ def log_density(sensor: Sensor, tangent: np.ndarray, range_m: np.ndarray, *, sma
     depth = max(sensor.spread_range_m, smallest_m)
     squares = np.square(tangent / angular).sum(axis=1) + np.square((range_m - sensor.range_m) / depth)
     angle = np.hypot(tangent[:, 0], tangent[:, 1])
-    log_jacobian = np.log(angle_over_sine(angle, np.sin(angle)))
+    log_jacobian = np.log(angle_over_sine(angle))
     return -squares / 2 - np.log(angular).sum() - np.log(depth) + log_jacobian
 
 

@@ -14,15 +14,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidardesign.design.features import Axes, Features
-from lidardesign.numerics import wrap_angle
+from lidardesign.numerics import ROUNDING, wrap_angle
 
 # Samples per block: arrays of 10 components then stay inside a core's second-level cache (measured).
 BLOCK = 2048
 # Cosines are kept this far from +-1: at +1 t / sin t differs from its limit 1 by 3e-13, and at the antipode,
 # where it diverges, it stays finite.
-COSINE_MARGIN = 1e-12
+COSINE_MARGIN = ROUNDING
 # A component without samples keeps this weight, so that its logarithm stays finite.
-SMALLEST_WEIGHT = 1e-12
+SMALLEST_WEIGHT = ROUNDING
 LOG_TWO_PI = math.log(2 * math.pi)
 
 

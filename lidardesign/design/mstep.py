@@ -17,14 +17,14 @@ from lidardesign.design.bounds import Bounds, Floors, clip_azimuth
 from lidardesign.design.features import Features
 from lidardesign.design.mixture import SMALLEST_WEIGHT, Mixture, Statistics, frames
 from lidardesign.design.origin_step import Limits, best_origins
-from lidardesign.numerics import box_quadratic_minimum, wrap_angle
+from lidardesign.numerics import COARSE_SLACK, SLACK, box_quadratic_minimum, sphere_exp, sphere_log, wrap_angle
 
 # A component with less than this share of the samples keeps its parameters: its moments are rounding noise.
-SMALLEST_MASS = 1e-9
+SMALLEST_MASS = SLACK
 # Rolls beyond this would swap what is called horizontal and vertical.
 LARGEST_ROLL_RAD = math.pi / 4
 # Boresights this close to a pole have no usable azimuth metric; the box is then enforced by clipping alone.
-POLE_COSINE = 1e-6
+POLE_COSINE = COARSE_SLACK
 
 
 def maximise(
@@ -219,9 +219,7 @@ def _moved(
 
 def exponential(level: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Unit vectors reached from boresights along tangent steps (east, north): (K, 3, 3), (K, 2) to (K, 3)."""
-    angle = np.linalg.norm(step, axis=1)
-    sideways = step * np.sinc(angle / np.pi)[:, None]
-    return np.cos(angle)[:, None] * level[:, 0] + np.einsum("kj,kji->ki", sideways, level[:, 1:])
+    return np.einsum("kj,kji->ki", sphere_exp(step), level)
 
 
 def _displacement(old: np.ndarray, new: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -231,9 +229,7 @@ def _displacement(old: np.ndarray, new: np.ndarray) -> tuple[np.ndarray, np.ndar
     (K, 2, 2) expresses transported axes in the new frame's axes.
     """
     local = np.einsum("kij,kj->ki", old, new[:, 0])
-    sine = np.hypot(local[:, 1], local[:, 2])
-    angle = np.arctan2(sine, local[:, 0])
-    taken = local[:, 1:] / np.sinc(angle / np.pi)[:, None]
+    taken = sphere_log(local)
     # Rodrigues: R x = x - (f + f')(f' . x) / (1 + f . f') + ... on vectors orthogonal to f
     total = old[:, 0] + new[:, 0]
     along = np.einsum("kij,kj->ki", old[:, 1:], new[:, 0]) / (1 + local[:, :1])

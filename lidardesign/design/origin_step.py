@@ -22,7 +22,7 @@ from lidardesign.design.box_step import (
     projected,
     variances,
 )
-from lidardesign.numerics import box_quadratic_minimum, clipped_eigenvalues
+from lidardesign.numerics import SLACK, box_quadratic_minimum, clipped_eigenvalues
 
 # Alternations between mean and covariance; each is exact, three reach rounding where both bind.
 ALTERNATIONS = 3
@@ -31,7 +31,6 @@ ALTERNATIONS = 3
 BOXES_TRIED = 2
 BOXES_SCORED = 8
 # Parameters keep bounds up to this share of a standard deviation, by rounding.
-ROUNDING = 1e-9
 
 
 class Limits(NamedTuple):
@@ -109,7 +108,7 @@ def _holding(point: np.ndarray, covariance: np.ndarray, limits: Limits) -> np.nd
     """Which boxes hold which intervals, shape (N, M) bool."""
     reach = limits.interval * np.sqrt(np.maximum(variances(covariance), 0.0))
     low, high = (point - reach)[:, None], (point + reach)[:, None]
-    slack = ROUNDING * reach[:, None]
+    slack = SLACK * reach[:, None]
     return ((low >= limits.free_low - slack) & (high <= limits.free_high + slack)).all(axis=2)
 
 
@@ -139,9 +138,9 @@ def _usable(point: np.ndarray, covariance: np.ndarray, limits: Limits) -> tuple[
     """Which parameters keep all bounds, shape (N,) bool, and the first box that holds them, or any, shape (N,)."""
     holding = _holding(point, covariance, limits)
     values = np.linalg.eigvalsh(covariance)
-    kept = (values[:, 0] > 0) & (values[:, -1] <= limits.most * (1 + ROUNDING))
-    kept &= (values[:, 0] <= limits.thinnest * (1 + ROUNDING)) & holding.any(axis=1)
-    slack = ROUNDING * np.sqrt(np.maximum(variances(covariance), 0.0))
+    kept = (values[:, 0] > 0) & (values[:, -1] <= limits.most * (1 + SLACK))
+    kept &= (values[:, 0] <= limits.thinnest * (1 + SLACK)) & holding.any(axis=1)
+    slack = SLACK * np.sqrt(np.maximum(variances(covariance), 0.0))
     kept &= ((point >= limits.low - slack) & (point <= limits.high + slack)).all(axis=1)
     return kept, holding.argmax(axis=1)
 

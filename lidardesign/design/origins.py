@@ -18,12 +18,13 @@ from typing import NamedTuple
 import numpy as np
 
 from lidardesign.design.constraints import SensorConstraints
+from lidardesign.numerics import HALF_DIGITS, SLACK
 from lidardesign.space import DesignSpace
 
 # Origin boxes thinner than this along an axis pin it [m].
-PINNED_BOX_M = 1e-9
+PINNED_BOX_M = SLACK
 # Gaps between excluded boxes narrower than this, in metres and relative to coordinates, leave no place.
-SMALLEST_GAP = 1e-8
+SMALLEST_GAP = HALF_DIGITS
 
 
 class Boxes(NamedTuple):

@@ -10,14 +10,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lidardesign.errors import ConfigError
+from lidardesign.numerics import COARSE_SLACK, SQUARABLE
 
 # The iteration stops when no centre moves by more than this share of the features' extent: far below the
 # spacing of any ray layout, far above rounding.
-MOVEMENT_TOLERANCE = 1e-6
+MOVEMENT_TOLERANCE = COARSE_SLACK
 # Seeds are drawn among at most so many points per centre: seeding costs N * K, an iteration only N log K.
 SEED_POOL = 16
 # Relative weights below this one count as it, so that the mass of a cell never underflows to nothing.
-SMALLEST_WEIGHT = 1e-200
+SMALLEST_WEIGHT = SQUARABLE
 
 
 # Cells need no more samples than this: their centres are then known to a tenth of their width.

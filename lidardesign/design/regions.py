@@ -15,13 +15,14 @@ from lidardesign.design.constraints import Constraints
 from lidardesign.design.coupling import conditional_means, conditional_spreads, relative
 from lidardesign.design.membership import FIELD_ROUNDING_RAD, SMALLEST_ANGLE_RAD, SMALLEST_LENGTH
 from lidardesign.design.origins import inside_excluded, origin_box
-from lidardesign.design.sensor import Design, Sensor, angle_over_sine
+from lidardesign.design.sensor import Design, Sensor
+from lidardesign.numerics import ROUNDING, SLACK, angle_over_sine
 from lidardesign.space import DesignSpace, aim, observed_point
 
 # Samples may lie outside a box or an ellipsoid by the rounding of their coordinates [m].
-ROUNDING_M = 1e-9
+ROUNDING_M = SLACK
 # Principal axes of an origin with less of the variance than this share are fixed: only rounding is left there.
-SMALLEST_AXIS_SHARE = 1e-12
+SMALLEST_AXIS_SHARE = ROUNDING
 
 
 def owned(
@@ -107,5 +108,5 @@ def log_joint_density(sensor: Sensor, points: np.ndarray, *, smallest_m: float) 
     squares = np.square((origin @ axes) / spreads).sum(axis=1) + np.square((tangent - mean_angle) / angular).sum(axis=1)
     squares += np.square((range_m + sensor.range_m - mean_range) / depth)
     angle = np.hypot(tangent[:, 0], tangent[:, 1])
-    log_jacobian = np.log(angle_over_sine(angle, np.sin(angle)))
+    log_jacobian = np.log(angle_over_sine(angle))
     return -squares / 2 - np.log(spreads).sum() - np.log(angular).sum() - np.log(depth) + log_jacobian

@@ -14,12 +14,12 @@ from lidardesign.design.feasibility import azimuth_interval
 from lidardesign.design.features import Axes
 from lidardesign.design.origins import PINNED_BOX_M, free_boxes, origin_box
 from lidardesign.errors import InfeasibleError
-from lidardesign.numerics import wrap_angle
+from lidardesign.numerics import SLACK, wrap_angle, wrap_turn
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace
 
 # Bounds move inward by this share, so that a value at its bound still keeps it after unit conversions, the
 # interval's own arithmetic and writing; a micrometre per kilometre.
-INWARD = 1e-9
+INWARD = SLACK
 
 Pins = tuple[float | None, float | None, float | None]
 
@@ -193,5 +193,4 @@ def _gate_row(one: SensorConstraints, space: DesignSpace) -> dict[str, object]:
 
 def mean_azimuth(internal_rad: np.ndarray) -> np.ndarray:
     """Azimuths in [0, 2 pi) as they are written [rad]."""
-    turned = np.mod(wrap_angle(internal_rad), 2 * math.pi)
-    return np.where(turned >= 2 * math.pi, 0.0, turned)
+    return wrap_turn(wrap_angle(internal_rad))

@@ -18,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.special import ndtri
 
+from lidardesign.numerics import sphere_exp, sphere_log
 from lidardesign.space import direction
 
 DEFAULT_LEVEL = 0.95
@@ -48,24 +49,12 @@ def boresight_frame(azimuth_rad: float, elevation_rad: float, roll_rad: float = 
 
 def tangent_coordinates(frame: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Angles (horizontal, vertical) of unit vectors from a boresight: (3, 3), (N, 3) to (N, 2) [rad]."""
-    local = directions @ frame.T
-    sine = np.hypot(local[:, 1], local[:, 2])
-    angle = np.arctan2(sine, local[:, 0])
-    return local[:, 1:] * angle_over_sine(angle, sine)[:, None]
+    return sphere_log(directions @ frame.T)
 
 
 def tangent_directions(frame: np.ndarray, tangent: np.ndarray) -> np.ndarray:
     """Unit vectors at angles (horizontal, vertical) from a boresight: (3, 3), (N, 2) to (N, 3)."""
-    angle = np.hypot(tangent[:, 0], tangent[:, 1])
-    local = np.concatenate([np.cos(angle)[:, None], tangent * np.sinc(angle / np.pi)[:, None]], axis=1)
-    return local @ frame
-
-
-def angle_over_sine(angle: np.ndarray, sine: np.ndarray) -> np.ndarray:
-    """t / sin t, 1 at t = 0; finite for every direction but the exact antipode, where it is capped."""
-    near = sine < 1e-8
-    ratio = angle / np.where(near, 1.0, sine)
-    return np.where(near, np.where(angle < 1.0, 1.0, np.pi / 1e-8), ratio)
+    return sphere_exp(tangent) @ frame
 
 
 @dataclass(frozen=True, eq=False)

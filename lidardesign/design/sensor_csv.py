@@ -17,6 +17,7 @@ import numpy as np
 
 from lidardesign.design.sensor import DEFAULT_LEVEL, Design, Sensor
 from lidardesign.errors import DataError
+from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.run.files import write_atomic
 from lidardesign.space import FULL_TURN
 
@@ -29,9 +30,9 @@ QUERY_COLUMN = "x_query"
 YAML_BEGINNINGS = ("{", "[", "- ", "#", "%")
 NOT_NEGATIVE = ("time_mean", "azimuth_sigma", "elevation_sigma", "time_sigma", "weight")
 # An elevation may exceed a right angle by its rounding in a file of few digits.
-ELEVATION_ROUNDING = 1e-6
-COVARIANCE_ROUNDING = 1e-6
-WEIGHT_SUM_TOLERANCE = 1e-9
+ELEVATION_ROUNDING = COARSE_SLACK
+COVARIANCE_ROUNDING = COARSE_SLACK
+WEIGHT_SUM_TOLERANCE = SLACK
 
 
 def looks_like_sensor_csv(head: bytes) -> bool:

@@ -24,7 +24,7 @@ from lidardesign.design.origins import inside_excluded, origin_box
 from lidardesign.design.resolve import Group, Pins
 from lidardesign.design.samples import Samples
 from lidardesign.errors import ConfigError, InfeasibleError, NumericalError
-from lidardesign.numerics import effective_count, systematic_draw, wrap_angle
+from lidardesign.numerics import SLACK, effective_count, systematic_draw, wrap_angle
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, aim, direction, observed_point
 
 Retarget = Callable[[np.ndarray], np.ndarray]
@@ -35,7 +35,7 @@ LEAST_MASS = 1e-3
 LEAST_SAMPLES_PER_SENSOR = 10
 LEAST_SAMPLES = 50
 # Fixed coordinates and boxes are met to this [m or rad].
-TOLERANCE = 1e-9
+TOLERANCE = SLACK
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,13 +33,13 @@ from lidardesign.design.sensor import DEFAULT_LEVEL, Design, Sensor, Track, inte
 from lidardesign.design.support import Support, check_support, restricted
 from lidardesign.design.track import TRAVELLED, boresight_azimuth, interpolated
 from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.numerics import SLACK
 from lidardesign.run.clock import phase
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace, angles, direction, observed_point
 from lidardesign.task import random_generator
 
 KNOT_SPACING_M = 0.1
 # A track of 4.5 m has 45 spacings, whatever the division rounds to.
-ROUNDING = 1e-9
 # The ends of a 95 % interval are then each known from one sample in forty.
 SAMPLES_PER_CELL = 40
 # The gate at a knot is taken over so many knots on either side: its ends need more samples than a mean does.
@@ -201,7 +201,7 @@ def _knots(low: float, high: float, effective: float, rays: int, wanted: int | N
         if wanted < 2:
             raise ConfigError(f"{wanted} knots", where="track", allowed="2 or more")
         return np.linspace(low, high, wanted)
-    usual = math.ceil((high - low) / KNOT_SPACING_M - ROUNDING)
+    usual = math.ceil((high - low) / KNOT_SPACING_M - SLACK)
     affordable = int(effective / (rays * SAMPLES_PER_CELL))
     return np.linspace(low, high, max(min(usual, affordable), 1) + 1)
 

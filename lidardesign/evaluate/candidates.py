@@ -16,6 +16,7 @@ import numpy as np
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.placement import opened_gate, rays_at
+from lidardesign.numerics import EPSILON
 from lidardesign.simulate.returns import Rays
 from lidardesign.space import RANGE, DesignSpace
 
@@ -85,7 +86,7 @@ class Layout:
         width_m = self.gate_m[1] - self.gate_m[0]
         single = bandwidth.mbps_of_widths(np.array([width_m]))
         # the ratio of two multiples of one bin may lie an ulp below a whole number
-        count = math.floor(limit_mbps / single * (1 + np.finfo(float).eps))
+        count = math.floor(limit_mbps / single * (1 + EPSILON))
         if count > MOST_RAYS:
             raise ConfigError(
                 f"a design of {limit_mbps:.3g} Mbit/s compares with baselines of {count:.3g} rays",

@@ -17,6 +17,7 @@ from lidardesign.errors import ConfigError, DataError
 from lidardesign.evaluate.capture import Capture
 from lidardesign.evaluate.capture_ranges import Estimation, measured
 from lidardesign.evaluate.placement import even_unit
+from lidardesign.numerics import EPSILON
 from lidardesign.simulate.returns import Rays
 
 # A ray that starts further from the scanner than this was not captured: it sees other surfaces.
@@ -128,7 +129,7 @@ def uniform_rays(capture: Capture, count: int) -> Rays:
     half = np.degrees(capture.spacing_rad or 0.0) / 2
     low, high = seen.min(axis=0) - half, seen.max(axis=0) + half
     # a scan along a line, or of a single pixel, has no extent across it
-    extents = np.maximum(high - low, np.finfo(float).eps)
+    extents = np.maximum(high - low, EPSILON)
     looking = scan_directions(frame, low + even_unit(count, extents) * (high - low))
     none = np.zeros(count)
     rays = Rays(np.tile(capture.origin_m, (count, 1)), looking, np.zeros((count, 2)), none, none)

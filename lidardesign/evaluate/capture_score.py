@@ -22,6 +22,7 @@ from lidardesign.evaluate.capture_ranges import Estimation
 from lidardesign.evaluate.capture_scan import Captured, CapturedScan, scan, scan_pixels, uniform_rays, whole_window
 from lidardesign.evaluate.metrics import SurfaceCloud, delaunay_surface, surface_cloud, visible_surface
 from lidardesign.meshio import load_mesh
+from lidardesign.numerics import circular_difference
 from lidardesign.scene import Body, Scene
 from lidardesign.simulate.returns import Rays
 from lidardesign.space import DesignSpace, angles
@@ -268,7 +269,7 @@ def _visible_mesh(capture: Capture, path: Path) -> SurfaceCloud:
     azimuth, elevation = angles(capture.direction)
     middle = float(angles(centre)[0])
     # azimuths about the middle of the field, so that a field across azimuth 0 is one interval
-    azimuth = middle + np.mod(azimuth - middle + np.pi, 2 * np.pi) - np.pi
+    azimuth = middle + circular_difference(azimuth, middle)
     half = (capture.spacing_rad or 0.0) / 2
     start, end = capture.window_m
     place = tuple(float(value) for value in capture.origin_m)

@@ -8,6 +8,7 @@ import numpy as np
 
 from lidardesign.design.grid import field_on_sphere
 from lidardesign.design.sensor import Sensor, interval_factor, tangent_directions
+from lidardesign.numerics import TINY
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.returns import Outcome, Rays
@@ -53,7 +54,7 @@ def thinned(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndar
     cells = math.sqrt(max(most, 1))
     while len(faces) > most:
         low, extent = vertices.min(axis=0), np.ptp(vertices, axis=0).max()
-        cell = np.floor((vertices - low) / max(extent, np.finfo(float).tiny) * cells).astype(np.int64)
+        cell = np.floor((vertices - low) / max(extent, TINY) * cells).astype(np.int64)
         _, group = np.unique(cell, axis=0, return_inverse=True)
         group = group.reshape(-1)
         counts = np.bincount(group)

@@ -24,6 +24,7 @@ from lidardesign.evaluate.drawing import (
     scene_bounds,
 )
 from lidardesign.evaluate.results import Evaluation
+from lidardesign.numerics import EPSILON_FLOAT32
 from lidardesign.scene import Scene
 from lidardesign.simulate.returns import Outcome, Rays
 
@@ -271,7 +272,7 @@ def _directions(rays: Sequence[Rays]) -> np.ndarray:
 
 def _camera(directions: np.ndarray) -> dict[str, Any]:
     """From behind and above the sensors; a world in the plane z = 0 is looked at from above, as on paper."""
-    if len(directions) and np.abs(directions[:, 2]).max() < np.finfo(np.float32).eps:
+    if len(directions) and np.abs(directions[:, 2]).max() < EPSILON_FLOAT32:
         up, kind = {"x": 0, "y": 1, "z": 0}, {"type": "orthographic"}
         return {"eye": {"x": 0, "y": 0, "z": 1.9}, "up": up, "projection": kind}
     return {"eye": _side_view(directions), "up": {"x": 0, "y": 0, "z": 1}}
@@ -282,6 +283,6 @@ def _side_view(directions: np.ndarray) -> dict[str, float]:
     mean = directions.mean(axis=0) if len(directions) else np.array([1.0, 0.0, 0.0])
     forward = np.array([mean[0], mean[1], 0.0])
     length = np.linalg.norm(forward)
-    forward = forward / length if length > np.finfo(np.float32).eps else np.array([1.0, 0.0, 0.0])
+    forward = forward / length if length > EPSILON_FLOAT32 else np.array([1.0, 0.0, 0.0])
     eye = 1.25 * np.array([-forward[1], forward[0], 0.0]) - 1.0 * forward + np.array([0.0, 0.0, 0.7])
     return {name: float(value) for name, value in zip("xyz", eye, strict=True)}

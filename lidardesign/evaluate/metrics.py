@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidardesign.errors import DataError
+from lidardesign.numerics import SLACK
 from lidardesign.scene import Receiver, Scene
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.receiver_view import in_view
@@ -198,7 +199,7 @@ def _stereographic(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates about the mean direction, shape (N, 2), and a mask without the point opposite to it."""
     mean = directions.mean(axis=0)
     length = np.linalg.norm(mean)
-    opposite = 1e-9  # directions this near (in 1 + cos) to the antipode have no finite coordinates
+    opposite = SLACK  # directions this near (in 1 + cos) to the antipode have no finite coordinates
     mean = mean / length if length > opposite else np.array([0.0, 0.0, 1.0])
     helper = np.eye(3)[np.argmin(np.abs(mean))]
     right = np.cross(helper, mean) / np.linalg.norm(np.cross(helper, mean))

@@ -11,6 +11,7 @@ import numpy as np
 from lidardesign.design.grid import low_discrepancy
 from lidardesign.evaluate.candidates import Positions, whole_range
 from lidardesign.evaluate.placement import RAY_AXES
+from lidardesign.numerics import wrap_turn
 from lidardesign.scene import Scene
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.space import AZIMUTH, ELEVATION, FULL_TURN, RANGE, DesignSpace, direction, observed_point
@@ -100,7 +101,7 @@ def unrolled(azimuth_rad: np.ndarray) -> np.ndarray:
     """Azimuths moved by whole turns onto one arc that starts behind the widest gap, shape (K,)."""
     if not len(azimuth_rad):
         return azimuth_rad
-    turned = np.sort(np.mod(azimuth_rad, FULL_TURN))
+    turned = np.sort(wrap_turn(azimuth_rad))
     gaps = np.diff(np.append(turned, turned[0] + FULL_TURN))
     start = turned[(int(np.argmax(gaps)) + 1) % len(turned)]
-    return start + np.mod(azimuth_rad - start, FULL_TURN)
+    return wrap_turn(azimuth_rad, start)

@@ -20,6 +20,7 @@ import numpy as np
 from lidardesign.evaluate.candidates import Layout, Spot, central
 from lidardesign.evaluate.observed import spread_frames
 from lidardesign.evaluate.placement import opened_gate
+from lidardesign.numerics import TINY
 from lidardesign.scene import Scene
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, aim, observed_point
 from lidardesign.surface import sample_body
@@ -107,7 +108,7 @@ class AimedPoints:
         """
         chosen: list[tuple[np.ndarray, np.ndarray]] = []
         total = squares = 0.0
-        while len(chosen) < MOST_BLOCKS and total**2 < worth * max(squares, np.finfo(float).tiny):
+        while len(chosen) < MOST_BLOCKS and total**2 < worth * max(squares, TINY):
             if len(chosen) == HOPELESS_BLOCKS and total == 0.0:
                 break
             if len(chosen) == len(self._blocks):

@@ -16,6 +16,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from lidardesign.numerics import TINY
+
 Value = TypeVar("Value")
 
 # Rungs whose times differ by less than this ratio cost the same: timings of one machine repeat no better.
@@ -121,7 +123,7 @@ class Ladder:
             return f"{chosen.setting} suffices"
         if chosen is default:
             return f"{chosen.setting}, the setting of this run, is the one to choose"
-        ratio = default.seconds / max(chosen.seconds, 1e-12)
+        ratio = default.seconds / max(chosen.seconds, TINY)
         if default.error + default.uncertainty > self.tolerance:
             told = "is needed" if chosen.seconds > default.seconds else "is good enough"
             return f"{chosen.setting} {told}: {default.setting}, as this run has it, may be outside the tolerance"

@@ -32,6 +32,7 @@ from lidardesign.estimates import Estimate
 from lidardesign.export.columns import losses
 from lidardesign.export.read_back import rays_rounding
 from lidardesign.export.steering import short_tour, travel
+from lidardesign.numerics import SLACK
 from lidardesign.run.files import write_atomic
 from lidardesign.simulate.returns import Rays
 
@@ -44,7 +45,7 @@ LONGEST_SHOWN = 200
 # What spreadsheets put in front of UTF-8.
 BOM = b"\xef\xbb\xbf"
 # Angles at the limit come out of sines and cosines a few units in the last place off.
-ROUNDING_DEG = 1e-9
+ROUNDING_DEG = SLACK
 MOST_ROWS = 1_000_000
 # Whole numbers up to here are exact as float64; light takes 104 days for so many picoseconds.
 MOST_WHOLE = 2**53

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from lidardesign.numerics import ROUNDING, TINY
+
 NEIGHBOURS = 6
 LONGEST_MOVED = 3
 # So many stops are improved from both starts, for some percent of the way; more from one, to save time.
@@ -19,7 +21,7 @@ MOST_NEAREST = 20_000
 # Rounds of improvement: 576 stops take 40, 5000 take 200; bounds the time of ever larger tours.
 MOST_ROUNDS = 500
 # Gains below this share of the tour's extent are rounding noise, and could be taken back and forth for ever.
-LEAST_GAIN = 1e-12
+LEAST_GAIN = ROUNDING
 
 
 def short_tour(points: np.ndarray) -> np.ndarray:
@@ -62,7 +64,7 @@ def _neighbours(points: np.ndarray) -> np.ndarray:
 
 def _rows(points: np.ndarray) -> np.ndarray:
     """Rows to and fro, as many as make their stops as far apart as the rows are."""
-    low, extent = points.min(axis=0), np.maximum(np.ptp(points, axis=0), np.finfo(float).tiny)
+    low, extent = points.min(axis=0), np.maximum(np.ptp(points, axis=0), TINY)
     rows = max(1, round(float(np.sqrt(len(points) * min(extent[1] / extent[0], len(points))))))
     row = np.minimum((points[:, 1] - low[1]) / extent[1] * rows, rows - 1).astype(np.int64)
     along = np.where(row % 2 == 0, points[:, 0], -points[:, 0])

@@ -19,6 +19,8 @@ import math
 import numpy as np
 from numba import njit
 
+from lidardesign.numerics import ROUNDING
+
 # Outside of this many standard deviations around a pulse, photons are background
 PULSE_REACH = 4.0
 # With fewer photons outside of the pulse than this, the level that is known beforehand is the better one
@@ -28,7 +30,7 @@ LEAST_BINS = 0.5
 # Above this mean, Poisson's tail is taken as a normal one
 NORMAL_MEAN = 1e5
 # Terms of a tail's sum that are smaller than this share of it do not change it
-TAIL_PRECISION = 1e-12
+TAIL_PRECISION = ROUNDING
 
 
 @njit(cache=True, nogil=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.numerics import SLACK
 from lidardesign.scene import SPEED_OF_LIGHT_M_S
 from lidardesign.simulate.detector import FWHM_PER_SIGMA, Detector, metres
 from lidardesign.simulate.echoes import Echoes
@@ -19,7 +20,6 @@ FINEST_BIN_M = 1e-5
 # A histogram of more bins is a mistake: 1 km in millimetres
 MOST_BINS = 1_000_000
 # Lengths of windows that were meant to be whole numbers of bins may exceed them by rounding, relative
-ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class Bins:
             ConfigError: A window has too many bins.
         """
         span = (windows_m[:, 1] - first_m) / width_m
-        number = np.where(windows_m[:, 1] > windows_m[:, 0], np.ceil(span * (1 - ROUNDING)), 0.0)
+        number = np.where(windows_m[:, 1] > windows_m[:, 0], np.ceil(span * (1 - SLACK)), 0.0)
         most = number.max(initial=0)
         if most > MOST_BINS:
             raise ConfigError(
@@ -114,11 +114,11 @@ def check_windows(windows_m: np.ndarray, detector: Detector) -> None:
         reach = detector.bins * detector.bin_m
         what = f"{detector.bins} bins of {1e12 * detector.bin_s:g} ps, {reach:.4g} m"
         length = (wide[:, 1] - wide[:, 0]).max()
-        if detector.histogram_start == "gate" and length > reach * (1 + ROUNDING):
+        if detector.histogram_start == "gate" and length > reach * (1 + SLACK):
             raise ConfigError(
                 f"a gate of {length:.4g} m is longer than the histogram", where=where, allowed=what, hint=_NARROWER
             )
-        if detector.histogram_start == "pulse" and wide[:, 1].max() > reach * (1 + ROUNDING):
+        if detector.histogram_start == "pulse" and wide[:, 1].max() > reach * (1 + SLACK):
             low, high = wide[np.argmax(wide[:, 1])]
             inside = "starts outside" if low >= reach else "ends outside"
             raise ConfigError(
@@ -129,7 +129,7 @@ def check_windows(windows_m: np.ndarray, detector: Detector) -> None:
             )
     if detector.photons is not None:
         reach = SPEED_OF_LIGHT_M_S / (2 * detector.photons.repetition_hz)
-        if wide[:, 1].max() > reach * (1 + ROUNDING):
+        if wide[:, 1].max() > reach * (1 + SLACK):
             raise ConfigError(
                 f"a gate ends at {wide[:, 1].max():.4g} m, where light of the next pulse is on its way",
                 where=where,

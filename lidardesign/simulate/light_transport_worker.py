@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from lidardesign.numerics import TINY_FLOAT32
 from lidardesign.simulate import light_transport_ends as ends
 
 # Plain float32 on the CPU, one channel: light of one wavelength.
@@ -27,8 +28,8 @@ VARIANT = "llvm_ad_mono"
 def _surface(shape: dict[str, Any]) -> dict[str, Any]:
     """Matt, mirroring and clear shares of a body's light as one material, the same on both sides."""
     clear, mirror = shape["transmission"], shape["specular"]
-    solid = max(1.0 - clear, np.finfo(np.float32).tiny)
-    matt_share = max(solid - mirror, np.finfo(np.float32).tiny)
+    solid = max(1.0 - clear, TINY_FLOAT32)
+    matt_share = max(solid - mirror, TINY_FLOAT32)
     material: dict[str, Any] = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 1.0}}
     material["reflectance"]["value"] = min(shape["reflectance"] / matt_share, 1.0)
     if mirror > 0:

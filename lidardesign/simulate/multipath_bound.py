@@ -27,6 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidardesign.numerics import COARSE_SLACK
 from lidardesign.scene import Scene
 from lidardesign.simulate.hits import Hits
 from lidardesign.simulate.raycast import SceneCaster
@@ -39,7 +40,7 @@ MOST_POINTS, DIRECTIONS, FURTHER_DIRECTIONS = 64, 64, 4
 FLATTEST_COSINE = 0.02
 GOLDEN_ANGLE_RAD = math.pi * (3 - math.sqrt(5))
 # Rays start this share of their distance above a surface, so as not to hit it again.
-CLEARANCE = 1e-6
+CLEARANCE = COARSE_SLACK
 # Bounces between white walls all around never end; a share this close to 1 stands for theirs.
 WHITEST = 0.999
 

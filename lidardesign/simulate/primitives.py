@@ -8,12 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidardesign.numerics import ROUNDING, unit_vectors
 from lidardesign.scene import Body, Box, Capsule, Plane, Sphere, inverse_rigid
 from lidardesign.simulate.hits import Crossings, Hits
 
 GROUP_CHUNK = 200_000  # ray-primitive pairs at a time: the temporaries stay below some 50 MB
 # Relative rounding of squared distances, doubled many times over: bounding balls are never missed.
-BALL_SLACK = 1e-12
+BALL_SLACK = ROUNDING
 
 
 class _Pairs(NamedTuple):
@@ -122,10 +123,6 @@ class PrimitiveGroup:
         return ray, member
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), np.finfo(float).tiny)
-
-
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("...k,...k->...", a, b)
 
@@ -143,7 +140,7 @@ def _sphere(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> t
 
 
 def _sphere_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return _unit(points)
+    return unit_vectors(points)
 
 
 def _box(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -192,7 +189,7 @@ def _capsule(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> 
 def _capsule_normal(sizes: np.ndarray, points: np.ndarray) -> np.ndarray:
     axis_point = np.zeros_like(points)
     axis_point[:, 2] = np.clip(points[:, 2], -sizes[:, 1], sizes[:, 1])
-    return _unit(points - axis_point)
+    return unit_vectors(points - axis_point)
 
 
 def _plane(sizes: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,6 +8,7 @@ from enum import IntEnum
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.numerics import COARSE_SLACK
 
 
 class Outcome(IntEnum):
@@ -57,7 +58,7 @@ class Rays:
                 raise ConfigError("values are NaN or infinite", where=f"rays.{name}")
             object.__setattr__(self, name, values)
         lengths = np.linalg.norm(self.direction, axis=1)
-        if count and np.abs(lengths - 1).max() > 1e-6:
+        if count and np.abs(lengths - 1).max() > COARSE_SLACK:
             raise ConfigError("directions are not unit vectors", where="rays.direction")
         if count and (self.gate_m[:, 0].min() < 0 or (self.gate_m[:, 1] < self.gate_m[:, 0]).any()):
             raise ConfigError("a gate is negative or ends before it starts", where="rays.gate_m")

@@ -21,6 +21,7 @@ from pydantic import Field
 
 from lidardesign.errors import ConfigError
 from lidardesign.meshio import list_mesh_files, load_mesh
+from lidardesign.numerics import circular_difference
 from lidardesign.scene import Body, Mesh, Scene, Sign
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace, aim
@@ -218,7 +219,7 @@ def derived_space(config: MeshesConfig, meshes: Sequence[Mesh]) -> DesignSpace:
     angle = math.asin(radius / nearest)
     bottom = max(float(elevation.min()) - angle, -math.pi / 2)
     top = min(float(elevation.max()) + angle, math.pi / 2)
-    turn = np.mod(azimuth - azimuth[0] + math.pi, 2 * math.pi) - math.pi
+    turn = circular_difference(azimuth, azimuth[0])
     # seen from above or below, a sphere covers more azimuth than its angle; over the pole, all of it
     steepest = math.cos(max(abs(bottom), abs(top)))
     widest = math.asin(math.sin(angle) / steepest) if math.sin(angle) < steepest else math.pi

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from lidardesign.numerics import safe_divide
+from lidardesign.numerics import EPSILON, TINY, safe_divide
 from lidardesign.simulate.bounds.light import ambient_per_metre, haze_per_pulse
 from lidardesign.simulate.bounds.sight import Sight
 from lidardesign.simulate.detector import FWHM_PER_SIGMA, Detector, metres
@@ -74,7 +74,7 @@ class Counts:
         """
         from scipy.special import ndtr
 
-        share = ndtr(-self.sight.gate_edge_m / np.maximum(sigma_m, np.finfo(float).tiny))
+        share = ndtr(-self.sight.gate_edge_m / np.maximum(sigma_m, TINY))
         return np.where(self.sight.returned, 0.0, self._of_first_hit * self.pulses * share)
 
     @cached_property
@@ -197,7 +197,7 @@ def share_in_bins(count: int, bin_m: float, sigma_m: np.ndarray) -> np.ndarray:
     """Share of an echo's photons in an odd number of bins, in the worst case: it lies on an edge of the middle one."""
     from scipy.special import erf
 
-    spread_m = math.sqrt(2) * np.maximum(sigma_m, np.finfo(float).tiny)
+    spread_m = math.sqrt(2) * np.maximum(sigma_m, TINY)
     return 0.5 * (erf((count - 1) / 2 * bin_m / spread_m) + erf((count + 1) / 2 * bin_m / spread_m))
 
 
@@ -208,8 +208,8 @@ def needed_counts(per_bin: np.ndarray, bins: np.ndarray, false_alarm: float) -> 
     """
     from scipy.special import pdtr, pdtrik
 
-    allowed = np.clip(false_alarm / bins, np.finfo(float).eps, 1.0)
-    least = np.maximum(per_bin, np.finfo(float).tiny)
+    allowed = np.clip(false_alarm / bins, EPSILON, 1.0)
+    least = np.maximum(per_bin, TINY)
     quiet = -np.expm1(-least) <= allowed
     with np.errstate(invalid="ignore"):
         needed = np.ceil(np.nan_to_num(pdtrik(1 - allowed, least))) + 1

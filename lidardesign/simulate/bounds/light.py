@@ -6,14 +6,14 @@ import math
 
 import numpy as np
 
-from lidardesign.numerics import safe_divide
+from lidardesign.numerics import COARSE_SLACK, TINY, safe_divide
 from lidardesign.scene import SPEED_OF_LIGHT_M_S
 from lidardesign.simulate.bistatic import range_of_path
 from lidardesign.simulate.bounds.sight import Sight
 from lidardesign.simulate.daylight import spectral_irradiance
 
 # Rays pass a receiver no nearer than this share of their way: differences of arctangents are then exact to 1e-9.
-NEAREST_SHARE = 1e-6
+NEAREST_SHARE = COARSE_SLACK
 
 
 def ambient_per_metre(sight: Sight) -> np.ndarray:
@@ -49,7 +49,7 @@ def haze_per_pulse(sight: Sight, emitted: np.ndarray, bin_m: float) -> tuple[np.
     if sight.scene.receiver is not None:
         whole, fullest = _beside(sight, end, bin_m)
         return light * whole, light * fullest
-    focus = 1 / np.maximum(sight.hits.range_m, np.finfo(float).tiny)
+    focus = 1 / np.maximum(sight.hits.range_m, TINY)
     sharp = 1 / (focus + math.sqrt(photons.field_of_view_sr / photons.aperture_m2))
     sharp = np.clip(sharp, start, end)
     before = safe_divide(sharp - start, (1 - start * focus) * (1 - sharp * focus))

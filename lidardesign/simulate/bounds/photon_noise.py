@@ -19,6 +19,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lidardesign.numerics import TINY
 from lidardesign.scene import Scene
 from lidardesign.simulate.bounds.blindness import Blindness, missed_behind
 from lidardesign.simulate.bounds.counts import Counts
@@ -47,5 +48,5 @@ def _cut_m(sight: Sight, sigma_m: np.ndarray) -> np.ndarray:
     """How far the mean of a pulse moves where the gate's end cuts it off, shape (N,) [m]."""
     from scipy.special import ndtr
 
-    away = np.where(sight.returned, sight.gate_edge_m, np.inf) / np.maximum(sigma_m, np.finfo(float).tiny)
+    away = np.where(sight.returned, sight.gate_edge_m, np.inf) / np.maximum(sigma_m, TINY)
     return sigma_m * np.exp(-(away**2) / 2) / (math.sqrt(2 * math.pi) * ndtr(away))

@@ -33,6 +33,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidardesign.numerics import EPSILON_FLOAT32
 from lidardesign.scene import Scene
 from lidardesign.simulate.bistatic import path_windows
 from lidardesign.simulate.detector import Detector
@@ -214,7 +215,7 @@ def _pixel_sr(detector: Detector) -> float:
 def _bins(detector: Detector, reach_m: float) -> PathBins:
     """Bins of whole paths that cover twice a reach of half paths, and half a bin on either side of it."""
     told_apart_m = 2 * resolution_m(detector) / CELLS_PER_RESOLUTION
-    finest_m = max(told_apart_m, 2 * reach_m / MOST_CELLS, np.finfo(np.float32).eps)
+    finest_m = max(told_apart_m, 2 * reach_m / MOST_CELLS, EPSILON_FLOAT32)
     width_m = 10 ** (math.ceil(math.log10(finest_m) * WIDTHS_PER_DECADE) / WIDTHS_PER_DECADE)
     count = math.ceil(2 * reach_m / width_m) + 1
     return PathBins(width_m, 1 << (count - 1).bit_length())

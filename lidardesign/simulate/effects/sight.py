@@ -6,6 +6,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from lidardesign.numerics import COARSE_SLACK
 from lidardesign.scene import Mesh, Scene
 from lidardesign.simulate.physics import Tracer
 from lidardesign.simulate.receiver_view import in_view
@@ -13,7 +14,7 @@ from lidardesign.simulate.receiver_view import in_view
 # Closed forms round at 1e-15 of a distance or so; this clears a surface and is far below the thickness of any pane.
 CLEARANCE_SHARE = 1e-5
 # Hits on meshes are exact to float32, up to 1e-6 of their radius from as far away as Embree is asked: twice that.
-MESH_CLEARANCE_SHARE = 2e-6
+MESH_CLEARANCE_SHARE = 2 * COARSE_SLACK
 # A line of sight through more surfaces than this counts as blocked.
 MAXIMUM_SURFACES = 8
 
