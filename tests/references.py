@@ -156,3 +156,26 @@ def first_photon_distribution(arriving):
         shares.append(survived * (1 - math.exp(-expected)))
         survived *= math.exp(-expected)
     return np.array([*shares, survived])
+
+
+# an edge or a vertex belongs to the triangles around it: barycentric coordinates are off by a few roundings
+ON_EDGE = 1e-9
+
+
+def naive_mesh_hit(vertices, faces, origins, directions):
+    """First hits of rays of unit length by Moeller and Trumbore (1997) in float64, every ray with every triangle."""
+    corner, first, second = (vertices[faces[:, 0]], *(vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2)))
+    nearest = np.full(len(origins), np.inf)
+    for index, (origin, ray) in enumerate(zip(origins, directions, strict=True)):
+        across = np.cross(ray, second)
+        volume = np.einsum("fk,fk->f", first, across)
+        usable = volume != 0
+        inverse = 1 / np.where(usable, volume, 1.0)
+        offset = origin - corner
+        u = np.einsum("fk,fk->f", offset, across) * inverse
+        turned = np.cross(offset, first)
+        v = turned @ ray * inverse
+        reach = np.einsum("fk,fk->f", second, turned) * inverse
+        inside = usable & (u >= -ON_EDGE) & (v >= -ON_EDGE) & (u + v <= 1 + ON_EDGE) & (reach >= 0)
+        nearest[index] = np.where(inside, reach, np.inf).min(initial=np.inf)
+    return nearest

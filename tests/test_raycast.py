@@ -139,17 +139,7 @@ def test_no_ray_slips_through_the_seam_between_a_capsules_side_and_its_caps():
     np.testing.assert_allclose(hits.range_m, np.linalg.norm(directions, axis=1), atol=1e-9)
 
 
-def test_lengths_of_directions_do_not_matter():
-    caster = SceneCaster(Scene((Body(Sphere(1.0)),)))
-    origins, directions = rays_towards(100, 7)
-    scaled = directions * np.logspace(-8, 8, 100)[:, None]
-    expected = caster.first_hit(origins, directions).range_m
-    np.testing.assert_allclose(caster.first_hit(origins, scaled).range_m, expected, rtol=1e-9)
-
-
 BAD_RAYS = {
-    "no direction": ([[0.0, 0, 0]], [[0.0, 0, 0]]),
-    "direction not a number": ([[0.0, 0, 0]], [[np.nan, 0, 1]]),
     "origin not a number": ([[np.nan, 0, 0]], [[0.0, 0, 1]]),
     "endless origin": ([[np.inf, 0, 0]], [[0.0, 0, 1]]),
     "one ray without its axis": ([0.0, 0, 0], [0.0, 0, 1]),
@@ -245,16 +235,6 @@ def test_rays_that_start_far_away_are_advanced_before_float32():
     assert hit.sum() > 500
     # a direction in float32 is off by 6e-8 rad, which over the last few metres is less than a micrometre
     assert np.abs(found.range_m[hit] - expected.range_m[hit]).max() < 10 * references.EMBREE_M
-
-
-def test_rays_through_vertices_are_hardly_ever_lost():
-    # measured 0.3 % at vertices in Embree's robust mode; without it a quarter of these rays is lost
-    mesh = trimesh.creation.icosphere(subdivisions=5, radius=1.0)
-    caster = SceneCaster(Scene((Body(solid_mesh(mesh)),)))
-    vertices = np.asarray(mesh.vertices)
-    edges = (vertices[mesh.edges_unique[:, 0]] + vertices[mesh.edges_unique[:, 1]]) / 2
-    assert np.isinf(caster.first_hit(np.zeros_like(vertices), vertices).range_m).mean() < 0.005
-    assert np.isinf(caster.first_hit(np.zeros_like(edges), edges).range_m).mean() < 0.001
 
 
 def test_crossings_are_all_hits_one_after_another():

@@ -9,12 +9,14 @@ module of `simulate.effects`, imported when it is on and never otherwise.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from lidardesign.errors import ConfigError
+from lidardesign.run.validation import suggest
 from lidardesign.scene import Scene
 from lidardesign.simulate.bistatic import path_windows, range_of_path
 from lidardesign.simulate.detector import IDEAL, Detector
@@ -52,6 +54,9 @@ class Physics:
         effects: Names out of `EFFECTS`.
         seed: Root of every effect's own random stream.
         repeat: Which time the scene is measured: rays that are fired again from elsewhere meet other chance.
+
+    Raises:
+        ConfigError: An unknown effect; all are listed.
     """
 
     detector: Detector = IDEAL
@@ -59,11 +64,25 @@ class Physics:
     seed: int = 0
     repeat: int = 0
 
+    def __post_init__(self) -> None:
+        check_effects(self.effects)
+
     def stream(self, effect: str, scene: Scene, frame: int) -> int:
         """The key of an effect's random numbers in a frame of a scene; no other effect changes them."""
         again = (str(self.repeat),) if self.repeat else ()
         label = "\0".join((str(self.seed), effect, scene.name, str(frame), *again))
         return int.from_bytes(hashlib.sha256(label.encode()).digest()[:8], "little")
+
+
+def check_effects(names: Iterable[str]) -> None:
+    """Refuse names that are no effects.
+
+    Raises:
+        ConfigError: An unknown effect; all are listed.
+    """
+    for name in sorted(set(names) - EFFECTS.keys()):
+        hint = suggest(name.lower(), EFFECTS)
+        raise ConfigError(f"unknown effect {name!r}", where="effects", allowed=", ".join(EFFECTS), hint=hint)
 
 
 def measure(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: Physics) -> Returns:

@@ -25,7 +25,7 @@ from lidardesign.simulate.bounds.sight import Sight, Stake
 from lidardesign.simulate.cost import predicted_seconds
 from lidardesign.simulate.detector import IDEAL, Detector
 from lidardesign.simulate.histogram import check_windows
-from lidardesign.simulate.physics import EFFECTS, Physics
+from lidardesign.simulate.physics import EFFECTS, Physics, check_effects
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.returns import Rays
 from lidardesign.simulate.simulate import build_casters
@@ -143,11 +143,18 @@ class Planner:
         choice: `auto` takes what a scene calls for, `all` whatever the detector and this machine have, `none` nothing;
             names are taken as they are.
         tolerance: Of what `auto` skips; None: `Tolerance.of` the detector.
+
+    Raises:
+        ConfigError: An unknown effect among names; all are listed.
     """
 
     detector: Detector = IDEAL
     choice: Choice = "auto"
     tolerance: Tolerance | None = None
+
+    def __post_init__(self) -> None:
+        if self.choice not in CHOICES:
+            check_effects(self.choice)
 
     @property
     def tolerated(self) -> Tolerance:

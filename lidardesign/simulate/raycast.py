@@ -15,7 +15,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from lidardesign.errors import ConfigError
-from lidardesign.numerics import COARSE_SLACK, unit_vectors
+from lidardesign.numerics import COARSE_SLACK, SQUARABLE, unit_vectors
 from lidardesign.scene import Body, Mesh, Scene
 from lidardesign.simulate.hits import Crossings, Hits
 from lidardesign.simulate.primitives import BALL_SLACK, PrimitiveGroup
@@ -135,10 +135,13 @@ def _checked_rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarr
     if directions.ndim != 2 or directions.shape[1] != 3:
         raise ConfigError(f"directions have shape {directions.shape}", where="rays", allowed="(N, 3)")
     origins = np.ascontiguousarray(np.broadcast_to(origins, directions.shape), dtype=np.float64)
-    lengths = np.linalg.norm(directions, axis=-1)
-    if not (np.isfinite(origins).all() and np.isfinite(lengths).all()) or (len(lengths) and lengths.min() == 0):
+    largest = np.abs(directions).max(axis=1, initial=0.0)
+    if not (np.isfinite(origins).all() and np.isfinite(largest).all()) or (len(largest) and largest.min() == 0):
         raise ConfigError("an origin or direction is not finite, or a direction has zero length", where="rays")
-    return origins, directions / lengths[:, None]
+    extreme = (largest < SQUARABLE) | (largest > 1 / SQUARABLE)
+    if extreme.any():
+        directions = np.where(extreme[:, None], directions / largest[:, None], directions)
+    return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 class _AtRest:
