@@ -17,6 +17,13 @@ from array_api_compat import array_namespace, device, is_torch_array
 LOG_HALF = -math.log(2.0)
 FULL_TURN = 2 * math.pi
 
+# Series in the square of a small angle t, or of its sine s: there the plain quotients are 0 / 0, and their derivatives
+# differences of large numbers.
+ANGLE_OVER_SINE = (1.0, 1 / 6, 7 / 360, 31 / 15120)
+ARCSINE_OVER_SINE = (1.0, 1 / 6, 3 / 40, 5 / 112)
+SINE_OVER_ANGLE = (1.0, -1 / 6, 1 / 120, -1 / 5040)
+COSINE = (1.0, -1 / 2, 1 / 24, -1 / 720)
+
 # Guards, from the finest to the coarsest. A module gives one a name of its own where that says more.
 # The smallest float64 that keeps all its digits: what is divided by at least this is finite if it is below 1e308 of it.
 TINY = float(np.finfo(np.float64).tiny)
@@ -74,7 +81,8 @@ def log1mexp(values: Any) -> Any:
     near = values > LOG_HALF
     one = xp.ones_like(values)
     with np.errstate(divide="ignore"):
-        close = xp.log(-xp.expm1(xp.where(near, values, -one)))
+        # 0 minus, for -0 would turn the sign of the derivative at 0
+        close = xp.log(0 - xp.expm1(xp.where(near, values, -one)))
         far = xp.log1p(-xp.exp(xp.where(near, -one, values)))
     return xp.where(near, close, far)
 
@@ -128,18 +136,18 @@ def unit_vectors(vectors: Any, axis: int = -1) -> Any:
 
 
 def wrap_angle(angle_rad: Any) -> Any:
-    """The same angle in [-pi, pi) [rad]."""
-    xp, angle = _floats(angle_rad)
-    wrapped = xp.remainder(angle + math.pi, FULL_TURN) - math.pi
-    # the remainder of a tiny negative number rounds to the full turn
-    return _scalar(xp.where(wrapped >= math.pi, wrapped - FULL_TURN, wrapped))
+    """The same angle in [-pi, pi) [rad]; an angle that lies there is not changed."""
+    return wrap_turn(angle_rad, -math.pi)
 
 
 def wrap_turn(angle_rad: Any, start_rad: float = 0.0) -> Any:
-    """The same angle in [start, start + 2 pi) [rad]."""
+    """The same angle in [start, start + 2 pi) [rad]; an angle that lies there is not changed."""
     xp, angle = _floats(angle_rad)
-    turned = xp.remainder(angle - start_rad, FULL_TURN)
-    return _scalar(start_rad + xp.where(turned >= FULL_TURN, turned - FULL_TURN, turned))
+    past = angle - start_rad
+    turned = xp.remainder(past, FULL_TURN)
+    # the remainder of a tiny negative number rounds to the full turn
+    turned = start_rad + xp.where(turned >= FULL_TURN, turned - FULL_TURN, turned)
+    return _scalar(xp.where((past >= 0) & (past < FULL_TURN), angle, turned))
 
 
 def circular_difference(first_rad: Any, second_rad: Any) -> Any:
@@ -170,7 +178,7 @@ def sphere_log(local: Any) -> Any:
     near = (squared < _series_limit(squared)) & (forward > 0)
     lost = xp.all(sideways == 0, axis=-1) & ~near
     sine = safe_norm(xp.where((near | lost)[..., None], xp.ones_like(sideways), sideways))
-    ratio = xp.where(near, 1 + squared / 6, xp.atan2(sine, forward) / sine)
+    ratio = xp.where(near, _series(squared, ARCSINE_OVER_SINE), xp.atan2(sine, forward) / sine)
     antipode = xp.stack([xp.full_like(forward, math.pi), xp.zeros_like(forward)], axis=-1)
     return xp.where(lost[..., None], antipode, sideways * ratio[..., None])
 
@@ -181,21 +189,22 @@ def sphere_exp(tangent: Any) -> Any:
     squared = xp.sum(tangent * tangent, axis=-1)
     near = squared < _series_limit(squared)
     angle = xp.sqrt(xp.where(near, xp.ones_like(squared), squared))
-    ratio = xp.where(near, 1 - squared / 6, xp.sin(angle) / angle)
-    cosine = xp.where(near, 1 - squared / 2, xp.cos(angle))
+    ratio = xp.where(near, _series(squared, SINE_OVER_ANGLE), xp.sin(angle) / angle)
+    cosine = xp.where(near, _series(squared, COSINE), xp.cos(angle))
     return xp.concat([cosine[..., None], tangent * ratio[..., None]], axis=-1)
 
 
 def angle_over_sine(angle_rad: Any) -> Any:
     """t / sin t for 0 <= t <= pi: the area factor of the sphere's exponential map; 1 at 0, large and finite at pi."""
     xp, angle = _floats(angle_rad)
-    near = angle * angle < _series_limit(angle)
+    squared = angle * angle
+    near = squared < _series_limit(squared)
     # beyond a right angle the sine of pi - t is the one that keeps its digits
     folded = xp.where(angle > math.pi / 2, math.pi - angle, angle)
     sine = xp.sin(xp.where(near, xp.ones_like(angle), folded))
     least = xp.finfo(angle.dtype).eps
     far = angle / xp.where(sine < least, xp.full_like(sine, least), sine)
-    return _scalar(xp.where(near, 1 + angle * angle / 6, far))
+    return _scalar(xp.where(near, _series(squared, ANGLE_OVER_SINE), far))
 
 
 def normalised_weights(log_weights: Any) -> np.ndarray:
@@ -330,5 +339,13 @@ def _scalar(values: Any) -> Any:
 
 
 def _series_limit(values: Any) -> float:
-    """Squares of angles below which two terms of a series in the square are exact to rounding."""
-    return math.sqrt(float(array_namespace(values).finfo(values.dtype).eps))
+    """Squares of angles below which four terms of a series in the square, and their derivative, are exact."""
+    return float(array_namespace(values).finfo(values.dtype).eps) ** 0.25
+
+
+def _series(squared: Any, coefficients: tuple[float, ...]) -> Any:
+    """A polynomial in the square of an angle, by Horner's rule."""
+    total = coefficients[-1]
+    for coefficient in coefficients[-2::-1]:
+        total = coefficient + squared * total
+    return total

@@ -1,30 +1,166 @@
-"""Laws of the log-space and safe primitives."""
+"""Laws of the log-space and safe primitives: float32 and float64, forward and backward, against 50 digits."""
 
 from __future__ import annotations
 
 import math
 
+import mpmath
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from lidardesign.numerics import (
+    angle_over_sine,
     box_quadratic_minimum,
+    circular_difference,
     circular_mean,
     clipped_eigenvalues,
     effective_count,
     effective_sample_size,
     log1mexp,
+    log_sigmoid,
     logsumexp,
     nearest_positive_definite,
     normalised_weights,
     safe_divide,
+    safe_norm,
+    safe_sqrt,
+    sphere_exp,
+    sphere_log,
     systematic_draw,
+    unit_vectors,
     wrap_angle,
+    wrap_turn,
 )
 
+DTYPES = [np.float32, np.float64]
+TORCH = {np.float32: torch.float32, np.float64: torch.float64}
+each_dtype = pytest.mark.parametrize("dtype", DTYPES, ids=["float32", "float64"])
+# a handful of operations, each rounded to half a unit in the last place
+ROUNDINGS = 8
 finite = st.floats(-700, 700)
+
+
+def digits(function, *values):
+    """A function of 50 digits (and as many more as a tiny argument needs) at floats, as float."""
+    with mpmath.workdps(400):
+        return function(*(mpmath.mpf(float(value)) for value in values))
+
+
+def close(found, exact, dtype, roundings=ROUNDINGS, least=0.0):
+    """Whether a number is as near to the exact one as the format allows."""
+    limit = roundings * float(np.finfo(dtype).eps) * max(abs(float(exact)), least) + float(np.finfo(dtype).tiny)
+    return abs(float(found) - float(exact)) <= limit
+
+
+def gradients(function, values, dtype):
+    """The derivative of the summed function at values, by torch."""
+    tensor = torch.tensor(np.asarray(values, dtype=dtype), requires_grad=True)
+    function(tensor).sum().backward()
+    return tensor.grad.numpy()
+
+
+def half_turns(value):
+    return value - 2 * mpmath.pi * mpmath.floor((value + mpmath.pi) / (2 * mpmath.pi))
+
+
+def ratio(value):
+    return value / mpmath.sin(value) if value else mpmath.mpf(1)
+
+
+def of_ratio(value):
+    sine, cosine = mpmath.sin(value), mpmath.cos(value)
+    return (sine - value * cosine) / sine**2 if value else mpmath.mpf(0)
+
+
+# function, what it is, its derivative, and arguments, ordinary and special
+ELEMENTWISE = {
+    "log1mexp": (
+        log1mexp,
+        lambda a: mpmath.log(-mpmath.expm1(a)),
+        lambda a: mpmath.exp(a) / mpmath.expm1(a),
+        [-1e-30, -1e-12, -1e-3, -0.5, -0.693, -0.694, -1.0, -17.0, -40.0, -80.0],
+    ),
+    "log_sigmoid": (
+        log_sigmoid,
+        lambda a: -mpmath.log1p(mpmath.exp(-a)),
+        lambda a: 1 / (1 + mpmath.exp(a)),
+        [-1e4, -200.0, -17.0, -1.0, -1e-8, 0.0, 1e-8, 1.0, 17.0, 80.0],
+    ),
+    "safe_sqrt": (
+        safe_sqrt,
+        mpmath.sqrt,
+        lambda a: 1 / (2 * mpmath.sqrt(a)),
+        [1e-37, 1e-12, 0.3, 1.0, 2.0, 1e30],
+    ),
+    "angle_over_sine": (
+        angle_over_sine,
+        ratio,
+        of_ratio,
+        [0.0, 1e-30, 1e-9, 1e-5, 0.01, 0.011, 0.012, 0.13, 0.14, 0.5, 1.5, 1.6, 2.5, 3.0],
+    ),
+    "wrap_angle": (wrap_angle, half_turns, lambda a: mpmath.mpf(1), [-3.0, -1e-20, 0.0, 1.0, 3.0]),
+    "wrap_turn": (
+        wrap_turn,
+        lambda a: a - 2 * mpmath.pi * mpmath.floor(a / (2 * mpmath.pi)),
+        lambda a: mpmath.mpf(1),
+        [0.0, 1e-20, 1.0, 6.0],
+    ),
+}
+
+
+@each_dtype
+@pytest.mark.parametrize("name", ELEMENTWISE)
+def test_a_function_of_one_number_keeps_the_digits_of_its_format(name, dtype):
+    function, exact, _, values = ELEMENTWISE[name]
+    values = np.asarray(values, dtype=dtype)
+    for found in (function(values), function(torch.tensor(values)).numpy()):
+        assert found.dtype == dtype
+        for value, number in zip(values, found, strict=True):
+            assert close(number, digits(exact, value), dtype), (value, number)
+
+
+@each_dtype
+@pytest.mark.parametrize("name", ELEMENTWISE)
+def test_the_derivative_of_a_function_of_one_number_keeps_them_too(name, dtype):
+    function, _, derivative, values = ELEMENTWISE[name]
+    for value, slope in zip(np.asarray(values, dtype=dtype), gradients(function, values, dtype), strict=True):
+        exact = digits(derivative, value)
+        # two terms of the ratio's derivative cancel near 0, where the value does not depend on them
+        assert close(slope, exact, dtype, roundings=64, least=1.0 if name == "angle_over_sine" else 0.0), (value, slope)
+
+
+@each_dtype
+def test_values_at_the_edges_are_limits_and_derivatives_there_are_defined(dtype):
+    cases = {
+        log1mexp: ([0.0, -math.inf], [-math.inf, 0.0], [-math.inf, 0.0]),
+        log_sigmoid: ([-math.inf, math.inf], [-math.inf, 0.0], [1.0, 0.0]),
+        safe_sqrt: ([0.0, -1.0, math.inf], [0.0, 0.0, math.inf], [0.0, 0.0, 0.0]),
+    }
+    for function, (values, expected, slopes) in cases.items():
+        np.testing.assert_array_equal(function(np.asarray(values, dtype=dtype)), expected)
+        np.testing.assert_array_equal(gradients(function, values, dtype), slopes)
+
+
+@each_dtype
+@pytest.mark.parametrize("function", [log1mexp, log_sigmoid, safe_sqrt, wrap_angle, logsumexp, safe_norm])
+def test_what_is_not_a_number_stays_none(function, dtype):
+    assert np.isnan(np.asarray(function(np.asarray([math.nan], dtype=dtype)))).all()
+    assert torch.isnan(function(torch.tensor([math.nan], dtype=TORCH[dtype]))).all()
+
+
+def test_lists_and_whole_numbers_become_float64_and_float32_stays_beside_plain_numbers():
+    assert logsumexp([1, 2]).dtype == np.float64
+    assert safe_divide(np.array([1, 2]), 3).dtype == np.float64
+    assert safe_divide(np.float32([1, 2]), 3.0).dtype == np.float32
+    assert safe_divide(np.float32([1]), np.float64([3])).dtype == np.float64
+    assert safe_divide(np.float32([1]), np.array([3])).dtype == np.float64
+    assert safe_divide(torch.ones(2, dtype=torch.float32), 3.0).dtype == torch.float32
+    assert safe_divide(torch.ones(2, dtype=torch.float32), torch.ones(2, dtype=torch.float64)).dtype == torch.float64
+    assert safe_divide(torch.ones(2, dtype=torch.int64), 3).dtype == torch.float64
+    assert isinstance(wrap_angle(7.0), np.float64)
 
 
 @given(st.lists(finite, min_size=1, max_size=8))
@@ -33,44 +169,108 @@ def test_logsumexp_is_the_logarithm_of_the_sum(values):
     assert logsumexp(values) == pytest.approx(exact, rel=1e-12, abs=1e-12)
 
 
-def test_logsumexp_of_nothing_possible_is_minus_infinity_without_a_warning():
-    rows = np.array([[-np.inf, -np.inf], [0.0, -np.inf]])
-    np.testing.assert_array_equal(logsumexp(rows, axis=1), [-np.inf, 0.0])
-    assert logsumexp([np.inf, 0.0]) == np.inf
+@each_dtype
+@pytest.mark.parametrize("shift", [0.0, 5000.0, -5000.0, -1e5])
+def test_logsumexp_and_its_derivative_survive_magnitudes_that_overflow(dtype, shift):
+    values = np.asarray([0.0, 1.0, -2.0, -math.inf], dtype=dtype) + dtype(shift)
+    exact = digits(lambda *a: mpmath.log(mpmath.fsum(mpmath.exp(v) for v in a)), *values[:3])
+    assert close(logsumexp(values), exact, dtype)
+    assert logsumexp(values).dtype == dtype
+    shares = gradients(logsumexp, values, dtype)
+    for value, share in zip(values[:3], shares, strict=False):
+        assert close(share, digits(lambda v: mpmath.exp(v - exact), value), dtype)
+    assert shares[3] == 0
 
 
-def test_logsumexp_survives_magnitudes_that_overflow():
-    assert logsumexp([5000.0, 5000.0]) == pytest.approx(5000 + math.log(2))
-    assert logsumexp([-5000.0, -5000.0]) == pytest.approx(-5000 + math.log(2))
+@each_dtype
+def test_logsumexp_of_nothing_possible_is_minus_infinity_and_has_derivative_0(dtype):
+    rows = np.asarray([[-math.inf, -math.inf], [0.0, -math.inf], [math.inf, 0.0]], dtype=dtype)
+    np.testing.assert_array_equal(logsumexp(rows, axis=1), [-math.inf, 0.0, math.inf])
+    np.testing.assert_array_equal(
+        gradients(lambda v: logsumexp(v, axis=1), rows, dtype), [[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]]
+    )
+    assert logsumexp(np.zeros((0,), dtype)) == -math.inf
+    np.testing.assert_array_equal(logsumexp(np.zeros((2, 0), dtype), axis=1), [-math.inf, -math.inf])
 
 
-def test_logsumexp_weights_are_factors():
-    assert logsumexp([0.0, 1.0], weights=[2.0, 0.0]) == pytest.approx(math.log(2))
+@each_dtype
+def test_logsumexp_weights_are_factors(dtype):
+    values, weights = np.asarray([[0.0, 1.0], [3.0, 4.0]], dtype), np.asarray([2.0, 0.0], dtype)
+    np.testing.assert_allclose(
+        logsumexp(values, axis=1, weights=weights), np.array([0.0, 3.0]) + math.log(2), rtol=1e-6
+    )
+    np.testing.assert_allclose(logsumexp(values, weights=weights), math.log(2 + 2 * math.exp(3)), rtol=1e-6)
+    assert logsumexp(values, weights=np.zeros(2, dtype)) == -math.inf
+    np.testing.assert_array_equal(
+        gradients(lambda v: logsumexp(v, axis=1, weights=weights), values, dtype), [[1.0, 0.0], [1.0, 0.0]]
+    )
 
 
-@pytest.mark.parametrize("value", [-1e-300, -1e-12, -0.5, -math.log(2), -1.0, -40.0, -800.0])
-def test_log1mexp_keeps_its_digits_at_both_ends(value):
-    import mpmath
-
-    with mpmath.workdps(400):
-        exact = float(mpmath.log(-mpmath.expm1(mpmath.mpf(value))))
-    assert float(log1mexp(value)) == pytest.approx(exact, rel=1e-14)
+def test_logsumexp_sums_the_axis_that_is_asked_for():
+    values = np.arange(6.0).reshape(2, 3)
+    for axis in (0, 1, -1):
+        np.testing.assert_allclose(logsumexp(values, axis=axis), np.log(np.exp(values).sum(axis=axis)))
+    assert logsumexp(values) == pytest.approx(math.log(np.exp(values).sum()))
 
 
-def test_log1mexp_of_zero_is_minus_infinity():
-    assert log1mexp(0.0) == -np.inf
+@each_dtype
+def test_division_by_zero_gives_the_stated_value_and_derivative_0(dtype):
+    numerator, denominator = np.asarray([1.0, 2.0], dtype), np.asarray([0.0, 4.0], dtype)
+    np.testing.assert_array_equal(safe_divide(numerator, denominator, otherwise=7.0), [7.0, 0.5])
+    np.testing.assert_array_equal(safe_divide(numerator, denominator), [0.0, 0.5])
+    np.testing.assert_array_equal(
+        gradients(lambda v: safe_divide(torch.tensor(numerator), v), denominator, dtype), [0.0, -0.125]
+    )
+    np.testing.assert_array_equal(
+        gradients(lambda v: safe_divide(v, torch.tensor(denominator)), numerator, dtype), [0.0, 0.25]
+    )
 
 
-@given(st.floats(-1e4, 1e4))
-def test_wrapped_angles_are_the_same_direction_in_half_open_turn(angle):
-    wrapped = float(wrap_angle(angle))
+@pytest.mark.parametrize(
+    ("dtype", "exponent"),
+    [*((np.float32, e) for e in (-30, -18, 0, 18, 30)), *((np.float64, e) for e in (-200, -150, 0, 150, 200))],
+)
+def test_lengths_of_large_and_small_vectors_neither_overflow_nor_vanish(dtype, exponent):
+    vector = np.asarray([[3.0, 4.0, 12.0], [0.0, 0.0, 1.0]], dtype) * dtype(10.0) ** dtype(exponent)
+    exact = [digits(lambda *v: mpmath.sqrt(mpmath.fsum(c * c for c in v)), *row) for row in vector]
+    for found in (safe_norm(vector), safe_norm(torch.tensor(vector)).numpy()):
+        assert all(close(number, length, dtype) for number, length in zip(found, exact, strict=True))
+    np.testing.assert_allclose(unit_vectors(vector), [[3 / 13, 4 / 13, 12 / 13], [0, 0, 1]], rtol=1e-6)
+    np.testing.assert_allclose(gradients(safe_norm, vector, dtype)[0], [3 / 13, 4 / 13, 12 / 13], rtol=1e-6)
+
+
+@each_dtype
+def test_the_zero_vector_has_length_0_derivative_0_and_no_direction(dtype):
+    vectors = np.asarray([[0.0, 0.0], [3.0, 4.0], [math.inf, 1.0]], dtype)
+    np.testing.assert_array_equal(safe_norm(vectors), [0.0, 5.0, math.inf])
+    np.testing.assert_allclose(gradients(safe_norm, vectors[:2], dtype), [[0.0, 0.0], [0.6, 0.8]], rtol=1e-6)
+    np.testing.assert_allclose(unit_vectors(vectors[:2]), [[0.0, 0.0], [0.6, 0.8]], rtol=1e-6)
+    np.testing.assert_allclose(unit_vectors(vectors[:2].T, axis=0), [[0.0, 0.6], [0.0, 0.8]], rtol=1e-6)
+
+
+@given(st.floats(-1e4, 1e4), st.floats(-10, 10))
+def test_wrapped_angles_are_the_same_direction_in_half_open_turns(angle, start):
+    wrapped, turned = float(wrap_angle(angle)), float(wrap_turn(angle, start))
     assert -math.pi <= wrapped < math.pi
-    assert math.cos(wrapped) == pytest.approx(math.cos(angle), abs=1e-9)
-    assert math.sin(wrapped) == pytest.approx(math.sin(angle), abs=1e-9)
+    assert start <= turned <= start + 2 * math.pi
+    for same in (wrapped, turned):
+        assert math.cos(same) == pytest.approx(math.cos(angle), abs=1e-9)
+        assert math.sin(same) == pytest.approx(math.sin(angle), abs=1e-9)
 
 
-def test_wrapping_a_tiny_negative_angle_stays_inside():
+@each_dtype
+def test_wrapping_a_tiny_negative_angle_stays_inside(dtype):
     assert -math.pi <= float(wrap_angle(-math.pi - 1e-18)) < math.pi
+    assert wrap_turn(dtype(-1e-30)) == 0
+    assert wrap_angle(dtype(math.pi)) == -dtype(math.pi)
+    assert wrap_angle(dtype(0)) == 0
+    # a multiple of the turn in float is no multiple of it
+    assert float(wrap_angle(1e6 * math.pi)) == pytest.approx(float(digits(half_turns, 1e6 * math.pi)), abs=1e-9)
+
+
+@given(st.floats(-100, 100), st.floats(-3.1, 3.1))
+def test_a_circular_difference_is_the_turn_that_leads_from_one_angle_to_the_other(angle, turn):
+    assert float(circular_difference(angle + turn, angle)) == pytest.approx(turn, abs=1e-12)
 
 
 @given(st.floats(0, 6.28), st.floats(0.01, 1.0))
@@ -80,8 +280,107 @@ def test_the_circular_mean_of_a_symmetric_pair_is_its_middle_also_across_zero(mi
     assert abs(float(wrap_angle(mean - middle))) < 1e-9
 
 
-def test_division_by_zero_gives_the_stated_value():
-    np.testing.assert_array_equal(safe_divide([1.0, 2.0], [0.0, 4.0], otherwise=7.0), [7.0, 0.5])
+@each_dtype
+def test_circular_means_weight_their_angles_and_have_derivatives(dtype):
+    angles, weights = np.asarray([6.2, 0.1, 0.4], dtype), np.asarray([1.0, 2.0, 0.0], dtype)
+    shifted = np.asarray([6.2 - 2 * math.pi, 0.1, 0.4], dtype)
+    exact = digits(
+        lambda a, b: mpmath.atan2(mpmath.sin(a) + 2 * mpmath.sin(b), mpmath.cos(a) + 2 * mpmath.cos(b)), *angles[:2]
+    )
+    assert close(circular_mean(angles, weights), exact, dtype, least=1.0)
+    assert close(circular_mean(shifted, weights), exact, dtype, least=1.0)
+    slopes = gradients(lambda a: circular_mean(a, torch.tensor(weights)), angles, dtype)
+    assert slopes[2] == 0
+    assert slopes.sum() == pytest.approx(1.0, rel=1e-5)  # a turned set has a turned mean
+    assert slopes[1] == pytest.approx(2 * slopes[0], rel=0.2)
+
+
+@each_dtype
+def test_directions_that_cancel_have_the_circular_mean_0_and_derivative_0(dtype):
+    assert circular_mean(np.zeros(0, dtype)) == 0
+    none = np.zeros(2, dtype)
+    assert circular_mean(np.asarray([1.0, 2.0], dtype), none) == 0
+    np.testing.assert_array_equal(gradients(lambda a: circular_mean(a, torch.tensor(none)), [1.0, 2.0], dtype), [0, 0])
+
+
+def at_angle(angle, dtype, toward=0.3):
+    """A unit vector at an angle from the pole (1, 0, 0), rounded, and its exact tangent coordinates."""
+    sine = mpmath.sin(angle)
+    vector = [mpmath.cos(angle), sine * mpmath.cos(toward), sine * mpmath.sin(toward)]
+    return np.asarray([float(v) for v in vector], dtype)
+
+
+def exact_log(vector):
+    """Tangent coordinates of a rounded unit vector, by the plain formula in 400 digits."""
+
+    def coordinates(forward, horizontal, vertical):
+        sine = mpmath.sqrt(horizontal**2 + vertical**2)
+        factor = mpmath.atan2(sine, forward) / sine
+        return [horizontal * factor, vertical * factor]
+
+    return digits(coordinates, *vector)
+
+
+ANGLES = [1e-30, 1e-12, 1e-8, 1e-5, 0.01, 0.011, 0.12, 0.13, 0.14, 0.5, 1.5, 2.0, 3.0, 3.14, 3.1415926]
+
+
+@each_dtype
+@pytest.mark.parametrize("angle", ANGLES)
+def test_the_maps_of_the_sphere_are_exact_near_the_pole_and_near_its_antipode(dtype, angle):
+    vector = at_angle(angle, dtype)
+    exact = exact_log(vector)
+    for found in (sphere_log(vector), sphere_log(torch.tensor(vector)).numpy()):
+        assert found.dtype == dtype
+        assert all(close(number, value, dtype) for number, value in zip(found, exact, strict=True))
+    # what is rounded by one unit in the tangent plane moves by as much on the sphere, not by its square root
+    back = sphere_exp(sphere_log(vector))
+    np.testing.assert_allclose(back, vector, atol=8 * np.finfo(dtype).eps)
+    tangent = np.asarray([angle * 0.6, -angle * 0.8], dtype)
+    length = digits(lambda a, b: mpmath.sqrt(a * a + b * b), *tangent)
+    expected = [mpmath.cos(length), *(mpmath.mpf(float(t)) * mpmath.sin(length) / length for t in tangent)]
+    found = sphere_exp(tangent)
+    assert found.dtype == dtype
+    assert all(
+        close(number, value, dtype, least=angle if angle > 1 else 1e-3 * angle)
+        for number, value in zip(found, expected, strict=True)
+    )
+    assert np.linalg.norm(found.astype(np.float64)) == pytest.approx(1, abs=8 * float(np.finfo(dtype).eps))
+
+
+@each_dtype
+@pytest.mark.parametrize("angle", [0.0, 1e-20, 1e-6, 0.01, 0.011, 0.12, 0.13, 0.14, 1.0, 2.5, 3.1])
+def test_one_map_of_the_sphere_undoes_the_other_in_their_derivatives_too(dtype, angle):
+    tangent = torch.tensor([0.6 * angle, 0.8 * angle], dtype=TORCH[dtype])
+    there = torch.autograd.functional.jacobian(sphere_exp, tangent).numpy().astype(np.float64)
+    back = torch.autograd.functional.jacobian(sphere_log, sphere_exp(tangent)).numpy().astype(np.float64)
+    # near the antipode one of them stretches by t / sin t, which multiplies rounding
+    allowed = 64 * float(np.finfo(dtype).eps) * float(angle_over_sine(angle)) ** 2
+    np.testing.assert_allclose(back @ there, np.eye(2), atol=allowed)
+    # along the tangent the sphere is met at unit speed, across it at sin t / t
+    along = there @ np.array([0.6, 0.8])
+    across = there @ np.array([-0.8, 0.6])
+    assert np.linalg.norm(along) == pytest.approx(1, abs=allowed)
+    assert np.linalg.norm(across) == pytest.approx(1 / float(angle_over_sine(angle)), abs=allowed)
+
+
+@each_dtype
+def test_the_antipode_is_at_the_angle_pi_and_the_pole_at_0_with_derivatives_that_are_numbers(dtype):
+    poles = np.asarray([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]], dtype)
+    np.testing.assert_array_equal(sphere_log(poles), np.asarray([[0, 0], [math.pi, 0], [math.pi, 0]], dtype))
+    np.testing.assert_array_equal(sphere_exp(np.zeros((1, 2), dtype)), [[1, 0, 0]])
+    np.testing.assert_array_equal(gradients(sphere_log, poles, dtype), [[0, 1, 1], [0, 0, 0], [0, 0, 0]])
+    np.testing.assert_array_equal(gradients(sphere_exp, np.zeros((1, 2)), dtype), [[1, 1]])
+    tiny = 1e-160 if dtype == np.float64 else 1e-30
+    behind = np.asarray([-1.0, 0.6 * tiny, 0.8 * tiny], dtype)
+    np.testing.assert_allclose(sphere_log(behind), [0.6 * math.pi, 0.8 * math.pi], rtol=1e-6)
+
+
+@each_dtype
+def test_the_area_factor_of_the_sphere_is_finite_at_the_antipode_and_beyond(dtype):
+    factors = angle_over_sine(np.asarray([math.pi, np.nextafter(dtype(math.pi), dtype(4))], dtype))
+    assert np.isfinite(factors).all()
+    assert (factors > 1e6).all()
+    assert np.isfinite(gradients(angle_over_sine, [math.pi], dtype)).all()
 
 
 def test_weights_are_normalised_and_refused_without_mass():
@@ -107,11 +406,45 @@ def test_clipped_eigenvalues_lie_within_their_bounds():
     assert values.max() <= 0.5 + 1e-12
 
 
-def test_positive_definite_matrices_are_left_as_they_are():
-    matrix = np.diag([1.0, 2.0, 3.0])
-    np.testing.assert_allclose(nearest_positive_definite(matrix, 0.5), matrix, atol=1e-15)
-    repaired = nearest_positive_definite(np.diag([1.0, -1.0]), 0.5)
+@each_dtype
+def test_positive_definite_matrices_are_left_as_they_are_and_others_moved_to_the_nearest(dtype):
+    matrix = np.diag(np.asarray([1.0, 2.0, 3.0], dtype))
+    np.testing.assert_allclose(nearest_positive_definite(matrix, 0.5), matrix, atol=4 * np.finfo(dtype).eps)
+    repaired = nearest_positive_definite(np.diag(np.asarray([1.0, -1.0], dtype)), 0.5)
+    assert repaired.dtype == dtype
     np.testing.assert_allclose(repaired, np.diag([1.0, 0.5]))
+    generator = np.random.default_rng(2)
+    noise = generator.standard_normal((10, 3, 3)).astype(dtype)
+    found = nearest_positive_definite(noise, 0.3)
+    np.testing.assert_array_equal(found, np.swapaxes(found, 1, 2))
+    assert np.linalg.eigvalsh(found).min() > 0.3 - 1e-5
+    symmetric = (noise + np.swapaxes(noise, 1, 2)) / 2
+    for _ in range(50):
+        root = generator.standard_normal((10, 3, 3)).astype(dtype)
+        other = 0.3 * np.eye(3) + root @ np.swapaxes(root, 1, 2)
+        assert (np.linalg.norm(found - symmetric, axis=(1, 2)) <= np.linalg.norm(other - symmetric, axis=(1, 2))).all()
+
+
+def test_the_derivative_of_the_nearest_positive_definite_matrix_is_the_one_of_small_differences():
+    generator = np.random.default_rng(3)
+    noise, direction = generator.standard_normal((2, 4, 4))
+    weight = generator.standard_normal((4, 4))
+
+    def value(matrix):
+        return float((weight * nearest_positive_definite(matrix, 0.3)).sum())
+
+    slope = gradients(lambda m: torch.tensor(weight) * nearest_positive_definite(m, 0.3), noise, np.float64)
+    step = 1e-6
+    central = (value(noise + step * direction) - value(noise - step * direction)) / (2 * step)
+    assert (slope * direction).sum() == pytest.approx(central, rel=1e-6)
+
+
+@each_dtype
+def test_equal_eigenvalues_leave_the_derivative_of_the_nearest_positive_definite_matrix_defined(dtype):
+    kept = gradients(lambda m: nearest_positive_definite(m, 0.5), np.eye(3), dtype)
+    np.testing.assert_allclose(kept, np.ones((3, 3)), atol=1e-6)
+    lost = gradients(lambda m: nearest_positive_definite(m, 0.5), np.zeros((3, 3)), dtype)
+    np.testing.assert_array_equal(lost, np.zeros((3, 3)))
 
 
 def test_the_box_minimum_beats_every_other_point_of_the_box():

@@ -19,7 +19,7 @@ from torch.nn.functional import embedding_bag
 from lidardesign.density.fields import TableField
 from lidardesign.density.target import Target
 from lidardesign.density.visibility import NoVisibility, Optics, Quadrature
-from lidardesign.numerics import safe_sqrt
+from lidardesign.numerics import logsumexp, safe_sqrt
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE
 
 # Beyond so many sharpness lengths a sigmoid is 0 or 1 to every digit, and its exponential would overflow float32.
@@ -66,7 +66,7 @@ class DeviceTarget(Target):
         terms = weights - distances.square() / (2 * optics.sigma_m**2)
         if self._occluders is not None:
             terms = terms - self._depth(origins, toward, range_m, optics)
-        return torch.logsumexp(terms, dim=1)
+        return logsumexp(terms, axis=1)
 
     def _rays(self, unit: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Origins (N, 3), unit directions (N, 3) and ranges (N,) of unit points."""

@@ -11,10 +11,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import logsumexp
 
 from lidardesign.errors import NumericalError
 from lidardesign.estimates import Estimate, effective_share_error, log_mean_error, standard_error, weighted_mean_error
+from lidardesign.numerics import logsumexp
 
 # A point counts as covered where p >= COVERED_RATIO * p* / Z.
 COVERED_RATIO = 0.1

@@ -25,6 +25,7 @@ from lidardesign.density.flow import DesignFlow
 from lidardesign.density.objective import Coordinates, log_target, log_target_values
 from lidardesign.density.parallel import Ranks
 from lidardesign.density.target import Target
+from lidardesign.numerics import effective_sample_size, logsumexp
 
 # Log weights further than this from the mean pull no harder.
 LARGEST_PULL_NATS = 5.0
@@ -45,8 +46,7 @@ def draw_conditions(flow: DesignFlow, count: int, generator: torch.Generator) ->
 
 def effective_share(log_weights: Tensor) -> float:
     """(sum w)^2 / (N sum w^2) of log weights, shape (N,)."""
-    log_weights = log_weights.detach().double()
-    return float(torch.exp(2 * log_weights.logsumexp(0) - (2 * log_weights).logsumexp(0)) / len(log_weights))
+    return effective_sample_size(log_weights.detach().double().cpu().numpy())
 
 
 def pathwise_loss(
@@ -124,7 +124,7 @@ def balancing_loss(
     unit = coordinates.join(learned, conditions)
     log_p_star = log_target_values(unit, target, coordinates)
     log_weights = ranks.gather(log_p_star - log_prob, of=count)
-    log_z = log_weights.logsumexp(0) - np.log(count)
+    log_z = logsumexp(log_weights) - np.log(count)
     centred = log_weights - log_z
     pull = centred.clamp(-LARGEST_PULL_NATS, LARGEST_PULL_NATS)
     pull = pull - pull.mean()

@@ -17,10 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.special import logsumexp
 
 from lidardesign.errors import NumericalError
-from lidardesign.numerics import SLACK, TINY, normalised_weights
+from lidardesign.numerics import SLACK, TINY, logsumexp, normalised_weights
 
 # Where log Z is found to: far below what samples can tell.
 LOG_Z_TOLERANCE_NATS = SLACK
