@@ -172,8 +172,14 @@ def test_a_cached_grid_has_the_same_bytes_and_a_damaged_one_is_built_again(tmp_p
     first = grids.cached_distance_grids([icosphere()], grid)[0]
     (cached,) = (tmp_path / "cache" / "fields").iterdir()
     assert grids.cached_distance_grids([icosphere()], grid)[0].tobytes() == first.tobytes()
-    cached.write_bytes(b"\x93NUMPY damaged")
-    assert grids.cached_distance_grids([icosphere()], grid)[0].tobytes() == first.tobytes()
+    whole = cached.read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 1  # still a finite number
+    older = whole[: -grids.DIGEST_BYTES]  # a version before wrote no hash
+    for damaged in (b"\x93NUMPY damaged", b"", whole[: len(whole) // 2], bytes(flipped), older):
+        cached.write_bytes(damaged)
+        assert grids.cached_distance_grids([icosphere()], grid)[0].tobytes() == first.tobytes()
+        assert cached.read_bytes() == whole
 
 
 def test_a_field_that_would_not_fit_is_refused_with_what_is_allowed():

@@ -6,6 +6,7 @@ import errno
 import hashlib
 import json
 import os
+import socket
 import stat
 import threading
 
@@ -13,11 +14,23 @@ import numpy as np
 import pytest
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.run import checkpoint, files, lock
+from lidardesign.run import files, lock, processes
+from lidardesign.run import manifest as manifest_module
 from lidardesign.run.checkpoint import load_arrays, save_arrays
 from lidardesign.run.files import remove_stray_temporaries, sha256_file, write_atomic
 from lidardesign.run.lock import run_lock
-from lidardesign.run.manifest import announce, note, read_manifest, record, start_manifest, verify, write_manifest
+from lidardesign.run.manifest import (
+    announce,
+    note,
+    read_manifest,
+    record,
+    start_manifest,
+    verify,
+    write_manifest,
+    write_recorded,
+)
+
+GONE = 2**22 + 1  # beyond the largest process id that Linux gives
 
 
 @pytest.fixture
@@ -78,6 +91,32 @@ def test_stray_temporaries_of_killed_writers_are_removed(tmp_path):
     (tmp_path / "samples.npz").write_bytes(b"whole")
     assert len(remove_stray_temporaries(tmp_path)) == 1
     assert os.listdir(tmp_path) == ["samples.npz"]
+
+
+@pytest.mark.parametrize("name", ["samples.npz", "größe " * 14 + ".npz"])
+def test_the_next_writer_of_a_file_removes_what_a_killed_one_left(tmp_path, name):
+    left = files.temporary_beside(tmp_path / name)
+    abandoned = left.with_name(left.name.replace(f"-{os.getpid()}.", f"-{GONE}."))
+    at_work, of_another_file = left, abandoned.with_name(f".other{abandoned.name}")
+    of_another_computer = abandoned.with_name(abandoned.name.replace(processes.host_mark(), "0" * 8))
+    for path in (abandoned, at_work, of_another_file, of_another_computer):
+        path.write_bytes(b"half")
+    write_atomic(tmp_path / name, b"whole")
+    assert {path.name for path in tmp_path.iterdir()} == {
+        name, at_work.name, of_another_file.name, of_another_computer.name
+    }  # fmt: skip
+
+
+def test_the_run_s_next_writer_cleans_its_folders_but_not_what_is_at_work_or_not_ours(tmp_path):
+    (tmp_path / "designs").mkdir()
+    at_work = files.temporary_beside(tmp_path / "designs" / "fit.yaml")
+    abandoned = at_work.with_name(at_work.name.replace(f"-{os.getpid()}.", f"-{GONE}."))
+    foreign = tmp_path / "designs" / ".notes.tmp"
+    for path in (at_work, abandoned, foreign):
+        path.write_bytes(b"half")
+    assert remove_stray_temporaries(tmp_path) == [abandoned]
+    assert at_work.exists()
+    assert foreign.exists()
 
 
 def test_the_hash_is_sha256(tmp_path):
@@ -173,7 +212,37 @@ def test_a_second_writer_is_told_who_holds_the_run(tmp_path):
     assert not (tmp_path / lock.FILE_NAME).exists()
 
 
-@pytest.mark.parametrize("change", [{"pid": 2**22 + 1}, {"started": "0"}])
+def test_a_lock_is_never_there_without_its_owner_s_name(tmp_path, monkeypatch):
+    """A full disk, or a kill, between making the lock and writing into it would lock the run for ever."""
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(lock.json, "dump", full)
+        with pytest.raises(DataError, match="No space left"), run_lock(tmp_path):
+            pass
+        patched.setattr(lock.os, "link", full)
+        with pytest.raises(DataError, match="No space left"), run_lock(tmp_path):
+            pass
+    assert os.listdir(tmp_path) == []
+    monkeypatch.setattr(lock.os, "link", full)  # a file system without hard links
+    with run_lock(tmp_path):
+        assert lock.writer(tmp_path) == f"process {os.getpid()} on {socket.gethostname()}"
+    assert lock.writer(tmp_path) is None
+
+
+def test_a_stale_lock_is_taken_over_once_even_when_the_next_owner_was_faster(tmp_path):
+    path = tmp_path / lock.FILE_NAME
+    path.write_text(json.dumps({**lock._owner(), "pid": GONE}))
+    lock._take_away(path)
+    assert not path.exists()
+    with run_lock(tmp_path):
+        lock._take_away(path)  # by a process that had seen the stale one
+        assert path.exists()
+
+
+@pytest.mark.parametrize("change", [{"pid": GONE}, {"started": "0"}])
 def test_the_lock_of_a_dead_process_is_taken_over(tmp_path, change):
     owner = {**lock._owner(), **change}
     (tmp_path / lock.FILE_NAME).write_text(json.dumps(owner))
@@ -217,6 +286,28 @@ def test_a_file_that_was_announced_but_never_written_is_missing(run):
         verify(run, "first.bin")
 
 
+def test_a_file_that_somebody_is_still_making_says_to_wait(run):
+    with pytest.raises(DataError, match="--resume"):
+        verify(run, "samples.npz")
+    with run_lock(run), pytest.raises(DataError, match=f"process {os.getpid()} .* still learning it: wait"):
+        verify(run, "samples.npz")
+
+
+@pytest.mark.parametrize("stopped_at", ["announce", "write_atomic", "record"])
+def test_a_kill_while_a_run_s_file_is_written_anew_leaves_one_that_verifies(run, monkeypatch, stopped_at):
+    names = ("announce", "write_atomic", "record")
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        for name in names[names.index(stopped_at) :]:
+            patched.setattr(manifest_module, name, killed)
+        with pytest.raises(KeyboardInterrupt):
+            write_recorded(run, "data.bin", b"longer than it was")
+    verify(run, "data.bin")
+
+
 def test_a_file_that_nobody_recorded_is_told_from_one_that_is_not_there_yet(run):
     (run / "foreign.bin").write_bytes(b"?")
     with pytest.raises(DataError, match="not listed"):
@@ -235,7 +326,7 @@ def test_a_kill_at_any_moment_leaves_a_checkpoint_that_loads(run, monkeypatch, s
             raise KeyboardInterrupt
 
         for name in names[names.index(stopped_at) :]:
-            patched.setattr(checkpoint, name, killed)
+            patched.setattr(manifest_module, name, killed)
         with pytest.raises(KeyboardInterrupt):
             save_arrays(run, "state.safetensors", {"step": np.arange(4)}, {"step": 2})
     arrays, state = load_arrays(run, "state.safetensors")

@@ -83,7 +83,7 @@ class Console:
     def note(self, text: str) -> None:
         """Tell something by the way, on stderr."""
         if not self.quiet:
-            print(text, file=sys.stderr)
+            tell(text)
 
     def result(
         self, document: dict[str, Any], show: Callable[[RichConsole], None], *, show_costs: bool = True
@@ -117,6 +117,14 @@ class Console:
         fields = [TextColumn("{task.fields[" + name + "]}") for name in columns]
         with Progress(*shown, *fields, console=self.rich(stderr=True), transient=True) as bar:
             yield bar
+
+
+def tell(text: str) -> None:
+    """Print on stderr; where nobody listens there any more, that is no reason to stop working."""
+    try:
+        print(text, file=sys.stderr, flush=True)
+    except (OSError, ValueError):
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - lives as long as the process
 
 
 def print_json(document: dict[str, Any], output: TextIO | None = None) -> None:
@@ -165,7 +173,7 @@ def report_error(error: BaseException, console: Console) -> int:
     document, code, text = describe_error(error, console)
     if console.json and not console.answered:
         print_json({"error": document, "exit_code": code}, console.output)
-    print(text, file=sys.stderr)
+    tell(text)
     if console.debug:
         traceback.print_exception(error)
     return code

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,11 +12,22 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
-from lidardesign.cli.goals import GOAL, Goal, Learner, TimeBudget, Tolerance, check_met, checked_goal, resumed_goal
+from lidardesign.cli.goals import Learner, TimeBudget, Tolerance, check_met, checked_goal
 from lidardesign.cli.ranks import joined_ranks
 from lidardesign.cli.runs import check_choice
+from lidardesign.cli.starts import (
+    CHECKPOINTS,
+    Job,
+    begin,
+    check_can_start,
+    has_stages,
+    made,
+    resumed,
+    started,
+    undone_on_failure,
+)
 from lidardesign.cli.times import keep_times
-from lidardesign.errors import ConfigError, DataError, LostRankError
+from lidardesign.errors import LostRankError
 from lidardesign.run.clock import WAIT_S, phase
 
 if TYPE_CHECKING:
@@ -26,13 +35,8 @@ if TYPE_CHECKING:
 
     from lidardesign.density.learn import LearnProgress, LearnResult
     from lidardesign.density.parallel import Ranks
-    from lidardesign.run.config import RunConfig
-    from lidardesign.task import Task
 
 DEVICES = ("auto", "cpu", "cuda")
-# Snapshots are of no use without a checkpoint.
-STARTED_FILES = {"config.yaml", "manifest.json", "progress.jsonl", "snapshots", ".lock"}
-CHECKPOINTS = "checkpoint*"
 # Below these a density is too rough for figures that are meant seriously.
 LOW_ESS = 0.1
 LOW_COVERAGE = 0.9
@@ -77,132 +81,44 @@ def learn(
         choices = {"preset": preset, "config_file": config, "overrides": overrides or (), "seed": seed}
         goal = checked_goal(tolerance, time_budget, choices, ranks)
         with phase("libraries"):
+            import lidardesign.run.config  # noqa: F401
             from lidardesign.registry import load_task
-            from lidardesign.run.config import load_run_config, resolve
 
         plugin = load_task(task)
         run = out if out is not None else Path("runs") / task
-        if resume:
-            _check_can_resume(run)
-            plugin, settings = load_run_config(run)
-            goal = resumed_goal(goal, run)
-            resume = any(run.glob(CHECKPOINTS))
-            if not resume:
-                console.note("the run has no checkpoint yet; it starts from the beginning")
-            _check_same(settings, plugin if plugin.name == task else load_task(task), choices, run)
-        else:
-            _check_can_start(run)
-            settings = resolve(plugin, **choices)
-        result = _learn_in_folder(plugin, settings, run, resume, goal, device, console, ranks)
+        job = resumed(plugin, run, goal, choices, console) if resume else started(plugin, run, goal, choices)
+        result = _learn_in_folder(job, device, console, ranks)
         keep_times(run, "learn", console, wait_s=WAIT_S)
         result = replace(result, notes=(*result.notes, *_advice(result)))
         console.result(_document(result), lambda rich: _show(result, rich))
         check_met(result, goal)
 
 
-def _check_can_start(run: Path) -> None:
-    """Refuse a folder that holds anything, so that no run is ever overwritten."""
-    if run.is_file():
-        raise ConfigError("is a file", where=f"--out {run}", allowed="a folder that is new or empty")
-    if run.is_dir() and any(run.iterdir()):
-        hint = "continue it with --resume, or give another --out"
-        raise ConfigError("the folder is not empty", where=f"--out {run}", allowed="a new or empty folder", hint=hint)
-
-
-def _check_can_resume(run: Path) -> None:
-    if not run.is_dir():
-        raise DataError("there is no run to resume", where=str(run), hint="leave out --resume to start it")
-
-
-def _check_same(stored: RunConfig, task: Task, choices: dict[str, Any], run: Path) -> None:
-    """Refuse to resume a run under another configuration; repeating its own options is fine."""
-    from lidardesign.run.config import resolve
-    from lidardesign.run.yaml import leaves
-
-    wanted = resolve(
-        task,
-        preset=choices["preset"] or stored.preset,
-        config_file=choices["config_file"] or run / "config.yaml",
-        overrides=choices["overrides"],
-        seed=stored.seed if choices["seed"] is None else choices["seed"],
-    )
-    old, new = dict(leaves(stored.as_document())), dict(leaves(wanted.as_document()))
-    for path in [*old, *new]:
-        if old.get(path) != new.get(path):
-            key = ".".join(map(str, path))
-            raise ConfigError(
-                f"the run was started with {key} = {old.get(path)!r}, not {new.get(path)!r}",
-                where=str(run / "config.yaml"),
-                hint="resume without options, or start a new run with another --out",
-            )
-
-
-def _learn_in_folder(
-    task: Task, settings: RunConfig, run: Path, resume: bool, goal: Goal, device: str, console: Console, ranks: Ranks
-) -> LearnResult:
-    from lidardesign.run.config import save_run_config
+def _learn_in_folder(job: Job, device: str, console: Console, ranks: Ranks) -> LearnResult:
     from lidardesign.run.lock import run_lock
-    from lidardesign.run.manifest import note, start_manifest
 
-    with _undone_on_failure(run), run_lock(run):
-        if not (run / "manifest.json").exists():
-            start_manifest(run, command=["lidardesign", *sys.argv[1:]], seed=settings.seed)
-            save_run_config(settings, run)
-            if not goal.is_none:
-                note(run, **{GOAL: goal.as_dict()})
-        console.when_interrupted = lambda: _interruption(task.name, run)
-        with _progress(console) as progress:
-            learner = Learner(task, run, device, progress, ranks, console)
-            try:
-                return learner.learn(settings, goal, resume=resume)
-            except LostRankError as error:
-                hint = f"{error.hint}; {_interruption(task.name, run)}"
-                raise LostRankError(error.message, where=error.where, hint=hint) from None
-
-
-@contextlib.contextmanager
-def _undone_on_failure(run: Path) -> Iterator[None]:
-    """Make the folder; when nothing was learned before a failure, take away what this command put there."""
-    made = [folder for folder in (run, *run.parents) if not folder.exists()]
-    try:
-        run.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"cannot be made: {error.strerror or error}", where=f"--out {run}") from None
-    started_empty = not any(run.iterdir())
-    try:
-        yield
-    except BaseException:
-        _take_away(run, made, started_empty)
-        raise
-
-
-def _take_away(run: Path, made: list[Path], started_empty: bool) -> None:
-    entries = list(run.iterdir())
-    nothing_learned = all(entry.name in STARTED_FILES or entry.stat().st_size == 0 for entry in entries)
-    if not started_empty or not nothing_learned or _has_stages(run):
-        return
-    with contextlib.suppress(OSError):
-        for entry in entries:
-            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
-        for folder in made:
-            folder.rmdir()
-
-
-def _has_stages(run: Path) -> bool:
-    """Whether trainings were finished on the way to a tolerance: what they reached is worth going on from."""
-    from lidardesign.run.manifest import read_manifest
-
-    try:
-        return bool((read_manifest(run).get(GOAL) or {}).get("stages"))
-    except DataError:
-        return False
+    task, run = job.task.name, job.run
+    with made(run), run_lock(run):
+        if not job.begun:
+            check_can_start(run)  # another process may have been faster
+        with undone_on_failure(job):
+            if not job.begun:
+                begin(job)
+            console.when_interrupted = lambda: _interruption(task, run)
+            with _progress(console) as progress:
+                learner = Learner(job.task, run, device, progress, ranks, console)
+                try:
+                    return learner.learn(job.settings, job.goal, resume=job.has_checkpoint)
+                except LostRankError as error:
+                    hint = f"{error.hint}; {_interruption(task, run)}"
+                    raise LostRankError(error.message, where=error.where, hint=hint) from None
 
 
 def _interruption(task: str, run: Path) -> str | None:
     checkpoints = sorted(path.name for path in run.glob(CHECKPOINTS))
     if checkpoints:
         kept = f"the last checkpoint is {run / checkpoints[-1]}"
-    elif _has_stages(run):
+    elif has_stages(run):
         kept = f"{run} keeps what the finished stages reached"
     else:
         return "before the first checkpoint; nothing was kept"

@@ -9,7 +9,7 @@ import typer
 
 from lidardesign import __version__
 from lidardesign.cli.capture import capture
-from lidardesign.cli.console import EXIT_BROKEN_PIPE, Console, forget_stdout, print_json, report_error
+from lidardesign.cli.console import EXIT_BROKEN_PIPE, Console, forget_stdout, print_json, report_error, tell
 from lidardesign.cli.constrain import constrain
 from lidardesign.cli.environment import make_streams_tolerant, set_cache_default, set_thread_defaults, terminate_cleanly
 from lidardesign.cli.evaluate import evaluate
@@ -141,10 +141,10 @@ def _report_usage(error: Any, console: Console) -> int:
     path = context.command_path if context else "lidardesign"
     message, hint = error.format_message().rstrip(), f"{path} --help"
     if type(error).__name__ == "NoArgsIsHelpError":
-        print(message, file=sys.stderr)
+        tell(message)
         message = "no command was given"
     if console.json:
         document = {"kind": "usage", "message": message, "where": path, "hint": hint}
         print_json({"error": document, "exit_code": EXIT_USAGE})
-    print(f"usage error: {path}: {message}\n  try: {hint}", file=sys.stderr)
+    tell(f"usage error: {path}: {message}\n  try: {hint}")
     return EXIT_USAGE

@@ -8,6 +8,7 @@ taken, found by an exact Euclidean distance transform, so that gradients reach f
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,11 +17,13 @@ from pathlib import Path
 import numpy as np
 
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.numerics import SLACK
 from lidardesign.scene import Mesh
 
 ALGORITHM = "narrow band 3 cells, igl winding sign, filled by distance transform, recentred, float32"
 BAND_CELLS = 3.0
 MAXIMUM_CELLS = 40_000_000
+DIGEST_BYTES = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +57,7 @@ def grid_around(bounds_m: np.ndarray, resolution: int, padding_m: float) -> Grid
     step = float((high - low).max() / (resolution - 1))
     if not step > 0:
         raise DataError("the meshes have no extent")
-    counts = np.maximum(np.ceil((high - low) / step - 1e-9).astype(np.int64) + 1, 2)
+    counts = np.maximum(np.ceil((high - low) / step - SLACK).astype(np.int64) + 1, 2)
     if counts.prod() > MAXIMUM_CELLS:
         raise ConfigError(
             f"a field of {' x '.join(map(str, counts))} points is too large",
@@ -141,24 +144,30 @@ def _cache_path(mesh: Mesh, grid: Grid) -> Path:
 
 
 def _load(path: Path, size: int) -> np.ndarray | None:
+    """The values of a cached field; None where the file is not whole: its hash stands behind the array."""
     try:
-        values = np.load(path, allow_pickle=False)
+        content = path.read_bytes()
+        if _digest(content[:-DIGEST_BYTES]) != content[-DIGEST_BYTES:]:
+            return None
+        values = np.load(io.BytesIO(content), allow_pickle=False)
     except (OSError, ValueError, EOFError):
         return None
     usable = values.shape == (size,) and values.dtype == np.float32 and np.isfinite(values).all()
     return values if usable else None
 
 
-def _store(path: Path, values: np.ndarray) -> None:
-    import io
+def _digest(content: bytes) -> bytes:
+    return hashlib.sha256(content).digest()
 
+
+def _store(path: Path, values: np.ndarray) -> None:
     from lidardesign.run.files import write_atomic
 
     buffer = io.BytesIO()
     np.save(buffer, values, allow_pickle=False)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, buffer.getvalue())
+        write_atomic(path, buffer.getvalue() + _digest(buffer.getvalue()))
     except (OSError, DataError):
         # a cache that cannot be written costs time, never the result
         return

@@ -31,6 +31,7 @@ from lidardesign.density.target import Target
 from lidardesign.errors import DataError, DivergenceError, LostRankError, NumericalError
 from lidardesign.run.checkpoint import load_arrays, save_arrays
 from lidardesign.run.clock import phase
+from lidardesign.run.files import write_atomic
 from lidardesign.run.manifest import record
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -295,7 +296,7 @@ class Trainer:
         path = self.run / PROGRESS
         if path.exists():
             kept = [line for line in path.read_text(encoding="utf-8").splitlines() if _step_of(line) <= self.step]
-            path.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+            write_atomic(path, "".join(line + "\n" for line in kept))
 
 
 def _moved(name: str, value: torch.Tensor, parameter: torch.Tensor) -> torch.Tensor:

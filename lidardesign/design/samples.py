@@ -13,8 +13,7 @@ import numpy as np
 from lidardesign.errors import DataError
 from lidardesign.numerics import normalised_weights, systematic_draw
 from lidardesign.run.clock import phase
-from lidardesign.run.files import write_atomic
-from lidardesign.run.manifest import record, verify
+from lidardesign.run.manifest import verify, write_recorded
 from lidardesign.space import DesignSpace
 
 FILE_NAME = "samples.npz"
@@ -67,7 +66,7 @@ class Samples:
 
 
 def save_samples(samples: Samples, run: Path) -> None:
-    """Write the samples into a run folder, atomically, with their hash in the manifest."""
+    """Write the samples into a run folder, atomically, with their hash in the manifest at every moment."""
     buffer = io.BytesIO()
     np.savez(
         buffer,
@@ -76,8 +75,7 @@ def save_samples(samples: Samples, run: Path) -> None:
         log_target=samples.log_target,
         space=np.frombuffer(json.dumps(samples.space.as_dict()).encode(), dtype=np.uint8),
     )
-    write_atomic(run / FILE_NAME, buffer.getvalue())
-    record(run, [FILE_NAME])
+    write_recorded(run, FILE_NAME, buffer.getvalue())
 
 
 @phase("samples")

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.errors import DataError
-from lidardesign.run.files import write_atomic
-from lidardesign.run.manifest import announce, record, verify
+from lidardesign.run.manifest import verify, write_recorded
 
 FORMAT = "lidardesign-1"
 
@@ -26,10 +25,7 @@ def save_arrays(run: Path, name: str, arrays: Mapping[str, np.ndarray], state: M
 
     # one entry only: safetensors writes several in an order that changes from process to process
     metadata = {FORMAT: json.dumps(dict(state))}
-    content = save({key: np.ascontiguousarray(value) for key, value in arrays.items()}, metadata)
-    announce(run, name, content)
-    write_atomic(run / name, content)
-    record(run, [name])
+    write_recorded(run, name, save({key: np.ascontiguousarray(value) for key, value in arrays.items()}, metadata))
 
 
 def load_arrays(run: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

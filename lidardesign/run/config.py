@@ -17,8 +17,7 @@ from lidardesign.density.settings import PRESET_LEARNING, PRESETS, DensitySettin
 from lidardesign.errors import ConfigError
 from lidardesign.registry import load_task, plugin_guard
 from lidardesign.run.clock import phase
-from lidardesign.run.files import write_atomic
-from lidardesign.run.manifest import record, verify
+from lidardesign.run.manifest import verify, write_recorded
 from lidardesign.run.overrides import Override, apply_override, parse_override
 from lidardesign.run.validation import anchor_paths, check_model, suggest
 from lidardesign.run.yaml import Document, KeyPath, dump_yaml, leaves, load_yaml
@@ -210,9 +209,8 @@ def config_of(document: Document) -> tuple[Task, RunConfig]:
 
 
 def save_run_config(config: RunConfig, run: Path) -> None:
-    """Write config.yaml into a run folder and enter it in the manifest."""
-    write_atomic(Path(run) / FILE_NAME, dump_yaml(config.as_document()))
-    record(run, [FILE_NAME])
+    """Write config.yaml into a run folder, with its hash in the manifest at every moment."""
+    write_recorded(run, FILE_NAME, dump_yaml(config.as_document()).encode())
 
 
 def _header(task: Task, document: Document, preset: str | None, seed: int | None) -> dict[str, Any]:

@@ -5,20 +5,27 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import re
 import secrets
 from pathlib import Path
 
 from lidardesign.errors import DataError
+from lidardesign.run.processes import host_mark, is_gone
 
 TEMPORARY_SUFFIX = ".tmp"
 CHUNK_BYTES = 1 << 20
+# Of a temporary file's name, which file systems limit to 255 bytes.
+NAME_BYTES = 100
+# .NAME.HOST-PROCESS.RANDOM.tmp
+_TEMPORARY = re.compile(r"\..+\.(?:(?P<host>[0-9a-f]+)-)?(?P<pid>\d+)\.[0-9a-f]+\.tmp", re.DOTALL)
 
 
 def write_atomic(path: Path, content: bytes | str) -> None:
     """Write a file so that a reader, or a crash at any time, finds the old content or the new one.
 
     The content goes to a temporary file in the same folder, is flushed to the disk, and takes the name by a
-    rename. A pipe or a device (as /dev/stdout) is written straight.
+    rename. What killed writers of the same file left is removed. A pipe or a device (as /dev/stdout) is written
+    straight.
 
     Arguments:
         path: The file; missing folders are made.
@@ -44,8 +51,15 @@ def write_atomic(path: Path, content: bytes | str) -> None:
         ) from error
 
 
+def temporary_beside(path: Path) -> Path:
+    """A name in the folder of a file that no other writer uses and that tells whose it is."""
+    name = os.fsdecode(os.fsencode(path.name)[:NAME_BYTES])
+    return path.with_name(f".{name}.{host_mark()}-{os.getpid()}.{secrets.token_hex(4)}{TEMPORARY_SUFFIX}")
+
+
 def _replace(path: Path, payload: bytes) -> None:
-    temporary = path.with_name(f".{path.name[:100]}.{os.getpid()}.{secrets.token_hex(4)}{TEMPORARY_SUFFIX}")
+    temporary = temporary_beside(path)
+    _remove_abandoned(temporary)
     try:
         with temporary.open("xb") as file:
             file.write(payload)
@@ -59,6 +73,16 @@ def _replace(path: Path, payload: bytes) -> None:
     _sync_folder(path.parent)
 
 
+def _remove_abandoned(temporary: Path) -> None:
+    """Remove the temporary files of the same target that processes of this computer left when they were killed."""
+    beginning = temporary.name.rsplit("-", 1)[0]
+    for name in os.listdir(temporary.parent):
+        found = _TEMPORARY.fullmatch(name) if name.startswith(beginning) else None
+        if found and is_gone(int(found["pid"])):
+            with contextlib.suppress(OSError):
+                temporary.with_name(name).unlink()
+
+
 def _sync_folder(folder: Path) -> None:
     """Make the rename itself durable, where the system can open folders."""
     with contextlib.suppress(OSError):
@@ -69,16 +93,24 @@ def _sync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
-def remove_stray_temporaries(folder: Path) -> list[Path]:
-    """Remove temporary files that a killed process left in a folder; returns what was removed.
+def is_temporary(name: str) -> bool:
+    """Whether a file of this name is one that a writer makes before the file itself."""
+    return _TEMPORARY.fullmatch(name) is not None
 
-    Call it only while no other process writes there (the run's lock is held).
+
+def remove_stray_temporaries(folder: Path) -> list[Path]:
+    """Remove temporary files that killed processes left in a folder and its subfolders; returns what was removed.
+
+    Call it only while no other computer writes there (the run's lock is held).
     """
     removed = []
-    for stray in sorted(Path(folder).glob(f".*{TEMPORARY_SUFFIX}")):
-        with contextlib.suppress(OSError):
-            stray.unlink()
-            removed.append(stray)
+    for stray in sorted([*Path(folder).glob(f".*{TEMPORARY_SUFFIX}"), *Path(folder).glob(f"*/.*{TEMPORARY_SUFFIX}")]):
+        found = _TEMPORARY.fullmatch(stray.name)
+        at_work = found and found["host"] == host_mark() and not is_gone(int(found["pid"]))
+        if found and not at_work:
+            with contextlib.suppress(OSError):
+                stray.unlink()
+                removed.append(stray)
     return removed
 
 

@@ -14,6 +14,7 @@ from typing import Any
 from lidardesign import __version__
 from lidardesign.errors import DataError
 from lidardesign.run.files import sha256_file, write_atomic
+from lidardesign.run.lock import writer
 
 FILE_NAME = "manifest.json"
 SCHEMA_VERSION = 1
@@ -146,6 +147,29 @@ def announce(run: Path, name: str, content: bytes) -> None:
     write_manifest(run, manifest)
 
 
+def write_recorded(run: Path, name: str, content: bytes) -> None:
+    """Write a file of a run atomically, with its hash in the manifest at every moment."""
+    announce(run, name, content)
+    write_atomic(Path(run) / name, content)
+    record(run, [name])
+
+
+def changed_since_recorded(run: Path, name: str) -> str | None:
+    """In what a file differs from the one that was recorded, in words; None where it does not, or never was.
+
+    Raises:
+        DataError: The manifest or the file cannot be read.
+    """
+    run = Path(run)
+    entry = read_manifest(run)["files"].get(Path(name).as_posix())
+    if entry is None or sha256_file(run / name) in _hashes(entry):
+        return None
+    size = (run / name).stat().st_size
+    if size < entry["bytes"]:
+        return f"is truncated: {size} of {entry['bytes']} bytes"
+    return "was changed since it was written (its SHA-256 is not the manifest's)"
+
+
 def _hashes(entry: dict[str, Any]) -> list[str]:
     """The SHA-256 of every content that a file may have: its own, and what it replaces while it is being written."""
     return [version["sha256"] for version in (entry, entry.get("replaces")) if version]
@@ -174,7 +198,9 @@ def verify(run: Path, name: str) -> None:
         hint = "continue learning with --resume; if that does not help, remove the file"
         raise DataError("is not listed in the run's manifest", where=str(path), hint=hint)
     if entry is None:
-        hint = "learning was not finished: continue with --resume"
+        at_work = writer(run)
+        unfinished = "learning was not finished: continue with --resume"
+        hint = f"{at_work} is still learning it: wait" if at_work else unfinished
         raise DataError(f"the run holds no {name} yet", where=str(run), hint=hint)
     if not path.is_file():
         raise DataError(
@@ -182,17 +208,6 @@ def verify(run: Path, name: str) -> None:
             where=str(path),
             hint="restore it, or learn again: --resume continues from the last checkpoint",
         )
-    if sha256_file(path) in _hashes(entry):
-        return
-    size = path.stat().st_size
-    if size < entry["bytes"]:
-        raise DataError(
-            f"is truncated: {size} of {entry['bytes']} bytes",
-            where=str(path),
-            hint="restore it or learn the run again",
-        )
-    raise DataError(
-        "was changed since it was written (its SHA-256 is not the manifest's)",
-        where=str(path),
-        hint="restore it or learn the run again",
-    )
+    difference = changed_since_recorded(run, name)
+    if difference is not None:
+        raise DataError(difference, where=str(path), hint="restore it or learn the run again")
