@@ -46,7 +46,11 @@ def prepare_ground(task: Task, config: RunConfig, ranks: Ranks = ALONE) -> Groun
         PluginError: The task's own code failed.
     """
     if not set(config.space.free) - set(config.space.conditioned):
-        raise ConfigError("every dimension of the design space is fixed", where="space", hint="free at least one")
+        raise ConfigError(
+            "every dimension of the design space is fixed: it is one design point, with nothing to learn",
+            where="space",
+            hint="free at least one, or write the point as a design file",
+        )
     ranks.announce({"job": "ground", "config": config.as_document()})
     scenes = training_scenes(task, config)
     target, notes = prepare_target(scenes, config, ranks=ranks)
@@ -78,7 +82,7 @@ def _pool(target: Target, scenes: Sequence[Scene], config: RunConfig) -> Pool:
         raise DataError(
             "no ray of the design space reaches a target surface in any training scene",
             where="space",
-            hint="widen the angles or the range, or move the origin",
+            hint="widen the angles or the range, move the origin, or raise density.sigma_m",
         )
     refuse_blind_receiver(scenes, points)
     log_target = target.ranks.spread(target.log_density, points)

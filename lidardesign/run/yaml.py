@@ -200,7 +200,8 @@ class _Builder:
         try:
             value = resolve_scalar(event.value) if plain else event.value
         except ValueError as error:
-            raise self._error(event, str(error)) from None
+            name = ".".join(map(str, self._next_path()))
+            raise self._error(event, f"{name}: {error}" if name else str(error)) from None
         self._count(event, 1)
         self._put(value, event)
         if event.anchor:
@@ -261,16 +262,22 @@ class _Builder:
     def _expects_key(self) -> bool:
         return bool(self._stack) and isinstance(self._stack[-1].value, dict) and self._stack[-1].key is None
 
-    def _put(self, value: Any, event: yaml.Event) -> KeyPath:
+    def _next_path(self) -> KeyPath:
+        """The path of the value that comes next."""
         if not self._stack:
-            self.root, path = value, ()
+            return ()
+        frame = self._stack[-1]
+        return (*frame.path, (frame.key or "") if isinstance(frame.value, dict) else len(frame.value))
+
+    def _put(self, value: Any, event: yaml.Event) -> KeyPath:
+        path = self._next_path()
+        if not self._stack:
+            self.root = value
         else:
             frame = self._stack[-1]
             if isinstance(frame.value, dict):
-                path = (*frame.path, frame.key or "")
                 frame.value[frame.key], frame.key = value, None
             else:
-                path = (*frame.path, len(frame.value))
                 frame.value.append(value)
         self.values[path] = _position(event)
         return path

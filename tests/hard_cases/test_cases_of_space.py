@@ -1,0 +1,477 @@
+"""The design space: seams and poles of the sphere, ranges that are none, fixed dimensions, bounds that cannot be."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+import pytest
+import references
+import torch
+from cases import hard_case
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from lidardesign.density.flow import DesignFlow
+from lidardesign.density.ground import prepare_ground
+from lidardesign.density.objective import Coordinates
+from lidardesign.density.settings import DensitySettings, LearningSettings
+from lidardesign.density.target import MINIMUM_POLE_COSINE, build_target
+from lidardesign.design.files import load_design, save_design
+from lidardesign.design.fit import fit
+from lidardesign.design.samples import Samples
+from lidardesign.design.sensor import boresight_frame, tangent_directions
+from lidardesign.design.sensor_csv import COLUMNS
+from lidardesign.errors import ConfigError, DataError, NumericalError
+from lidardesign.numerics import circular_mean
+from lidardesign.registry import load_task
+from lidardesign.run.config import RunConfig, resolve
+from lidardesign.run.yaml import dump_yaml
+from lidardesign.scene import Body, Plane, Scene, Sphere, rigid
+from lidardesign.space import (
+    AZIMUTH,
+    DIMENSIONS,
+    ELEVATION,
+    RANGE,
+    DesignSpace,
+    angles,
+    direction,
+    observed_point,
+)
+from lidardesign.task import TaskConfig
+
+TURN = 2 * math.pi
+BOTH_POLES = ((-1.0, -1, -1, 0, -math.pi / 2, 0.0), (1.0, 1, 1, TURN, math.pi / 2, 4.0))
+AROUND = DesignSpace(*BOTH_POLES)
+MEASURES = ("solid_angle", "angles")
+WAYS = ("off", "quadrature", "raycast")
+SETTINGS = DensitySettings(sigma_m=0.05, attenuation_per_m=20.0, sharpness_per_m=40.0, margin_m=0.05)
+BALLS = Scene(
+    (
+        Body(Sphere(0.3), "ball", poses=rigid(translation_m=(1.2, 0.05, 0.1))),
+        Body(Sphere(0.1), "before", "occluder", rigid(translation_m=(0.6, -0.1, 0.0))),
+    )
+)
+azimuths = st.floats(-50.0, 50.0)
+elevations = st.floats(-math.pi / 2, math.pi / 2)
+
+
+@hard_case(
+    "1",
+    "Azimuth across 0 and 2 pi, azimuth = 2 pi, negative azimuths",
+    done="angles count modulo a turn everywhere: wrapped into the bounds, densities the same on both sides of the "
+    "seam, means taken of directions, boresights in tangent planes",
+)
+class TestAzimuthAcrossTheSeam:
+    @staticmethod
+    def broke() -> str:
+        angle = np.mod(np.random.default_rng(0).normal(0, 0.1, 2000), TURN)
+        return (
+            f"the plain mean of a cluster at azimuth 0 of 0.1 rad is {angle.mean():.2g} rad and its spread "
+            f"{angle.std():.2g} rad"
+        )
+
+    @given(azimuths, elevations, st.floats(-7.0, 7.0), st.floats(0.1, TURN))
+    def test_wrapping_turns_no_ray_and_ends_inside_any_interval_that_holds_it(self, azimuth, elevation, start, width):
+        space = DesignSpace((0, 0, 0, start, -math.pi / 2, 0), (0, 0, 0, start + width, math.pi / 2, 1))
+        point = np.array([0, 0, 0, azimuth, elevation, 1.0])
+        wrapped = space.wrap(point)
+        # a number of 50 rad is known to 7e-15
+        np.testing.assert_allclose(observed_point(wrapped), observed_point(point), atol=1e-13)
+        np.testing.assert_array_equal(space.wrap(wrapped), wrapped)
+        assert abs(wrapped[AZIMUTH] - (start + width / 2)) <= math.pi * (1 + references.ROUNDING) + width / 2
+        assert bool(space.contains(wrapped)) == bool(space.contains(point))
+
+    @pytest.mark.parametrize("way", WAYS)
+    def test_densities_and_gradients_are_the_same_a_turn_further_in_either_direction(self, way):
+        space = DesignSpace((0, 0, 0, -0.5, -0.5, 0.2), (0, 0, 0, 0.5, 0.5, 3.0))
+        target = build_target([BALLS], space, SETTINGS, way)
+        points = space.sample(100, np.random.default_rng(1))
+        values, gradient = target.log_density_and_gradient(points)
+        for turns in (-1, 1, 2):
+            moved, turned = target.log_density_and_gradient(points + np.eye(6)[AZIMUTH] * turns * TURN)
+            # angles of ten radians are rounded to 1e-15, times slopes of up to 1e4 nats per radian here
+            np.testing.assert_allclose(moved, values, atol=1e-9)
+            np.testing.assert_allclose(turned, gradient, atol=1e-6, rtol=1e-6)
+
+    @pytest.mark.parametrize("way", WAYS)
+    def test_the_density_has_no_step_at_the_seam_of_a_full_turn(self, way):
+        target = build_target([BALLS], AROUND, SETTINGS, way)
+        points = AROUND.sample(100, np.random.default_rng(2))
+        points[:, :3] *= 0.1
+        before, after, last = points.copy(), points.copy(), points.copy()
+        before[:, AZIMUTH], after[:, AZIMUTH], last[:, AZIMUTH] = TURN - 1e-9, 1e-9, TURN
+        first = points.copy()
+        first[:, AZIMUTH] = 0.0
+        slopes = np.abs(target.log_density_and_gradient(first)[1][:, AZIMUTH])
+        np.testing.assert_allclose(target.log_density(last), target.log_density(first), atol=1e-9)
+        step = np.abs(target.log_density(before) - target.log_density(after))
+        assert (step <= 2e-9 * (2 * slopes + 1) + 1e-8).all()
+
+    def test_unit_coordinates_of_negative_and_positive_azimuths_agree(self):
+        space = DesignSpace((0, 0, 0, -math.pi / 2, -1, 0), (0, 0, 0, math.pi / 2, 1, 1))
+        points = space.sample(200, np.random.default_rng(3))
+        positive = points.copy()
+        positive[:, AZIMUTH] = np.mod(positive[:, AZIMUTH], TURN)
+        assert (positive[:, AZIMUTH] >= 0).all()
+        assert space.contains(positive).all()
+        np.testing.assert_allclose(space.to_unit(positive), space.to_unit(points), atol=1e-14)
+
+    def test_means_are_those_of_directions(self):
+        assert circular_mean(np.radians([350.0, 10.0])) == pytest.approx(0.0, abs=1e-15)
+        angle = np.random.default_rng(4).normal(0, 0.1, 4000)
+        found = circular_mean(np.mod(angle, TURN))
+        assert min(found, TURN - found) < references.STANDARD_ERRORS * 0.1 / math.sqrt(4000)
+
+    def test_a_sensor_that_looks_across_the_seam_is_the_one_that_looks_elsewhere(self):
+        tangent = np.random.default_rng(5).normal(0, [0.1, 0.05], (4000, 2))
+        sensors = []
+        for azimuth in (1.0, 0.0, TURN - 0.02):
+            looking = tangent_directions(boresight_frame(azimuth, 0.1, 0.0), tangent)
+            points = np.column_stack([np.zeros((4000, 3)), *angles(looking), np.full(4000, 1.0)])
+            level = np.zeros(4000)
+            sensors.append(fit(Samples(points, level, level, AROUND), sensors=1).design.sensors[0])
+        for sensor in sensors[1:]:
+            np.testing.assert_allclose(sensor.field_of_view_rad, sensors[0].field_of_view_rad, rtol=1e-9)
+            assert sensor.elevation_rad == pytest.approx(sensors[0].elevation_rad, abs=1e-12)
+
+
+@hard_case(
+    "2",
+    "Elevation at +-pi/2, where the azimuth says nothing",
+    done="the chart is sin(elevation) and densities are per solid angle; the one unbounded derivative is capped; a "
+    "field of view is two physical angles around its boresight, the same at a pole as on the horizon",
+)
+class TestElevationAtThePoles:
+    @staticmethod
+    def broke() -> str:
+        with np.errstate(divide="ignore"):
+            slope = np.float64(1.0) / np.sqrt(1.0 - np.square(np.float64(1.0)))
+        cosine = np.log(np.cos(np.float32(math.pi / 2)).astype(np.float64) ** 2) / 2
+        return (
+            f"d elevation / d sin(elevation) is {slope} at a pole, and log cos(elevation), -inf there, is {cosine:.3g} "
+            "in float32"
+        )
+
+    @given(azimuths, st.sampled_from([-1.0, 1.0]))
+    def test_the_direction_is_straight_whatever_the_azimuth(self, azimuth, pole):
+        x, y, z = direction(azimuth, pole * math.pi / 2)
+        # cos of the float64 nearest to pi/2 is 6e-17
+        assert math.hypot(x, y) <= np.finfo(float).eps
+        assert z == pole
+
+    def test_straight_vectors_have_an_azimuth_of_zero(self):
+        for z in (-2.0, 1e-200, 1e200):
+            assert angles(np.array([0.0, 0.0, z])) == (0.0, math.copysign(math.pi / 2, z))
+
+    @pytest.mark.parametrize("way", WAYS)
+    @pytest.mark.parametrize("measure", MEASURES)
+    def test_values_and_gradients_are_finite_at_both_poles_in_both_charts(self, measure, way):
+        space = DesignSpace(*BOTH_POLES, measure=measure)
+        scene = Scene((Body(Plane(), "floor", poses=rigid(translation_m=(0, 0, -2.0))), *BALLS.bodies))
+        target = build_target([scene], space, SETTINGS, way)
+        points = space.sample(200, np.random.default_rng(6))
+        points[:, ELEVATION] = np.repeat([-math.pi / 2, math.pi / 2], 100)
+        values, gradient = target.log_density_and_gradient(points)
+        assert np.isfinite(values).all()
+        assert np.isfinite(gradient).all()
+        spun = points.copy()
+        spun[:, AZIMUTH] = np.roll(points[:, AZIMUTH], 1)
+        # all azimuths are the same ray
+        np.testing.assert_allclose(target.log_density(spun), values, atol=1e-9)
+
+    def test_the_capped_derivative_is_exact_down_to_its_cap(self):
+        target = build_target([BALLS], AROUND, SETTINGS, "off")
+        points = np.tile([0.0, 0, 0, 0.3, 0, 1.0], (50, 1))
+        cosine = np.geomspace(2 * MINIMUM_POLE_COSINE, 0.1, 50)
+        points[:, ELEVATION] = np.arccos(cosine)
+        gradient = target.log_density_and_gradient(points)[1][:, ELEVATION]
+
+        def value(chart):
+            return target.log_density(AROUND.from_chart(chart))
+
+        # the chart is bent by 1 / cos^3: steps shrink with cos^2
+        step = 1e-4 * np.square(cosine)
+        chart = AROUND.to_chart(points)
+        ends = [chart + sign * step[:, None] * np.eye(6)[ELEVATION] for sign in (1, -1)]
+        numerical = (value(ends[0]) - value(ends[1])) / (2 * step)
+        np.testing.assert_allclose(gradient, numerical, rtol=1e-3)
+
+    def test_a_cap_at_the_pole_holds_its_solid_angle_and_is_filled_evenly(self):
+        low = math.pi / 2 - 0.3
+        space = DesignSpace((0, 0, 0, 0, low, 1), (0, 0, 0, TURN, math.pi / 2, 1))
+        assert space.log_volume == pytest.approx(math.log(TURN * (1 - math.cos(0.3))), rel=1e-12)
+        height = direction(*space.sample(20_000, np.random.default_rng(7))[:, [AZIMUTH, ELEVATION]].T)[:, 2]
+        # by Archimedes, heights are uniform
+        middle, spread = (1 + math.cos(0.3)) / 2, (1 - math.cos(0.3)) / math.sqrt(12)
+        assert abs(height.mean() - middle) < references.STANDARD_ERRORS * spread / math.sqrt(20_000)
+
+    def test_the_flow_has_a_finite_density_at_the_poles(self):
+        coordinates = Coordinates(AROUND)
+        flow = DesignFlow(
+            coordinates.blocks, 0, layers=1, hidden=8, bins=4, periodic=[False] * 3 + [True, False, False],
+            generator=torch.Generator().manual_seed(0),
+        ).double()  # fmt: skip
+        points = AROUND.sample(50, np.random.default_rng(8))
+        points[:, ELEVATION] = np.repeat([-math.pi / 2, math.pi / 2], 25)
+        unit = torch.as_tensor(AROUND.to_unit(points))
+        assert torch.isfinite(flow.log_prob(unit, None)).all()
+
+    @given(st.integers(0, 2**20))
+    def test_a_field_of_view_does_not_change_when_the_world_turns_its_sensor_to_a_pole(self, seed):
+        generator = np.random.default_rng(seed)
+        tangent = generator.normal(0, [0.12, 0.05], (500, 2))
+        looking = tangent_directions(boresight_frame(0.4, 0.2, 0.3), tangent)
+        down = direction(0.4, 0.2)
+        turn = Rotation.align_vectors([[0, 0, -1.0]], [down])[0].as_matrix()
+        widths = []
+        for toward in (looking, looking @ turn.T):
+            points = np.column_stack([np.zeros((500, 3)), *angles(toward), np.ones(500)])
+            level = np.zeros(500)
+            sensor = fit(Samples(points, level, level, AROUND), sensors=1).design.sensors[0]
+            widths.append(sensor.field_of_view_rad)
+        # which of the two is horizontal depends on a boresight that no azimuth describes; spreads along turned axes
+        # of one covariance differ, its trace does not
+        assert np.square(widths[1]).sum() == pytest.approx(np.square(widths[0]).sum(), rel=1e-9)
+
+
+TAUS = {"negative": -0.1, "infinite": math.inf, "not a number": math.nan}
+
+
+@hard_case(
+    "3",
+    "Range 0, negative, infinite or NaN",
+    done="0 is a range: the ray listens at its origin with T = 1; what is negative or not finite is refused by the "
+    "name of the field, in bounds, configurations, design files, sensor tables and by the target density",
+)
+class TestRangesThatAreNone:
+    @staticmethod
+    def broke() -> str:
+        tau = -0.1
+        passed = math.exp(-1000.0 * tau)
+        return f"exp(-beta tau) is {passed:.2g} for tau = -0.1 m and beta = 1000: a ray brighter than its light"
+
+    @pytest.mark.parametrize("way", WAYS)
+    def test_at_range_zero_the_density_is_that_of_the_origin_and_nothing_is_in_the_way(self, way):
+        target = build_target([BALLS], AROUND, SETTINGS, way)
+        points = AROUND.sample(100, np.random.default_rng(9))
+        points[:, RANGE] = 0.0
+        values, gradient = target.log_density_and_gradient(points)
+        distance = np.linalg.norm(points[:, :3] - [1.2, 0.05, 0.1], axis=1) - 0.3
+        np.testing.assert_allclose(values, -np.square(distance / 0.05) / 2, rtol=1e-12, atol=1e-12)
+        assert np.isfinite(gradient).all()
+
+    def test_a_space_may_fix_the_range_at_zero(self):
+        space = DesignSpace(AROUND.low, (*AROUND.high[:5], 0.0))
+        assert (space.sample(10, np.random.default_rng(10))[:, RANGE] == 0.0).all()
+
+    @pytest.mark.parametrize("value", TAUS.values(), ids=TAUS)
+    @pytest.mark.parametrize("side", ["low", "high"])
+    def test_bounds_are_refused_by_name(self, side, value):
+        low, high = list(AROUND.low), list(AROUND.high)
+        (low if side == "low" else high)[RANGE] = value
+        with pytest.raises(ConfigError, match=r"space\.range_m"):
+            DesignSpace(tuple(low), tuple(high))
+
+    @pytest.mark.parametrize("text", ["[-0.1, 1]", "[0, .inf]", "[.nan, 1]", "-0.1", ".nan", "-.inf"])
+    def test_configurations_are_refused_by_name_and_place(self, tmp_path, text):
+        (tmp_path / "config.yaml").write_text(f"space:\n  range_m: {text}\n", encoding="utf-8")
+        with pytest.raises(ConfigError, match=r"space\.range_m") as caught:
+            resolve(load_task("flatland"), config_file=tmp_path / "config.yaml")
+        assert caught.value.where.startswith(f"{tmp_path / 'config.yaml'}:2:1")
+
+    @pytest.mark.parametrize("value", TAUS.values(), ids=TAUS)
+    @pytest.mark.parametrize("key", ["range_m", "gate_m.start", "gate_m.end", "spread.range_m"])
+    def test_design_files_are_refused_by_name(self, tmp_path, key, value):
+        sensor = {
+            "origin_m": {"mean": [0.0, 0.0, 0.0]},
+            "boresight": {"azimuth_rad": 0.0, "elevation_rad": 0.0},
+            "field_of_view_rad": {"horizontal": 0.1, "vertical": 0.1},
+        }
+        if key.startswith("gate_m"):
+            sensor["gate_m"] = {"start": 0.5, "end": 1.0, key.removeprefix("gate_m."): value}
+        else:
+            sensor |= {"range_m": 1.0, "spread": {"range_m": 0.1}}
+            if key == "range_m":
+                sensor["range_m"] = value
+            else:
+                sensor["spread"]["range_m"] = value
+        flow_style = re.sub(r"\b(nan|inf)\b", r".\1", str(sensor).replace("'", ""))
+        path = tmp_path / "bad.yaml"
+        path.write_text(f"schema_version: 1\nsensors:\n  - {flow_style}\n", encoding="utf-8")
+        with pytest.raises(ConfigError, match=key.replace(".", r"\.")) as caught:
+            load_design(path)
+        assert f"{path}:3:" in str(caught.value)
+
+    @pytest.mark.parametrize("value", ["-0.1", "inf", "nan"])
+    def test_sensor_tables_are_refused_by_column(self, tmp_path, value):
+        good = dict.fromkeys(COLUMNS, "0.1") | {"orig_cov_xy": "0", "orig_cov_xz": "0", "orig_cov_yz": "0"}
+        row = (good | {"time_mean": value}).values()
+        path = tmp_path / "table.csv"
+        path.write_text(",".join(COLUMNS) + "\n" + ",".join(row) + "\n", encoding="utf-8")
+        with pytest.raises(DataError, match="time_mean"):
+            load_design(path)
+
+    @pytest.mark.parametrize("way", WAYS)
+    @pytest.mark.parametrize("value", TAUS.values(), ids=TAUS)
+    def test_the_target_density_refuses_points_by_name(self, way, value):
+        points = AROUND.sample(3, np.random.default_rng(11))
+        points[1, RANGE] = value
+        with pytest.raises(NumericalError, match="range_m"):
+            build_target([BALLS], AROUND, SETTINGS, way).log_density(points)
+
+
+def config_of(space: DesignSpace) -> RunConfig:
+    return RunConfig("flatland", 0, "draft", TaskConfig(), space, SETTINGS, LearningSettings())
+
+
+@hard_case(
+    "4",
+    "Lower bound = upper bound",
+    done="such a dimension is fixed: it leaves the flow and comes back with exactly its value; with all six fixed the "
+    "space is one design point, and learning it is refused, since there is nothing to learn",
+)
+class TestFixedDimensions:
+    @staticmethod
+    def broke() -> str:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            unit = np.float64(2 * 1.0 - 1.0 - 1.0) / np.float64(1.0 - 1.0)
+            volume = np.log(np.float64(1.0 - 1.0))
+        return f"scaling a ceiling z = 1 to [-1, 1] gives {unit}, and the log volume of its box is {volume}"
+
+    @given(st.sets(st.integers(0, 5)), st.integers(0, 2**20), st.sampled_from(MEASURES))
+    def test_fixed_dimensions_leave_the_unit_box_and_come_back_bit_for_bit(self, fixed, seed, measure):
+        generator = np.random.default_rng(seed)
+        low, high = np.array(AROUND.low), np.array(AROUND.high)
+        for index in fixed:
+            low[index] = high[index] = generator.uniform(low[index], high[index])
+        space = DesignSpace(tuple(low.tolist()), tuple(high.tolist()), measure=measure)
+        assert set(space.free) == set(range(6)) - fixed
+        points = space.from_unit(generator.uniform(-1, 1, (20, len(space.free))))
+        for index in fixed:
+            assert (points[:, index] == low[index]).all()
+        assert space.contains(points).all()
+        assert np.isfinite(space.log_volume)
+        assert space.to_unit(points).shape == (20, 6 - len(fixed))
+
+    @pytest.mark.parametrize("fixed", range(6))
+    def test_gradients_of_the_free_dimensions_do_not_notice(self, fixed):
+        generator = np.random.default_rng(12)
+        low, high = list(AROUND.low), list(AROUND.high)
+        low[fixed] = high[fixed] = 0.25
+        space = DesignSpace(tuple(low), tuple(high))
+        points = space.sample(40, generator)
+        some, all_free = (build_target([BALLS], one, SETTINGS, "raycast") for one in (space, AROUND))
+        values, gradient = some.log_density_and_gradient(points)
+        expected, whole = all_free.log_density_and_gradient(points)
+        np.testing.assert_array_equal(values, expected)
+        np.testing.assert_array_equal(gradient[:, list(space.free)], whole[:, list(space.free)])
+
+    def test_samples_of_a_flow_under_a_ceiling_are_all_on_it(self):
+        space = DesignSpace((*AROUND.low[:2], 1.0, *AROUND.low[3:]), (*AROUND.high[:2], 1.0, *AROUND.high[3:]))
+        coordinates = Coordinates(space)
+        generator = torch.Generator().manual_seed(1)
+        circular = [False, False, True, False, False]
+        flow = DesignFlow(coordinates.blocks, 0, layers=1, hidden=8, bins=4, periodic=circular, generator=generator)
+        assert flow.features == 5
+        learned, _ = flow(flow.draw_base(200, generator), None)
+        points = space.from_unit(coordinates.join(learned, None).detach().double().numpy())
+        assert (points[:, 2] == 1.0).all()
+
+    def test_a_design_under_a_ceiling_hangs_on_it_exactly_also_in_its_file(self, tmp_path):
+        space = DesignSpace((-1, -1, 1.1, 0, -math.pi / 2, 0.2), (1, 1, 1.1, TURN, 0, 2))
+        points = space.sample(2000, np.random.default_rng(13))
+        level = np.zeros(2000)
+        design = fit(Samples(points, level, level, space), sensors=2, em_samples=2000, restarts=1).design
+        save_design(design, tmp_path / "ceiling.yaml")
+        for one in (design, load_design(tmp_path / "ceiling.yaml")):
+            for sensor in one.sensors:
+                assert sensor.origin_m[2] == 1.1
+                assert (sensor.origin_covariance_m2[2] == 0).all()
+                assert (sensor.origin_covariance_m2[:, 2] == 0).all()
+
+    def test_a_space_with_all_six_fixed_is_one_design_point(self):
+        here = (0.1, -0.2, 0.3, 1.0, -0.4, 2.0)
+        space = DesignSpace(here, here)
+        assert space.free == ()
+        assert space.log_volume == 0.0
+        np.testing.assert_array_equal(space.sample(4, np.random.default_rng(14)), np.tile(here, (4, 1)))
+        values, gradient = build_target([BALLS], space, SETTINGS, "raycast").log_density_and_gradient(
+            space.sample(2, np.random.default_rng(15))
+        )
+        assert np.isfinite(values).all()
+        assert np.isfinite(gradient).all()
+
+    @pytest.mark.parametrize("condition", [(), ("x_m",)])
+    def test_with_nothing_left_to_learn_learning_is_refused(self, condition):
+        low, high = (0.1, 0, 0, 1, 0, 2), (0.1 + bool(condition), 0, 0, 1, 0, 2)
+        with pytest.raises(ConfigError, match="every dimension of the design space is fixed") as caught:
+            prepare_ground(load_task("flatland"), config_of(DesignSpace(low, high, condition=condition)))
+        assert caught.value.exit_code == 2
+
+
+BAD_BOUNDS = {
+    "upside down": ("[2, 1]", "above the upper bound"),
+    "not a number below": ("[.nan, 1]", "finite"),
+    "not a number above": ("[0, .nan]", "finite"),
+    "infinite": ("[0, .inf]", "finite"),
+    "minus infinity": ("[-.inf, 1]", "finite"),
+    "overflow": ("[0, 1e999]", "too large"),
+    "fixed at nothing": (".nan", "finite"),
+}
+
+
+@hard_case(
+    "5",
+    "Bounds upside down, NaN or infinite",
+    done="a configuration error (exit 2) that names file, line and column, the dimension, and what is allowed",
+)
+class TestBoundsThatCannotBe:
+    @staticmethod
+    def broke() -> str:
+        with np.errstate(invalid="ignore"):
+            volume = np.log(np.float64(1.0 - 2.0))
+            inside = bool(np.nan <= 0.5 <= np.nan)
+        return f"the log volume of [2, 1] is {volume}, and 'nan <= x <= nan' is {inside} for every x: an empty space"
+
+    @pytest.mark.parametrize("dimension", DIMENSIONS)
+    @pytest.mark.parametrize("case", BAD_BOUNDS)
+    def test_the_error_names_the_line_and_the_dimension(self, tmp_path, dimension, case):
+        value, words = BAD_BOUNDS[case]
+        file = tmp_path / "config.yaml"
+        file.write_text(f"seed: 1\nspace:\n  {dimension}: {value}\n", encoding="utf-8")
+        with pytest.raises(ConfigError) as caught:
+            resolve(load_task("flatland"), config_file=file)
+        assert caught.value.where.startswith(f"{file}:3:")
+        assert f"space.{dimension}" in str(caught.value)
+        assert words in str(caught.value)
+        assert caught.value.exit_code == 2
+
+    @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+    @pytest.mark.parametrize("side", ["low", "high"])
+    @pytest.mark.parametrize("dimension", DIMENSIONS)
+    def test_the_space_itself_refuses_them_by_name(self, dimension, side, value):
+        bounds = {"low": list(AROUND.low), "high": list(AROUND.high)}
+        bounds[side][DIMENSIONS.index(dimension)] = value
+        with pytest.raises(ConfigError, match=rf"space\.{dimension}"):
+            DesignSpace(tuple(bounds["low"]), tuple(bounds["high"]))
+
+    @given(st.lists(st.tuples(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5)), min_size=6, max_size=6))
+    def test_every_space_that_is_accepted_has_a_point(self, pairs):
+        low, high = (tuple(pair[side] for pair in pairs) for side in (0, 1))
+        try:
+            space = DesignSpace(low, high)
+        except ConfigError:
+            assert any(a > b for a, b in pairs) or low[RANGE] < 0
+            return
+        points = space.sample(5, np.random.default_rng(0))
+        assert space.contains(points).all()
+        assert np.isfinite(points).all()
+
+    def test_what_is_written_of_a_space_reads_back_as_it(self, tmp_path):
+        task, file = load_task("flatland"), tmp_path / "config.yaml"
+        space = DesignSpace((-1 / 3, 0.1, 2, -math.pi, -0.3, 0), (1e5 / 7, 0.1, 2, math.pi, math.pi / 2, 1e-9))
+        file.write_text(dump_yaml({"space": space.as_dict()}), encoding="utf-8")
+        assert resolve(task, config_file=file).space == space
