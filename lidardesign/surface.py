@@ -26,7 +26,12 @@ def sample_triangles(
 
     Places along the cumulated area are stratified, which halves the noise of means over the surface.
     A surface without area gives its vertices.
+
+    Raises:
+        ValueError: There are no faces.
     """
+    if not len(faces):
+        raise ValueError("a surface without faces has no points")
     corners = vertices[faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     cumulated = np.cumsum(area)

@@ -13,8 +13,7 @@ from lidardesign_tasks.flatland import FlatlandTask
 from test_bad_input import GARBAGE, GOOD, check_one_clear_message
 
 from lidardesign.cli.console import EXIT_INTERRUPTED, Console, describe_error
-from lidardesign.density.ground import refuse_blind_receiver
-from lidardesign.errors import DataError, PluginError
+from lidardesign.errors import PluginError
 from lidardesign.registry import plugin_guard
 from lidardesign.scene import Ambient, Body, Medium, Mesh, Receiver, Scene, Sphere
 from lidardesign.simulate import light_transport_process
@@ -224,19 +223,6 @@ def test_a_plugin_that_gives_impossible_scenes_is_told_what_is_wrong(ready, monk
     monkeypatch.setattr(FlatlandTask, "scenes", lambda *arguments: [change(scene) for scene in scenes(*arguments)])
     result = ready("evaluate", "run", "--rays", 8, "--json")
     check_one_clear_message(result, 3, words)
-
-
-def test_a_receiver_that_sees_nothing_that_is_lit_is_refused_before_learning():
-    ball = Body(Sphere(0.1), "ball")
-    points = np.array([[1.0, 0.0, 0.0, math.pi, 0.0, 0.9]])
-    towards = Receiver((1.0, 0.5, 0.0), math.pi + 0.5, 0.0, 0.5, 0.5, (0.0, 2.0))
-    away = Receiver((1.0, 0.5, 0.0), 0.5, 0.0, 0.5, 0.5, (0.0, 2.0))
-    short = Receiver((1.0, 0.5, 0.0), math.pi + 0.5, 0.0, 0.5, 0.5, (0.0, 0.2))
-    refuse_blind_receiver([Scene((ball,))], points)
-    refuse_blind_receiver([Scene((ball,), receiver=towards)], points)
-    for blind in (away, short):
-        with pytest.raises(DataError, match="receiver: its field of view and range hold no surface"):
-            refuse_blind_receiver([Scene((ball,), receiver=blind)], points)
 
 
 @pytest.mark.parametrize("place", ["[-0.05,0,0]", "[-0.1,0.02,0.01]"])

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from lidardesign_tasks.arm import ArmTask
 from lidardesign_tasks.face import FaceTask
 from lidardesign_tasks.flatland import FlatlandTask
@@ -18,7 +15,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.rays import fire_times
 from lidardesign.evaluate.audit import Audit, AuditRow
 from lidardesign.evaluate.placement import even_placement, rays_at
-from lidardesign.scene import Body, Box, Receiver, rigid
+from lidardesign.scene import Body, Box, rigid
 from lidardesign.simulate.detector import Detector
 from lidardesign.simulate.detector_files import load_detector
 from lidardesign.simulate.physics import EFFECTS, Physics
@@ -163,63 +160,6 @@ def test_a_wide_beam_at_a_depth_edge_calls_for_its_footprint():
     assert_called_for("footprint", "beams of 100 mrad", FLATLAND, scenes, rays, wide)
     for decisions in plans(scenes, rays, replace(wide, divergence_rad=1e-6)):
         assert not decisions["footprint"].on
-
-
-def test_what_a_scene_does_not_call_for_changes_not_a_bit():
-    (head,) = heads()[:1]
-    rays = face_rays()
-    calm = frozenset({"photon_noise", "jitter", "quantisation", "pile_up"})
-    (planned,) = simulate(head, rays, physics=Physics(SINGLE_PHOTON, calm))
-    more = calm | {"motion", "specular", "atmosphere", "shadowing"}
-    (everything,) = simulate(head, rays, physics=Physics(SINGLE_PHOTON, more))
-    assert np.array_equal(planned.range_m, everything.range_m, equal_nan=True)
-    assert np.array_equal(planned.outcome, everything.outcome)
-
-
-@pytest.mark.parametrize("effect", ["footprint", "motion", "specular", "shadowing", "atmosphere"])
-def test_effects_of_geometry_leave_a_plain_scene_as_geometry_has_it(effect):
-    (head,) = heads()[:1]
-    thin = Detector("thin", pulse_sigma_s=1e-12)
-    (alone,) = simulate(head, face_rays())
-    (measured,) = simulate(head, face_rays(), physics=Physics(thin, frozenset({effect})))
-    assert np.array_equal(alone.outcome, measured.outcome)
-    assert np.array_equal(alone.range_m, measured.range_m, equal_nan=True)
-    assert np.array_equal(alone.body, measured.body)
-
-
-@pytest.mark.parametrize("detector", ["single-photon", "consumer-8x8"])
-def test_a_receiver_at_the_emitter_measures_to_the_bit_what_an_emitter_without_one_does(detector):
-    harsh = {"visibility_m": 20, "gloss": 0.3, "speed_m_s": 1, "illuminance_lux": 100_000, "light": "sun"}
-    (alone,) = FACE.scenes(FACE.Config(test=1, **harsh), "test", 0)
-    beside = replace(alone, receiver=Receiver((0.4, 0.0, 0.0), math.pi, 0.0, 3.0, 3.0, (0.0, 9.0)))
-    physics = Physics(load_detector(detector), EVERYTHING)
-    (here,), (there,) = (simulate(scene, face_rays(), physics=physics) for scene in (alone, beside))
-    assert here.returned.sum() > 50
-    for name in ("outcome", "range_m", "body"):
-        assert np.array_equal(getattr(here, name), getattr(there, name), equal_nan=name == "range_m")
-
-
-@pytest.mark.parametrize("effect", ["footprint", "motion", "specular", "shadowing", "atmosphere"])
-def test_an_effect_imports_no_other(effect):
-    code = f"""
-import sys
-import numpy as np
-from lidardesign.scene import Body, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector import Detector
-from lidardesign.simulate.physics import Physics
-from lidardesign.simulate.returns import Rays
-from lidardesign.simulate.simulate import simulate
-ahead = np.array([[1.0, 0.0, 0.0]])
-rays = Rays(0 * ahead, ahead, np.array([[0.0, 5.0]]), np.zeros(1), np.zeros(1))
-receiver = Receiver((0.0, 0.1, 0.0), 0.0, 0.0, 1.0, 1.0, (0.0, 9.0))
-scene = Scene((Body(Sphere(0.5), poses=rigid(translation_m=(3, 0, 0))),), receiver=receiver)
-(returns,) = simulate(scene, rays, physics=Physics(Detector("plain"), frozenset({{{effect!r}}})))
-assert returns.returned.all()
-names = [name for name in sys.modules if name.startswith("lidardesign.simulate.effects.")]
-print(*(name.rpartition(".")[2] for name in names))
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert set(done.stdout.split()) - {"sight"} == {effect}
 
 
 def test_baselines_fire_over_the_same_frame_as_designs():

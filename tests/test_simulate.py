@@ -9,10 +9,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from lidardesign.errors import ConfigError
-from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.scene import Body, Box, Capsule, Mesh, Scene, Sphere, rigid
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.returns import Outcome, Rays
-from lidardesign.simulate.simulate import build_casters, gate_outcomes, simulate, simulate_many
+from lidardesign.simulate.simulate import build_casters, simulate, simulate_many
 from lidardesign.space import direction
 
 
@@ -61,39 +61,6 @@ def test_whatever_stands_before_the_gate_hides_what_is_in_it():
     assert hidden.outcome.tolist() == [Outcome.OCCLUDED]
     assert np.isnan(hidden.range_m).all()
     assert len(hidden.points_m) == 0
-
-
-def test_a_gate_is_closed_at_its_start_and_open_at_its_end():
-    wall = Scene((Body(Plane(), "floor"),))
-    down = [[0.0, 0.0, -1.0]] * 4
-    rays = Rays(
-        np.tile([0.0, 0.0, 2.0], (4, 1)),
-        np.array(down),
-        np.array([[2.0, 3.0], [1.0, 2.0], [np.nextafter(2.0, 3.0), 3.0], [1.0, np.nextafter(2.0, 3.0)]]),
-        np.zeros(4),
-        np.zeros(4),
-    )
-    (returns,) = simulate(wall, rays)
-    expected = [Outcome.RETURN, Outcome.AFTER_GATE, Outcome.OCCLUDED, Outcome.RETURN]
-    assert returns.outcome.tolist() == expected
-
-
-def test_outcomes_of_edges_without_a_scene():
-    ranges = np.array([0.0, 1.0, 2.0, np.inf])
-    gates = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 3.0], [0.0, 1.0]])
-    expected = [Outcome.RETURN, Outcome.AFTER_GATE, Outcome.RETURN, Outcome.MISS]
-    assert gate_outcomes(ranges, gates).tolist() == expected
-
-
-def test_the_order_of_rays_does_not_matter():
-    rays = make_rays((0, 0, 0), fan(), gate=(2.4, 2.8))
-    order = np.random.default_rng(2).permutation(len(rays))
-    scene = Scene((ball(), Body(Box((0.1, 0.1, 0.1)), "box", "both", rigid(translation_m=(1.5, 0.2, 0.1)))))
-    (straight,), (shuffled,) = simulate(scene, rays), simulate(scene, rays.subset(order))
-    assert np.array_equal(straight.outcome[order], shuffled.outcome)
-    assert np.array_equal(straight.range_m[order], shuffled.range_m, equal_nan=True)
-    assert np.array_equal(straight.body[order], shuffled.body)
-    assert sum(straight.counts().values()) == len(rays)
 
 
 def test_casters_that_are_shared_change_nothing():

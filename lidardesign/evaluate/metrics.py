@@ -36,9 +36,14 @@ def chamfer_m(first: np.ndarray, second: np.ndarray) -> float:
     Arguments:
         first: Points, shape (N, D).
         second: Points, shape (M, D).
+
+    Raises:
+        ValueError: A set without points.
     """
     from scipy.spatial import cKDTree
 
+    if not len(first) or not len(second):
+        raise ValueError("a set without points has no distance")
     forth, _ = cKDTree(second).query(first)
     back, _ = cKDTree(first).query(second)
     return float(forth.mean() + back.mean())
@@ -86,10 +91,17 @@ class SurfaceCloud:
     Arguments:
         points: Area-uniform points [m], shape (K, 3).
         triangles: Corners of each point's triangle [m], shape (K, 3, 3).
+
+    Raises:
+        ValueError: There are no points.
     """
 
     points: np.ndarray
     triangles: np.ndarray
+
+    def __post_init__(self) -> None:
+        if not len(self.points):
+            raise ValueError("a surface without points has no distance")
 
     @cached_property
     def tree(self) -> cKDTree:

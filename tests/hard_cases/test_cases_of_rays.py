@@ -45,7 +45,7 @@ STARTS = {
 
 
 def aimed(solid, start):
-    """Rays from a start at all vertices and middles of edges (from outside, those that face it), and how far they are."""
+    """Rays from a start at all vertices and middles of edges that face it, and how far these are."""
     vertices = np.asarray(solid.vertices)
     ends = vertices[solid.edges_unique]
     outward = np.concatenate([solid.vertex_normals, solid.vertex_normals[solid.edges_unique].sum(axis=1)])
