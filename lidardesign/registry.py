@@ -1,24 +1,35 @@
-"""Task plugins found through the entry-point group `lidardesign.tasks`; a broken one affects only itself."""
+"""Task plugins found through the entry-point group `lidardesign.tasks`; a broken one affects only itself.
+
+Plugins of other packages are imported in a process of their own first, see `probe`.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import difflib
+import faulthandler
+import functools
+import os
 import signal
 import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, distributions, entry_points
 from typing import Any
 
 from lidardesign.errors import ConfigError, LidardesignError, PluginError
+from lidardesign.probe import BEGUN, PROBING, Probe, answer, probed
 from lidardesign.run.clock import phase
 from lidardesign.task import API_VERSION, Defaults, Metric, Task, TaskConfig
 
 GROUP = "lidardesign.tasks"
 IMPORT_SECONDS = 30.0
 LIST_HINT = "lidardesign tasks list"
+AUTHOR_HINT = "tell its author"
+OWN_DISTRIBUTION = "lidardesign"
+# Plugins that are imported elsewhere at the same time.
+SIDE_BY_SIDE = 8
 
 
 @dataclass(frozen=True)
@@ -41,16 +52,23 @@ class TaskListing:
 @phase("tasks")
 def list_tasks() -> list[TaskListing]:
     """Every installed task by name, broken ones with their reason."""
-    listings = []
-    for name, offers in sorted(_offers().items()):
-        distribution = ", ".join(_distribution(offer) for offer in offers)
-        try:
-            task = _load(name, offers)
-        except PluginError as error:
-            listings.append(TaskListing(name, "", distribution, error.message))
-        else:
-            listings.append(TaskListing(name, task.summary, distribution))
-    return listings
+    found = sorted(_offers().items())
+    foreign = [offers[0] for _, offers in found if len(offers) == 1 and _is_foreign(offers[0])]
+    probes: dict[str, Probe | None] = {}
+    for start in range(0, len(foreign), SIDE_BY_SIDE):
+        some = foreign[start : start + SIDE_BY_SIDE]
+        probes.update(zip((offer.name for offer in some), probed(some, IMPORT_SECONDS), strict=True))
+    return [_listing(name, offers, probes.get(name)) for name, offers in found]
+
+
+def _listing(name: str, offers: list[EntryPoint], probe: Probe | None) -> TaskListing:
+    distribution = ", ".join(_distribution(offer) for offer in offers)
+    if probe is not None:
+        return TaskListing(name, probe.summary, distribution, probe.error)
+    try:
+        return TaskListing(name, _load(name, offers).summary, distribution)
+    except PluginError as error:
+        return TaskListing(name, "", distribution, error.message)
 
 
 @phase("tasks")
@@ -71,34 +89,55 @@ def load_task(name: str) -> Task:
 
 @contextlib.contextmanager
 def plugin_guard(name: str) -> Iterator[None]:
-    """Run a plugin's code; what it raises, other than this program's own errors, becomes a PluginError.
+    """Run a plugin's code; whatever it raises, other than this program's own errors, becomes a PluginError.
 
     Whatever it prints goes to stderr, so that it cannot spoil a command's output.
     """
     try:
         with contextlib.redirect_stdout(sys.stderr):
             yield
-    except (LidardesignError, KeyboardInterrupt, MemoryError):
+    except (LidardesignError, KeyboardInterrupt, GeneratorExit, MemoryError):
         raise
     except SystemExit as error:
         raise PluginError(f"tried to end the program (exit {error.code})", where=f"task {name}") from error
-    except Exception as error:
-        text = " ".join(str(error).split()) or "no message"
+    except BaseException as error:
         raise PluginError(
-            f"{type(error).__name__}: {text}",
+            f"{type(error).__name__}: {_text_of(error)}",
             where=f"task {name}",
-            hint="--debug shows where; tell its author",
+            hint=f"--debug shows where; {AUTHOR_HINT}",
         ) from error
+
+
+def _text_of(error: BaseException) -> str:
+    try:
+        return " ".join(str(error).split()) or "no message"
+    except Exception:
+        return "no message"
 
 
 def _offers() -> dict[str, list[EntryPoint]]:
     """Entry points by name; one that is found twice on the path (an editable install) counts once."""
     found: dict[str, list[EntryPoint]] = {}
-    for offer in entry_points(group=GROUP):
+    for offer in _all_offers():
         same_name = found.setdefault(offer.name, [])
         if all(offer.value != other.value for other in same_name):
             same_name.append(offer)
     return found
+
+
+def _all_offers() -> list[EntryPoint]:
+    """Every entry point of the group; of a package whose list of them cannot be read, none."""
+    try:
+        return list(entry_points(group=GROUP))
+    except Exception:  # importlib reads those of all packages, and one broken file ends it
+        return [offer for distribution in distributions() for offer in _offers_of(distribution)]
+
+
+def _offers_of(distribution: Any) -> list[EntryPoint]:
+    try:
+        return list(distribution.entry_points.select(group=GROUP))
+    except Exception:
+        return []
 
 
 def _distribution(offer: EntryPoint) -> str:
@@ -109,25 +148,66 @@ def _load(name: str, offers: list[EntryPoint]) -> Task:
     if len(offers) > 1:
         packages = " and ".join(f"{_distribution(offer)} ({offer.value})" for offer in offers)
         raise PluginError(f"is offered by {packages}", where=f"task {name}", hint="uninstall one of them")
-    with plugin_guard(name), _time_limit(name):
-        plugin = offers[0].load()
+    if _is_foreign(offers[0]):
+        _check_containable(name, offers[0].value, tuple(sys.path))
+    return _imported(name, offers[0], IMPORT_SECONDS)
+
+
+def _imported(name: str, offer: EntryPoint, seconds: float) -> Task:
+    with plugin_guard(name), _time_limit(name, seconds):
+        plugin = offer.load()
         task = plugin() if callable(plugin) else plugin
-    _check(name, task)
+        _check(name, task)
     return task
 
 
+def _is_foreign(offer: EntryPoint) -> bool:
+    """Whether a plugin is none of this package's own, and this is not the process that finds out about it."""
+    return PROBING not in os.environ and (offer.dist is None or offer.dist.name != OWN_DISTRIBUTION)
+
+
+@functools.cache
+def _check_containable(name: str, value: str, path: tuple[str, ...]) -> None:
+    """Import a plugin elsewhere first; what it raises there, it raises here as well, and can be shown where.
+
+    Raises:
+        PluginError: It hangs, or ends the process.
+    """
+    (probe,) = probed([EntryPoint(name, value, GROUP)], IMPORT_SECONDS)
+    if probe is not None and probe.contained:
+        raise PluginError(str(probe.error), where=f"task {name}", hint=AUTHOR_HINT)
+
+
+def answer_probe(request: dict[str, Any]) -> None:
+    """In the process of a probe: import the plugin that is asked about, answer on stdout, and end."""
+    result = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    nowhere = open(os.devnull, "w")  # noqa: SIM115 - lives as long as the process
+    os.dup2(nowhere.fileno(), sys.stdout.fileno())
+    name, seconds = request["name"], request["seconds"]
+    result.write(BEGUN)
+    result.flush()
+    # ends this process even where nobody is left to do it
+    faulthandler.dump_traceback_later(2 * seconds + IMPORT_SECONDS, exit=True, file=nowhere)
+    try:
+        answer(result, {"summary": _imported(name, EntryPoint(name, request["value"], GROUP), seconds).summary})
+    except PluginError as error:
+        answer(result, {"error": error.message})
+    except BaseException as error:
+        answer(result, {"error": f"{type(error).__name__}: {_text_of(error)}"})
+
+
 @contextlib.contextmanager
-def _time_limit(name: str) -> Iterator[None]:
+def _time_limit(name: str, seconds: float) -> Iterator[None]:
     """Interrupt an import that hangs; only where the system can (POSIX signals, main thread)."""
     if not hasattr(signal, "setitimer") or threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def interrupt(*_: Any) -> None:
-        raise PluginError(f"was not imported within {IMPORT_SECONDS:g} s", where=f"task {name}", hint="tell its author")
+        raise PluginError(f"was not imported within {seconds:g} s", where=f"task {name}", hint=AUTHOR_HINT)
 
     previous = signal.signal(signal.SIGALRM, interrupt)
-    signal.setitimer(signal.ITIMER_REAL, IMPORT_SECONDS)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
     try:
         yield
     finally:
@@ -151,11 +231,11 @@ def _check(name: str, task: Any) -> None:
         )
     for member, kind in (("name", str), ("summary", str), ("metric", Metric), ("defaults", Defaults)):
         if not isinstance(getattr(task, member, None), kind):
-            raise PluginError(f"its {member} is no {kind.__name__}", where=f"task {name}", hint="tell its author")
+            raise PluginError(f"its {member} is no {kind.__name__}", where=f"task {name}", hint=AUTHOR_HINT)
     if not (isinstance(getattr(task, "Config", None), type) and issubclass(task.Config, TaskConfig)):
-        raise PluginError("its Config is no subclass of TaskConfig", where=f"task {name}", hint="tell its author")
+        raise PluginError("its Config is no subclass of TaskConfig", where=f"task {name}", hint=AUTHOR_HINT)
     for member in ("space", "scenes", "score"):
         if not callable(getattr(task, member, None)):
-            raise PluginError(f"it has no method {member}()", where=f"task {name}", hint="tell its author")
+            raise PluginError(f"it has no method {member}()", where=f"task {name}", hint=AUTHOR_HINT)
     if task.name != name:
-        raise PluginError(f"it calls itself {task.name!r}", where=f"task {name}", hint="tell its author")
+        raise PluginError(f"it calls itself {task.name!r}", where=f"task {name}", hint=AUTHOR_HINT)

@@ -45,6 +45,7 @@ LAYERS = {
     "lidardesign.density": 4,
     "lidardesign.density.settings": 4,
     "lidardesign.task": 5,
+    "lidardesign.probe": 5,
     "lidardesign.registry": 6,
     "lidardesign.testing": 6,
     "lidardesign.run.config": 7,

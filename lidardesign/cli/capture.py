@@ -12,7 +12,7 @@ from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
 from lidardesign.cli.designs import number
 from lidardesign.cli.grids import print_table
-from lidardesign.cli.runs import check_choice, folder_of, parse_at
+from lidardesign.cli.runs import check_choice, folder_of, parse_at, read_design
 from lidardesign.cli.times import keep_times
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.clock import phase
@@ -157,7 +157,6 @@ def _rays(path: Path, count: int | None, at: dict[str, float], seed: int, consol
 
 def _listed_rays(path: Path, count: int | None, at: dict[str, float], seed: int, console: Console) -> Rays:
     from lidardesign.cli.export import design_and_rays
-    from lidardesign.design.files import load_design
     from lidardesign.export.galvo import is_galvo_file, read
 
     if not path.exists():
@@ -171,7 +170,7 @@ def _listed_rays(path: Path, count: int | None, at: dict[str, float], seed: int,
                 hint="leave them out",
             )
         return read(path)
-    return design_and_rays(load_design(path), path, "galvo", count, at, seed, console)[1]
+    return design_and_rays(read_design(path, console), path, "galvo", count, at, seed, console)[1]
 
 
 def _folders(designs: list[Path]) -> list[Path]:

@@ -57,7 +57,7 @@ def constrain(
             check_choice(layout, "--layout", LAYOUTS)
         count, condition = sensor_count(sensors, None), parse_at(at)
         checked = load_constraints(constraints, overrides or [])
-        opened, design = open_target(target)
+        opened, design = open_target(target, console)
         run = need_run(opened, target)
         layout = layout or (design.layout if design else usual_layout(run))
         check_sensors(count, layout)

@@ -178,10 +178,10 @@ def show_fit(document: dict[str, Any], design: Design, checks: Sequence[Any], ri
 
 def write_design(design: Design, run: Path, path: Path) -> None:
     """Write a design into its run, under the run's lock, and enter it in the manifest."""
-    from lidardesign.design.files import save_design
+    from lidardesign.design.files import design_text
     from lidardesign.run.lock import run_lock
-    from lidardesign.run.manifest import record
+    from lidardesign.run.manifest import write_recorded
 
+    content = design_text(design, path).encode()
     with run_lock(run, wait_s=WAIT_S):
-        save_design(design, path)
-        record(run, [path.relative_to(run).as_posix()])
+        write_recorded(run, path.relative_to(run).as_posix(), content)

@@ -15,7 +15,7 @@ from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
 from lidardesign.cli.designs import number
 from lidardesign.cli.physics import Detector, Effects, RangeTolerance, ReturnTolerance, planner_of
-from lidardesign.cli.runs import open_run, run_of
+from lidardesign.cli.runs import open_run, read_design, run_of
 from lidardesign.cli.scores import show_evaluation
 from lidardesign.cli.times import keep_times
 from lidardesign.errors import ConfigError, DataError, ThresholdError
@@ -139,7 +139,7 @@ def evaluate(
         wanted = check_workers(workers)
         _check_baselines(baseline or [])
         planner, audit = planner_of(effects, detector, range_tolerance_mm, return_tolerance)
-        entries, runs = _collect(targets)
+        entries, runs = _collect(targets, console)
         run = learned = _common_run(_named_apart(entries), runs)
         if accuracy:
             _check_measurable(learned)
@@ -177,20 +177,18 @@ def _check_baselines(names: list[str]) -> None:
 
 
 @phase("designs")
-def _collect(targets: list[Path]) -> tuple[list[_Entry], list[Run]]:
+def _collect(targets: list[Path], console: Console) -> tuple[list[_Entry], list[Run]]:
     """The designs that were named, and the runs: of folders all designs, of files the file."""
-    from lidardesign.design.files import load_design
-
     entries: list[_Entry] = []
     runs: list[Run] = []
     for target in targets:
         if target.is_dir():
             runs.append(open_run(target))
-            entries += [_Entry(load_design(path), path, runs[-1]) for path in runs[-1].designs()]
+            entries += [_Entry(read_design(path, console), path, runs[-1]) for path in runs[-1].designs()]
         elif not target.exists():
             raise DataError("no such run or design", where=str(target), hint="give run folders or design files")
         else:
-            design = load_design(target)
+            design = read_design(target, console)
             entries.append(_Entry(design, target, run_of(design, target)))
     seen: dict[Path, _Entry] = {}
     for entry in entries:

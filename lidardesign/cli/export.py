@@ -10,7 +10,7 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
-from lidardesign.cli.runs import folder_of, parse_at
+from lidardesign.cli.runs import folder_of, parse_at, read_design
 from lidardesign.cli.times import keep_times
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
@@ -87,7 +87,6 @@ def _export(
     with phase("libraries"):
         import lidardesign.cli.layouts
         import lidardesign.design.rays  # noqa: F401
-        from lidardesign.design.files import load_design
         from lidardesign.estimates import as_documents
         from lidardesign.export.registry import EXPORTERS
 
@@ -96,7 +95,7 @@ def _export(
     if name not in EXPORTERS:
         found = "no format was given" if name is None else f"unknown format {name!r}"
         raise ConfigError(found, where="--format", allowed=", ".join(EXPORTERS))
-    design = load_design(path)
+    design = read_design(path, console)
     exporter = EXPORTERS[name]
     target = out if out is not None else path.with_suffix(exporter.suffix)
     if target.exists() and path.exists() and target.samefile(path):

@@ -13,6 +13,7 @@ from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
+    from lidardesign.cli.console import Console
     from lidardesign.design.sensor import Design
     from lidardesign.run.config import RunConfig
     from lidardesign.scene import Scene
@@ -66,7 +67,41 @@ def open_run(folder: Path) -> Run:
     return Run(folder, task, config)
 
 
-def open_target(path: Path) -> tuple[Run | None, Design | None]:
+def read_design(path: Path, console: Console) -> Design:
+    """A design file. One of a run that is not as it was written says so: it may be cut, or mended by hand.
+
+    Raises:
+        ConfigError, DataError: It cannot be read.
+    """
+    from lidardesign.design.files import load_design
+
+    difference = _difference(path)
+    try:
+        design = load_design(path)
+    except (ConfigError, DataError) as error:
+        if difference is None:
+            raise
+        hint = f"the file {difference}; fit it again, or mend it"
+        raise type(error)(error.message, where=error.where, allowed=error.allowed, hint=hint) from None
+    if difference is not None:
+        console.note(f"note: {path} {difference}")
+    return design
+
+
+def _difference(path: Path) -> str | None:
+    """In what a design differs from the one that its run's manifest has, where it lies in a run."""
+    from lidardesign.run.manifest import changed_since_recorded
+
+    folder, run = path.absolute().parent, path.absolute().parent.parent
+    if folder.name != DESIGN_FOLDER or not path.is_file() or not (run / MANIFEST).is_file():
+        return None
+    try:
+        return changed_since_recorded(run, f"{DESIGN_FOLDER}/{path.name}")
+    except DataError:  # a manifest that is damaged is told by whatever needs it
+        return None
+
+
+def open_target(path: Path, console: Console) -> tuple[Run | None, Design | None]:
     """Open what a command was given: a run folder, or a design file and the run that it came from.
 
     Returns:
@@ -79,9 +114,7 @@ def open_target(path: Path) -> tuple[Run | None, Design | None]:
         return open_run(path), None
     if not path.exists():
         raise DataError("no such run or design", where=str(path), hint="give a run folder or a design file")
-    from lidardesign.design.files import load_design
-
-    design = load_design(path)
+    design = read_design(path, console)
     return run_of(design, path), design
 
 

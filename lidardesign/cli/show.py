@@ -24,13 +24,12 @@ def show(
     with command(json=json, quiet=quiet, debug=debug) as console:
         with phase("libraries"):
             from lidardesign.cli.designs import show_design
-            from lidardesign.cli.runs import parse_at
-            from lidardesign.design.files import load_design
+            from lidardesign.cli.runs import parse_at, read_design
             from lidardesign.design.track import placed
             from lidardesign.design.track_document import track_document
 
         condition = parse_at(at)
-        loaded = load_design(design)
+        loaded = read_design(design, console)
         loaded = placed(loaded, condition) if condition else loaded
         document = {
             "design": str(design),

@@ -115,6 +115,15 @@ def save_design(design: Design, path: Path) -> None:
 
     Raises:
         DataError: The file cannot be written.
+        NumericalError, ConfigError: See `design_text`.
+    """
+    write_atomic(Path(path), design_text(design, path))
+
+
+def design_text(design: Design, path: Path) -> str:
+    """What a design's file holds.
+
+    Raises:
         NumericalError: The design holds a number that is not finite.
         ConfigError: More explicit rays than a file can be read back with.
     """
@@ -132,7 +141,7 @@ def save_design(design: Design, path: Path) -> None:
             allowed=f"at most {MOST_TRACK_RAYS}",
             hint="fewer rays per position",
         )
-    write_atomic(Path(path), dump_yaml(design_document(design)))
+    return dump_yaml(design_document(design))
 
 
 @phase("designs")
