@@ -84,29 +84,6 @@ def test_a_visible_surface_does_not_hide_itself(name):
         assert transmittance_on(scene, both_ways(scene)[name], [2.0])[0] > 0.99
 
 
-def test_behind_a_thin_plate_ray_casting_sees_nothing_however_thin():
-    for thickness in (0.005, 0.0002):
-        scene = Scene((wall(), plate(thickness)))
-        assert transmittance_on(scene, Raycast([scene]), [2.0])[0] < 0.01
-
-
-def test_quadrature_is_refined_until_a_thin_plate_hides_what_is_behind():
-    scene = Scene((wall(role="target"), plate(0.005, role="occluder")))
-    target, notes = prepare_target([scene], config_of("quadrature", quadrature_points=16))
-    assert any("refined from 16 to" in note for note in notes)
-    assert not any("sees through" in note for note in notes)
-    assert transmittance_on(scene, target.visibility, np.linspace(1.95, 2.05, 20), target.optics).max() < 0.01
-
-
-def test_quadrature_says_which_thickness_it_resolves_when_a_plate_is_too_thin():
-    scene = Scene((wall(role="target"), plate(0.0002, role="occluder")))
-    target, notes = prepare_target([scene], config_of("quadrature"))
-    (warning,) = [note for note in notes if "sees through" in note]
-    assert "thicker than 0.00" in warning
-    assert "density.visibility=raycast" in warning
-    assert target.visibility.points == 1024
-
-
 def test_auto_turns_visibility_off_where_nothing_is_in_the_way_and_says_so():
     target, notes = prepare_target([Scene((wall(),))], config_of("auto"))
     assert target.visibility.name == "off"
