@@ -16,6 +16,7 @@ import numpy as np
 from lidardesign.errors import DataError, LidardesignError
 from lidardesign.numerics import ROUNDING
 from lidardesign.scene import Mesh, Sign
+from lidardesign.space import FARTHEST_M
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 LARGEST_FILE_BYTES = 2 * 1024**3
@@ -58,7 +59,9 @@ def load_mesh(path: str | Path, *, sign: Sign = "auto", scale: float = 1.0) -> M
             f"the scale {scale} is no factor to metres", where=str(path), allowed="a positive number"
         )
     vertices, faces = _read(path)
-    return check_mesh(vertices * scale, faces, sign=sign, where=str(path))
+    with np.errstate(over="ignore", invalid="ignore"):  # what is too large is refused below
+        vertices = vertices * scale
+    return check_mesh(vertices, faces, sign=sign, where=str(path))
 
 
 def check_mesh(vertices: Any, faces: Any, *, sign: Sign = "auto", where: str = "mesh") -> Mesh:
@@ -114,6 +117,10 @@ def _refuse_unusable(vertices: np.ndarray, faces: np.ndarray, where: str) -> Non
             where=where,
             hint="export the mesh again",
         )
+    farthest = float(np.abs(vertices).max())
+    if farthest > FARTHEST_M:
+        allowed = f"within {FARTHEST_M:g} m of the origin"
+        raise DataError(f"reaches {farthest:.3g} m", where=where, allowed=allowed, hint="is the scale right?")
     if faces.min() < 0 or faces.max() >= len(vertices):
         wrong = int(((faces < 0) | (faces >= len(vertices))).any(axis=1).sum())
         raise DataError(

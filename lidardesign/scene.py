@@ -17,6 +17,7 @@ import numpy as np
 
 from lidardesign.errors import DataError
 from lidardesign.numerics import COARSE_SLACK, SLACK
+from lidardesign.space import FARTHEST_M
 
 Role = Literal["target", "occluder", "both"]
 Sign = Literal["auto", "solid", "winding", "unsigned"]
@@ -32,8 +33,8 @@ SHARE_ROUNDING = SLACK
 
 def _check_lengths(shape: object, *lengths_m: float, low: float = 0.0, strict: bool = True) -> None:
     for length in lengths_m:
-        if not math.isfinite(length) or length < low or (strict and length == low):
-            raise DataError(f"{shape} has the length {length} m", allowed="finite lengths above 0 m")
+        if not low <= length <= FARTHEST_M or (strict and length == low):
+            raise DataError(f"{shape} has the length {length} m", allowed=f"lengths above 0 m, up to {FARTHEST_M:g} m")
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,9 @@ class Mesh:
             raise DataError(f"a mesh needs (V, 3) vertices and (F, 3) faces, found {vertices.shape} and {faces.shape}")
         if not np.isfinite(vertices).all():
             raise DataError("a mesh has vertices that are NaN or infinite")
+        farthest = float(np.abs(vertices).max())
+        if farthest > FARTHEST_M:
+            raise DataError(f"a mesh has vertices {farthest:g} m away", allowed=f"at most {FARTHEST_M:g} m")
         if faces.min() < 0 or faces.max() >= len(vertices):
             worst = faces.min() if faces.min() < 0 else faces.max()
             raise DataError(f"a mesh of {len(vertices)} vertices has faces that name vertex {int(worst)}")
@@ -235,6 +239,11 @@ class Body:
             raise DataError(
                 f"body {self.name!r}: poses have shape {poses.shape} or are not finite",
                 allowed="(4, 4) or (frames, 4, 4)",
+            )
+        if np.abs(poses[..., :3, 3]).max() > FARTHEST_M:
+            raise DataError(
+                f"body {self.name!r}: a pose is {np.abs(poses[..., :3, 3]).max():g} m away",
+                allowed=f"at most {FARTHEST_M:g} m from the origin",
             )
         rotation = poses[..., :3, :3]
         orthogonal = np.allclose(rotation @ np.swapaxes(rotation, -1, -2), np.eye(3), atol=RIGID_TOLERANCE)

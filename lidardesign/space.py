@@ -26,6 +26,8 @@ X, Y, Z, AZIMUTH, ELEVATION, RANGE = range(6)
 
 Measure = Literal["solid_angle", "angles"]
 MEASURES = ("solid_angle", "angles")
+# A million kilometres: what is further is a slip of units, and fourth powers of lengths must stay numbers.
+FARTHEST_M = 1e9
 # Bounds such as 2 pi are written with some ten digits.
 ROUNDING_RAD = SLACK
 
@@ -106,6 +108,11 @@ class DesignSpace:
                 where="space.elevation_rad",
                 allowed="-pi/2 to pi/2 rad",
             )
+        for index in (X, Y, Z, RANGE):
+            farthest = max(abs(self.low[index]), abs(self.high[index]))
+            if farthest > FARTHEST_M:
+                where, allowed = f"space.{DIMENSIONS[index]}", f"at most {FARTHEST_M:g} m from the origin"
+                raise ConfigError(f"a bound is {farthest:g} m away", where=where, allowed=allowed)
         if self.low[RANGE] < 0:
             raise ConfigError(f"range {self.low[RANGE]} m is negative", where="space.range_m", allowed="0 or more")
 

@@ -6,12 +6,13 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from lidardesign.space import FARTHEST_M
+
 Visibility = Literal["auto", "raycast", "quadrature", "off"]
 Preset = Literal["draft", "standard", "fine"]
 PRESETS: tuple[str, ...] = ("draft", "standard", "fine")
-# Within these all squares and products that the density is made of are numbers, in float32 too.
-LONGEST_M = 1e9
-SHORTEST_M = 1 / LONGEST_M
+# Between these all squares and products that the density is made of are numbers, in float32 too.
+LONGEST_M, SHORTEST_M = FARTHEST_M, 1 / FARTHEST_M
 FASTEST_PER_M = 1e12
 
 
