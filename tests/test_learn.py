@@ -17,10 +17,9 @@ from lidardesign.density.learn import learn
 from lidardesign.density.measure import log_density_of
 from lidardesign.density.prepare import prepare_target
 from lidardesign.density.settings import DensitySettings, LearningSettings
-from lidardesign.density.target import Target
 from lidardesign.design.samples import load_samples
-from lidardesign.errors import ConfigError, DataError, DivergenceError, PluginError
-from lidardesign.run.checkpoint import load_arrays, save_arrays
+from lidardesign.errors import ConfigError, DataError, PluginError
+from lidardesign.run.checkpoint import save_arrays
 from lidardesign.run.config import RunConfig
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
@@ -101,29 +100,6 @@ def test_a_resumed_run_is_an_uninterrupted_run_bit_for_bit(finished, tmp_path, s
     assert [row["step"] for row in rows] == list(range(10, 121, 10))
 
 
-def test_a_resume_after_steps_were_skipped_is_bit_identical_too(tmp_path, monkeypatch):
-    exact = Target.log_density_and_gradient
-    calls = {"n": 0}
-
-    def flaky(self, points, sigma_m=None):
-        values, gradient = exact(self, points, sigma_m)
-        calls["n"] += 1
-        # a whole stretch of steps after the snapshot at step 50 has no gradient, so weights are taken back
-        return values, gradient * (np.nan if 54 < calls["n"] <= 62 else 1.0)
-
-    monkeypatch.setattr(Target, "log_density_and_gradient", flaky)
-    (tmp_path / "straight").mkdir()
-    result = learn(BallTask(), config_of(), tmp_path / "straight")
-    assert any("8 steps were not finite" in note for note in result.notes)
-    calls["n"] = 0
-    (tmp_path / "resumed").mkdir()
-    with pytest.raises(KeyboardInterrupt):
-        learn(BallTask(), config_of(), tmp_path / "resumed", progress=Interrupter(60))
-    calls["n"] = 50  # the resumed run starts at the snapshot of step 50
-    learn(BallTask(), config_of(), tmp_path / "resumed", resume=True)
-    assert result_bytes(tmp_path / "resumed") == result_bytes(tmp_path / "straight")
-
-
 def test_proposals_on_the_faces_of_the_space_are_inside_the_flows_box(monkeypatch):
     # the space counts what is outside by rounding as inside; the flow's density would be 0 there
     points = np.array([[0, 0, 0, 0.4 + 1e-10, 0, 1.0], [0, 0, 0, 0.1, 0, 0.2 - 1e-10]])
@@ -169,35 +145,6 @@ def test_resuming_a_finished_run_changes_nothing(finished, tmp_path):
     before = result_bytes(tmp_path)
     learn(BallTask(), config_of(), tmp_path, resume=True)
     assert result_bytes(tmp_path) == before
-
-
-def test_gradients_that_stay_nan_end_in_a_divergence_error_with_a_readable_checkpoint(tmp_path, monkeypatch):
-    exact = Target.log_density_and_gradient
-
-    def broken(self, points, sigma_m=None):
-        values, gradient = exact(self, points, sigma_m)
-        return values, gradient * np.nan
-
-    monkeypatch.setattr(Target, "log_density_and_gradient", broken)
-    with pytest.raises(DivergenceError, match=r"(?s)non-finite.*checkpoint\.safetensors.*learning\.rate") as caught:
-        learn(BallTask(), config_of(), tmp_path)
-    assert caught.value.exit_code == 5
-    arrays, state = load_arrays(tmp_path, training.CHECKPOINT)
-    assert state["step"] % training.SNAPSHOT_STEPS == 0
-    assert all(np.isfinite(value).all() for value in arrays.values() if value.dtype.kind == "f")
-
-
-def test_points_that_leave_the_numbers_are_a_skipped_step(tmp_path, monkeypatch):
-    exact, calls = training.pathwise_loss, {"n": 0}
-
-    def sometimes(*args):
-        calls["n"] += 1
-        loss, value, ess = exact(*args)
-        return (loss * math.nan, value, ess) if calls["n"] == 7 else (loss, value, ess)
-
-    monkeypatch.setattr(training, "pathwise_loss", sometimes)
-    result = learn(BallTask(), config_of(), tmp_path)
-    assert any("1 steps were not finite" in note for note in result.notes)
 
 
 def test_the_result_has_sensible_figures_and_files(finished):

@@ -119,7 +119,8 @@ def learn(
         **{name: estimate.value for name, estimate in measured.estimates.items()},
     )
     if ranks.first:
-        note(run, learn=result.as_dict(), visibility=ground.target.visibility.name, ranks=ranks.size)
+        found = {"visibility": ground.target.visibility.name, "round_trip_nats": measured.round_trip_nats}
+        note(run, learn=result.as_dict(), ranks=ranks.size, **found)
     return result
 
 
@@ -128,6 +129,8 @@ def _notes(trainer: Trainer, place: torch.device) -> list[str]:
     notes = [] if stays_on(trainer.target, place) else [ON_PROCESSOR]
     if trainer.skipped:
         notes.append(f"{trainer.skipped} steps were not finite and skipped")
+    if trainer.doubled_at is not None:
+        notes.append(f"float32 could not invert the flow's splines: from step {trainer.doubled_at} on float64")
     return notes
 
 

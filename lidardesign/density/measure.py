@@ -15,6 +15,7 @@ from lidardesign.density.independent import independent_points
 from lidardesign.density.losses import draw_conditions
 from lidardesign.density.objective import Coordinates
 from lidardesign.density.overlap import Sides, overlap
+from lidardesign.density.round_trip import TOLERANCE_NATS, round_trip_nats
 from lidardesign.density.target import Target
 from lidardesign.design.samples import Samples
 from lidardesign.estimates import Estimate
@@ -24,6 +25,8 @@ from lidardesign.space import DesignSpace
 
 SAMPLE_CHUNK = 16384
 CONDITION_GROUPS = 32
+# So many samples go back to the flow's base.
+ROUND_TRIPS = 1000
 NOT_COVERED = (
     "coverage could not be measured and counts as 0, and misplaced leaves out what the density dropped: "
     "no independently drawn ray fits in the space"
@@ -61,11 +64,13 @@ class Measured:
     Arguments:
         samples: The samples with both log densities.
         estimates: ess, kl_nats, log_z, coverage, and misplaced: the share of the mass in the wrong place.
+        round_trip_nats: See `round_trip`.
         notes: What the user should know.
     """
 
     samples: Samples
     estimates: dict[str, Estimate]
+    round_trip_nats: float = 0.0
     notes: tuple[str, ...] = ()
 
 
@@ -88,7 +93,7 @@ def measure(learned: Learned, probes: Probes, count: int) -> Measured:
     space = samples.space
     groups = condition_groups(space, samples.points)
     found = quality(samples.log_prob, samples.log_target, groups)
-    covered, notes = Estimate(0.0, None), ()
+    covered, notes = Estimate(0.0, None), []
     sides = Sides(samples.log_weights, samples.log_weights, samples.log_weights, groups, groups)
     if len(probes.points):
         log_prob = log_density_of(learned, probes.points)
@@ -98,10 +103,16 @@ def measure(learned: Learned, probes: Probes, count: int) -> Measured:
         theirs = condition_groups(space, probes.points)
         sides = Sides(samples.log_weights, probes.log_target - log_prob, log_weights, groups, theirs)
     else:
-        notes = (NOT_COVERED,)
+        notes.append(NOT_COVERED)
     apart = overlap(sides)
-    misplaced = Estimate(apart.misplaced, apart.error)
-    return Measured(samples, {**found.estimates(), "coverage": covered, "misplaced": misplaced}, notes)
+    estimates = {**found.estimates(), "coverage": covered, "misplaced": Estimate(apart.misplaced, apart.error)}
+    off = round_trip_nats(learned.flow, ROUND_TRIPS, torch.Generator().manual_seed(0))
+    if off > TOLERANCE_NATS:
+        notes.append(
+            f"log densities are off by up to {off:.2g} nats: the flow's splines are too steep to be inverted in "
+            "float64; fewer learning.layers are easier to invert"
+        )
+    return Measured(samples, estimates, off, tuple(notes))
 
 
 def draw_samples(learned: Learned, count: int) -> Samples:

@@ -3,7 +3,8 @@
 First the reverse KL along paths, while sigma falls geometrically from its start to its final value, so that surfaces
 are found while they are wide; eta falls to zero with it. The last steps balance the mass by values of p* (`losses`).
 A step whose loss or gradient is not finite is skipped; several in a row take the last good weights back and halve the
-step size; when that does not help either, training stops with the last good checkpoint.
+step size; when that does not help either, training stops with the last good checkpoint. Balancing looks back from
+places to densities: where float32 cannot (`round_trip`), the remaining steps are taken in float64.
 
 Every `SNAPSHOT_STEPS` steps the whole state is copied. Checkpoints are these snapshots, also after an interruption: a
 resumed run falls back on the same weights as an uninterrupted one would, so both stay the same bit for bit.
@@ -25,6 +26,8 @@ import torch
 from lidardesign.density.flow import DesignFlow
 from lidardesign.density.losses import Pool, balancing_loss, pathwise_loss
 from lidardesign.density.objective import Coordinates
+from lidardesign.density.resumed import check_resumable
+from lidardesign.density.round_trip import TOLERANCE_NATS, round_trip_nats
 from lidardesign.density.settings import LearningSettings
 from lidardesign.density.snapshots import clear_snapshots, save_snapshot, snapshot_steps
 from lidardesign.density.target import Target
@@ -44,6 +47,7 @@ SKIPS_BEFORE_BACKING_OFF = 5
 HALVINGS_BEFORE_GIVING_UP = 6
 SNAPSHOT_STEPS = 50
 PROGRESS_STEPS = 10
+ROUND_TRIPS = 256
 
 
 @dataclass(frozen=True)
@@ -80,6 +84,7 @@ class Trainer:
     """The state of training: flow, optimiser, random stream and counters.
 
     `replan` is asked for other settings once, when balancing begins; they may differ in the number of balancing steps.
+    `doubled_at` is the step from which on float64 replaced float32, None where it did not have to.
     """
 
     flow: DesignFlow
@@ -93,6 +98,7 @@ class Trainer:
     skipped: int = 0
     skipped_in_a_row: int = 0
     halvings: int = 0
+    doubled_at: int | None = None
     seconds_before: float = 0.0
     replan: Callable[[Trainer], LearningSettings] | None = None
     _snapshot: _Snapshot | None = None
@@ -148,6 +154,8 @@ class Trainer:
     def _run_steps(self, progress: Callable[[LearnProgress], None] | None) -> None:
         checkpointed = time.perf_counter()
         while self.step < self.settings.steps:
+            if self.step % SNAPSHOT_STEPS == 0 or self.step == self.pathwise_steps:
+                self._check_round_trip()
             if self.step % SNAPSHOT_STEPS == 0 or self._snapshot is None:
                 self._snapshot = self._taken()
                 if time.perf_counter() - checkpointed > self.settings.checkpoint_seconds:
@@ -194,6 +202,21 @@ class Trainer:
             return pathwise_loss(self.flow, target, self.coordinates, count, sigma_m, eta, self.generator)
         except NumericalError:  # the flow left the numbers: a step to skip like any other
             return torch.tensor(math.nan), math.nan, math.nan
+
+    def _check_round_trip(self) -> None:
+        """Go on in float64 where balancing asks for densities that float32 gets wrong; the stream is left alone."""
+        if self.step < self.pathwise_steps or next(self.flow.parameters()).dtype == torch.float64:
+            return
+        off = round_trip_nats(self.flow, ROUND_TRIPS, torch.Generator().manual_seed(self.step))
+        if self.target.ranks.max(np.array([off]))[0] > TOLERANCE_NATS:
+            self._double(self.step)
+
+    def _double(self, step: int) -> None:
+        self.doubled_at = step
+        self.flow.double()
+        for parameter in self.flow.parameters():
+            state = self.optimiser.state.get(parameter, {})
+            state.update({name: _moved(name, value, parameter) for name, value in state.items()})
 
     def _few_frames(self) -> Target:
         """The target of a path-wise step. While sigma is wide thousands of frames would matter at every point.
@@ -268,7 +291,8 @@ class Trainer:
 
     def _taken(self) -> _Snapshot:
         """A copy of the present state."""
-        counters = {name: getattr(self, name) for name in ("step", "skipped", "skipped_in_a_row", "halvings")}
+        names = ("step", "skipped", "skipped_in_a_row", "halvings", "doubled_at")
+        counters = {name: getattr(self, name) for name in names}
         return _Snapshot(self._state_arrays(), {**counters, "seconds": self.seconds})
 
     def _save(self, snapshot: _Snapshot) -> None:
@@ -286,6 +310,9 @@ class Trainer:
         """Take the state of the run's checkpoint; progress.jsonl and snapshots are cut back to it."""
         ranks = self.target.ranks
         arrays, state = ranks.state_of_first(lambda: load_arrays(self.run, CHECKPOINT))
+        check_resumable(arrays, state, self.flow, self.generator, self.run / CHECKPOINT)
+        if state.get("doubled_at") is not None:  # older checkpoints have no such entry
+            self._double(state["doubled_at"])
         self._restore_arrays(arrays, with_generator=True)
         self.step, self.skipped = state["step"], state["skipped"]
         self.skipped_in_a_row, self.halvings = state["skipped_in_a_row"], state["halvings"]

@@ -1,0 +1,564 @@
+"""Hard cases of learning the flow: edges, float32, steps that are not finite, separated modes, ranks that die."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import references
+import torch
+from cases import hard_case
+from hypothesis import given
+from hypothesis import strategies as st
+from ranks import SMALL_WAIT_S, finished, start_ranks
+from test_flow import FLOWS, draw, flow_of
+from test_learn import SPACE, BallTask, Interrupter, a_trainer, config_of, result_bytes
+from zuko.distributions import BoxUniform
+from zuko.transforms import MonotonicRQSTransform
+
+from lidardesign.cli.main import run as run_program
+from lidardesign.density import measure, training
+from lidardesign.density.ground import prepare_ground
+from lidardesign.density.learn import learn, make_trainer
+from lidardesign.density.round_trip import TOLERANCE_NATS, round_trip_nats
+from lidardesign.density.settings import DensitySettings
+from lidardesign.density.splines import BoundedSpline
+from lidardesign.density.target import Target
+from lidardesign.design.samples import load_samples
+from lidardesign.errors import DivergenceError
+from lidardesign.run.checkpoint import load_arrays
+from lidardesign.scene import Body, Scene, Sphere, rigid
+from lidardesign.space import DesignSpace
+
+
+def plain_spline(scale, dtype, count=20_000):
+    """zuko's spline of random parameters, and points of the box."""
+    generator = torch.Generator().manual_seed(0)
+    sizes = [torch.randn(count, 1, n, generator=generator, dtype=torch.float64) for n in (8, 8, 7)]
+    made = MonotonicRQSTransform(*((scale * size).to(dtype) for size in sizes), bound=1.0, slope=1e-4)
+    return made, (2 * torch.rand(count, 1, generator=generator, dtype=torch.float64) - 1).to(dtype)
+
+
+def interrupted(run, step, **settings):
+    with pytest.raises(KeyboardInterrupt):
+        learn(BallTask(), config_of(**settings), run, progress=Interrupter(step))
+
+
+@hard_case(
+    "23",
+    "Points at or over the edge of the flow's box, knots beyond its bound, infinite and NaN inputs",
+    done="points are kept inside, where densities are finite; the density is 0 outside the box and nowhere else",
+)
+class TestEdgesOfTheBox:
+    @staticmethod
+    def broke():
+        """zuko's spline and box in float32."""
+        made, points = plain_spline(3.0, torch.float32)
+        over = float((made.horizontal[..., -1] - 1).max())
+        log_slope = made.call_and_ladj(torch.full_like(points, math.inf))[1]
+        edge = float(BoxUniform(torch.tensor([-1.0]), torch.tensor([1.0])).log_prob(torch.tensor([1.0])))
+        lost = "NaN" if torch.isnan(log_slope).all() else "finite"
+        return f"a last knot is {over:.0e} beyond the bound, the slope at inf is {lost}, log p at the upper edge {edge}"
+
+    @pytest.mark.parametrize("name", FLOWS)
+    def test_edges_are_finite_and_only_the_outside_has_no_density(self, name):
+        flow = flow_of(name)
+        _, context = draw(flow, 2)
+        for edge in (-1.0, 1.0, math.nextafter(1.0, 0.0)):
+            with torch.no_grad():
+                points = torch.full((2, flow.features), edge, dtype=torch.float64)
+                assert torch.isfinite(flow.log_prob(points, context)).all()
+                assert all(torch.isfinite(part).all() for part in flow(points, context))
+        for outside in (1.0000001, -2.0, math.inf, -math.inf, math.nan):
+            points = torch.zeros(2, flow.features, dtype=torch.float64)
+            points[0, -1] = outside
+            with torch.no_grad():
+                found = flow.log_prob(points, context)
+            assert found[0] == -math.inf
+            assert torch.isfinite(found[1])
+
+    @given(st.integers(0, 2**31), st.floats(0.0, 100.0), st.sampled_from(["float32", "float64"]))
+    def test_the_last_knots_are_the_bounds_and_points_never_leave_them(self, seed, scale, dtype):
+        generator, dtype = torch.Generator().manual_seed(seed), getattr(torch, dtype)
+        sizes = [scale * torch.randn(20, 2, n, generator=generator, dtype=dtype) for n in (8, 8, 9)]
+        made = BoundedSpline(*sizes, torch.tensor([False, True]))
+        assert (made.horizontal[..., -1] == 1).all()
+        assert (made.vertical[..., -1] == 1).all()
+        for edge in (-1.0, 1.0):
+            x = torch.full((20, 2), edge, dtype=dtype)
+            for there in (made(x), made.inv(x)):
+                assert (there.abs() <= 1).all()
+
+    @pytest.mark.parametrize("name", FLOWS)
+    def test_gradients_at_the_edge_are_finite(self, name):
+        flow = flow_of(name)
+        _, context = draw(flow, 2)
+        points = torch.ones(2, flow.features, dtype=torch.float64, requires_grad=True)
+        for total in (flow.log_prob(points, context).sum(), sum(part.sum() for part in flow(points, context))):
+            (gradient,) = torch.autograd.grad(total, points)
+            assert torch.isfinite(gradient).all()
+
+    def test_a_design_point_outside_the_space_has_no_density_and_one_on_its_face_has_one(self, tmp_path):
+        trainer = a_trainer(tmp_path)
+        face, beyond = np.array([[0, 0, 0, 0.4, 0, 2.5]]), np.array([[0, 0, 0, 0.4, 0, 2.501]])
+        assert np.isfinite(measure.log_density_of(trainer, face)).all()
+        assert measure.log_density_of(trainer, beyond) == -np.inf
+
+
+@hard_case(
+    "24",
+    "Parameters of the flow grow until float32 cannot invert its splines",
+    done="discriminants are kept positive and splines evaluated in float64; every 50 steps of balancing a round trip "
+    "is measured: above 0.01 nats the steps go on in float64, and the run notes it",
+)
+class TestSteepSplines:
+    @staticmethod
+    def broke():
+        """zuko's spline in float32, with parameters of standard deviation 10 and 100."""
+        said = []
+        for scale in (10.0, 100.0):
+            made, points = plain_spline(scale, torch.float32)
+            off = (made.inv(made(points)) - points).abs()
+            wrong, lost = float((off > 1e-3).float().mean()), float(torch.isnan(off).float().mean())
+            said.append(f"at a spread of {scale:g} {wrong:.0%} of inverses are off by over 1e-3 and {lost:.1%} NaN")
+        return "; ".join(said)
+
+    @pytest.mark.parametrize("scale", [3.0, 10.0, 100.0])
+    def test_extreme_splines_stay_finite_inside_and_invertible_in_float32(self, scale):
+        generator = torch.Generator().manual_seed(2)
+        widths, heights = (scale * torch.randn(2000, 1, 8, generator=generator) for _ in range(2))
+        slopes = scale * torch.randn(2000, 1, 9, generator=generator)
+        spline = BoundedSpline(widths, heights, slopes)
+        x = (2 * torch.rand(2000, 1, generator=generator) - 1).requires_grad_()
+        y, log_slope = spline.call_and_ladj(x)
+        back = spline.inv(y.detach().requires_grad_())
+        for found in (y, log_slope, back):
+            assert torch.isfinite(found).all()
+        assert y.abs().max() <= 1
+        assert back.abs().max() <= 1
+        assert torch.isfinite(torch.autograd.grad(log_slope.sum(), x)[0]).all()
+
+    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+    @pytest.mark.parametrize("scale", [10.0, 100.0, 1000.0])
+    def test_densities_of_the_steepest_flows_stay_finite(self, scale, dtype):
+        flow = flow_of("all six", scale=scale).to(dtype)
+        base, _ = draw(flow.double(), 300)
+        flow, base = flow.to(dtype), base.to(dtype)
+        with torch.no_grad():
+            values, log_prob = flow(base)
+            assert torch.isfinite(log_prob).all()
+            assert torch.isfinite(flow.log_prob(values)).all()
+
+    def test_the_round_trip_tells_a_flow_that_float32_inverts_from_one_that_it_does_not(self):
+        generator = torch.Generator().manual_seed(4)
+        mild, steep = flow_of("all six").float(), flow_of("a block of two", layers=4, scale=10.0)
+        assert round_trip_nats(mild, 500, generator) < 0.1 * TOLERANCE_NATS
+        assert round_trip_nats(steep.float(), 500, generator) > 100 * TOLERANCE_NATS
+        assert round_trip_nats(steep.double(), 500, generator) < TOLERANCE_NATS
+
+    def test_a_round_trip_that_is_not_finite_is_infinitely_long(self):
+        flow = flow_of("one dimension")
+        with torch.no_grad():
+            next(flow.parameters()).fill_(math.nan)
+        assert round_trip_nats(flow, 10, torch.Generator().manual_seed(0)) == math.inf
+
+    def test_steps_go_on_in_float64_where_float32_fails_and_not_before(self, tmp_path):
+        trainer = a_trainer(tmp_path)
+        trainer._advance()
+        trainer.step = trainer.pathwise_steps
+        trainer._check_round_trip()
+        assert trainer.doubled_at is None
+        with torch.no_grad():
+            for parameter in trainer.flow.parameters():
+                parameter.mul_(50.0)
+        trainer.step = 0
+        trainer._check_round_trip()  # no foreign density is asked for yet
+        assert trainer.doubled_at is None
+        trainer.step = trainer.pathwise_steps
+        trainer._check_round_trip()
+        assert trainer.doubled_at == trainer.pathwise_steps
+        state = [v for one in trainer.optimiser.state.values() for n, v in one.items() if n != "step"]
+        assert {p.dtype for p in trainer.flow.parameters()} == {v.dtype for v in state} == {torch.float64}
+        trainer._advance()
+        assert all(torch.isfinite(p).all() for p in trainer.flow.parameters())
+
+    def test_a_run_that_changed_to_float64_says_so_and_resumes_to_the_same_bytes(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(training, "TOLERANCE_NATS", 0.0)
+        (tmp_path / "straight").mkdir()
+        result = learn(BallTask(), config_of(), tmp_path / "straight")
+        assert any("from step 60 on float64" in note for note in result.notes)
+        for step in (70, 110):  # before and after the first checkpoint in float64
+            run = tmp_path / f"stopped at {step}"
+            run.mkdir()
+            interrupted(run, step)
+            learn(BallTask(), config_of(), run, resume=True)
+            assert result_bytes(run) == result_bytes(tmp_path / "straight")
+
+    def test_samples_and_their_densities_are_float64_whatever_the_steps_were(self, tmp_path):
+        learn(BallTask(), config_of(dtype="float32"), tmp_path)
+        samples = load_samples(tmp_path)
+        assert samples.log_prob.dtype == samples.points.dtype == np.float64
+        arrays, _ = load_arrays(tmp_path, "flow.safetensors")
+        assert {value.dtype for value in arrays.values()} == {np.dtype(np.float64)}
+
+    def test_the_round_trip_of_a_learned_flow_is_recorded_and_noted_where_it_is_long(self, tmp_path, monkeypatch):
+        result = learn(BallTask(), config_of(), tmp_path)
+        recorded = json.loads((tmp_path / "manifest.json").read_text())["round_trip_nats"]
+        assert 0 <= recorded < references.FLOW_ROUND_TRIP_NATS
+        assert not any("off by" in note for note in result.notes)
+        monkeypatch.setattr(measure, "round_trip_nats", lambda *_: 0.5)
+        (tmp_path / "steep").mkdir()
+        result = learn(BallTask(), config_of(), tmp_path / "steep")
+        assert any("log densities are off by up to 0.5 nats" in note for note in result.notes)
+
+
+@hard_case(
+    "25",
+    "A loss or a gradient of a step is NaN or infinite",
+    done="the step is skipped and counted; five in a row take the last good weights back and halve the step size; "
+    "after six halvings learning ends with exit 5 and a checkpoint that can be read",
+)
+class TestStepsThatAreNotFinite:
+    @staticmethod
+    def broke():
+        """One step of plain Adam with one NaN in its gradient."""
+        weights = torch.nn.Parameter(torch.zeros(1000))
+        optimiser = torch.optim.Adam([weights])
+        gradient = torch.ones(1000)
+        gradient[0] = math.nan
+        weights.grad = gradient / gradient.norm()  # clipping by the norm
+        optimiser.step()
+        lost = int(torch.isnan(weights).sum())
+        return f"one NaN among 1000 gradients, clipped by their norm, makes {lost} weights NaN for good"
+
+    @staticmethod
+    def broken_between(monkeypatch, first, last, factor=math.nan):
+        """Gradients of the target that are no numbers at some of its evaluations, which are counted."""
+        exact, calls = Target.log_density_and_gradient, {"n": 0}
+
+        def flaky(self, points, sigma_m=None):
+            values, gradient = exact(self, points, sigma_m)
+            calls["n"] += 1
+            return values, gradient * (factor if first < calls["n"] <= last else 1.0)
+
+        monkeypatch.setattr(Target, "log_density_and_gradient", flaky)
+        return calls
+
+    @pytest.mark.parametrize("what", [math.nan, math.inf])
+    def test_points_that_leave_the_numbers_are_a_skipped_step(self, tmp_path, monkeypatch, what):
+        exact, calls = training.pathwise_loss, {"n": 0}
+
+        def sometimes(*args):
+            calls["n"] += 1
+            loss, value, ess = exact(*args)
+            return (loss * what, value, ess) if calls["n"] == 7 else (loss, value, ess)
+
+        monkeypatch.setattr(training, "pathwise_loss", sometimes)
+        result = learn(BallTask(), config_of(), tmp_path)
+        assert any("1 steps were not finite" in note for note in result.notes)
+        assert math.isfinite(result.kl_nats)
+
+    def test_a_skipped_step_leaves_weights_and_moments_alone(self, tmp_path, monkeypatch):
+        trainer = a_trainer(tmp_path)
+        trainer._advance()
+        before = trainer._state_arrays()
+        self.broken_between(monkeypatch, 0, 1)
+        trainer._advance()
+        after = trainer._state_arrays()
+        assert trainer.skipped == 1
+        for name in before.keys() - {"generator"}:
+            np.testing.assert_array_equal(after[name], before[name])
+
+    def test_five_in_a_row_take_the_last_good_weights_back_and_halve_the_step_size(self, tmp_path, monkeypatch):
+        self.broken_between(monkeypatch, 54, 59)
+        learn(BallTask(), config_of(), tmp_path)
+        rows = {row["step"]: row for row in map(json.loads, (tmp_path / "progress.jsonl").read_text().splitlines())}
+        (tmp_path / "plain").mkdir()
+        monkeypatch.undo()
+        learn(BallTask(), config_of(), tmp_path / "plain")
+        plain = [json.loads(line) for line in (tmp_path / "plain" / "progress.jsonl").read_text().splitlines()]
+        for row in plain:
+            halved = 2.0 if row["step"] > 50 else 1.0
+            assert rows[row["step"]]["rate"] == pytest.approx(row["rate"] / halved)
+        assert rows[120]["skipped"] == 5
+
+    def test_gradients_that_stay_nan_end_in_a_divergence_error_with_a_readable_checkpoint(self, tmp_path, monkeypatch):
+        self.broken_between(monkeypatch, 0, math.inf)
+        match = r"(?s)non-finite.*checkpoint\.safetensors.*learning\.rate"
+        with pytest.raises(DivergenceError, match=match) as caught:
+            learn(BallTask(), config_of(), tmp_path)
+        assert caught.value.exit_code == 5
+        arrays, state = load_arrays(tmp_path, training.CHECKPOINT)
+        assert state["step"] % training.SNAPSHOT_STEPS == 0
+        assert all(np.isfinite(value).all() for value in arrays.values() if value.dtype.kind == "f")
+
+    def test_a_resume_after_steps_were_skipped_is_bit_identical_too(self, tmp_path, monkeypatch):
+        # a whole stretch of steps after the snapshot at step 50 has no gradient, so weights are taken back
+        calls = self.broken_between(monkeypatch, 54, 62)
+        (tmp_path / "straight").mkdir()
+        result = learn(BallTask(), config_of(), tmp_path / "straight")
+        assert any("8 steps were not finite" in note for note in result.notes)
+        calls["n"] = 0
+        (tmp_path / "resumed").mkdir()
+        interrupted(tmp_path / "resumed", 60)
+        calls["n"] = 50  # the resumed run starts at the snapshot of step 50
+        learn(BallTask(), config_of(), tmp_path / "resumed", resume=True)
+        assert result_bytes(tmp_path / "resumed") == result_bytes(tmp_path / "straight")
+
+
+LEFT, RIGHT = -0.9, 0.9
+WIDE = DesignSpace((0, 0, 0, -1.2, 0, 0.5), (0, 0, 0, 1.2, 0, 2.5))
+LONGER = {"steps": 250, "batch": 256, "layers": 2, "hidden": 32, "samples": 8000, "checkpoint_seconds": 100.0}
+
+
+class BallsTask(BallTask):
+    """Balls of 5 cm, 1.5 m away at azimuths."""
+
+    def __init__(self, *azimuths):
+        self.azimuths = azimuths
+
+    def scenes(self, config, split, seed):
+        places = [1.5 * np.array([math.cos(a), math.sin(a), 0]) for a in self.azimuths]
+        return [
+            Scene(tuple(Body(Sphere(0.05), f"ball {i}", poses=rigid(translation_m=p)) for i, p in enumerate(places)))
+        ]
+
+
+def trainer_of(task, space, run, **settings):
+    config = config_of(space, **settings)
+    ground = prepare_ground(task, config)
+    return make_trainer(ground, config, run, torch.device("cpu")), ground, config
+
+
+@hard_case(
+    "26",
+    "A target of modes far apart, of which the reverse KL drops some",
+    done="sigma is annealed from six times its value and half of the steps balance by independent proposals; coverage, "
+    "measured on proposals that know nothing of the flow, tells what the ESS of its own samples cannot",
+)
+class TestModesFarApart:
+    @staticmethod
+    def broke():
+        """A Gaussian fitted to one of two modes by the reverse KL, judged by its own weights."""
+        x = np.random.default_rng(0).normal(-5, 1, 10_000)
+        log_target = np.logaddexp(-np.square(x + 5) / 2, -np.square(x - 5) / 2)
+        weights = np.exp(log_target + np.square(x + 5) / 2)
+        ess = weights.sum() ** 2 / np.square(weights).sum() / len(x)
+        return f"a density that holds one of two equal modes has an ESS of {ess:.3f} by its own samples"
+
+    def test_both_modes_are_learned_with_the_settings_that_stand(self, tmp_path):
+        result = learn(BallsTask(LEFT, RIGHT), config_of(WIDE, **LONGER), tmp_path)
+        left = load_samples(tmp_path)
+        share = float(left.weights[left.points[:, 3] < 0].sum())
+        own = float((left.points[:, 3] < 0).mean())
+        # both balls look alike from the middle
+        assert share == pytest.approx(0.5, abs=0.1)
+        assert own == pytest.approx(0.5, abs=0.15)
+        assert result.coverage > 0.9
+        assert result.ess > 0.2
+
+    def test_a_dropped_mode_is_told_by_the_coverage_and_not_by_the_ess(self, tmp_path):
+        # learned for the left ball, judged for both
+        one, _, _ = trainer_of(BallsTask(LEFT), WIDE, tmp_path, **LONGER)
+        one.train()
+        _, both, config = trainer_of(BallsTask(LEFT, RIGHT), WIDE, tmp_path, **LONGER)
+        judged = SimpleNamespace(
+            flow=one.flow.double(), target=both.target, coordinates=one.coordinates, generator=one.generator
+        )
+        probes = measure.draw_probes(both.target, both.scenes, 2000, np.random.default_rng(1))
+        found = measure.measure(judged, probes, 4000).estimates
+        alone = SimpleNamespace(**{**vars(judged), "target": prepare_ground(BallsTask(LEFT), config).target})
+        whole = measure.measure(
+            alone, measure.draw_probes(alone.target, both.scenes[:1], 2000, np.random.default_rng(1)), 4000
+        )
+        assert found["ess"].value > 0.8 * whole.estimates["ess"].value
+        assert found["coverage"].value == pytest.approx(0.5, abs=0.1)
+        assert found["misplaced"].value > 0.4
+
+    def test_annealing_and_balancing_are_on_where_nothing_is_said(self, tmp_path):
+        trainer = a_trainer(tmp_path)
+        assert trainer.sigma_m(0) == pytest.approx(training.SIGMA_START_RATIO * 0.05)
+        assert trainer.sigma_m(trainer.pathwise_steps) == pytest.approx(0.05)
+        assert 0 < trainer.pathwise_steps < trainer.settings.steps
+
+
+@hard_case(
+    "27",
+    "A target that is next to a point or constant, a single scene, a single free dimension",
+    done="all of them are learned, with finite figures that agree with the closed forms",
+)
+class TestTargetsWithoutShape:
+    ONE = DesignSpace((0, 0, 0, 0, 0, 0.2), (0, 0, 0, 0, 0, 2.5))
+
+    @staticmethod
+    def broke():
+        """The density of a target of 0.1 mm on a grid of 64 steps over 2.3 m, as a linear sum."""
+        edges = np.linspace(0.2, 2.5, 65)
+        with np.errstate(under="ignore"):
+            total = float(np.exp(-np.square(((edges[1:] + edges[:-1]) / 2 - 1.0001) / 1e-4) / 2).sum())
+        log_z = math.log(total) if total > 0 else -math.inf
+        return f"summed on 64 steps the log of a shell of 0.1 mm is {log_z}, and every weight 0 / 0"
+
+    @staticmethod
+    def learned(run, space, sigma_m, **settings):
+        config = config_of(
+            space, **{"steps": 200, "batch": 256, "samples": 4000, "checkpoint_seconds": 100.0, **settings}
+        )
+        config = replace(config, density=DensitySettings(sigma_m=sigma_m))
+        result = learn(BallTask(), config, run)
+        for value in (result.ess, result.kl_nats, result.log_z, result.coverage, result.misplaced):
+            assert math.isfinite(value)
+        samples = load_samples(run)
+        assert np.isfinite(-samples.log_prob.mean())  # its entropy
+        return result, samples
+
+    @pytest.mark.parametrize("sigma_m", [0.1, 0.01, 1e-3])
+    def test_one_free_dimension_has_the_closed_forms_log_z_however_thin_the_surface(self, tmp_path, sigma_m):
+        result, samples = self.learned(tmp_path, self.ONE, sigma_m, steps=300, layers=3, bins=16)
+        assert (samples.points[:, :5] == 0).all()
+        # a normal distribution about the front of the ball, a metre away; from one sigma behind it on T cuts in
+        front = math.log(sigma_m * math.sqrt(2 * math.pi))
+        error = references.STANDARD_ERRORS * result.error_estimates["log_z"].error
+        assert front + math.log(0.84) - error < result.log_z < front + error
+        assert np.average(samples.points[:, 5], weights=samples.weights) == pytest.approx(1.0, abs=2 * sigma_m)
+        assert result.coverage > 0.99
+        assert result.ess > 0.1
+
+    def test_a_constant_target_is_met_by_the_uniform_density(self, tmp_path):
+        result, samples = self.learned(tmp_path, SPACE, 1e3)
+        assert result.ess > 0.5
+        assert result.kl_nats < 0.5
+        assert any("flat" in note for note in result.notes)
+        assert samples.space.log_volume >= -samples.log_prob.mean()  # no density has more entropy
+
+    def test_a_single_scene_of_a_single_frame_is_enough(self, tmp_path):
+        assert len(BallTask().scenes(None, "train", 0)) == 1
+        result, _ = self.learned(tmp_path, SPACE, 0.05)
+        assert result.ess > 0.1
+
+
+TINY = (
+    "train=4", "learning.steps=200", "learning.batch=64", "learning.layers=1", "learning.hidden=16",
+    "learning.samples=2000", "learning.balance_proposals=512", "learning.coverage_proposals=256",
+    "learning.checkpoint_seconds=0.001", "learning.dtype=float64",
+)  # fmt: skip
+LOST = 3
+
+
+def learning(folder, *further):
+    settings = [part for text in TINY for part in ("--set", text)]
+    return ["learn", "flatland", "--preset", "draft", "--out", str(folder), "--seed", "3", *settings, *further]
+
+
+def wait_for_checkpoint(folder, after=0.0):
+    """The time of a run's next checkpoint."""
+    deadline = time.monotonic() + SMALL_WAIT_S
+    path = folder / "checkpoint.safetensors"
+    while not (path.exists() and path.stat().st_mtime > after):
+        assert time.monotonic() < deadline, "no checkpoint came"
+        time.sleep(0.01)
+    return path.stat().st_mtime
+
+
+FAILING = """
+import os, sys
+from lidardesign.density import ground
+from lidardesign.errors import DataError
+
+def broken(task, config):
+    raise DataError("this computer has no scans", where="scans")
+
+if os.environ["RANK"] == "1":
+    ground.training_scenes = broken
+from lidardesign.cli.main import run
+run(sys.argv[1:])
+"""
+
+
+@pytest.fixture(scope="module")
+def by_torchrun(tmp_path_factory):
+    """What two ranks of torchrun learn: the folder and their whole stdout."""
+    folder = tmp_path_factory.mktemp("torchrun") / "run"
+    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    ended = subprocess.run(
+        [*launcher, "-m", "lidardesign", *learning(folder, "--json")],
+        capture_output=True, text=True, timeout=SMALL_WAIT_S, check=False,
+    )  # fmt: skip
+    assert ended.returncode == 0, ended.stderr
+    return folder, ended.stdout
+
+
+@hard_case(
+    "28",
+    "One of several processes that learn together dies",
+    done="the others end as well, with exit 3 and what happened; resuming from the last checkpoint gives the bytes of "
+    "an uninterrupted run",
+)
+@pytest.mark.slow
+class TestRanksThatDie:
+    @staticmethod
+    def broke():
+        """What gloo does by itself."""
+        from torch.distributed.constants import default_pg_timeout
+
+        minutes = default_pg_timeout.total_seconds() / 60
+        return (
+            f"a collective of torch waits {minutes:.0f} minutes for a process that is gone, and then raises a traceback"
+        )
+
+    def test_two_ranks_of_torchrun_print_one_document_and_write_one_run(self, by_torchrun):
+        folder, out = by_torchrun
+        found = json.loads(out)
+        assert found["steps"] == 200
+        assert found["run"] == str(folder)
+        manifest = json.loads((folder / "manifest.json").read_text())
+        assert manifest["ranks"] == 2
+        rows = [json.loads(line) for line in (folder / "progress.jsonl").read_text().splitlines()]
+        assert [row["step"] for row in rows] == list(range(10, 201, 10))
+
+    def test_two_ranks_reach_what_one_process_reaches(self, by_torchrun, tmp_path, capsys):
+        with pytest.raises(SystemExit):
+            run_program(learning(tmp_path / "run", "--json"))
+        alone, together = json.loads(capsys.readouterr().out), json.loads(by_torchrun[1])
+        for name in ("ess", "kl_nats", "log_z", "coverage"):
+            error = alone["error_estimates"][name]["error"]
+            assert abs(alone[name] - together[name]) <= references.STANDARD_ERRORS * error, name
+
+    def test_a_killed_rank_ends_all_and_the_last_checkpoint_resumes_to_the_same_bytes(self, by_torchrun, tmp_path):
+        folder = tmp_path / "run"
+        ranks = start_ranks(2, "-m", "lidardesign", *learning(folder))
+        wait_for_checkpoint(folder)
+        ranks[1].send_signal(signal.SIGKILL)
+        (code, _, said), (killed, _, _) = finished(ranks)
+        assert (code, killed) == (LOST, -signal.SIGKILL)
+        assert "another rank ended" in said
+        assert "--resume" in said
+        assert not (folder / "flow.safetensors").exists()
+        saved = wait_for_checkpoint(folder)
+        ranks = start_ranks(2, "-m", "lidardesign", *learning(folder, "--resume"))
+        wait_for_checkpoint(folder, after=saved)
+        ranks[0].send_signal(signal.SIGKILL)
+        (killed, _, _), (code, _, said) = finished(ranks)
+        assert (killed, code) == (-signal.SIGKILL, LOST)
+        assert "rank 1: system error: torchrun: another rank ended" in said
+        ended = finished(start_ranks(2, "-m", "lidardesign", *learning(folder, "--resume")))
+        assert [status for status, _, _ in ended] == [0, 0]
+        assert result_bytes(folder) == result_bytes(by_torchrun[0])
+
+    def test_what_only_one_rank_knows_is_told_by_it(self, tmp_path):
+        folder = tmp_path / "run"
+        (code, out, said), (other, silent, told) = finished(start_ranks(2, "-c", FAILING, *learning(folder, "--json")))
+        assert (code, other) == (LOST, LOST)
+        assert json.loads(out)["error"]["kind"] == "system"
+        assert "another rank ended" in said
+        assert silent == ""
+        assert "rank 1: data error: scans: this computer has no scans" in told
+        assert not folder.exists()
