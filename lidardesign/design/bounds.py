@@ -12,13 +12,12 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from lidardesign.design.features import Features
-from lidardesign.numerics import SLACK, wrap_angle
+from lidardesign.numerics import wrap_angle
 
 # Smallest standard deviations relative to the spread of all data: below it a component has collapsed on a
-# duplicate. In angle and range separately, and per origin axis.
+# duplicate. In angle and range separately, and per origin axis. Where the data themselves do not vary, their scale
+# is a share of the space (see `features`), so that no length stands here that would be coarse in a small world.
 RELATIVE_FLOOR = 1e-4
-# Relative to the extent of the space or a full turn, where the data themselves do not vary.
-ABSOLUTE_FLOOR = SLACK
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,11 +110,7 @@ class Floors:
         count = len(features.axes.origin)
         origin = float(features.scale[:count].min()) if count else 1.0
         reach = float(features.scale[-1]) if features.axes.range else 1.0
-        return cls(
-            max(RELATIVE_FLOOR * origin, ABSOLUTE_FLOOR),
-            RELATIVE_FLOOR * features.angular_scale,
-            max(RELATIVE_FLOOR * reach, ABSOLUTE_FLOOR),
-        )
+        return cls(RELATIVE_FLOOR * origin, RELATIVE_FLOOR * features.angular_scale, RELATIVE_FLOOR * reach)
 
 
 def clip_azimuth(azimuth_rad: np.ndarray, bounds: Bounds) -> np.ndarray:

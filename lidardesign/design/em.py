@@ -17,7 +17,7 @@ from lidardesign.design.mixture import (
     mean_directions,
     responsibilities,
 )
-from lidardesign.design.mstep import maximise
+from lidardesign.design.mstep import SMALLEST_MASS, maximise
 from lidardesign.design.origins import nearest_admitted
 from lidardesign.design.quantise import lloyd
 from lidardesign.errors import NumericalError
@@ -37,6 +37,8 @@ SEED_LLOYD_ITERATIONS = 4
 # A component that explains less than this many effective samples has died.
 DEAD_SAMPLES = 2.0
 MOST_REVIVALS = 3
+# So many samples usually tell that there are more different ones than components.
+FEW_SAMPLES = 256
 # Shorter boresight steps than this share are as good as none.
 SMALLEST_STEP = 0.02
 # Mass that stands for an empty cell, so that its mean is finite.
@@ -110,11 +112,11 @@ def _finite(statistics: Statistics) -> float:
 def from_labels(features: Features, labels: np.ndarray, bounds: Bounds) -> Mixture:
     """Admissible components of a hard assignment, in two passes: boresights, then moments about them.
 
-    A cell without samples repeats the heaviest one.
+    A cell whose samples weigh next to nothing repeats the heaviest one.
     """
     count, axes = len(bounds), features.axes
     mass = np.bincount(labels, features.weights, minlength=count)
-    source = np.where(mass > 0, np.arange(count), mass.argmax())
+    source = np.where(mass > SMALLEST_MASS, np.arange(count), mass.argmax())
     azimuth, elevation = mean_directions(features, labels, count)
     blank = Mixture(
         weights=mass[source] / mass[source].sum(),
@@ -198,8 +200,17 @@ def fit_mixture(
     """
     if start is None:
         start = _best_seed(features, bounds, generator, 1 if len(bounds) == 1 else max(restarts, 1))
-    trace = climb(start, features, bounds)
-    return _revived(trace, features, bounds, generator)
+    trace = _revived(climb(start, features, bounds), features, bounds, generator)
+    return replace(trace, notes=(*_shared_notes(features, len(bounds)), *trace.notes))
+
+
+def _shared_notes(features: Features, count: int) -> tuple[str, ...]:
+    """A line where there are fewer different samples than components: some then share one."""
+    for part in (features.points[: max(count, FEW_SAMPLES)], features.points):
+        different = len(np.unique(part, axis=0))
+        if different >= count:
+            return ()
+    return (f"fewer different samples ({different}) than sensors ({count}): some sensors share one",)
 
 
 def _best_seed(features: Features, bounds: Bounds, generator: np.random.Generator, restarts: int) -> Mixture:
