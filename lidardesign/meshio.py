@@ -15,6 +15,7 @@ import numpy as np
 
 from lidardesign.errors import DataError, LidardesignError
 from lidardesign.numerics import ROUNDING
+from lidardesign.orientation import edge_defects, turned_to_agree
 from lidardesign.scene import Mesh, Sign
 from lidardesign.space import FARTHEST_M
 
@@ -67,9 +68,9 @@ def load_mesh(path: str | Path, *, sign: Sign = "auto", scale: float = 1.0) -> M
 def check_mesh(vertices: Any, faces: Any, *, sign: Sign = "auto", where: str = "mesh") -> Mesh:
     """A mesh without degenerate, duplicate or dangling parts, with a sign rule that it can bear.
 
-    `auto` takes `solid` for a closed, consistently wound mesh, `winding` for a closed one with mixed winding
-    and `unsigned` for an open one, with a note. Only an explicit `solid` refuses. A mesh that is inside
-    out is turned, with a note.
+    `auto` takes `solid` for a closed mesh, after turning faces that disagree with their neighbours, and `unsigned` for
+    an open one or one that has no outside (a Klein bottle), each with a note. Only an explicit `solid` refuses. A mesh
+    that is inside out is turned, with a note.
 
     Arguments:
         vertices: Positions [m], shape (V, 3).
@@ -137,9 +138,8 @@ def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
 def usable_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray:
     """The faces that have an area and are no duplicate of another; what was dropped is added to `notes`."""
     edges = np.roll(vertices[faces], -1, axis=1) - vertices[faces]
-    double_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     longest = np.einsum("fek,fek->fe", edges, edges).max(axis=1)
-    degenerate = double_area <= FLATTEST_TRIANGLE * longest
+    degenerate = _double_areas(vertices, faces) <= FLATTEST_TRIANGLE * longest
     if degenerate.any():
         notes.append(f"dropped {int(degenerate.sum())} degenerate faces (without area)")
         faces = faces[~degenerate]
@@ -149,11 +149,19 @@ def usable_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> n
     return faces[np.sort(first)]
 
 
+def _double_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Twice the area of each face, shape (F,)."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
 def _oriented(
     vertices: np.ndarray, faces: np.ndarray, sign: Sign, notes: list[str], where: str
 ) -> tuple[np.ndarray, Literal["solid", "winding", "unsigned"]]:
     """Faces that point outwards where that is defined, and the sign rule that holds for them."""
     open_edges, mixed_edges = edge_defects(faces)
+    if mixed_edges and sign in ("auto", "winding"):
+        faces, mixed_edges = _agreeing(vertices, faces, notes)
     if not open_edges and not mixed_edges and signed_volume_m3(vertices, faces) < 0:
         faces = faces[:, ::-1]
         notes.append("the mesh was inside out: all faces were turned")
@@ -173,23 +181,17 @@ def _oriented(
         notes.append(f"open mesh ({found}): unsigned distances, no inside")
         return faces, "unsigned"
     if mixed_edges:
-        notes.append(f"closed mesh with {found}: the inside is where the winding number is above 1/2")
-        return faces, "winding"
+        notes.append(f"closed mesh with {found}: it has no outside: unsigned distances")
+        return faces, "unsigned"
     return faces, "solid"
 
 
-def edge_defects(faces: np.ndarray) -> tuple[int, int]:
-    """How many edges are open, and how many join faces that run along them the same way.
-
-    An edge is open when an odd number of faces meets there. Where closed parts touch, four faces share an
-    edge, two in each direction: that is no defect.
-    """
-    directed = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
-    sense = np.where(directed[:, 0] < directed[:, 1], 1.0, -1.0)
-    _, edge, count = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True, return_counts=True)
-    balance = np.bincount(edge.reshape(-1), weights=sense)
-    is_open = count % 2 == 1
-    return int(is_open.sum()), int((~is_open & (balance != 0)).sum())
+def _agreeing(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> tuple[np.ndarray, int]:
+    """Faces turned where they disagree with their neighbours, and how many edges still join faces that disagree."""
+    faces, turned = turned_to_agree(faces, _double_areas(vertices, faces))
+    if turned:
+        notes.append(f"turned {turned} faces that ran against their neighbours")
+    return faces, edge_defects(faces)[1]
 
 
 def signed_volume_m3(vertices: np.ndarray, faces: np.ndarray) -> float:

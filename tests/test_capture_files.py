@@ -3,6 +3,7 @@
 import contextlib
 import io
 import pickle
+import struct
 import zipfile
 
 import h5py
@@ -12,9 +13,10 @@ from captures import BINS, make_capture
 from scipy.io import savemat
 
 from lidardesign.errors import DataError
-from lidardesign.evaluate import capture_arrays
 from lidardesign.evaluate.capture import load_capture
 from lidardesign.evaluate.capture_arrays import read_arrays
+from lidardesign.evaluate.capture_matlab import read_matlab
+from lidardesign.run import npz
 
 
 def save_npz(path, arrays):
@@ -216,6 +218,55 @@ def test_matlab_structures_are_refused(tmp_path, kind):
         load_capture(tmp_path / "s.mat")
 
 
+NUMBERS = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "?")
+SHAPES = ((1, 1), (1, 3), (4, 1), (2, 3), (3, 2, 4), (0, 3), (0, 0))
+
+
+@pytest.mark.parametrize("kind", NUMBERS)
+@pytest.mark.parametrize("packed", [True, False])
+def test_every_type_and_shape_of_matlab_5_comes_through(kind, packed):
+    generator = np.random.default_rng(0)
+    arrays = {f"a{n}": (100 * generator.random(shape)).astype(kind) for n, shape in enumerate(SHAPES)}
+    content = io.BytesIO()
+    savemat(content, arrays, do_compression=packed)
+    found = read_matlab(content.getvalue(), "s.mat")
+    assert list(found) == list(arrays)
+    for name, array in arrays.items():
+        # SciPy writes booleans as bytes with a flag, as MATLAB does
+        assert found[name].dtype == array.dtype
+        np.testing.assert_array_equal(found[name], array)
+
+
+@pytest.mark.parametrize("kind", ["f8", "f4", "i4", "i2", "u1"])
+def test_matrices_of_matlab_4_come_through(kind):
+    arrays = {"first": np.arange(12).reshape(3, 4).astype(kind), "b": np.ones((1, 1), kind)}
+    content = io.BytesIO()
+    savemat(content, arrays, format="4")
+    found = read_matlab(content.getvalue(), "s.mat")
+    assert list(found) == list(arrays)
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(found[name], array)
+    for other in ({"a": "text"}, {"a": np.array([[1j]])}):
+        content = io.BytesIO()
+        savemat(content, other, format="4")
+        with pytest.raises(DataError, match=r"'a' is a MATLAB (char|complex)"):
+            read_matlab(content.getvalue(), "s.mat")
+
+
+def test_numbers_that_matlab_stored_in_less_space_and_in_the_other_byte_order_come_through():
+    """Doubles that are whole and small are stored as bytes; files of some computers begin with the high byte."""
+    for order, mark in (("<", b"IM"), (">", b"MI")):
+        flags = struct.pack(order + "IIII", 6, 8, 6, 0)
+        shape = struct.pack(order + "IIii", 5, 8, 1, 3)
+        name = struct.pack(order + "I", 1 << 16 | 1) + b"a\x00\x00\x00"
+        values = struct.pack(order + "I", 3 << 16 | 2) + bytes([7, 8, 9, 0])
+        body = flags + shape + name + values
+        content = bytes(124) + struct.pack(order + "H", 0x0100) + mark + struct.pack(order + "II", 14, len(body)) + body
+        found = read_matlab(content, "s.mat")["a"]
+        assert found.dtype == np.float64
+        np.testing.assert_array_equal(found, [[7.0, 8.0, 9.0]])
+
+
 def test_matlab_7_structures_and_foreign_hdf5_are_refused(tmp_path):
     path = tmp_path / "s.mat"
     save_matlab_73(path, make_capture(3))
@@ -281,7 +332,7 @@ def test_garbage_a_folder_and_nothing_are_refused(tmp_path, suffix):
 
 
 def test_files_above_the_stated_size_are_refused_before_they_are_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(capture_arrays, "LARGEST_BYTES", 100_000)
+    monkeypatch.setattr(npz, "LARGEST_BYTES", 100_000)
     zeros = {**make_capture(3), "counts": np.zeros((3, 3, 100_000), np.uint8)}
     for kind, save in FORMATS.items():
         path = path_of(tmp_path, kind)

@@ -20,7 +20,7 @@ from lidardesign.errors import ConfigError, DataError
 from lidardesign.numerics import SLACK
 from lidardesign.scene import Mesh
 
-ALGORITHM = "narrow band 3 cells, igl winding sign, filled by distance transform, recentred, float32"
+ALGORITHM = "narrow band 3 cells, igl sign by the absolute winding number, filled by distance transform, recentred, float32"
 BAND_CELLS = 3.0
 MAXIMUM_CELLS = 40_000_000
 DIGEST_BYTES = 32
@@ -76,7 +76,8 @@ def distance_grid(mesh: Mesh, grid: Grid) -> np.ndarray:
     if mesh.sign != "unsigned":
         import igl
 
-        inside = igl.fast_winding_number(vertices, faces, points) > 0.5
+        # -1 is the inside of a part whose faces all point inwards
+        inside = np.abs(igl.fast_winding_number(vertices, faces, points)) > 0.5
         distance = np.where(inside, -distance, distance)
     return distance.astype(np.float32)
 
@@ -150,7 +151,8 @@ def _load(path: Path, size: int) -> np.ndarray | None:
         if _digest(content[:-DIGEST_BYTES]) != content[-DIGEST_BYTES:]:
             return None
         values = np.load(io.BytesIO(content), allow_pickle=False)
-    except (OSError, ValueError, EOFError):
+    # numpy raises anything on garbage, as TokenError; what cannot be read is made again
+    except Exception:
         return None
     usable = values.shape == (size,) and values.dtype == np.float32 and np.isfinite(values).all()
     return values if usable else None

@@ -14,9 +14,12 @@ from lidardesign.errors import DataError
 from lidardesign.numerics import normalised_weights, systematic_draw
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import verify, write_recorded
+from lidardesign.run.npz import guarded, read_npz
 from lidardesign.space import DesignSpace
 
 FILE_NAME = "samples.npz"
+NUMBERS = ("points", "log_prob", "log_target")
+DAMAGED_HINT = "learn the run again"
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,12 +90,17 @@ def load_samples(run: Path) -> Samples:
     """
     verify(run, FILE_NAME)
     path = run / FILE_NAME
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            space = DesignSpace.from_dict(json.loads(arrays["space"].tobytes()))
-            samples = Samples(arrays["points"], arrays["log_prob"], arrays["log_target"], space)
-    except (OSError, ValueError, KeyError) as error:
-        raise DataError(f"cannot be read: {error}", where=str(path), hint="learn the run again") from None
-    if not (np.isfinite(samples.points).all() and np.isfinite(samples.log_prob).all()):
-        raise DataError("holds values that are not finite", where=str(path), hint="learn the run again")
-    return samples
+    arrays = read_npz(path, hint=DAMAGED_HINT)
+    missing = [name for name in (*NUMBERS, "space") if name not in arrays]
+    if missing:
+        raise DataError(f"has no {', '.join(missing)}", where=str(path), hint=DAMAGED_HINT)
+    points, log_prob, log_target = (arrays[name] for name in NUMBERS)
+    count = len(points) if points.ndim else 0
+    for array, shape in ((points, (count, 6)), (log_prob, (count,)), (log_target, (count,))):
+        if array.shape != shape or array.dtype != np.float64 or not count:
+            found, allowed = f"holds an array of {array.dtype} of shape {array.shape}", f"float64 of shape {shape}"
+            raise DataError(found, where=str(path), allowed=allowed, hint=DAMAGED_HINT)
+    if not (np.isfinite(points).all() and np.isfinite(log_prob).all() and (log_target < np.inf).all()):
+        raise DataError("holds values that are not finite", where=str(path), hint=DAMAGED_HINT)
+    space = guarded(lambda: DesignSpace.from_dict(json.loads(arrays["space"].tobytes())), path, DAMAGED_HINT)
+    return Samples(points, log_prob, log_target, space)

@@ -235,7 +235,8 @@ def _directions(arrays: Mapping[str, np.ndarray], pixels: tuple[int, ...], where
     if array.shape != (*pixels, 3):
         raise _shape("direction", array, f"{(*pixels, 3)}", where)
     vectors = _finite(np.asarray(array, dtype=np.float64).reshape(-1, 3), "direction", where)
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    with np.errstate(over="ignore"):  # an infinite length is none of a unit vector
+        length = np.linalg.norm(vectors, axis=1, keepdims=True)
     if np.abs(length - 1).max() > UNIT_TOLERANCE:
         worst = float(length[np.abs(length - 1).argmax(), 0])
         raise DataError(f"direction has a vector of length {worst:.4g}", where=where, allowed="unit vectors")
@@ -252,7 +253,9 @@ def _check_counts(counts: np.ndarray, where: str) -> None:
             _refuse_counts(bad, part, first, "finite numbers", where)
             _refuse_counts(part != np.floor(part), part, first, "whole numbers of photons", where)
         _refuse_counts(part < 0, part, first, "0 or more", where)
-        _refuse_counts(part > MOST_COUNTS, part, first, f"at most {MOST_COUNTS:.3g}", where)
+        # some types of counts do not reach the limit
+        most = min(MOST_COUNTS, float(np.finfo(part.dtype).max)) if part.dtype.kind == "f" else MOST_COUNTS
+        _refuse_counts(part > most, part, first, f"at most {MOST_COUNTS:.3g}", where)
         seen = seen or bool(part.any())
     if not seen:
         raise DataError("counts are all zero: no photon was captured", where=where)

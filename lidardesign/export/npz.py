@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from lidardesign.design.sensor import Design
-from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.columns import losses, ray_columns, rays_of
 from lidardesign.export.read_back import rays_rounding
 from lidardesign.run.files import write_atomic
+from lidardesign.run.npz import NUMERIC_KINDS, read_npz
 from lidardesign.simulate.returns import Rays
 
 
@@ -32,12 +31,7 @@ def read(path: Path) -> Rays:
     Raises:
         DataError: The file cannot be read, or holds no such arrays.
     """
-    try:
-        # numpy leaves a damaged file open where it opened it itself
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-            return rays_of(dict(arrays), path)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise DataError(f"cannot be read as numpy arrays: {error}", where=str(path)) from error
+    return rays_of(read_npz(path, kinds=NUMERIC_KINDS + "U", hint="export it again"), path)
 
 
 def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:

@@ -46,8 +46,20 @@ def load_arrays(run: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, 
         raise DataError(f"cannot be read: {error}", where=str(path), hint="learn the run again") from None
     if FORMAT not in metadata:
         found = ", ".join(sorted(metadata)) or "none"
-        raise DataError(f"has the format {found!r}", where=str(path), allowed=FORMAT, hint="learn the run again")
+        newer = found.startswith(FORMAT.rstrip("0123456789"))
+        hint = "use the version of lidardesign that wrote it, or a newer one" if newer else "learn the run again"
+        raise DataError(f"has the format {found!r}", where=str(path), allowed=FORMAT, hint=hint)
     for key, value in arrays.items():
         if value.dtype.kind == "f" and not np.isfinite(value).all():
             raise DataError(f"{key} holds values that are not finite", where=str(path), hint="learn the run again")
-    return arrays, json.loads(metadata[FORMAT])
+    return arrays, _state_of(metadata[FORMAT], path)
+
+
+def _state_of(text: str, path: Path) -> dict[str, Any]:
+    try:
+        state = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"its state cannot be read: {error}", where=str(path), hint="learn the run again") from None
+    if not isinstance(state, dict):
+        raise DataError("holds no state", where=str(path), hint="learn the run again")
+    return state

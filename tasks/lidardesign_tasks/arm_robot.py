@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import as_file, files
@@ -66,7 +67,8 @@ def load_robot(path: Path | None, tool_m: float) -> Robot:
 def _read_once(path: Path, states: tuple[FileState, ...], tool_m: float) -> Robot:
     """`states`, of all files of the model, only tells a changed model from the one in memory."""
     mujoco = import_mujoco()
-    with mujoco_warnings() as warnings:
+    with mujoco_warnings() as warned, warnings.catch_warnings(record=True) as also_warned:
+        warnings.simplefilter("always")
         try:
             spec = mujoco.MjSpec.from_file(str(path))
             _add_tool(_flange(spec, path), tool_m)
@@ -77,8 +79,9 @@ def _read_once(path: Path, states: tuple[FileState, ...], tool_m: float) -> Robo
             raise DataError(f"MuJoCo cannot read it: {reason}", where=str(path), allowed=allowed) from error
     _check_chain(model, path)
     links, notes = seen_links(model, path)
-    warned = [f"{path.name}: MuJoCo warns: {' '.join(line.split())}" for line in warnings]
-    return Robot(model, links, _home(model), (*warned, *notes))
+    lines = dict.fromkeys(" ".join(str(line).split()) for line in (*warned, *(one.message for one in also_warned)))
+    said = [f"{path.name}: MuJoCo warns: {line}" for line in lines]
+    return Robot(model, links, _home(model), (*said, *notes))
 
 
 def _flange(spec: Any, path: Path) -> Any:

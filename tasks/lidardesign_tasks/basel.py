@@ -90,7 +90,7 @@ class _File:
         if not present:
             raise self.fail(name, "is missing", LAYOUT)
         dataset = self.file[self.prefix + present[0]]
-        if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "iuf":
+        if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "iuf" or dataset.shape is None:
             raise self.fail(present[0], "is not an array of numbers")
         if dataset.file != self.file or dataset.external or dataset.is_virtual:
             raise self.fail(present[0], "is stored in another file", "all data in one file")
@@ -165,7 +165,8 @@ def _unit(file: _File, mean: np.ndarray, unit: Unit, notes: list[str]) -> str:
         if isinstance(said, str) and said.strip() in METRES:
             return said.strip()
     if file.prefix + "representer/length-unit" in file.file:
-        length = float(file.numbers("representer/length-unit").reshape(-1)[0])
+        lengths = file.numbers("representer/length-unit").reshape(-1)
+        length = float(lengths[0]) if lengths.size else 0.0
         named = [name for name, metres in METRES.items() if np.isclose(length, metres)]
         if not named:
             raise file.fail("representer/length-unit", f"is {length} m", "0.001, 0.01 or 1")
