@@ -10,6 +10,7 @@ import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from lidardesign.design.check import check_design
 from lidardesign.design.constraints import Constraints, check_feasible
@@ -119,6 +120,94 @@ def test_what_a_file_may_not_say_is_a_config_error_with_its_key(values, text):
     assert caught.value.exit_code == 2
 
 
+BOX = {"low_m": [0, 0, 0], "high_m": [1, 1, 1]}
+# key, what it takes, what it does not: the last accepted and the first refused on each side
+LIMITS = {
+    "sensors.count": ([1, 2], [0, -1, 1.5, 2.0, "2"]),
+    "sensors.min": ([1, 2], [0, 1.5]),
+    "sensors.max": ([1, 2], [0, 1.5]),
+    "budget.rays": ([1, 2], [0, 10.0]),
+    "budget.bandwidth_mbps": ([1e-9, 0.5], [0, -0.5]),
+    "budget.bin_ps": ([1e-9, 0.5], [0, -0.5]),
+    "budget.bits_per_bin": ([1e-9, 0.5], [0, -0.5]),
+    "budget.rate_hz": ([1e-9, 0.5], [0, -0.5]),
+    "boresight.azimuth_deg.min": ([-1000.0, 0, 1000.0], [math.inf, math.nan, "0"]),
+    "boresight.elevation_deg.min": ([-90, 0.5, 90], [-90.5, 90.5]),
+    "boresight.elevation_deg.max": ([-90, 0.5, 90], [-90.5, 90.5]),
+    "field_of_view.horizontal_deg.min": ([0, 0.5, 360], [-0.5, 360.5]),
+    "field_of_view.vertical_deg.min": ([0, 0.5, 360], [-0.5, 360.5]),
+    "field_of_view.horizontal_deg.max": ([0.5, 360], [0, -0.5, 360.5]),
+    "field_of_view.vertical_deg.max": ([0.5, 360], [0, -0.5, 360.5]),
+    "gate.start_m.min": ([0, 0.5], [-0.5]),
+    "gate.start_m.max": ([1e-9, 0.5], [0, -0.5]),
+    "gate.width_m.min": ([0, 0.5], [-0.5]),
+    "origin.spread_m.max": ([1e-9, 0.5], [0, -0.5]),
+    "origin.low_m": ([[0, 0, 0]], [[0, 0], [0, 0, 0, 0], [0, 0, "0"]]),
+    "origin.mounts_m": ([[[0, 0, 0]], [[0, 0, 0], [0, 0, 1]]], [[], [[0, 0]]]),
+    "origin.exclude": ([[], [BOX] * 32], [[BOX] * 33, [{"low_m": [0, 0, 0]}]]),
+}
+
+
+@pytest.mark.parametrize("key", LIMITS)
+def test_every_number_is_taken_up_to_its_limit_and_not_beyond(key):
+    taken, refused = LIMITS[key]
+
+    def read(value):
+        for part in reversed(key.split(".")):
+            value = {part: value}
+        return Constraints.from_mapping(value)
+
+    for value in taken:
+        found = read(value)
+        for part in key.split("."):
+            found = getattr(found, part)
+        assert (len(found) == len(value)) if key == "origin.exclude" else (found == value)
+    for value in refused:
+        with pytest.raises(ConfigError, match=key.replace(".", r"\.")):
+            read(value)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_an_excluded_box_is_given_from_low_to_high_and_may_be_flat(axis):
+    low, high = [0.0, 0.0, 0.0], [1.0, 1.0, 1.0]
+    low[axis] = 1.0
+    read = Constraints.from_mapping({"origin": {"exclude": [{"low_m": low, "high_m": high}]}})
+    assert read.origin.exclude[0].low_m == low
+    low[axis] = 1.5
+    with pytest.raises(ConfigError, match=f"above high_m along {'xyz'[axis]}"):
+        Constraints.from_mapping({"origin": {"exclude": [{"low_m": low, "high_m": high}]}})
+
+
+def test_a_read_out_without_numbers_has_those_of_a_photon_counter():
+    budget = Constraints().budget
+    assert (budget.bin_ps, budget.bits_per_bin, budget.rate_hz) == (100.0, 40.0, 10.0)
+
+
+@pytest.mark.parametrize("other", ["min", "max"])
+def test_a_number_of_sensors_is_given_in_one_form(other):
+    with pytest.raises(ConfigError, match="either count, or min and max"):
+        Constraints.from_mapping({"sensors": {"count": 2, other: 2}})
+    assert Constraints.from_mapping({"sensors": {"min": 2, "max": 2}}).sensors.count is None
+
+
+def test_constraints_that_were_read_cannot_be_changed():
+    constraints = Constraints.from_mapping({"gate": {"width_m": {"max": 0.5}}})
+    with pytest.raises(ValidationError, match="frozen"):
+        constraints.gate.width_m.max = 0.6
+
+
+@pytest.mark.parametrize("values", [[], "gate", 3, False, ()])
+def test_what_is_no_mapping_is_named(values):
+    with pytest.raises(ConfigError, match=f"found one {type(values).__name__}"):
+        Constraints.from_mapping(values)
+
+
+def test_the_place_of_an_error_without_a_file_is_what_the_caller_says():
+    with pytest.raises(ConfigError) as caught:
+        Constraints.from_mapping({"gates": {}}, where="--constraints")
+    assert "--constraints" in str(caught.value)
+
+
 def test_positions_of_errors_come_from_the_file():
     def locate(path, *, key=False):
         return f"c.yaml:{len(path)}:{int(key)}"
@@ -138,6 +227,17 @@ def test_entries_of_each_lie_over_the_common_keys():
     assert constraints.of_sensor(1).gate.width_m.max == 0.5
     assert constraints.of_sensor(7).gate.width_m.max == 0.5
     assert constraints.as_document() == values
+
+
+def test_an_entry_of_each_is_named_where_a_key_stands_in_it():
+    constraints = Constraints.from_mapping(
+        {"gate": {"width_m": {"min": 0.1}}, "each": [{"gate": {"width_m": {"max": 0.2}}}, {}]}
+    )
+    assert constraints.name_of(0, "gate.width_m.max") == "each[0].gate.width_m.max"
+    assert constraints.name_of(0, "gate.width_m.min") == "gate.width_m.min"
+    assert constraints.name_of(0, "gate.width_m.max.deeper") == "gate.width_m.max.deeper"
+    assert constraints.name_of(1, "gate.width_m.max") == "gate.width_m.max"
+    assert constraints.name_of(2, "gate.width_m.max") == "gate.width_m.max"
 
 
 def test_empty_sections_say_nothing():
