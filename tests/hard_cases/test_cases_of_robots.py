@@ -1,0 +1,333 @@
+"""Hard cases of moving robots: motions that MuJoCo cannot vouch for, poses out of reach, files where none belong."""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from pathlib import Path
+
+import mink
+import mujoco
+import numpy as np
+import pytest
+from cases import hard_case
+from lidardesign_tasks import arm_motion
+from lidardesign_tasks.arm import ArmTask
+from lidardesign_tasks.arm_engine import mujoco_warnings
+from lidardesign_tasks.arm_files import MAX_INCLUDES, model_files
+from lidardesign_tasks.arm_links import BALL
+from lidardesign_tasks.arm_motion import PENETRATION_M, POSITION_RESIDUAL_M, TRIES, Arm, RejectedError, draw_waypoints
+from lidardesign_tasks.arm_robot import load_robot
+from test_arm_robot import TOOL_M, mjcf, written
+
+from lidardesign.errors import DataError
+
+TASK = ArmTask()
+FREE = "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
+WARNINGS = [mujoco.mjtWarning(number) for number in range(int(mujoco.mjtWarning.mjNWARNING))]
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return Arm(load_robot(None, TOOL_M), 1.0)
+
+
+def in_a_folder_of_its_own(action):
+    """What an action gives, and the names of the files that it leaves in the working folder."""
+    here = Path.cwd()
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        try:
+            return action(), sorted(path.name for path in Path(folder).iterdir())
+        finally:
+            os.chdir(here)
+
+
+def step_with_nan():
+    """A step of a body whose velocity is NaN: what remains of its time and velocity."""
+    model = mujoco.MjModel.from_xml_string(FREE)
+    data = mujoco.MjData(model)
+    data.time, data.qvel[0] = 1.0, np.nan
+    mujoco.mj_step(model, data)
+    return data.time, float(data.qvel[0])
+
+
+@hard_case(
+    "M1",
+    "A rollout is unstable: MuJoCo warns, bodies sink into each other, numbers are NaN",
+    done="the motion is rejected and drawn anew, at most 50 times, from the stream of the run's seed; how often and "
+    "why is kept with the scene and noted; where none can be done learning is refused with the reasons",
+)
+class TestUnstableRollouts:
+    @staticmethod
+    def broke():
+        """A NaN velocity, and a box that falls on a plane in steps of half a second."""
+        with mujoco_warnings() as warnings:
+            time_s, velocity = step_with_nan()
+            falling = FREE.replace(
+                "<worldbody>", "<option timestep='0.5'/><worldbody><geom type='plane' size='9 9 1'/>"
+            )
+            model = mujoco.MjModel.from_xml_string(falling.replace("<body>", "<body pos='0 0 1'>"))
+            data, lowest, said = mujoco.MjData(model), 1.0, len(warnings)
+            for _ in range(40):
+                mujoco.mj_step(model, data)
+                lowest = min(lowest, float(data.qpos[2]))
+        return (
+            f"after a NaN velocity MuJoCo puts the body back to time {time_s:g} s and velocity {velocity:g} and goes on; "
+            f"in steps of 0.5 s a ball on the floor sinks {1 - lowest:.1g} m into it with {len(warnings) - said} warnings"
+        )
+
+    @pytest.mark.parametrize("warning", WARNINGS, ids=lambda w: w.name)
+    def test_any_warning_of_mujoco_rejects_the_motion(self, arm, warning):
+        data = mujoco.MjData(arm.robot.model)
+        arm._check_state(data)
+        data.warning[warning].number = 1
+        with pytest.raises(RejectedError, match="warned"):
+            arm._check_state(data)
+
+    @pytest.mark.parametrize("name", ["qpos", "qacc", "xpos"])
+    @pytest.mark.parametrize("value", [math.nan, math.inf])
+    def test_numbers_that_are_not_finite_reject_the_motion(self, arm, name, value):
+        data = mujoco.MjData(arm.robot.model)
+        getattr(data, name).flat[0] = value
+        with pytest.raises(RejectedError, match="diverged"):
+            arm._check_state(data)
+
+    def test_a_motion_whose_velocities_overflow_is_rejected(self, arm):
+        joints = np.zeros((3, 7))
+        joints[1] = 1e200
+        with mujoco_warnings(), pytest.raises(RejectedError):
+            arm._forward(joints, 1.0)
+        joints[1] = math.nan
+        with mujoco_warnings(), pytest.raises(RejectedError):
+            arm._forward(joints, 1.0)
+
+    def test_links_that_are_deeper_in_each_other_than_the_tolerance_reject_the_motion(self, arm):
+        folded = np.tile([0.0, 1.2, 0.0, -2.05, 0.0, 1.5, 0.0], (3, 1))  # the tool reaches into the pedestal
+        with pytest.raises(RejectedError, match="collide"):
+            arm._forward(folded, 1.0)
+        data = mujoco.MjData(arm.robot.model)
+        data.qpos[:] = folded[0]
+        mujoco.mj_forward(arm.robot.model, data)
+        assert data.contact.dist[: data.ncon].min() < -PENETRATION_M
+
+    def test_rejected_motions_are_drawn_again_counted_and_noted(self):
+        config = TASK.Config(train=6, frames=6, jitter_m=0.3)
+        made = TASK.scenes(config, "train", 0)
+        counted = sum((Counter(scene.truth["rejected"]) for scene in made), Counter())
+        assert len(made) == 6
+        assert counted.total() > 0
+        (note,) = made[0].notes
+        assert note.startswith("train: motions that the arm cannot do were drawn again: ")
+        assert all(f"{count} {reason}" in note for reason, count in counted.items())
+        again = TASK.scenes(config, "train", 0)
+        for first, second in zip(made, again, strict=True):  # the seed tells which ones were rejected
+            assert first.truth["rejected"] == second.truth["rejected"]
+            np.testing.assert_array_equal(first.truth["ball_m"], second.truth["ball_m"])
+
+    def test_an_arm_that_always_fails_is_given_up_after_so_many_tries(self, arm, monkeypatch):
+        tried = []
+
+        def unstable(self, data):
+            tried.append(data)
+            raise RejectedError("MuJoCo warned")
+
+        monkeypatch.setattr(Arm, "_check_state", unstable)
+        match = rf"none of {TRIES} drawn motions \({TRIES} MuJoCo warned\)"
+        with pytest.raises(DataError, match=match) as refused:
+            arm.draw(0.1, 3, 0.5, np.random.default_rng(0), "train 0")
+        assert len(tried) == TRIES
+        assert "trajectory train 0" in str(refused.value)
+        assert refused.value.exit_code == 3
+
+
+@hard_case(
+    "M2",
+    "Inverse kinematics has no solution: the place is out of reach",
+    done="the pose's error is checked against 1 mm and half a degree after every way-point; the motion is drawn anew, "
+    "and an arm that reaches nothing is refused with the reasons",
+)
+class TestPosesOutOfReach:
+    @staticmethod
+    def broke():
+        """mink, asked for a place 3 m away."""
+        robot = load_robot(None, TOOL_M)
+        configuration = mink.Configuration(robot.model)
+        configuration.update(robot.home_rad)
+        task = mink.FrameTask(BALL, "site", position_cost=1.0, orientation_cost=0.0)
+        target = np.array([3.0, 0.0, 0.5])
+        task.set_target(mink.SE3.from_translation(target))
+        for _ in range(60):
+            velocity = mink.solve_ik(configuration, [task], 1.0, "daqp", limits=[mink.ConfigurationLimit(robot.model)])
+            configuration.integrate_inplace(velocity, 1.0)
+        off = float(np.linalg.norm(configuration.data.site_xpos[robot.model.site(BALL).id] - target))
+        return f"mink raises nothing for a place out of reach: after 60 steps the ball is {off:.1f} m away from it"
+
+    @pytest.mark.parametrize("away", [(1.0, 0, 0), (0, 0, 1.5), (0, -2.0, 0), (1e6, 0, 0)])
+    def test_a_place_out_of_reach_is_rejected(self, arm, away):
+        far = draw_waypoints(0.1, np.random.default_rng(0)) + np.array(away)
+        with pytest.raises(RejectedError, match="out of reach"):
+            arm.follow(far, 10, 1.0, Counter())
+
+    def test_a_place_that_is_no_place_is_rejected(self, arm):
+        nowhere = draw_waypoints(0.1, np.random.default_rng(0))
+        nowhere[3] = np.nan
+        with pytest.raises(RejectedError):
+            arm.follow(nowhere, 10, 1.0, Counter())
+
+    def test_what_is_not_rejected_is_where_it_should_be(self, arm):
+        waypoints = draw_waypoints(0.1, np.random.default_rng(4))
+        motion = arm.follow(waypoints, 20, 4.0, Counter())
+        planned = arm_motion.ball_path(waypoints, np.linspace(0, 1, 20))
+        assert np.linalg.norm(motion.ball_m - planned, axis=1).max() <= POSITION_RESIDUAL_M
+
+    def test_an_arm_that_reaches_nothing_is_refused_with_the_reasons(self, arm, monkeypatch):
+        monkeypatch.setattr(arm_motion, "HOVER_M", np.array([5.0, 0.0, 0.35]))
+        with pytest.raises(DataError, match=rf"none of {TRIES} drawn motions \({TRIES} out of reach\)"):
+            arm.draw(0.1, 4, 1.0, np.random.default_rng(0), "train 0")
+
+
+@hard_case(
+    "M3",
+    "MuJoCo warns: it writes MUJOCO_LOG.TXT into the working folder",
+    done="warnings are collected while robots are read and moved, become notes or reasons, and no file is written",
+)
+class TestNoLogFile:
+    @staticmethod
+    def broke():
+        """A step with a NaN velocity, outside of the program."""
+        _, left = in_a_folder_of_its_own(step_with_nan)
+        return f"one step with a NaN velocity leaves {', '.join(left) or 'nothing'} in the working folder"
+
+    def test_warnings_are_collected_and_the_handler_is_put_back(self):
+        before = mujoco.get_mju_user_warning()
+
+        def collected():
+            with mujoco_warnings() as warnings:
+                step_with_nan()
+            return warnings
+
+        warnings, left = in_a_folder_of_its_own(collected)
+        assert any("QVEL" in line or "Nan" in line for line in warnings)
+        assert mujoco.get_mju_user_warning() is before
+        assert left == []
+
+    def test_the_handler_is_put_back_after_an_error_as_well(self):
+        before = mujoco.get_mju_user_warning()
+        with pytest.raises(RejectedError), mujoco_warnings():
+            raise RejectedError("out of reach")
+        assert mujoco.get_mju_user_warning() is before
+
+    def test_an_unstable_motion_leaves_no_file(self, arm):
+        def rejected():
+            joints = np.full((3, 7), 1e200)
+            joints[1] = -1e200
+            with pytest.raises(RejectedError), mujoco_warnings():
+                arm._forward(joints, 1e-200)
+
+        assert in_a_folder_of_its_own(rejected)[1] == []
+
+    def test_a_robot_that_cannot_be_read_leaves_no_file(self):
+        def refused():
+            with pytest.raises(DataError):
+                load_robot(written(Path.cwd(), mjcf(inside='<asset><mesh name="m" file="m.obj"/></asset>')), TOOL_M)
+
+        assert in_a_folder_of_its_own(refused)[1] == ["arm.xml"]
+
+    def test_no_log_file_is_written_and_importing_the_task_imports_no_mujoco(self, tmp_path):
+        code = (
+            "import sys; from lidardesign_tasks.arm import ArmTask as T; "
+            "assert not {'mujoco', 'mink', 'scipy'} & set(sys.modules), sorted(sys.modules); "
+            "c = T.Config(size='small', train=1, frames=4); T().scenes(c, 'train', 0); assert 'mujoco' in sys.modules"
+        )
+        subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True, timeout=120)
+        assert not list(tmp_path.iterdir())
+
+
+OUTSIDE = {
+    "an include of the folder above": '<mujoco><include file="../other.xml"/></mujoco>',
+    "an absolute include": '<mujoco><include file="/etc/hostname"/></mujoco>',
+    "an include by way of a folder inside": '<mujoco><include file="parts/../../other.xml"/></mujoco>',
+    "an attached model": '<mujoco><asset><model name="m" file="../other.xml"/></asset></mujoco>',
+    "an absolute mesh": '<mujoco><asset><mesh name="m" file="/etc/passwd"/></asset></mujoco>',
+    "a folder of meshes above": '<mujoco><compiler meshdir=".."/><asset><mesh name="m" file="a.stl"/></asset></mujoco>',
+    "a folder of textures elsewhere": '<mujoco><compiler texturedir="/tmp"/></mujoco>',
+    "a side of a texture": '<mujoco><asset><texture type="cube" fileright="../t.png"/></asset></mujoco>',
+    "a height field": '<mujoco><asset><hfield name="h" file="../h.png"/></asset></mujoco>',
+    "a skin": '<mujoco><asset><skin file="../s.skn"/></asset></mujoco>',
+}
+
+
+@hard_case(
+    "M4",
+    "A robot's XML reads files outside of its folder: includes, meshes, links, entities",
+    done="every file that a model names is resolved, links followed, before MuJoCo sees the model; one outside the "
+    "model's folder is refused with its name",
+)
+class TestFilesOutsideTheFolder:
+    @staticmethod
+    def broke():
+        """MuJoCo itself, with an include of a file beside the model's folder."""
+        with tempfile.TemporaryDirectory() as folder:
+            model = Path(folder) / "model"
+            model.mkdir()
+            written(Path(folder), "<mujoco><worldbody><body name='secret'/></worldbody></mujoco>", "other.xml")
+            path = written(model, OUTSIDE["an include of the folder above"])
+            with mujoco_warnings():
+                read = mujoco.MjModel.from_xml_path(str(path))
+        return f"MuJoCo reads {read.nbody - 1} body out of a file beside the model's folder without a word"
+
+    @pytest.mark.parametrize("case", OUTSIDE)
+    def test_what_leads_out_of_the_folder_is_refused(self, tmp_path, case):
+        (tmp_path / "model").mkdir()
+        written(tmp_path, "<mujoco/>", "other.xml")
+        path = written(tmp_path / "model", OUTSIDE[case])
+        with pytest.raises(DataError, match="outside the model's folder") as refused:
+            load_robot(path, TOOL_M)
+        assert str(path) in str(refused.value)
+
+    def test_an_included_file_leads_no_further_out(self, tmp_path):
+        (tmp_path / "model").mkdir()
+        written(tmp_path / "model", '<mujoco><include file="../third.xml"/></mujoco>', "second.xml")
+        path = written(tmp_path / "model", '<mujoco><include file="second.xml"/></mujoco>')
+        with pytest.raises(DataError, match=r"'\.\./third\.xml', which is outside"):
+            load_robot(path, TOOL_M)
+
+    def test_a_link_out_of_the_models_folder_is_refused(self, tmp_path):
+        (tmp_path / "model").mkdir()
+        outside = written(tmp_path, "v 0 0 0", "secret.obj")
+        (tmp_path / "model" / "m.obj").symlink_to(outside)
+        path = written(tmp_path / "model", mjcf(inside='<asset><mesh name="m" file="m.obj"/></asset>'))
+        with pytest.raises(DataError, match="outside the model's folder"):
+            load_robot(path, TOOL_M)
+
+    @pytest.mark.parametrize(
+        "text",
+        [
+            '<!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/passwd">]><mujoco model="&x;"/>',
+            '<!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/passwd">]><mujoco>&x;</mujoco>',
+        ],
+    )
+    def test_an_entity_reads_no_file(self, tmp_path, text):
+        path = written(tmp_path, text)
+        with pytest.raises(DataError) as refused:
+            model_files(path)
+        assert str(path) in str(refused.value)
+        assert "root:" not in str(refused.value)
+
+    def test_includes_inside_the_folder_are_read_and_watched(self, tmp_path):
+        body = mjcf().replace("<mujoco>", "").replace("</mujoco>", "")
+        included = written(tmp_path, f"<mujoco>{body}</mujoco>", "body.xml")
+        path = written(tmp_path, '<mujoco><include file="body.xml"/></mujoco>')
+        assert [Path(name) for name, *_ in model_files(path)] == [path, included]
+        assert load_robot(path, TOOL_M).model.njnt == 7
+
+    def test_more_includes_than_anybody_needs_are_refused(self, tmp_path):
+        for number in range(MAX_INCLUDES + 2):
+            written(tmp_path, f'<mujoco><include file="{number + 1}.xml"/></mujoco>', f"{number}.xml")
+        with pytest.raises(DataError, match=f"more than {MAX_INCLUDES}"):
+            model_files(tmp_path / "0.xml")
