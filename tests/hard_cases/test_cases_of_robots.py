@@ -77,8 +77,8 @@ class TestUnstableRollouts:
                 mujoco.mj_step(model, data)
                 lowest = min(lowest, float(data.qpos[2]))
         return (
-            f"after a NaN velocity MuJoCo puts the body back to time {time_s:g} s and velocity {velocity:g} and goes on; "
-            f"in steps of 0.5 s a ball on the floor sinks {1 - lowest:.1g} m into it with {len(warnings) - said} warnings"
+            f"after a NaN velocity MuJoCo puts the body back to {time_s:g} s and velocity {velocity:g} and goes on; in "
+            f"steps of 0.5 s a ball on the floor sinks {1 - lowest:.1g} m into it, with {len(warnings) - said} warnings"
         )
 
     @pytest.mark.parametrize("warning", WARNINGS, ids=lambda w: w.name)
