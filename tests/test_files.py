@@ -259,7 +259,7 @@ BAD = [
     ("layout: grid", "layout: gird", ":2:9", "grid or density or scan"),
     ("layout: grid", "layuot: grid", ":2:", "layout"),
     ("rays: 10", "rays: 10.5", ":3:7", "whole number"),
-    ("rays: 10", "rays: -1", ":3:7", "at least 0"),
+    ("rays: 10", "rays: -1", ":3:7", "from 0"),
     ("rays: 10", "rays: yes", ":3:7", "whole number"),
     ("rays: 10", "rays: true", ":3:7", "whole number"),
     ("schema_version: 1", "schema_version: 2", ":1:17", "newer version"),

@@ -32,6 +32,7 @@ EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
 EXIT_TERMINATED = 143
 PLAIN_WIDTH = 120
+NO_MEMORY = "can't allocate memory"
 DISK_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 
 
@@ -190,7 +191,8 @@ def describe_error(error: BaseException, console: Console) -> tuple[dict[str, An
         further = console.when_interrupted()
         text = f"{kind}: {further}" if further else kind
         return {"kind": kind, "message": text}, code, text
-    if isinstance(error, MemoryError):
+    # torch says so by a name or by words of its own
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or NO_MEMORY in str(error):
         text = "the computer has no memory left; a smaller batch, field_resolution or preset needs less"
         return {"kind": "memory", "message": text}, EXIT_INTERNAL, f"memory error: {text}"
     if isinstance(error, OSError):

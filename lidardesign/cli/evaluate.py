@@ -52,7 +52,12 @@ Targets = Annotated[
 RayCounts = Annotated[
     list[int] | None,
     typer.Option(
-        "--rays", metavar="N", min=1, help="Rays per frame and position; repeatable.", show_default="the task's"
+        "--rays",
+        metavar="N",
+        min=1,
+        max=1_000_000,
+        help="Rays per frame and position; repeatable.",
+        show_default="the task's",
     ),
 ]
 Baseline = Annotated[

@@ -40,6 +40,7 @@ RayCount = Annotated[
         "--rays",
         metavar="N",
         min=1,
+        max=1_000_000,
         help="Rays per frame, over all sensors.",
         show_default="left open, or the task's most",
     ),

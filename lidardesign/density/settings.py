@@ -40,19 +40,22 @@ class DensitySettings(BaseModel):
 
 
 class LearningSettings(BaseModel):
-    """The flow, its optimiser and what is measured after training."""
+    """The flow, its optimiser and what is measured after training.
+
+    The largest numbers are what a large computer might bear; what is beyond them is a typing error.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    steps: int = Field(1000, ge=1, description="optimiser steps")
-    batch: int = Field(1024, ge=2, description="design points per step")
+    steps: int = Field(1000, ge=1, le=100_000_000, description="optimiser steps")
+    batch: int = Field(1024, ge=2, le=1_000_000, description="design points per step")
     rate: float = Field(1e-2, gt=0, description="initial Adam step size")
     frames: int = Field(
-        256, ge=1, description="scenes and frames that stand for all in each path-wise step, drawn anew"
+        256, ge=1, le=1_000_000, description="scenes and frames that stand for all in each path-wise step, drawn anew"
     )
     layers: int = Field(3, ge=1, le=32, description="autoregressive spline layers per block of the chain")
-    hidden: int = Field(96, ge=4, description="hidden width of each layer's network")
-    bins: int = Field(16, ge=2, description="spline bins per dimension")
+    hidden: int = Field(96, ge=4, le=8_192, description="hidden width of each layer's network")
+    bins: int = Field(16, ge=2, le=1_024, description="spline bins per dimension")
     dtype: Literal["float64", "float32"] = Field(
         "float32", description="arithmetic of training steps; samples and densities are always float64"
     )
@@ -62,11 +65,17 @@ class LearningSettings(BaseModel):
     )
     anneal: float = Field(0.7, ge=0, le=1, description="share of the path-wise steps over which sigma falls")
     balance: float = Field(0.5, ge=0, le=1, description="share of the steps, the last ones, that balance by values")
-    balance_proposals: int = Field(65536, ge=256, description="independent proposals that balancing draws from")
+    balance_proposals: int = Field(
+        65536, ge=256, le=10_000_000, description="independent proposals that balancing draws from"
+    )
     clip_norm: float = Field(5.0, gt=0, description="gradient norm that steps are clipped to")
     checkpoint_seconds: float = Field(20.0, gt=0, description="time between checkpoints [s]")
-    samples: int = Field(100_000, ge=1000, description="fresh samples for ESS, KL, log Z, fit and constrain")
-    coverage_proposals: int = Field(8192, ge=256, description="independent proposals that coverage is measured on")
+    samples: int = Field(
+        100_000, ge=1000, le=10_000_000, description="fresh samples for ESS, KL, log Z, fit and constrain"
+    )
+    coverage_proposals: int = Field(
+        8192, ge=256, le=10_000_000, description="independent proposals that coverage is measured on"
+    )
 
 
 PRESET_LEARNING: dict[str, dict[str, Any]] = {

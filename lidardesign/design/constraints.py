@@ -23,6 +23,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import ConfigError
 from lidardesign.run.validation import check_model
 
@@ -31,6 +32,9 @@ Distance = Annotated[float, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
 # The boxes between excluded ones grow faster than their number: with so many a fit still takes seconds.
 MOST_EXCLUDED = 32
+# So many components of a mixture over all samples fill some 100 MB; a scan has its rays instead.
+MOST_FITTED = 1000
+Count = Annotated[int, Field(ge=1, le=MOST_FITTED)]
 
 
 class _Keys(BaseModel):
@@ -42,9 +46,9 @@ class _Keys(BaseModel):
 class SensorCount(_Keys):
     """`{count: 4}` or `{min: 1, max: 8}`."""
 
-    count: Annotated[int, Field(ge=1)] | None = None
-    min: Annotated[int, Field(ge=1)] | None = None
-    max: Annotated[int, Field(ge=1)] | None = None
+    count: Count | None = None
+    min: Count | None = None
+    max: Count | None = None
 
     @model_validator(mode="after")
     def _one_form(self) -> SensorCount:
@@ -145,7 +149,7 @@ class Gate(_Keys):
 class Budget(_Keys):
     """Rays per frame and the read-out of the whole design."""
 
-    rays: Annotated[int, Field(ge=1)] | None = None
+    rays: Annotated[int, Field(ge=1, le=MOST_RAYS)] | None = None
     bandwidth_mbps: Positive | None = None
     bin_ps: Positive = 100.0
     bits_per_bin: Positive = 40.0

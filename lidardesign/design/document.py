@@ -86,7 +86,8 @@ class Node:
         value = self.value
         top = math.inf if high is None else high
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= top:
-            raise self.wrong(f"a whole number{_between(low, top)}")
+            between = f" of at least {low}" if high is None else f" from {low} to {high}"
+            raise self.wrong(f"a whole number{between}")
         return value
 
     def text(self) -> str:

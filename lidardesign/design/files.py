@@ -20,6 +20,7 @@ from lidardesign.design.document import Locate, Node
 from lidardesign.design.sensor import (
     DEFAULT_LEVEL,
     LEVELS,
+    MOST_RAYS,
     Coupling,
     Design,
     RayTable,
@@ -187,7 +188,7 @@ def design_from_document(
     keys = _versioned(root).mapping(REQUIRED, OPTIONAL)
     level = keys["level"].number(*LEVELS) if "level" in keys else DEFAULT_LEVEL
     sensors = _sensors(keys["sensors"], level)
-    rays = keys["rays"].integer(0) if "rays" in keys else None
+    rays = keys["rays"].integer(0, MOST_RAYS) if "rays" in keys else None
     table = _ray_table(keys["ray_table"], len(sensors)) if "ray_table" in keys else None
     track = read_track(keys["track"], len(sensors)) if "track" in keys else None
     _check_rays(keys, sensors, rays, table, track)
@@ -270,7 +271,7 @@ def _sensor(node: Node, index: int, level: float) -> Sensor:
         range_m=range_m,
         spread_range_m=spread_range,
         level=level,
-        rays=keys["rays"].integer(0) if "rays" in keys else None,
+        rays=keys["rays"].integer(0, MOST_RAYS) if "rays" in keys else None,
         coupling=_coupling(keys["coupling"]) if "coupling" in keys else None,
     )
     if "travel_m" in keys:

@@ -12,7 +12,7 @@ import numpy as np
 from lidardesign.design.budget import ReadOut, within_budget
 from lidardesign.design.check import ConstraintCheck, check_design
 from lidardesign.design.conditions import fixed_conditions
-from lidardesign.design.constraints import Constraints
+from lidardesign.design.constraints import MOST_FITTED, Constraints
 from lidardesign.design.coupling import couplings
 from lidardesign.design.ensemble import Ensemble, Part, fit_parts, heaviest_first, sensors_of
 from lidardesign.design.feasibility import check_feasible, least_sensors
@@ -25,7 +25,7 @@ from lidardesign.design.rays import Gates, make_ray_table, own_gates, split_budg
 from lidardesign.design.resolve import bounds_of, groups
 from lidardesign.design.samples import Samples
 from lidardesign.design.scan import fit_scan, rays_of
-from lidardesign.design.sensor import DEFAULT_LEVEL, Design, Layout, Sensor, interval_factor
+from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, Design, Layout, Sensor, interval_factor
 from lidardesign.design.support import Retarget, Support, check_support, pinned, restricted
 from lidardesign.design.track_fit import fit_track
 from lidardesign.design.uncertainty import fit_estimates, likelihood_error
@@ -176,10 +176,12 @@ def _check_options(
     """Options against each other and against the constraints, before anything is computed."""
     if isinstance(sensors, str) and sensors != "auto":
         raise ConfigError(f"{sensors!r} sensors", where="--sensors", allowed="a whole number, or auto")
-    if isinstance(sensors, int) and sensors < 1:
-        raise ConfigError(f"{sensors} sensors", where="--sensors", allowed="1 or more")
-    if rays is not None and rays < 1:
-        raise ConfigError(f"{rays} rays", where="--rays", allowed="1 or more")
+    if isinstance(sensors, int) and not 1 <= sensors <= MOST_FITTED:
+        raise ConfigError(
+            f"{sensors} sensors", where="--sensors", allowed=f"1 to {MOST_FITTED}", hint="--layout scan has one per ray"
+        )
+    if rays is not None and not 1 <= rays <= MOST_RAYS:
+        raise ConfigError(f"{rays} rays", where="--rays", allowed=f"1 to {MOST_RAYS}")
     if samples.space.conditioned and layout != "scan":
         names = [DIMENSIONS[index] for index in samples.space.conditioned]
         raise ConfigError(

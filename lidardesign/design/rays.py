@@ -24,7 +24,7 @@ from lidardesign.design.membership import Members, members
 from lidardesign.design.quantise import lloyd, samples_for
 from lidardesign.design.resolve import bounds_of, groups
 from lidardesign.design.samples import Samples
-from lidardesign.design.sensor import Design, Layout, RayTable, Sensor, interval_factor, tangent_directions
+from lidardesign.design.sensor import MOST_RAYS, Design, Layout, RayTable, Sensor, interval_factor, tangent_directions
 from lidardesign.design.support import Retarget
 from lidardesign.design.track import moved, placed
 from lidardesign.errors import ConfigError
@@ -59,8 +59,8 @@ def split_budget(weights: np.ndarray, count: int) -> np.ndarray:
         raise ConfigError(
             "weights are negative, not finite or all zero", where="budget", allowed="0 or more, one above 0"
         )
-    if count < 0 or count != int(count):
-        raise ConfigError(f"{count} rays", where="budget", allowed="a whole number of 0 or more")
+    if not 0 <= count <= MOST_RAYS or count != int(count):
+        raise ConfigError(f"{count} rays", where="budget", allowed=f"a whole number from 0 to {MOST_RAYS}")
     scaled = weights / weights.max()
     quotas = scaled / scaled.sum() * count
     shares = np.floor(quotas).astype(np.int64)

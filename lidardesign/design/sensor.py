@@ -24,6 +24,8 @@ from lidardesign.space import direction
 DEFAULT_LEVEL = 0.95
 # Beyond these an interval is next to nothing, or next to everything, of a normal distribution.
 LEVELS = (0.01, 0.999999)
+# Returns of so many fill some 100 MB per scene; no scanner fires more in a frame.
+MOST_RAYS = 1_000_000
 Layout = Literal["grid", "density", "scan", "distributed"]
 
 

@@ -14,6 +14,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.placement import opened_gate, rays_at
 from lidardesign.numerics import EPSILON
@@ -21,8 +22,6 @@ from lidardesign.simulate.returns import Rays
 from lidardesign.space import RANGE, DesignSpace
 
 CENTRAL_SHARE = 0.99
-# Their returns fill some 100 MB per scene; a design of the task's own ranges compares with far fewer.
-MOST_RAYS = 1_000_000
 
 Positions = tuple[Rays, ...]  # one list of rays per condition value, in the task's order
 
