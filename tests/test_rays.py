@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from lidardesign.design.grid import grid_rows, grid_tangent
 from lidardesign.design.membership import log_density, members, seen_from
-from lidardesign.design.rays import lay_out, make_ray_table, own_count, split_budget
+from lidardesign.design.rays import gates_of, lay_out, make_ray_table, own_count, own_gates, refitted, split_budget
 from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import (
     Design,
@@ -20,6 +20,7 @@ from lidardesign.design.sensor import (
     tangent_directions,
 )
 from lidardesign.errors import ConfigError
+from lidardesign.run.clock import running
 from lidardesign.space import DesignSpace, angles, direction
 
 SPACE = DesignSpace((-5, -5, -5, 0, -math.pi / 2, 0), (5, 5, 5, 2 * math.pi, math.pi / 2, 10))
@@ -122,11 +123,24 @@ def test_fewer_rays_than_sensors_leave_some_without():
 
 @pytest.mark.parametrize(
     ("weights", "count"),
-    [([], 3), ([0.0, 0.0], 3), ([-1.0, 2.0], 3), ([np.nan], 3), ([1.0], -1), ([1.0], 2.5)],
+    [
+        *[([], 3), ([0.0, 0.0], 3), ([-1.0, 2.0], 3), ([np.nan], 3), ([1.0, np.inf], 3), ([1.0], -1), ([1.0], 2.5)],
+        *[([[0.5, 0.5]], 3), (1.0, 3)],
+    ],
 )
 def test_a_budget_that_cannot_be_split_is_refused(weights, count):
     with pytest.raises(ConfigError, match="budget"):
         split_budget(np.array(weights), count)
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-160, 1e160, 1e300])
+def test_weights_of_any_size_share_a_budget(scale):
+    assert split_budget(np.array([3.0, 1.0]) * scale, 100).tolist() == [75, 25]
+
+
+def test_shares_that_differ_in_the_tenth_decimal_tie_and_in_the_ninth_do_not():
+    assert split_budget(np.array([0.5 - 1e-10, 0.5 + 1e-10]), 1).tolist() == [1, 0]
+    assert split_budget(np.array([0.5 - 2e-9, 0.5 + 2e-9]), 1).tolist() == [0, 1]
 
 
 # --- grids
@@ -242,6 +256,38 @@ def test_rays_of_each_sensor_can_be_fixed_by_the_design():
     assert np.bincount(lay_out(design, 10).sensor).tolist() == [5, 3, 2]
 
 
+def test_a_frame_lasts_a_tenth_of_a_second_unless_told_otherwise():
+    design = Design("d", three_sensors())
+    np.testing.assert_allclose(lay_out(design, 8).time_s, np.arange(8) / 80.0)
+    np.testing.assert_array_equal(lay_out(design, 8, rate_hz=10.0).time_s, lay_out(design, 8).time_s)
+
+
+def test_a_sensor_may_have_no_rays_of_its_own_number():
+    own = tuple(replace(s, rays=n) for s, n in zip(three_sensors(), (0, 2, 30), strict=True))
+    design = Design("d", own)
+    assert own_count(design) == 32
+    assert np.bincount(lay_out(design).sensor, minlength=3).tolist() == [0, 2, 30]
+
+
+def test_a_design_was_made_for_the_number_that_it_names_then_for_that_of_its_table_then_of_its_sensors():
+    own = tuple(replace(s, rays=n) for s, n in zip(three_sensors(), (1, 2, 30), strict=True))
+    table = make_ray_table(Design("d", own), 40)
+    assert own_count(Design("d", own, rays=7, ray_table=table)) == 7
+    assert own_count(Design("d", own, ray_table=table)) == 40
+    assert own_count(Design("d", own, layout="scan")) == 33
+    assert own_count(Design("d", three_sensors(), layout="scan")) == 3
+
+
+def test_a_table_is_laid_out_anew_whatever_table_the_design_has_and_its_time_is_that_of_rays():
+    design = Design("d", three_sensors())
+    narrow = replace(design, sensors=three_sensors(spread_horizontal_rad=0.01))
+    old = replace(design, ray_table=make_ray_table(narrow, 40))
+    with running() as clock:
+        table = make_ray_table(old, 40)
+    np.testing.assert_array_equal(table.azimuth_rad, make_ray_table(design, 40).azimuth_rad)
+    assert list(clock.timings()) == ["rays", "other"]
+
+
 def test_a_design_without_a_number_of_rays_asks_for_one():
     with pytest.raises(ConfigError, match="--rays"):
         lay_out(Design("d", three_sensors()))
@@ -279,6 +325,38 @@ def test_a_density_layout_needs_samples_unless_its_table_has_that_many_rays():
     assert len(lay_out(design, 0)) == 0
 
 
+def test_as_many_samples_as_rays_are_the_rays_row_by_row_upwards():
+    design = Design("d", (sensor(),), layout="density")
+    samples = drawn_from(design, 40)
+    inside = members(design, samples.points, samples.weights)[0].tangent
+    exact = coordinates(design, lay_out(design, len(inside), samples))
+    np.testing.assert_allclose(exact, inside[np.lexsort((inside[:, 0], inside[:, 1]))], atol=1e-9)
+    one_more = coordinates(design, lay_out(design, len(inside) + 1, samples))
+    even = coordinates(design, lay_out(replace(design, layout="grid"), len(inside) + 1))
+    np.testing.assert_array_equal(one_more, even)
+
+
+def test_rays_of_a_density_layout_follow_the_seed_and_their_order_does_not():
+    design = Design("d", (sensor(),), layout="density")
+    samples = drawn_from(design)
+    one, other = (coordinates(design, lay_out(design, 30, samples, seed=seed)) for seed in (0, 1))
+    assert not np.array_equal(one, other)
+    np.testing.assert_array_equal(one, coordinates(design, lay_out(design, 30, samples)))
+    for rays in (one, other):
+        assert (np.diff(rays[:, 1]) >= -1e-12).all()
+
+
+def test_what_is_missing_is_said_with_the_number_of_rays_that_the_design_has():
+    design = Design("d", three_sensors(), layout="density", rays=40)
+    kept = replace(design, ray_table=make_ray_table(design, 40, drawn_from(design)))
+    words = r"41 rays in the layout `density`(.|\n)*40 rays(.|\n)*fit RUN --layout density --rays 41"
+    with pytest.raises(ConfigError, match=words):
+        lay_out(kept, 41)
+    with pytest.raises(ConfigError, match="gates per ray need samples") as caught:
+        lay_out(Design("d", three_sensors()), 41, gates="ray")
+    assert caught.value.allowed is None
+
+
 def test_a_sensor_with_too_few_samples_falls_back_to_the_grid():
     design = Design("d", three_sensors(), layout="density")
     few = drawn_from(design).subset(np.arange(5))
@@ -309,7 +387,137 @@ def test_a_scan_of_another_number_of_rays_is_fitted_anew_and_keeps_its_constrain
     assert (lay_out(design, 40, samples).direction == rays.direction).all()
 
 
+def test_a_refit_is_remembered_by_number_and_seed():
+    design, samples = Design("d", three_sensors(), layout="scan"), drawn_from(Design("d", three_sensors()), 600)
+    first = refitted(design, 5, samples)
+    assert refitted(design, 5, samples, 0) is first
+    assert refitted(design, 5, samples, 1) is not first
+    assert refitted(design, 6, samples) is not first
+    assert (first.name, len(first.sensors), first.level) == ("d", 5, design.level)
+    with pytest.raises(ConfigError, match="5 rays in the layout `scan`"):
+        refitted(design, 5, None)
+
+
+def test_a_scan_from_a_pinned_origin_is_not_fitted_anew_without_its_target():
+    pinned = {"origin": {"fixed_m": [0.1, -0.2, 0.3]}, "budget": {"rays": 3}}
+    design = Design("d", three_sensors(), layout="scan", constraints=pinned)
+    with pytest.raises(ConfigError, match=r"pinned origin(.|\n)*4 rays(.|\n)*3 rays(.|\n)*--layout scan --rays 4"):
+        lay_out(design, 4, drawn_from(design, 600))
+
+
+def test_one_ray_is_not_a_scan_of_three_sensors():
+    with pytest.raises(ConfigError, match="one ray of each"):
+        lay_out(Design("d", three_sensors(), layout="scan", rays=1))
+
+
+# --- conditions
+
+RAILS = DesignSpace(SPACE.low, SPACE.high, condition=("x_m",))
+
+
+def along_rails(design, count=4000):
+    """Samples of a design whose origins are anywhere along x."""
+    samples = drawn_from(design, count)
+    points = samples.points.copy()
+    points[:, 0] = np.random.default_rng(9).uniform(-5, 5, len(points))
+    return Samples(points, samples.log_prob, samples.log_target, RAILS)
+
+
+def no_target(points):
+    return np.zeros(len(points))
+
+
+def test_even_rays_ask_no_target_density_where_the_samples_have_conditions():
+    design = Design("d", three_sensors(), layout="grid", rays=30)
+    samples = along_rails(design)
+    np.testing.assert_array_equal(lay_out(design, 40, samples).direction, lay_out(design, 40).direction)
+    with pytest.raises(ConfigError, match="x_m"):
+        lay_out(design, 40, samples, gates="ray", at={"x_m": 1.0})
+    away = lay_out(design, 40, samples, gates="ray", at={"x_m": 1.0}, retarget=no_target)
+    assert (away.origin_m[:, 0] == 1.0).all()
+    assert len(np.unique(away.gate_m, axis=0)) > 3
+
+
+def test_a_density_layout_asks_the_target_density_at_its_place_unless_its_table_answers():
+    design = Design("d", three_sensors(), layout="density", rays=30)
+    samples = along_rails(design)
+    with pytest.raises(ConfigError, match="x_m"):
+        lay_out(design, 30, samples, at={"x_m": 1.0})
+    assert len(lay_out(design, 0, samples, at={"x_m": 1.0})) == 0
+    rays = lay_out(design, 30, samples, at={"x_m": 1.0}, retarget=no_target)
+    table = make_ray_table(design, 30, drawn_from(design))
+    kept = lay_out(replace(design, ray_table=table), 30, samples, at={"x_m": 1.0})
+    assert len(rays) == len(kept) == 30
+    np.testing.assert_array_equal(kept.origin_m[:, 0], 1.0)
+    np.testing.assert_allclose(angles(kept.direction)[0], table.azimuth_rad)
+
+
+def test_distributed_rays_are_laid_out_by_their_sensors_where_no_target_density_is_known():
+    spread = np.eye(3) * 0.01
+    design = Design("d", three_sensors(origin_covariance_m2=spread), layout="distributed", rays=30)
+    samples = along_rails(design)
+    alone, asked = lay_out(design, 30, at={"x_m": 1.0}), lay_out(design, 30, samples, at={"x_m": 1.0})
+    np.testing.assert_array_equal(alone.direction, asked.direction)
+    with_target = lay_out(design, 30, samples, at={"x_m": 1.0}, retarget=no_target)
+    assert not np.array_equal(with_target.direction, alone.direction)
+
+
 # --- gates
+
+
+@pytest.mark.parametrize(
+    ("layout", "samples", "wide", "expected"),
+    [
+        ("grid", True, (), "sensor"),
+        ("grid", True, (7,), "ray"),
+        ("grid", False, (7,), "sensor"),
+        ("distributed", False, (7,), "ray"),
+        ("distributed", False, (), "sensor"),
+    ],
+)
+def test_a_table_tells_by_two_rays_of_one_sensor_whose_gates_its_rays_keep(layout, samples, wide, expected):
+    design = Design("d", three_sensors())
+    table = make_ray_table(design, 30)
+    gate = table.gate_m.copy()
+    gate[list(wide), 1] += 0.1
+    design = replace(design, layout=layout, ray_table=replace(table, gate_m=gate))
+    assert gates_of(design, drawn_from(design, 60) if samples else None) == expected
+
+
+def test_no_table_and_one_ray_of_each_sensor_tell_nothing_of_gates():
+    design = Design("d", three_sensors())
+    samples = drawn_from(design, 60)
+    assert gates_of(design, samples) is None
+    single = replace(design, ray_table=make_ray_table(replace(design, layout="scan"), 3))
+    assert gates_of(single, samples) is None
+    assert (own_gates("distributed"), own_gates("grid"), own_gates("scan")) == ("ray", "sensor", "sensor")
+
+
+def test_distributed_rays_have_gates_of_their_own_or_of_their_sensor():
+    design = Design("d", three_sensors(origin_covariance_m2=np.eye(3) * 0.01), layout="distributed")
+    samples = drawn_from(design, 3000)
+    samples.points[:, 5] += 0.3 * (samples.points[:, 3] - 1.0)
+    own, shared = lay_out(design, 30, samples), lay_out(design, 30, samples, gates="sensor")
+    np.testing.assert_array_equal(own.gate_m, lay_out(design, 30, samples, gates="ray").gate_m)
+    assert not np.array_equal(own.gate_m, shared.gate_m)
+    for index, component in enumerate(design.sensors):
+        assert (shared.gate_m[shared.sensor == index] == component.gate_m).all()
+
+
+@pytest.mark.parametrize(("count", "own"), [(19, False), (20, True)])
+def test_a_ray_has_a_gate_of_its_own_from_twenty_samples_on(count, own):
+    design = Design("d", (sensor(),))
+    distance = np.linspace(0.9, 1.1, count)
+    points = np.column_stack([np.tile([0.1, -0.2, 0.3, 1.0, -0.3], (count, 1)), distance])
+    rays = lay_out(design, 1, Samples(points, np.zeros(count), np.zeros(count), SPACE), gates="ray")
+    assert (rays.gate_m[0] != design.sensors[0].gate_m).any() == own
+
+
+def test_samples_at_one_range_make_no_gate_of_their_own():
+    design = Design("d", (sensor(),))
+    points = np.tile([0.1, -0.2, 0.3, 1.0, -0.3, 1.0], (50, 1))
+    rays = lay_out(design, 1, Samples(points, np.zeros(50), np.zeros(50), SPACE), gates="ray")
+    assert (rays.gate_m[0] == design.sensors[0].gate_m).all()
 
 
 @pytest.mark.parametrize("layout", ["grid", "density"])

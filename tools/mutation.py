@@ -1,0 +1,198 @@
+"""How many small changes of the core's code its tests notice: `python tools/mutation.py` (see `make mutation`).
+
+Every mutant (`mutants.py`) of a module meets the module's own fast test files in a forked process (`mutant_tests.py`);
+nothing on disk is changed. What survives is listed with the reason that `mutation_reasons.yaml` gives.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import HealthCheck, Phase, settings
+from mutant_tests import OPTIONS, Children, InPlace, function_at, preload, run_anew
+from mutants import Mutant, function_bodies, mutants_of
+
+ROOT = Path(__file__).resolve().parent.parent
+RECORDS = ROOT / "build" / "mutation"
+# The files that test each module. A change outside of functions meets the first one alone, whole.
+TESTS = {
+    "lidardesign/numerics.py": ("numerics",),
+    "lidardesign/design/mixture.py": ("mixture", "physical"),
+    "lidardesign/design/constraints.py": ("constraints", "check", "exclude"),
+    "lidardesign/design/rays.py": ("rays", "track", "distributed"),
+}
+# Packages and modules that a mutant is to meet anew; the tests are too.
+OURS = {"lidardesign", "lidardesign_tasks"}
+WANTED = 0.85
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one mutant: `killed`, `timeout` (killed too) or `survived`."""
+
+    key: str
+    operator: str
+    line: int
+    before: str
+    after: str
+    outcome: str
+
+
+class Record:
+    """The outcomes of a module's mutants, one a line of a file in `build`."""
+
+    def __init__(self, module: str) -> None:
+        self.module = module
+        self.path = RECORDS / (module.replace("/", ".") + ".jsonl")
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+
+    def read(self) -> list[Outcome]:
+        """All outcomes, by line of the module."""
+        lines = self.path.read_text().splitlines() if self.path.exists() else []
+        return sorted((Outcome(**json.loads(line)) for line in lines), key=lambda one: (one.line, one.operator))
+
+    def begin(self, kept: list[Outcome]) -> None:
+        """Start it anew with outcomes that are known."""
+        self.path.write_text("".join(json.dumps(asdict(one)) + "\n" for one in kept))
+
+    def tell(self, mutant: Mutant, outcome: str) -> None:
+        """Write down what became of a mutant."""
+        one = Outcome(key_of(mutant), mutant.operator, mutant.line, mutant.before, mutant.after, outcome)
+        with self.path.open("a") as file:
+            file.write(json.dumps(asdict(one)) + "\n")
+        if outcome == "survived":
+            print(f"{self.module}:{one.line} {one.operator}\n  - {one.before}\n  + {one.after}", flush=True)
+
+
+def key_of(mutant: Mutant) -> str:
+    """What names the changed source."""
+    return hashlib.sha256(mutant.code.encode()).hexdigest()[:16]
+
+
+def run_module(module: str, jobs: int, retry: bool, sample: int | None) -> int:
+    """Test the mutants of a module in this process, which imports for it; returns pytest's exit code.
+
+    With `retry` those that were killed before are not tested again.
+    """
+    path, name = ROOT / module, module.removesuffix(".py").replace("/", ".")
+    files = [str(ROOT / "tests" / f"test_{one}.py") for one in TESTS[module]]
+    found, record = mutants_of(path.read_text()), Record(module)
+    found = found if sample is None else found[:: max(1, len(found) // sample)]
+    keys = {key_of(mutant) for mutant in found}
+    record.begin([one for one in record.read() if retry and one.outcome != "survived" and one.key in keys])
+    known = {one.key for one in record.read()}
+    waiting = [mutant for mutant in found if key_of(mutant) not in known]
+    bodies, children = function_bodies(path.read_text()), Children(jobs, record.tell)
+    preload(path, name, files, OURS | {one.stem for one in (ROOT / "tests").rglob("*.py")})
+    for mutant in waiting:
+        if function_at(bodies, mutant.line) is None:
+            children.start(mutant, lambda m=mutant: run_anew(path, name, m.code, files[:1]), 60)
+    children.finish()
+    inside = [mutant for mutant in waiting if function_at(bodies, mutant.line) is not None]
+    return int(pytest.main([*OPTIONS, *files], plugins=[InPlace(path, name, inside, children)]))
+
+
+def report(results: dict[str, list[Outcome]], minutes: float) -> str:
+    """The result as a page: a row per module, then every survivor with its reason."""
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
+    rows = ["| Module | Mutants | Killed | of these by time | Survived | Killed |", "|---|--:|--:|--:|--:|--:|"]
+    for module, found in results.items():
+        alive = sum(one.outcome == "survived" for one in found)
+        late = sum(one.outcome == "timeout" for one in found)
+        share = killed_share(found)
+        rows.append(f"| `{module}` | {len(found)} | {len(found) - alive} | {late} | {alive} | {share:.1%} |")
+    about = (
+        f"{datetime.date.today()}, commit {commit.stdout.strip()}, {minutes:.0f} minutes. Mutants by the operators of "
+        "cosmic-ray, as `tools/mutants.py` chooses them; each meets only its module's own test files:"
+    )
+    tests = [f"- `{module}`: " + ", ".join(f"`test_{name}.py`" for name in TESTS[module]) for module in results]
+    return "\n".join(["# Mutation", "", about, "", *tests, "", *rows, "", *_survivors(results)]) + "\n"
+
+
+def killed_share(found: list[Outcome]) -> float:
+    """Share of the mutants that did not survive."""
+    return sum(one.outcome != "survived" for one in found) / len(found)
+
+
+def _survivors(results: dict[str, list[Outcome]]) -> Iterator[str]:
+    reasons = _reasons()
+    yield "## Survivors"
+    for module, found in results.items():
+        for one in found:
+            if one.outcome == "survived":
+                why = reasons.get((module, one.before, one.after), "no reason is written down")
+                yield f"\n`{module}` line {one.line}, {one.operator}: {why}\n"
+                yield f"```diff\n- {one.before}\n+ {one.after}\n```"
+
+
+def _reasons() -> dict[tuple[str, str, str], str]:
+    """Reasons by module, the line and what it became."""
+    entries = yaml.safe_load((Path(__file__).parent / "mutation_reasons.yaml").read_text()) or []
+    return {(one["module"], one["before"], after): one["reason"] for one in entries for after in one["after"]}
+
+
+def main() -> int:
+    """Run the mutants; exit code 1 where a module's tests kill fewer than are wanted."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("modules", nargs="*", default=list(TESTS), help="modules, as lidardesign/numerics.py; all")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes at once; one for each core")
+    parser.add_argument("--retry", action="store_true", help="run only what survived the last time, or is new")
+    parser.add_argument("--sample", type=int, help="about so many mutants of each module, evenly spread")
+    parser.add_argument("--out", type=Path, help="write the page there")
+    options = parser.parse_args()
+    os.chdir(ROOT)
+    sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tasks")]
+    _own_hypothesis_profile()
+    began = time.monotonic()
+    for module in options.modules:
+        # what one module's process imports must not be there for the next
+        child = os.fork()
+        if not child:
+            os._exit(_status_of(lambda m=module: run_module(m, options.jobs, options.retry, options.sample)))
+        if os.waitpid(child, 0)[1]:
+            return 2
+        print(f"{module}: {killed_share(Record(module).read()):.1%} killed", flush=True)
+    results = {module: Record(module).read() for module in options.modules}
+    if options.out is not None:
+        options.out.write_text(report(results, (time.monotonic() - began) / 60))
+    return int(min(map(killed_share, results.values())) < WANTED)
+
+
+def _status_of(work: Callable[[], int]) -> int:
+    """What `work` returns; 2 and its message where it raises."""
+    try:
+        return work()
+    except BaseException:
+        traceback.print_exc()
+        return 2
+
+
+def _own_hypothesis_profile() -> None:
+    """The same examples for every mutant, none shrunk and none kept."""
+    settings.register_profile(
+        "mutation",
+        max_examples=25,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        phases=(Phase.explicit, Phase.generate),
+        suppress_health_check=[HealthCheck.too_slow],
+    )
+    os.environ["HYPOTHESIS_PROFILE"] = "mutation"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
