@@ -26,6 +26,7 @@ LAYERS = {
     "lidardesign.run.processes": 1,
     "lidardesign.run.npz": 1,
     "lidardesign.run.yaml": 1,
+    "lidardesign.run.kinds": 2,
     "lidardesign.run.manifest": 2,
     "lidardesign.run.lock": 2,
     "lidardesign.run.clock": 3,

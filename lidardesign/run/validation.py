@@ -7,12 +7,12 @@ import os
 import typing
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from types import UnionType
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from lidardesign.errors import ConfigError
+from lidardesign.run.kinds import nested_model, parts, wrong_kinds
 from lidardesign.run.yaml import KeyPath
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -36,9 +36,14 @@ def check_model(model: type[Model], values: Any, locate: typing.Callable[[KeyPat
         section: Name of the section in messages.
     """
     try:
-        return model.model_validate(values)
+        checked = model.model_validate(values)
     except ValidationError as error:
         raise _explain(model, values, error, locate, section) from None
+    for path, value in wrong_kinds(model, values):
+        path = (section, *path) if section else path
+        name, allowed = ".".join(map(str, path)), "a number, without quotes"
+        raise ConfigError(f"{name}: found {_short(value)}", where=locate(path), allowed=allowed)
+    return checked
 
 
 def anchor_paths(values: Any, given: Any, model: type[BaseModel], base: Path) -> None:
@@ -49,7 +54,7 @@ def anchor_paths(values: Any, given: Any, model: type[BaseModel], base: Path) ->
         info = model.model_fields.get(name) if isinstance(name, str) else None
         if info is None or name not in values:
             continue
-        nested = _nested_model(info.annotation)
+        nested = nested_model(info.annotation)
         if isinstance(value, dict) and nested:
             anchor_paths(values[name], value, nested, base)
         elif _holds_path(info.annotation):
@@ -64,23 +69,8 @@ def _absolute(value: Any, base: Path) -> Any:
     return value
 
 
-def _parts(annotation: Any) -> list[Any]:
-    """An annotation and everything that it is a union, list or annotated form of."""
-    origin = typing.get_origin(annotation)
-    if origin is None:
-        return [annotation]
-    if origin in (typing.Union, UnionType, list, tuple, typing.Annotated):
-        return [part for argument in typing.get_args(annotation) for part in _parts(argument)]
-    return []
-
-
 def _holds_path(annotation: Any) -> bool:
-    return any(isinstance(part, type) and issubclass(part, Path) for part in _parts(annotation))
-
-
-def _nested_model(annotation: Any) -> type[BaseModel] | None:
-    models = [part for part in _parts(annotation) if isinstance(part, type) and issubclass(part, BaseModel)]
-    return models[0] if models else None
+    return any(isinstance(part, type) and issubclass(part, Path) for part in parts(annotation))
 
 
 def _explain(
@@ -144,7 +134,7 @@ def _is_union(location: tuple[Any, ...], path: KeyPath) -> bool:
 def _fields_at(model: type[BaseModel], path: KeyPath) -> list[str]:
     for key in path:
         info = model.model_fields.get(str(key))
-        nested = _nested_model(info.annotation) if info else None
+        nested = nested_model(info.annotation) if info else None
         model = nested or model
     return list(model.model_fields)
 
@@ -157,7 +147,7 @@ def suggest(key: str, allowed: Iterable[str]) -> str | None:
 
 def _elsewhere(model: type[BaseModel], key: str) -> str | None:
     """A hint at the section of a model that has a key which was given outside of it, if one has."""
-    sections = {name: _nested_model(info.annotation) for name, info in model.model_fields.items()}
+    sections = {name: nested_model(info.annotation) for name, info in model.model_fields.items()}
     found = [f"{name}.{key}" for name, nested in sections.items() if nested and key in nested.model_fields]
     return f"did you mean {found[0]!r}?" if found else None
 
