@@ -15,7 +15,7 @@ import numpy as np
 
 from lidardesign.errors import DataError, LidardesignError
 from lidardesign.numerics import ROUNDING
-from lidardesign.orientation import edge_defects, turned_to_agree
+from lidardesign.orientation import edge_defects, turned_to_agree, unique_rows
 from lidardesign.scene import Mesh, Sign
 from lidardesign.space import FARTHEST_M
 
@@ -131,8 +131,9 @@ def _refuse_unusable(vertices: np.ndarray, faces: np.ndarray, where: str) -> Non
 
 def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices at exactly the same place become one, as formats without shared vertices (STL) need."""
-    unique, index = np.unique(vertices + 0.0, axis=0, return_inverse=True)  # -0.0 and 0.0 are one place
-    return unique, index.reshape(-1)[faces]
+    vertices = vertices + 0.0  # -0.0 and 0.0 are one place
+    first, index = unique_rows(vertices)
+    return vertices[first], index[faces]
 
 
 def usable_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray:
@@ -143,7 +144,7 @@ def usable_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> n
     if degenerate.any():
         notes.append(f"dropped {int(degenerate.sum())} degenerate faces (without area)")
         faces = faces[~degenerate]
-    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    first, _ = unique_rows(np.sort(faces, axis=1))
     if len(first) < len(faces):
         notes.append(f"dropped {len(faces) - len(first)} duplicate faces")
     return faces[np.sort(first)]

@@ -82,7 +82,7 @@ class Mesh:
         vertices: Positions [m], shape (V, 3) float64.
         faces: Vertex indices, shape (F, 3) int32.
         sign: How the inside is told from the outside: `solid` (closed and consistently wound), `winding`
-            (generalised winding number above 1/2), `unsigned` (no inside: distances are never negative).
+            (generalised winding number beyond +-1/2), `unsigned` (no inside: distances are never negative).
         notes: What loading mended or found, one line each.
     """
 

@@ -179,3 +179,20 @@ def naive_mesh_hit(vertices, faces, origins, directions):
         inside = usable & (u >= -ON_EDGE) & (v >= -ON_EDGE) & (u + v <= 1 + ON_EDGE) & (reach >= 0)
         nearest[index] = np.where(inside, reach, np.inf).min(initial=np.inf)
     return nearest
+
+
+def naive_crossings(vertices, faces, points, looking):
+    """How many triangles the rays from points (N, 3) along one direction cross, (N,): every one, by its plane."""
+    a, b, c = np.moveaxis(np.asarray(vertices, float)[faces], 1, 0)
+    normal = np.cross(b - a, c - a)
+    along = normal @ looking
+    counts = np.zeros(len(points), dtype=int)
+    for number, point in enumerate(points):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            travelled = np.einsum("fk,fk->f", normal, a - point) / along
+        met = point + travelled[:, None] * looking
+        inside = travelled > 0
+        for start, end in ((a, b), (b, c), (c, a)):
+            inside &= np.einsum("fk,fk->f", np.cross(end - start, met - start), normal) >= 0
+        counts[number] = inside.sum()
+    return counts

@@ -76,12 +76,6 @@ def test_gradients_of_primitives_have_unit_length_and_match_differences(name):
     np.testing.assert_allclose(gradient[smooth], numerical[smooth], atol=1e-5)
 
 
-def test_the_centre_of_a_sphere_has_a_finite_gradient():
-    field = field_of(Scene((Body(Sphere(1.0)),)))
-    assert field.distances(np.zeros((1, 3)))[0, 0] == -1.0
-    assert np.isfinite(field.gradient(np.zeros((1, 3)), np.ones((1, 1)))).all()
-
-
 @pytest.mark.parametrize("resolution", [24, 48, 96])
 def test_a_mesh_field_is_within_the_interpolation_error_of_the_sphere(resolution):
     field = field_of(Scene((Body(icosphere()),)), resolution=resolution)
@@ -95,29 +89,6 @@ def test_a_mesh_field_is_within_the_interpolation_error_of_the_sphere(resolution
     far = np.abs(field.distances(points)[~near, 0] - exact[~near])
     assert far.max() < step / 2  # the kink at the centre
     assert (np.sign(field.distances(points)[~near, 0]) == np.sign(exact[~near])).all()
-
-
-def test_outside_the_grid_the_distance_is_a_lower_bound_that_grows():
-    field = field_of(Scene((Body(icosphere()),)))
-    directions = np.random.default_rng(4).normal(size=(200, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    previous = np.zeros(200)
-    for radius in (1.2, 2.0, 5.0, 1000.0):
-        found = field.distances(radius * directions)[:, 0]
-        assert (found <= radius - 0.5 + 1e-3).all()
-        assert (found > previous).all()
-        previous = found
-    # from far away the bound is off by no more than the grid's own size
-    assert (previous > 1000 - 0.5 - 1.5).all()
-
-
-def test_distances_are_continuous_across_the_faces_of_the_grid():
-    field = field_of(Scene((Body(icosphere()),)))
-    face = field.grid.low[0]
-    points = np.random.default_rng(5).uniform(-0.4, 0.4, (100, 3))
-    inner, outer = points.copy(), points.copy()
-    inner[:, 0], outer[:, 0] = face + 1e-9, face - 1e-9
-    np.testing.assert_allclose(field.distances(inner), field.distances(outer), atol=1e-6)
 
 
 def test_contracted_gradients_match_differences_inside_and_outside():
@@ -185,14 +156,6 @@ def test_a_cached_grid_has_the_same_bytes_and_a_damaged_one_is_built_again(tmp_p
 def test_a_field_that_would_not_fit_is_refused_with_what_is_allowed():
     with pytest.raises(ConfigError, match="field_resolution"):
         grids.grid_around(np.array([[0.0, 0, 0], [1, 1, 1]]), 512, 0.1)
-
-
-def test_chunks_do_not_change_the_bits():
-    field = field_of(Scene((Body(icosphere()),)))
-    points = np.random.default_rng(9).normal(size=(257, 3))
-    whole = field.distances(points)
-    parts = np.concatenate([field.distances(points[:100]), field.distances(points[100:])])
-    assert whole.tobytes() == parts.tobytes()
 
 
 def test_plain_and_compiled_interpolation_agree_inside_and_outside():

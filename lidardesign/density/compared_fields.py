@@ -64,7 +64,7 @@ def mesh_distances(mesh: Mesh, points: np.ndarray) -> np.ndarray:
     distance = igl.signed_distance(points, vertices, faces, sign_type=igl.SIGNED_DISTANCE_TYPE_UNSIGNED)[0]
     if mesh.sign == "unsigned":
         return distance
-    return np.where(igl.fast_winding_number(vertices, faces, points) > 0.5, -distance, distance)
+    return np.where(np.abs(igl.fast_winding_number(vertices, faces, points)) > 0.5, -distance, distance)
 
 
 def fresh_table(scenes: Sequence[Scene], around: Sequence[Scene], resolution: int, padding_m: float) -> TableField:

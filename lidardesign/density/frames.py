@@ -16,14 +16,13 @@ import numpy as np
 from lidardesign.density.bodies import GROUP_COLUMNS, Bodies, collect_bodies
 from lidardesign.density.occlusion import BodyRaycast, NoOcclusion, Pairs
 from lidardesign.density.settings import DensitySettings
-from lidardesign.density.target import Target
+from lidardesign.density.target import PAIRS_AT_ONCE, Target
 from lidardesign.density.visibility import Optics, RayBatch, RayGradient
 from lidardesign.scene import Scene
 from lidardesign.space import DesignSpace, observed_point
 
 # Points at a time, fewer where there are more columns: should all of these matter, their pairs still fit in 300 MB.
 ROWS_AT_ONCE = 2048
-PAIRS_AT_ONCE = 2**22
 # Room for pairs is not touched before it is used; too little of it costs a second pass.
 PAIRS_PER_ROW = 1024
 

@@ -20,7 +20,7 @@ from lidardesign.errors import ConfigError, DataError
 from lidardesign.numerics import SLACK
 from lidardesign.scene import Mesh
 
-ALGORITHM = "narrow band 3 cells, igl sign by the absolute winding number, filled by distance transform, recentred, float32"
+ALGORITHM = "narrow band 3 cells, sign by the absolute winding number, filled by distance transform, recentred, float32"
 BAND_CELLS = 3.0
 MAXIMUM_CELLS = 40_000_000
 DIGEST_BYTES = 32

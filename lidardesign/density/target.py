@@ -20,7 +20,6 @@ from lidardesign.density.parallel import ALONE, Ranks
 from lidardesign.density.receiver import HeardVisibility, common_receiver
 from lidardesign.density.settings import DensitySettings
 from lidardesign.density.visibility import (
-    ROWS_AT_ONCE,
     NoVisibility,
     Optics,
     Quadrature,
@@ -36,6 +35,8 @@ from lidardesign.scene import Mesh, Scene
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace, observed_point
 
 PADDING_SIGMAS = 4.0
+# Points times columns at a time: some ten arrays of so many float64 are in use at once.
+PAIRS_AT_ONCE = 2**22
 MOST_QUADRATURE_BODIES = 2000
 # d direction / d sin(elevation) grows without bound at the poles; it is capped at this cosine of the elevation.
 MINIMUM_POLE_COSINE = 1e-4
@@ -70,7 +71,7 @@ class Target:
     @property
     def rows_at_once(self) -> int:
         """How many points keep the memory bounded."""
-        return self.visibility.rows_at_once
+        return int(np.clip(PAIRS_AT_ONCE // self.columns, 1, self.visibility.rows_at_once))
 
     def drawn(self, columns: np.ndarray) -> Target:
         """An estimate of p* from some columns alone, weighted to stand for all; the others need no visibility."""
@@ -82,8 +83,8 @@ class Target:
         """log of the sum of surface terms at the scene points that design points (N, 6) observe, shape (N,)."""
         sigma_m = self.optics.sigma_m if sigma_m is None else sigma_m
         values = np.empty(len(points))
-        for start in range(0, len(points), ROWS_AT_ONCE):
-            rows = slice(start, start + ROWS_AT_ONCE)
+        for start in range(0, len(points), self.rows_at_once):
+            rows = slice(start, start + self.rows_at_once)
             distances = self.field.distances(observed_point(points[rows])).astype(np.float64)
             values[rows] = logsumexp(self.log_column_weights - np.square(distances / sigma_m) / 2, axis=1)
         return values
