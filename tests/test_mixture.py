@@ -18,7 +18,9 @@ from lidardesign.design.mixture import (
     expect,
     frames,
     label_statistics,
+    linear_coefficients,
     log_density,
+    mean_directions,
     responsibilities,
 )
 from lidardesign.design.mstep import fit_field, fit_gate, maximise
@@ -446,3 +448,116 @@ def test_fixed_dimensions_leave_the_density(name):
     free = [i for i in space.free]
     volume = np.prod([space.chart_high[i] - space.chart_low[i] for i in free])
     assert -math.log(volume) - 1.0 < trace.log_likelihood < -math.log(volume) + 0.6
+
+
+SPACES = {name: DesignSpace(*bounds) for name, bounds in FIXED.items()} | {"all free": WHOLE, "one origin": POINT}
+
+
+def naive_terms(mixture, features):
+    """Log joint densities over the free dimensions alone, one sample and one component at a time, (N, K)."""
+    axes = features.axes
+    free, used = list(axes.origin), (axes.horizontal, axes.vertical)
+    terms = np.zeros((len(features), len(mixture)))
+    for k in range(len(mixture)):
+        covariance = mixture.origin_covariance_m2[k][np.ix_(free, free)]
+        tangent = tangent_coordinates(mixture.frames[k], features.directions.T)
+        for n, point in enumerate(features.points):
+            total = math.log(mixture.weights[k])
+            away = (point[:3] - mixture.origin_m[k])[free]
+            total -= 0.5 * (away @ np.linalg.solve(covariance, away) if free else 0.0)
+            total -= 0.5 * math.log(np.linalg.det(2 * math.pi * covariance)) if free else 0.0
+            for u, spread, random in zip(tangent[n], mixture.spread_rad[k], used, strict=True):
+                total -= (0.5 * (u / spread) ** 2 + math.log(spread * math.sqrt(2 * math.pi))) if random else 0.0
+            angle = math.hypot(*tangent[n])
+            total += math.log(angle / math.sin(angle)) if all(used) and angle > 0 else 0.0
+            z = (point[5] - mixture.range_m[k]) / mixture.spread_range_m[k]
+            reach = 0.5 * z * z + math.log(mixture.spread_range_m[k] * math.sqrt(2 * math.pi))
+            terms[n, k] = total - (reach if axes.range else 0.0)
+    return terms
+
+
+def case_of(name, count=70):
+    """Three wide components and weighted samples of a space; boresights point off a fixed angle too."""
+    generator, space = np.random.default_rng(21), SPACES[name]
+    mixture = random_mixture(generator, 3, width=0.8)
+    return mixture, features_of(space.sample(count, generator), space, generator.uniform(0.1, 1, count))
+
+
+@pytest.mark.parametrize("name", SPACES)
+def test_density_and_shares_are_those_of_the_free_dimensions_alone(name):
+    mixture, features = case_of(name)
+    terms = naive_terms(mixture, features)
+    whole = logsumexp(terms, axis=1)
+    np.testing.assert_allclose(log_density(mixture, features), whole, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(responsibilities(mixture, features), np.exp(terms - whole[:, None]), atol=1e-9)
+
+
+@pytest.mark.parametrize("block", [1, 7, 70, 1000])
+@pytest.mark.parametrize("name", SPACES)
+def test_statistics_are_sums_over_the_shares_in_blocks_of_any_length(name, block, monkeypatch):
+    monkeypatch.setattr("lidardesign.design.mixture.BLOCK", block)
+    mixture, features = case_of(name)
+    terms = naive_terms(mixture, features)
+    shares = np.exp(terms - logsumexp(terms, axis=1)[:, None]) * features.weights[:, None]
+    found = expect(mixture, features)
+    assert found.log_likelihood == pytest.approx(features.weights @ logsumexp(terms, axis=1), rel=1e-9)
+    np.testing.assert_allclose(found.mass, shares.sum(axis=0), rtol=1e-8)
+    np.testing.assert_allclose(found.phi, shares.T @ features.phi.T, rtol=1e-7, atol=1e-10)
+    np.testing.assert_allclose(found.tangent, tangent_sums(mixture, features, shares), rtol=1e-7, atol=1e-10)
+
+
+def tangent_sums(mixture, features, shares):
+    """Sums of 1, u_h, u_v times u_h, u_v by shares (N, K), 0 along fixed angles: (K, 2, 3)."""
+    used = np.array([features.axes.horizontal, features.axes.vertical], dtype=float)
+    sums = np.zeros((len(mixture), 2, 3))
+    for k in range(len(mixture)):
+        u = tangent_coordinates(mixture.frames[k], features.directions.T) * used
+        sums[k, :, 0] = shares[:, k] @ u
+        sums[k, :, 1:] = np.einsum("n,ni,nj->ij", shares[:, k], u, u)
+    return sums
+
+
+@pytest.mark.parametrize("name", SPACES)
+def test_hard_statistics_are_sums_over_the_samples_of_a_label(name):
+    mixture, features = case_of(name)
+    labels = np.random.default_rng(22).choice([0, 2], size=len(features))
+    shares = features.weights[:, None] * (labels[:, None] == np.arange(3))
+    found = label_statistics(mixture, features, labels)
+    assert math.isnan(found.log_likelihood)
+    np.testing.assert_allclose(found.mass, shares.sum(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(found.phi, shares.T @ features.phi.T, rtol=1e-10, atol=1e-13)
+    np.testing.assert_allclose(found.tangent, tangent_sums(mixture, features, shares), rtol=1e-9, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", SPACES)
+def test_the_mean_direction_of_a_cell_is_that_of_its_mean_unit_vector(name):
+    _, features = case_of(name)
+    labels = np.random.default_rng(23).choice([0, 1, 3], size=len(features))
+    azimuth, elevation = mean_directions(features, labels, 5)
+    assert azimuth.shape == elevation.shape == (5,)
+    for cell in range(5):
+        mine = labels == cell
+        mean = features.weights[mine] @ features.directions[:, mine].T
+        expected = math.atan2(mean[1], mean[0]) if features.axes.horizontal else 0.0
+        assert abs(math.remainder(azimuth[cell] - expected, 2 * math.pi)) < 1e-12
+        expected = math.atan2(mean[2], math.hypot(mean[0], mean[1])) if features.axes.vertical else 0.0
+        assert elevation[cell] == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_component_without_weight_changes_nothing_and_its_logarithm_stays_finite():
+    generator = np.random.default_rng(25)
+    without = random_mixture(generator, 3, width=0.8).with_weights(np.array([0.4, 0.0, 0.6]))
+    left = without.take(np.array([0, 2]))
+    features = features_of(drawn(left, 100, generator))
+    assert np.isfinite(linear_coefficients(without, features)).all()
+    # a floor of 1e-12 stands under the weight
+    np.testing.assert_allclose(log_density(without, features), log_density(left, features), atol=1e-6)
+    assert expect(without, features).mass[1] < 1e-6
+
+
+def test_components_that_are_taken_share_what_they_had_in_proportion():
+    mixture = random_mixture(np.random.default_rng(24), 4).with_weights(np.array([0.1, 0.2, 0.3, 0.4]))
+    part = mixture.take(np.array([3, 0]))
+    np.testing.assert_allclose(part.weights, [0.8, 0.2])
+    np.testing.assert_array_equal(part.origin_m, mixture.origin_m[[3, 0]])
+    assert len(part) == 2
