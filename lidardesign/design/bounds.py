@@ -65,9 +65,12 @@ class Bounds:
         return replace(self, **arrays)
 
     def narrowed(self, width_m: float) -> Bounds:
-        """The same with gates no wider than a common cap [m], never below a component's least width."""
-        cap = np.minimum(self.width_high, width_m)
-        return replace(self, width_high=np.maximum(cap, self.width_low))
+        """The same with gates no wider than a common cap [m], never below a component's least width.
+
+        A gate that must start early and end late has a least width, too.
+        """
+        least = np.maximum(self.width_low, self.end_low - self.start_high)
+        return replace(self, width_high=np.maximum(np.minimum(self.width_high, width_m), least))
 
     @classmethod
     def unbounded(cls, count: int, interval: float) -> Bounds:

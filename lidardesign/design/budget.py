@@ -9,7 +9,8 @@ from typing import TypeVar
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.constraints import Budget
+from lidardesign.design.constraints import Constraints
+from lidardesign.design.feasibility import least_width
 from lidardesign.design.rays import split_budget
 from lidardesign.errors import InfeasibleError
 from lidardesign.numerics import COARSE_SLACK
@@ -29,17 +30,24 @@ class ReadOut:
         model: Bins, bits and rate.
         limit_mbps: The budget; None is none.
         rays: Rays per frame; None leaves them to the budget.
+        names: What stands in the way of a smaller bandwidth: the number of rays, and least widths of gates.
     """
 
     model: Bandwidth
     limit_mbps: float | None
     rays: int | None
+    names: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, budget: Budget, rays: int | None) -> ReadOut:
+    def of(cls, constraints: Constraints, rays: int | None) -> ReadOut:
         """The read-out that a constraint file and an option ask for."""
+        budget = constraints.budget
+        names = ["--rays"] if rays is not None else ["budget.rays"] if budget.rays is not None else []
+        for index in range(len(constraints.each) + 1):
+            names += least_width(constraints, index)[1]
         model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
-        return cls(model, budget.bandwidth_mbps, budget.rays if rays is None else rays)
+        wanted = budget.rays if rays is None else rays
+        return cls(model, budget.bandwidth_mbps, wanted, tuple(dict.fromkeys(names)))
 
     def mbps(self, widths_m: np.ndarray, weights: np.ndarray, rays: int) -> float:
         """Bandwidth of gates (K,) [m] whose rays are split by weights (K,)."""
@@ -98,9 +106,9 @@ def within_budget(
     needed = read_out.mbps(widths, weights, rays)
     raise InfeasibleError(
         f"{rays} rays still need {needed:g} Mbit/s with the narrowest gates that the other constraints admit",
-        conflicts=["budget.bandwidth_mbps", "budget.rays", "gate.width_m.min"],
+        conflicts=["budget.bandwidth_mbps", *read_out.names],
         allowed=f"at most {read_out.limit_mbps:g} Mbit/s",
-        hint="fewer rays, a lower gate.width_m.min or gate.end_m.min, or more bandwidth",
+        hint="fewer rays, narrower gates, or more bandwidth",
     )
 
 

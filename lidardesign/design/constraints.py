@@ -241,9 +241,11 @@ def _without_empty(values: dict[str, Any]) -> dict[str, Any]:
     return kept
 
 
-def check_feasible(constraints: Constraints, space: Any, *, sensors: int | None = None) -> None:
+def check_feasible(
+    constraints: Constraints, space: Any, *, sensors: int | None = None, rays: int | None = None
+) -> None:
     """Refuse constraints that no design can satisfy; see `feasibility.check_feasible`."""
     # the checks need the constraint models, and callers look for them here
     from lidardesign.design.feasibility import check_feasible as check
 
-    check(constraints, space, sensors=sensors)
+    check(constraints, space, sensors=sensors, rays=rays)

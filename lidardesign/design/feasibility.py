@@ -31,22 +31,23 @@ class _Bound:
     name: str
 
 
-def check_feasible(constraints: Constraints, space: DesignSpace, *, sensors: int | None = None) -> None:
+def check_feasible(
+    constraints: Constraints, space: DesignSpace, *, sensors: int | None = None, rays: int | None = None
+) -> None:
     """Refuse constraints that contradict each other or the design space.
 
     Arguments:
         constraints: A checked constraint file.
         space: The design space of the density.
         sensors: The number of sensors asked for elsewhere (an option), if any.
+        rays: The number of rays asked for elsewhere, if any.
 
     Raises:
         InfeasibleError: With the conflicting names.
     """
     _check_count(constraints, sensors)
     _check_mount_count(constraints, sensors)
-    # sensors beyond the entries of `each` have the common constraints
-    entries = len(constraints.each) + (least_sensors(constraints, sensors).value > len(constraints.each))
-    for index in range(entries):
+    for index in range(_entries(constraints, sensors)):
         one = constraints.of_sensor(index)
         _check_origin(constraints, one, index, space)
         _check_mounts(constraints, one, index, space)
@@ -54,7 +55,12 @@ def check_feasible(constraints: Constraints, space: DesignSpace, *, sensors: int
         _check_boresight(constraints, one, index, space)
         _check_field(constraints, one, index, space)
         _check_gate(constraints, one, index, space)
-    _check_budget(constraints, sensors)
+    _check_budget(constraints, sensors, rays)
+
+
+def _entries(constraints: Constraints, sensors: int | None) -> int:
+    """How many sensors differ in their constraints: those beyond the entries of `each` have the common ones."""
+    return len(constraints.each) + (least_sensors(constraints, sensors).value > len(constraints.each))
 
 
 def _refuse(message: str, conflicts: Sequence[str]) -> None:
@@ -275,20 +281,43 @@ def least_sensors(constraints: Constraints, sensors: int | None = None) -> _Boun
     return max(bounds, key=lambda b: b.value, default=_Bound(1, ""))
 
 
-def _check_budget(constraints: Constraints, sensors: int | None) -> None:
-    budget = constraints.budget
-    least = least_sensors(constraints, sensors)
-    if budget.rays is not None and budget.rays < least.value:
-        _refuse(f"{budget.rays} rays for {least.value:g} sensors", ["budget.rays", least.name or "sensors"])
+def _check_budget(constraints: Constraints, sensors: int | None, asked: int | None) -> None:
+    budget, least = constraints.budget, least_sensors(constraints, sensors)
+    if asked is not None and budget.rays is not None and asked != budget.rays:
+        _refuse(f"{asked} and {budget.rays} rays asked for", ["--rays", "budget.rays"])
+    given = _Bound(asked, "--rays") if asked is not None else _Bound(budget.rays, "budget.rays")
+    if given.value is not None and given.value < least.value:
+        _refuse(f"{given.value} rays for {least.value:g} sensors", [given.name, least.name or "sensors"])
     if budget.bandwidth_mbps is None:
         return
-    widths = [constraints.of_sensor(i).gate.width_m.min or 0.0 for i in range(max(len(constraints.each), 1))]
     model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
-    rays, rays_name = (budget.rays, "budget.rays") if budget.rays is not None else (int(least.value), least.name)
-    needed = model.mbps_of_widths([min(widths)], rays)
+    rays, name = (given.value, given.name) if given.value is not None else (int(least.value), least.name)
+    widths = [least_width(constraints, index) for index in range(_entries(constraints, sensors))]
+    needed = model.mbps_of_widths([min(width for width, _ in widths)], rays)
     if needed > budget.bandwidth_mbps:
-        single = model.mbps_of_widths([0.0], rays)
-        names = [rays_name, "budget.bandwidth_mbps"]
-        if single <= budget.bandwidth_mbps:
-            names.append(constraints.name_of(widths.index(min(widths)), "gate.width_m.min"))
+        names = [name, "budget.bandwidth_mbps"]
+        if model.mbps_of_widths([0.0], rays) <= budget.bandwidth_mbps:
+            names += [one for _, width_names in widths for one in width_names]
         _refuse(f"{rays} rays need at least {needed:g} Mbit/s, more than {budget.bandwidth_mbps:g} Mbit/s", names)
+
+
+def most_rays(constraints: Constraints) -> int | None:
+    """The number of rays that the bandwidth pays for with the narrowest gates, at least 1; None without a limit."""
+    budget = constraints.budget
+    if budget.bandwidth_mbps is None:
+        return None
+    narrowest = min(least_width(constraints, index)[0] for index in range(len(constraints.each) + 1))
+    each_mbps = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz).mbps_of_widths([narrowest], 1)
+    return max(int(budget.bandwidth_mbps / each_mbps), 1)
+
+
+def least_width(constraints: Constraints, index: int) -> tuple[float, list[str]]:
+    """The narrowest gate that a sensor's constraints admit [m], and the names of those that keep it so wide."""
+    gate = constraints.of_sensor(index).gate
+    widths: list[tuple[float, list[str]]] = [(0.0, [])]
+    if gate.width_m.min is not None:
+        widths.append((gate.width_m.min, ["gate.width_m.min"]))
+    if gate.end_m.min is not None and gate.start_m.max is not None:
+        widths.append((gate.end_m.min - gate.start_m.max, ["gate.end_m.min", "gate.start_m.max"]))
+    width, keys = max(widths, key=lambda one: one[0])
+    return width, [constraints.name_of(index, key) for key in keys]

@@ -15,7 +15,7 @@ from lidardesign.design.conditions import fixed_conditions
 from lidardesign.design.constraints import MOST_FITTED, Constraints
 from lidardesign.design.coupling import couplings
 from lidardesign.design.ensemble import Ensemble, Part, fit_parts, heaviest_first, sensors_of
-from lidardesign.design.feasibility import check_feasible, least_sensors
+from lidardesign.design.feasibility import check_feasible, most_rays
 from lidardesign.design.features import Axes, Features
 from lidardesign.design.fit_result import FitResult
 from lidardesign.design.mount_choice import at_mounts
@@ -29,7 +29,7 @@ from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, Design, Layout, 
 from lidardesign.design.support import Retarget, Support, check_support, pinned, restricted
 from lidardesign.design.track_fit import fit_track
 from lidardesign.design.uncertainty import fit_estimates, likelihood_error
-from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.errors import ConfigError
 from lidardesign.estimates import Estimate
 from lidardesign.numerics import systematic_draw
 from lidardesign.run.clock import phase
@@ -107,7 +107,7 @@ def fit(
     if samples.space.conditioned:
         return _along_condition(samples, constraints, rays, level, seed, name)
     request = _Request(samples, constraints, seed, restarts, em_samples, level, retarget)
-    read_out = ReadOut.of(constraints.budget, rays)
+    read_out = ReadOut.of(constraints, rays)
     supports, fitted, total, ensemble = _solved(request, read_out, sensors, layout)
     design = _design(fitted, layout, total, request, name, gates or own_gates(layout))
     checks = _checked(design, constraints, samples)
@@ -162,7 +162,7 @@ def _solved(
         part = _features(request, supports, 1)[0]
         beams, fit = fit_scan(part.features, space, constraints, part.group, read_out, request.level, request.seed)
         return supports, beams, len(beams), fit
-    supports, ensemble = _fitted(request, sensors)
+    supports, ensemble = _fitted(request, sensors, read_out.rays)
     ensemble, total = within_budget(ensemble, Ensemble.narrowed, lambda e: (e.widths_m, e.weights), read_out)
     fitted = couplings(ensemble, sensors_of(ensemble, space, request.level))
     if not constraints.each:
@@ -189,9 +189,6 @@ def _check_options(
             where=f"--layout {layout}",
             hint=f"--layout scan, or {' '.join(f'--at {condition}=VALUE' for condition in names)}",
         )
-    budget = constraints.budget.rays
-    if rays is not None and budget is not None and rays != budget:
-        raise InfeasibleError(f"{rays} and {budget} rays asked for", conflicts=["--rays", "budget.rays"])
     if layout == "scan":
         if is_mounted(constraints):
             raise ConfigError(
@@ -205,25 +202,21 @@ def _check_options(
                 where="--layout scan",
                 hint="remove sensors and each from the constraints",
             )
-        check_feasible(constraints, samples.space)
+        check_feasible(constraints, samples.space, rays=rays)
         return
     count = sensors if isinstance(sensors, int) else None
-    check_feasible(constraints, samples.space, sensors=count)
-    least = least_sensors(constraints, count)
-    if rays is not None and rays < least.value:
-        names = ["--rays", least.name or "sensors"]
-        raise InfeasibleError(f"{rays} rays for {least.value} sensors", conflicts=names)
+    check_feasible(constraints, samples.space, sensors=count, rays=rays)
 
 
-def _sensor_counts(constraints: Constraints, sensors: int | str | None) -> list[int]:
-    """The numbers of sensors to try: one where it is said, a range for `auto`."""
+def _sensor_counts(constraints: Constraints, sensors: int | str | None, rays: int | None) -> list[int]:
+    """The numbers of sensors to try: one where it is said, a range for `auto`; none without a ray if that can be."""
     asked = constraints.sensors
     if isinstance(sensors, int) or asked.count is not None:
         return [sensors if isinstance(sensors, int) else int(asked.count or 1)]
     low = max(asked.min or 1, len(constraints.each), 1)
     mounted = most_mounted(constraints)
     high = max(MOST_SENSORS, mounted or 0) if asked.max is None else asked.max
-    for limit in (mounted, constraints.budget.rays):
+    for limit in (mounted, rays, most_rays(constraints)):
         high = high if limit is None else min(high, limit)
     if sensors == "auto":
         return list(range(low, max(low, high) + 1))
@@ -231,8 +224,8 @@ def _sensor_counts(constraints: Constraints, sensors: int | str | None) -> list[
     return [min(max(usual, low), max(low, high))]
 
 
-def _fitted(request: _Request, sensors: int | str | None) -> tuple[list[Support], Ensemble]:
-    counts = _sensor_counts(request.constraints, sensors)
+def _fitted(request: _Request, sensors: int | str | None, rays: int | None) -> tuple[list[Support], Ensemble]:
+    counts = _sensor_counts(request.constraints, sensors, rays)
     if is_mounted(request.constraints):
         fixed, counts = at_mounts(request.constraints, request.samples, counts, request.retarget, request.seed)
         request = replace(request, constraints=fixed)

@@ -94,7 +94,7 @@ def fit_track(
     """
     constraints = Constraints() if constraints is None else constraints
     dimension = _travelled(samples.space)
-    read_out = ReadOut.of(constraints.budget, rays)
+    read_out = ReadOut.of(constraints, rays)
     if read_out.rays is None:
         raise ConfigError("a track needs its number of rays per position", where="--layout scan", hint="give --rays N")
     group = Group((None, None, None), tuple(range(read_out.rays)))
