@@ -140,6 +140,29 @@ def test_proposals_lie_in_the_space_within_eight_range_errors_of_their_surface(s
     assert set(proposals.column) == {0, 1}
 
 
+ARC = DesignSpace((-0.5, 0, 0, -0.6, 0, 1.6), (0.5, 0, 0, 0.6, 0, 1.6))
+CAP = DesignSpace((0, 0, 0, -0.6, -0.6, 1.6), (0, 0, 0, 0.6, 0.6, 1.6))
+
+
+@pytest.mark.parametrize(("space", "side"), [(ARC, 0), (CAP, AZIMUTH)], ids=["rays traced", "points aimed at"])
+def test_proposals_at_a_fixed_range_match_plain_integration(space, side):
+    proposals = drawn([BALL], space, 200_000)
+    assert len(proposals.points) > 1000
+    assert (proposals.points[:, RANGE] == 1.6).all()
+
+    def right_part(points, weights):
+        # right of the middle third, where the ball's near side is 1.5 to 1.7 m away
+        part = points[:, side] > 0.05
+        terms = weights * shell(points)
+        share = (terms * part).sum() / terms.sum()
+        return share, np.sqrt(np.square(terms * (part - share)).sum()) / terms.sum()
+
+    found, error = right_part(proposals.points, np.exp(-proposals.log_density))
+    plain = space.sample(400_000, np.random.default_rng(9))
+    truth, rest = right_part(plain, np.ones(len(plain)))
+    assert abs(found - truth) < references.STANDARD_ERRORS * math.hypot(error, rest)
+
+
 def test_no_mesh_proposal_has_an_unbounded_weight():
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
     mesh = Scene((Body(Mesh(ball.vertices + np.array([2.0, 0, 0]), np.asarray(ball.faces))),))

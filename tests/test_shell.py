@@ -96,6 +96,23 @@ def test_with_a_fixed_angle_points_are_resampled_by_proximity():
     assert found[0] > 0.01
 
 
+@pytest.mark.parametrize("body", [ball, mesh_ball], ids=["primitive", "mesh"])
+def test_with_a_fixed_range_points_at_that_range_have_the_moments_of_the_target(body, tmp_path, monkeypatch):
+    monkeypatch.setenv("LIDARDESIGN_CACHE", str(tmp_path))
+    wide, scenes = open_space(), [Scene((body(),))]
+    range_m = (wide.low[5] + wide.high[5]) / 2
+    space = DesignSpace((*wide.low[:5], range_m), (*wide.high[:5], range_m))
+    target = build_target(scenes, space, DensitySettings(sigma_m=SIGMA), "raycast")
+    generator = np.random.default_rng(3)
+    points, log_density = independent_points(target, scenes, 20_000, generator)
+    assert (points[:, 5] == range_m).all()
+    found, error = weighted_means(points, target.log_density(points) - log_density, FUNCTIONS)
+    brute = space.sample(200_000, generator)
+    expected, brute_error = weighted_means(brute, target.log_density(brute), FUNCTIONS)
+    # 20,000 points are drawn, with repetition, from the candidates near the surface: as in plain integration
+    assert (np.abs(found - expected) < 4 * np.hypot(error, 2 * brute_error) + 1e-3).all()
+
+
 def test_a_space_that_reaches_no_surface_gives_no_proposals():
     away = DesignSpace((0, 0, 0, math.pi - 0.1, -0.1, 0.1), (0, 0, 0, math.pi + 0.1, 0.1, 0.5))
     for body in (ball(), mesh_ball()):

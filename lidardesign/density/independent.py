@@ -6,6 +6,7 @@
 - An angle fixed: hardly any surface point can be aimed at from a given origin, but few dimensions are free, so uniform
   points of the space are resampled by the surface proximity, which is then their density; with more free dimensions
   uniform rays are traced (`proposals`).
+- The range fixed: hardly any surface point is that far from a given origin. Uniform points are resampled, too.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from lidardesign.space import AZIMUTH, ELEVATION, RANGE, aim, observed_point
 # Up to so many free dimensions, uniform candidates meet the surfaces often enough to be resampled.
 RESAMPLED_DIMENSIONS = 3
 CANDIDATES = 131_072
+# Surfaces that fill less than a millionth of the space are given up.
+CANDIDATE_ROUNDS = 8
 FARTHEST_SIGMAS = 6.0
 # Scene points are proposed this far around bounding boxes; the surface term is below e^-12 beyond.
 REACH_SIGMAS = 5.0
@@ -46,6 +49,8 @@ def independent_points(
     Empty where no ray of the space comes near a target.
     """
     space, sigma_m = target.space, target.optics.sigma_m
+    if RANGE not in space.free:
+        return resampled_proposals(target, count, generator)
     if AZIMUTH in space.free and ELEVATION in space.free:
         if isinstance(target, FramesTarget) and np.isfinite(target.field.low).all():
             return proximity_proposals(target, count, generator)
@@ -64,9 +69,12 @@ def resampled_proposals(
 
     Empty where no candidate comes within `FARTHEST_SIGMAS` of any surface.
     """
-    candidates = target.space.sample(CANDIDATES, generator)
-    log_proximity = target.log_proximity(candidates)
-    near = log_proximity > target.log_column_weights.max() - FARTHEST_SIGMAS**2 / 2
+    for _ in range(CANDIDATE_ROUNDS):
+        candidates = target.space.sample(CANDIDATES, generator)
+        log_proximity = target.log_proximity(candidates)
+        near = log_proximity > target.log_column_weights.max() - FARTHEST_SIGMAS**2 / 2
+        if near.any():
+            break
     candidates, log_proximity = candidates[near], log_proximity[near]
     if not len(candidates):
         return candidates, log_proximity

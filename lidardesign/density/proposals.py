@@ -3,7 +3,8 @@
 They find modes that the flow dropped (`coverage`), and show whether anything can be in the way of a ray at all
 (visibility `auto`). Where both angles are free they aim at points that are uniform in area from random admissible
 origins; where an angle is fixed hardly any surface point can be aimed at, so random admissible rays are traced
-through all surfaces within reach and one of these is chosen. A normal range error is added in both cases.
+through all surfaces within reach and one of these is chosen. A normal range error is added in both cases; where the
+range is fixed, the error is what the surface is away from it.
 
 The density that they are drawn from sums over all surfaces of all scenes along a ray, each with its own range error;
 surfaces more than `WINDOW_SPREADS` of these away add less than 1e-13 of their share and are not looked for.
@@ -115,7 +116,7 @@ def _from_aimed_rays(
     A point of an area A at range s and incidence theta has the density s^2 / (A cos theta) per solid angle.
     """
     rays, column = _aimed_rays(scenes, columns, space, count, generator)
-    points, surface_range = _with_range_error(rays, spread_m, generator)
+    points, surface_range, accepted = _with_range_error(rays, space, spread_m, generator)
     directions = direction(points[:, AZIMUTH], points[:, ELEVATION])
     start = np.maximum(points[:, RANGE] - WINDOW_SPREADS * spread_m, 0.0)
     end = points[:, RANGE] + WINDOW_SPREADS * spread_m
@@ -129,7 +130,7 @@ def _from_aimed_rays(
         _add_shares(density, crossed, share, points, spread_m)
         own = np.abs(crossed.range_m - surface_range[crossed.row]) < FOUND_SPREADS * spread_m
         found[crossed.row[own & (column[crossed.row] == number)]] = True
-    return points, surface_range, column, np.where(found, density, 0.0)
+    return points, surface_range, column, np.where(found & accepted, density, 0.0)
 
 
 def _from_random_rays(
@@ -154,21 +155,29 @@ def _from_random_rays(
         # of several writes to one row the last one stays, and their order is random
         chosen[found.row[order]] = found.range_m[order]
     rays[:, RANGE] = chosen
-    points, surface_range = _with_range_error(rays, spread_m, generator)
+    points, surface_range, accepted = _with_range_error(rays, space, spread_m, generator)
     density = np.zeros(count)
     for found in crossed:
         share = 1.0 / np.bincount(found.row, minlength=count)[found.row]
         _add_shares(density, found, share, points, spread_m)
-    kept = np.isfinite(chosen)
+    kept = np.isfinite(chosen) & accepted
     return points[kept], surface_range[kept], column[kept], density[kept]
 
 
 def _with_range_error(
-    rays: np.ndarray, spread_m: float, generator: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    points = rays.copy()
-    points[:, RANGE] += generator.normal(scale=spread_m, size=len(points))
-    return points, rays[:, RANGE].copy()
+    rays: np.ndarray, space: DesignSpace, spread_m: float, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points (N, 6), the ranges of their surfaces (N,), and which points are to be kept (N,) bool.
+
+    A fixed range is an error that is known: a ray is kept with the probability that its surface has this error.
+    """
+    points, surface_range = rays.copy(), rays[:, RANGE].copy()
+    if RANGE in space.free:
+        points[:, RANGE] += generator.normal(scale=spread_m, size=len(points))
+        return points, surface_range, np.ones(len(points), dtype=bool)
+    points[:, RANGE] = space.low[RANGE]
+    probability = np.exp(-np.square((points[:, RANGE] - surface_range) / spread_m) / 2)
+    return points, surface_range, generator.random(len(points)) < probability
 
 
 def _add_shares(

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lidardesign.design.features import Features
+from lidardesign.numerics import safe_divide
 from lidardesign.space import RANGE, observed_point
 
 # The mean range of like rays is over so many of so many samples: one in three hundred of the density.
@@ -24,5 +25,8 @@ def looks(features: Features) -> np.ndarray:
     near = cKDTree(aiming[pool]).query(aiming, k=min(NEIGHBOURS, len(aiming)))[1].reshape(len(aiming), -1)
     share = features.weights[near]
     points = features.points.copy()
-    points[:, RANGE] = (share * points[near, RANGE]).sum(axis=1) / share.sum(axis=1)
+    # far from all of the density neighbours weigh nothing together, and there is no mean
+    total = share.sum(axis=1)
+    mean = safe_divide((share * points[near, RANGE]).sum(axis=1), total)
+    points[:, RANGE] = np.where(total > 0, mean, points[:, RANGE])
     return observed_point(points)
