@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import inspect
+import itertools
 import json
 import os
 import resource
@@ -32,6 +33,7 @@ PATIENCE = 3
 PATIENCE_S = 5
 # Tests of a function take this long together at most, the quickest ones first [s].
 ENOUGH_S = 3.0
+ANEW_LIMIT_S = 60
 MEMORY_BYTES = 8 << 30
 # Exit code of a process whose work raised, which pytest never lets a test do.
 BROKEN = 99
@@ -62,6 +64,28 @@ class Children:
             raise SystemExit(f"this mutant could not be tested: {self.running[child]}")
         over = os.WIFSIGNALED(status) and os.WTERMSIG(status) in (signal.SIGXCPU, signal.SIGKILL)
         self.tell(self.running.pop(child), "survived" if status == 0 else "timeout" if over else "killed")
+
+
+def try_mutants(
+    path: Path, name: str, files: list[str], mutants: list[Mutant], children: Children, ours: set[str]
+) -> int:
+    """Let mutants of the module `name` at `path` meet tests, in this process, which imports for it: pytest's exit code.
+
+    Arguments:
+        path, name: The module.
+        files: Its test files; a change outside of functions meets the first one alone, whole.
+        mutants: Its changed sources.
+        children: Runs them, and tells what became of each.
+        ours: Packages and modules that a mutant is to meet anew.
+    """
+    bodies = function_bodies(path.read_text())
+    preload(path, name, files, ours)
+    for mutant in mutants:
+        if function_at(bodies, mutant.line) is None:
+            children.start(mutant, lambda m=mutant: run_anew(path, name, m.code, files[:1]), ANEW_LIMIT_S)
+    children.finish()
+    inside = [mutant for mutant in mutants if function_at(bodies, mutant.line) is not None]
+    return int(pytest.main([*OPTIONS, *files], plugins=[InPlace(path, name, inside, children)]))
 
 
 def forked(work: Callable[[], int], limit_s: int) -> int:
@@ -205,7 +229,7 @@ class InPlace:
 
 def run_items(items: list[pytest.Item]) -> None:
     """Run collected tests as pytest does, up to the first failure."""
-    for item, following in zip(items, [*items[1:], None], strict=True):
+    for item, following in itertools.zip_longest(items, items[1:]):
         item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
         if item.session.testsfailed:
             return

@@ -8,14 +8,17 @@ taken away. Annotations of functions are left alone, since nothing evaluates the
 from __future__ import annotations
 
 import ast
+import functools
+import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import CodeType
 
 import cosmic_ray.plugins
 import parso
 from cosmic_ray.ast import ast_nodes, get_ast
 from cosmic_ray.mutating import mutate_code
+from cosmic_ray.operators.operator import Operator
 
 BINARY = {"Add_Sub", "Sub_Add", "Mul_Div", "Div_Mul", "FloorDiv_Mul", "Mod_Mul", "Pow_Mul"} | {
     f"{one}_{other}" for one, other in (("BitOr", "BitAnd"), ("BitAnd", "BitOr"), ("BitXor", "BitAnd"))
@@ -51,9 +54,21 @@ class Mutant:
 
 def mutants_of(source: str) -> list[Mutant]:
     """Every mutant of a source that compiles, by line."""
-    found = [mutant for name in sorted(cosmic_ray.plugins.operator_names()) for mutant in _by_operator(source, name)]
+    lines = source.splitlines(keepends=True)
+    starts = [*(_first_line(node) - 1 for node in ast.parse(source).body), len(lines)]
+    found = []
+    # statement by statement: every mutant is parsed anew
+    for start, end in itertools.pairwise(starts):
+        before, part, after = ("".join(lines[one]) for one in (slice(start), slice(start, end), slice(end, None)))
+        for mutant in _of_part(part):
+            code, line = before + mutant.code + after, mutant.line + start
+            found.append(replace(mutant, code=code, line=line))
     distinct = {mutant.code: mutant for mutant in found}
     return sorted(distinct.values(), key=lambda mutant: (mutant.line, mutant.operator, mutant.after))
+
+
+def _first_line(node: ast.stmt) -> int:
+    return min([node.lineno, *(one.lineno for one in getattr(node, "decorator_list", []))])
 
 
 def function_bodies(source: str) -> dict[str, tuple[int, int]]:
@@ -78,21 +93,30 @@ def function_code(code: CodeType, name: str) -> CodeType:
     return code
 
 
-def _by_operator(source: str, name: str) -> Iterator[Mutant]:
-    operator_class, short = cosmic_ray.plugins.get_operator(name), name.partition("/")[2]
-    family, _, pair = short.partition("_")
-    # the variable operators take arguments, and there is no default for them
-    if operator_class.arguments() or (family in CHOSEN and pair not in CHOSEN[family]):
-        return
-    operator, tree = operator_class(), get_ast(source)
-    unread = _annotations(tree)
-    places = [place for node in ast_nodes(tree) for place in operator.mutation_positions(node)]
-    for occurrence, (start, _) in enumerate(places):
-        if any(low <= start < high for low, high in unread):
-            continue
-        code = mutate_code(source, operator, occurrence)
-        if code is not None and code != source and _compiles(code):
-            yield _described(source, code, short, start[0])
+def _of_part(source: str) -> Iterator[Mutant]:
+    tree = get_ast(source)
+    nodes, unread = list(ast_nodes(tree)), _annotations(tree)
+    for name, operator in _operators():
+        places = [place for node in nodes for place in operator.mutation_positions(node)]
+        for occurrence, (start, _) in enumerate(places):
+            if any(low <= start < high for low, high in unread):
+                continue
+            code = mutate_code(source, operator, occurrence)
+            if code is not None and code != source and _compiles(code):
+                yield _described(source, code, name, start[0])
+
+
+@functools.cache
+def _operators() -> tuple[tuple[str, Operator], ...]:
+    """The operators that are used, by name."""
+    found = []
+    for name in sorted(cosmic_ray.plugins.operator_names()):
+        kind, short = cosmic_ray.plugins.get_operator(name), name.partition("/")[2]
+        family, _, pair = short.partition("_")
+        # the variable operators take arguments, and there is no default for them
+        if not kind.arguments() and (family not in CHOSEN or pair in CHOSEN[family]):
+            found.append((short, kind()))
+    return tuple(found)
 
 
 def _annotations(tree: parso.tree.NodeOrLeaf) -> list[tuple[tuple[int, int], tuple[int, int]]]:

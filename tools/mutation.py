@@ -19,11 +19,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import pytest
 import yaml
 from hypothesis import HealthCheck, Phase, settings
-from mutant_tests import OPTIONS, Children, InPlace, function_at, preload, run_anew
-from mutants import Mutant, function_bodies, mutants_of
+from mutant_tests import Children, try_mutants
+from mutants import Mutant, mutants_of
 
 ROOT = Path(__file__).resolve().parent.parent
 RECORDS = ROOT / "build" / "mutation"
@@ -95,14 +94,8 @@ def run_module(module: str, jobs: int, retry: bool, sample: int | None) -> int:
     record.begin([one for one in record.read() if retry and one.outcome != "survived" and one.key in keys])
     known = {one.key for one in record.read()}
     waiting = [mutant for mutant in found if key_of(mutant) not in known]
-    bodies, children = function_bodies(path.read_text()), Children(jobs, record.tell)
-    preload(path, name, files, OURS | {one.stem for one in (ROOT / "tests").rglob("*.py")})
-    for mutant in waiting:
-        if function_at(bodies, mutant.line) is None:
-            children.start(mutant, lambda m=mutant: run_anew(path, name, m.code, files[:1]), 60)
-    children.finish()
-    inside = [mutant for mutant in waiting if function_at(bodies, mutant.line) is not None]
-    return int(pytest.main([*OPTIONS, *files], plugins=[InPlace(path, name, inside, children)]))
+    ours = OURS | {one.stem for one in (ROOT / "tests").rglob("*.py")}
+    return try_mutants(path, name, files, waiting, Children(jobs, record.tell), ours)
 
 
 def report(results: dict[str, list[Outcome]], minutes: float) -> str:
