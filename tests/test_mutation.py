@@ -98,4 +98,5 @@ def test_changes_that_tests_can_see_are_killed_inside_and_outside_of_functions(f
     alive = {after for _, _, after, outcome in found if outcome == "survived"}
     # equal values have one larger, a static method is one without its decorator too, nothing calls the last function
     assert alive == {"return one if one >= other else other", "", "return value"}
-    assert sum(outcome == "killed" for *_, outcome in found) > 20
+    assert {outcome for *_, outcome in found} == {"killed", "survived"}
+    assert len(found) > 15
