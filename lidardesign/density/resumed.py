@@ -43,6 +43,11 @@ def check_resumable(
     seconds = state.get("seconds")
     if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds < math.inf:
         raise DataError(f"has seconds = {seconds!r}", where=str(path), allowed="a number from 0", hint=HINT)
+    weights = {f"flow.{name}": value.numel() for name, value in flow.state_dict().items()}
+    held = {name: array.size for name, array in arrays.items() if name.startswith("flow.")}
+    if held != weights:
+        differing = sorted(name for name in {*held, *weights} if held.get(name) != weights.get(name))
+        raise DataError(f"the checkpoint is of another flow: {differing[0]} differs", where=str(path), hint=HINT)
     for index, parameter in enumerate(flow.parameters()):
         start = f"adam.{index}."
         found = {name: array for name, array in arrays.items() if name.startswith(start)}
