@@ -11,6 +11,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lidardesign import numerics
 from lidardesign.numerics import (
     angle_over_sine,
     box_quadratic_minimum,
@@ -474,3 +475,88 @@ def test_a_systematic_draw_takes_every_index_as_often_as_its_weight_says_rounded
     assert (np.abs(times - expected) < 1).all()
     assert (times[weights == 0] == 0).all()
     assert (np.diff(chosen) >= 0).all()
+
+
+def test_the_series_are_those_of_their_functions():
+    whole = [math.factorial(k) for k in range(8)]
+    assert pytest.approx([(-1) ** k / whole[2 * k + 1] for k in range(4)], rel=1e-15) == numerics.SINE_OVER_ANGLE
+    assert pytest.approx([(-1) ** k / whole[2 * k] for k in range(4)], rel=1e-15) == numerics.COSINE
+    exact = [math.comb(2 * k, k) / (4**k * (2 * k + 1)) for k in range(4)]
+    assert pytest.approx(exact, rel=1e-15) == numerics.ARCSINE_OVER_SINE
+    # t / sin t times sin t / t is 1, in every power
+    for power in range(4):
+        terms = [numerics.ANGLE_OVER_SINE[k] * numerics.SINE_OVER_ANGLE[power - k] for k in range(power + 1)]
+        assert math.fsum(terms) == pytest.approx(float(power == 0), abs=1e-17)
+
+
+def test_guards_go_from_the_finest_to_the_coarsest():
+    names = ["TINY", "SQUARABLE", "TINY_FLOAT32", "EPSILON", "ROUNDING", "SLACK", "HALF_DIGITS"]
+    names += ["FLOAT32_ROUNDING", "EPSILON_FLOAT32", "COARSE_SLACK"]
+    values = [getattr(numerics, name) for name in names]
+    assert values == sorted(set(values))
+    assert values[0] > 0
+    assert values[-1] < 1e-5
+    # what is squared, and the two roundings of a format
+    assert numerics.SQUARABLE**2 > numerics.TINY
+    assert 1 + numerics.EPSILON > 1
+    assert 1 + numerics.EPSILON / 2 == 1
+    assert pytest.approx(math.sqrt(numerics.EPSILON), rel=0.5) == numerics.HALF_DIGITS
+
+
+def test_more_sweeps_come_nearer_to_the_minimum_and_enough_end_by_themselves():
+    precision = np.array([[[1.0, 0.99], [0.99, 1.0]]])
+    centre, low, high = np.array([[3.0, -1.0]]), np.full((1, 2), -1.0), np.ones((1, 2))
+    inside = np.array([[0.4, 0.2]])
+    np.testing.assert_array_equal(box_quadratic_minimum(precision, inside, low, high), inside)
+    # along the lower edge's opposite the first coordinate stands at its bound, the other at its best there
+    best = box_quadratic_minimum(precision, centre, low, high)
+    np.testing.assert_allclose(best, [[1.0, -1.0 + 0.99 * 2.0]], atol=1e-9)
+    np.testing.assert_array_equal(best, box_quadratic_minimum(precision, centre, low, high, sweeps=10_000))
+
+
+def test_normalised_weights_know_no_scale_and_refuse_what_is_no_number():
+    values = np.array([0.0, 1.0, -2.0])
+    expected = np.exp(values) / np.exp(values).sum()
+    for shift in (-1e5, 0.0, 1e5):
+        np.testing.assert_allclose(normalised_weights(values + shift), expected, rtol=1e-9)
+    for bad in ([math.nan, 0.0], [math.inf, 0.0], []):
+        with pytest.raises(ValueError, match="normalised"):
+            normalised_weights(bad)
+
+
+def test_effective_counts_are_the_square_of_the_sum_over_the_sum_of_squares():
+    weights = np.array([3.0, 1.0, 0.0])
+    assert effective_count(weights) == pytest.approx(16 / 10)
+    assert effective_count(weights * 1e200) == pytest.approx(16 / 10)
+    assert effective_sample_size(np.log([3.0, 1.0, 0.5])) == pytest.approx(4.5**2 / 10.25 / 3)
+    assert effective_sample_size(np.log([3.0, 1.0]) + 1e5) == pytest.approx(16 / 10 / 2)
+    assert effective_sample_size([]) == 0.0
+    assert effective_count([]) == 0.0
+
+
+def test_the_least_eigenvalue_is_lowered_besides_and_eigenvectors_stay():
+    turn = np.array([[0.8, -0.6], [0.6, 0.8]])
+    matrix = turn @ np.diag([2.0, 5.0]) @ turn.T
+    found = clipped_eigenvalues(matrix[None], np.array([0.5]), np.array([4.0]), np.array([1.5]))
+    np.testing.assert_allclose(found[0], turn @ np.diag([1.5, 4.0]) @ turn.T, rtol=1e-12)
+    np.testing.assert_array_equal(found, np.swapaxes(found, -1, -2))
+    np.testing.assert_allclose(clipped_eigenvalues(matrix, 0.5), matrix, rtol=1e-12)
+    skewed = matrix + np.array([[0.0, 0.3], [-0.3, 0.0]])
+    np.testing.assert_allclose(clipped_eigenvalues(skewed, 0.5), matrix, rtol=1e-12)
+
+
+def test_a_systematic_draw_of_whole_shares_is_exact_and_one_offset_moves_all():
+    class Fixed:
+        def __init__(self, value):
+            self.value = value
+
+        def uniform(self):
+            return self.value
+
+    weights = np.array([1.0, 0.0, 2.0, 1.0])
+    for offset in (0.0, 0.5, 0.999):
+        assert systematic_draw(weights, 4, Fixed(offset)).tolist() == [0, 2, 2, 3]
+    assert systematic_draw(weights, 2, Fixed(0.0)).tolist() == [0, 2]
+    assert systematic_draw(weights, 2, Fixed(0.6)).tolist() == [2, 3]
+    # rounding of the last place never leads past the last index
+    assert systematic_draw(weights, 1, Fixed(1.0)).tolist() == [3]
