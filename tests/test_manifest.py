@@ -10,13 +10,11 @@ import socket
 import stat
 import threading
 
-import numpy as np
 import pytest
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run import files, lock, processes
 from lidardesign.run import manifest as manifest_module
-from lidardesign.run.checkpoint import load_arrays, save_arrays
 from lidardesign.run.files import remove_stray_temporaries, sha256_file, write_atomic
 from lidardesign.run.lock import run_lock
 from lidardesign.run.manifest import (
@@ -314,22 +312,3 @@ def test_a_file_that_nobody_recorded_is_told_from_one_that_is_not_there_yet(run)
         verify(run, "foreign.bin")
     with pytest.raises(DataError, match=r"holds no absent\.bin yet"):
         verify(run, "absent.bin")
-
-
-@pytest.mark.parametrize("stopped_at", ["announce", "write_atomic", "record"])
-def test_a_kill_at_any_moment_leaves_a_checkpoint_that_loads(run, monkeypatch, stopped_at):
-    save_arrays(run, "state.safetensors", {"step": np.arange(3)}, {"step": 1})
-    names = ("announce", "write_atomic", "record")
-    with monkeypatch.context() as patched:
-
-        def killed(*_):
-            raise KeyboardInterrupt
-
-        for name in names[names.index(stopped_at) :]:
-            patched.setattr(manifest_module, name, killed)
-        with pytest.raises(KeyboardInterrupt):
-            save_arrays(run, "state.safetensors", {"step": np.arange(4)}, {"step": 2})
-    arrays, state = load_arrays(run, "state.safetensors")
-    assert len(arrays["step"]) == state["step"] + 2
-    save_arrays(run, "state.safetensors", {"step": np.arange(5)}, {"step": 3})
-    assert load_arrays(run, "state.safetensors")[1] == {"step": 3}

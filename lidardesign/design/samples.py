@@ -20,6 +20,7 @@ from lidardesign.space import DesignSpace
 FILE_NAME = "samples.npz"
 NUMBERS = ("points", "log_prob", "log_target")
 DAMAGED_HINT = "learn the run again"
+NOT_FINITE = "holds values that are not finite"
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,12 +32,20 @@ class Samples:
         log_prob: The density that they were drawn from, per chart volume, shape (N,).
         log_target: log p* at them, unnormalised, shape (N,).
         space: The design space of both densities.
+
+    Raises:
+        DataError: Values that are no numbers; log p* alone may be -inf.
     """
 
     points: np.ndarray
     log_prob: np.ndarray
     log_target: np.ndarray
     space: DesignSpace
+
+    def __post_init__(self) -> None:
+        finite = np.isfinite(self.points).all() and np.isfinite(self.log_prob).all()
+        if not (finite and (self.log_target < np.inf).all()):
+            raise DataError(NOT_FINITE, where="samples", hint=DAMAGED_HINT)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -100,7 +109,8 @@ def load_samples(run: Path) -> Samples:
         if array.shape != shape or array.dtype != np.float64 or not count:
             found, allowed = f"holds an array of {array.dtype} of shape {array.shape}", f"float64 of shape {shape}"
             raise DataError(found, where=str(path), allowed=allowed, hint=DAMAGED_HINT)
-    if not (np.isfinite(points).all() and np.isfinite(log_prob).all() and (log_target < np.inf).all()):
-        raise DataError("holds values that are not finite", where=str(path), hint=DAMAGED_HINT)
     space = guarded(lambda: DesignSpace.from_dict(json.loads(arrays["space"].tobytes())), path, DAMAGED_HINT)
-    return Samples(points, log_prob, log_target, space)
+    try:
+        return Samples(points, log_prob, log_target, space)
+    except DataError as error:
+        raise DataError(error.message, where=str(path), hint=error.hint) from None

@@ -247,7 +247,7 @@ class TestStepsThatAreNotFinite:
         def flaky(self, points, sigma_m=None):
             values, gradient = exact(self, points, sigma_m)
             calls["n"] += 1
-            return values, gradient * (factor if first < calls["n"] <= last else 1.0)
+            return values, np.full_like(gradient, factor) if first < calls["n"] <= last else gradient
 
         monkeypatch.setattr(Target, "log_density_and_gradient", flaky)
         return calls
@@ -266,11 +266,12 @@ class TestStepsThatAreNotFinite:
         assert any("1 steps were not finite" in note for note in result.notes)
         assert math.isfinite(result.kl_nats)
 
-    def test_a_skipped_step_leaves_weights_and_moments_alone(self, tmp_path, monkeypatch):
+    @pytest.mark.parametrize("factor", [math.nan, math.inf, -math.inf])
+    def test_a_skipped_step_leaves_weights_and_moments_alone(self, tmp_path, monkeypatch, factor):
         trainer = a_trainer(tmp_path)
         trainer._advance()
         before = trainer._state_arrays()
-        self.broken_between(monkeypatch, 0, 1)
+        self.broken_between(monkeypatch, 0, 1, factor)
         trainer._advance()
         after = trainer._state_arrays()
         assert trainer.skipped == 1
@@ -299,6 +300,17 @@ class TestStepsThatAreNotFinite:
         arrays, state = load_arrays(tmp_path, training.CHECKPOINT)
         assert state["step"] % training.SNAPSHOT_STEPS == 0
         assert all(np.isfinite(value).all() for value in arrays.values() if value.dtype.kind == "f")
+
+    def test_the_command_ends_with_exit_5_and_says_what_to_do(self, tmp_path, monkeypatch, capsys):
+        exact = training.pathwise_loss
+        monkeypatch.setattr(training, "pathwise_loss", lambda *given: (exact(*given)[0] * math.nan, math.nan, math.nan))
+        with pytest.raises(SystemExit) as ended:
+            run_program(learning(tmp_path / "run", "--json"))
+        error = json.loads(capsys.readouterr().out)["error"]
+        assert ended.value.code == 5
+        assert "learning diverged at step 34" in error["message"]  # the last of seven times five steps
+        assert "learning.rate" in error["hint"]
+        assert not (tmp_path / "run" / "flow.safetensors").exists()
 
     def test_a_resume_after_steps_were_skipped_is_bit_identical_too(self, tmp_path, monkeypatch):
         # a whole stretch of steps after the snapshot at step 50 has no gradient, so weights are taken back
