@@ -1,0 +1,258 @@
+"""The long run of the fuzzer: every target in processes of its own that may hang, crash or run out of memory.
+
+    PYTHONPATH=tests python tests/fuzz/campaign.py --inputs 100000 --out docs/soak
+
+A target's inputs go through the program in batches, each in a fresh process with a memory limit. Which input is being
+read is on disk before it is read, so that one which ends or stops the process is known, and the batch goes on after it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from importlib.metadata import version
+from pathlib import Path
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+WORKER = HERE / "fuzz_worker.py"
+BATCH = 2500
+COMMAND_BATCH = 60
+# A process that says nothing for so long hangs [s]; the machine may be busy with other things.
+HANG_S = 120.0
+POLL_S = 0.2
+ALL_SHARES = 100_000
+
+
+@dataclass
+class Job:
+    """A batch of inputs of one target.
+
+    Arguments:
+        name: The target.
+        inputs: How many.
+        seed: Of the batch.
+    """
+
+    name: str
+    inputs: int
+    seed: int
+
+
+@dataclass
+class Found:
+    """What a target's batches found.
+
+    Arguments:
+        inputs, read, refused: Counts.
+        places: Lines of the program at which inputs were refused.
+        slowest_s, seconds: Processor times.
+        memory_mib: The most memory that a process needed beyond what it began with.
+        faults: Reasons by the place of the saved input.
+    """
+
+    inputs: int = 0
+    read: int = 0
+    refused: int = 0
+    places: set[str] = field(default_factory=set)
+    slowest_s: float = 0.0
+    seconds: float = 0.0
+    memory_mib: float = 0.0
+    faults: dict[str, str] = field(default_factory=dict)
+
+
+def jobs(inputs: int, only: list[str], seed: int) -> Iterator[Job]:
+    """Batches of all targets, inputs in the targets' shares."""
+    from commands import COMMANDS
+    from fuzz_targets import TARGETS
+
+    chosen = [target for target in (*TARGETS, *COMMANDS) if not only or any(word in target.name for word in only)]
+    shares = sum(target.share for target in (*TARGETS, *COMMANDS))
+    commands = {target.name for target in COMMANDS}
+    for target in chosen:
+        left = max(round(inputs * target.share / shares), 1)
+        batch = COMMAND_BATCH if target.name in commands else BATCH
+        for number in range(-(-left // batch)):
+            yield Job(target.name, min(batch, left - number * batch), 1000 * seed + number)
+
+
+def run_job(job: Job, kept: Path) -> Found:
+    """One batch: started again behind every input that ended its process."""
+    found, first = Found(), 0
+    with tempfile.TemporaryDirectory(prefix="fuzz-") as name:
+        while first < job.inputs:
+            folder = Path(name) / str(first)
+            folder.mkdir()
+            ended = _process(job, first, folder)
+            _merge(found, folder, kept, job)
+            if ended is None:
+                break
+            number, content = _current(folder)
+            found.inputs += 1
+            _keep(found, kept, job, content, ended)
+            # a process that ends before it reads anything would end again
+            first = first + number if number else job.inputs
+            shutil.rmtree(folder, ignore_errors=True)
+    return found
+
+
+def _current(folder: Path) -> tuple[int, bytes]:
+    """Number and content of the input that a process read last; 0 where it read none."""
+    path = folder / "current"
+    number, _, content = path.read_bytes().partition(b"\n") if path.exists() else (b"0", b"", b"")
+    return int(number), content
+
+
+def _process(job: Job, first: int, folder: Path) -> str | None:
+    """Run inputs from the first on; why the process ended before the last, or None."""
+    arguments = [job.name, str(job.seed), str(first), str(job.inputs), str(folder)]
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT / 'tests'}:{HERE}"}
+    with (folder / "output").open("wb") as output:
+        process = subprocess.Popen(
+            [sys.executable, str(WORKER), *arguments],
+            stdout=output, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, env=environment, cwd=folder,
+        )  # fmt: skip
+        seen, since = -1, time.monotonic()
+        while process.poll() is None:
+            time.sleep(POLL_S)
+            done = _read_json(folder / "tally.json").get("beat", 0)
+            if done != seen:
+                seen, since = done, time.monotonic()
+            elif time.monotonic() - since > HANG_S:
+                process.kill()
+                process.wait()
+                return f"said nothing for {HANG_S:g} s: it hangs"
+    if process.returncode == 0:
+        return None
+    tail = (folder / "output").read_text(errors="replace")[-2000:]
+    return f"the process ended with {process.returncode}\n{tail}"
+
+
+def _read_json(path: Path) -> dict[str, object]:
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+
+
+def _merge(found: Found, folder: Path, kept: Path, job: Job) -> None:
+    """Add what a process counted."""
+    tally = _read_json(folder / "tally.json")
+    if not tally:
+        return
+    found.read += tally["read"]
+    found.refused += tally["refused"]
+    found.inputs += tally["read"] + tally["refused"] + tally["broken"]
+    found.places |= set(tally["places"])
+    found.slowest_s = max(found.slowest_s, tally["slowest_s"])
+    found.seconds += tally["seconds"]
+    found.memory_mib = max(found.memory_mib, tally["memory_mib"])
+    for path in sorted((folder / "faults").glob("*.input")):
+        _keep(found, kept, job, path.read_bytes(), path.with_suffix(".txt").read_text())
+
+
+def _keep(found: Found, kept: Path, job: Job, content: bytes, reason: str) -> None:
+    """Save an input that found a fault, with the reason."""
+    kept.mkdir(parents=True, exist_ok=True)
+    stem = "".join(letter if letter.isalnum() else "-" for letter in job.name)
+    path = kept / f"{stem}-{hashlib.sha256(content + reason[-200:].encode()).hexdigest()[:12]}.input"
+    path.write_bytes(content)
+    path.with_suffix(".txt").write_text(reason)
+    found.faults[str(path)] = reason
+
+
+def together(parts: list[tuple[Job, Found]]) -> dict[str, Found]:
+    """What was found, by target."""
+    result: dict[str, Found] = {}
+    for job, part in parts:
+        whole = result.setdefault(job.name, Found())
+        for name in ("inputs", "read", "refused", "seconds"):
+            setattr(whole, name, getattr(whole, name) + getattr(part, name))
+        for name in ("slowest_s", "memory_mib"):
+            setattr(whole, name, max(getattr(whole, name), getattr(part, name)))
+        whole.places |= part.places
+        whole.faults.update(part.faults)
+    return result
+
+
+def report(found: dict[str, Found], arguments: argparse.Namespace, seconds: float) -> str:
+    """The result as a page."""
+    total = {name: sum(getattr(one, name) for one in found.values()) for name in ("inputs", "read", "refused")}
+    faults = {path: reason for one in found.values() for path, reason in one.faults.items()}
+    packages = ("numpy", "pyyaml", "pydantic", "trimesh", "h5py", "scipy", "safetensors", "torch", "mujoco")
+    revision = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT).stdout
+    lines = [
+        "# Damaged files",
+        "",
+        f"{datetime.now(timezone.utc):%Y-%m-%d}, revision {revision.strip() or 'unknown'}, seed {arguments.seed}, "
+        f"{seconds / 60:.0f} minutes, {arguments.workers} processes at a time.",
+        "",
+        f"**{total['inputs']:,} damaged files: {total['read']:,} were read, {total['refused']:,} refused with a "
+        f"message, {len(faults)} ended otherwise** (a traceback, a warning, a process that crashed or hung, a number "
+        "that is not finite, too much memory, code of the file that ran, a file that was left or half-written).",
+        "",
+        "Good files of every kind, made by the program, are damaged by a seeded generator: bytes, numbers, words and "
+        "lines, keys and values of documents, arrays and headers inside archives whose checksums are right again. An "
+        "input that is refused at a new place of the program is damaged further. Each goes through the function by "
+        "which commands read such files; the last rows are whole commands. Processes may take 2 GiB of memory beyond "
+        "what they begin with; an input may take 5 s of processor time, a command 60 s.",
+        "",
+        f"Python {platform.python_version()}, {', '.join(f'{name} {version(name)}' for name in packages)}.",
+        "",
+        "| file | inputs | read | refused | places of refusal | mean [ms] | slowest [s] | memory [MiB] | faults |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    for name, one in found.items():
+        mean = 1000 * one.seconds / max(one.inputs, 1)
+        lines.append(
+            f"| {name} | {one.inputs:,} | {one.read:,} | {one.refused:,} | {len(one.places)} | {mean:.1f} | "
+            f"{one.slowest_s:.2f} | {one.memory_mib:.0f} | {len(one.faults)} |"
+        )
+    for path, reason in faults.items():
+        last = (reason.strip().splitlines() or ["no reason"])[-1][:300]
+        lines += ["", f"`{Path(path).name}`: {last}"]
+    return "\n".join([*lines, "", "`make fuzz` runs it again.", ""])
+
+
+def main() -> int:
+    """Run, write the report, and say whether anything was found."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--inputs", type=int, default=ALL_SHARES)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--only", nargs="*", default=[], help="parts of the names of targets")
+    parser.add_argument("--out", type=Path, help="a folder for the report")
+    parser.add_argument("--kept", type=Path, default=Path("fuzz-found"), help="a folder for inputs that find a fault")
+    arguments = parser.parse_args()
+    began, parts = time.monotonic(), []
+    planned = list(jobs(arguments.inputs, arguments.only, arguments.seed))
+    with ThreadPoolExecutor(arguments.workers) as pool:
+        for job, found in zip(planned, pool.map(lambda job: run_job(job, arguments.kept), planned), strict=True):
+            parts.append((job, found))
+            print(f"{job.name}: {found.inputs} inputs, {len(found.faults)} faults", flush=True)
+            for path, reason in found.faults.items():
+                print(f"  {path}: {(reason.strip().splitlines() or ['?'])[-1][:200]}", flush=True)
+    found = together(parts)
+    text = report(found, arguments, time.monotonic() - began)
+    print(text)
+    if arguments.out:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        (arguments.out / f"fuzz-{datetime.now(timezone.utc):%Y-%m-%d}.md").write_text(text, encoding="utf-8")
+    return int(any(one.faults for one in found.values()))
+
+
+if __name__ == "__main__":
+    sys.path[:0] = [str(ROOT / "tests")]
+    sys.exit(main())

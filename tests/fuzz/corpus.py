@@ -1,0 +1,298 @@
+"""Good files of every kind that the program reads, made by the program itself or as its documentation shows them."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import trimesh
+import yaml
+from captures import BIN_PS, BINS, make_capture
+from command_line import make_run
+from scipy.io import savemat
+
+from lidardesign.design.files import design_document
+from lidardesign.design.rays import lay_out
+from lidardesign.design.sensor import Coupling, Design, RayTable, Sensor, Track
+from lidardesign.design.sensor_csv import QUERY_COLUMN, write_sensor_csv
+from lidardesign.export import csv as csv_format
+from lidardesign.export import galvo
+from lidardesign.export import npz as npz_format
+from lidardesign.registry import load_task
+from lidardesign.run.config import resolve
+from lidardesign.run.manifest import note, read_manifest
+from lidardesign.run.yaml import dump_yaml
+from lidardesign.simulate.detector_files import FOLDER as DETECTORS
+
+ROOT = Path(__file__).parents[2]
+TASKS = ("flatland", "meshes", "face", "arm", "warehouse", "emitter")
+CONSTRAINTS = (
+    {"sensors": {"count": 3}, "gate": {"width_m": {"max": 0.2}}, "budget": {"rays": 100}},
+    {
+        "sensors": {"min": 1, "max": 4},
+        "origin": {
+            "low_m": [-1, -1, 0], "high_m": [1, 1, 1], "spread_m": {"max": 0.1}, "thickness_m": {"max": 0.05},
+            "exclude": [{"low_m": [-0.1, -0.1, 0], "high_m": [0.1, 0.1, 0.5]}],
+        },
+        "boresight": {"azimuth_deg": {"min": 90, "max": 270}, "elevation_deg": {"min": -90, "max": 10}},
+        "field_of_view": {"horizontal_deg": {"min": 1, "max": 30}, "vertical_deg": {"max": 20}},
+        "gate": {"start_m": {"min": 0.1}, "end_m": {"max": 2.0}, "width_m": {"min": 0.01, "max": 0.5}},
+        "budget": {"rays": 100, "bandwidth_mbps": 5.0, "bin_ps": 100, "bits_per_bin": 40, "rate_hz": 10},
+        "each": [{"gate": {"width_m": {"max": 0.2}}}, {"gate": {"end_m": {"max": 1.5}}}],
+    },
+    {"origin": {"mounts_m": [[0, 0, 1], [0.5, 0, 1], [-0.5, 0.2, 1]]}, "budget": {"rays": 50}},
+    {"origin": {"fixed_m": [0.4, 0.0, 1.0]}, "sensors": {"count": 2}},
+)  # fmt: skip
+
+
+def sensor(index: int = 0, *, spread_m: float = 0.0, coupled: bool = False) -> Sensor:
+    """A sensor that looks along -x."""
+    covariance = np.diag([spread_m**2, (2 * spread_m) ** 2, 0.0])
+    coupling = Coupling(np.full((2, 3), 0.1), np.array([0.2, 0.0, 0.1]), np.array([0.0, 0.3]), np.full(2, 0.02), 0.01)
+    return Sensor(
+        f"sensor {index}", 0.5, np.array([0.4, 0.1 * index, 0.0]), covariance, 3.1 + 0.2 * index, 0.02, 0.1, 0.05, 0.04,
+        0.4, 0.02, coupling=coupling if coupled else None,
+    )  # fmt: skip
+
+
+def sample_designs() -> list[Design]:
+    """A grid, explicit rays, a scan along a track, and a distributed design with couplings."""
+    pair = (sensor(0), sensor(1))
+    table = RayTable(
+        np.zeros((4, 3)), np.linspace(3, 3.3, 4), np.zeros(4), np.tile([0.2, 0.5], (4, 1)), np.array([0, 0, 1, 1])
+    )
+    knots = np.array([0.0, 0.5, 1.0])
+    gates = np.tile([0.2, 0.5], (3, 2, 1))
+    track = Track("x_m", knots, np.full((3, 2), 3.1), np.zeros((3, 2)), gates, np.array([0, 1]))
+    spread = (sensor(0, spread_m=0.1, coupled=True), sensor(1, spread_m=0.2))
+    constraints = {"gate": {"width_m": {"max": 0.5}}}
+    return [
+        Design("grid", pair, rays=60, constraints=constraints, provenance={"run": "..", "seed": 3}),
+        Design("rays", pair, layout="density", rays=4, ray_table=table),
+        Design("track", pair, layout="scan", rays=2, track=track),
+        Design("spread", spread, layout="distributed", rays=40, level=0.99),
+        Design("own", tuple(replace(one, rays=7) for one in pair), rays=14, at={"x_m": 0.5}),
+    ]
+
+
+def configurations(_: Path) -> list[bytes]:
+    """The whole configuration of every task, and short ones as people write them."""
+    whole = [dump_yaml(resolve(load_task(name), preset="draft").as_document()) for name in TASKS if name != "meshes"]
+    short = (
+        "task_name: flatland\ndensity: {sigma_m: 0.02, visibility: raycast}\nlearning:\n  steps: 100\n  rate: 1e-3\n",
+        "task_name: meshes\ntask: {folder: meshes, scale: 0.001, up: y, origin_m: [1, 0, 0]}\n"
+        "space: {x_m: 1, y_m: 0, z_m: 0, azimuth_rad: [2.8, 3.5], elevation_rad: [-0.3, 0.3], range_m: [0.5, 1.5]}\n",
+        "task_name: arm\nseed: 5\npreset: draft\ntask: &t {size: small}\nspace: {condition: [x_m], measure: angles}\n",
+    )
+    return [text.encode() for text in (*whole, *short)]
+
+
+def overrides(_: Path) -> list[bytes]:
+    """Values of `--set`."""
+    texts = (
+        "density.sigma_m=0.01", "learning.steps=100", "train=3", "space.range_m=[0.1, 2]", "space.condition=[x_m]",
+        "origin.fixed_m=[0.4, 0, 0]", "learning.rate=1e-3", "task.test=2", "density.visibility=raycast",
+        'scene="discs"', "gate={width_m: {max: 0.1}, start_m: {min: 0.2}}",
+    )  # fmt: skip
+    return [text.encode() for text in texts]
+
+
+def constraint_files(_: Path) -> list[bytes]:
+    """Constraint files with every key."""
+    return [yaml.safe_dump(values, sort_keys=False).encode() for values in CONSTRAINTS]
+
+
+def design_files(_: Path) -> list[bytes]:
+    """Design files of every layout, and the one written by hand."""
+    written = [dump_yaml(design_document(one)).encode() for one in sample_designs()]
+    return [*written, (ROOT / "examples" / "hand_written_design.yaml").read_bytes()]
+
+
+def sensor_tables(folder: Path) -> list[bytes]:
+    """Sensor tables with and without their header, and with a position."""
+    found = []
+    for design in sample_designs()[:4:3]:
+        write_sensor_csv(design, folder / "table.csv")
+        content = (folder / "table.csv").read_bytes()
+        header, *rows = content.decode().splitlines()
+        placed = "\n".join([f"{QUERY_COLUMN},{header}", *(f"0.5,{row}" for row in rows)])
+        found += [content, "\n".join(rows).encode(), placed.encode()]
+    return found
+
+
+def detectors(_: Path) -> list[bytes]:
+    """The shipped detector files and a short one."""
+    shipped = [path.read_bytes() for path in sorted(DETECTORS.glob("*.yaml"))]
+    return [*shipped, b"name: mine\npulse_fwhm_ps: 100\njitter_fwhm_ns: 0.2\nbin_ps: 50\nbins: 500\nestimator: peak\n"]
+
+
+def mesh_exports(kind: str) -> list[bytes]:
+    """A box, a ball and two boxes in one file format."""
+    shapes = [trimesh.creation.box((1, 2, 3)), trimesh.creation.icosphere(1, 0.5)]
+    pair = trimesh.Scene({"a": shapes[0], "b": shapes[1].copy().apply_translation((3, 0, 0))})
+    encodings = {"stl": ("stl", "stl_ascii"), "ply": ("ply",), "gltf": ()}.get(kind, (kind,))
+    found = [shape.export(file_type=encoding) for shape in shapes for encoding in encodings]
+    if kind == "ply":
+        found.append(shapes[0].export(file_type="ply", encoding="ascii"))
+    if kind in ("glb", "obj"):
+        found.append(pair.export(file_type=kind))
+    if kind == "gltf":
+        found = [_embedded(pair.export(file_type="gltf"))]
+    return [content.encode() if isinstance(content, str) else bytes(content) for content in found]
+
+
+def _embedded(files: dict[str, bytes]) -> bytes:
+    """A .gltf with its buffers inside, as data addresses."""
+    import base64
+
+    document = json.loads(files["model.gltf"])
+    for buffer in document["buffers"]:
+        buffer["uri"] = "data:application/octet-stream;base64," + base64.b64encode(files[buffer["uri"]]).decode()
+    return json.dumps(document).encode()
+
+
+def face_models(_: Path) -> list[bytes]:
+    """Small morphable models in both layouts of the Basel Face Model."""
+    random = np.random.default_rng(0)
+    mean = 100 * random.uniform(-1, 1, (12, 3))
+    mean[0], mean[1] = (0.0, -100.0, 0.0), (0.0, 100.0, 0.0)
+    basis, _ = np.linalg.qr(random.normal(size=(36, 3)))
+    faces = np.array([random.choice(12, 3, replace=False) for _ in range(10)])
+    found = []
+    layouts = (("shape/", "representer/cells", "mm"), ("", "representer/reference-mesh/triangle-list", None))
+    for prefix, cells, unit in layouts:
+        buffer = io.BytesIO()
+        with h5py.File(buffer, "w") as file:
+            file[prefix + "model/mean"] = mean.ravel()
+            file[prefix + "model/pcaBasis"] = basis
+            file[prefix + "model/pcaVariance"] = np.array([400.0, 100.0, 25.0])
+            file[prefix + cells] = faces.T.astype(np.int32)
+            if unit:
+                file["shape"].attrs["unit"] = unit
+            else:
+                file["representer/length-unit"] = np.array([0.001])
+        found.append(buffer.getvalue())
+    return found
+
+
+def _captured() -> list[dict[str, np.ndarray]]:
+    scanned = make_capture(4, images=True)
+    scanned = {**scanned, "counts": scanned["counts"][..., : BINS // 2]}
+    looking = make_capture(3, images=False)
+    pixels = {name: value for name, value in looking.items() if not name.endswith("_deg")}
+    own = {"direction": np.array([[1.0, 0.0, 0.0]] * 9), "start_ps": np.full(9, 2000.0), "bin_width_ps": BIN_PS}
+    both = (scanned, {**pixels, **own})
+    return [{name: np.asarray(value) for name, value in arrays.items()} for arrays in both]
+
+
+def captures_npz(_: Path) -> list[bytes]:
+    """Captures as numpy archives."""
+    found = []
+    for arrays in _captured():
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **arrays)
+        found.append(buffer.getvalue())
+    return found
+
+
+def captures_matlab(_: Path) -> list[bytes]:
+    """Captures as MATLAB 5 files, packed and not."""
+    found = []
+    for arrays, packed in zip(_captured(), (True, False), strict=True):
+        buffer = io.BytesIO()
+        savemat(buffer, arrays, do_compression=packed)
+        found.append(buffer.getvalue())
+    return found
+
+
+def captures_hdf5(_: Path) -> list[bytes]:
+    """Captures as MATLAB 7.3 files: HDF5 with the axes in reverse."""
+    kinds = {"f": "double", "u": "uint16", "i": "int64"}
+    found = []
+    for arrays in _captured():
+        buffer = io.BytesIO()
+        with h5py.File(buffer, "w") as file:
+            for name, array in arrays.items():
+                stored = file.create_dataset(name, data=np.atleast_2d(array).T)
+                stored.attrs["MATLAB_class"] = np.bytes_(kinds[array.dtype.kind])
+        found.append(buffer.getvalue())
+    return found
+
+
+def steering_lists(folder: Path) -> list[bytes]:
+    """Ray lists for a scanner."""
+    design = sample_designs()[0]
+    galvo.write(design, lay_out(design), folder / "rays.galvo.csv")
+    return [(folder / "rays.galvo.csv").read_bytes()]
+
+
+def ray_tables(folder: Path) -> list[bytes]:
+    """Ray lists as text."""
+    design = sample_designs()[1]
+    csv_format.write(design, lay_out(design), folder / "rays.csv")
+    return [(folder / "rays.csv").read_bytes()]
+
+
+def ray_archives(folder: Path) -> list[bytes]:
+    """Ray lists as numpy archives."""
+    design = sample_designs()[1]
+    npz_format.write(design, lay_out(design), folder / "rays.npz")
+    return [(folder / "rays.npz").read_bytes()]
+
+
+def robots(_: Path) -> list[bytes]:
+    """The embedded arm, a chain of capsules, and one with what models may have besides."""
+    piece = '<body pos="0 0 .18"><joint axis="{}"/><geom type="capsule" size=".03" fromto="0 0 0 0 0 .18"/>'
+    chain = "".join(piece.format("0 0 1" if link % 2 else "0 1 0") for link in range(7)) + "</body>" * 7
+    further = (
+        '<compiler angle="degree" meshdir="."/><option timestep="0.002"/><default><geom rgba="1 0 0 1"/></default>'
+        '<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>'
+        '<keyframe><key name="home" qpos="0 0 0 0 0 0 0"/></keyframe>'
+    )
+    world = '<geom type="plane" size="1 1 1"/><body pos="1 0 0"><geom type="mesh" mesh="m"/></body>'
+    embedded = ROOT / "tasks" / "lidardesign_tasks" / "data" / "iiwa14.xml"
+    return [
+        embedded.read_bytes(),
+        f"<mujoco><worldbody>{chain}</worldbody></mujoco>".encode(),
+        f"<mujoco>{further}<worldbody>{world}{chain}</worldbody></mujoco>".encode(),
+    ]
+
+
+def manifests(folder: Path) -> list[bytes]:
+    """The manifest of a run that was learned."""
+    run = make_run(folder / "run", count=50)
+    note(run, learn={"ess": 0.5, "notes": []}, visibility="raycast", timings={"learn": 1.0}, goal={"steps": 10})
+    return [json.dumps(read_manifest(run)).encode()]
+
+
+def samples(folder: Path) -> list[bytes]:
+    """The samples of a run."""
+    return [(make_run(folder / "run", count=300) / "samples.npz").read_bytes()]
+
+
+def progresses(_: Path) -> list[bytes]:
+    """The progress of learning, one JSON document per line."""
+    rows = [{"step": step, "loss": -1.5, "ess": 0.4, "seconds": step / 10} for step in range(10, 60, 10)]
+    return ["".join(json.dumps(row) + "\n" for row in rows).encode()]
+
+
+def locks(_: Path) -> list[bytes]:
+    """Locks of processes here and elsewhere."""
+    return [json.dumps({"pid": pid, "host": "elsewhere", "started": "17"}).encode() for pid in (1, 4_000_000)]
+
+
+def distance_fields(_: Path) -> list[bytes]:
+    """A cached distance field."""
+    buffer = io.BytesIO()
+    np.save(buffer, np.linspace(-1, 1, 64, dtype=np.float32), allow_pickle=False)
+    return [buffer.getvalue()]
+
+
+def header_of(content: bytes) -> dict[str, object]:
+    """The header of a safetensors file."""
+    return json.loads(content[8 : 8 + struct.unpack("<Q", content[:8])[0]])

@@ -1,0 +1,136 @@
+"""The files of a run as commands read them, behind the hashes that would refuse any damage first."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+from command_line import make_run
+from fuzz_kinds import Read, of_file
+
+
+def rerecord(run: Path, name: str, content: bytes) -> None:
+    """Put a file into a run with its hash, as somebody would who means it; without waiting for the disk."""
+    (run / name).write_bytes(content)
+    manifest = json.loads((run / "manifest.json").read_bytes())
+    manifest["files"][name] = {"sha256": hashlib.sha256(content).hexdigest(), "bytes": len(content)}
+    (run / "manifest.json").write_text(json.dumps(manifest))
+
+
+def open_manifests(folder: Path) -> Read:
+    """As every command does that is given a run."""
+    from lidardesign.cli.runs import open_run
+    from lidardesign.density.snapshots import kept_snapshots
+    from lidardesign.run.manifest import verify
+
+    run = make_run(folder / "run", count=50)
+
+    def read(content: bytes) -> object:
+        (run / "manifest.json").write_bytes(content)
+        opened = open_run(run)
+        verify(run, "samples.npz")
+        return opened.config.space, kept_snapshots(run)
+
+    return read
+
+
+def open_samples(folder: Path) -> Read:
+    """As `fit` does, behind the hash."""
+    from lidardesign.design.samples import load_samples
+
+    run = make_run(folder / "run", count=50)
+
+    def read(content: bytes) -> object:
+        rerecord(run, "samples.npz", content)
+        samples = load_samples(run)
+        return samples.points, samples.weights, samples.effective_sample_size
+
+    return read
+
+
+def open_progress(folder: Path) -> Read:
+    """As `evaluate --accuracy` does, behind the hash."""
+    from lidardesign.density.ladder import seconds_at
+
+    run = make_run(folder / "run", count=50)
+
+    def read(content: bytes) -> object:
+        rerecord(run, "progress.jsonl", content)
+        return seconds_at(run, [5, 20, 1000])
+
+    return read
+
+
+def open_locks(folder: Path) -> Read:
+    """As every command does that writes into a run."""
+    from lidardesign.run.lock import run_lock
+
+    def read(content: bytes) -> object:
+        (folder / ".lock").write_bytes(content)
+        try:
+            with run_lock(folder):
+                return None
+        finally:
+            (folder / ".lock").unlink(missing_ok=True)
+
+    return read
+
+
+def open_fields(folder: Path) -> Read:
+    """As `learn` does with its cache: what cannot be used is built again."""
+    from lidardesign.density.grids import _digest, _load
+
+    read = of_file(".npy", lambda path: _load(path, 64))(folder)
+    return lambda content: (read(content), read(content + _digest(content)))
+
+
+def _trainer(run: Path) -> object:
+    """A trainer at its first step, with a small flow and nothing to train on."""
+    import torch
+
+    from lidardesign.density.learn import make_flow
+    from lidardesign.density.objective import Coordinates
+    from lidardesign.density.parallel import ALONE
+    from lidardesign.density.training import Trainer
+    from lidardesign.registry import load_task
+    from lidardesign.run.config import resolve
+
+    config = resolve(load_task("flatland"), preset="draft", overrides=["learning.hidden=8", "learning.layers=1"])
+    generator = torch.Generator().manual_seed(0)
+    target = SimpleNamespace(ranks=ALONE)
+    flow, coordinates = make_flow(config, generator), Coordinates(config.space)
+    trainer = Trainer(flow, target, coordinates, config.learning, run, generator, None)
+    for parameter in trainer.flow.parameters():
+        parameter.grad = torch.zeros_like(parameter)
+    trainer.optimiser.step()
+    return trainer
+
+
+def checkpoints(folder: Path) -> list[bytes]:
+    """The checkpoint of a small flow."""
+    run = make_run(folder / "checkpointed", count=50)
+    trainer = _trainer(run)
+    trainer._save(trainer._taken())
+    return [(run / "checkpoint.safetensors").read_bytes()]
+
+
+def open_checkpoints(folder: Path) -> Read:
+    """As `learn --resume` does, behind the hash, and a step of the optimiser from there."""
+    import torch
+
+    run = make_run(folder / "run", count=50)
+
+    def read(content: bytes) -> object:
+        rerecord(run, "checkpoint.safetensors", content)
+        trainer = trainers[0]
+        trainer.optimiser.state.clear()
+        trainer.resume()
+        for parameter in trainer.flow.parameters():
+            parameter.grad = torch.zeros_like(parameter)
+        trainer.optimiser.step()
+        return [value.detach().numpy() for value in trainer.flow.state_dict().values()], trainer._rate()
+
+    trainers = [_trainer(run)]
+    return read

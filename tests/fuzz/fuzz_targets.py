@@ -1,0 +1,215 @@
+"""What is fuzzed: every kind of file that the program reads, through the function with which its commands read it."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import corpus
+from containers import (
+    mutate_glb,
+    mutate_gltf,
+    mutate_hdf5,
+    mutate_matlab,
+    mutate_npz,
+    mutate_safetensors,
+)
+from fuzz_kinds import Read, Target, of_file
+from fuzz_runs import (
+    checkpoints,
+    open_checkpoints,
+    open_fields,
+    open_locks,
+    open_manifests,
+    open_progress,
+    open_samples,
+)
+from mutators import either, mutate_bytes, mutate_json, mutate_text, mutate_yaml
+
+MOST_LAID_OUT = 5000
+
+
+def read_configuration(path: Path) -> object:
+    """As `learn --config` does, for the task that the file names."""
+    from lidardesign.registry import load_task
+    from lidardesign.run.config import SECTIONS, config_of, resolve
+    from lidardesign.run.yaml import load_yaml
+
+    document = load_yaml(path)
+    named = document.mapping.get("task_name")
+    task = named if named in corpus.TASKS else corpus.TASKS[zlib.crc32(path.read_bytes()) % len(corpus.TASKS)]
+    if named == task and set(SECTIONS) <= set(document.mapping):
+        return config_of(document)[1]
+    return resolve(load_task(task), config_file=path)
+
+
+def open_overrides(_: Path) -> Read:
+    """As `--set` does, for a configuration and for constraints."""
+    from lidardesign.cli.constrain import load_constraints
+    from lidardesign.errors import LidardesignError
+    from lidardesign.registry import load_task
+    from lidardesign.run.config import resolve
+
+    def configured(text: str) -> object:
+        return resolve(load_task("flatland"), overrides=[text])
+
+    def constrained(text: str) -> object:
+        return load_constraints(None, ["gate.width_m.max=0.1", text])
+
+    def run(content: bytes) -> object:
+        text = content.decode("utf-8", errors="replace")
+        for read in (configured, constrained):
+            try:
+                return read(text)
+            except LidardesignError as error:
+                refused = error
+        raise refused
+
+    return run
+
+
+@lru_cache(maxsize=1)
+def _spaces() -> list[object]:
+    from lidardesign.registry import load_task
+    from lidardesign.run.config import resolve
+
+    return [resolve(load_task(name), preset="draft").space for name in ("flatland", "arm")]
+
+
+def read_constraints(path: Path) -> object:
+    """As `constrain --constraints` does, up to the check that any design can satisfy them."""
+    from lidardesign.cli.constrain import load_constraints
+    from lidardesign.design.constraints import check_feasible
+    from lidardesign.errors import InfeasibleError
+    from lidardesign.run.yaml import dump_yaml, parse_yaml
+
+    constraints = load_constraints(path, [])
+    parse_yaml(dump_yaml(constraints.as_document()), where="written again")
+    refused = []
+    for space in _spaces():
+        try:
+            check_feasible(constraints, space)
+        except InfeasibleError as error:
+            refused.append(error)
+    if len(refused) == len(_spaces()):
+        raise refused[0]
+    return constraints
+
+
+def read_design(path: Path) -> object:
+    """As `show` and `export` do: what was read can be written and read again, and its rays are rays."""
+    from lidardesign.design.files import design_document, design_from_document, load_design
+    from lidardesign.design.rays import lay_out
+    from lidardesign.run.yaml import dump_yaml, parse_yaml
+
+    design = load_design(path)
+    again = design_from_document(parse_yaml(dump_yaml(design_document(design)), where="written again").value)
+    if len(again.sensors) != len(design.sensors):
+        raise AssertionError("the design that was written again has another number of sensors")
+    if design.track is None and (design.rays or 0) <= MOST_LAID_OUT and len(design.sensors) <= MOST_LAID_OUT:
+        return design, lay_out(design, design.rays or max(30, len(design.sensors)))
+    return design
+
+
+def read_detector(path: Path) -> object:
+    """As `evaluate --detector` does."""
+    from lidardesign.simulate.detector_files import load_detector
+
+    return load_detector(path)
+
+
+def read_mesh(path: Path) -> object:
+    """As the task meshes does."""
+    from lidardesign.meshio import load_mesh
+
+    mesh = load_mesh(path)
+    return mesh, mesh.bounds_m
+
+
+def read_face(path: Path) -> object:
+    """As the task face does."""
+    from lidardesign_tasks.basel import load_model
+
+    model = load_model(path)
+    return model, model.shape(model.modes[:, 0, 0] * 0)
+
+
+def read_capture(path: Path) -> object:
+    """As `capture` does; true ranges may be NaN where nothing is."""
+    from lidardesign.evaluate.capture import load_capture
+
+    capture = load_capture(path)
+    return replace(capture, true_range_m=None), capture.spacing_rad, capture.background_per_bin
+
+
+def read_steering(path: Path) -> object:
+    """As `capture` does with an exported list."""
+    from lidardesign.export import galvo
+
+    return galvo.read(path)
+
+
+def read_ray_table(path: Path) -> object:
+    """As `export --format csv` reads back."""
+    from lidardesign.export import csv
+
+    return csv.read(path)
+
+
+def read_ray_archive(path: Path) -> object:
+    """As `export --format npz` reads back."""
+    from lidardesign.export import npz
+
+    return npz.read(path)
+
+
+def read_robot(path: Path) -> object:
+    """As the task arm does."""
+    from lidardesign_tasks.arm_robot import load_robot
+
+    robot = load_robot(path, 0.15)
+    return robot.home_rad, robot.links
+
+
+def _meshes(kind: str) -> Callable[[Path], list[bytes]]:
+    return lambda _: corpus.mesh_exports(kind)
+
+
+TEXTS = either(mutate_text, mutate_text, mutate_bytes)
+TARGETS = (
+    Target("configuration (YAML)", 12_000, corpus.configurations, mutate_yaml, of_file(".yaml", read_configuration)),
+    Target("--set", 5_000, corpus.overrides, TEXTS, open_overrides),
+    Target("constraints (YAML)", 12_000, corpus.constraint_files, mutate_yaml, of_file(".yaml", read_constraints)),
+    Target("design (YAML)", 14_000, corpus.design_files, mutate_yaml, of_file(".yaml", read_design)),
+    Target("sensor table (CSV)", 8_000, corpus.sensor_tables, TEXTS, of_file(".csv", read_design)),
+    Target("detector (YAML)", 6_000, corpus.detectors, mutate_yaml, of_file(".yaml", read_detector)),
+    Target("mesh, STL", 5_000, _meshes("stl"), either(mutate_bytes, mutate_text), of_file(".stl", read_mesh)),
+    Target("mesh, OBJ", 4_000, _meshes("obj"), TEXTS, of_file(".obj", read_mesh)),
+    Target("mesh, PLY", 4_000, _meshes("ply"), either(mutate_bytes, mutate_text), of_file(".ply", read_mesh)),
+    Target("mesh, OFF", 2_000, _meshes("off"), TEXTS, of_file(".off", read_mesh)),
+    Target("mesh, GLB", 3_000, _meshes("glb"), mutate_glb, of_file(".glb", read_mesh)),
+    Target("mesh, glTF", 2_000, _meshes("gltf"), either(mutate_gltf, mutate_json), of_file(".gltf", read_mesh)),
+    Target("face model (HDF5)", 3_000, corpus.face_models, mutate_hdf5, of_file(".h5", read_face)),
+    Target("capture (npz)", 3_000, corpus.captures_npz, mutate_npz, of_file(".npz", read_capture)),
+    Target("capture (MATLAB 5)", 2_000, corpus.captures_matlab, mutate_matlab, of_file(".mat", read_capture)),
+    Target("capture (MATLAB 7.3)", 1_500, corpus.captures_hdf5, mutate_hdf5, of_file(".mat", read_capture)),
+    Target("steering list (CSV)", 2_000, corpus.steering_lists, TEXTS, of_file(".galvo.csv", read_steering)),
+    Target("ray list (CSV)", 1_000, corpus.ray_tables, TEXTS, of_file(".csv", read_ray_table)),
+    Target("ray list (npz)", 1_000, corpus.ray_archives, mutate_npz, of_file(".npz", read_ray_archive)),
+    Target("robot (MJCF)", 1_500, corpus.robots, TEXTS, of_file(".xml", read_robot)),
+    Target("manifest (JSON)", 2_500, corpus.manifests, mutate_json, open_manifests),
+    Target("samples (npz)", 1_500, corpus.samples, mutate_npz, open_samples),
+    Target("checkpoint (safetensors)", 1_500, checkpoints, mutate_safetensors, open_checkpoints),
+    Target("progress (JSON lines)", 500, corpus.progresses, TEXTS, open_progress),
+    Target("lock (JSON)", 250, corpus.locks, mutate_json, open_locks),
+    Target("distance field (npy)", 250, corpus.distance_fields, mutate_bytes, open_fields),
+)
+NAMES = tuple(target.name for target in TARGETS)
+
+
+def target_of(name: str) -> Target:
+    """The target of a name."""
+    return TARGETS[NAMES.index(name)]
