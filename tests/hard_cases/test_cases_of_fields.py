@@ -444,7 +444,7 @@ class TestQueriesAtSpecialPlaces:
     def broke() -> str:
         from scipy.ndimage import map_coordinates
 
-        table = field_of(Scene((Body(mesh_of(BALL)),)), resolution=16)
+        table = coarse_field()
         place = ((np.array([[1000.0, 0, 0]]) - table.grid.low) / table.grid.step).T
         clamped = map_coordinates(table.table[:, 0].reshape(table.grid.counts), place, order=1, mode="nearest")[0]
         norm = np.float64(0.0)
@@ -545,7 +545,8 @@ def many_columns(count=200):
     "16",
     "10 million faces, 10 million queries",
     done="points are evaluated in chunks of bounded memory, each by itself: the same bits for any chunk size, order "
-    "and number of threads; faces and edges are told apart by sorting numbers",
+    "and number of threads; faces and edges are told apart by sorting numbers (10 million faces checked, cast at, made "
+    "a field of and asked 10 million times: 5.0 GiB at most)",
 )
 class TestManyFacesAndManyQueries:
     @staticmethod
