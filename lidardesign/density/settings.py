@@ -57,7 +57,7 @@ class LearningSettings(BaseModel):
     hidden: int = Field(96, ge=4, le=8_192, description="hidden width of each layer's network")
     bins: int = Field(16, ge=2, le=1_024, description="spline bins per dimension")
     dtype: Literal["float64", "float32"] = Field(
-        "float32", description="arithmetic of training steps; samples and densities are always float64"
+        "float32", description="arithmetic of training steps, while it can invert the flow; samples are always float64"
     )
     entropy: float = Field(0.0, ge=0, description="eta of the paper; annealed to 0")
     sigma_start_m: float | None = Field(

@@ -432,7 +432,7 @@ class TestTargetsWithoutShape:
         assert np.isfinite(-samples.log_prob.mean())  # its entropy
         return result, samples
 
-    @pytest.mark.parametrize("sigma_m", [0.1, 0.01, 1e-3])
+    @pytest.mark.parametrize("sigma_m", [0.1, 1e-3])
     def test_one_free_dimension_has_the_closed_forms_log_z_however_thin_the_surface(self, tmp_path, sigma_m):
         result, samples = self.learned(tmp_path, self.ONE, sigma_m, steps=300, layers=3, bins=16)
         assert (samples.points[:, :5] == 0).all()
