@@ -28,6 +28,8 @@ Measure = Literal["solid_angle", "angles"]
 MEASURES = ("solid_angle", "angles")
 # A million kilometres: what is further is a slip of units, and fourth powers of lengths must stay numbers.
 FARTHEST_M = 1e9
+# Of an angle of many turns ever fewer digits are left; nobody needs more than one.
+MOST_TURNS = 100
 # Bounds such as 2 pi are written with some ten digits.
 ROUNDING_RAD = SLACK
 
@@ -108,6 +110,12 @@ class DesignSpace:
                 where="space.elevation_rad",
                 allowed="-pi/2 to pi/2 rad",
             )
+        if max(abs(self.low[AZIMUTH]), abs(self.high[AZIMUTH])) > MOST_TURNS * FULL_TURN:
+            raise ConfigError(
+                f"azimuth {self.low[AZIMUTH]} to {self.high[AZIMUTH]} rad is many turns away",
+                where="space.azimuth_rad",
+                allowed=f"at most {MOST_TURNS} turns from 0",
+            )
         for index in (X, Y, Z, RANGE):
             farthest = max(abs(self.low[index]), abs(self.high[index]))
             if farthest > FARTHEST_M:
@@ -118,8 +126,8 @@ class DesignSpace:
 
     @cached_property
     def free(self) -> tuple[int, ...]:
-        """Indices of the dimensions that are not fixed."""
-        return tuple(i for i in range(6) if self.low[i] < self.high[i])
+        """Indices of the dimensions that are not fixed; elevations whose sines are one number are."""
+        return tuple(i for i in range(6) if self.low[i] < self.high[i] and self.chart_low[i] < self.chart_high[i])
 
     @cached_property
     def conditioned(self) -> tuple[int, ...]:

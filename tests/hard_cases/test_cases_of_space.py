@@ -182,6 +182,18 @@ class TestElevationAtThePoles:
         # all azimuths are the same ray
         np.testing.assert_allclose(target.log_density(spun), values, atol=1e-9)
 
+    @given(st.floats(1e-12, 1e-3), st.floats(0, 1), st.sampled_from([-1.0, 1.0]))
+    def test_a_narrow_interval_at_a_pole_has_finite_coordinates_also_where_its_sines_are_one_number(
+        self, width, gap, pole
+    ):
+        ends = sorted((pole * (math.pi / 2 - gap * width), pole * (math.pi / 2 - (gap + 1) * width)))
+        space = DesignSpace((*AROUND.low[:4], ends[0], 0.0), (*AROUND.high[:4], ends[1], 4.0))
+        points = space.sample(20, np.random.default_rng(0))
+        assert np.isfinite(space.log_volume)
+        assert np.isfinite(space.to_unit(points)).all()
+        assert space.contains(points).all()
+        assert (ELEVATION in space.free) == (math.sin(ends[0]) < math.sin(ends[1]))
+
     def test_the_capped_derivative_is_exact_down_to_its_cap(self):
         target = build_target([BALLS], AROUND, SETTINGS, "off")
         points = np.tile([0.0, 0, 0, 0.3, 0, 1.0], (50, 1))
@@ -448,6 +460,15 @@ class TestBoundsThatCannotBe:
         assert f"space.{dimension}" in str(caught.value)
         assert words in str(caught.value)
         assert caught.value.exit_code == 2
+
+    @pytest.mark.parametrize("value", [1e12, 1e300])
+    @pytest.mark.parametrize("dimension", DIMENSIONS)
+    def test_bounds_absurdly_far_are_refused_too(self, dimension, value):
+        low, high = list(AROUND.low), list(AROUND.high)
+        low[DIMENSIONS.index(dimension)] = high[DIMENSIONS.index(dimension)] = value
+        words = "leaves the sphere" if dimension == "elevation_rad" else "away"
+        with pytest.raises(ConfigError, match=rf"space\.{dimension}: .*{words}"):
+            DesignSpace(tuple(low), tuple(high))
 
     @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
     @pytest.mark.parametrize("side", ["low", "high"])
