@@ -42,7 +42,7 @@ class ReadOut:
     def of(cls, constraints: Constraints, rays: int | None) -> ReadOut:
         """The read-out that a constraint file and an option ask for."""
         budget = constraints.budget
-        names = ["--rays"] if rays is not None else ["budget.rays"] if budget.rays is not None else []
+        names = ["budget.rays"] if budget.rays is not None else ["--rays"] if rays is not None else []
         for index in range(len(constraints.each) + 1):
             names += least_width(constraints, index)[1]
         model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)

@@ -234,38 +234,39 @@ def _check_field(constraints: Constraints, one: SensorConstraints, index: int, s
 
 
 def _check_gate(constraints: Constraints, one: SensorConstraints, index: int, space: DesignSpace) -> None:
-    def bound(part: str, end: str, otherwise: float) -> _Bound:
-        value = getattr(getattr(one.gate, part), end)
-        key = constraints.name_of(index, f"gate.{part}.{end}")
-        return _Bound(otherwise, "") if value is None else _Bound(value, key)
+    """Every cycle through bounds of any kind is looked at, and one that needs the fewest of them is told."""
 
-    near, far = _Bound(space.low[RANGE], "space.range_m"), _Bound(space.high[RANGE], "space.range_m")
-    start_low = max(bound("start_m", "min", -math.inf), near, key=lambda b: b.value)
-    end_high = min(bound("end_m", "max", math.inf), far, key=lambda b: b.value)
-    start_high, end_low = bound("start_m", "max", math.inf), bound("end_m", "min", -math.inf)
-    width_low, width_high = bound("width_m", "min", 0.0), bound("width_m", "max", math.inf)
-    if RANGE not in space.free:
-        width_high = min(width_high, _Bound(0.0, "space.range_m"), key=lambda b: b.value)
-    text = "no gate can satisfy this"
-    for low, high in ((start_low, start_high), (end_low, end_high), (width_low, width_high)):
-        if low.value > high.value + AGREEMENT:
-            _refuse(f"{text}: at least {low.value:g} and at most {high.value:g} m", [low.name, high.name])
-    zero, thick = _Bound(0.0, ""), RANGE in space.free
+    def bounds(part: str, end: str, *others: _Bound) -> list[_Bound]:
+        value = getattr(getattr(one.gate, part), end)
+        own = [] if value is None else [_Bound(value, constraints.name_of(index, f"gate.{part}.{end}"))]
+        return [*own, *others]
+
     # a bound that the others do not need to conflict is not named: distances are at least 0, and so are widths
-    for start, width in ((zero, width_low), (start_low, zero), (start_low, width_low)):
-        room = end_high.value - start.value
+    zero, thick = _Bound(0.0, ""), RANGE in space.free
+    near, far = _Bound(space.low[RANGE], "space.range_m"), _Bound(space.high[RANGE], "space.range_m")
+    start_low, start_high = bounds("start_m", "min", near, zero), bounds("start_m", "max")
+    end_low, end_high = bounds("end_m", "min"), bounds("end_m", "max", far)
+    width_low = bounds("width_m", "min", zero)
+    width_high = bounds("width_m", "max", *([] if thick else [_Bound(0.0, "space.range_m")]))
+    text = "no gate can satisfy this"
+    found: list[tuple[str, list[str]]] = []
+    for lows, highs in ((start_low, start_high), (end_low, end_high), (width_low, width_high)):
+        for low, high in itertools.product(lows, highs):
+            if low.value > high.value + AGREEMENT:
+                found.append((f"{text}: at least {low.value:g} and at most {high.value:g} m", [low.name, high.name]))
+    for start, width, end in itertools.product(start_low, width_low, end_high):
+        room = end.value - start.value
         if width.value > room + AGREEMENT or (thick and room <= 0):
-            _refuse(
-                f"{text}: it starts at {start.value:g} m or later, is at least {width.value:g} m wide, "
-                f"and ends at {end_high.value:g} m or earlier",
-                [start.name, width.name, end_high.name],
-            )
-    if end_low.value - width_high.value > start_high.value + AGREEMENT:
-        _refuse(
-            f"{text}: it ends at {end_low.value:g} m or later, is at most {width_high.value:g} m wide, "
-            f"and starts at {start_high.value:g} m or earlier",
-            [end_low.name, width_high.name, start_high.name],
-        )
+            told = f"starts at {start.value:g} m or later, is at least {width.value:g} m wide"
+            told = f"{text}: it {told}, and ends at {end.value:g} m or earlier"
+            found.append((told, [start.name, width.name, end.name]))
+    for end, width, start in itertools.product(end_low, width_high, start_high):
+        if end.value - width.value > start.value + AGREEMENT:
+            told = f"ends at {end.value:g} m or later, is at most {width.value:g} m wide"
+            told = f"{text}: it {told}, and starts at {start.value:g} m or earlier"
+            found.append((told, [end.name, width.name, start.name]))
+    if found:
+        _refuse(*min(found, key=lambda conflict: len(set(conflict[1]) - {""})))
 
 
 def least_sensors(constraints: Constraints, sensors: int | None = None) -> _Bound:
@@ -285,20 +286,21 @@ def _check_budget(constraints: Constraints, sensors: int | None, asked: int | No
     budget, least = constraints.budget, least_sensors(constraints, sensors)
     if asked is not None and budget.rays is not None and asked != budget.rays:
         _refuse(f"{asked} and {budget.rays} rays asked for", ["--rays", "budget.rays"])
-    given = _Bound(asked, "--rays") if asked is not None else _Bound(budget.rays, "budget.rays")
+    given = _Bound(asked, "--rays") if budget.rays is None else _Bound(budget.rays, "budget.rays")
     if given.value is not None and given.value < least.value:
         _refuse(f"{given.value} rays for {least.value:g} sensors", [given.name, least.name or "sensors"])
     if budget.bandwidth_mbps is None:
         return
     model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
-    rays, name = (given.value, given.name) if given.value is not None else (int(least.value), least.name)
     widths = [least_width(constraints, index) for index in range(_entries(constraints, sensors))]
-    needed = model.mbps_of_widths([min(width for width, _ in widths)], rays)
-    if needed > budget.bandwidth_mbps:
-        names = [name, "budget.bandwidth_mbps"]
-        if model.mbps_of_widths([0.0], rays) <= budget.bandwidth_mbps:
-            names += [one for _, width_names in widths for one in width_names]
-        _refuse(f"{rays} rays need at least {needed:g} Mbit/s, more than {budget.bandwidth_mbps:g} Mbit/s", names)
+    numbers = [_Bound(1, ""), least] + ([given] if given.value is not None else [])
+    narrowest = [(0.0, []), (min(width for width, _ in widths), [name for _, names in widths for name in names])]
+    # the fewest names first: one ray of any gate, then as many as are asked for, then as wide as is asked for
+    for (width, names), rays in sorted(itertools.product(narrowest, numbers), key=lambda one: len(one[0][1])):
+        needed = model.mbps_of_widths([width], int(rays.value))
+        if needed > budget.bandwidth_mbps:
+            text = f"{rays.value:g} rays need at least {needed:g} Mbit/s, more than {budget.bandwidth_mbps:g} Mbit/s"
+            _refuse(text, [rays.name, "budget.bandwidth_mbps", *names])
 
 
 def most_rays(constraints: Constraints) -> int | None:
