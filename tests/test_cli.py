@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import caller, files_under, make_run, program
+from command_line import caller, files_under, make_run
 
 from lidardesign import __version__
 from lidardesign.cli import console as console_module
@@ -351,15 +349,6 @@ def test_quiet_says_nothing_by_the_way(capsys):
     assert capsys.readouterr().err == "something else\n"
 
 
-def test_a_closed_pipe_ends_quietly(tmp_path):
-    for arguments in (["tasks", "list", "--json"], ["tasks", "list"], ["--help"]):
-        process = program(*arguments, cwd=tmp_path)
-        process.stdout.close()
-        assert process.wait() == 141
-        assert process.stderr.read() == b""
-        process.stderr.close()
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs the device /dev/full")
 def test_a_full_disk_behind_stdout_is_one_message(tmp_path):
     with open("/dev/full", "w") as full:
@@ -368,33 +357,6 @@ def test_a_full_disk_behind_stdout_is_one_message(tmp_path):
     assert result.returncode == 3
     assert result.stderr.splitlines()[0] == b"system error: No space left on device"
     assert len(result.stderr.splitlines()) == 2
-
-
-@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
-def test_any_output_encoding_works_and_no_colour_is_written_to_a_pipe(tmp_path, encoding):
-    process = program("tasks", "list", env={**os.environ, "PYTHONIOENCODING": encoding, "NO_COLOR": "1"}, cwd=tmp_path)
-    out, err = process.communicate()
-    assert process.returncode == 0, err
-    assert b"flatland" in out
-    assert b"\x1b[" not in out
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_an_interruption_keeps_the_checkpoint_and_says_how_to_continue(tmp_path, sent, code):
-    settings = ["learning.steps=100000", "learning.batch=64", "learning.checkpoint_seconds=0.2"]
-    options = [word for setting in settings for word in ("--set", setting)]
-    process = program("learn", "flatland", "--preset", "draft", "--out", "run", *options, "--json", cwd=tmp_path)
-    deadline = time.monotonic() + 120
-    while not list((tmp_path / "run").glob("checkpoint*")) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    process.send_signal(sent)
-    out, err = process.communicate()
-    assert process.returncode == code, err
-    assert "--resume" in json.loads(out)["error"]["message"]
-    assert (tmp_path / "run" / "config.yaml").is_file()
-    assert not (tmp_path / "run" / ".lock").exists()
-    assert not list((tmp_path / "run").glob(".*.tmp"))
 
 
 def test_a_design_fits_a_terminal_of_80_columns(lidardesign, flat, monkeypatch):

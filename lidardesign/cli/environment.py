@@ -20,6 +20,7 @@ THREAD_DEFAULTS = {
     "MKL_NUM_THREADS": "1",
     "OMP_WAIT_POLICY": "PASSIVE",
 }
+STREAM_DESCRIPTORS = (0, 1, 2)
 
 
 class TerminatedError(KeyboardInterrupt):
@@ -61,6 +62,7 @@ def _can_be_written(folder: Path) -> bool:
 
 def make_streams_tolerant() -> None:
     """Escape characters that the terminal lacks; a stream that was closed swallows its output."""
+    _occupy_descriptors()
     if sys.stdout is None:
         sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - lives as long as the process
     if sys.stderr is None:
@@ -68,6 +70,15 @@ def make_streams_tolerant() -> None:
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(AttributeError, ValueError):
             stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+
+
+def _occupy_descriptors() -> None:
+    """Open those of the streams that are closed on nothing: else the next file takes their place, and what they say."""
+    for descriptor in STREAM_DESCRIPTORS:
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
 
 
 def terminate_cleanly() -> None:

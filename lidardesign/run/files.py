@@ -35,7 +35,8 @@ def write_atomic(path: Path, content: bytes | str) -> None:
         DataError: The disk is full, the folder is read-only, or anything else the system reports.
     """
     path = Path(path)
-    payload = content.encode() if isinstance(content, str) else content
+    # names of files may be no UTF-8; they are shown escaped then
+    payload = content.encode(errors="backslashreplace") if isinstance(content, str) else content
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_dir():

@@ -321,6 +321,7 @@ def dump_yaml(value: Any) -> str:
 
     Raises:
         NumericalError: A number is not finite.
+        ConfigError: A text is none, as the name of a file may be that is not in UTF-8.
     """
     return yaml.dump(
         _plain(value), Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=110, allow_unicode=True
@@ -337,8 +338,18 @@ def _plain(value: Any, path: KeyPath = ()) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         raise NumericalError(f"{value} cannot be written to a file", where=".".join(map(str, path)))
     if isinstance(value, Path):
-        return str(value)
+        return _plain(str(value), path)
+    if isinstance(value, str) and not _is_text(value):
+        raise ConfigError(f"{value!r} cannot be written to a file", where=".".join(map(str, path)), allowed="UTF-8")
     return value
+
+
+def _is_text(value: str) -> bool:
+    try:
+        value.encode()
+    except UnicodeEncodeError:  # bytes of a file name or an argument that are no UTF-8
+        return False
+    return True
 
 
 def leaves(value: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:

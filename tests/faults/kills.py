@@ -1,0 +1,265 @@
+"""Kills of learn, fit and evaluate: what is left can be read, and going on gives the bytes of a straight run.
+
+Usage: PYTHONPATH=tests python -m faults.kills [--kills 60] [--terms 20] [--pairs 5] [--out docs/soak/kills.md]
+
+Three ways to end a command: SIGKILL of a process of its own after a random time; SIGKILL of a fork before single steps
+that change a file; SIGTERM after a random time. After each the folder is examined as it is, the command is given again
+(`learn` with --resume), and the folder is compared with the straight one. Last, two commands work in it at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import os
+import platform
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from pathlib import Path
+
+import numpy as np
+
+from faults.processes import Ended, Fork, forked, fresh, import_all
+from faults.runs import COMMANDS, LEARN, Straight, contents, strays, unreadable
+
+# Kills of a command per 10: learning is the longest, and writes the most.
+SHARES = {"learn": 6, "fit": 2, "evaluate": 2}
+# Commands that are given at once, in a folder as it was before one of them.
+RESUME = [*LEARN, "--resume"]
+PAIRS = {
+    "learn and learn": ("learn", LEARN, LEARN),
+    "learn and learn --resume": ("learn", LEARN, RESUME),
+    "learn and fit": ("learn", LEARN, COMMANDS["fit"]),
+    "learn --resume twice": ("fit", RESUME, RESUME),
+    "learn --resume and fit": ("fit", RESUME, COMMANDS["fit"]),
+    "fit and fit": ("fit", COMMANDS["fit"], COMMANDS["fit"]),
+    "evaluate and evaluate": ("evaluate", COMMANDS["evaluate"], COMMANDS["evaluate"]),
+    "evaluate and fit": ("evaluate", COMMANDS["evaluate"], COMMANDS["fit"]),
+}
+REFUSED = (2, 3)
+LONGEST_DELAY_S = 2.0
+TERMINATED = 143
+WAYS = {
+    "SIGKILL": "SIGKILL after a random time, a process of its own",
+    "step": "SIGKILL before a step that changes a file, a fork",
+    "SIGTERM": "SIGTERM after a random time, a process of its own",
+    "pair": "two commands in one folder at once",
+}
+
+
+RECOVERED = """\
+After each: every file that was there could be read, the command given again ended with 0, no temporary file and no lock
+was left, and the bytes of flow, samples, snapshots, checkpoint, designs and tables were those of the straight run, but
+for the seconds in them. Of two commands at once one worked at least, and the other worked or was told why not."""
+
+
+@dataclass
+class Tally:
+    """What was done and what came of it.
+
+    Arguments:
+        sent: Ends by way and command.
+        early: Those of them that met the command at work, rather than after its end.
+        faults: One sentence for each thing that was not as it must be.
+    """
+
+    sent: Counter[tuple[str, str]] = field(default_factory=Counter)
+    early: Counter[tuple[str, str]] = field(default_factory=Counter)
+    faults: list[str] = field(default_factory=list)
+
+
+class Killing:
+    """Ends commands and looks at what is left.
+
+    Arguments:
+        folder: Where to work.
+        straight: The undisturbed run.
+    """
+
+    def __init__(self, folder: Path, straight: Straight) -> None:
+        self.folder, self.straight, self.tally = folder, straight, Tally()
+
+    def end(self, way: str, name: str, run_it: Callable[[Path], Ended], told: str) -> None:
+        """End one command in a folder of its own, look, give it again, and compare.
+
+        Arguments:
+            way: How, a key of WAYS.
+            name: The command.
+            run_it: Runs it in a folder and ends it.
+            told: The moment, for a fault's sentence.
+        """
+        place = self.folder / "killed"
+        shutil.copytree(self.straight.before[name], place)
+        ended = run_it(place)
+        self.tally.sent[way, name] += 1
+        self.tally.early[way, name] += ended.code != 0
+        faults = [*self._left(way, ended, place), *self._after(name, place)]
+        self.tally.faults += [f"{WAYS[way]}, {name}, {told}: {fault}" for fault in faults]
+        print(f"{way} of {name}, {told}: {'; '.join(faults) or 'recovered'}", file=sys.stderr, flush=True)
+        shutil.rmtree(place)
+
+    def _left(self, way: str, ended: Ended, place: Path) -> Iterator[str]:
+        """What is wrong with the folder as it was left."""
+        yield from (f"unreadable: {fault}" for fault in unreadable(place / "run"))
+        if way != "SIGTERM":
+            return
+        if ended.code not in (0, TERMINATED, -signal.SIGTERM):
+            yield f"exit code {ended.code}: {ended.said[-300:]}"
+        if "Traceback" in ended.said:
+            yield f"a traceback: {ended.said[-300:]}"
+        if strays(place):
+            yield f"left {strays(place)}"
+
+    def _after(self, name: str, place: Path) -> Iterator[str]:
+        """What is wrong with the folder after the command was given again."""
+        arguments = list(COMMANDS[name])
+        if name == "learn" and (place / "run").exists():
+            arguments.append("--resume")
+        ended = forked(arguments, place)
+        if ended.code != 0:
+            yield f"given again it ended with {ended.code}: {ended.said[-300:]}"
+            return
+        if strays(place):
+            yield f"given again it left {strays(place)}"
+        expected = self._expected(name)
+        found = contents(place / "run")
+        yield from (f"{file} differs" for file in sorted({*expected, *found}) if expected.get(file) != found.get(file))
+
+    def pair(self, name: str, delay_s: float) -> None:
+        """Two commands at once: each works or is told why not, one works at least, and nothing is spoilt."""
+        before, first, second = PAIRS[name]
+        place = self.folder / "both"
+        shutil.copytree(self.straight.before[before], place)
+        one = Fork(first, place)
+        time.sleep(delay_s)
+        other = Fork(second, place)
+        ends = [one.ended(), other.ended()]
+        self.tally.sent["pair", name] += 1
+        self.tally.early["pair", name] += all(end.code == 0 for end in ends)
+        faults = [*_badly_refused(ends), *(f"unreadable: {fault}" for fault in unreadable(place / "run"))]
+        faults += [f"left {strays(place)}"] if strays(place) else []
+        found, whole = contents(place / "run"), self.straight.content
+        faults += [f"{file} is missing" for file in self._expected("learn") if file not in found]
+        faults += [f"{file} differs" for file in found if file in whole and found[file] != whole[file]]
+        self.tally.faults += [f"{name}, {delay_s:.3f} s apart: {fault}" for fault in faults]
+        print(f"{name}, {delay_s:.3f} s apart: {'; '.join(faults) or 'in order'}", file=sys.stderr, flush=True)
+        shutil.rmtree(place)
+
+    def _expected(self, name: str) -> dict[str, object]:
+        """The straight run's content as it was after a command."""
+        later = {"learn": ("designs/", "rows.csv"), "fit": ("rows.csv",), "evaluate": ()}[name]
+        return {file: value for file, value in self.straight.content.items() if not file.startswith(later)}
+
+
+def _badly_refused(ends: list[Ended]) -> Iterator[str]:
+    """What is wrong with how commands ended that worked in one folder."""
+    if all(end.code != 0 for end in ends):
+        yield "neither worked"
+    for end in ends:
+        if end.code not in (0, *REFUSED) or "Traceback" in end.said or "internal error" in end.said:
+            yield f"exit code {end.code}: {end.said[-300:]}"
+
+
+def at_random(
+    killing: Killing, way: str, count: int, generator: np.random.Generator, seconds: dict[str, float]
+) -> None:
+    """End commands in processes of their own after random times."""
+    sent = signal.SIGTERM if way == "SIGTERM" else signal.SIGKILL
+    names = [name for name, share in SHARES.items() for _ in range(share)]
+    for number in range(count):
+        name = names[number % len(names)]
+        after_s = float(generator.uniform(0.05, seconds[name]))
+        ends = functools.partial(fresh, COMMANDS[name], after_s=after_s, sent=sent)
+        killing.end(way, name, ends, f"after {after_s:.3f} s")
+
+
+def at_steps(killing: Killing, steps: dict[str, list[int]]) -> None:
+    """Kill forks of commands before steps of given numbers."""
+    for name, numbers in steps.items():
+        for number in numbers:
+            killing.end("step", name, functools.partial(forked, COMMANDS[name], at_step=number), f"step {number}")
+
+
+def in_pairs(killing: Killing, count: int, generator: np.random.Generator) -> None:
+    """Give every pair of commands so many times, from at once to one after the other."""
+    for name in PAIRS:
+        for number in range(count):
+            delay_s = float(generator.uniform(0, LONGEST_DELAY_S * number / max(count - 1, 1)))
+            killing.pair(name, delay_s)
+
+
+def spread(last: int, count: int) -> list[int]:
+    """So many of the numbers from 1 to a last one, evenly spread; all of them where there are no more."""
+    return sorted({round(number) for number in np.linspace(0, last + 1, min(count, last) + 2)[1:-1]})
+
+
+def page(tally: Tally, seed: int, minutes: float, source: str) -> str:
+    """The result as Markdown."""
+    lines = [
+        "# Kills", "", "Made by `python -m faults.kills`; see its first lines for what is done.", "",
+        f"- date: {datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC, {minutes:.0f} minutes",
+        f"- source: {source}, seed {seed}",
+        f"- machine: {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
+        f"- killed or terminated: {_sum(tally.sent)}, of them while the command was at work: {_sum(tally.early)}",
+        f"- two at once: {_sum(tally.sent, pairs=True)}, of them both worked: {_sum(tally.early, pairs=True)}",
+        f"- not recovered: {len(tally.faults)}", "",
+        "| how | command | times | at work, or both worked |", "|---|---|---:|---:|",
+    ]  # fmt: skip
+    for (way, name), count in sorted(tally.sent.items()):
+        lines.append(f"| {WAYS[way]} | {name} | {count} | {tally.early[way, name]} |")
+    lines += ["", *(tally.faults or [RECOVERED])]
+    return "\n".join(lines) + "\n"
+
+
+def _sum(counted: Counter[tuple[str, str]], *, pairs: bool = False) -> int:
+    return sum(count for (way, _), count in counted.items() if (way == "pair") == pairs)
+
+
+def source_version() -> str:
+    """The commit that is tested, and whether files differ from it."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
+    told = subprocess.run(command, capture_output=True, text=True, check=False)
+    return f"commit {told.stdout.strip()}" if told.returncode == 0 else "no repository"
+
+
+def main() -> None:
+    """Kill, look, tell; exit 1 where anything was not as it must be."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--kills", type=int, default=60, help="processes killed after random times")
+    parser.add_argument("--terms", type=int, default=20, help="processes sent SIGTERM after random times")
+    parser.add_argument("--pairs", type=int, default=5, help="how often each two commands work at once")
+    parser.add_argument("--steps", type=int, default=10_000, help="at most so many steps of each command")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=None, help="write the result as Markdown")
+    parser.add_argument("--source", default=None, help="what is tested, in words")
+    asked = parser.parse_args()
+    started, generator = time.monotonic(), np.random.default_rng(asked.seed)
+    import_all()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "straight").mkdir()
+        straight = Straight(folder / "straight")
+        killing = Killing(folder, straight)
+        at_steps(killing, {command: spread(ended.steps, asked.steps) for command, ended in straight.forks.items()})
+        seconds = straight.measure_fresh(folder) if asked.kills + asked.terms else {}
+        at_random(killing, "SIGKILL", asked.kills, generator, seconds)
+        at_random(killing, "SIGTERM", asked.terms, generator, seconds)
+        in_pairs(killing, asked.pairs, generator)
+    text = page(killing.tally, asked.seed, (time.monotonic() - started) / 60, asked.source or source_version())
+    print(text)
+    if asked.out is not None:
+        asked.out.parent.mkdir(parents=True, exist_ok=True)
+        asked.out.write_text(text, encoding="utf-8")
+    sys.exit(1 if killing.tally.faults else 0)
+
+
+if __name__ == "__main__":
+    main()

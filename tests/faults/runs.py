@@ -1,0 +1,112 @@
+"""The run that is disturbed, the same one undisturbed, and what of a run can be read and compared."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from faults.processes import forked, fresh
+from lidardesign.design.files import load_design
+from lidardesign.design.samples import load_samples
+from lidardesign.errors import LidardesignError
+from lidardesign.run.checkpoint import load_arrays
+from lidardesign.run.manifest import read_manifest, verify
+
+SETTINGS = (
+    "learning.steps=160", "learning.batch=64", "learning.layers=1", "learning.hidden=12", "learning.samples=1000",
+    "learning.coverage_proposals=256", "learning.balance_proposals=256", "learning.checkpoint_seconds=0.000001",
+    "train=3", "test=2",
+)  # fmt: skip
+LEARN = ["learn", "flatland", "--preset", "draft", "--out", "run", "--seed", "3", "--quiet"]
+LEARN += [word for setting in SETTINGS for word in ("--set", setting)]
+COMMANDS = {
+    "learn": LEARN,
+    "fit": ["fit", "run", "--sensors", "2", "--quiet"],
+    "evaluate": ["evaluate", "run", "--rays", "8", "--csv", "run/rows.csv", "--report", "run/page.html", "--quiet"],
+}
+STATE = "checkpoint.safetensors"
+SAMPLES = "samples.npz"
+
+
+class Straight:
+    """The run that nobody disturbed, and how long its commands take.
+
+    Arguments:
+        folder: Where; the run is `run` inside of it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.before, self.forks = folder, {}, {}
+        for name, arguments in COMMANDS.items():
+            self.before[name] = folder.with_name(f"before {name}")
+            shutil.copytree(folder, self.before[name])
+            ended = forked(arguments, folder)
+            if ended.code != 0:
+                raise SystemExit(f"{name} failed undisturbed: {ended.said}")
+            self.forks[name] = ended
+        self.content = contents(folder / "run")
+
+    def measure_fresh(self, folder: Path) -> dict[str, float]:
+        """Seconds of each command in a process of its own."""
+        return {name: self._timed(name, folder / f"timed {name}") for name in COMMANDS}
+
+    def _timed(self, name: str, folder: Path) -> float:
+        shutil.copytree(self.before[name], folder)
+        return fresh(COMMANDS[name], folder).seconds
+
+
+def contents(run: Path) -> dict[str, object]:
+    """What a run holds, without the times that are in some of its files."""
+    found: dict[str, object] = {}
+    for path in sorted(run.rglob("*")):
+        name = path.relative_to(run).as_posix()
+        if path.is_dir() or name in ("manifest.json", "page.html"):
+            continue
+        found[name] = _plain(path, name)
+    return found
+
+
+def _plain(path: Path, name: str) -> object:
+    if name == "progress.jsonl":
+        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        return [{key: value for key, value in row.items() if key != "seconds"} for row in rows]
+    if name == STATE:
+        arrays, state = load_arrays(path.parent, name)
+        return {key: value.tobytes() for key, value in arrays.items()}, {**state, "seconds": None}
+    if name == "rows.csv":
+        with path.open(newline="", encoding="utf-8") as file:
+            return [{key: value for key, value in row.items() if "seconds" not in key} for row in csv.DictReader(file)]
+    return path.read_bytes()
+
+
+def unreadable(run: Path) -> Iterator[str]:
+    """What of a run that was just killed is there but cannot be read, in one line each."""
+    if not (run / "config.yaml").exists():
+        return  # it had not begun
+    manifest = read_manifest(run)
+    for name in (*manifest["files"], "config.yaml"):
+        if name != "progress.jsonl" and (run / name).exists():
+            yield from _refused(name, lambda name=name: verify(run, name))
+    for name, read in ((STATE, lambda: load_arrays(run, STATE)), (SAMPLES, lambda: load_samples(run))):
+        if (run / name).exists() and name in manifest["files"]:
+            yield from _refused(name, read)
+    for path in (run / "designs").glob("*.yaml"):
+        yield from _refused(path.name, lambda path=path: load_design(path))
+    page = run / "page.html"
+    if page.exists() and not page.read_text(encoding="utf-8").rstrip().endswith("</html>"):
+        yield "page.html is cut"
+
+
+def _refused(name: str, read: Callable[[], object]) -> Iterator[str]:
+    try:
+        read()
+    except LidardesignError as error:
+        yield f"{name}: {error.message}"
+
+
+def strays(folder: Path) -> list[str]:
+    """Temporary files and locks."""
+    return [path.name for path in folder.rglob(".*") if path.suffix == ".tmp" or path.name == ".lock"]
