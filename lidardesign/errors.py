@@ -7,6 +7,11 @@ Exit codes (design contract): 0 ok, 1 threshold missed, 2 usage or config, 3 bad
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeVar
+
+# What files and options say may be quoted; nobody reads more of it than this.
+LONGEST_PART = 1500
+Text = TypeVar("Text", str, None)
 
 
 class LidardesignError(Exception):
@@ -25,7 +30,7 @@ class LidardesignError(Exception):
     def __init__(
         self, message: str, *, where: str | None = None, allowed: str | None = None, hint: str | None = None
     ) -> None:
-        self.message, self.where, self.allowed, self.hint = message, where, allowed, hint
+        self.message, self.where, self.allowed, self.hint = _short(message), _short(where), _short(allowed), hint
         super().__init__(self.render())
 
     def render(self) -> str:
@@ -41,6 +46,14 @@ class LidardesignError(Exception):
         """The same content for `--json`."""
         fields = {"where": self.where, "allowed": self.allowed, "hint": self.hint}
         return {"kind": self.kind, "message": self.message, **{k: v for k, v in fields.items() if v}}
+
+
+def _short(text: Text) -> Text:
+    """The beginning and the end of a text that is too long to be read."""
+    if text is None or len(text) <= LONGEST_PART:
+        return text
+    half = LONGEST_PART // 2
+    return f"{text[:half]} ... {text[-half:]}"
 
 
 class ConfigError(LidardesignError):
