@@ -17,6 +17,7 @@ from lidardesign.design.constraints import Constraints, check_feasible
 from lidardesign.design.files import design_document, design_from_document
 from lidardesign.design.fit import fit
 from lidardesign.design.samples import Samples
+from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.space import DesignSpace
 
@@ -123,10 +124,10 @@ def test_what_a_file_may_not_say_is_a_config_error_with_its_key(values, text):
 BOX = {"low_m": [0, 0, 0], "high_m": [1, 1, 1]}
 # key, what it takes, what it does not: the last accepted and the first refused on each side
 LIMITS = {
-    "sensors.count": ([1, 2], [0, -1, 1.5, 2.0, "2"]),
-    "sensors.min": ([1, 2], [0, 1.5]),
-    "sensors.max": ([1, 2], [0, 1.5]),
-    "budget.rays": ([1, 2], [0, 10.0]),
+    "sensors.count": ([1, 2, 1000], [0, -1, 1.5, 2.0, "2", 1001]),
+    "sensors.min": ([1, 2, 1000], [0, 1.5, 1001]),
+    "sensors.max": ([1, 2, 1000], [0, 1.5, 1001]),
+    "budget.rays": ([1, 2, MOST_RAYS], [0, 10.0, MOST_RAYS + 1]),
     "budget.bandwidth_mbps": ([1e-9, 0.5], [0, -0.5]),
     "budget.bin_ps": ([1e-9, 0.5], [0, -0.5]),
     "budget.bits_per_bin": ([1e-9, 0.5], [0, -0.5]),

@@ -561,3 +561,16 @@ def test_components_that_are_taken_share_what_they_had_in_proportion():
     np.testing.assert_allclose(part.weights, [0.8, 0.2])
     np.testing.assert_array_equal(part.origin_m, mixture.origin_m[[3, 0]])
     assert len(part) == 2
+
+
+def test_mixtures_and_their_statistics_are_themselves_alone_and_can_be_keys():
+    mixture, features = case_of("all free")
+    statistics = expect(mixture, features)
+    for one, same in ((mixture, mixture.take(np.arange(3))), (statistics, expect(mixture, features))):
+        assert one == one
+        assert one != same
+        assert len({one, same}) == 2
+    with pytest.raises(AttributeError):
+        mixture.weights = np.ones(3)
+    with pytest.raises(AttributeError):
+        statistics.mass = np.ones(3)
