@@ -294,7 +294,10 @@ def _check_budget(constraints: Constraints, sensors: int | None, asked: int | No
     model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
     widths = [least_width(constraints, index) for index in range(_entries(constraints, sensors))]
     numbers = [_Bound(1, ""), least] + ([given] if given.value is not None else [])
-    narrowest = [(0.0, []), (min(width for width, _ in widths), [name for _, names in widths for name in names])]
+    common, least_of_all = least_width(constraints, len(constraints.each)), min(width for width, _ in widths)
+    narrowest = [(0.0, []), (least_of_all, [name for _, names in widths for name in names])]
+    # what all sensors must keep says more than what single ones must besides
+    narrowest += [common] if common[0] <= least_of_all else []
     # the fewest names first: one ray of any gate, then as many as are asked for, then as wide as is asked for
     for (width, names), rays in sorted(itertools.product(narrowest, numbers), key=lambda one: len(one[0][1])):
         needed = model.mbps_of_widths([width], int(rays.value))

@@ -135,6 +135,20 @@ BUDGETS = {
         {},
         {"budget.rays", "budget.bandwidth_mbps", "gate.start_m.max", "gate.end_m.min"},
     ),
+    "wide gates of all": (
+        {
+            "budget": {"bandwidth_mbps": 0.1, "rays": 20},
+            "gate": {"width_m": {"min": 0.4}},
+            "each": [{}, {"gate": {"width_m": {"min": 0.6}}}],
+        },
+        {},
+        {"budget.rays", "budget.bandwidth_mbps", "gate.width_m.min"},
+    ),
+    "one ray too wide": (
+        {"budget": {"bandwidth_mbps": 0.02, "rays": 20}, "gate": {"width_m": {"min": 0.9}}},
+        {},
+        {"budget.bandwidth_mbps", "gate.width_m.min"},
+    ),
     "wide gates of each": (
         {
             "budget": {"bandwidth_mbps": 0.1, "rays": 20},

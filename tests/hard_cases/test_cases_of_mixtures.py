@@ -10,6 +10,7 @@ from cases import hard_case
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_mixture import POINT, WHOLE, Z, drawn, features_of, naive_log_density, random_mixture
+from test_track import shelves
 
 from lidardesign.design.bounds import Bounds, Floors
 from lidardesign.design.em import climb, fit_mixture, seed
@@ -188,6 +189,28 @@ class TestSamplesThatDoNotFillTheirSpace:
         for sensor in result.design.sensors:
             values = [*sensor.origin_m, *sensor.gate_m, *sensor.field_of_view_rad, sensor.weight]
             assert np.isfinite(values).all()
+
+    @pytest.mark.parametrize("kind", ["duplicates", "three points", "one ray"])
+    def test_a_track_takes_them(self, kind):
+        result = fit(narrowed_aisle(kind), rays=6, layout="scan")
+        assert result.satisfied
+        assert math.isfinite(result.log_likelihood)
+        track = result.design.track
+        for values in (track.gate_m, track.azimuth_rad, track.elevation_rad):
+            assert np.isfinite(values).all()
+
+
+def narrowed_aisle(kind):
+    """Samples along an aisle that vary in nothing else, or hardly."""
+    samples = shelves(1500)
+    points = samples.points.copy()
+    if kind == "duplicates":
+        points = np.repeat(points[:300], 5, axis=0)
+    elif kind == "three points":
+        points = points[np.arange(1500) % 3]
+    elif kind == "one ray":
+        points[:, 4:] = 0.5, 1.4
+    return Samples(points, np.zeros(len(points)), np.zeros(len(points)), samples.space)
 
 
 def far_away(mixture, sigmas, generator):
