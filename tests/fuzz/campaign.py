@@ -30,8 +30,9 @@ ROOT = HERE.parents[1]
 WORKER = HERE / "fuzz_worker.py"
 BATCH = 2500
 COMMAND_BATCH = 60
-# A process that says nothing for so long hangs [s]; the machine may be busy with other things.
-HANG_S = 120.0
+# A process that reads one input for so long hangs: of processor time, as the machine may be busy with other things, or
+# by the clock, as it may wait for what never comes [s].
+HANG_PROCESSOR_S, HANG_S = 150.0, 1200.0
 POLL_S = 0.2
 ALL_SHARES = 100_000
 
@@ -124,20 +125,36 @@ def _process(job: Job, first: int, folder: Path) -> str | None:
             [sys.executable, str(WORKER), *arguments],
             stdout=output, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, env=environment, cwd=folder,
         )  # fmt: skip
-        seen, since = -1, time.monotonic()
-        while process.poll() is None:
-            time.sleep(POLL_S)
-            done = _read_json(folder / "tally.json").get("beat", 0)
-            if done != seen:
-                seen, since = done, time.monotonic()
-            elif time.monotonic() - since > HANG_S:
-                process.kill()
-                process.wait()
-                return f"said nothing for {HANG_S:g} s: it hangs"
+        if _watched(process, folder):
+            return "it hangs: one input took more than any may"
     if process.returncode == 0:
         return None
     tail = (folder / "output").read_text(errors="replace")[-2000:]
     return f"the process ended with {process.returncode}\n{tail}"
+
+
+def _watched(process: subprocess.Popen, folder: Path) -> bool:
+    """Wait for a process; whether it had to be ended."""
+    seen, since, spent = -1, time.monotonic(), 0.0
+    while process.poll() is None:
+        time.sleep(POLL_S)
+        done, processor_s = _read_json(folder / "tally.json").get("beat", 0), _processor_s(process.pid)
+        if done != seen:
+            seen, since, spent = done, time.monotonic(), processor_s
+        elif time.monotonic() - since > HANG_S or processor_s - spent > HANG_PROCESSOR_S:
+            process.kill()
+            process.wait()
+            return True
+    return False
+
+
+def _processor_s(pid: int) -> float:
+    """The processor time of a process so far [s]; 0 once it is gone."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _read_json(path: Path) -> dict[str, object]:

@@ -151,13 +151,19 @@ if first == 0:
 
 @pytest.mark.parametrize(
     ("what", "words"),
-    [("os.abort()", "ended with -6"), ("time.sleep(60)", "it hangs"), ("raise ValueError('x')", "ValueError: x")],
+    [
+        ("os.abort()", "ended with -6"),
+        ("time.sleep(60)", "it hangs"),
+        ("while True: pass", "it hangs"),
+        ("raise ValueError('x')", "ValueError: x"),
+    ],
 )
 def test_an_input_that_ends_or_stops_its_process_is_kept_and_the_batch_goes_on(tmp_path, monkeypatch, what, words):
     worker = tmp_path / "worker.py"
     worker.write_text(CRASHING.replace("WHAT", what))
     monkeypatch.setattr(campaign, "WORKER", worker)
-    monkeypatch.setattr(campaign, "HANG_S", 1.0)
+    monkeypatch.setattr(campaign, "HANG_S", 1.0 if "sleep" in what else 60.0)
+    monkeypatch.setattr(campaign, "HANG_PROCESSOR_S", 0.5)
     job = Job("any", 9, 0)
     found = run_job(job, tmp_path / "kept")
     assert [words in reason for reason in found.faults.values()] == [True]
