@@ -1,6 +1,10 @@
 # make demo   sets everything up in .venv and runs the whole chain on the built-in face task, about two minutes
 # make test   sets up, lints and runs the tests, a few minutes; also installs the light-transport simulator, 200 MB
 # make fuzz   reads 100,000 damaged files, an hour on two cores; the result goes to docs/soak
+# make coverage  measures the lines and branches that the tests take, an hour
+# make mutation  changes the core's code in a thousand small ways and counts what its tests notice; to docs/soak
+# make soak   all long runs, a night on two cores: random whole runs, many seeds, kills, then fuzz and mutation; each
+#             also alone, as make soak-runs, soak-seeds and soak-kills; dated results go to docs/soak
 # make clean  takes all of it away again
 PYTHON ?= python3
 VENV := .venv
@@ -10,7 +14,7 @@ export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_WAIT_POLICY ?= PASSIVE
 
-.PHONY: demo test lint fuzz clean
+.PHONY: demo test coverage mutation lint fuzz soak soak-runs soak-seeds soak-kills clean
 
 $(BIN)/.ready: pyproject.toml constraints.txt
 	@echo "Setting up $(VENV): once, a minute or more"
@@ -33,11 +37,39 @@ test: $(BIN)/.ready $(BIN)/.transport
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m pytest
 
+# The suite with every line and branch that it takes; what numba compiles is traced by a second run without compiler
+coverage: $(BIN)/.ready
+	$(BIN)/python -m coverage erase
+	$(BIN)/python -m coverage run -m pytest
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage run -m pytest tests/test_splines.py tests/test_occupancy.py
+	$(BIN)/python -m coverage combine
+	$(BIN)/python -m coverage report --fail-under=90
+
+# Small changes of the core's code, and how many of them its tests notice: an hour
+mutation: $(BIN)/.ready
+	$(BIN)/python tools/mutation.py --out docs/soak/mutation-$$(date -u +%F).md
+
 lint: $(BIN)/.ready
 	$(BIN)/python -m ruff check .
 
 fuzz: $(BIN)/.ready
 	PYTHONPATH=tests $(BIN)/python tests/fuzz/campaign.py --inputs 100000 --out docs/soak
+
+# JOBS=N does so many runs at once
+JOBS ?= 2
+soak: soak-runs soak-seeds soak-kills fuzz mutation
+
+# 200 whole runs of random configurations: no fault, every constraint kept, the same bytes when done again
+soak-runs: $(BIN)/.ready
+	PYTHONPATH=tests $(BIN)/python -m soak runs --whole 200 --jobs $(JOBS)
+
+# The face and the arm at draft from 20 seeds each: every one learns well enough
+soak-seeds: $(BIN)/.ready
+	PYTHONPATH=tests $(BIN)/python -m soak seeds face arm --count 20 --jobs $(JOBS)
+
+# Learning, fitting and evaluating are killed at random moments: what is left can be read, and going on repeats the bytes
+soak-kills: $(BIN)/.ready
+	PYTHONPATH=tests $(BIN)/python -m faults.kills --out docs/soak/kills-$$(date -u +%F).md
 
 clean:
 	rm -rf $(VENV) build dist runs *.egg-info

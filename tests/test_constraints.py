@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from lidardesign.design.check import check_design
-from lidardesign.design.constraints import Constraints, check_feasible
+from lidardesign.design.constraints import Constraints, DistanceRange, Gate, check_feasible
 from lidardesign.design.files import design_document, design_from_document
 from lidardesign.design.fit import fit
 from lidardesign.design.samples import Samples
@@ -239,6 +239,12 @@ def test_an_entry_of_each_is_named_where_a_key_stands_in_it():
     assert constraints.name_of(0, "gate.width_m.max.deeper") == "gate.width_m.max.deeper"
     assert constraints.name_of(1, "gate.width_m.max") == "gate.width_m.max"
     assert constraints.name_of(2, "gate.width_m.max") == "gate.width_m.max"
+
+
+def test_a_document_holds_what_was_given_and_no_more():
+    width = DistanceRange(min=None, max=0.5)
+    assert Constraints(gate=Gate(width_m=width)).as_document() == {"gate": {"width_m": {"max": 0.5}}}
+    assert Constraints().as_document() == {}
 
 
 def test_empty_sections_say_nothing():

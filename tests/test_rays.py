@@ -13,8 +13,10 @@ from lidardesign.design.membership import log_density, members, seen_from
 from lidardesign.design.rays import gates_of, lay_out, make_ray_table, own_count, own_gates, refitted, split_budget
 from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import (
+    MOST_RAYS,
     Design,
     Sensor,
+    Track,
     interval_factor,
     tangent_coordinates,
     tangent_directions,
@@ -136,6 +138,13 @@ def test_a_budget_that_cannot_be_split_is_refused(weights, count):
 @pytest.mark.parametrize("scale", [1e-300, 1e-160, 1e160, 1e300])
 def test_weights_of_any_size_share_a_budget(scale):
     assert split_budget(np.array([3.0, 1.0]) * scale, 100).tolist() == [75, 25]
+
+
+def test_a_sensor_without_weight_gets_no_ray_and_the_most_rays_can_be_shared():
+    assert split_budget(np.array([0.0, 1.0, 0.0]), 3).tolist() == [0, 3, 0]
+    assert split_budget(np.array([1.0, 3.0]), MOST_RAYS).tolist() == [MOST_RAYS // 4, 3 * MOST_RAYS // 4]
+    with pytest.raises(ConfigError, match="budget"):
+        split_budget(np.ones(2), MOST_RAYS + 1)
 
 
 def test_shares_that_differ_in_the_tenth_decimal_tie_and_in_the_ninth_do_not():
@@ -462,7 +471,65 @@ def test_distributed_rays_are_laid_out_by_their_sensors_where_no_target_density_
     assert not np.array_equal(with_target.direction, alone.direction)
 
 
+def test_a_table_of_another_number_of_rays_does_not_answer():
+    design = Design("d", three_sensors(), layout="density", rays=30)
+    kept = replace(design, ray_table=make_ray_table(design, 30, drawn_from(design)))
+    samples = along_rails(design)
+    with pytest.raises(ConfigError, match="x_m"):
+        lay_out(kept, 40, samples, at={"x_m": 1.0})
+    assert len(lay_out(kept, 40, samples, at={"x_m": 1.0}, retarget=no_target)) == 40
+
+
+def test_a_scan_asks_the_target_density_for_other_rays_and_for_gates_of_their_own_alone():
+    design = Design("d", three_sensors(), layout="scan")
+    samples = along_rails(design)
+    assert len(lay_out(design, 3, samples, at={"x_m": 1.0})) == 3
+    for changes in ({"count": 5}, {"count": 3, "gates": "ray"}):
+        with pytest.raises(ConfigError, match="x_m"):
+            lay_out(design, samples=samples, at={"x_m": 1.0}, **changes)
+    assert len(lay_out(design, 5, samples, at={"x_m": 1.0}, retarget=no_target)) == 5
+
+
+def tracked():
+    """Three rays of one sensor on a track of two knots."""
+    elevation = np.array([[0.0, 0.1, 0.2], [0.2, 0.1, 0.0]])
+    gate = np.tile([0.5, 1.5], (2, 3, 1))
+    track = Track("x_m", np.array([0.0, 1.0]), np.full((2, 3), 1.0), elevation, gate, np.zeros(3, dtype=np.int64))
+    return Design("t", (sensor(),), layout="scan", rays=3, track=track)
+
+
+def test_a_track_gives_its_own_number_of_rays_at_a_place_and_others_by_samples_alone():
+    design, at = tracked(), {"x_m": 0.25}
+    rays = lay_out(design, at=at)
+    np.testing.assert_allclose(angles(rays.direction)[1], [0.05, 0.1, 0.15])
+    np.testing.assert_allclose(rays.origin_m, np.tile([0.25, -0.2, 0.3], (3, 1)))
+    np.testing.assert_array_equal(lay_out(design, 3, at=at).direction, rays.direction)
+    assert len(lay_out(design, 0, at=at)) == 0
+    for count in (1, 2, 4):
+        with pytest.raises(ConfigError, match=f"{count} rays in the layout `scan` need samples"):
+            lay_out(design, count, at=at)
+    for nowhere in (None, {}):
+        with pytest.raises(ConfigError, match="--at"):
+            lay_out(design, at=nowhere)
+
+
 # --- gates
+
+
+def test_gates_per_ray_leave_an_even_grid_as_it_is():
+    design = Design("d", three_sensors())
+    samples = drawn_from(design)
+    own = lay_out(design, 60, samples, gates="ray")
+    np.testing.assert_array_equal(own.direction, lay_out(design, 60).direction)
+    assert len(np.unique(own.gate_m, axis=0)) > 3
+
+
+@pytest.mark.parametrize("layout", ["grid", "density"])
+def test_rays_share_the_gate_of_their_sensor_unless_they_are_to_have_their_own(layout):
+    design = Design("d", three_sensors(), layout=layout)
+    rays = lay_out(design, 60, drawn_from(design))
+    for index, component in enumerate(design.sensors):
+        assert (rays.gate_m[rays.sensor == index] == component.gate_m).all()
 
 
 @pytest.mark.parametrize(
