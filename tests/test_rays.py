@@ -345,6 +345,27 @@ def test_as_many_samples_as_rays_are_the_rays_row_by_row_upwards():
     np.testing.assert_array_equal(one_more, even)
 
 
+def test_repeated_samples_are_one_place_for_a_ray():
+    design = Design("d", (sensor(),), layout="density")
+    samples = drawn_from(design, 40)
+    twice = samples.subset(np.r_[np.arange(40), np.arange(40)])
+    distinct = len(members(design, samples.points, samples.weights)[0])
+    even = lay_out(replace(design, layout="grid"), distinct + 1)
+    np.testing.assert_array_equal(lay_out(design, distinct + 1, twice).direction, even.direction)
+    assert len(np.unique(coordinates(design, lay_out(design, distinct, twice)).round(9), axis=0)) == distinct
+
+
+def test_rays_of_one_row_go_from_one_side_to_the_other():
+    fan = sensor(azimuth_rad=0.0, elevation_rad=0.0, roll_rad=0.0, spread_vertical_rad=0.0)
+    generator = np.random.default_rng(8)
+    angle, distance = generator.normal(0, 0.1, 2000), generator.normal(1, 0.1, 2000)
+    points = np.column_stack([np.tile(fan.origin_m, (2000, 1)), angle, np.zeros(2000), distance])
+    design = Design("d", (fan,), layout="density")
+    tangent = coordinates(design, lay_out(design, 20, Samples(points, np.zeros(2000), np.zeros(2000), SPACE)))
+    assert (tangent[:, 1] == 0).all()
+    assert (np.diff(tangent[:, 0]) > 0).all()
+
+
 def test_rays_of_a_density_layout_follow_the_seed_and_their_order_does_not():
     design = Design("d", (sensor(),), layout="density")
     samples = drawn_from(design)
