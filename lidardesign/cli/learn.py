@@ -27,7 +27,7 @@ from lidardesign.cli.starts import (
     undone_on_failure,
 )
 from lidardesign.cli.times import keep_times
-from lidardesign.errors import LostRankError
+from lidardesign.errors import DataError, LostRankError
 from lidardesign.run.clock import WAIT_S, phase
 
 if TYPE_CHECKING:
@@ -109,9 +109,12 @@ def _learn_in_folder(job: Job, device: str, console: Console, ranks: Ranks) -> L
                 learner = Learner(job.task, run, device, progress, ranks, console)
                 try:
                     return learner.learn(job.settings, job.goal, resume=job.has_checkpoint)
-                except LostRankError as error:
+                except (LostRankError, DataError) as error:
+                    # of errors about data, those that only ended the writing: a full disk
+                    if isinstance(error, DataError) and not isinstance(error.__cause__, OSError):
+                        raise
                     hint = f"{error.hint}; {_interruption(task, run)}"
-                    raise LostRankError(error.message, where=error.where, hint=hint) from None
+                    raise type(error)(error.message, where=error.where, hint=hint) from error.__cause__
 
 
 def _interruption(task: str, run: Path) -> str | None:

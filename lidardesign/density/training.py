@@ -34,7 +34,7 @@ from lidardesign.density.target import Target
 from lidardesign.errors import DataError, DivergenceError, LostRankError, NumericalError
 from lidardesign.run.checkpoint import load_arrays, save_arrays
 from lidardesign.run.clock import phase
-from lidardesign.run.files import write_atomic
+from lidardesign.run.files import append_line, write_atomic
 from lidardesign.run.manifest import record
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -258,8 +258,7 @@ class Trainer:
             "skipped": self.skipped,
             "seconds": round(seconds, 3),
         }
-        with (self.run / PROGRESS).open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
+        append_line(self.run / PROGRESS, json.dumps(row))
         if progress:
             progress(LearnProgress(self.step, self.settings.steps, loss, ess, seconds, left))
 
@@ -322,7 +321,8 @@ class Trainer:
         clear_snapshots(self.run, beyond=self.step)
         path = self.run / PROGRESS
         if path.exists():
-            kept = [line for line in path.read_text(encoding="utf-8").splitlines() if _step_of(line) <= self.step]
+            lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+            kept = [line for line in lines if _step_of(line) <= self.step]
             write_atomic(path, "".join(line + "\n" for line in kept))
 
 

@@ -46,10 +46,25 @@ def write_atomic(path: Path, content: bytes | str) -> None:
         else:
             _replace(path, payload)
     except OSError as error:
-        reason = error.strerror or str(error)
-        raise DataError(
-            f"cannot be written: {reason}", where=str(path), hint="check the folder and the space left"
-        ) from error
+        raise _unwritten(path, error) from error
+
+
+def append_line(path: Path, line: str) -> None:
+    """Add a line to a file that grows; a kill leaves at most the last one cut.
+
+    Raises:
+        DataError: As of `write_atomic`.
+    """
+    try:
+        with Path(path).open("a", encoding="utf-8") as file:
+            file.write(line + "\n")
+    except OSError as error:
+        raise _unwritten(path, error) from error
+
+
+def _unwritten(path: Path, error: OSError) -> DataError:
+    reason = error.strerror or str(error)
+    return DataError(f"cannot be written: {reason}", where=str(path), hint="check the folder and the space left")
 
 
 def temporary_beside(path: Path) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import pty
@@ -31,6 +32,11 @@ from lidardesign.task import Score
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="faults of processes are made with POSIX calls")
 OLD, NEW = b"old " * 2000, b"new " * 3000
+# The least that can be learned.
+TINY = (
+    "train=2", "learning.steps=20", "learning.batch=32", "learning.layers=1", "learning.hidden=8", "learning.bins=8",
+    "learning.samples=1000", "learning.balance_proposals=256", "learning.coverage_proposals=256",
+)  # fmt: skip
 GONE = 2**22 + 1  # beyond the largest process id that Linux gives
 # Python that has imported what it needs before anything is limited, as it writes files of its own
 QUIET = "import sys; sys.dont_write_bytecode = True; "
@@ -222,6 +228,54 @@ class TestKillsFullDisksAndTwoWriters:
         assert "--resume" in lidardesign("fit", run).err
         with run_lock(run):
             assert f"process {os.getpid()}" in lidardesign("fit", run).err
+
+    def test_a_disk_that_fills_after_the_last_step_of_learning_keeps_the_checkpoint_and_says_how_to_go_on(
+        self, tmp_path, lidardesign, monkeypatch
+    ):
+        rename, options = os.replace, [word for setting in TINY for word in ("--set", setting)]
+
+        def full(source, target):
+            if Path(target).name == "samples.npz":
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            rename(source, target)
+
+        learn = ("learn", "flatland", "--preset", "draft", "--out", "run", *options)
+        with monkeypatch.context() as patched:
+            patched.setattr("lidardesign.run.files.os.replace", full)
+            result = lidardesign(*learn, "--json")
+        assert result.code == 3
+        error = result.json["error"]
+        assert (error["where"], error["message"]) == ("run/samples.npz", "cannot be written: No space left on device")
+        assert "run/checkpoint.safetensors" in error["hint"]
+        assert "--resume" in error["hint"]
+        # a log that was spoilt as well: its readable lines are kept
+        with (tmp_path / "run" / "progress.jsonl").open("ab") as file:
+            file.write(bytes(range(256)))
+        assert lidardesign(*learn, "--resume").code == 0
+        rows = [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()]
+        assert [row["step"] for row in rows] == [10, 20]
+
+    @pytest.mark.parametrize("damage", ["cut between sensors", "cut inside", "one digit"])
+    def test_a_design_that_is_not_as_it_was_written_says_so_wherever_it_is_used(self, tmp_path, lidardesign, damage):
+        run = make_run(tmp_path / "run", count=1000)
+        assert lidardesign("fit", run, "--sensors", 2).code == 0
+        design = run / "designs" / "fit.yaml"
+        text = design.read_text()
+        second = text.index("- name", text.index("- name") + 1)
+        design.write_text(
+            {
+                "cut between sensors": text[:second],
+                "cut inside": text[: second + 40],
+                "one digit": text.replace("weight: 0.", "weight: 0.1", 1),
+            }[damage]
+        )
+        size = design.stat().st_size
+        said = "was changed since it was written" if damage == "one digit" else f"is truncated: {size} of"
+        export = ("export", design, "--format", "csv", "--rays", 5)
+        for command in (("show", design), ("evaluate", run, "--rays", 4, "--set", "test=1"), export):
+            result = lidardesign(*command)
+            assert result.code == (2 if damage == "cut inside" else 0), result.err
+            assert said in result.err
 
     @pytest.mark.slow
     def test_kills_at_steps_spread_over_learn_fit_and_evaluate_are_all_recovered(self):
