@@ -24,6 +24,7 @@ from lidardesign.design.samples import Samples, load_samples
 from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.evaluate.capture import load_capture
+from lidardesign.export import csv as csv_format
 from lidardesign.export import npz as npz_format
 from lidardesign.meshio import check_mesh, load_mesh
 from lidardesign.run.manifest import record
@@ -104,6 +105,26 @@ def test_a_cached_field_with_a_damaged_header_is_built_again(tmp_path, header):
     assert _load(tmp_path / "field.npy", 8) is None
 
 
+RAY_COLUMNS = (
+    "origin_x_m,origin_y_m,origin_z_m,direction_x,direction_y,direction_z,azimuth_rad,elevation_rad,gate_start_m,"
+    "gate_end_m,sensor,time_s"
+)
+RAY_ROW = ["0", "0", "0", "1", "0", "0", "0", "0", "1", "2", "3", "0.1"]
+
+
+@pytest.mark.parametrize(
+    ("column", "text"),
+    [(0, "1e300"), (3, "1e200"), (3, "nan"), (9, "inf"), (10, "1e30"), (10, "0.5"), (10, "-1"), (11, "nan")],
+)
+def test_numbers_of_rays_that_cannot_be_are_refused_without_a_warning(tmp_path, column, text):
+    path = tmp_path / "rays.csv"
+    path.write_text(f"{RAY_COLUMNS}\n{','.join(RAY_ROW)}\n")
+    assert csv_format.read(path).sensor[0] == 3
+    path.write_text(f"{RAY_COLUMNS}\n{','.join([*RAY_ROW[:column], text, *RAY_ROW[column + 1 :]])}\n")
+    with pytest.raises(DataError, match="holds no ray list"):
+        csv_format.read(path)
+
+
 # --- geometry
 
 
@@ -132,6 +153,18 @@ def test_a_dataset_without_values_is_refused_by_name(tmp_path, dataset):
         for name, array in values.items():
             file[name] = h5py.Empty("f8") if name == dataset else array
     with pytest.raises(DataError, match="not an array of numbers") as refused:
+        load_model(tmp_path / "m.h5", unit="mm")
+    assert dataset in str(refused.value)
+
+
+@pytest.mark.parametrize("dataset", ["model/mean", "model/pcaVariance", "model/pcaBasis"])
+def test_a_face_beyond_all_sizes_is_refused_without_a_warning(tmp_path, dataset):
+    values = {"model/mean": np.arange(9.0), "model/pcaVariance": np.ones(1), "model/pcaBasis": np.full((9, 1), 1 / 3)}
+    with h5py.File(tmp_path / "m.h5", "w") as file:
+        for name, array in values.items():
+            file[name] = array * (1e300 if name == dataset else 1.0)
+        file["representer/cells"] = np.array([[0], [1], [2]])
+    with pytest.raises(DataError, match="reaches") as refused:
         load_model(tmp_path / "m.h5", unit="mm")
     assert dataset in str(refused.value)
 

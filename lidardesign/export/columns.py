@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import MOST_RAYS, Design
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.simulate.returns import Rays
-from lidardesign.space import angles
+from lidardesign.space import FARTHEST_M, angles
+
+# Unit vectors, however they were rounded; frames are far shorter.
+LONGEST_DIRECTION, LATEST_S = 2.0, 1e9
 
 
 def ray_columns(rays: Rays) -> dict[str, np.ndarray]:
@@ -44,9 +48,26 @@ def rays_of(columns: Mapping[str, np.ndarray], path: Path) -> Rays:
             for name, axes in (("origin", ("x_m", "y_m", "z_m")), ("direction", ("x", "y", "z")))
         )
         gate = np.stack([columns["gate_start_m"], columns["gate_end_m"]], axis=1)
+        _check_numbers(origin, ray, gate, columns["sensor"], columns["time_s"])
         return Rays(origin, ray, gate, columns["sensor"], columns["time_s"])
     except (KeyError, ValueError, ConfigError) as error:
         raise DataError(f"holds no ray list: {error}", where=str(path)) from error
+
+
+def _check_numbers(origin: Any, ray: Any, gate: Any, sensor: Any, time: Any) -> None:
+    """Refuse numbers that cannot be, before anything is computed of them.
+
+    Raises:
+        ValueError: They are none, or far beyond what rays have; sensors that are no whole numbers.
+    """
+    for name, values, most in (
+        ("origin", origin, FARTHEST_M), ("direction", ray, LONGEST_DIRECTION), ("gate", gate, FARTHEST_M),
+        ("sensor", sensor, MOST_RAYS), ("time", time, LATEST_S),
+    ):  # fmt: skip
+        if values.dtype.kind not in "iuf" or not (np.abs(values.astype(np.float64)) <= most).all():
+            raise ValueError(f"a number of {name} is none, or beyond {most:g}")
+    if (np.asarray(sensor) % 1 != 0).any() or (np.asarray(sensor) < 0).any():
+        raise ValueError("a sensor is no whole number of 0 or more")
 
 
 def losses(design: Design) -> list[str]:

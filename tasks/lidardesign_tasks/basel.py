@@ -19,6 +19,8 @@ Unit = Literal["auto", "mm", "cm", "m"]
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 LAYOUT = "the HDF5 layout of the Basel Face Model"
 LARGEST_DATASET_BYTES = 2 * 1024**3
+# Squares of what is beyond would overflow; no head is as large in any unit.
+LARGEST_VALUE = 1e12
 CELL_NAMES = ("representer/cells", "representer/reference-mesh/triangle-list")
 # norms of basis columns are 1, or the standard deviations, to single precision and file rounding
 NORM_TOLERANCE = 1e-2
@@ -102,6 +104,9 @@ class _File:
             raise self.fail(present[0], f"is damaged ({str(error).splitlines()[0]})") from error
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             raise self.fail(present[0], f"{int((~np.isfinite(values)).sum())} values are NaN or infinite")
+        largest = float(np.abs(values.astype(np.float64)).max(initial=0.0))
+        if largest > LARGEST_VALUE:
+            raise self.fail(present[0], f"reaches {largest:.3g}", f"at most {LARGEST_VALUE:g}")
         return values
 
 
