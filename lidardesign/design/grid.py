@@ -58,10 +58,11 @@ def low_discrepancy(count: int, axes: int) -> np.ndarray:
     Up to two axes the additive recurrence R_k (M. Roberts 2018): its generators are the powers of 1 / phi, with phi
     the root of phi^(k+1) = phi + 1 above 1. Beyond, small multiples of two generators nearly add up to a whole number,
     and points lie on a few lines of that pair of axes (of four axes the first and the third: 1000 points leave 30
-    of 100 cells of their square empty); there J. Halton's sequence (1960) in the first primes.
+    of 100 cells of their square empty); there J. Halton's sequence (1960) in the first primes. The smallest ones are
+    the most even: they go to the last axes, which are those of directions.
     """
     if axes > RECURRENCE_AXES:
-        return np.stack([_radical_inverse(count, base) for base in PRIMES[:axes]], axis=1)
+        return np.stack([_radical_inverse(count, base) for base in PRIMES[axes - 1 :: -1]], axis=1)
     phi = 1.5
     for _ in range(64):  # a contraction by at least 3: 64 steps are far below rounding
         phi = (1.0 + phi) ** (1.0 / (axes + 1))
