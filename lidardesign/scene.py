@@ -27,14 +27,17 @@ RIGID_TOLERANCE = COARSE_SLACK
 SPEED_OF_LIGHT_M_S = 299_792_458.0
 # Light that fades over a nanometre has entered a solid.
 DENSEST = 1e9
+# A picometre is less than an atom; areas are squares of lengths and must stay numbers, as must what is divided by them.
+SMALLEST_M = 1 / 1e12
 # Shares of light that were meant to add up to 1 may exceed it by rounding.
 SHARE_ROUNDING = SLACK
 
 
-def _check_lengths(shape: object, *lengths_m: float, low: float = 0.0, strict: bool = True) -> None:
+def _check_lengths(shape: object, *lengths_m: float, low: float = SMALLEST_M) -> None:
     for length in lengths_m:
-        if not low <= length <= FARTHEST_M or (strict and length == low):
-            raise DataError(f"{shape} has the length {length} m", allowed=f"lengths above 0 m, up to {FARTHEST_M:g} m")
+        if not low <= length <= FARTHEST_M:
+            allowed = f"lengths from {low:g} to {FARTHEST_M:g} m"
+            raise DataError(f"{shape} has the length {length} m", allowed=allowed)
 
 
 @dataclass(frozen=True)
@@ -66,7 +69,7 @@ class Capsule:
 
     def __post_init__(self) -> None:
         _check_lengths(self, self.radius_m)
-        _check_lengths(self, self.half_length_m, strict=False)
+        _check_lengths(self, self.half_length_m, low=0.0)
 
 
 @dataclass(frozen=True)
@@ -101,6 +104,9 @@ class Mesh:
         farthest = float(np.abs(vertices).max())
         if farthest > FARTHEST_M:
             raise DataError(f"a mesh has vertices {farthest:g} m away", allowed=f"at most {FARTHEST_M:g} m")
+        size = float(np.ptp(vertices, axis=0).max())
+        if size < SMALLEST_M:
+            raise DataError(f"a mesh is {size:g} m in size", allowed=f"at least {SMALLEST_M:g} m")
         if faces.min() < 0 or faces.max() >= len(vertices):
             worst = faces.min() if faces.min() < 0 else faces.max()
             raise DataError(f"a mesh of {len(vertices)} vertices has faces that name vertex {int(worst)}")

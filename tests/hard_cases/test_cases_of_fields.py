@@ -135,6 +135,18 @@ class TestPartsOfMeshesThatAreNone:
         with pytest.raises(DataError, match="away"):
             Mesh(BOX_VERTICES * scale, BOX_FACES)
 
+    @pytest.mark.parametrize("length", [0.0, -1.0, 1e-160, 1e10, 1e300, math.nan, math.inf])
+    def test_bodies_of_absurd_sizes_are_refused_by_name(self, length):
+        for make in (Sphere, lambda one: Box((1.0, one, 1.0)), lambda one: Capsule(one, 1.0)):
+            with pytest.raises(DataError, match="has the length"):
+                make(length)
+        if math.isfinite(length) and abs(length) < 1:
+            with pytest.raises(DataError, match="m in size"):
+                Mesh(BOX_VERTICES * min(abs(length), 1e-160), BOX_FACES)
+        if not math.isfinite(length) or abs(length) > 1:
+            with pytest.raises(DataError, match="body"):
+                Body(Sphere(1.0), poses=rigid(translation_m=(0.0, length, 0.0)))
+
     @pytest.mark.parametrize("index", [-1, 8])
     def test_faces_that_name_missing_vertices_are_refused(self, index):
         with pytest.raises(DataError, match="1 faces name vertices that do not exist"):
