@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,8 @@ import torch
 from lidardesign.errors import DataError
 
 COUNTERS = ("step", "skipped", "skipped_in_a_row", "halvings")
+# A step size is divided by 2 to this power.
+MOST_HALVINGS, MOST_STEPS, MOST_SECONDS = 64, 10**12, 1e12
 MOMENTS = ("exp_avg", "exp_avg_sq")
 HINT = "resume with the run's own configuration, or learn the run again"
 
@@ -37,11 +38,12 @@ def check_resumable(
     """
     for name in (*COUNTERS, "doubled_at"):
         value = state.get(name)
-        whole = isinstance(value, int) and not isinstance(value, bool) and value >= 0
+        most = MOST_HALVINGS if name == "halvings" else MOST_STEPS
+        whole = isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most
         if not whole and not (name == "doubled_at" and value is None):
             raise DataError(f"has {name} = {value!r}", where=str(path), allowed="a whole number", hint=HINT)
     seconds = state.get("seconds")
-    if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds < math.inf:
+    if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds <= MOST_SECONDS:
         raise DataError(f"has seconds = {seconds!r}", where=str(path), allowed="a number from 0", hint=HINT)
     weights = {f"flow.{name}": value.numel() for name, value in flow.state_dict().items()}
     held = {name: array.size for name, array in arrays.items() if name.startswith("flow.")}
@@ -58,6 +60,9 @@ def check_resumable(
             raise DataError(f"the checkpoint is of another flow: {start[:-1]} differs", where=str(path), hint=HINT)
         if any(array.dtype.kind != "f" for array in found.values()):
             raise DataError(f"holds no numbers in {start[:-1]}", where=str(path), hint=HINT)
+        # squares are not negative, and who has moments has taken a step: the optimiser takes roots and divides
+        if found and (found[f"{start}exp_avg_sq"].min() < 0 or found[f"{start}step"].min() < 1):
+            raise DataError(f"holds impossible numbers in {start[:-1]}", where=str(path), hint=HINT)
     stream, own = arrays.get("generator"), generator.get_state()
     if stream is None or stream.dtype != np.uint8 or stream.shape != tuple(own.shape):
         raise DataError("holds no random stream", where=str(path), hint=HINT)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import math
 import os
 import platform
 import shutil
@@ -83,7 +84,7 @@ def jobs(inputs: int, only: list[str], seed: int) -> Iterator[Job]:
     shares = sum(target.share for target in (*TARGETS, *COMMANDS))
     commands = {target.name for target in COMMANDS}
     for target in chosen:
-        left = max(round(inputs * target.share / shares), 1)
+        left = math.ceil(inputs * target.share / shares)
         batch = COMMAND_BATCH if target.name in commands else BATCH
         for number in range(-(-left // batch)):
             yield Job(target.name, min(batch, left - number * batch), 1000 * seed + number)

@@ -10,6 +10,20 @@ from types import SimpleNamespace
 from command_line import make_run
 from fuzz_kinds import Read, of_file
 
+from lidardesign.registry import load_task
+from lidardesign.run.config import RunConfig, resolve
+
+# Two steps of a small flow, measured roughly.
+SMALL = (
+    "learning.steps=2", "learning.samples=1000", "learning.batch=16", "learning.hidden=8", "learning.layers=1",
+    "learning.bins=4", "learning.balance_proposals=256", "learning.coverage_proposals=256",
+)  # fmt: skip
+
+
+def small_config() -> RunConfig:
+    """A configuration of flatland that is learned in a moment."""
+    return resolve(load_task("flatland"), preset="draft", overrides=SMALL)
+
 
 def rerecord(run: Path, name: str, content: bytes) -> None:
     """Put a file into a run with its hash, as somebody would who means it; without waiting for the disk."""
@@ -94,10 +108,8 @@ def _trainer(run: Path) -> object:
     from lidardesign.density.objective import Coordinates
     from lidardesign.density.parallel import ALONE
     from lidardesign.density.training import Trainer
-    from lidardesign.registry import load_task
-    from lidardesign.run.config import resolve
 
-    config = resolve(load_task("flatland"), preset="draft", overrides=["learning.hidden=8", "learning.layers=1"])
+    config = small_config()
     generator = torch.Generator().manual_seed(0)
     target = SimpleNamespace(ranks=ALONE)
     flow, coordinates = make_flow(config, generator), Coordinates(config.space)
@@ -127,10 +139,11 @@ def open_checkpoints(folder: Path) -> Read:
         trainer = trainers[0]
         trainer.optimiser.state.clear()
         trainer.resume()
+        weights = [value.detach().numpy().copy() for value in trainer.flow.state_dict().values()]
         for parameter in trainer.flow.parameters():
             parameter.grad = torch.zeros_like(parameter)
         trainer.optimiser.step()
-        return [value.detach().numpy() for value in trainer.flow.state_dict().values()], trainer._rate()
+        return weights, trainer._rate()
 
     trainers = [_trainer(run)]
     return read

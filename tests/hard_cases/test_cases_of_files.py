@@ -264,7 +264,7 @@ class TestCheckpoints:
         trainer.resume()
 
     @pytest.mark.parametrize("name", ["step", "skipped", "skipped_in_a_row", "halvings", "seconds"])
-    @pytest.mark.parametrize("value", [None, -1, "7", True, [1], 1e400])
+    @pytest.mark.parametrize("value", [None, -1, "7", True, [1], 1e400, 10**400], ids=lambda value: str(value)[:5])
     def test_a_counter_that_is_none_is_refused(self, run, name, value):
         trainer = fresh_trainer(run, hidden=8)
         taken = trainer._taken()
@@ -279,6 +279,7 @@ class TestCheckpoints:
             ("generator", np.zeros(5056), "random stream"),
             ("adam.0.exp_avg", np.zeros(3), "another flow"),
             ("adam.0.surprise", np.zeros(3), "another flow"),
+            ("flow.surprise", np.zeros(3), "another flow"),
         ],
     )
     def test_parts_that_do_not_fit_are_refused(self, run, name, array, words):
@@ -286,6 +287,23 @@ class TestCheckpoints:
         taken = trainer._taken()
         save_arrays(run, CHECKPOINT, {**taken.arrays, name: array}, taken.state)
         with pytest.raises(DataError, match=words):
+            trainer.resume()
+
+    @pytest.mark.parametrize(("moment", "value"), [("exp_avg_sq", -1.0), ("step", 0.0), ("step", -1.0)])
+    def test_moments_that_no_step_leaves_are_refused(self, run, moment, value):
+        import torch
+
+        trainer = fresh_trainer(run, hidden=8)
+        for parameter in trainer.flow.parameters():
+            parameter.grad = torch.ones_like(parameter)
+        trainer.optimiser.step()
+        taken = trainer._taken()
+        save_arrays(run, CHECKPOINT, taken.arrays, taken.state)
+        trainer.resume()
+        name = f"adam.0.{moment}"
+        array = np.full_like(taken.arrays[name], value)
+        save_arrays(run, CHECKPOINT, {**taken.arrays, name: array}, taken.state)
+        with pytest.raises(DataError, match="impossible numbers"):
             trainer.resume()
 
     def test_one_from_before_float64_was_entered_is_resumed(self, run):
