@@ -53,7 +53,7 @@ lint: $(BIN)/.ready
 	$(BIN)/python -m ruff check .
 
 fuzz: $(BIN)/.ready
-	PYTHONPATH=tests $(BIN)/python tests/fuzz/campaign.py --inputs 100000 --out docs/soak
+	$(BIN)/python tests/fuzz/campaign.py --inputs 100000 --out docs/soak
 
 # JOBS=N does so many runs at once
 JOBS ?= 2

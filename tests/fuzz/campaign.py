@@ -1,6 +1,6 @@
 """The long run of the fuzzer: every target in processes of its own that may hang, crash or run out of memory.
 
-    PYTHONPATH=tests python tests/fuzz/campaign.py --inputs 100000 --out docs/soak
+    python tests/fuzz/campaign.py --inputs 100000 --out docs/soak
 
 A target's inputs go through the program in batches, each in a fresh process with a memory limit. Which input is being
 read is on disk before it is read, so that one which ends or stops the process is known, and the batch goes on after it.
@@ -120,7 +120,9 @@ def _current(folder: Path) -> tuple[int, bytes]:
 def _process(job: Job, first: int, folder: Path) -> str | None:
     """Run inputs from the first on; why the process ended before the last, or None."""
     arguments = [job.name, str(job.seed), str(first), str(job.inputs), str(folder)]
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT / 'tests'}:{HERE}"}
+    # the program beside this file, wherever another is installed
+    places = (ROOT, ROOT / "tasks", ROOT / "tests", HERE)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, places))}
     with (folder / "output").open("wb") as output:
         process = subprocess.Popen(
             [sys.executable, str(WORKER), *arguments],
@@ -272,5 +274,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.path[:0] = [str(ROOT / "tests")]
+    sys.path[:0] = [str(ROOT), str(ROOT / "tasks"), str(ROOT / "tests")]
     sys.exit(main())
