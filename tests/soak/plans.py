@@ -1,0 +1,218 @@
+"""What one random run does: a valid configuration, a fit, constraints and an evaluation, all from one number."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lidardesign.task import random_generator
+from soak.scaled_flatland import NAME
+
+# What the soak promises to cover, as powers of ten: the width of the scenes, and sigma as a share of it.
+SIZES_M = (-3.0, 4.0)
+SIGMA_SHARES = (-4.0, 0.0)
+MOST_SENSORS = 12
+DIMENSIONS = ("x_m", "y_m", "z_m", "azimuth_rad", "elevation_rad", "range_m")
+# Shipped detectors that count photons, and how far their histograms or pulses reach [m].
+DETECTORS = {"single-photon": 14.9, "consumer-8x8": 4.79}
+LENGTHS = {"x_m": 0, "y_m": 1, "z_m": 2}
+# Where a dimension stands when it is fixed, at home: in the middle of the line below, looking up at the curve.
+FIXED = {"x_m": 0.5, "y_m": 0.0, "z_m": 0.0, "azimuth_rad": math.pi / 2, "elevation_rad": 0.0, "range_m": 0.78}
+# Bounds of a free one; of these, one is drawn.
+FREE: dict[str, list[tuple[float, float]]] = {
+    "x_m": [(0.0, 1.0), (0.2, 0.7)],
+    "y_m": [(-0.2, 0.2), (0.0, 0.1)],
+    "z_m": [(-0.1, 0.1), (0.0, 0.3)],
+    "azimuth_rad": [(math.pi / 4, 3 * math.pi / 4), (0.0, 2 * math.pi), (-math.pi, math.pi), (0.0, math.pi)],
+    "elevation_rad": [(-0.3, 0.3), (-math.pi / 2, math.pi / 2), (-0.5, 0.1)],
+    "range_m": [(0.0, 1.2), (0.3, 1.0)],
+}
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """One random run.
+
+    Arguments:
+        seed: What everything follows from.
+        config: The configuration file of `learn`.
+        sensors: How many are fitted.
+        fit: Further options of `fit`.
+        evaluate: Options of `evaluate`.
+    """
+
+    seed: int
+    config: dict[str, Any]
+    sensors: int
+    fit: tuple[str, ...]
+    evaluate: tuple[str, ...]
+
+    @property
+    def size_m(self) -> float:
+        """Width of the scenes [m]."""
+        return self.config["task"]["size_m"]
+
+    @property
+    def sigma_share(self) -> float:
+        """Sigma as a share of that width."""
+        return self.config["density"]["sigma_m"] / self.size_m
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of the free dimensions."""
+        return tuple(name for name in DIMENSIONS if isinstance(self.config["space"][name], list))
+
+
+def random_plan(seed: int) -> RunPlan:
+    """The run of a number, always the same."""
+    generator = random_generator(seed, "soak", "plan")
+    size = _power(generator, *SIZES_M)
+    offset = [float(v) for v in size * _pick(generator, [0.0, 1.0, 100.0]) * generator.normal(size=3)]
+    space = _space(generator, size, offset)
+    at = _condition_value(space, generator)
+    # only a scan has rays for all values of a condition
+    layouts = ["scan"] if "condition" in space and not at else ["grid", "grid", "density", "scan", "distributed"]
+    layout = _pick(generator, layouts)
+    sensors = int(generator.integers(1, MOST_SENSORS + 1))
+    return RunPlan(
+        seed,
+        {
+            "task_name": NAME,
+            "task": {**_scenes(generator, size), "size_m": size, "offset_m": offset},
+            "space": space,
+            "density": _density(generator, size),
+            "learning": _learning(generator),
+        },
+        sensors,
+        (*_fit_options(generator, layout, sensors), *at),
+        _evaluate_options(generator, reach_m=_high(space["range_m"])),
+    )
+
+
+def _power(generator: np.random.Generator, low: float, high: float) -> float:
+    """Ten to the power of an even draw, with digits that a person would write."""
+    return float(f"{10 ** generator.uniform(low, high):.4g}")
+
+
+def _pick(generator: np.random.Generator, choices: list[Any]) -> Any:
+    return choices[int(generator.integers(len(choices)))]
+
+
+def _space(generator: np.random.Generator, size: float, offset: list[float]) -> dict[str, Any]:
+    count = int(generator.integers(1, 7))
+    free = {DIMENSIONS[i] for i in generator.permutation(6)[:count]}
+    space: dict[str, Any] = {}
+    for name in DIMENSIONS:
+        shift = offset[LENGTHS[name]] if name in LENGTHS else 0.0
+        unit = size if name.endswith("_m") else 1.0
+        if name in free:
+            space[name] = [shift + unit * bound for bound in _pick(generator, FREE[name])]
+        else:
+            space[name] = shift + unit * FIXED[name]
+    space["measure"] = _pick(generator, ["solid_angle", "solid_angle", "angles"])
+    if "x_m" in free and count > 1 and generator.random() < 0.15:
+        space["condition"] = ["x_m"]
+    return space
+
+
+def _high(bounds: float | list[float]) -> float:
+    return bounds[1] if isinstance(bounds, list) else bounds
+
+
+def _condition_value(space: dict[str, Any], generator: np.random.Generator) -> tuple[str, ...]:
+    """Half of the designs of a density with a condition are for one value of it."""
+    if "condition" not in space or generator.random() < 0.5:
+        return ()
+    low, high = space["x_m"]
+    return ("--at", f"x_m={float(generator.uniform(low, high))!r}")
+
+
+def _scenes(generator: np.random.Generator, size: float) -> dict[str, Any]:
+    scenes: dict[str, Any] = {
+        "scene": _pick(generator, ["surface", "discs", "occluded"]),
+        "train": int(generator.integers(1, 7)),
+        "test": int(generator.integers(1, 4)),
+        "variation": float(generator.uniform(0.1, 1.5)),
+        "illuminance_lux": _pick(generator, [0.0, 300.0, 100_000.0]),
+        "light": _pick(generator, ["indoor", "sun"]),
+        "reflectance": float(generator.uniform(0.02, 1.0)),
+        "gloss": _pick(generator, [0.0, 0.0, 0.5]),
+    }
+    if generator.random() < 0.2:
+        scenes["visibility_m"] = max(size * _power(generator, 0.0, 2.0), 0.01)
+    return scenes
+
+
+def _density(generator: np.random.Generator, size: float) -> dict[str, Any]:
+    density: dict[str, Any] = {
+        "sigma_m": size * _power(generator, *SIGMA_SHARES),
+        "visibility": _pick(generator, ["auto", "auto", "raycast", "quadrature", "off"]),
+        "quadrature_points": int(_pick(generator, [8, 32])),
+    }
+    if generator.random() < 0.3:
+        density["attenuation_per_m"] = _power(generator, 0.0, 4.0) / size
+    if generator.random() < 0.3:
+        density["sharpness_per_m"] = _power(generator, 0.0, 4.0) / size
+    if generator.random() < 0.3:
+        density["margin_m"] = size * _pick(generator, [0.0, 0.001, 0.05])
+    return density
+
+
+# What learns most densities in seconds, and what else may be asked for.
+USUAL_LEARNING: dict[str, Any] = {
+    "steps": 120,
+    "batch": 256,
+    "rate": 0.01,
+    "layers": 3,
+    "hidden": 48,
+    "bins": 16,
+    "samples": 8000,
+    "balance_proposals": 8192,
+    "coverage_proposals": 512,
+}
+UNUSUAL_LEARNING: dict[str, list[Any]] = {
+    "steps": [1, 20, 300],
+    "batch": [2, 32, 512],
+    "rate": [0.001, 0.05],
+    "layers": [1, 2, 4],
+    "hidden": [4, 16, 96],
+    "bins": [2, 8],
+    "samples": [1000, 30_000],
+    "balance_proposals": [256, 4096],
+    "dtype": ["float64"],
+    "entropy": [0.3],
+    "anneal": [0.0, 1.0],
+    "balance": [0.0, 1.0],
+    "clip_norm": [0.1],
+}
+UNUSUAL_SHARE = 0.1
+
+
+def _learning(generator: np.random.Generator) -> dict[str, Any]:
+    unusual = {k: _pick(generator, v) for k, v in UNUSUAL_LEARNING.items() if generator.random() < UNUSUAL_SHARE}
+    return {**USUAL_LEARNING, **unusual}
+
+
+def _fit_options(generator: np.random.Generator, layout: str, sensors: int) -> tuple[str, ...]:
+    options = ["--layout", layout, "--level", f"{_pick(generator, [0.5, 0.9, 0.95, 0.99])}"]
+    if layout == "scan":
+        return (*options, "--rays", str(sensors))
+    options += ["--sensors", _pick(generator, [str(sensors)] * 5 + ["auto"])]
+    if layout != "grid" or generator.random() < 0.5:
+        options += ["--rays", str(int(generator.integers(MOST_SENSORS, 65)))]
+        if generator.random() < 0.3:
+            options += ["--gates", _pick(generator, ["sensor", "ray"])]
+    return tuple(options)
+
+
+def _evaluate_options(generator: np.random.Generator, *, reach_m: float) -> tuple[str, ...]:
+    options = ["--rays", str(int(generator.integers(1, 65)))]
+    detectors = ["ideal", *(name for name, farthest_m in DETECTORS.items() if reach_m < farthest_m)]
+    options += ["--detector", _pick(generator, detectors)]
+    options += ["--effects", _pick(generator, ["auto", "auto", "none", "all"])]
+    if generator.random() < 0.2:
+        options += ["--baseline", _pick(generator, ["occupancy", "no-visibility"])]
+    return tuple(options)

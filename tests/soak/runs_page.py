@@ -1,0 +1,74 @@
+"""The page of the random runs: what they covered, how they ended, and every one of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from soak.pages import heading, paragraph, table, write_page
+from soak.whole_runs import BLIND, DONE, INFEASIBLE, ROUGH, WHOLE
+
+COLUMNS = ("seed", "width [m]", "sigma / width", "free", "sensors", "layout", "ESS", "bounds", "outcome", "constrain")
+
+
+def runs_page(path: Path, records: Sequence[dict[str, Any]], command: str) -> None:
+    """Write the page."""
+    faults = [f"- seed {r['seed']}: {fault}" for r in records for fault in r["faults"]]
+    parts = [
+        heading("Random whole runs", command),
+        paragraph(_summary(records)),
+        table(("how it ended", "runs"), _outcomes(records)),
+        table(("constraints", "asked", "kept", "refused with exit 4"), _constraints(records)),
+        "## Faults\n\n" + ("\n".join(faults) if faults else "None."),
+        "## Every run\n\n" + paragraph("`python -m soak one SEED` does a run again and shows its configuration."),
+        table(COLUMNS, [_row(r) for r in records]),
+    ]
+    write_page(path, parts)
+
+
+def _summary(records: Sequence[dict[str, Any]]) -> str:
+    whole = [r for r in records if r["outcome"] == WHOLE]
+
+    def span(key: str) -> str:
+        values = [r[key] for r in whole]
+        return f"{min(values):.2g} to {max(values):.2g}" if values else "none"
+
+    repeated = [r["repeated"] for r in records if r["repeated"] is not None]
+    return (
+        f"{len(whole)} runs did all of learn, fit, constrain and evaluate: widths of {span('size_m')} m, sigma of "
+        f"{span('sigma_share')} of the width, {span('free')} free dimensions, {span('sensors')} sensors. "
+        f"{sum(r['bounds'] for r in records)} bounds were read back from the written files and checked. "
+        f"{sum(repeated)} of {len(repeated)} runs that were done twice repeated every document and every byte of "
+        "densities, samples and designs."
+    )
+
+
+def _outcomes(records: Sequence[dict[str, Any]]) -> list[tuple[str, int]]:
+    counts = Counter(r["outcome"] for r in records)
+    meaning = {
+        WHOLE: "learned, fitted, constrained, evaluated",
+        ROUGH: "learned; `fit` refuses the density as too rough (exit 3)",
+        BLIND: "`learn` says that the design space sees no target (exit 3)",
+        "fault": "a fault",
+    }
+    return [(text, counts[outcome]) for outcome, text in meaning.items()]
+
+
+def _constraints(records: Sequence[dict[str, Any]]) -> list[tuple[str, int, int, int]]:
+    kinds: dict[str, Counter[int]] = {}
+    for record in records:
+        for command, asked, code, _ in record["steps"]:
+            if command == "constrain":
+                kind = {"kept already": "bounds that the fit kept already", "drawn": "bounds drawn blindly"}
+                kinds.setdefault(kind.get(asked, "contradictions"), Counter())[code] += 1
+    return [(kind, codes.total(), codes[DONE], codes[INFEASIBLE]) for kind, codes in sorted(kinds.items())]
+
+
+def _row(record: dict[str, Any]) -> tuple[object, ...]:
+    ess = "" if record["ess"] is None else f"{record['ess']:.3g}"
+    constrained = [f"{asked}: {code}" for command, asked, code, _ in record["steps"] if command == "constrain"]
+    figures = (record["seed"], f"{record['size_m']:g}", f"{record['sigma_share']:.2g}", record["free"])
+    kind = (record["sensors"], record["layout"], ess, record["bounds"], record["outcome"])
+    return (*figures, *kind, "; ".join(constrained))
