@@ -163,7 +163,7 @@ def _density(generator: np.random.Generator, size: float) -> dict[str, Any]:
 
 # What learns most densities in seconds, and what else may be asked for.
 USUAL_LEARNING: dict[str, Any] = {
-    "steps": 120,
+    "steps": 100,
     "batch": 256,
     "rate": 0.01,
     "layers": 3,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from soak.pages import heading, paragraph, table, write_page
-from soak.whole_runs import BLIND, DONE, INFEASIBLE, ROUGH, WHOLE
+from soak.whole_runs import BLIND, DONE, INFEASIBLE, ROUGH, USAGE, WHOLE
 
 COLUMNS = ("seed", "width [m]", "sigma / width", "free", "sensors", "layout", "ESS", "bounds", "outcome", "constrain")
 
@@ -20,7 +20,10 @@ def runs_page(path: Path, records: Sequence[dict[str, Any]], command: str) -> No
         heading("Random whole runs", command),
         paragraph(_summary(records)),
         table(("how it ended", "runs"), _outcomes(records)),
-        table(("constraints", "asked", "kept", "refused with exit 4"), _constraints(records)),
+        table(
+            ("constraints", "asked", "kept", "refused with exit 4", "too few samples left, exit 2"),
+            _constraints(records),
+        ),
         "## Faults\n\n" + ("\n".join(faults) if faults else "None."),
         "## Every run\n\n" + paragraph("`python -m soak one SEED` does a run again and shows its configuration."),
         table(COLUMNS, [_row(r) for r in records]),
@@ -56,14 +59,16 @@ def _outcomes(records: Sequence[dict[str, Any]]) -> list[tuple[str, int]]:
     return [(text, counts[outcome]) for outcome, text in meaning.items()]
 
 
-def _constraints(records: Sequence[dict[str, Any]]) -> list[tuple[str, int, int, int]]:
+def _constraints(records: Sequence[dict[str, Any]]) -> list[tuple[str, int, int, int, int]]:
     kinds: dict[str, Counter[int]] = {}
     for record in records:
         for command, asked, code, _ in record["steps"]:
             if command == "constrain":
                 kind = {"kept already": "bounds that the fit kept already", "drawn": "bounds drawn blindly"}
                 kinds.setdefault(kind.get(asked, "contradictions"), Counter())[code] += 1
-    return [(kind, codes.total(), codes[DONE], codes[INFEASIBLE]) for kind, codes in sorted(kinds.items())]
+    return [
+        (kind, codes.total(), codes[DONE], codes[INFEASIBLE], codes[USAGE]) for kind, codes in sorted(kinds.items())
+    ]
 
 
 def _row(record: dict[str, Any]) -> tuple[object, ...]:
