@@ -11,6 +11,7 @@ from soak.pages import heading, paragraph, table, write_page
 from soak.whole_runs import BLIND, DONE, INFEASIBLE, ROUGH, USAGE, WHOLE
 
 COLUMNS = ("seed", "width [m]", "sigma / width", "free", "sensors", "layout", "ESS", "bounds", "outcome", "constrain")
+CONSTRAIN_COLUMNS = ("constraints", "asked", "kept", "refused, exit 4", "too few samples left for a scan, exit 2")
 
 
 def runs_page(path: Path, records: Sequence[dict[str, Any]], command: str) -> None:
@@ -59,7 +60,7 @@ def _outcomes(records: Sequence[dict[str, Any]]) -> list[tuple[str, int]]:
     return [(text, counts[outcome]) for outcome, text in meaning.items()]
 
 
-def _constraints(records: Sequence[dict[str, Any]]) -> list[tuple[str, int, int, int, int]]:
+def _constraints(records: Sequence[dict[str, Any]]) -> list[tuple[object, ...]]:
     kinds: dict[str, Counter[int]] = {}
     for record in records:
         for command, asked, code, _ in record["steps"]:
