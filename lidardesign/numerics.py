@@ -199,9 +199,8 @@ def angle_over_sine(angle_rad: Any) -> Any:
     xp, angle = _floats(angle_rad)
     squared = angle * angle
     near = squared < _series_limit(squared)
-    # beyond a right angle the sine of pi - t is the one that keeps its digits
-    folded = xp.where(angle > math.pi / 2, math.pi - angle, angle)
-    sine = xp.sin(xp.where(near, xp.ones_like(angle), folded))
+    # not of pi - t, where pi is the rounded one: of t itself it is exact up to the antipode
+    sine = xp.sin(xp.where(near, xp.ones_like(angle), angle))
     least = xp.finfo(angle.dtype).eps
     far = angle / xp.where(sine < least, xp.full_like(sine, least), sine)
     return _scalar(xp.where(near, _series(squared, ANGLE_OVER_SINE), far))

@@ -100,7 +100,7 @@ ELEMENTWISE = {
         angle_over_sine,
         ratio,
         of_ratio,
-        [0.0, 1e-30, 1e-9, 1e-5, 0.01, 0.011, 0.012, 0.13, 0.14, 0.5, 1.5, 1.6, 2.5, 3.0],
+        [0.0, 1e-30, 1e-9, 1e-5, 0.01, 0.011, 0.012, 0.13, 0.14, 0.5, 1.5, 1.6, 2.5, 3.0, 3.1, 3.14, 3.141],
     ),
     "wrap_angle": (wrap_angle, half_turns, lambda a: mpmath.mpf(1), [-3.0, -1e-20, 0.0, 1.0, 3.0]),
     "wrap_turn": (
@@ -560,3 +560,36 @@ def test_a_systematic_draw_of_whole_shares_is_exact_and_one_offset_moves_all():
     assert systematic_draw(weights, 2, Fixed(0.6)).tolist() == [2, 3]
     # rounding of the last place never leads past the last index
     assert systematic_draw(weights, 1, Fixed(1.0)).tolist() == [3]
+
+
+def test_an_angle_inside_its_turn_keeps_every_bit():
+    angles = np.random.default_rng(5).uniform(0, 2 * math.pi, 1000)
+    np.testing.assert_array_equal(wrap_turn(angles), angles)
+    np.testing.assert_array_equal(wrap_angle(angles - math.pi), angles - math.pi)
+    assert wrap_turn(5.0, 5.0) == 5.0
+    assert float(wrap_turn(4.999, 5.0)) == pytest.approx(4.999 + 2 * math.pi)
+
+
+def test_circular_means_on_the_axes_are_no_cancellation():
+    assert float(circular_mean([3.0, -3.0])) == pytest.approx(math.pi)
+    assert float(circular_mean([math.pi, -math.pi], [0.5, 0.5])) == pytest.approx(math.pi)
+    # the cosines of these cancel to the last bit
+    assert math.cos(0.3) + math.cos(math.pi - 0.3) == 0
+    assert float(circular_mean([0.3, math.pi - 0.3])) == pytest.approx(math.pi / 2)
+    assert float(circular_mean([0.0])) == 0.0
+
+
+def test_unit_vectors_are_along_the_last_axis_of_any_number():
+    np.testing.assert_allclose(unit_vectors([3.0, 4.0]), [0.6, 0.8])
+    np.testing.assert_allclose(unit_vectors(np.full((2, 2, 2, 1), -7.0)), -np.ones((2, 2, 2, 1)))
+
+
+def test_clipped_matrices_of_any_batch_are_symmetric_to_the_last_bit_and_those_of_the_symmetric_part():
+    generator = np.random.default_rng(6)
+    root = generator.standard_normal((5, 20, 3, 3))
+    matrices, skew = root @ np.swapaxes(root, -1, -2), generator.standard_normal((5, 20, 3, 3))
+    found = clipped_eigenvalues(matrices + skew - np.swapaxes(skew, -1, -2), np.full((5, 20), 0.2), 2.0)
+    np.testing.assert_array_equal(found, np.swapaxes(found, -1, -2))
+    np.testing.assert_allclose(found, clipped_eigenvalues(matrices, 0.2, 2.0), atol=1e-12)
+    values, expected = np.linalg.eigvalsh(found), np.clip(np.linalg.eigvalsh(matrices), 0.2, 2.0)
+    np.testing.assert_allclose(values, expected, atol=1e-12)
