@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import functools
+import itertools
 import os
 import platform
 import shutil
@@ -28,7 +29,7 @@ from pathlib import Path
 import numpy as np
 
 from faults.processes import Ended, Fork, forked, fresh, import_all
-from faults.runs import COMMANDS, LEARN, Straight, contents, strays, unreadable
+from faults.runs import COMMANDS, FINISHED, LEARN, STAGED, Straight, contents, strays, unreadable
 
 # Kills of a command per 10: learning is the longest, and writes the most.
 SHARES = {"learn": 6, "fit": 2, "evaluate": 2}
@@ -45,6 +46,9 @@ PAIRS = {
     "evaluate and fit": ("evaluate", COMMANDS["evaluate"], COMMANDS["fit"]),
 }
 REFUSED = (2, 3)
+# Random moments lie behind this share of a command's time: before it, hardly anything but libraries is loaded.
+LIBRARIES_LOADED = 0.25
+MOST_TRIES = 4
 LONGEST_DELAY_S = 2.0
 TERMINATED = 143
 WAYS = {
@@ -82,12 +86,13 @@ class Killing:
     Arguments:
         folder: Where to work.
         straight: The undisturbed run.
+        tally: Where to count.
     """
 
-    def __init__(self, folder: Path, straight: Straight) -> None:
-        self.folder, self.straight, self.tally = folder, straight, Tally()
+    def __init__(self, folder: Path, straight: Straight, tally: Tally) -> None:
+        self.folder, self.straight, self.tally = folder, straight, tally
 
-    def end(self, way: str, name: str, run_it: Callable[[Path], Ended], told: str) -> None:
+    def end(self, way: str, name: str, run_it: Callable[[Path], Ended], told: str) -> Ended:
         """End one command in a folder of its own, look, give it again, and compare.
 
         Arguments:
@@ -100,11 +105,12 @@ class Killing:
         shutil.copytree(self.straight.before[name], place)
         ended = run_it(place)
         self.tally.sent[way, name] += 1
-        self.tally.early[way, name] += ended.code != 0
+        self.tally.early[way, name] += ended.code not in FINISHED
         faults = [*self._left(way, ended, place), *self._after(name, place)]
         self.tally.faults += [f"{WAYS[way]}, {name}, {told}: {fault}" for fault in faults]
         print(f"{way} of {name}, {told}: {'; '.join(faults) or 'recovered'}", file=sys.stderr, flush=True)
         shutil.rmtree(place)
+        return ended
 
     def _left(self, way: str, ended: Ended, place: Path) -> Iterator[str]:
         """What is wrong with the folder as it was left."""
@@ -120,17 +126,16 @@ class Killing:
 
     def _after(self, name: str, place: Path) -> Iterator[str]:
         """What is wrong with the folder after the command was given again."""
-        arguments = list(COMMANDS[name])
-        if name == "learn" and (place / "run").exists():
+        arguments = list(self.straight.commands[name])
+        if arguments[0] == "learn" and (place / "run").exists():
             arguments.append("--resume")
         ended = forked(arguments, place)
-        if ended.code != 0:
+        if ended.code not in FINISHED:
             yield f"given again it ended with {ended.code}: {ended.said[-300:]}"
             return
         if strays(place):
             yield f"given again it left {strays(place)}"
-        expected = self._expected(name)
-        found = contents(place / "run")
+        expected, found = self.straight.after[name], contents(place / "run")
         yield from (f"{file} differs" for file in sorted({*expected, *found}) if expected.get(file) != found.get(file))
 
     def pair(self, name: str, delay_s: float) -> None:
@@ -146,17 +151,12 @@ class Killing:
         self.tally.early["pair", name] += all(end.code == 0 for end in ends)
         faults = [*_badly_refused(ends), *(f"unreadable: {fault}" for fault in unreadable(place / "run"))]
         faults += [f"left {strays(place)}"] if strays(place) else []
-        found, whole = contents(place / "run"), self.straight.content
-        faults += [f"{file} is missing" for file in self._expected("learn") if file not in found]
+        found, whole = contents(place / "run"), self.straight.after["evaluate"]
+        faults += [f"{file} is missing" for file in self.straight.after["learn"] if file not in found]
         faults += [f"{file} differs" for file in found if file in whole and found[file] != whole[file]]
         self.tally.faults += [f"{name}, {delay_s:.3f} s apart: {fault}" for fault in faults]
         print(f"{name}, {delay_s:.3f} s apart: {'; '.join(faults) or 'in order'}", file=sys.stderr, flush=True)
         shutil.rmtree(place)
-
-    def _expected(self, name: str) -> dict[str, object]:
-        """The straight run's content as it was after a command."""
-        later = {"learn": ("designs/", "rows.csv"), "fit": ("rows.csv",), "evaluate": ()}[name]
-        return {file: value for file, value in self.straight.content.items() if not file.startswith(later)}
 
 
 def _badly_refused(ends: list[Ended]) -> Iterator[str]:
@@ -171,21 +171,25 @@ def _badly_refused(ends: list[Ended]) -> Iterator[str]:
 def at_random(
     killing: Killing, way: str, count: int, generator: np.random.Generator, seconds: dict[str, float]
 ) -> None:
-    """End commands in processes of their own after random times."""
+    """End commands in processes of their own after random times, until so many were met at work."""
     sent = signal.SIGTERM if way == "SIGTERM" else signal.SIGKILL
     names = [name for name, share in SHARES.items() for _ in range(share)]
-    for number in range(count):
-        name = names[number % len(names)]
-        after_s = float(generator.uniform(0.05, seconds[name]))
-        ends = functools.partial(fresh, COMMANDS[name], after_s=after_s, sent=sent)
-        killing.end(way, name, ends, f"after {after_s:.3f} s")
+    for name in itertools.islice(itertools.cycle(names), MOST_TRIES * count):
+        if sum(met for (one, _), met in killing.tally.early.items() if one == way) >= count:
+            return
+        after_s = float(generator.uniform(LIBRARIES_LOADED, 1.0) * seconds[name])
+        ends = functools.partial(fresh, killing.straight.commands[name], after_s=after_s, sent=sent)
+        ended = killing.end(way, name, ends, f"after {after_s:.3f} s")
+        if ended.code in FINISHED:  # the computer has less to do than before
+            seconds[name] = ended.seconds
 
 
-def at_steps(killing: Killing, steps: dict[str, list[int]]) -> None:
-    """Kill forks of commands before steps of given numbers."""
-    for name, numbers in steps.items():
-        for number in numbers:
-            killing.end("step", name, functools.partial(forked, COMMANDS[name], at_step=number), f"step {number}")
+def at_steps(killing: Killing, most: int) -> None:
+    """Kill forks of all commands before steps, at most so many of each."""
+    for name, whole in killing.straight.forks.items():
+        for number in spread(whole.steps, most):
+            ends = functools.partial(forked, killing.straight.commands[name], at_step=number)
+            killing.end("step", name, ends, f"step {number}")
 
 
 def in_pairs(killing: Killing, count: int, generator: np.random.Generator) -> None:
@@ -241,19 +245,19 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=None, help="write the result as Markdown")
     parser.add_argument("--source", default=None, help="what is tested, in words")
     asked = parser.parse_args()
-    started, generator = time.monotonic(), np.random.default_rng(asked.seed)
+    started, generator, tally = time.monotonic(), np.random.default_rng(asked.seed), Tally()
     import_all()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        (folder / "straight").mkdir()
-        straight = Straight(folder / "straight")
-        killing = Killing(folder, straight)
-        at_steps(killing, {command: spread(ended.steps, asked.steps) for command, ended in straight.forks.items()})
-        seconds = straight.measure_fresh(folder) if asked.kills + asked.terms else {}
-        at_random(killing, "SIGKILL", asked.kills, generator, seconds)
-        at_random(killing, "SIGTERM", asked.terms, generator, seconds)
+        killing = Killing(folder, Straight(folder / "straight", COMMANDS), tally)
+        at_steps(killing, asked.steps)
         in_pairs(killing, asked.pairs, generator)
-    text = page(killing.tally, asked.seed, (time.monotonic() - started) / 60, asked.source or source_version())
+        if asked.kills + asked.terms:
+            at_steps(Killing(folder, Straight(folder / "staged", {"learn --tolerance": STAGED}), tally), asked.steps)
+            seconds = killing.straight.measure_fresh(folder)
+            at_random(killing, "SIGKILL", asked.kills, generator, seconds)
+            at_random(killing, "SIGTERM", asked.terms, generator, seconds)
+    text = page(tally, asked.seed, (time.monotonic() - started) / 60, asked.source or source_version())
     print(text)
     if asked.out is not None:
         asked.out.parent.mkdir(parents=True, exist_ok=True)

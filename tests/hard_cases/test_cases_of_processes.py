@@ -23,11 +23,13 @@ from command_line import caller, files_under, make_run, program
 from lidardesign_tasks.flatland import FlatlandTask
 
 from lidardesign import probe, registry
+from lidardesign.density.stages import with_steps
 from lidardesign.errors import PluginError
 from lidardesign.run import lock
+from lidardesign.run.config import load_run_config, save_run_config
 from lidardesign.run.files import remove_stray_temporaries
 from lidardesign.run.lock import run_lock
-from lidardesign.run.manifest import start_manifest
+from lidardesign.run.manifest import note, start_manifest
 from lidardesign.task import Score
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="faults of processes are made with POSIX calls")
@@ -218,6 +220,19 @@ class TestKillsFullDisksAndTwoWriters:
         result = lidardesign("learn", "flatland", "--preset", "draft", "--out", run, *resume, "--json")
         assert (result.code, "as far as this" in result.err) == (6, True), result.err
         assert files_under(run) == {}
+
+    def test_a_stage_towards_a_tolerance_is_resumed_by_the_command_that_started_it(
+        self, tmp_path, lidardesign, monkeypatch
+    ):
+        run = make_run(tmp_path / "run", count=1000)
+        task, config = load_run_config(run)
+        note(run, goal={"tolerance": 0.1, "planned_steps": 400, "stages": []})
+        save_run_config(with_steps(config, 50), run)
+        monkeypatch.setattr(FlatlandTask, "scenes", lambda *_: (_ for _ in ()).throw(RuntimeError("as far as this")))
+        again = ("learn", task.name, "--preset", "draft", "--out", run, "--tolerance", 0.1, "--resume", "--set")
+        assert "as far as this" in lidardesign(*again, "learning.steps=400").err
+        other = lidardesign(*again, "learning.steps=500")
+        assert (other.code, "learning.steps = 50, not 500" in other.err) == (2, True)
 
     def test_a_run_that_was_only_started_is_no_density_yet_and_says_who_is_at_it(self, tmp_path, lidardesign):
         run = make_run(tmp_path / "run", count=1000)
