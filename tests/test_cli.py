@@ -310,6 +310,19 @@ def test_an_unexpected_error_is_one_line_with_a_hint(capsys):
         assert ("Traceback" in captured.err) == debug
 
 
+def test_a_damaged_cache_of_compiled_code_is_named_with_what_to_do(tmp_path, capsys):
+    from numba.core.caching import IndexDataCacheFile
+
+    (tmp_path / "kernel.nbi").write_bytes(b"\x80\x04 cut")
+    cache = IndexDataCacheFile(str(tmp_path), "kernel", "stamp")
+    with pytest.raises(console_module.typer.Exit) as ended, command(json=True, quiet=False, debug=False):
+        cache.load("overload")
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert (ended.value.exit_code, error["kind"]) == (3, "system")
+    assert str(tmp_path) in error["message"]
+    assert "*.nbi" in error["hint"]
+
+
 def test_what_libraries_print_does_not_spoil_the_document(capsys):
     with command(json=True, quiet=False, debug=False) as console:
         print("a library says hello")

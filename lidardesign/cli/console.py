@@ -32,6 +32,7 @@ EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
 EXIT_TERMINATED = 143
 PLAIN_WIDTH = 120
+NUMBA_CACHE = "numba/core/caching.py"
 NO_MEMORY = "can't allocate memory"
 DISK_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 
@@ -197,6 +198,11 @@ def describe_error(error: BaseException, console: Console) -> tuple[dict[str, An
         return {"kind": "memory", "message": text}, EXIT_INTERNAL, f"memory error: {text}"
     if isinstance(error, OSError):
         return _describe_system_error(error)
+    folder = _damaged_cache(error)
+    if folder is not None:
+        text, hint = f"{folder}: the cache of compiled code is damaged", "remove its files *.nbi and *.nbc"
+        document = {"kind": "system", "message": text, "hint": hint}
+        return document, EXIT_SYSTEM, f"system error: {text}\n  try: {hint}"
     text = f"{type(error).__name__}: {' '.join(str(error).split())}"
     hint = "this is a fault of lidardesign; --debug shows where, please report it"
     return (
@@ -213,6 +219,19 @@ def _interruption(error: BaseException) -> KeyboardInterrupt | None:
         if isinstance(cause, KeyboardInterrupt):
             return cause
         cause = cause.__cause__
+    return None
+
+
+def _damaged_cache(error: BaseException) -> str | None:
+    """The folder of numba's cache where an error came of reading it: files that are cut or changed are no pickles."""
+    trace = error.__traceback__
+    while trace is not None:
+        frame = trace.tb_frame
+        if frame.f_code.co_filename.replace(os.sep, "/").endswith(NUMBA_CACHE):
+            folder = getattr(frame.f_locals.get("self"), "_cache_path", None)
+            if folder is not None:
+                return str(folder)
+        trace = trace.tb_next
     return None
 
 

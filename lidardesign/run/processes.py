@@ -20,7 +20,9 @@ def started(pid: int) -> str | None:
 
 
 def is_gone(pid: int) -> bool:
-    """Whether no process of this computer has an id; one that may not be asked is there."""
+    """Whether no process of this computer has an id; one that cannot be asked counts as there."""
+    if os.name != "posix":  # elsewhere the question ends the process
+        return False
     try:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):
