@@ -9,8 +9,10 @@ import pytest
 from lidardesign_tasks.arm_files import model_files
 from lidardesign_tasks.arm_robot import load_robot
 
-from lidardesign.errors import DataError
+from lidardesign.design.files import load_design
+from lidardesign.errors import ConfigError, DataError
 from lidardesign.meshio import load_mesh
+from lidardesign.simulate.detector_files import load_detector
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted([*(ROOT / "lidardesign").rglob("*.py"), *(ROOT / "tasks").rglob("*.py")])
@@ -80,6 +82,22 @@ def test_a_module_runs_no_code_of_files(path):
 )  # fmt: skip
 def test_what_could_run_code_is_found(code):
     assert len(list(unsafe(ast.parse(code)))) == 1
+
+
+@pytest.mark.parametrize("mark", ["\\e[31m", "\\e]0;title\\a", "\\r", "\\b", "\\x9b2J", "\\n"])
+def test_a_name_that_would_steer_the_terminal_is_refused(tmp_path, mark):
+    path = tmp_path / "d.yaml"
+    sensor = "origin_m: {mean: [0, 0, 0]}\n  boresight: {azimuth_rad: 0, elevation_rad: 0}\n"
+    sensor += "  field_of_view_rad: {horizontal: 1, vertical: 1}\n  gate_m: {start: 1, end: 2}\n"
+    for text, read in (
+        (f'name: "a{mark}b"\nsensors:\n- {sensor}', load_design),
+        (f'sensors:\n- name: "a{mark}b"\n  {sensor}', load_design),
+        (f'name: "a{mark}b"\npulse_fwhm_ps: 100\n', load_detector),
+    ):
+        path.write_text("schema_version: 1\n" + text if read is load_design else text)
+        with pytest.raises(ConfigError, match="control characters") as refused:
+            read(path)
+        assert all(letter.isprintable() or letter == "\n" for letter in str(refused.value))
 
 
 BOMB = (

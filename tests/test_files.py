@@ -30,7 +30,7 @@ SCHEMA = json.loads(SCHEMA_FILE.read_text(encoding="utf-8"))
 finite = st.floats(-1e6, 1e6)
 length = st.floats(0, 1e5)
 anything = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)))
-words = anything.filter(str.strip)
+words = st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc"))).filter(str.strip)
 
 
 @st.composite

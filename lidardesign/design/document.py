@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.run.kinds import is_name
 
 KeyPath = tuple[str | int, ...]
 Locate = Callable[[KeyPath], str]
@@ -91,9 +92,9 @@ class Node:
         return value
 
     def text(self) -> str:
-        """Text that is not empty."""
-        if not isinstance(self.value, str) or not self.value.strip():
-            raise self.wrong("text")
+        """Text that is not empty, without characters that steer a terminal."""
+        if not is_name(self.value):
+            raise self.wrong("text without control characters")
         return self.value
 
     def choice(self, options: Iterable[str]) -> str:

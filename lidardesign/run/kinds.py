@@ -1,8 +1,9 @@
-"""Booleans and quoted text are no numbers, although pydantic would take them for some."""
+"""What values of files are: booleans and quoted text are no numbers, and names do not steer terminals."""
 
 from __future__ import annotations
 
 import typing
+import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
 from types import UnionType
@@ -13,6 +14,13 @@ from pydantic import BaseModel
 from lidardesign.run.yaml import KeyPath
 
 LIKE_TEXT = (str, bytes, Path)
+
+
+def is_name(value: Any) -> bool:
+    """Whether a value is text that may be shown: not blank, and without characters that steer a terminal."""
+    if not isinstance(value, str) or not value.strip():
+        return False
+    return not any(unicodedata.category(letter) == "Cc" for letter in value)
 
 
 def parts(annotation: Any) -> list[Any]:

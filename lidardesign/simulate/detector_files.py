@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from lidardesign.errors import ConfigError
+from lidardesign.run.kinds import is_name
 from lidardesign.run.validation import suggest
 from lidardesign.run.yaml import Document, load_yaml
 from lidardesign.simulate.detector import FWHM_PER_SIGMA, Detector, Photons
@@ -199,8 +200,9 @@ def _choice(document: Document, values: Mapping[str, Any], name: str, options: t
 
 def _name(document: Document, values: Mapping[str, Any], fallback: str) -> str:
     name = values.get("name", fallback)
-    if not isinstance(name, str) or not name.strip():
-        raise ConfigError(f"name: found {name!r}", where=document.locate(("name",)), allowed="text")
+    if not is_name(name):
+        allowed = "text without control characters"
+        raise ConfigError(f"name: found {name!r}", where=document.locate(("name",)), allowed=allowed)
     return name
 
 
