@@ -21,7 +21,7 @@ from lidardesign.design.files import load_design
 from lidardesign.design.fit import fit
 from lidardesign.design.rays import split_budget
 from lidardesign.design.samples import Samples, load_samples
-from lidardesign.design.sensor import MOST_RAYS
+from lidardesign.design.sensor import MOST_RAYS, interval_factor
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.evaluate.capture import load_capture
 from lidardesign.export import csv as csv_format
@@ -198,6 +198,20 @@ def test_what_mujoco_warns_of_becomes_a_note_of_the_robot(tmp_path):
     links = [piece.format(geom.format("1e-12" if link == 6 else "1e12")) for link in range(7)]
     (tmp_path / "arm.xml").write_text(f"<mujoco><worldbody>{''.join(links)}{'</body>' * 7}</worldbody></mujoco>")
     assert all("\n" not in note for note in load_robot(tmp_path / "arm.xml", 0.15).notes)
+
+
+@pytest.mark.parametrize(("length", "fits"), [(1.0, True), (1e-300, True), (1e308, True), (0.0, False)])
+def test_a_direction_of_travel_may_have_any_length_but_none(tmp_path, length, fits):
+    text = design_text().replace(
+        "{mean: [0, 0, 0]}", "{mean: [0, 0, 0], covariance: [[4, 0, 0], [0, 1, 0], [0, 0, 1]]}"
+    )
+    travel = 2 * 2 * interval_factor(0.95)
+    (tmp_path / "d.yaml").write_text(f"{text}  travel_m: {{length: {travel!r}, direction: [{length!r}, 0, 0]}}\n")
+    if fits:
+        assert load_design(tmp_path / "d.yaml").sensors[0].travel_m[0] == pytest.approx(travel)
+    else:
+        with pytest.raises(ConfigError, match="longest"):
+            load_design(tmp_path / "d.yaml")
 
 
 # --- numbers that no computer bears

@@ -305,6 +305,8 @@ def _check_travel(node: Node, sensor: Sensor) -> None:
         )
     if "direction" in keys:
         along = keys["direction"].numbers(3)
+        # any length will do, and squares of large ones overflow
+        along = along / (np.abs(along).max() or 1.0)
         length, variance = np.linalg.norm(along), np.linalg.eigvalsh(sensor.origin_covariance_m2)[-1]
         reached = along @ sensor.origin_covariance_m2 @ along / length**2 if length > 0 else 0.0
         if abs(reached - variance) > AGREEMENT * variance:
