@@ -18,6 +18,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import textwrap
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -36,6 +37,7 @@ COMMAND_BATCH = 60
 HANG_PROCESSOR_S, HANG_S = 150.0, 1200.0
 POLL_S = 0.2
 ALL_SHARES = 100_000
+WIDTH = 120
 
 
 @dataclass
@@ -212,25 +214,23 @@ def report(found: dict[str, Found], arguments: argparse.Namespace, seconds: floa
     total = {name: sum(getattr(one, name) for one in found.values()) for name in ("inputs", "read", "refused")}
     faults = {path: reason for one in found.values() for path, reason in one.faults.items()}
     packages = ("numpy", "pyyaml", "pydantic", "trimesh", "h5py", "scipy", "safetensors", "torch", "mujoco")
-    revision = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT).stdout
-    lines = [
-        "# Damaged files",
-        "",
-        f"{datetime.now(timezone.utc):%Y-%m-%d}, revision {revision.strip() or 'unknown'}, seed {arguments.seed}, "
-        f"{seconds / 60:.0f} minutes, {arguments.workers} processes at a time.",
-        "",
+    texts = (
+        f"`make fuzz`, seed {arguments.seed}, on {datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC, commit {_commit()}, "
+        f"{seconds / 60:.0f} minutes with {arguments.workers} processes at a time on {os.cpu_count()} cores, Python "
+        f"{platform.python_version()}, {', '.join(f'{name} {version(name)}' for name in packages)}.",
         f"**{total['inputs']:,} damaged files: {total['read']:,} were read, {total['refused']:,} refused with a "
         f"message, {len(faults)} ended otherwise** (a traceback, a warning, a process that crashed or hung, a number "
         "that is not finite, too much memory, code of the file that ran, a file that was left or half-written).",
-        "",
         "Good files of every kind, made by the program, are damaged by a seeded generator: bytes, numbers, words and "
         "lines, keys and values of documents, arrays and headers inside archives whose checksums are right again. An "
         "input that is refused at a new place of the program is damaged further. Each goes through the function by "
         "which commands read such files; the last rows are whole commands. Processes may take 2 GiB of memory beyond "
         "what they begin with; an input may take 5 s of processor time, a command 60 s.",
-        "",
-        f"Python {platform.python_version()}, {', '.join(f'{name} {version(name)}' for name in packages)}.",
-        "",
+    )
+    lines = ["# Damaged files", ""]
+    for text in texts:
+        lines += [textwrap.fill(text, WIDTH, break_long_words=False, break_on_hyphens=False), ""]
+    lines += [
         "| file | inputs | read | refused | places of refusal | mean [ms] | slowest [s] | memory [MiB] | faults |",
         "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
@@ -243,7 +243,17 @@ def report(found: dict[str, Found], arguments: argparse.Namespace, seconds: floa
     for path, reason in faults.items():
         last = (reason.strip().splitlines() or ["no reason"])[-1][:300]
         lines += ["", f"`{Path(path).name}`: {last}"]
-    return "\n".join([*lines, "", "`make fuzz` runs it again.", ""])
+    return "\n".join([*lines, ""])
+
+
+def _commit() -> str:
+    """The commit of the working tree, and whether the program differs from it."""
+
+    def git(*arguments: str) -> str:
+        return subprocess.run(["git", *arguments], capture_output=True, text=True, cwd=ROOT).stdout.strip()
+
+    number = git("rev-parse", "--short", "HEAD") or "unknown"
+    return f"{number} with changes" if git("status", "--porcelain", "--", "lidardesign", "tasks") else number
 
 
 def main() -> int:
