@@ -11,7 +11,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from soak.batches import do_batch, soak
+from soak.batches import do_batch, records_in, soak
 from soak.pages import ROOT
 from soak.plans import random_plan
 from soak.runs_page import runs_page
@@ -47,6 +47,10 @@ def _parser() -> argparse.ArgumentParser:
     seeds.add_argument("tasks", nargs="*", default=list(LEAST_ESS), metavar="TASK")
     seeds.add_argument("--count", type=int, default=20, help="seeds 0 to N - 1")
     seeds.add_argument("--page", type=Path, default=PAGES / f"seeds-{TODAY}.md")
+    page = commands.add_parser(
+        "page", help="the page of what `runs --folder` has done until now, or until it was ended"
+    )
+    page.add_argument("--page", type=Path, default=PAGES / f"runs-{TODAY}.md")
     one = commands.add_parser("one", help="one random run, with its configuration")
     one.add_argument("seed", type=int)
     batch = commands.add_parser("batch", help="runs in this process, as `runs` starts them")
@@ -55,8 +59,8 @@ def _parser() -> argparse.ArgumentParser:
     batch.add_argument("--repeat-every", type=int, default=0)
     for command in (runs, seeds):
         command.add_argument("--jobs", type=int, default=1, help="processes at once")
-    for command in (runs, seeds, one, batch):
-        command.add_argument("--folder", type=Path, help="where runs are kept; else they are taken away")
+    for command in (runs, seeds, one, batch, page):
+        command.add_argument("--folder", type=Path, required=command is page, help="where runs are kept")
     return parser
 
 
@@ -67,6 +71,12 @@ def _runs(given: argparse.Namespace, folder: Path) -> int:
     faults = sum(bool(record["faults"]) for record in records)
     _tell(f"{len(records)} runs, {faults} with faults: {given.page}")
     return int(faults > 0)
+
+
+def _page(given: argparse.Namespace, folder: Path) -> int:
+    records = records_in(folder)
+    runs_page(given.page, records, "python -m soak runs")
+    return int(any(record["faults"] for record in records))
 
 
 def _seeds(given: argparse.Namespace, folder: Path) -> int:
@@ -91,7 +101,7 @@ def _tell(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-_DO = {"runs": _runs, "seeds": _seeds, "one": _one}
+_DO = {"runs": _runs, "seeds": _seeds, "one": _one, "page": _page}
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import subprocess
@@ -114,6 +115,14 @@ def soak(
     finally:
         for batch in running:
             batch.process.kill()
+
+
+def records_in(folder: Path) -> list[dict[str, Any]]:
+    """What is done of a soak that goes on or was ended, in order, as far as no number is missing."""
+    lines = [json.loads(line) for path in folder.glob("batch-*.jsonl") for line in path.read_text().splitlines()]
+    found = {line["seed"]: line for line in lines if "outcome" in line}
+    first = min(found, default=0)
+    return [found[seed] for seed in itertools.takewhile(found.__contains__, itertools.count(first))]
 
 
 def _whole(found: dict[int, dict[str, Any]]) -> int:
