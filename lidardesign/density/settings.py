@@ -80,7 +80,7 @@ class LearningSettings(BaseModel):
 
 PRESET_LEARNING: dict[str, dict[str, Any]] = {
     "draft": {
-        "steps": 290,
+        "steps": 350,
         "hidden": 64,
         "samples": 40_000,
         "balance_proposals": 32768,
