@@ -460,11 +460,13 @@ class TestBrokenPlugins:
 
     @pytest.mark.parametrize("value", [float("nan"), float("inf"), "far", None, 3.0, Score(float("nan")), Score("far")])
     def test_a_metric_that_is_no_number_exits_6_and_writes_nothing(self, lidardesign, tmp_path, monkeypatch, value):
-        run = make_run(tmp_path / "run", count=1000)
-        assert lidardesign("fit", run, "--sensors", 1).code == 0
+        make_run(tmp_path / "run", count=1000)
+        design = tmp_path / "run" / "designs" / "by_hand.yaml"
+        design.parent.mkdir()
+        shutil.copy(Path(__file__).parents[2] / "examples" / "hand_written_design.yaml", design)
         monkeypatch.setattr(FlatlandTask, "score", lambda *_: value)
         before = files_under(tmp_path)
-        result = lidardesign("evaluate", run, "--rays", 4, "--set", "test=1", "--csv", "rows.csv", "--json")
+        result = lidardesign("evaluate", "run", "--rays", 4, "--set", "test=1", "--csv", "rows.csv", "--json")
         assert result.code == 6, result.err
         assert "metric Chamfer distance" in result.json["error"]["where"]
         assert files_under(tmp_path) == before
@@ -539,8 +541,7 @@ class TestStreamsLocalesAndSignals:
             process.stderr.close()
 
     def test_notes_that_nobody_reads_any_more_do_not_end_the_work(self, tmp_path):
-        run = make_run(tmp_path / "run", count=1000)
-        (run / "designs").mkdir()
+        make_run(tmp_path / "run", count=1000)
         process = program("fit", "run", "--sensors", 2, "--json", cwd=tmp_path)
         process.stderr.close()
         out, _ = process.stdout.read(), process.stdout.close()
