@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
 import zipfile
 
@@ -16,6 +17,8 @@ from lidardesign_tasks.basel import load_model
 
 from lidardesign.cli.console import Console, describe_error
 from lidardesign.density.grids import _digest, _load
+from lidardesign.density.ladder import seconds_at
+from lidardesign.density.training import _step_of
 from lidardesign.design.constraints import MOST_FITTED, Constraints
 from lidardesign.design.files import load_design
 from lidardesign.design.fit import fit
@@ -96,6 +99,30 @@ def test_no_room_is_made_for_what_a_header_only_promises(tmp_path, shape):
     for read in (npz_format.read, load_capture):
         with pytest.raises(DataError, match="80 bytes of data"):
             read(tmp_path / "rays.npz")
+
+
+BAD_PROGRESS = {
+    "an infinite step": '{"step": 1e400, "seconds": 1}',
+    "a step of many digits": '{"step": 1' + "0" * 400 + ', "seconds": 1}',
+    "no time": '{"step": 20, "seconds": NaN}',
+    "a step of text": '{"step": "x", "seconds": 1}',
+    "a list": "[20, 1]",
+    "a step backwards": '{"step": 5, "seconds": 1}',
+    "bytes": "\ufffd",
+    "nesting": "[" * 100_000,
+}
+
+
+@pytest.mark.parametrize("case", BAD_PROGRESS)
+def test_progress_that_is_none_is_refused_and_cut_back_at_resume(tmp_path, case):
+    run = make_run(tmp_path / "run", count=20)
+    good = '{"step": 10, "seconds": 0.5}'
+    (run / "progress.jsonl").write_text(f"{good}\n{BAD_PROGRESS[case]}\n")
+    record(run, ["progress.jsonl"])
+    with pytest.raises(DataError, match="no progress of learning"):
+        seconds_at(run, [10])
+    assert _step_of(good) == 10
+    assert _step_of(BAD_PROGRESS[case]) in (20, 5, math.inf)
 
 
 @pytest.mark.parametrize("header", [b"{" * 300, b"(", b"{'descr': '<f8', 'fortran_order': False, 'shape': (1", b""])

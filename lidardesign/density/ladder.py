@@ -128,8 +128,11 @@ def seconds_at(run: Path, steps: list[int]) -> dict[int, float]:
     verify(run, PROGRESS)
     try:
         rows = [json.loads(line) for line in (run / PROGRESS).read_text(encoding="utf-8").splitlines()]
-        done, taken = [0, *(int(row["step"]) for row in rows)], [0.0, *(float(row["seconds"]) for row in rows)]
-    except (ValueError, TypeError, KeyError):
+        done = np.array([0.0, *(float(row["step"]) for row in rows)])
+        taken = np.array([0.0, *(float(row["seconds"]) for row in rows)])
+        if not (np.isfinite(done).all() and np.isfinite(taken).all() and (np.diff(done) > 0).all()):
+            raise ValueError("steps do not ascend, or a number is none")
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
         raise DataError("is no progress of learning", where=str(run / PROGRESS), hint="learn the run again") from None
     return {step: float(np.interp(step, done, taken)) for step in steps}
 

@@ -334,6 +334,6 @@ def _moved(name: str, value: torch.Tensor, parameter: torch.Tensor) -> torch.Ten
 def _step_of(line: str) -> float:
     """The step of a progress line; a line that was cut by a kill counts as beyond every checkpoint."""
     try:
-        return json.loads(line)["step"]
-    except (ValueError, KeyError, TypeError):
+        return float(json.loads(line)["step"])
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return math.inf
