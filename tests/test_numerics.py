@@ -566,6 +566,9 @@ def test_an_angle_inside_its_turn_keeps_every_bit():
     angles = np.random.default_rng(5).uniform(0, 2 * math.pi, 1000)
     np.testing.assert_array_equal(wrap_turn(angles), angles)
     np.testing.assert_array_equal(wrap_angle(angles - math.pi), angles - math.pi)
+    starts = np.random.default_rng(7).uniform(-2, 2, 1000)
+    for start, past in zip(starts, angles / 7, strict=True):
+        assert wrap_turn(start + past, start) == start + past
     assert wrap_turn(5.0, 5.0) == 5.0
     assert float(wrap_turn(4.999, 5.0)) == pytest.approx(4.999 + 2 * math.pi)
 
