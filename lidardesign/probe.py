@@ -78,7 +78,7 @@ class Probing:
             return None
         _, line = self._next(begun + self._seconds + GRACE_SECONDS)
         if line:
-            return Probe(**json.loads(line))
+            return _read(line)
         died_of = None if line is None else self._died_of()
         return Probe(error=died_of or f"was not imported within {self._seconds:g} s", contained=True)
 
@@ -112,6 +112,15 @@ class Probing:
         if code < 0:
             return f"crashes while it is imported ({signal.strsignal(-code)})"
         return f"ends the program while it is imported (exit code {code})"
+
+
+def _read(line: bytes) -> Probe:
+    """The answer of a line; a plugin may have written it, which knows neither its form nor that it is read."""
+    try:
+        found = json.loads(line)
+        return Probe(summary=str(found.get("summary", "")), error=found.get("error"))
+    except (ValueError, AttributeError):
+        return Probe(error="writes into what is not its own while it is imported", contained=True)
 
 
 def probed(offers: list[EntryPoint], seconds: float) -> list[Probe | None]:

@@ -338,6 +338,8 @@ FATAL = {
     "exits_hard": ("import os\nos._exit(7)", "ends the program while it is imported (exit code 7)"),
     "crashes": ("import ctypes\nctypes.string_at(0)", "crashes while it is imported (Segmentation fault)"),
     "aborts": ("import os\nos.abort()", "crashes while it is imported (Aborted)"),
+    "writes_anywhere": ("import os\nfor number in range(3, 64):\n    try: os.write(number, b'hello\\n')\n"
+                        "    except OSError: pass", "writes into what is not its own"),
     "closes_all": ("import os, time\nos.closerange(0, 100)\ntime.sleep(600)", "was not imported within 0.3 s"),
 }  # fmt: skip
 
