@@ -72,6 +72,7 @@ def random_plan(seed: int) -> RunPlan:
     size = _power(generator, *SIZES_M)
     offset = [float(v) for v in size * _pick(generator, [0.0, 1.0, 100.0]) * generator.normal(size=3)]
     space = _space(generator, size, offset)
+    density = _density(generator, size)
     at = _condition_value(space, generator)
     # only a scan has rays for all values of a condition
     layouts = ["scan"] if "condition" in space and not at else ["grid", "grid", "density", "scan", "distributed"]
@@ -83,8 +84,8 @@ def random_plan(seed: int) -> RunPlan:
             "task_name": NAME,
             "task": {**_scenes(generator, size), "size_m": size, "offset_m": offset},
             "space": space,
-            "density": _density(generator, size),
-            "learning": _learning(generator),
+            "density": density,
+            "learning": _learning(generator, is_fine=density["sigma_m"] < FINE_SHARE * size),
         },
         sensors,
         (*_fit_options(generator, layout, sensors), *at),
@@ -163,7 +164,7 @@ def _density(generator: np.random.Generator, size: float) -> dict[str, Any]:
 
 # What learns most densities in seconds, and what else may be asked for.
 USUAL_LEARNING: dict[str, Any] = {
-    "steps": 100,
+    "steps": 80,
     "batch": 256,
     "rate": 0.01,
     "layers": 3,
@@ -173,6 +174,9 @@ USUAL_LEARNING: dict[str, Any] = {
     "balance_proposals": 8192,
     "coverage_proposals": 512,
 }
+# With a narrow sigma these are needed for a density that is worth fitting to.
+FINE_SHARE = 0.02
+FINE_LEARNING: dict[str, Any] = {"steps": 200, "samples": 30_000, "balance_proposals": 32768}
 UNUSUAL_LEARNING: dict[str, list[Any]] = {
     "steps": [1, 20, 300],
     "batch": [2, 32, 512],
@@ -191,9 +195,9 @@ UNUSUAL_LEARNING: dict[str, list[Any]] = {
 UNUSUAL_SHARE = 0.1
 
 
-def _learning(generator: np.random.Generator) -> dict[str, Any]:
+def _learning(generator: np.random.Generator, *, is_fine: bool) -> dict[str, Any]:
     unusual = {k: _pick(generator, v) for k, v in UNUSUAL_LEARNING.items() if generator.random() < UNUSUAL_SHARE}
-    return {**USUAL_LEARNING, **unusual}
+    return {**USUAL_LEARNING, **(FINE_LEARNING if is_fine else {}), **unusual}
 
 
 def _fit_options(generator: np.random.Generator, layout: str, sensors: int) -> tuple[str, ...]:
