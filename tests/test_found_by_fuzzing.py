@@ -241,6 +241,13 @@ def test_a_direction_of_travel_may_have_any_length_but_none(tmp_path, length, fi
             load_design(tmp_path / "d.yaml")
 
 
+@pytest.mark.parametrize("key", ["bin_ps", "bits_per_bin", "rate_hz"])
+@pytest.mark.parametrize("value", [5e-324, 1e-300, 1e300])
+def test_a_read_out_that_no_detector_has_is_refused_without_a_warning(key, value):
+    with pytest.raises(ConfigError, match=key):
+        Constraints.from_mapping({"budget": {key: value, "rays": 10, "bandwidth_mbps": 5.0}})
+
+
 # --- numbers that no computer bears
 
 

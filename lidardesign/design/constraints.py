@@ -151,9 +151,10 @@ class Budget(_Keys):
 
     rays: Annotated[int, Field(ge=1, le=MOST_RAYS)] | None = None
     bandwidth_mbps: Positive | None = None
-    bin_ps: Positive = 100.0
-    bits_per_bin: Positive = 40.0
-    rate_hz: Positive = 10.0
+    # wider than any part's; beyond them products under- and overflow
+    bin_ps: Annotated[float, Field(ge=0.001, le=1e9)] = 100.0
+    bits_per_bin: Annotated[float, Field(ge=0.001, le=1e9)] = 40.0
+    rate_hz: Annotated[float, Field(ge=0.001, le=1e12)] = 10.0
 
 
 class SensorConstraints(_Keys):
