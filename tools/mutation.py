@@ -98,7 +98,7 @@ def run_module(module: str, jobs: int, retry: bool, sample: int | None) -> int:
     return try_mutants(path, name, files, waiting, Children(jobs, record.tell), ours)
 
 
-def report(results: dict[str, list[Outcome]], minutes: float) -> str:
+def report(results: dict[str, list[Outcome]], minutes: float, retry: bool) -> str:
     """The result as a page: a row per module, then every survivor with its reason."""
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
     rows = ["| Module | Mutants | Killed | of these by time | Survived | Killed |", "|---|--:|--:|--:|--:|--:|"]
@@ -109,7 +109,8 @@ def report(results: dict[str, list[Outcome]], minutes: float) -> str:
         rows.append(f"| `{module}` | {len(found)} | {len(found) - alive} | {late} | {alive} | {share:.1%} |")
     about = (
         f"{datetime.date.today()}, commit {commit.stdout.strip()}, {minutes:.0f} minutes. Mutants by the operators of "
-        "cosmic-ray, as `tools/mutants.py` chooses them; each meets only its module's own test files:"
+        "cosmic-ray, as `tools/mutants.py` chooses them; each meets only its module's own test files"
+        + (", and those that died before in the same source are not tested again:" if retry else ":")
     )
     tests = [f"- `{module}`: " + ", ".join(f"`test_{name}.py`" for name in TESTS[module]) for module in results]
     return "\n".join(["# Mutation", "", about, "", *tests, "", *rows, "", *_survivors(results)]) + "\n"
@@ -160,7 +161,7 @@ def main() -> int:
         print(f"{module}: {killed_share(Record(module).read()):.1%} killed", flush=True)
     results = {module: Record(module).read() for module in options.modules}
     if options.out is not None:
-        options.out.write_text(report(results, (time.monotonic() - began) / 60))
+        options.out.write_text(report(results, (time.monotonic() - began) / 60, options.retry))
     return int(min(map(killed_share, results.values())) < WANTED)
 
 
