@@ -15,6 +15,8 @@ from soak.scaled_flatland import NAME
 SIZES_M = (-3.0, 4.0)
 SIGMA_SHARES = (-4.0, 0.0)
 MOST_SENSORS = 12
+# Below this share of the width a sigma is narrow.
+FINE_SHARE = 0.02
 DIMENSIONS = ("x_m", "y_m", "z_m", "azimuth_rad", "elevation_rad", "range_m")
 # Shipped detectors that count photons, and how far their histograms or pulses reach [m].
 DETECTORS = {"single-photon": 14.9, "consumer-8x8": 4.79}
@@ -148,9 +150,12 @@ def _scenes(generator: np.random.Generator, size: float) -> dict[str, Any]:
 
 
 def _density(generator: np.random.Generator, size: float) -> dict[str, Any]:
+    share = _power(generator, *SIGMA_SHARES)
+    # a narrow sigma asks the quadrature for thousands of points: minutes
+    wide_only = "quadrature" if share >= FINE_SHARE else "auto"
     density: dict[str, Any] = {
-        "sigma_m": size * _power(generator, *SIGMA_SHARES),
-        "visibility": _pick(generator, ["auto", "auto", "raycast", "quadrature", "off"]),
+        "sigma_m": size * share,
+        "visibility": _pick(generator, ["auto", "auto", "raycast", wide_only, "off"]),
         "quadrature_points": int(_pick(generator, [8, 32])),
     }
     if generator.random() < 0.3:
@@ -164,7 +169,7 @@ def _density(generator: np.random.Generator, size: float) -> dict[str, Any]:
 
 # What learns most densities in seconds, and what else may be asked for.
 USUAL_LEARNING: dict[str, Any] = {
-    "steps": 80,
+    "steps": 60,
     "batch": 256,
     "rate": 0.01,
     "layers": 3,
@@ -175,8 +180,7 @@ USUAL_LEARNING: dict[str, Any] = {
     "coverage_proposals": 512,
 }
 # With a narrow sigma these are needed for a density that is worth fitting to.
-FINE_SHARE = 0.02
-FINE_LEARNING: dict[str, Any] = {"steps": 200, "samples": 30_000, "balance_proposals": 32768}
+FINE_LEARNING: dict[str, Any] = {"steps": 120, "samples": 20_000}
 UNUSUAL_LEARNING: dict[str, list[Any]] = {
     "steps": [1, 20, 300],
     "batch": [2, 32, 512],
