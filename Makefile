@@ -37,12 +37,16 @@ test: $(BIN)/.ready $(BIN)/.transport
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m pytest
 
-# The suite with every line and branch that it takes; what numba compiles is traced by a second run without compiler
+# The suite with every line and branch that it takes; what numba compiles, apart, in a run without the compiler
+KERNELS := NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage
 coverage: $(BIN)/.ready
 	$(BIN)/python -m coverage erase
 	$(BIN)/python -m coverage run -m pytest
-	NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage run -m pytest tests/test_splines.py tests/test_occupancy.py
 	$(BIN)/python -m coverage combine
+	@mkdir -p build
+	$(KERNELS) run --rcfile=/dev/null --branch --source=lidardesign --data-file=build/kernels.coverage \
+		-m pytest -W ignore::RuntimeWarning tests/test_splines.py
+	$(KERNELS) report --rcfile=/dev/null --data-file=build/kernels.coverage --include='*kernels.py'
 	$(BIN)/python -m coverage report --fail-under=90
 
 # Small changes of the core's code, and how many of them its tests notice: an hour
