@@ -89,20 +89,21 @@ def soak(
 ) -> list[dict[str, Any]]:
     """Runs from one number on until so many of them were whole: learned, fitted, constrained and evaluated.
 
+    What an earlier soak did in the same folder counts.
+
     Returns:
         The records of all numbers up to the last of these, in order, refused ones and faults among them.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    found: dict[int, dict[str, Any]] = {}
+    found = _done(folder)
     waiting: list[list[int]] = []
     running: list[Batch] = []
-    following = first
+    missing = (seed for seed in itertools.count(first) if seed not in found)
     try:
         while True:
             while len(running) < jobs and (waiting or _whole(found) < whole):
                 if not waiting:
-                    waiting.append(list(range(following, following + RUNS_AT_ONCE)))
-                    following += RUNS_AT_ONCE
+                    waiting.append(list(itertools.islice(missing, RUNS_AT_ONCE)))
                 running.append(_started(waiting.pop(0), folder, repeat_every))
             if not running:
                 return _first_whole([found[seed] for seed in sorted(found)], whole)
@@ -119,10 +120,16 @@ def soak(
 
 def records_in(folder: Path) -> list[dict[str, Any]]:
     """What is done of a soak that goes on or was ended, in order, as far as no number is missing."""
-    lines = [json.loads(line) for path in folder.glob("batch-*.jsonl") for line in path.read_text().splitlines()]
-    found = {line["seed"]: line for line in lines if "outcome" in line}
+    found = _done(folder)
     first = min(found, default=0)
     return [found[seed] for seed in itertools.takewhile(found.__contains__, itertools.count(first))]
+
+
+def _done(folder: Path) -> dict[int, dict[str, Any]]:
+    """What batches in a folder have done, by number."""
+    texts = [path.read_text().splitlines(keepends=True) for path in sorted(folder.glob("batch-*.jsonl"))]
+    lines = [json.loads(line) for text in texts for line in text if line.endswith("\n")]
+    return {line["seed"]: line for line in lines if "outcome" in line}
 
 
 def _whole(found: dict[int, dict[str, Any]]) -> int:
@@ -130,8 +137,7 @@ def _whole(found: dict[int, dict[str, Any]]) -> int:
 
 
 def _started(seeds: list[int], folder: Path, repeat_every: int) -> Batch:
-    path = folder / f"batch-{seeds[0]}.jsonl"
-    path.unlink(missing_ok=True)
+    path = folder / f"batch-{seeds[0]}-{time.time_ns()}.jsonl"
     tests = Path(__file__).resolve().parents[1]
     command = [sys.executable, "-m", "soak", "batch", *map(str, seeds), "--lines", str(path)]
     command += ["--folder", str(folder), "--repeat-every", str(repeat_every)]

@@ -99,18 +99,21 @@ def _origin_around(sensors: Sequence[Mapping[str, Any]], bounds: Bounds) -> Rule
 
 
 def drawn(bounds: Bounds, sensors: int, generator: np.random.Generator, *, is_scan: bool = False) -> Rules:
-    """Some bounds drawn without a look at any design: a fit keeps them all, or refuses them."""
+    """Some bounds drawn without a look at any design: a fit keeps them all, or refuses them.
+
+    A scan's rays have neither mounts nor bounds of their own.
+    """
     options: list[Callable[[], Rules]] = [
         lambda: {"gate": _drawn_gate(bounds, generator)},
         lambda: {"field_of_view": _drawn_field(bounds, generator)},
         lambda: {"boresight": _drawn_boresight(bounds, generator)},
-        lambda: {"origin": _drawn_origin(bounds, sensors, generator)},
+        lambda: {"origin": _drawn_origin(bounds, sensors, generator, is_scan)},
         lambda: {"budget": _drawn_budget(bounds, sensors, generator)},
     ]
     if not is_scan:
         options.append(lambda: {"sensors": {"count": int(generator.integers(1, 13))}})
     rules = _some(options, generator)
-    if generator.random() < 0.25:
+    if not is_scan and generator.random() < 0.25:
         some = int(generator.integers(1, sensors + 1))
         rules["each"] = [{"gate": _drawn_gate(bounds, generator)} for _ in range(some)]
     return rules
@@ -148,7 +151,7 @@ def _drawn_boresight(bounds: Bounds, generator: np.random.Generator) -> Rules:
     return {"azimuth_deg": {"min": start, "max": start + float(generator.uniform(1, 120))}}
 
 
-def _drawn_origin(bounds: Bounds, sensors: int, generator: np.random.Generator) -> Rules:
+def _drawn_origin(bounds: Bounds, sensors: int, generator: np.random.Generator, is_scan: bool) -> Rules:
     low, high = np.array(bounds.low[:3]), np.array(bounds.high[:3])
     inside = [(low + (high - low) * share).tolist() for share in generator.random((sensors + 1, 3))]
     ends = np.sort(np.array(inside[:2]), axis=0).tolist()
@@ -165,7 +168,7 @@ def _drawn_origin(bounds: Bounds, sensors: int, generator: np.random.Generator) 
         {"thickness_m": {"max": size * float(generator.uniform(0.001, 0.3))}},
         {"exclude": [taken]},
     ]
-    if len({tuple(point) for point in inside}) == len(inside):
+    if not is_scan and len({tuple(point) for point in inside}) == len(inside):
         choices.append({"mounts_m": inside})
     return choices[int(generator.integers(len(choices)))]
 
@@ -191,7 +194,6 @@ def contradictions(bounds: Bounds, sensors: int, *, is_scan: bool = False) -> di
         "a gate wider than the range": {"gate": {"width_m": {"min": (far - near) + size}}},
         "a fixed origin outside the space": {"origin": {"fixed_m": away}},
         "an origin box outside the space": {"origin": {"low_m": away}},
-        "mounts outside the space": {"origin": {"mounts_m": [[away[0] + i * size, *away[1:]] for i in range(sensors)]}},
         "a taken box that holds all origins": {
             "origin": {
                 "exclude": [
@@ -206,6 +208,8 @@ def contradictions(bounds: Bounds, sensors: int, *, is_scan: bool = False) -> di
         "at least 5 and at most 3 sensors": {"sensors": {"min": 5, "max": 3}},
     }
     if not is_scan:
+        mounts = [[away[0] + i * size, *away[1:]] for i in range(sensors)]
+        found["mounts outside the space"] = {"origin": {"mounts_m": mounts}}
         found["fewer rays than sensors"] = {"sensors": {"count": 8}, "budget": {"rays": 7}}
     if up < 80:
         found["a boresight above the space"] = {"boresight": {"elevation_deg": {"min": min(up + 5.0, 90.0)}}}

@@ -76,9 +76,7 @@ def random_plan(seed: int) -> RunPlan:
     space = _space(generator, size, offset)
     density = _density(generator, size)
     at = _condition_value(space, generator)
-    # only a scan has rays for all values of a condition
-    layouts = ["scan"] if "condition" in space and not at else ["grid", "grid", "density", "scan", "distributed"]
-    layout = _pick(generator, layouts)
+    layout = _pick(generator, ["grid", "grid", "density", "scan", "distributed"])
     sensors = int(generator.integers(1, MOST_SENSORS + 1))
     return RunPlan(
         seed,
@@ -126,8 +124,8 @@ def _high(bounds: float | list[float]) -> float:
 
 
 def _condition_value(space: dict[str, Any], generator: np.random.Generator) -> tuple[str, ...]:
-    """Half of the designs of a density with a condition are for one value of it."""
-    if "condition" not in space or generator.random() < 0.5:
+    """The value that the designs are for, where the density has a condition."""
+    if "condition" not in space:
         return ()
     low, high = space["x_m"]
     return ("--at", f"x_m={float(generator.uniform(low, high))!r}")
