@@ -35,7 +35,7 @@ $(BIN)/.transport: $(BIN)/.ready
 
 test: $(BIN)/.ready $(BIN)/.transport
 	$(BIN)/python -m ruff check .
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
 # The suite with every line and branch that it takes; what numba compiles, apart, in a run without the compiler
 KERNELS := NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage
