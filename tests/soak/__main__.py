@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import datetime
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -19,6 +20,7 @@ from soak.scaled_flatland import offer
 from soak.seeds import LEAST_ESS, learn_seeds, seeds_page
 from soak.whole_runs import plan_lines, whole_run
 
+TERMINATED = 143
 PAGES = ROOT / "docs" / "soak"
 TODAY = datetime.datetime.now(datetime.timezone.utc).date().isoformat()
 
@@ -65,6 +67,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _runs(given: argparse.Namespace, folder: Path) -> int:
+    # the processes that do the runs end with this one
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(TERMINATED))
     choices = {"first": given.first, "jobs": given.jobs, "repeat_every": given.repeat_every}
     records = soak(given.whole, folder, **choices, tell=_tell)
     runs_page(given.page, records, f"python -m soak runs --whole {given.whole} --first {given.first}")
