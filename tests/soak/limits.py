@@ -205,11 +205,11 @@ def contradictions(bounds: Bounds, sensors: int, *, is_scan: bool = False) -> di
             "field_of_view": {"horizontal_deg": {"min": 20.0, "max": 10.0}}
         },
         "a bandwidth below one bin per ray": {"budget": {"rays": 100, "bandwidth_mbps": 0.02}},
-        "at least 5 and at most 3 sensors": {"sensors": {"min": 5, "max": 3}},
     }
     if not is_scan:
         mounts = [[away[0] + i * size, *away[1:]] for i in range(sensors)]
         found["mounts outside the space"] = {"origin": {"mounts_m": mounts}}
+        found["at least 5 and at most 3 sensors"] = {"sensors": {"min": 5, "max": 3}}
         found["fewer rays than sensors"] = {"sensors": {"count": 8}, "budget": {"rays": 7}}
     if up < 80:
         found["a boresight above the space"] = {"boresight": {"elevation_deg": {"min": min(up + 5.0, 90.0)}}}

@@ -85,7 +85,7 @@ def random_plan(seed: int) -> RunPlan:
             "task": {**_scenes(generator, size), "size_m": size, "offset_m": offset},
             "space": space,
             "density": density,
-            "learning": _learning(generator, is_fine=density["sigma_m"] < FINE_SHARE * size),
+            "learning": _affordable(_learning(generator, is_fine=density["sigma_m"] < FINE_SHARE * size), density),
         },
         sensors,
         (*_fit_options(generator, layout, sensors), *at),
@@ -200,6 +200,13 @@ UNUSUAL_SHARE = 0.1
 def _learning(generator: np.random.Generator, *, is_fine: bool) -> dict[str, Any]:
     unusual = {k: _pick(generator, v) for k, v in UNUSUAL_LEARNING.items() if generator.random() < UNUSUAL_SHARE}
     return {**USUAL_LEARNING, **(FINE_LEARNING if is_fine else {}), **unusual}
+
+
+def _affordable(learning: dict[str, Any], density: dict[str, Any]) -> dict[str, Any]:
+    """Less of it with the quadrature, whose every step costs a second."""
+    if density["visibility"] != "quadrature":
+        return learning
+    return {**learning, "steps": min(learning["steps"], 20), "batch": min(learning["batch"], 64), "samples": 3000}
 
 
 def _fit_options(generator: np.random.Generator, layout: str, sensors: int) -> tuple[str, ...]:
