@@ -256,7 +256,7 @@ def test_no_epsilon_stands_outside_numerics(path):
         if any(isinstance(target, ast.Name) and target.id in allowed for target in targets):
             continue
         for node in ast.walk(statement):
-            small = isinstance(node, ast.Constant) and isinstance(node.value, float) and 0 < abs(node.value)
-            assert not (small and abs(node.value) < SMALLEST_PLAIN_NUMBER), f"{path}:{node.lineno}: {node.value!r}"
+            size = abs(node.value) if isinstance(node, ast.Constant) and isinstance(node.value, float) else 0.0
+            assert not 0 < size < SMALLEST_PLAIN_NUMBER, f"{path}:{node.lineno}: {node.value!r}"
             limit = isinstance(node, ast.Attribute) and node.attr in FLOAT_LIMITS
             assert not limit, f"{path}:{node.lineno}: .{node.attr}"

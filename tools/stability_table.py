@@ -60,7 +60,7 @@ def main() -> None:
     import conftest  # noqa: F401  one thread, as in the tests
 
     cases = importlib.import_module("cases").CASES
-    for path in sorted(CASES_FOLDER.glob("test_cases_of_*.py")) + [CASES_FOLDER / "test_promises.py"]:
+    for path in [*sorted(CASES_FOLDER.glob("test_cases_of_*.py")), CASES_FOLDER / "test_promises.py"]:
         importlib.import_module(path.stem)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the plain formulas overflow: that is what is shown

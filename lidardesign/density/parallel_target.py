@@ -151,7 +151,8 @@ class SharedFrames(FramesTarget):
         # what one rank finds out about its points ends the step of all
         wrong = unusable(np.asarray(points, dtype=np.float64))
         if self.ranks.max(np.array([wrong is not None]))[0]:
-            raise NumericalError(wrong or "design points are not finite, or their ranges negative, on another rank", where="target density")
+            elsewhere = "design points are not finite, or their ranges negative, on another rank"
+            raise NumericalError(wrong or elsewhere, where="target density")
         return super()._in_chunks(points, sigma_m, gradient)
 
 

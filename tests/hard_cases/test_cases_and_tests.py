@@ -38,9 +38,8 @@ def decorated_classes() -> list[tuple[str, str, str]]:
 
 def test_cases_and_classes_map_one_to_one():
     keys = [key for key, _, _ in decorated_classes()]
-    assert sorted(keys) == sorted(KEYS), (
-        f"without a class: {sorted(set(KEYS) - set(keys))}; twice: {sorted({key for key in keys if keys.count(key) > 1})}"
-    )
+    twice = sorted({key for key in keys if keys.count(key) > 1})
+    assert sorted(keys) == sorted(KEYS), f"without a class: {sorted(set(KEYS) - set(keys))}; twice: {twice}"
 
 
 def test_every_class_of_the_folder_is_a_case():
@@ -55,7 +54,8 @@ def test_every_class_of_the_folder_is_a_case():
 def test_a_case_has_tests_and_says_what_broke_and_what_is_done(key):
     case = CASES[key]
     assert case.names, f"{case.tests.__name__} has no tests"
-    assert len(case.title) > 10 and len(case.done) > 10
+    assert len(case.title) > 10
+    assert len(case.done) > 10
     assert len(case.broke().split()) > 3
 
 
