@@ -64,7 +64,8 @@ def do_batch(seeds: list[int], path: Path, folder: Path, *, repeat_every: int) -
         folder: Where runs have their folders while they last.
         repeat_every: Runs whose number is a multiple of it are done twice, and have to do the same; 0 does none twice.
     """
-    sys.path.insert(0, str(offer(folder / "offered")))
+    # a folder of its own: another batch may be reading
+    sys.path.insert(0, str(offer(folder / f"offered{seeds[0]}")))
     with path.open("a", encoding="utf-8") as file:
         for seed in seeds:
             print(json.dumps({"started": seed}), file=file, flush=True)

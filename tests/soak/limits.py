@@ -101,7 +101,7 @@ def _origin_around(sensors: Sequence[Mapping[str, Any]], bounds: Bounds) -> Rule
 def drawn(bounds: Bounds, sensors: int, generator: np.random.Generator, *, is_scan: bool = False) -> Rules:
     """Some bounds drawn without a look at any design: a fit keeps them all, or refuses them.
 
-    A scan's rays have neither mounts nor bounds of their own.
+    A scan's rays have neither mounts nor bounds of their own, and one from a fixed place has its own number of rays.
     """
     options: list[Callable[[], Rules]] = [
         lambda: {"gate": _drawn_gate(bounds, generator)},
@@ -163,11 +163,12 @@ def _drawn_origin(bounds: Bounds, sensors: int, generator: np.random.Generator, 
     }
     choices: list[Rules] = [
         {"low_m": ends[0], "high_m": ends[1]},
-        {"fixed_m": inside[0]},
         {"spread_m": {"max": size * float(generator.uniform(0.001, 0.3))}},
         {"thickness_m": {"max": size * float(generator.uniform(0.001, 0.3))}},
         {"exclude": [taken]},
     ]
+    if not is_scan:
+        choices.append({"fixed_m": inside[0]})
     if not is_scan and len({tuple(point) for point in inside}) == len(inside):
         choices.append({"mounts_m": inside})
     return choices[int(generator.integers(len(choices)))]

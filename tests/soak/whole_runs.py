@@ -35,7 +35,7 @@ DONE, TOO_ROUGH, INFEASIBLE = 0, 3, 4
 USAGE, TOO_FEW_SAMPLES = 2, re.compile(r"^\d+ rays from \d+ samples$")
 # It was the soak that somebody wanted to end.
 INTERRUPTED = (130, 143)
-TOO_ROUGH_WORDS = "the density is too rough"
+TOO_ROUGH_WORDS = re.compile("the density is too rough|nearest samples are worth")
 NOTHING_SEEN_WORDS = "no ray of the design space reaches a target surface"
 # Outcomes: all four commands did their work; the two refusals that learning may end with.
 WHOLE, ROUGH, BLIND = "whole", "density too rough", "nothing in sight"
@@ -165,7 +165,7 @@ class _Doing:
 
     def _fit(self) -> None:
         code, found = self._call("fit", "", "run", *self.plan.fit)
-        if code == TOO_ROUGH and TOO_ROUGH_WORDS in _message(found):
+        if code == TOO_ROUGH and TOO_ROUGH_WORDS.search(_message(found)):
             raise StoppedError
         self._expect(code == DONE, f"fit ended with {code}: {_message(found)}", stop=True)
         self._check_design("fit", {})
