@@ -224,11 +224,14 @@ def test_a_run_that_takes_its_process_down_or_hangs_is_a_fault_and_the_others_go
     assert words in found[8]["faults"][0]
 
 
-def test_what_an_ended_soak_did_is_read_up_to_the_first_run_that_is_missing(tmp_path):
+def test_what_an_ended_soak_did_is_read_and_its_page_names_the_runs_that_are_missing(tmp_path):
     for seeds in ([20, 21], [22, 24], [30]):
         lines = [{"started": seeds[0]}, *({**record_of(seed).as_dict(), "outcome": WHOLE} for seed in seeds)]
         (tmp_path / f"batch-{seeds[0]}.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    assert [record["seed"] for record in batches.records_in(tmp_path)] == [20, 21, 22]
+    records = batches.records_in(tmp_path)
+    assert [record["seed"] for record in records] == [20, 21, 22, 24, 30]
+    runs_page(tmp_path / "runs.md", records, "soak page")
+    assert "seeds 23, 25, 26, 27, 28, 29." in (tmp_path / "runs.md").read_text()
 
 
 def test_pages_say_how_many_runs_were_whole_and_which_were_not(tmp_path):

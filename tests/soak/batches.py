@@ -120,10 +120,9 @@ def soak(
 
 
 def records_in(folder: Path) -> list[dict[str, Any]]:
-    """What is done of a soak that goes on or was ended, in order, as far as no number is missing."""
+    """What is done of a soak that goes on or was ended, in order; numbers in between may be missing."""
     found = _done(folder)
-    first = min(found, default=0)
-    return [found[seed] for seed in itertools.takewhile(found.__contains__, itertools.count(first))]
+    return [found[seed] for seed in sorted(found)]
 
 
 def _done(folder: Path) -> dict[int, dict[str, Any]]:

@@ -20,6 +20,7 @@ def runs_page(path: Path, records: Sequence[dict[str, Any]], command: str) -> No
     parts = [
         heading("Random whole runs", command),
         paragraph(_summary(records)),
+        paragraph(_missing(records)),
         table(("how it ended", "runs"), _outcomes(records)),
         table(
             ("constraints", "asked", "kept", "refused with exit 4", "too few samples left, exit 2"),
@@ -47,6 +48,13 @@ def _summary(records: Sequence[dict[str, Any]]) -> str:
         f"{sum(repeated)} of {len(repeated)} runs that were done twice repeated every document and every byte of "
         "densities, samples and designs."
     )
+
+
+def _missing(records: Sequence[dict[str, Any]]) -> str:
+    """Runs between others that were not done when the page was made; empty where there are none."""
+    done = {record["seed"] for record in records}
+    missing = [str(seed) for seed in range(min(done, default=0), max(done, default=0)) if seed not in done]
+    return f"Not done when this was written: seeds {', '.join(missing)}." if missing else ""
 
 
 def _outcomes(records: Sequence[dict[str, Any]]) -> list[tuple[str, int]]:
