@@ -149,6 +149,26 @@ def test_a_cluster_that_lost_its_last_worker_is_given_up(scheduler, monkeypatch)
             evaluate(replace(request, scorer=scorer), progress=kill)
 
 
+def test_a_worker_that_dies_between_its_answer_and_its_delivery_is_not_waited_for_in_vain(scheduler, monkeypatch):
+    monkeypatch.setattr(worker_cluster, "LOOK_SECONDS", 0.1)
+    only = scheduler.add_worker()
+    cluster, wait = worker_cluster.Cluster(scheduler.address), worker_cluster.Cluster._next
+    monkeypatch.setattr(worker_cluster, "WORKER_SECONDS", 1.0)
+
+    def next_of_a_dying_worker(self, done):
+        future = wait(self, done)
+        only.kill()
+        only.wait()
+        return future
+
+    monkeypatch.setattr(worker_cluster.Cluster, "_next", next_of_a_dying_worker)
+    try:
+        with pytest.raises(ConfigError, match="has had no worker for 1 s"):
+            list(cluster.answers([b""]))
+    finally:
+        cluster.close()
+
+
 def test_long_messages_are_sent_and_nonsense_is_answered(scheduler):
     scheduler.add_worker()
     cluster = worker_cluster.Cluster(scheduler.address)

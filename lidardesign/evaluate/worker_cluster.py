@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from lidardesign import __version__
-from lidardesign.errors import ConfigError, NumericalError
+from lidardesign.errors import ConfigError, LidardesignError, NumericalError
 from lidardesign.evaluate.worker import answer
 
 HINT = "docs/cluster.md has the commands that start a scheduler and its workers"
@@ -99,14 +99,19 @@ class Cluster:
             try:
                 return done.get(timeout=LOOK_SECONDS)
             except queue.Empty:
-                now = time.monotonic()
-                last_seen = now if self._threads() else last_seen
-                if now - last_seen > WORKER_SECONDS:
-                    raise ConfigError(
-                        f"the scheduler at {self._address} has had no worker for {WORKER_SECONDS:g} s",
-                        where="--workers",
-                        hint="the logs of the workers say why they ended",
-                    ) from None
+                last_seen = self._last_worker_seen(last_seen)
+
+    def _last_worker_seen(self, before: float) -> float:
+        """When there was a worker last, now or before; gives up where that is too long ago."""
+        now = time.monotonic()
+        last_seen = now if self._threads() else before
+        if now - last_seen > WORKER_SECONDS:
+            raise ConfigError(
+                f"the scheduler at {self._address} has had no worker for {WORKER_SECONDS:g} s",
+                where="--workers",
+                hint="the logs of the workers say why they ended",
+            )
+        return last_seen
 
     def _threads(self) -> int:
         """Messages that workers can take at a time, as of now."""
@@ -119,7 +124,7 @@ class Cluster:
         from distributed import CancelledError, KilledWorker
 
         try:
-            return future.result()
+            return self._fetched(future)
         except KilledWorker as error:
             raise NumericalError(
                 f"the workers of held-out scene {number} died, one after the other",
@@ -128,9 +133,22 @@ class Cluster:
             ) from error
         except (CancelledError, OSError) as error:
             raise self._lost() from error
+        except LidardesignError:
+            raise
         except Exception as error:
             # `answer` itself never raises: the cluster could not load or run it
             raise _unusable(f"{type(error).__name__}: {error}") from error
+
+    def _fetched(self, future: Any) -> bytes:
+        """The answer of a future that was done; where its worker died since, another one has to make it again."""
+        from distributed import TimeoutError as NotYet
+
+        last_seen = time.monotonic()
+        while True:
+            try:
+                return future.result(timeout=max(LOOK_SECONDS, 1.0))
+            except NotYet:
+                last_seen = self._last_worker_seen(last_seen)
 
     def _lost(self) -> ConfigError:
         return ConfigError(f"the scheduler at {self._address} was lost", where="--workers", hint=HINT)
