@@ -63,6 +63,30 @@ class Score:
     details: Mapping[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Where in a scene the error of a set of returns is, for refinement.
+
+    Arguments:
+        points_m: Places in the world frame [m], shape (M, 3); on or near what rays should have observed.
+        values: What the score suffers there, 0 or more, shape (M,): larger where it suffers more, in any unit that
+            all scenes of the task share.
+
+    Raises:
+        ValueError: Shapes that do not fit, or values that are negative or no numbers.
+    """
+
+    points_m: np.ndarray
+    values: np.ndarray
+
+    def __post_init__(self) -> None:
+        points, values = np.shape(self.points_m), np.shape(self.values)
+        if len(points) != 2 or points[1] != 3 or values != points[:1]:
+            raise ValueError(f"residuals of shape {values} at places of shape {points}: allowed are (M,) and (M, 3)")
+        if not (np.isfinite(self.points_m).all() and np.isfinite(self.values).all() and (self.values >= 0).all()):
+            raise ValueError("residuals or their places are negative, NaN or infinite")
+
+
 @dataclass(frozen=True)
 class Defaults:
     """What a task suggests where the user says nothing.
@@ -94,6 +118,9 @@ class Task(Protocol):
     A task whose space has conditions may also give `conditions(config)`, the condition values that designs are
     evaluated at, as [{"x_m": 0.0}, {"x_m": 1.2}]. `score` then gets one `Returns` per condition value (and, within
     each, per time frame), in this order.
+
+    A task may also give `residuals(scene, returns) -> Residuals`, where the error of what `score` judges is; designs
+    of a task without them cannot be refined.
     """
 
     name: ClassVar[str]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -71,6 +71,10 @@ class Samples:
     def subset(self, keep: np.ndarray) -> Samples:
         """The samples at an index or mask."""
         return Samples(self.points[keep], self.log_prob[keep], self.log_target[keep], self.space)
+
+    def reweighted(self, log_factors: np.ndarray) -> Samples:
+        """The samples with log p* moved by so much at each of them, shape (N,): of another target density."""
+        return replace(self, log_target=self.log_target + log_factors)
 
     def resample(self, count: int, generator: np.random.Generator) -> np.ndarray:
         """Design points drawn from p* by systematic importance resampling, shape (count, 6)."""

@@ -17,7 +17,7 @@ from lidardesign.simulate.physics import Physics
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.returns import Rays, Returns
 from lidardesign.simulate.simulate import simulate, simulate_many
-from lidardesign.task import Score, Task
+from lidardesign.task import Residuals, Score, Task
 
 # Rays times frames that are traced together: their returns take 24 bytes each.
 MOST_RETURNS = 4_000_000
@@ -110,6 +110,31 @@ def checked_score(task: Task, scene: Scene, returns: Sequence[Returns]) -> Score
         )
     clip = min if task.metric.better == "lower" else max
     return Score(clip(float(score.value), float(task.metric.worst)), details=score.details)
+
+
+def gives_residuals(task: Task) -> bool:
+    """Whether a task says where in a scene the error is."""
+    return callable(getattr(task, "residuals", None))
+
+
+@phase("metric")
+def checked_residuals(task: Task, scene: Scene, returns: Sequence[Returns]) -> Residuals:
+    """Where the error of returns is in a scene, by a task that gives residuals.
+
+    Raises:
+        PluginError: The task's code raised, or returned something else.
+    """
+    where = f"task {task.name}, residuals, scene {scene.name}"
+    try:
+        with plugin_guard(task.name):
+            found = task.residuals(scene, returns)  # type: ignore[attr-defined]
+    except PluginError as error:
+        raise PluginError(f"residuals failed: {error.message}", where=where, hint=error.hint) from error
+    if not isinstance(found, Residuals):
+        raise PluginError(
+            f"residuals returned {type(found).__name__}", where=where, allowed="lidardesign.task.Residuals"
+        )
+    return found
 
 
 def _is_number(value: object) -> bool:

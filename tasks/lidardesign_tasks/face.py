@@ -23,10 +23,10 @@ from lidardesign.meshio import check_mesh, usable_faces
 from lidardesign.scene import Body, Mesh, Receiver, Scene, Sign
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Metric, Score, Split, random_generator
+from lidardesign.task import Defaults, Metric, Residuals, Score, Split, random_generator
 from lidardesign_tasks.basel import MorphableModel, Unit, load_model
 from lidardesign_tasks.pose import jittered_pose
-from lidardesign_tasks.surface import surface_score, with_visible_truth
+from lidardesign_tasks.surface import surface_residuals, surface_score, with_visible_truth
 from lidardesign_tasks.surroundings import Surroundings, any_direction, moving
 
 Vector = tuple[float, float, float]
@@ -104,6 +104,10 @@ class FaceTask:
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """Chamfer distance [mm] between the reconstruction and the part of the face that could be seen."""
         return surface_score(self.metric, scene, returns)
+
+    def residuals(self, scene: Scene, returns: Sequence[Returns]) -> Residuals:
+        """Where the Chamfer distance is [mm]."""
+        return surface_residuals(self.metric, scene, returns)
 
 
 def head_scenes(

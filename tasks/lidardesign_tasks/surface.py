@@ -12,7 +12,7 @@ from lidardesign.evaluate.metrics import SurfaceCloud, delaunay_surface, surface
 from lidardesign.scene import Scene
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
-from lidardesign.task import Metric, Score, random_generator
+from lidardesign.task import Metric, Residuals, Score, random_generator
 
 MILLIMETRES = 1000.0
 RECONSTRUCTION_POINTS = 4000
@@ -93,8 +93,7 @@ def surface_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> S
     reconstruction within 10 mm.
     """
     details = {"returns": float(sum(int(frame.returned.sum()) for frame in returns))}
-    viewpoint_m = None if scene.receiver is None else np.array(scene.receiver.origin_m)
-    estimate, truth = reconstruct(returns, viewpoint_m), scene.truth["surface"]
+    estimate, truth = _reconstructed(scene, returns), scene.truth["surface"]
     if details["returns"]:
         away_m = truth.distance_m(np.concatenate([frame.points_m for frame in returns]))
         details["outliers_percent"] = 100.0 * float((away_m > max(OUTLIER_M, truth.gap_m)).mean())
@@ -103,3 +102,25 @@ def surface_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> S
     missed, wrong = estimate.distance_m(truth.points), truth.distance_m(estimate.points)
     details["coverage"] = float((missed <= COVERED_M).mean())
     return Score(min(MILLIMETRES * float(missed.mean() + wrong.mean()), metric.worst), details=details)
+
+
+def surface_residuals(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Residuals:
+    """Where the Chamfer distance is: on the visible surface what is missed, on the reconstruction what is wrong.
+
+    Values sum to the score [mm] before it is cut at the metric's worst value; where nothing can be reconstructed,
+    that value is spread evenly over the visible surface.
+    """
+    estimate, truth = _reconstructed(scene, returns), scene.truth["surface"]
+    if estimate is None:
+        return Residuals(truth.points, np.full(len(truth.points), metric.worst / len(truth.points)))
+    missed = estimate.distance_m(truth.points) / len(truth.points)
+    wrong = truth.distance_m(estimate.points) / len(estimate.points)
+    return Residuals(
+        np.concatenate([truth.points, estimate.points]), MILLIMETRES * np.concatenate([missed, wrong])
+    )
+
+
+def _reconstructed(scene: Scene, returns: Sequence[Returns]) -> SurfaceCloud | None:
+    """The surface through returns, as a fixed receiver sees them where the scene has one."""
+    viewpoint_m = None if scene.receiver is None else np.array(scene.receiver.origin_m)
+    return reconstruct(returns, viewpoint_m)
