@@ -8,7 +8,15 @@ import pytest
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.grid import low_discrepancy
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.baselines import BASELINES, NO_VISIBILITY, Baselines, build_baseline
+from lidardesign.evaluate import baselines
+from lidardesign.evaluate.baselines import (
+    Baselines,
+    Family,
+    baseline_of,
+    build_baseline,
+    is_baseline,
+)
+from lidardesign.evaluate.candidates import Layout
 from lidardesign.evaluate.observed import unrolled
 from lidardesign.evaluate.placement import even_placement, opened_gate
 from lidardesign.scene import Body, Box, Scene, Sphere, rigid
@@ -23,7 +31,8 @@ TURN = DesignSpace((0, 0, 0, 0, -0.5, 0.05), (0, 0, 0, 2 * math.pi, 0.5, 4.0))
 FROZEN = DesignSpace((0, 0, 0, 0, 0, 3), (0, 0, 0, 0, 0, 3))
 
 
-BUILT = [name for name in BASELINES if name != NO_VISIBILITY]
+# the others need a design, a density or a part
+BUILT = ["uniform", "random", "bounding", "occupancy"]
 
 
 def balls(centre, radius=0.4, jitter=0.05, count=3):
@@ -181,6 +190,53 @@ def test_the_random_baseline_is_uniform_in_solid_angle():
 def test_an_unknown_baseline_names_the_known_ones():
     with pytest.raises(ConfigError, match="uniform, random, bounding"):
         build_baseline("bouncing", FIXED, [], 3, seed=0)
+
+
+@pytest.fixture
+def of_axis(monkeypatch):
+    """A family whose argument names the axis that all its rays look along."""
+
+    def build(source, argument):
+        return [Layout(argument, lambda count, _: np.tile(AXES[argument], (count, 1)), np.array([0.1, 1.0]))]
+
+    def check(argument):
+        if argument not in AXES:
+            raise ConfigError(f"no axis {argument!r}", allowed=", ".join(AXES))
+
+    monkeypatch.setitem(baselines.BASELINES, "axis", Family(build, "AXIS", check=check))
+
+
+AXES = {"x": [0, 0, 0, 0, 0], "y": [0, 0, 0, math.pi / 2, 0]}
+
+
+def test_what_follows_the_colon_reaches_the_family_and_keeps_its_layouts_apart(of_axis):
+    source = Baselines(FIXED, [], seed=0)
+    for name, looking in (("axis:x", [1, 0, 0]), ("axis:y", [0, 1, 0])):
+        (rays,) = source.positions(name, 3)
+        np.testing.assert_allclose(rays.direction, np.tile(looking, (3, 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("axis", "lacks what it is to be of"),
+        ("axis:", "lacks what it is to be of"),
+        ("axis:z", "no axis 'z'"),
+        ("uniform:3", "takes nothing after its name"),
+        ("uniform:", "takes nothing after its name"),
+        ("axes:x", "axis:AXIS"),
+        ("", "axis:AXIS"),
+    ],
+)
+def test_a_name_that_no_family_takes_is_refused_with_what_is_allowed(of_axis, name, message):
+    with pytest.raises(ConfigError, match=message):
+        baseline_of(name)
+
+
+def test_a_name_with_a_familys_name_before_its_colon_is_a_baselines(of_axis):
+    assert [is_baseline(name) for name in ("axis:x", "axis:z", "uniform", "axes", "my axis")] == [
+        True, True, True, False, False,
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("axes", [1, 2, 3, 5])

@@ -90,9 +90,7 @@ class Baselines:
 
     def options_within(self, name: str, limit_mbps: float, bandwidth: Bandwidth) -> list[Option]:
         """All candidates of a baseline with as many rays as fit in a bandwidth [Mbit/s]."""
-        return [
-            Option(one, one.positions_within(self.spaces, limit_mbps, bandwidth)) for one in self.candidates(name)
-        ]
+        return [Option(one, one.positions_within(self.spaces, limit_mbps, bandwidth)) for one in self.candidates(name)]
 
     def candidates(self, name: str) -> list[Candidate]:
         """The layouts that a baseline chooses from.
@@ -100,10 +98,9 @@ class Baselines:
         Raises:
             ConfigError: There is no such baseline.
         """
-        if name not in BASELINES:
-            raise ConfigError(f"unknown baseline {name!r}", where="baselines", allowed=", ".join(BASELINES))
         if name not in self._candidates:
-            self._candidates[name] = BASELINES[name](self)
+            family, argument = baseline_of(name)
+            self._candidates[name] = family.build(self, argument)
         return self._candidates[name]
 
     @phase("baselines")
@@ -144,7 +141,7 @@ def build_baseline(
     return Baselines(space, train_scenes, seed, judge).positions(name, count)[0]
 
 
-def _uniform(source: Baselines) -> list[Candidate]:
+def _uniform(source: Baselines, argument: str) -> list[Candidate]:
     def place(count: int, spot: Spot) -> np.ndarray:
         low, high = np.array(spot.space.low[:RAY_AXES]), np.array(spot.space.high[:RAY_AXES])
         return even_placement(low, high, count)
@@ -152,7 +149,7 @@ def _uniform(source: Baselines) -> list[Candidate]:
     return [Layout("even", place, whole_range(source.space))]
 
 
-def _random(source: Baselines) -> list[Candidate]:
+def _random(source: Baselines, argument: str) -> list[Candidate]:
     def place(count: int, spot: Spot) -> np.ndarray:
         # the first position draws what a space without conditions draws
         later = [spot.number] if spot.number else []
@@ -162,16 +159,16 @@ def _random(source: Baselines) -> list[Candidate]:
     return [Layout("random", place, whole_range(source.space), drawn_anew=True)]
 
 
-def _bounding(source: Baselines) -> list[Candidate]:
-    return list(bounding(source.views)) or _uniform(source)
+def _bounding(source: Baselines, argument: str) -> list[Candidate]:
+    return list(bounding(source.views)) or _uniform(source, argument)
 
 
-def _occupancy(source: Baselines) -> list[Candidate]:
+def _occupancy(source: Baselines, argument: str) -> list[Candidate]:
     layout = occupancy(source.space, source.train, source.seed)
-    return _random(source) if layout is None else [layout]
+    return _random(source, argument) if layout is None else [layout]
 
 
-def _no_visibility(source: Baselines) -> list[Candidate]:
+def _no_visibility(source: Baselines, argument: str) -> list[Candidate]:
     if source.without_visibility is None:
         raise ConfigError(
             "there is no design to fit anew without occlusion",
@@ -182,10 +179,56 @@ def _no_visibility(source: Baselines) -> list[Candidate]:
     return [source.without_visibility()]
 
 
-BASELINES: dict[str, Callable[[Baselines], list[Candidate]]] = {
-    "uniform": _uniform,
-    "random": _random,
-    "bounding": _bounding,
-    "occupancy": _occupancy,
-    NO_VISIBILITY: _no_visibility,
+class Family(NamedTuple):
+    """A kind of baseline: its name on the command line is `NAME`, or `NAME:ARGUMENT` where it takes one.
+
+    Arguments:
+        build: The candidates to choose from, of a source and the argument (empty where there is none).
+        argument: What follows the colon, for messages; empty where nothing may.
+        optional: Whether the argument may be left out.
+        check: Raises ConfigError for an argument that cannot be used, before anything is built.
+    """
+
+    build: Callable[[Baselines, str], list[Candidate]]
+    argument: str = ""
+    optional: bool = False
+    check: Callable[[str], object] | None = None
+
+    def named(self, name: str) -> list[str]:
+        """How this family is asked for, for messages."""
+        return [name] * (self.optional or not self.argument) + [f"{name}:{self.argument}"] * bool(self.argument)
+
+
+BASELINES: dict[str, Family] = {
+    "uniform": Family(_uniform),
+    "random": Family(_random),
+    "bounding": Family(_bounding),
+    "occupancy": Family(_occupancy),
+    NO_VISIBILITY: Family(_no_visibility),
 }
+
+
+def baseline_of(name: str, *, where: str = "baselines") -> tuple[Family, str]:
+    """The family that a baseline's name belongs to, and its argument (empty where there is none).
+
+    Raises:
+        ConfigError: There is no such baseline, its argument is missing or not wanted, or it cannot be used.
+    """
+    kind, colon, argument = name.partition(":")
+    family = BASELINES.get(kind)
+    known = ", ".join(one for kind, family in BASELINES.items() for one in family.named(kind))
+    if family is None:
+        raise ConfigError(f"unknown baseline {name!r}", where=where, allowed=known)
+    if colon and not family.argument:
+        raise ConfigError(f"the baseline {kind!r} takes nothing after its name", where=where, allowed=kind)
+    if not argument and (colon or (family.argument and not family.optional)):
+        allowed = " or ".join(family.named(kind))
+        raise ConfigError(f"the baseline {name!r} lacks what it is to be of", where=where, allowed=allowed)
+    if argument and family.check is not None:
+        family.check(argument)
+    return family, argument
+
+
+def is_baseline(name: str) -> bool:
+    """Whether a name is a baseline's, or would be read as one."""
+    return name.partition(":")[0] in BASELINES

@@ -13,7 +13,7 @@ from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import Design
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.evaluate.ablation import LayOut
-from lidardesign.evaluate.baselines import BASELINES
+from lidardesign.evaluate.baselines import baseline_of, is_baseline
 from lidardesign.evaluate.passes import Scorer, score_here
 from lidardesign.scene import Scene
 from lidardesign.simulate.plan import Planner
@@ -77,11 +77,10 @@ class EvaluationRequest:
             raise PluginError(f"the worst value is {self.task.metric.worst}", where=where, allowed="finite")
         names = [design.name for design in self.designs]
         for name in names:
-            if names.count(name) > 1 or name in BASELINES:
-                other = "a baseline" if name in BASELINES else "another design"
+            if names.count(name) > 1 or is_baseline(name):
+                other = "a baseline" if is_baseline(name) else "another design"
                 raise ConfigError(f"a design has the name of {other}: {name!r}", hint="rename its file")
-        unknown = [name for name in self.baselines if name not in BASELINES]
-        if unknown:
-            raise ConfigError(f"unknown baseline {unknown[0]!r}", where="--baseline", allowed=", ".join(BASELINES))
+        for name in self.baselines:
+            baseline_of(name, where="--baseline")
         if any(count < 1 for count in self.rays):
             raise ConfigError(f"{min(self.rays)} rays", where="--rays", allowed="1 or more")
