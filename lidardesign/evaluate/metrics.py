@@ -40,13 +40,16 @@ def chamfer_m(first: np.ndarray, second: np.ndarray) -> float:
     Raises:
         ValueError: A set without points.
     """
-    from scipy.spatial import cKDTree
-
     if not len(first) or not len(second):
         raise ValueError("a set without points has no distance")
-    forth, _ = cKDTree(second).query(first)
-    back, _ = cKDTree(first).query(second)
-    return float(forth.mean() + back.mean())
+    return float(nearest_m(second, first).mean() + nearest_m(first, second).mean())
+
+
+def nearest_m(points: np.ndarray, queries: np.ndarray) -> np.ndarray:
+    """The distance of each query (M, D) to the nearest of the points (N, D), shape (M,) [m]."""
+    from scipy.spatial import cKDTree
+
+    return cKDTree(points).query(queries)[0]
 
 
 def discrete_frechet_m(first: np.ndarray, second: np.ndarray) -> float:

@@ -19,9 +19,9 @@ from lidardesign.errors import ConfigError
 from lidardesign.scene import Mesh, Receiver, Scene, inverse_rigid
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Metric, Score, Split
+from lidardesign.task import Defaults, Metric, Residuals, Score, Split
 from lidardesign_tasks.face import FaceTask, HeadConfig, Vector, head_scenes
-from lidardesign_tasks.surface import surface_score
+from lidardesign_tasks.surface import surface_residuals, surface_score
 
 
 class EmitterConfig(HeadConfig):
@@ -124,6 +124,10 @@ class EmitterTask:
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """Chamfer distance [mm] between the reconstruction and the part of the face that could be heard."""
         return surface_score(self.metric, scene, returns)
+
+    def residuals(self, scene: Scene, returns: Sequence[Returns]) -> Residuals:
+        """Where the Chamfer distance is [mm]."""
+        return surface_residuals(self.metric, scene, returns)
 
 
 def winding_number(mesh: Mesh, point: np.ndarray) -> float:

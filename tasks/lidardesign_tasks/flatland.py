@@ -15,12 +15,12 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from lidardesign.evaluate.metrics import chamfer_m
+from lidardesign.evaluate.metrics import chamfer_m, nearest_m
 from lidardesign.scene import Body, Capsule, Scene, Sphere, rigid
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace, aim
-from lidardesign.task import Defaults, Metric, Score, Split, random_generator
+from lidardesign.task import Defaults, Metric, Residuals, Score, Split, random_generator
 from lidardesign_tasks.surroundings import Surroundings
 
 MILLIMETRES = 1000.0
@@ -81,12 +81,33 @@ class FlatlandTask:
 
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """Symmetric Chamfer distance [mm] between the curve through the returns and the visible curve."""
-        points = np.concatenate([frame.points_m for frame in returns])[:, :2]
+        points = measured_points(returns)
         curve = reconstruct_curve(points)
         if curve is None:
             return Score(self.metric.worst, failed=True, details={"returns": float(len(points))})
         value = MILLIMETRES * chamfer_m(curve, scene.truth["curve_m"])
         return Score(min(value, self.metric.worst), details={"returns": float(len(points))})
+
+    def residuals(self, scene: Scene, returns: Sequence[Returns]) -> Residuals:
+        """Where the Chamfer distance [mm] is: on the visible curve what is missed, on the estimate what is wrong.
+
+        Values sum to the score before it is cut at the worst value, which a failure spreads evenly.
+        """
+        truth, curve = scene.truth["curve_m"], reconstruct_curve(measured_points(returns))
+        if curve is None:
+            return Residuals(in_space(truth), np.full(len(truth), self.metric.worst / len(truth)))
+        missed, wrong = nearest_m(curve, truth) / len(truth), nearest_m(truth, curve) / len(curve)
+        return Residuals(in_space(np.concatenate([truth, curve])), MILLIMETRES * np.concatenate([missed, wrong]))
+
+
+def measured_points(returns: Sequence[Returns]) -> np.ndarray:
+    """The returns of all frames in the plane, shape (N, 2) [m]."""
+    return np.concatenate([frame.points_m for frame in returns])[:, :2]
+
+
+def in_space(points: np.ndarray) -> np.ndarray:
+    """Points (N, 2) of the plane z = 0 as points (N, 3) [m]."""
+    return np.column_stack([points, np.zeros(len(points))])
 
 
 def build_scene(
@@ -167,7 +188,7 @@ def outline(body: Body) -> np.ndarray:
 def visible_outline(scene: Scene, space: DesignSpace) -> np.ndarray:
     """The points of target outlines that some admissible ray sees first, shape (K, 2) [m]."""
     points = np.concatenate([outline(body) for body in scene.bodies if body.is_target])
-    flat = np.column_stack([points, np.zeros(len(points))])
+    flat = in_space(points)
     origins = np.linspace(space.low[:3], space.high[:3], TRUTH_ORIGINS)
     design = aim(np.repeat(origins, len(flat), axis=0), np.tile(flat, (len(origins), 1)))
     seen = space.contains(design)

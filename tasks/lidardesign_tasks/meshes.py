@@ -25,9 +25,9 @@ from lidardesign.numerics import circular_difference
 from lidardesign.scene import Body, Mesh, Scene, Sign
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace, aim
-from lidardesign.task import Defaults, Metric, Score, Split, random_generator
+from lidardesign.task import Defaults, Metric, Residuals, Score, Split, random_generator
 from lidardesign_tasks.pose import jittered_pose
-from lidardesign_tasks.surface import surface_score, with_visible_truth
+from lidardesign_tasks.surface import surface_residuals, surface_score, with_visible_truth
 from lidardesign_tasks.surroundings import Surroundings, any_direction, moving
 
 Vector = tuple[float, float, float]
@@ -122,6 +122,10 @@ class MeshesTask:
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """Chamfer distance [mm] between the reconstruction and the part of the surface that could be seen."""
         return surface_score(self.metric, scene, returns)
+
+    def residuals(self, scene: Scene, returns: Sequence[Returns]) -> Residuals:
+        """Where the Chamfer distance is [mm]."""
+        return surface_residuals(self.metric, scene, returns)
 
 
 def load_folder(config: MeshesConfig) -> list[tuple[str, Mesh]]:

@@ -17,8 +17,8 @@ import numpy as np
 from lidardesign.errors import ConfigError
 from lidardesign.scene import Body, Scene
 from lidardesign.simulate.returns import Returns
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace
-from lidardesign.task import Metric, Score
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
+from lidardesign.task import Metric, Residuals, Score
 
 PERCENT = 100.0
 # No step between neighbouring elevations is wider: the ends of the design space's range cut faces to this angle.
@@ -98,16 +98,41 @@ def _crossed(body: Body, origin_m: np.ndarray, forward: np.ndarray) -> tuple[flo
     return (near, far) if near < far else None
 
 
-def visible_boxes(cut: PlaneCut, space: DesignSpace) -> np.ndarray:
-    """The bodies of the boxes that some admissible ray of the plane sees, ascending, shape (V,)."""
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """What every admissible ray of a plane sees: one ray per step of elevations with the same first hit.
+
+    Arguments:
+        elevation_rad: Of the ray in the middle of each step, shape (S,).
+        width_rad: Of each step, shape (S,).
+        body: What the ray sees, shape (S,).
+        range_m: How far away it is, shape (S,).
+    """
+
+    elevation_rad: np.ndarray
+    width_rad: np.ndarray
+    body: np.ndarray
+    range_m: np.ndarray
+
+
+def swept(cut: PlaneCut, space: DesignSpace) -> Sweep:
+    """The steps of the space's elevations whose rays see a box within the space's ranges."""
     low, high = space.low[ELEVATION], space.high[ELEVATION]
     corners = [np.arctan2(z, s) for s in (cut.low[:, 0], cut.high[:, 0]) for z in (cut.low[:, 1], cut.high[:, 1])]
     even = np.linspace(low, high, math.ceil((high - low) / LARGEST_STEP_RAD) + 1)
     edges = np.unique(np.clip(np.concatenate([*corners, even]), low, high))
-    row, range_m = cut.first_hits((edges[:-1] + edges[1:]) / 2)
-    admissible = (row >= 0) & (range_m >= space.low[RANGE]) & (range_m <= space.high[RANGE])
-    seen_rad = np.bincount(row[admissible], np.diff(edges)[admissible], minlength=len(cut.body))
-    return cut.body[cut.is_box & (seen_rad >= SMALLEST_VISIBLE_RAD)]
+    elevation = (edges[:-1] + edges[1:]) / 2
+    row, range_m = cut.first_hits(elevation)
+    seen = (row >= 0) & (range_m >= space.low[RANGE]) & (range_m <= space.high[RANGE])
+    seen[seen] = cut.is_box[row[seen]]
+    return Sweep(elevation[seen], np.diff(edges)[seen], cut.body[row[seen]], range_m[seen])
+
+
+def visible_boxes(cut: PlaneCut, space: DesignSpace) -> np.ndarray:
+    """The bodies of the boxes that some admissible ray of the plane sees, ascending, shape (V,)."""
+    sweep = swept(cut, space)
+    bodies, box = np.unique(sweep.body, return_inverse=True)
+    return bodies[np.bincount(box, sweep.width_rad, len(bodies)) >= SMALLEST_VISIBLE_RAD]
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,22 +213,56 @@ def miss_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Scor
         ConfigError: The number of returns is not the number of evaluated positions.
     """
     truth = scene.truth
-    if len(returns) != len(truth.origins_m):
-        raise ConfigError(
-            f"{len(returns)} lists of returns", where=f"scene {scene.name}", allowed=f"{len(truth.origins_m)} positions"
-        )
-    seen = 0
-    for one, cut, origin, visible in zip(returns, truth.cuts, truth.origins_m, truth.visible, strict=True):
-        found = seen_boxes(cut, one.points_m, origin, truth.space.low[AZIMUTH])
-        seen += len(np.intersect1d(found, visible))
+    missed = sum(map(len, missed_boxes(scene, returns)))
     boxes, standing = sum(map(len, truth.visible)), sum(map(len, truth.standing))
     count = sum(int(one.returned.sum()) for one in returns)
     details = {
         "returns": float(count),
         "boxes": float(boxes),
-        "boxes_seen": float(seen),
+        "boxes_seen": float(boxes - missed),
         "hidden_percent": PERCENT * (1 - boxes / standing),
     }
     if not count:
         return Score(metric.worst, failed=True, details=details)
-    return Score(PERCENT * (1 - seen / boxes), details=details)
+    return Score(PERCENT * (1 - (boxes - missed) / boxes), details=details)
+
+
+def missed_boxes(scene: Scene, returns: Sequence[Returns]) -> list[np.ndarray]:
+    """The bodies of the boxes that could be seen and that no return lies on, per position.
+
+    Raises:
+        ConfigError: The number of returns is not the number of evaluated positions.
+    """
+    truth = scene.truth
+    if len(returns) != len(truth.origins_m):
+        raise ConfigError(
+            f"{len(returns)} lists of returns", where=f"scene {scene.name}", allowed=f"{len(truth.origins_m)} positions"
+        )
+    azimuth = truth.space.low[AZIMUTH]
+    return [
+        np.setdiff1d(visible, seen_boxes(cut, one.points_m, origin, azimuth))
+        for one, cut, origin, visible in zip(returns, truth.cuts, truth.origins_m, truth.visible, strict=True)
+    ]
+
+
+def miss_residuals(scene: Scene, returns: Sequence[Returns]) -> Residuals:
+    """Where rays could have met the boxes that are missed, [%] of all (box, position) pairs that could be seen.
+
+    The share of a pair is spread over the box's visible part, even in the elevation of the rays that see it. Values
+    sum to the score.
+
+    Raises:
+        ConfigError: The number of returns is not the number of evaluated positions.
+    """
+    truth = scene.truth
+    points, values = [np.empty((0, 3))], [np.empty(0)]
+    for origin, cut, missed in zip(truth.origins_m, truth.cuts, missed_boxes(scene, returns), strict=True):
+        sweep = swept(cut, truth.space)
+        chosen = np.isin(sweep.body, missed)
+        ray = direction(truth.space.low[AZIMUTH], sweep.elevation_rad[chosen])
+        _, box = np.unique(sweep.body[chosen], return_inverse=True)
+        width = sweep.width_rad[chosen]
+        points.append(origin + sweep.range_m[chosen, None] * ray)
+        values.append(width / np.bincount(box, width)[box])
+    share = PERCENT / sum(map(len, truth.visible))
+    return Residuals(np.concatenate(points), share * np.concatenate(values))
