@@ -80,7 +80,9 @@ class Residuals:
     values: np.ndarray
 
     def __post_init__(self) -> None:
-        points, values = np.shape(self.points_m), np.shape(self.values)
+        for name in ("points_m", "values"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+        points, values = self.points_m.shape, self.values.shape
         if len(points) != 2 or points[1] != 3 or values != points[:1]:
             raise ValueError(f"residuals of shape {values} at places of shape {points}: allowed are (M,) and (M, 3)")
         if not (np.isfinite(self.points_m).all() and np.isfinite(self.values).all() and (self.values >= 0).all()):

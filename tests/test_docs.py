@@ -13,6 +13,7 @@ from lidardesign import registry
 from lidardesign.cli.main import app
 from lidardesign.design.constraints import Constraints
 from lidardesign.errors import LidardesignError
+from lidardesign.evaluate.scoring import checked_residuals
 from lidardesign.registry import load_task
 from lidardesign.run.config import resolve
 from lidardesign.run.yaml import parse_yaml
@@ -137,6 +138,16 @@ def test_the_moving_ball_of_the_guide_is_scored_over_its_frames():
     assert task.score(scene, simulate(scene, everywhere)).value < task.score(
         scene, simulate(scene, seen_at_the_ends)
     ).value
+
+
+def test_the_residuals_of_the_guide_are_the_frames_without_the_ball():
+    task, _, scene = moving_scene_of("PassingTask", 0)
+    ball = scene.bodies[0].poses[:, :3, 3]
+    returns = simulate(scene, rays_at(ball[[0]], np.array([0.0, 0.0, 0.3])))
+    found = checked_residuals(task, scene, returns)
+    assert np.array_equal(found.points_m, ball)
+    assert found.values[0] == 0.0 < found.values[-1]
+    assert found.values.sum() == pytest.approx(task.score(scene, returns).value)
 
 
 def test_the_drive_of_the_guide_is_scored_over_its_positions():
