@@ -12,6 +12,7 @@ from lidardesign.errors import DataError
 from lidardesign.evaluate.metrics import (
     chamfer_m,
     delaunay_surface,
+    ray_spacing,
     sample_surface,
     surface_cloud,
     triangle_distance_m,
@@ -151,6 +152,46 @@ def test_triangles_that_bridge_a_depth_step_can_be_left_out():
     everything, all_faces = delaunay_surface(points, np.zeros(3))
     assert len(all_faces) > len(faces)
     assert np.ptp(everything[all_faces][:, :, 0], axis=1).max() == 1
+
+
+def plane_of_rays(side=13):
+    """Rays on a grid of slopes, and what each meets on the plane x = 1."""
+    y, z = np.meshgrid(np.linspace(-0.3, 0.3, side), np.linspace(-0.3, 0.3, side))
+    points = np.column_stack([np.ones(side**2), y.ravel(), z.ravel()])
+    return points / np.linalg.norm(points, axis=1, keepdims=True), points
+
+
+def area_through(points, spacing):
+    vertices, faces = delaunay_surface(points, np.zeros(3), spacing=spacing)
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+
+
+def test_where_rays_side_by_side_saw_nothing_there_is_no_surface():
+    directions, points = plane_of_rays()
+    seen = np.abs(points[:, 1]) > 0.12  # five columns of rays in the middle pass through
+    beside = 2 * 0.15 * 0.6
+    assert area_through(points[seen], ray_spacing(directions)[seen]) == pytest.approx(beside)
+    assert area_through(points[seen], None) == pytest.approx(0.36), "without the rays that saw nothing it is bridged"
+
+
+def test_a_single_lost_ray_leaves_no_hole():
+    directions, points = plane_of_rays()
+    seen = np.ones(169, dtype=bool)
+    seen[[84, 30, 100]] = False
+    assert area_through(points[seen], ray_spacing(directions)[seen]) == pytest.approx(0.36)
+
+
+def test_the_spacing_of_rays_is_that_of_their_grid_and_of_different_directions_alone():
+    steps = np.linspace(-0.1, 0.1, 21)
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    directions = np.column_stack([np.sqrt(1 - (grid**2).sum(axis=1)), grid])
+    inside = (np.abs(grid) < 0.06).all(axis=1)
+    # four at one step and two of the four at its diagonal
+    np.testing.assert_allclose(ray_spacing(directions)[inside], 0.01 * (4 + 2 * math.sqrt(2)) / 6, rtol=0.01)
+    twice = np.concatenate([directions, directions])
+    np.testing.assert_array_equal(ray_spacing(twice)[:441], ray_spacing(directions))
+    assert np.isinf(ray_spacing(directions[:1])).all()
 
 
 def test_points_on_a_mesh_are_uniform_in_area_and_repeatable():

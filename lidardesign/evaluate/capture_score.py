@@ -20,7 +20,7 @@ from lidardesign.estimates import Estimate, median_error, share_error
 from lidardesign.evaluate.capture import Capture
 from lidardesign.evaluate.capture_ranges import Estimation
 from lidardesign.evaluate.capture_scan import Captured, CapturedScan, scan, scan_pixels, uniform_rays, whole_window
-from lidardesign.evaluate.metrics import SurfaceCloud, delaunay_surface, surface_cloud, visible_surface
+from lidardesign.evaluate.metrics import SurfaceCloud, delaunay_surface, ray_spacing, surface_cloud, visible_surface
 from lidardesign.meshio import load_mesh
 from lidardesign.numerics import circular_difference
 from lidardesign.scene import Body, Scene
@@ -242,20 +242,22 @@ def _reference_surface(capture: Capture, mesh: Path | None) -> tuple[SurfaceClou
     if capture.true_range_m is None:
         return None, None
     points = capture.origin_m + capture.true_range_m[:, None] * capture.direction
-    surface = _surface(capture, points)
+    surface = _surface(capture, points, capture.direction)
     return surface, None if surface is None else "the surface through the capture's true ranges"
 
 
-def _surface(capture: Capture, points: np.ndarray) -> SurfaceCloud | None:
-    """The surface through points (N, 3), those with NaN left out; None where they span none."""
-    kept = points[np.isfinite(points).all(axis=1)]
-    surface = delaunay_surface(kept, capture.origin_m, steepest_deg=STEEPEST_DEG)
+def _surface(capture: Capture, points: np.ndarray, directions: np.ndarray) -> SurfaceCloud | None:
+    """The surface through the points of rays (N, 3), NaN where one measured nothing; None where they span none."""
+    kept = np.isfinite(points).all(axis=1)
+    spacing = ray_spacing(directions)[kept]
+    surface = delaunay_surface(points[kept], capture.origin_m, steepest_deg=STEEPEST_DEG, spacing=spacing)
     return None if surface is None else surface_cloud(*surface, SURFACE_POINTS, random_generator(0, "capture"))
 
 
 def _chamfer_mm(capture: Capture, found: CapturedScan, surface: SurfaceCloud) -> float | None:
     """Mean distances of both surfaces to each other, added [mm]; None where the returns span no surface."""
-    estimate = _surface(capture, found.points_m)
+    fired = found.captured == Captured.YES
+    estimate = _surface(capture, found.points_m[fired], capture.direction[found.pixel[fired]])
     if estimate is None:
         return None
     apart = estimate.distance_m(surface.points).mean() + surface.distance_m(estimate.points).mean()

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from lidardesign.evaluate.metrics import SurfaceCloud, delaunay_surface, surface_cloud, visible_surface
+from lidardesign.evaluate.metrics import SurfaceCloud, delaunay_surface, ray_spacing, surface_cloud, visible_surface
 from lidardesign.scene import Scene
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
@@ -66,7 +66,8 @@ def with_visible_truth(
 def reconstruct(returns: Sequence[Returns], viewpoint_m: np.ndarray | None = None) -> SurfaceCloud | None:
     """The surface through all returns, neighbours as seen from a viewpoint; `None` where they span none.
 
-    Nothing but rays and returns goes in: a return from an occluder inside the gate is taken for surface.
+    Nothing but rays and returns goes in: a return from an occluder inside the gate is taken for surface, and where
+    several rays side by side saw nothing there is none.
 
     Arguments:
         returns: Of all frames.
@@ -77,10 +78,25 @@ def reconstruct(returns: Sequence[Returns], viewpoint_m: np.ndarray | None = Non
         return None
     points = np.concatenate([frame.points_m for frame in returns])
     viewpoint_m = origins.mean(axis=0) if viewpoint_m is None else viewpoint_m
-    surface = delaunay_surface(points, viewpoint_m, steepest_deg=STEEPEST_DEG)
+    spacing = np.concatenate([_spacing(frame, viewpoint_m) for frame in returns])
+    surface = delaunay_surface(points, viewpoint_m, steepest_deg=STEEPEST_DEG, spacing=spacing)
     if surface is None:
         return None
     return surface_cloud(*surface, RECONSTRUCTION_POINTS, random_generator(0, "reconstruction"))
+
+
+def _spacing(frame: Returns, viewpoint_m: np.ndarray) -> np.ndarray:
+    """How far apart a frame's rays are, seen from a viewpoint, at each of its returns, shape (K,).
+
+    A ray without a return counts where it would be at the returns' median range.
+    """
+    hit = frame.returned
+    if not hit.any():
+        return np.zeros(0)
+    range_m = np.where(hit, frame.range_m, np.median(frame.range_m[hit]))
+    away = frame.rays.origin_m + range_m[:, None] * frame.rays.direction - viewpoint_m
+    length = np.linalg.norm(away, axis=1, keepdims=True)
+    return ray_spacing(np.divide(away, length, out=np.zeros_like(away), where=length > 0))[hit]
 
 
 def surface_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Score:
