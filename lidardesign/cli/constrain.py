@@ -51,6 +51,8 @@ def constrain(
     with command(json=json, quiet=quiet, debug=debug) as console:
         check_name(name)
         load_libraries()
+        from lidardesign.design.sensor import fitted_layout
+
         if gates is not None:
             check_choice(gates, "--gates", GATES)
         if layout is not None:
@@ -59,7 +61,7 @@ def constrain(
         checked = load_constraints(constraints, overrides or [])
         opened, design = open_target(target, console)
         run = need_run(opened, target)
-        layout = layout or (design.layout if design else usual_layout(run))
+        layout = layout or (fitted_layout(design.layout) if design else usual_layout(run))
         check_sensors(count, layout)
         fit_and_write(
             run,

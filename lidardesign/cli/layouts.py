@@ -71,7 +71,7 @@ class Layouts:
 
 def may_need_samples(design: Design) -> bool:
     """Whether another number of rays of a design may follow from samples of its run."""
-    return design.layout != "grid" or design.ray_table is not None
+    return design.layout != "fixed" and (design.layout != "grid" or design.ray_table is not None)
 
 
 def twin_without_visibility(design: Design, run: Run, layouts: Layouts) -> tuple[Design, Samples]:

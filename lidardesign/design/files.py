@@ -38,7 +38,7 @@ from lidardesign.run.yaml import Document, dump_yaml, load_yaml
 
 SCHEMA_VERSION = 1
 SCHEMA_FILE = Path(__file__).with_name("design.schema.json")
-LAYOUTS = ("grid", "density", "scan", "distributed")
+LAYOUTS = ("grid", "density", "scan", "distributed", "fixed")
 # A file of a hundred thousand explicit rays; the YAML reader's own limit is for settings.
 MAX_BYTES = 64_000_000
 # Eight numbers a ray stay below the number of values that the YAML reader accepts in one file.
@@ -423,6 +423,8 @@ def _check_rays(
     """The places that may count rays must agree, and one of them says where rays go."""
     if table is not None and track is not None:
         raise keys["track"].error("is given beside ray_table", hint="remove either of the two")
+    if table is None and keys.get("layout") is not None and keys["layout"].value == "fixed":
+        raise keys["layout"].error("is fixed, but there is no ray_table", hint="the layout grid needs none")
     counts: dict[str, int] = {}
     if rays is not None:
         counts["rays"] = rays

@@ -174,6 +174,8 @@ def _check_options(
     constraints: Constraints, samples: Samples, sensors: int | str | None, layout: str, rays: int | None
 ) -> None:
     """Options against each other and against the constraints, before anything is computed."""
+    if layout == "fixed":
+        raise ConfigError("the rays of real parts cannot be fitted", where="--layout fixed", hint="--layout grid")
     if isinstance(sensors, str) and sensors != "auto":
         raise ConfigError(f"{sensors!r} sensors", where="--sensors", allowed="a whole number, or auto")
     if isinstance(sensors, int) and not 1 <= sensors <= MOST_FITTED:

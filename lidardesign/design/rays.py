@@ -15,6 +15,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from scipy.spatial import cKDTree
 
+from lidardesign.design.catalog.thinning import thinned
 from lidardesign.design.conditions import conditioned
 from lidardesign.design.constraints import Constraints
 from lidardesign.design.distributed import distributed_beams
@@ -85,7 +86,8 @@ def lay_out(
     At the number of rays of its explicit table, the design's table is the answer, gates included. Otherwise
     `grid` is even in each sensor's field of view; `density` quantises the samples inside each sensor; `scan`
     fires along each sensor's boresight, and at another number of rays is fitted anew to the samples;
-    `distributed` starts rays across each sensor's origins, by the samples inside it or by its own Gaussian.
+    `distributed` starts rays across each sensor's origins, by the samples inside it or by its own Gaussian; `fixed`
+    fires what stands in its table, of fewer rays an evenly spread subset.
 
     Arguments:
         design: The design.
@@ -148,6 +150,8 @@ def _laid_out(
     total = own_count(design) if count is None else count
     if design.ray_table is not None and len(design.ray_table.sensor) == total:
         return _table_rays(design.ray_table, rate_hz)
+    if design.layout == "fixed" and total:
+        return _table_rays(_fewer(design, total), rate_hz)
     shares = _shares(design, total)
     if design.layout == "distributed":
         return _distributed_rays(design, shares, samples, gates, rate_hz, seed)
@@ -299,6 +303,26 @@ def _needs_samples(design: Design, total: int, gates: Gates) -> ConfigError:
         allowed=f"{len(design.ray_table.sensor)} rays" if design.ray_table is not None else None,
         hint=f"lidardesign fit RUN --layout {design.layout} --rays {total}",
     )
+
+
+def _fewer(design: Design, total: int) -> RayTable:
+    """An evenly spread subset of a fixed design's rays, each sensor's in proportion."""
+    table = design.ray_table
+    if table is None or total > len(table.sensor):
+        raise ConfigError(
+            f"{total} rays, but the design's fixed pattern has {0 if table is None else len(table.sensor)}",
+            where=design.name,
+            allowed=None if table is None else f"at most {len(table.sensor)}",
+            hint="a design of more parts: lidardesign catalog show NAME --rays N --out FILE",
+        )
+    own = np.bincount(table.sensor, minlength=len(design.sensors))
+    shares = split_budget(own, total)
+    looking = direction(table.azimuth_rad, table.elevation_rad)
+    of_sensor = [np.flatnonzero(table.sensor == index) for index in range(len(own))]
+    kept = [rows[thinned(looking[rows], int(share))] for rows, share in zip(of_sensor, shares, strict=True)]
+    chosen = np.sort(np.concatenate(kept))
+    columns = (table.origin_m, table.azimuth_rad, table.elevation_rad, table.gate_m, table.sensor)
+    return RayTable(*(column[chosen] for column in columns))
 
 
 def _table_rays(table: RayTable, rate_hz: float) -> Rays:

@@ -26,12 +26,17 @@ DEFAULT_LEVEL = 0.95
 LEVELS = (0.01, 0.999999)
 # Returns of so many fill some 100 MB per scene; no scanner fires more in a frame.
 MOST_RAYS = 1_000_000
-Layout = Literal["grid", "density", "scan", "distributed"]
+Layout = Literal["grid", "density", "scan", "distributed", "fixed"]
 
 
 def interval_factor(level: float) -> float:
     """The number of standard deviations on each side of the mean that hold `level` of a normal distribution."""
     return float(ndtri((1 + level) / 2))
+
+
+def fitted_layout(layout: Layout) -> Layout:
+    """The layout in which sensors like a design's are fitted: fixed rays are what they are, so `grid` for those."""
+    return "grid" if layout == "fixed" else layout
 
 
 def boresight_frame(azimuth_rad: float, elevation_rad: float, roll_rad: float = 0.0) -> np.ndarray:
@@ -235,7 +240,7 @@ class Design:
     Arguments:
         name: The file's stem, the row's name in tables.
         sensors: At least one.
-        layout: `grid`, `density`, `scan` or `distributed`.
+        layout: `grid`, `density`, `scan`, `distributed`, or `fixed`: the rays of its table, as real parts fire them.
         rays: Rays per frame that it was made for; None leaves the budget to `evaluate`.
         ray_table: The explicit rays of every layout but `grid`.
         constraints: The constraint document that it satisfies (plain values).

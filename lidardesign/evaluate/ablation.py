@@ -17,7 +17,7 @@ from lidardesign.design.constraints import Constraints
 from lidardesign.design.fit import fit
 from lidardesign.design.rays import gates_of
 from lidardesign.design.samples import Samples
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import Design, fitted_layout
 from lidardesign.evaluate.candidates import Positions, mean_mbps
 from lidardesign.simulate.returns import Rays
 from lidardesign.space import DesignSpace
@@ -53,7 +53,7 @@ def fitted_twin(design: Design, samples: Samples, *, name: str, retarget: LogTar
     return fit(
         samples,
         sensors=None if one_per_ray else len(design.sensors),
-        layout=design.layout,
+        layout=fitted_layout(design.layout),
         rays=design.rays,
         constraints=Constraints.from_mapping(dict(design.constraints), where=f"constraints of {design.name}"),
         seed=seed if isinstance(seed, int) else 0,

@@ -24,7 +24,7 @@ from lidardesign.design.fit import EM_SAMPLES, HELD_OUT_SHARE, RESTARTS
 from lidardesign.design.mixture import log_density
 from lidardesign.design.resolve import bounds_of, groups
 from lidardesign.design.samples import FILE_NAME, Samples, load_samples
-from lidardesign.design.sensor import Design, interval_factor
+from lidardesign.design.sensor import Design, fitted_layout, interval_factor
 from lidardesign.design.support import LEAST_SAMPLES
 from lidardesign.evaluate.accuracy import AccuracyRequest
 from lidardesign.evaluate.rungs import Ladder, Rung, with_memory
@@ -104,7 +104,8 @@ def _command_seconds(run: Path, design: Design) -> float | None:
     needed = [run / name for name in (CONFIG_FILE, MANIFEST_FILE, FILE_NAME)]
     if not all(path.exists() for path in needed):
         return None
-    options = ["--sensors", str(len(design.sensors)), "--layout", design.layout, "--level", str(design.level)]
+    options = ["--sensors", str(len(design.sensors)), "--layout", fitted_layout(design.layout)]
+    options += ["--level", str(design.level)]
     options += [] if design.rays is None else ["--rays", str(design.rays)]
     options += [option for name, value in design.at.items() for option in ("--at", f"{name}={value}")]
     taken = []

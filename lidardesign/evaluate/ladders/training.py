@@ -19,7 +19,7 @@ from lidardesign.design.constraints import Constraints
 from lidardesign.design.fit import fit
 from lidardesign.design.rays import gates_of
 from lidardesign.design.samples import Samples
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import Design, fitted_layout
 from lidardesign.errors import LidardesignError
 from lidardesign.estimates import Estimate
 from lidardesign.evaluate.accuracy import AccuracyRequest
@@ -223,7 +223,7 @@ class _Judge:
         return fit(
             samples,
             sensors=None if one_per_ray else len(design.sensors),
-            layout=design.layout,
+            layout=fitted_layout(design.layout),
             rays=None if design.layout == "grid" and design.ray_table is None else self._rays,
             constraints=Constraints.from_mapping(dict(design.constraints), where=f"constraints of {design.name}"),
             seed=self._asked.seed,

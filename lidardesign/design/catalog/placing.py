@@ -1,0 +1,235 @@
+"""A real part at a place: its rays, its sensor in the design space, and a design of one or several of it.
+
+A part fires its own pattern. Of fewer rays than it has, the evenly spread subset is taken; more rays than it has take
+more parts, whose rays share the number equally.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lidardesign.design.catalog.part import Part
+from lidardesign.design.catalog.thinning import thinned
+from lidardesign.design.grid import grid_rows, low_discrepancy
+from lidardesign.design.sensor import (
+    DEFAULT_LEVEL,
+    MOST_RAYS,
+    Design,
+    RayTable,
+    Sensor,
+    boresight_frame,
+    interval_factor,
+)
+from lidardesign.errors import ConfigError
+from lidardesign.simulate.returns import Rays
+from lidardesign.space import angles, observed_point
+
+Wanted = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Where a part stands and how it is turned; its forward axis looks along the boresight.
+
+    Arguments:
+        origin_m: Shape (3,).
+        azimuth_rad, elevation_rad, roll_rad: Of its forward axis, as a sensor's boresight.
+    """
+
+    origin_m: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    azimuth_rad: float = 0.0
+    elevation_rad: float = 0.0
+    roll_rad: float = 0.0
+
+    @property
+    def frame(self) -> np.ndarray:
+        """Rows forward, horizontal, vertical, shape (3, 3): directions in the part's frame @ frame are the world's."""
+        return boresight_frame(self.azimuth_rad, self.elevation_rad, self.roll_rad)
+
+
+def looking_at(part: Part, origin_m: np.ndarray, azimuth_rad: float, elevation_rad: float) -> Pose:
+    """The pose, without roll where its field is centred, in which the centre of a part's field looks somewhere.
+
+    A field that is not centred on the forward axis is turned with the part: the axis tilts by what the centre is off.
+    """
+    azimuth, elevation = part.centre_rad
+    tilted = math.remainder(elevation_rad - elevation, 2 * math.pi)
+    if abs(tilted) <= math.pi / 2:
+        return Pose(np.asarray(origin_m, dtype=np.float64), azimuth_rad - azimuth, tilted)
+    # over the zenith: the part stands on its head on the other side
+    over = math.copysign(math.pi, tilted) - tilted
+    return Pose(np.asarray(origin_m, dtype=np.float64), azimuth_rad - azimuth + math.pi, over, math.pi)
+
+
+def covered(part: Part, pose: Pose, points: np.ndarray) -> np.ndarray:
+    """Which scene points of design points a part at a pose could measure: (N, 6) to bool (N,).
+
+    A design point says what is seen from its own origin; the part sees the same scene point from its own, if it lies
+    in its field of view and between its nearest and its farthest range.
+    """
+    offset = observed_point(points) - pose.origin_m
+    distance = np.linalg.norm(offset, axis=1)
+    near, far = part.range_m
+    local = (offset / np.where(distance > 0, distance, 1.0)[:, None]) @ pose.frame.T
+    return (distance >= near) & (distance <= far) & (distance > 0) & part.inside(local)
+
+
+def parts_for(part: Part, count: int) -> int:
+    """How many parts of a kind fire `count` rays; at least one."""
+    return max(-(-count // part.rays), 1)
+
+
+def part_rays(
+    part: Part, poses: Pose | Sequence[Pose], count: int | None = None, *, wanted: Wanted | None = None
+) -> Rays:
+    """The rays of parts at poses, in the order in which each fires.
+
+    Arguments:
+        part: The kind of part; its range is the gate of every ray, its rate says how long a frame lasts.
+        poses: One part stands at each.
+        count: Rays in all; None is every ray of every part. The parts share them equally, the first ones take what
+            is left over, and each fires an evenly spread subset of its pattern.
+        wanted: Which unit vectors (N, 3) of the world are worth firing, bool (N,): the subset is taken among those
+            where there are enough, and other rays fill it up.
+
+    Raises:
+        ConfigError: More rays than the parts have, or than any design may.
+    """
+    poses = [poses] if isinstance(poses, Pose) else list(poses)
+    capacity = part.rays * len(poses)
+    total = capacity if count is None else count
+    if not 0 <= total <= min(capacity, MOST_RAYS):
+        raise ConfigError(
+            f"{total} rays of {len(poses)} x {part.name}",
+            where="catalog",
+            allowed=f"at most {min(capacity, MOST_RAYS)} ({part.rays} each)",
+            hint=f"{parts_for(part, total)} parts have as many",
+        )
+    shares = [total // len(poses) + (index < total % len(poses)) for index in range(len(poses))]
+    looking = [_chosen(part.directions @ pose.frame, share, wanted) for pose, share in zip(poses, shares, strict=True)]
+    sensor = np.repeat(np.arange(len(poses)), shares)
+    # all parts run at once, each over its own frame
+    times = [np.arange(share) / (max(share, 1) * part.rate_hz) for share in shares]
+    return Rays(
+        np.array([pose.origin_m for pose in poses], dtype=np.float64)[sensor],
+        np.concatenate(looking),
+        np.tile(part.range_m, (total, 1)),
+        sensor,
+        np.concatenate(times),
+    )
+
+
+def _chosen(directions: np.ndarray, count: int, wanted: Wanted | None) -> np.ndarray:
+    """An evenly spread subset of a part's rays, of the wanted ones first, shape (count, 3)."""
+    if count == len(directions) or wanted is None:
+        return directions[thinned(directions, count)]
+    mask = np.asarray(wanted(directions), dtype=bool)
+    first, other = np.flatnonzero(mask), np.flatnonzero(~mask)
+    if len(first) >= count:
+        return directions[first[thinned(directions[first], count)]]
+    rest = other[thinned(directions[other], count - len(first))]
+    return directions[np.sort(np.concatenate([first, rest]))]
+
+
+def boresight_of(frame: np.ndarray) -> tuple[float, float, float]:
+    """Azimuth, elevation and roll of a frame with the rows forward, horizontal, vertical; undoes `boresight_frame`."""
+    azimuth, elevation = (float(value) for value in angles(frame[0]))
+    upright = boresight_frame(azimuth, elevation)
+    return azimuth, elevation, math.atan2(float(frame[1] @ upright[2]), float(frame[1] @ upright[1]))
+
+
+def part_sensor(
+    part: Part,
+    pose: Pose,
+    *,
+    name: str = "s0",
+    weight: float = 1.0,
+    rays: int | None = None,
+    level: float = DEFAULT_LEVEL,
+) -> Sensor:
+    """The part as a component of design space: its field of view and its range are the intervals that hold `level`.
+
+    The boresight is the centre of the field. A field of a full turn is a ring about the part's axis, of which the
+    component is the Gaussian of the same extents; what the part does see is said by its rays.
+    """
+    azimuth, elevation, roll = boresight_of(boresight_frame(*part.centre_rad) @ pose.frame)
+    horizontal, vertical = part.field_of_view_rad
+    near, far = part.range_m
+    half = interval_factor(level)
+    return Sensor(
+        name=name,
+        weight=weight,
+        origin_m=np.asarray(pose.origin_m, dtype=np.float64),
+        origin_covariance_m2=np.zeros((3, 3)),
+        azimuth_rad=azimuth,
+        elevation_rad=elevation,
+        roll_rad=roll,
+        spread_horizontal_rad=horizontal / (2 * half),
+        spread_vertical_rad=vertical / (2 * half),
+        range_m=(near + far) / 2,
+        spread_range_m=(far - near) / (2 * half),
+        level=level,
+        rays=rays,
+    )
+
+
+def part_design(
+    part: Part,
+    poses: Pose | Sequence[Pose],
+    count: int | None = None,
+    *,
+    name: str | None = None,
+    level: float = DEFAULT_LEVEL,
+    wanted: Wanted | None = None,
+) -> Design:
+    """A design of real parts at poses, with the explicit rays of their patterns; see `part_rays`.
+
+    Its layout is `fixed`: at fewer rays it fires an evenly spread subset, more it does not have.
+
+    Raises:
+        ConfigError: See `part_rays`.
+    """
+    poses = [poses] if isinstance(poses, Pose) else list(poses)
+    rays = part_rays(part, poses, count, wanted=wanted)
+    azimuth, elevation = angles(rays.direction)
+    shares = np.bincount(rays.sensor, minlength=len(poses))
+    sensors = tuple(
+        part_sensor(part, pose, name=f"s{index}", weight=1 / len(poses), rays=int(shares[index]), level=level)
+        for index, pose in enumerate(poses)
+    )
+    return Design(
+        name=name or part.name.replace(":", "-"),
+        sensors=sensors,
+        layout="fixed",
+        rays=len(rays),
+        ray_table=RayTable(rays.origin_m, azimuth, elevation, rays.gate_m, rays.sensor),
+        provenance={"catalog": part.name, "product": part.product, "rate_hz": part.rate_hz},
+        level=level,
+    )
+
+
+def side_by_side(part: Part, pose: Pose, number: int) -> list[Pose]:
+    """Poses at one place whose fields of view stand beside each other around that of one pose."""
+    horizontal, vertical = part.field_of_view_rad
+    rows = grid_rows(horizontal, vertical, number)
+    across = np.concatenate([np.arange(n) - (n - 1) / 2 for n in rows])
+    up = np.repeat(np.arange(len(rows)) - (len(rows) - 1) / 2, rows)
+    return [_turned(pose, *shift) for shift in zip(across * horizontal, up * vertical, strict=True)]
+
+
+def interleaved(part: Part, pose: Pose, number: int) -> list[Pose]:
+    """Poses at one place that see the same, each with its rays between those of the others."""
+    horizontal, vertical = part.field_of_view_rad
+    columns, rows = part.grid
+    shifts = np.mod(low_discrepancy(number, 2) - low_discrepancy(1, 2) + 0.5, 1.0) - 0.5
+    pitch = np.array([horizontal / columns, vertical / rows])
+    return [_turned(pose, *shift) for shift in shifts * pitch]
+
+
+def _turned(pose: Pose, azimuth_rad: float, elevation_rad: float) -> Pose:
+    """A pose turned about its own place by an azimuth and an elevation in its own frame."""
+    return Pose(pose.origin_m, *boresight_of(boresight_frame(azimuth_rad, elevation_rad) @ pose.frame))
