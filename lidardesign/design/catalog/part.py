@@ -129,11 +129,11 @@ class Part:
 
     @property
     def histogram_mbps(self) -> float | None:
-        """What its histograms cost to read: rays x bins x bits x rate [Mbit/s]; None where it gives no histogram."""
+        """What its histograms cost to read: their number x bins x bits x rate [Mbit/s]; None where it gives none."""
         bins, bits = self.value("bins"), self.value("bits_per_bin")
         if bins is None or bits is None:
             return None
-        return self.rays * bins * bits * self.rate_hz / BITS_PER_MEGABIT
+        return (self.value("histograms") or self.rays) * bins * bits * self.rate_hz / BITS_PER_MEGABIT
 
     @property
     def processed_mbps(self) -> float | None:

@@ -32,7 +32,7 @@ class Source(_Keys):
     """Where figures come from."""
 
     title: Text
-    kind: Literal["datasheet", "manual", "product page", "simulator file", "driver", "paper", "measurement"]
+    kind: Literal["datasheet", "manual", "product page", "simulator file", "driver", "list", "paper", "measurement"]
     publisher: Text | None = None
     revision: Text | None = None
 
@@ -179,6 +179,7 @@ class Figures(_Keys):
         noise_m: Standard deviation of a range.
         accuracy_m, accuracy_percent: The largest error of a range, or its share.
         bins, bin_ps, bits_per_bin: The histogram that it gives per ray, where it gives one.
+        histograms: Histograms per frame, where they are not one per ray.
         frame_bytes: What it sends per frame when it processes histograms itself.
         points_per_s: Points that it sends per second.
     """
@@ -197,6 +198,7 @@ class Figures(_Keys):
     bins: Wholes | None = None
     bin_ps: Values | None = None
     bits_per_bin: Wholes | None = None
+    histograms: Wholes | None = None
     frame_bytes: Wholes | None = None
     points_per_s: Values | None = None
     power_w: Values | None = None
