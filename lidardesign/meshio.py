@@ -18,6 +18,7 @@ from lidardesign.numerics import ROUNDING
 from lidardesign.orientation import edge_defects, turned_to_agree, unique_rows
 from lidardesign.scene import Mesh, Sign
 from lidardesign.space import FARTHEST_M
+from lidardesign.vertex_weights import Painted, painted_weights
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 LARGEST_FILE_BYTES = 2 * 1024**3
@@ -43,29 +44,35 @@ def list_mesh_files(folder: str | Path) -> list[Path]:
     return files
 
 
-def load_mesh(path: str | Path, *, sign: Sign = "auto", scale: float = 1.0) -> Mesh:
+def load_mesh(
+    path: str | Path, *, sign: Sign = "auto", scale: float = 1.0, painted: Painted | None = None
+) -> Mesh:
     """A checked mesh from a file; all geometry in it becomes one mesh.
 
     Arguments:
         path: A file of one of the formats `SUFFIXES`.
         sign: How the inside is told from the outside, see `check_mesh`.
         scale: Factor from the file's unit to metres (0.001 for millimetres).
+        painted: Where the file has the importance of the surface; None: it counts 1 everywhere.
 
     Raises:
-        DataError: The file is missing, unreadable, empty, or its mesh cannot be used; the message names it.
+        DataError: The file is missing, unreadable, empty, or its mesh cannot be used, or it has no such importance; the
+            message names it.
     """
     path = Path(path)
     if not (np.isfinite(scale) and scale > 0):
         raise DataError(
             f"the scale {scale} is no factor to metres", where=str(path), allowed="a positive number"
         )
-    vertices, faces = _read(path)
+    vertices, faces, importance = _read(path, painted)
     with np.errstate(over="ignore", invalid="ignore"):  # what is too large is refused below
         vertices = vertices * scale
-    return check_mesh(vertices, faces, sign=sign, where=str(path))
+    return check_mesh(vertices, faces, sign=sign, where=str(path), importance=importance)
 
 
-def check_mesh(vertices: Any, faces: Any, *, sign: Sign = "auto", where: str = "mesh") -> Mesh:
+def check_mesh(
+    vertices: Any, faces: Any, *, sign: Sign = "auto", where: str = "mesh", importance: np.ndarray | None = None
+) -> Mesh:
     """A mesh without degenerate, duplicate or dangling parts, with a sign rule that it can bear.
 
     `auto` takes `solid` for a closed mesh, after turning faces that disagree with their neighbours, and `unsigned` for
@@ -77,6 +84,8 @@ def check_mesh(vertices: Any, faces: Any, *, sign: Sign = "auto", where: str = "
         faces: Vertex indices, shape (F, 3).
         sign: How the inside is told from the outside.
         where: The file or object that messages name.
+        importance: How much the surface counts at each vertex, shape (V,). Where vertices become one, it is their
+            geometric mean.
 
     Raises:
         DataError: Nothing usable is left, values are not finite, indices are wrong, or `sign` does not fit.
@@ -87,15 +96,20 @@ def check_mesh(vertices: Any, faces: Any, *, sign: Sign = "auto", where: str = "
     except (TypeError, ValueError) as error:
         raise DataError(f"vertices or faces are not numbers ({error})", where=where) from error
     _refuse_unusable(vertices, faces, where)
+    if importance is not None and np.shape(importance) != vertices.shape[:1]:
+        raise DataError(f"has {np.shape(importance)} weights for {len(vertices)} vertices", where=where)
     notes: list[str] = []
-    vertices, faces = _merge_vertices(vertices, faces.astype(np.int64))
+    vertices, faces, place = _merge_vertices(vertices, faces.astype(np.int64))
     faces = usable_faces(vertices, faces, notes)
     if not len(faces):
         raise DataError(f"no usable face is left ({'; '.join(notes)})", where=where)
     used, faces = np.unique(faces, return_inverse=True)
+    if importance is not None:
+        log_sums = np.bincount(place, np.log(importance), minlength=len(vertices))
+        importance = np.exp(log_sums / np.bincount(place, minlength=len(vertices)))[used]
     vertices, faces = vertices[used], faces.reshape(-1, 3)
     faces, rule = _oriented(vertices, faces, sign, notes, where)
-    return Mesh(vertices, faces, rule, tuple(notes))
+    return Mesh(vertices, faces, rule, tuple(notes), importance)
 
 
 def _refuse_unusable(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
@@ -129,11 +143,11 @@ def _refuse_unusable(vertices: np.ndarray, faces: np.ndarray, where: str) -> Non
         )
 
 
-def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices at exactly the same place become one, as formats without shared vertices (STL) need."""
+def _merge_vertices(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices at exactly the same place become one, as formats without shared vertices (STL) need; which one, (V,)."""
     vertices = vertices + 0.0  # -0.0 and 0.0 are one place
     first, index = unique_rows(vertices)
-    return vertices[first], index[faces]
+    return vertices[first], index[faces], index
 
 
 def usable_faces(vertices: np.ndarray, faces: np.ndarray, notes: list[str]) -> np.ndarray:
@@ -201,8 +215,8 @@ def signed_volume_m3(vertices: np.ndarray, faces: np.ndarray) -> float:
     return float(np.einsum("fk,fk->f", a, np.cross(b, c)).sum() / 6)
 
 
-def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of everything in a file, with every way to fail turned into a `DataError`."""
+def _read(path: Path, painted: Painted | None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Vertices, faces and weights of everything in a file, with every way to fail turned into a `DataError`."""
     where = str(path)
     if path.suffix.lower() not in SUFFIXES:
         raise DataError(f"has the suffix {path.suffix!r}", where=where, allowed=", ".join(SUFFIXES))
@@ -218,7 +232,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise DataError("is an empty file", where=where)
     try:
         with _quiet_trimesh():
-            return _geometry(path, data)
+            return _geometry(path, data, painted)
     except LidardesignError:
         raise
     # loaders raise anything on garbage: IndexError, KeyError, ModuleNotFoundError, struct.error
@@ -238,8 +252,10 @@ def _reason(error: Exception) -> str:
     return f"{type(error).__name__}: {(str(error) or 'no reason given').splitlines()[0]}"
 
 
-def _geometry(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """All triangles of a file as one mesh, each part at its place in the file's scene."""
+def _geometry(
+    path: Path, data: bytes, painted: Painted | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """All triangles of a file as one mesh, each part at its place in the file's scene; weights where asked for."""
     import trimesh
 
     suffix = path.suffix.lower()[1:]
@@ -251,7 +267,7 @@ def _geometry(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
     scene = trimesh.load_scene(
         io.BytesIO(data), file_type=suffix, resolver=_SameFolder(path), process=False, **options
     )
-    vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], 0
+    vertices, faces, weights, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], [np.zeros(0)], 0
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
         part = scene.geometry[name]
@@ -259,7 +275,9 @@ def _geometry(path: Path, data: bytes) -> tuple[np.ndarray, np.ndarray]:
             vertices.append(part.vertices @ transform[:3, :3].T + transform[:3, 3])
             faces.append(np.asarray(part.faces, dtype=np.int64) + count)
             count += len(part.vertices)
-    return np.concatenate(vertices), np.concatenate(faces)
+            if painted is not None:
+                weights.append(painted_weights(part, painted, str(path)))
+    return np.concatenate(vertices), np.concatenate(faces), np.concatenate(weights) if painted else None
 
 
 class _SameFolder:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -29,8 +29,22 @@ SPEED_OF_LIGHT_M_S = 299_792_458.0
 DENSEST = 1e9
 # A picometre is less than an atom; areas are squares of lengths and must stay numbers, as must what is divided by them.
 SMALLEST_M = 1 / 1e12
+# A part of a surface that counts a million times as much as another is what a density ever sees of it.
+LARGEST_WEIGHT = 1e6
 # Shares of light that were meant to add up to 1 may exceed it by rounding.
 SHARE_ROUNDING = SLACK
+
+
+def _check_weights(what: str, weights: np.ndarray, shape: tuple[int, ...] = ()) -> None:
+    if weights.shape != shape:
+        raise DataError(f"{what}: importance has the shape {weights.shape}", allowed=f"{shape}: one number each")
+    wrong = ~((weights >= 1 / LARGEST_WEIGHT) & (weights <= LARGEST_WEIGHT))
+    if wrong.any():
+        raise DataError(
+            f"{what}: importance is {weights[wrong].flat[0]:g}",
+            allowed=f"{1 / LARGEST_WEIGHT:g} to {LARGEST_WEIGHT:g}",
+            hint="what does not count at all is a body with the role occluder, or no part of the mesh",
+        )
 
 
 def _check_lengths(shape: object, *lengths_m: float, low: float = SMALLEST_M) -> None:
@@ -87,12 +101,15 @@ class Mesh:
         sign: How the inside is told from the outside: `solid` (closed and consistently wound), `winding`
             (generalised winding number beyond +-1/2), `unsigned` (no inside: distances are never negative).
         notes: What loading mended or found, one line each.
+        importance: How much the surface counts at each vertex, above 0, shape (V,); between vertices its logarithm is
+            interpolated. None: 1 everywhere.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     sign: Literal["solid", "winding", "unsigned"] = "solid"
     notes: tuple[str, ...] = ()
+    importance: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
@@ -112,14 +129,23 @@ class Mesh:
             raise DataError(f"a mesh of {len(vertices)} vertices has faces that name vertex {int(worst)}")
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", np.ascontiguousarray(faces, dtype=np.int32))
+        if self.importance is not None:
+            importance = np.ascontiguousarray(self.importance, dtype=np.float64)
+            _check_weights(f"a mesh of {len(vertices)} vertices", importance, vertices.shape[:1])
+            object.__setattr__(self, "importance", importance)
 
     @cached_property
     def content_hash(self) -> str:
-        """SHA-256 of vertices, faces and sign rule: the name of everything cached about this mesh."""
+        """SHA-256 of vertices, faces and sign rule: the name of everything cached about this geometry."""
         digest = hashlib.sha256(self.sign.encode())
         digest.update(self.vertices.tobytes())
         digest.update(self.faces.tobytes())
         return digest.hexdigest()
+
+    @cached_property
+    def importance_hash(self) -> str:
+        """SHA-256 of the importance, empty without one."""
+        return "" if self.importance is None else hashlib.sha256(self.importance.tobytes()).hexdigest()
 
     @cached_property
     def bounds_m(self) -> np.ndarray:
@@ -131,7 +157,7 @@ class Mesh:
 
     def transformed(self, pose: np.ndarray) -> Mesh:
         """The same surface with a rigid 4x4 pose applied to its vertices."""
-        return Mesh(self.vertices @ pose[:3, :3].T + pose[:3, 3], self.faces, self.sign, self.notes)
+        return replace(self, vertices=self.vertices @ pose[:3, :3].T + pose[:3, 3])
 
 
 Shape = Sphere | Box | Capsule | Plane | Mesh
@@ -228,6 +254,7 @@ class Body:
         transmission: Share of the light that each of its surfaces lets through, straight on, 0 to 1.
         velocity_m_s: How a body at rest in all frames moves within one [m/s]; bodies with a pose per frame move
             from each to the next.
+        importance: How much its surface counts as a target, above 0; a factor on that of its mesh.
     """
 
     shape: Shape
@@ -238,6 +265,7 @@ class Body:
     specular: float = 0.0
     transmission: float = 0.0
     velocity_m_s: Vector = (0.0, 0.0, 0.0)
+    importance: float = 1.0
 
     def __post_init__(self) -> None:
         poses = np.asarray(self.poses, dtype=np.float64)
@@ -266,6 +294,7 @@ class Body:
             specular=self.specular,
             transmission=self.transmission,
         )
+        _check_weights(f"body {self.name!r}", np.asarray(self.importance, dtype=np.float64))
         velocity = tuple(float(value) for value in self.velocity_m_s)
         if len(velocity) != 3 or not all(math.isfinite(value) for value in velocity):
             raise DataError(f"body {self.name!r}: velocity_m_s is {self.velocity_m_s}", allowed="three finite numbers")

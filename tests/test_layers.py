@@ -36,6 +36,7 @@ LAYERS = {
     "lidardesign.space": 2,
     "lidardesign.scene": 3,
     "lidardesign.orientation": 2,
+    "lidardesign.vertex_weights": 3,
     "lidardesign.meshio": 3,
     "lidardesign.simulate": 4,
     "lidardesign.simulate.hits": 4,

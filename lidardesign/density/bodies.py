@@ -38,6 +38,7 @@ class Grids:
         starts, counts, lows, inverse_steps: Where each grid begins and how it is placed, one row per grid.
         meshes: The mesh of each grid, from row 1 on.
         high: Upper corners of the grids, one row per grid.
+        log_weights: log importance at the points of `values`, float32; None: 0 everywhere.
     """
 
     values: np.ndarray
@@ -47,6 +48,7 @@ class Grids:
     inverse_steps: np.ndarray
     high: np.ndarray
     meshes: tuple[Mesh, ...]
+    log_weights: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +64,8 @@ class Bodies:
         column: The column of each, ascending, shape (B,).
         starts: Where each column begins, shape (columns + 1,).
         grids: Of the meshes.
+        log_weight: log importance: that of each as a whole, and with its mesh's the least and the largest, shape
+            (B, 3); None: 0 everywhere.
     """
 
     kinds: np.ndarray
@@ -73,6 +77,7 @@ class Bodies:
     column: np.ndarray
     starts: np.ndarray
     grids: Grids
+    log_weight: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.kinds)
@@ -118,7 +123,8 @@ class Bodies:
         counts = self.starts[columns + 1] - self.starts[columns]
         starts = np.concatenate([[0], np.cumsum(counts)])
         rows = np.arange(starts[-1]) - np.repeat(starts[:-1] - self.starts[columns], counts)
-        fields = {name: getattr(self, name)[rows] for name in ("kinds", "sizes", "to_body", "grid", "low", "high")}
+        names = ["kinds", "sizes", "to_body", "grid", "low", "high", *["log_weight"] * (self.log_weight is not None)]
+        fields = {name: getattr(self, name)[rows] for name in names}
         return replace(self, **fields, column=np.repeat(np.arange(len(columns)), counts), starts=starts)
 
     def apart(self) -> Bodies:
@@ -204,18 +210,19 @@ def size_of(body: Body) -> tuple[float, float, float]:
 
 def _grids(entries: Sequence[Entry], build_grid: BuildGrid) -> tuple[Grids, np.ndarray]:
     """One grid per distinct mesh, and the grid row of every entry."""
-    known: dict[str, int] = {}
+    known: dict[tuple[str, str], int] = {}
     meshes: list[Mesh] = []
     built: list[tuple[Grid, np.ndarray]] = []
     row = np.zeros(len(entries), dtype=np.int64)
     for index, (_, body, _) in enumerate(entries):
         mesh = body.shape
         if isinstance(mesh, Mesh):
-            if mesh.content_hash not in known:
-                known[mesh.content_hash] = len(meshes) + 1
+            name = mesh.content_hash, mesh.importance_hash
+            if name not in known:
+                known[name] = len(meshes) + 1
                 meshes.append(mesh)
                 built.append(build_grid(mesh))
-            row[index] = known[mesh.content_hash]
+            row[index] = known[name]
     # row 0 is a grid of one empty cell, so that the kernels always have something to index
     values = [np.zeros(8, np.float32), *(distances for _, distances in built)]
     lengths = [len(part) for part in values]

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import embedding_bag
 
 from lidardesign.density.fields import TableField
+from lidardesign.density.grids import Grid
 from lidardesign.density.target import Target
 from lidardesign.density.visibility import NoVisibility, Optics, Quadrature
 from lidardesign.numerics import logsumexp, safe_sqrt
@@ -39,18 +40,24 @@ class DeviceTarget(Target):
 
     @cached_property
     def _table(self) -> _Table:
-        return _Table(self.field, self.device)
+        return _Table(self.field.table, self.field.grid, self.device)
 
     @cached_property
     def _occluders(self) -> _Table | None:
         if isinstance(self.visibility, NoVisibility):
             return None
-        return self._table if self.visibility.field is self.field else _Table(self.visibility.field, self.device)
+        field = self.visibility.field
+        return self._table if field is self.field else _Table(field.table, field.grid, self.device)
+
+    @cached_property
+    def _weights(self) -> _Table | None:
+        importance = self.importance
+        return None if importance is None else _Table(importance.table, importance.grid, self.device)
 
     def drawn(self, columns: np.ndarray) -> DeviceTarget:
         """See `Target`; what is on the device stays there."""
         few = super().drawn(columns)
-        vars(few).update(_table=self._table, _occluders=self._occluders)
+        vars(few).update(_table=self._table, _occluders=self._occluders, _weights=self._weights)
         return few
 
     def log_density_of_unit(self, unit: Tensor, sigma_m: float | None = None) -> Tensor:
@@ -61,9 +68,12 @@ class DeviceTarget(Target):
 
     def _log_density(self, unit: Tensor, optics: Optics) -> Tensor:
         origins, toward, range_m = self._rays(unit)
-        distances = self._table.distances(origins + range_m[:, None] * toward)
+        observed = origins + range_m[:, None] * toward
+        distances = self._table.distances(observed)
         weights = torch.as_tensor(self.log_column_weights).to(unit)
         terms = weights - distances.square() / (2 * optics.sigma_m**2)
+        if self._weights is not None:
+            terms = terms + self._weights.values(observed)
         if self._occluders is not None:
             terms = terms - self._depth(origins, toward, range_m, optics)
         return logsumexp(terms, axis=1)
@@ -93,11 +103,10 @@ class DeviceTarget(Target):
 
 
 class _Table:
-    """A table of distances on a device."""
+    """A table of distances, or of other values, on a device: shape (grid points, columns)."""
 
-    def __init__(self, distances: TableField, device: torch.device) -> None:
-        grid = distances.grid
-        self._table = torch.as_tensor(distances.table).to(device)
+    def __init__(self, table: np.ndarray, grid: Grid, device: torch.device) -> None:
+        self._table = torch.as_tensor(table).to(device)
         self._low = torch.as_tensor(grid.low).to(device)
         self._counts = torch.as_tensor(grid.counts).to(device)
         self._corners = CORNERS.to(device)
@@ -105,18 +114,29 @@ class _Table:
 
     def distances(self, places: Tensor) -> Tensor:
         """Distances of all columns at places, (N, 3) to (N, columns): trilinear; a lower bound outside the grid."""
+        cells, inside = self._cells(places)
+        values = self._blended(inside)
+        beyond = ((cells - inside) * self._step).square().sum(dim=-1, keepdim=True)
+        outside = beyond > 0
+        return torch.where(outside, safe_sqrt(beyond + values.clamp(min=0).square()), values)
+
+    def values(self, places: Tensor) -> Tensor:
+        """Values of all columns at places, (N, 3) to (N, columns): trilinear; those at its faces outside the grid."""
+        return self._blended(self._cells(places)[1])
+
+    def _cells(self, places: Tensor) -> tuple[Tensor, Tensor]:
+        """Places in steps from the first grid point, and the nearest such places inside the grid, (N, 3) each."""
         cells = (places - self._low.to(places)) / self._step
-        inside = torch.minimum(cells.clamp(min=0), (self._counts - 1).to(places))
+        return cells, torch.minimum(cells.clamp(min=0), (self._counts - 1).to(places))
+
+    def _blended(self, inside: Tensor) -> Tensor:
         first = torch.minimum(inside.detach().long(), self._counts - 2)
         fraction = (inside - first)[:, None]
         corners = self._corners[None]
         weights = torch.where(corners > 0, fraction, 1 - fraction).prod(dim=-1)
         index = first[:, None] + corners
         rows = (index[..., 0] * self._counts[1] + index[..., 1]) * self._counts[2] + index[..., 2]
-        values = embedding_bag(rows, self._table.to(places.dtype), per_sample_weights=weights, mode="sum")
-        beyond = ((cells - inside) * self._step).square().sum(dim=-1, keepdim=True)
-        outside = beyond > 0
-        return torch.where(outside, safe_sqrt(beyond + values.clamp(min=0).square()), values)
+        return embedding_bag(rows, self._table.to(inside.dtype), per_sample_weights=weights, mode="sum")
 
 
 def on_device(target: Target, device: torch.device) -> Target:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidardesign.density.bodies import GROUP_COLUMNS, Bodies, collect_bodies
+from lidardesign.density.importance import BodyWeights, is_weighted, weigh
 from lidardesign.density.occlusion import BodyRaycast, NoOcclusion, Pairs
 from lidardesign.density.settings import DensitySettings
 from lidardesign.density.target import PAIRS_AT_ONCE, Target
@@ -34,10 +35,12 @@ class FramesTarget(Target):
     Arguments:
         field: The targets, sorted by column.
         visibility: How occlusion is computed.
+        importance: How much their surfaces count; None: 1 everywhere.
     """
 
     field: Bodies
     visibility: BodyRaycast | NoOcclusion
+    importance: BodyWeights | None = None
 
     @property
     def rows_at_once(self) -> int:
@@ -47,9 +50,11 @@ class FramesTarget(Target):
     def drawn(self, columns: np.ndarray) -> FramesTarget:
         """See `Target`: an estimate of p* from some columns alone, weighted to stand for all of them."""
         share = np.log(self.field.columns / len(columns))
+        field = self.field.take(columns)
         return replace(
             self,
-            field=self.field.take(columns),
+            field=field,
+            importance=None if self.importance is None else BodyWeights(field),
             visibility=self.visibility.take(columns),
             log_column_weights=self.log_column_weights[columns] + share,
         )
@@ -60,24 +65,35 @@ class FramesTarget(Target):
         observed, values = observed_point(points), np.empty(len(points))
         for start in range(0, len(points), self.rows_at_once):
             rows = slice(start, min(start + self.rows_at_once, len(points)))
-            pairs = self._pairs(observed[rows], sigma_m)
-            surface = self.log_column_weights[pairs.columns] - np.square(pairs.distances / sigma_m) / 2
+            pairs, surface = self._pairs(observed[rows], sigma_m)
             values[rows] = row_log_sums(surface, pairs)[0]
         return values
 
-    def _pairs(self, observed: np.ndarray, sigma_m: float) -> Pairs:
-        return near_pairs(self.field, observed, self.log_column_weights, sigma_m, self.surface_tolerance_nats)
+    def _pairs(self, observed: np.ndarray, sigma_m: float) -> tuple[Pairs, np.ndarray]:
+        """The pairs that matter and their surface terms, shape (P,)."""
+        if self.importance is None:
+            pairs = near_pairs(self.field, observed, self.log_column_weights, sigma_m, self.surface_tolerance_nats)
+            return pairs, self.log_column_weights[pairs.columns] - np.square(pairs.distances / sigma_m) / 2
+        # bounds know the most that a column may count, and by how much it may count less
+        weights, tolerance = self.log_column_weights + self.importance.column_peaks, self.surface_tolerance_nats
+        pairs = near_pairs(self.field, observed, weights, sigma_m, tolerance + self.importance.spread)
+        surface = self.log_column_weights[pairs.columns] - np.square(pairs.distances / sigma_m) / 2
+        surface += self.importance.of_pairs(observed, pairs)
+        best = np.maximum.reduceat(surface, pairs.row_starts[:-1])
+        kept = surface >= best[pairs.rows] - tolerance
+        return pairs.where(kept), surface[kept]
 
     def _evaluate(self, points: np.ndarray, optics: Optics, gradient: bool) -> tuple[np.ndarray, np.ndarray | None]:
         rays = RayBatch.of(points)
         observed = rays.observed
-        pairs = self._pairs(observed, optics.sigma_m)
-        surface = self.log_column_weights[pairs.columns] - np.square(pairs.distances / optics.sigma_m) / 2
+        pairs, surface = self._pairs(observed, optics.sigma_m)
         passed = self.visibility.blocked(rays, pairs, optics)
         values, shares = row_log_sums(surface + passed.log_values, pairs)
         if not gradient:
             return values, None
         by_point = self._surface_gradient(observed, pairs, -shares * pairs.distances / optics.sigma_m**2)
+        if self.importance is not None:
+            self.importance.add_pair_gradients(observed, pairs, shares, by_point)
         by_ray = RayGradient.zeros(len(points))
         passed.add_gradient(shares, by_ray)
         by_ray.add_by_point(by_point, rays)
@@ -103,6 +119,11 @@ def build_frames_target(
 ) -> FramesTarget:
     """The target of scenes whose targets are primitives or moving bodies; see `target.build_target`."""
     targets = collect_bodies(scenes, lambda body: body.is_target, resolution=resolution, padding_m=padding_m)
+    importance = None
+    if is_weighted(scenes):
+        entries = [body for scene in scenes for _ in range(scene.frames) for body in scene.bodies if body.is_target]
+        targets = weigh(targets, entries)
+        importance = BodyWeights(targets)
     return FramesTarget(
         field=targets,
         visibility=NoOcclusion() if visibility == "off" else BodyRaycast.of(scenes),
@@ -110,6 +131,7 @@ def build_frames_target(
         optics=Optics.of(settings),
         space=space,
         surface_tolerance_nats=settings.surface_tolerance_nats,
+        importance=importance,
     )
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import io
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,7 +73,8 @@ def distance_grid(mesh: Mesh, grid: Grid) -> np.ndarray:
     # relative to the grid's corner: squares of coordinates far from the origin would lose every digit
     points, vertices = Grid(np.zeros(3), grid.step, grid.counts).points(), mesh.vertices - grid.low
     faces = mesh.faces.astype(np.int64)
-    distance = _filled(*_narrow_band(points, vertices, faces, grid), points, grid)
+    distance, _, closest = narrow_band(points, vertices, faces, grid)
+    distance = _filled(distance, closest, points, grid)
     if mesh.sign != "unsigned":
         import igl
 
@@ -82,33 +84,37 @@ def distance_grid(mesh: Mesh, grid: Grid) -> np.ndarray:
     return distance.astype(np.float32)
 
 
-def _narrow_band(
+def narrow_band(
     points: np.ndarray, vertices: np.ndarray, faces: np.ndarray, grid: Grid
-) -> tuple[np.ndarray, np.ndarray]:
-    """Exact unsigned distances within the band (NaN beyond) and the closest surface points."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Exact unsigned distances within the band (NaN beyond), the closest faces and the closest surface points."""
     import igl
 
     unsigned = igl.SIGNED_DISTANCE_TYPE_UNSIGNED
     reach = BAND_CELLS * grid.step
-    distance, _, closest, _ = igl.signed_distance(
+    distance, face, closest, _ = igl.signed_distance(
         points, vertices, faces, sign_type=unsigned, lower_bound=0.0, upper_bound=reach
     )
     if np.isnan(distance).all():  # a surface that no grid point comes near: exact everywhere
-        distance, _, closest, _ = igl.signed_distance(points, vertices, faces, sign_type=unsigned)
-    return distance, closest
+        distance, face, closest, _ = igl.signed_distance(points, vertices, faces, sign_type=unsigned)
+    return distance, face, closest
 
 
-def _filled(distance: np.ndarray, closest: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray:
+def nearest_known(beyond: np.ndarray, grid: Grid) -> np.ndarray:
+    """For the grid points that are `beyond` a band, shape (size,) bool: the rows of the nearest ones that are not."""
     from scipy.ndimage import distance_transform_edt
 
-    beyond = np.isnan(distance)
-    if not beyond.any():
-        return distance
     nearest = distance_transform_edt(
         beyond.reshape(grid.counts), return_distances=False, return_indices=True
     ).reshape(3, -1)[:, beyond]
-    rows = np.ravel_multi_index(tuple(nearest), tuple(grid.counts))
-    filled = distance.copy()
+    return np.ravel_multi_index(tuple(nearest), tuple(grid.counts))
+
+
+def _filled(distance: np.ndarray, closest: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray:
+    beyond = np.isnan(distance)
+    if not beyond.any():
+        return distance
+    rows, filled = nearest_known(beyond, grid), distance.copy()
     filled[beyond] = np.linalg.norm(points[beyond] - closest[rows], axis=1)
     return filled
 
@@ -123,12 +129,31 @@ def cache_folder() -> Path:
 
 def cached_distance_grids(meshes: list[Mesh], grid: Grid, workers: int = 2) -> list[np.ndarray]:
     """One distance grid per mesh, from the cache where its content hash is known; damaged files are built again."""
+    return cached_grids(meshes, grid, distance_grid, lambda _: ALGORITHM, workers)
+
+
+def cached_grids(
+    meshes: list[Mesh],
+    grid: Grid,
+    build: Callable[[Mesh, Grid], np.ndarray],
+    named: Callable[[Mesh], str],
+    workers: int = 2,
+) -> list[np.ndarray]:
+    """What `build` makes of each mesh, shape (size,) float32: from the cache where it is known, else built and kept.
+
+    Arguments:
+        meshes: Any number.
+        grid: Where the values are.
+        build: Makes them.
+        named: What it does, and all that it depends on besides the geometry of mesh and grid.
+        workers: Threads.
+    """
 
     def load_or_build(mesh: Mesh) -> np.ndarray:
-        path = _cache_path(mesh, grid)
+        path = _cache_path(mesh, grid, named(mesh))
         loaded = _load(path, grid.size)
         if loaded is None:
-            loaded = distance_grid(mesh, grid)
+            loaded = build(mesh, grid)
             _store(path, loaded)
         return loaded
 
@@ -137,9 +162,9 @@ def cached_distance_grids(meshes: list[Mesh], grid: Grid, workers: int = 2) -> l
         return list(pool.map(load_or_build, meshes))
 
 
-def _cache_path(mesh: Mesh, grid: Grid) -> Path:
+def _cache_path(mesh: Mesh, grid: Grid, name: str) -> Path:
     digest = hashlib.sha256(mesh.content_hash.encode())
-    digest.update(ALGORITHM.encode())
+    digest.update(name.encode())
     digest.update(np.array([*grid.low, grid.step, *grid.counts]).tobytes())
     return cache_folder() / "fields" / f"{digest.hexdigest()}.npy"
 

@@ -72,7 +72,7 @@ def resampled_proposals(
     for _ in range(CANDIDATE_ROUNDS):
         candidates = target.space.sample(CANDIDATES, generator)
         log_proximity = target.log_proximity(candidates)
-        near = log_proximity > target.log_column_weights.max() - FARTHEST_SIGMAS**2 / 2
+        near = log_proximity > target.log_peak - FARTHEST_SIGMAS**2 / 2
         if near.any():
             break
     candidates, log_proximity = candidates[near], log_proximity[near]

@@ -39,6 +39,11 @@ class Pairs:
         """The ray of each pair, shape (P,)."""
         return np.repeat(np.arange(len(self.row_starts) - 1), np.diff(self.row_starts))
 
+    def where(self, kept: np.ndarray) -> Pairs:
+        """Those that a mask (P,) keeps."""
+        row_starts = np.concatenate([[0], np.cumsum(kept)])[self.row_starts]
+        return Pairs(row_starts, self.columns[kept], self.distances[kept], self.bodies[kept])
+
 
 @dataclass(frozen=True, eq=False)
 class Blocked:

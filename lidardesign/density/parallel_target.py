@@ -20,6 +20,7 @@ import numpy as np
 
 from lidardesign.density.fields import Field
 from lidardesign.density.frames import FramesTarget
+from lidardesign.density.importance import LogWeights
 from lidardesign.density.parallel import ALONE, Ranks
 from lidardesign.density.receiver import HeardVisibility, common_receiver
 from lidardesign.density.refinement import refine_quadrature
@@ -53,16 +54,49 @@ class GatheredField:
 
     def distances(self, points: np.ndarray) -> np.ndarray:
         """See `Field`."""
-        found = np.empty((self.columns, len(points)))
-        own = self.own.distances(points).T[: len(self.owned)]
-        found[self.order] = self.ranks.gather(own.astype(np.float64))
-        return np.ascontiguousarray(found.T)
+        return self.gathered(self.own.distances(points))
 
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """See `Field`."""
-        own = np.zeros((len(points), self.own.columns))
+        return self.ranks.sum(self.own.gradient(points, self.mine(weights)))
+
+    def gathered(self, own: np.ndarray) -> np.ndarray:
+        """The values of all columns from those that this rank holds, (N, held columns) to (N, columns)."""
+        found = np.empty((self.columns, len(own)))
+        found[self.order] = self.ranks.gather(own.T[: len(self.owned)].astype(np.float64))
+        return np.ascontiguousarray(found.T)
+
+    def mine(self, weights: np.ndarray) -> np.ndarray:
+        """The weights of the columns that this rank holds, 0 for one that it does not own: (N, held columns)."""
+        own = np.zeros((len(weights), self.own.columns))
         own[:, : len(self.owned)] = weights[:, self.owned]
-        return self.ranks.sum(self.own.gradient(points, own))
+        return own
+
+
+@dataclass(frozen=True, eq=False)
+class GatheredWeights:
+    """The log weights of all ranks' columns, in the order of one process: collective, for points that all share.
+
+    Arguments:
+        own: Those of this rank's columns.
+        field: Who holds what.
+    """
+
+    own: LogWeights
+    field: GatheredField
+
+    @property
+    def peak(self) -> float:
+        """See `LogWeights`, of all ranks."""
+        return float(self.field.ranks.max(np.array([self.own.peak]))[0])
+
+    def values(self, points: np.ndarray) -> np.ndarray:
+        """See `LogWeights`."""
+        return self.field.gathered(self.own.values(points))
+
+    def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """See `LogWeights`."""
+        return self.field.ranks.sum(self.own.gradient(points, self.field.mine(weights)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,10 +247,12 @@ def _shared(
     common = {"optics": part.optics, "space": part.space, "surface_tolerance_nats": part.surface_tolerance_nats}
     weights = _weights(log_weights, owned, part.columns)
     visibility = _with_thickest_shell(part.visibility, ranks)
-    own = OwnColumns(part.field, visibility, weights, ranks=ranks, **common)
+    own = OwnColumns(part.field, visibility, weights, ranks=ranks, importance=part.importance, **common)
     order, shell_m = ranks.gather(owned), np.zeros(columns)
     shell_m[order] = ranks.gather(part.field.shell_m[: len(owned)])
+    field = GatheredField(part.field, columns, owned, order, shell_m, ranks)
+    importance = None if part.importance is None else GatheredWeights(part.importance, field)
     return SharedTarget(
-        GatheredField(part.field, columns, owned, order, shell_m, ranks), visibility, log_weights,
+        field, visibility, log_weights, importance=importance,
         own=own, owned=owned, scenes=scenes, rows=_fewest(part.rows_at_once, ranks), ranks=ranks, **common,
     )  # fmt: skip

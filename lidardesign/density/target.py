@@ -1,9 +1,10 @@
 """The target density p*(d): how often, over the scenes of a task, a design point sees a surface (paper, eq. 3 to 5).
 
-log p*(d) = logsumexp_i [ log w_i - SDF_i(s)^2 / (2 sigma^2) + log T_i(d) ], s = M(d); one term per column, that is
-per scene, or per frame of a moving scene with w_i = 1 / frames. Visibility is only computed for columns whose
-surface term is within `surface_tolerance_nats` (t) of the best one at that point; the others are left out, which
-changes p* by less than columns * exp(-t) of the largest surface proximity there.
+log p*(d) = logsumexp_i [ log w_i(s) - SDF_i(s)^2 / (2 sigma^2) + log T_i(d) ], s = M(d); one term per column, that is
+per scene, or per frame of a moving scene. w_i is the column's own weight, 1 / frames, times the importance of the
+surface next to s, where there is one (`importance`). Visibility is only computed for columns whose surface term is
+within `surface_tolerance_nats` (t) of the best one at that point; the others are left out, which changes p* by less
+than columns * exp(-t) of the largest surface term there.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import ClassVar
 import numpy as np
 
 from lidardesign.density.fields import Field, TableField, build_field, scene_columns
+from lidardesign.density.importance import LogWeights, build_log_weights
 from lidardesign.density.locality import nearby_order
 from lidardesign.density.parallel import ALONE, Ranks
 from lidardesign.density.receiver import HeardVisibility, common_receiver
@@ -49,10 +51,11 @@ class Target:
     Arguments:
         field: Distances to the targets, one column per scene and frame.
         visibility: How occlusion is computed.
-        log_column_weights: log w_i per column, shape (columns,).
+        log_column_weights: log of the columns' own weights, shape (columns,).
         optics: The final sigma and what goes with it.
         space: The design space; it fixes the chart that gradients are given in.
         surface_tolerance_nats: See the module docstring.
+        importance: How much the surfaces count; None: 1 everywhere.
     """
 
     field: Field
@@ -61,6 +64,7 @@ class Target:
     optics: Optics
     space: DesignSpace
     surface_tolerance_nats: float = 16.0
+    importance: LogWeights | None = None
     ranks: ClassVar[Ranks] = ALONE  # who shares the columns
 
     @property
@@ -72,6 +76,11 @@ class Target:
     def rows_at_once(self) -> int:
         """How many points keep the memory bounded."""
         return int(np.clip(PAIRS_AT_ONCE // self.columns, 1, self.visibility.rows_at_once))
+
+    @property
+    def log_peak(self) -> float:
+        """What no surface term of a single column exceeds."""
+        return float(self.log_column_weights.max()) + (0.0 if self.importance is None else self.importance.peak)
 
     def drawn(self, columns: np.ndarray) -> Target:
         """An estimate of p* from some columns alone, weighted to stand for all; the others need no visibility."""
@@ -85,8 +94,9 @@ class Target:
         values = np.empty(len(points))
         for start in range(0, len(points), self.rows_at_once):
             rows = slice(start, start + self.rows_at_once)
-            distances = self.field.distances(observed_point(points[rows])).astype(np.float64)
-            values[rows] = logsumexp(self.log_column_weights - np.square(distances / sigma_m) / 2, axis=1)
+            observed = observed_point(points[rows])
+            distances = self.field.distances(observed).astype(np.float64)
+            values[rows] = logsumexp(self._surface_terms(observed, distances, sigma_m), axis=1)
         return values
 
     def log_density(self, points: np.ndarray, sigma_m: float | None = None) -> np.ndarray:
@@ -120,7 +130,7 @@ class Target:
         rays = RayBatch.of(points)
         observed = rays.observed
         distances = self.field.distances(observed).astype(np.float64)
-        surface = self.log_column_weights - np.square(distances / optics.sigma_m) / 2
+        surface = self._surface_terms(observed, distances, optics.sigma_m)
         active = surface >= self._best(surface) - self.surface_tolerance_nats
         passed = self.visibility.transmittance(rays, active, optics, differentiable=gradient)
         terms = np.where(active, surface + passed.log_values, -np.inf)
@@ -128,9 +138,16 @@ class Target:
         if not gradient:
             return values, None
         by_point = self.field.gradient(observed, -shares * distances / optics.sigma_m**2)
+        if self.importance is not None:
+            by_point += self.importance.gradient(observed, shares)
         by_ray = passed.gradient(shares)
         by_ray.add_by_point(by_point, rays)
         return values, self._by_chart(points, by_ray)
+
+    def _surface_terms(self, observed: np.ndarray, distances: np.ndarray, sigma_m: float) -> np.ndarray:
+        """log w - distance^2 / (2 sigma^2) at scene points (N, 3), shape (N, columns)."""
+        terms = self.log_column_weights - np.square(distances / sigma_m) / 2
+        return terms if self.importance is None else terms + self.importance.values(observed)
 
     def _best(self, surface: np.ndarray) -> np.ndarray:
         """The largest surface term of each point, (N, columns) to (N, 1)."""
@@ -201,6 +218,7 @@ def build_target(
     field = build_field(scenes, lambda body: body.is_target, around=around, **fields)
     if isinstance(field, TableField):
         field = replace(field, compiled=compiled)
+    importance = build_log_weights(scenes, field, around=around)
     way = _build_visibility(scenes, settings, visibility, field, {**fields, "around": around})
     return Target(
         field=field,
@@ -209,6 +227,7 @@ def build_target(
         optics=optics,
         space=space,
         surface_tolerance_nats=settings.surface_tolerance_nats,
+        importance=importance,
     )
 
 

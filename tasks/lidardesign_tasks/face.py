@@ -25,9 +25,10 @@ from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Residuals, Score, Split, random_generator
 from lidardesign_tasks.basel import MorphableModel, Unit, load_model
+from lidardesign_tasks.importance import Importance
 from lidardesign_tasks.pose import jittered_pose
 from lidardesign_tasks.surface import surface_residuals, surface_score, with_visible_truth
-from lidardesign_tasks.surroundings import Surroundings, any_direction, moving
+from lidardesign_tasks.surroundings import any_direction, moving
 
 Vector = tuple[float, float, float]
 # columns: the world's x, y, z are the model's z (out of the face), x (to the head's left) and y (up)
@@ -35,8 +36,8 @@ WORLD_AXES = [2, 0, 1]
 LARGEST_COEFFICIENT = 3.0  # identities further from the mean than this in any mode are cut: no faces are so
 
 
-class HeadConfig(Surroundings):
-    """The model, how many heads, how much they move, how finely they are judged, and what surrounds them."""
+class HeadConfig(Importance):
+    """The model, how many heads, how they move, how finely they are judged, what counts, and what surrounds them."""
 
     model: Path | None = Field(
         None, description="HDF5 file of a morphable model; empty: the embedded head model"
@@ -138,9 +139,12 @@ def head_scenes(
 
 
 class HeadFamily:
-    """The heads of a model in the world frame: cleaned faces, sign rule, and the nose tip as origin."""
+    """The heads of a model in the world frame: cleaned faces, sign rule, and the nose tip as origin.
 
-    def __init__(self, model: MorphableModel, sign: Sign, where: str) -> None:
+    What counts is measured on the mean head, and holds for the same vertices of all heads.
+    """
+
+    def __init__(self, model: MorphableModel, sign: Sign, where: str, importance: Importance | None = None) -> None:
         self.model = model
         notes = list(model.notes)
         self.faces = usable_faces(model.mean, model.faces, notes)
@@ -149,6 +153,7 @@ class HeadFamily:
         mean = model.mean[:, WORLD_AXES]
         self.nose_tip = mean[mean[:, 0].argmax()]
         self.centre = (mean - self.nose_tip)[np.unique(self.faces)].mean(axis=0)
+        self.weights = None if importance is None else importance.weights(mean - self.nose_tip, self.faces)
 
     @classmethod
     def load(cls, config: HeadConfig) -> HeadFamily:
@@ -158,15 +163,14 @@ class HeadFamily:
             DataError: The model cannot be used; see `load_model` and `check_mesh`.
         """
         if config.model is not None:
-            return cls(
-                load_model(config.model, unit=config.unit, modes=config.modes), config.sign, str(config.model)
-            )
-        return cls(_embedded_model(config.modes), config.sign, "the embedded head model")
+            model = load_model(config.model, unit=config.unit, modes=config.modes)
+            return cls(model, config.sign, str(config.model), config)
+        return cls(_embedded_model(config.modes), config.sign, "the embedded head model", config)
 
     def mesh(self, coefficients: np.ndarray) -> Mesh:
         """The head with standardised coefficients, in the world frame before its pose."""
         vertices = self.model.shape(coefficients)[:, WORLD_AXES] - self.nose_tip
-        return Mesh(vertices, self.faces, self.sign, self.notes)
+        return Mesh(vertices, self.faces, self.sign, self.notes, self.weights)
 
     def scene(
         self,

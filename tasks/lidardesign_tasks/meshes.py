@@ -26,9 +26,11 @@ from lidardesign.scene import Body, Mesh, Scene, Sign
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace, aim
 from lidardesign.task import Defaults, Metric, Residuals, Score, Split, random_generator
+from lidardesign.vertex_weights import Painted
+from lidardesign_tasks.importance import Importance
 from lidardesign_tasks.pose import jittered_pose
 from lidardesign_tasks.surface import surface_residuals, surface_score, with_visible_truth
-from lidardesign_tasks.surroundings import Surroundings, any_direction, moving
+from lidardesign_tasks.surroundings import any_direction, moving
 
 Vector = tuple[float, float, float]
 Axis = Literal["x", "y", "z"]
@@ -40,8 +42,8 @@ DOUBTFUL_EXTENT_M = 20.0  # an object that large is more likely in another unit
 ROOM = 1.1  # around the bounding sphere, for the pose jitter
 
 
-class MeshesConfig(Surroundings):
-    """Where the meshes are, how they are read, split and moved, what surrounds them, and where the sensor may be."""
+class MeshesConfig(Importance):
+    """Where meshes are, how they are read, split and moved, what counts, what is around, and where the sensor is."""
 
     folder: Path | None = Field(None, description="folder of mesh files (glb, gltf, obj, off, ply, stl)")
     scale: float = Field(1.0, gt=0, description="factor from the files' unit to metres (0.001 for mm)")
@@ -65,6 +67,12 @@ class MeshesConfig(Surroundings):
         5000, ge=100, le=200_000, description="points of the visible surface to judge by"
     )
     speed_m_s: float = Field(0.0, ge=0, le=100, description="how fast objects move within a frame, in any direction")
+    importance: str | None = Field(
+        None, min_length=1, description="vertex property of the files that says how much the surface counts, or colours"
+    )
+    colour_contrast: float = Field(
+        10.0, gt=1e-3, le=1e3, description="how many times as much white counts as black, with importance=colours"
+    )
 
 
 class MeshesTask:
@@ -132,7 +140,9 @@ def load_folder(config: MeshesConfig) -> list[tuple[str, Mesh]]:
     """Name and mesh of every file, in metres, z up, centred if so configured."""
     if config.folder is None:
         raise ConfigError("no folder of meshes is set", where="task.folder", hint="--set folder=PATH")
-    return _load(str(config.folder), config, config.sign, config.centre)
+    painted = None if config.importance is None else Painted(config.importance, config.colour_contrast)
+    meshes = _load(str(config.folder), config, config.sign, config.centre, painted)
+    return [(name, _weighted(mesh, config)) for name, mesh in meshes]
 
 
 def load_occluders(config: MeshesConfig) -> list[tuple[str, Mesh]]:
@@ -140,26 +150,36 @@ def load_occluders(config: MeshesConfig) -> list[tuple[str, Mesh]]:
     return _load(str(config.occluders), config, "auto", False) if config.occluders is not None else []
 
 
-def _load(folder: str, config: MeshesConfig, sign: Sign, centre: bool) -> list[tuple[str, Mesh]]:
+def _weighted(mesh: Mesh, config: MeshesConfig) -> Mesh:
+    """A mesh with what the configuration says of its importance, besides what its file says."""
+    weights = config.weights(mesh.vertices, mesh.faces)
+    if weights is None:
+        return mesh
+    return replace(mesh, importance=weights if mesh.importance is None else weights * mesh.importance)
+
+
+def _load(
+    folder: str, config: MeshesConfig, sign: Sign, centre: bool, painted: Painted | None = None
+) -> list[tuple[str, Mesh]]:
     meshes = []
     for path in list_mesh_files(folder):
         state = path.stat()
-        mesh = _load_file(path, state.st_mtime_ns, state.st_size, sign, config.scale, config.up, centre)
+        mesh = _load_file(path, state.st_mtime_ns, state.st_size, sign, config.scale, config.up, centre, painted)
         meshes.append((path.name, mesh))
     return meshes
 
 
 @lru_cache(maxsize=256)
 def _load_file(
-    path: Path, changed_ns: int, size: int, sign: Sign, scale: float, up: Axis, centre: bool
+    path: Path, changed_ns: int, size: int, sign: Sign, scale: float, up: Axis, centre: bool, painted: Painted | None
 ) -> Mesh:
     """One file; the same file unchanged is read once per process, as space and both splits need it."""
-    mesh = load_mesh(path, sign=sign, scale=scale)
+    mesh = load_mesh(path, sign=sign, scale=scale, painted=painted)
     vertices = mesh.vertices[:, WORLD_AXES[up]]
     if centre:
         vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     notes = [*mesh.notes, *_doubts_about_unit(vertices, scale)]
-    return Mesh(vertices, mesh.faces, mesh.sign, tuple(f"{path.name}: {note}" for note in notes))
+    return replace(mesh, vertices=vertices, notes=tuple(f"{path.name}: {note}" for note in notes))
 
 
 def _doubts_about_unit(vertices: np.ndarray, scale: float) -> list[str]:
