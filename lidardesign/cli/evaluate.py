@@ -6,6 +6,7 @@ import math
 import shlex
 import sys
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -33,7 +34,8 @@ ALWAYS = ("uniform", "random", "bounding")
 BASELINE_HELP = (
     "A further baseline beside uniform, random and bounding: occupancy (rays towards cells that targets occupy) or "
     "no-visibility (the first design fitted anew to the density without its occlusion term, from samples drawn for it: "
-    "some seconds). Repeatable."
+    "some seconds), catalog:NAME (a real part of `lidardesign catalog list` where it sees most; at a pose, in metres "
+    "and degrees: catalog:NAME@X,Y,Z,AZIMUTH,ELEVATION). Repeatable."
 )
 
 
@@ -241,7 +243,7 @@ def _common_run(entries: list[_Entry], runs: list[Run]) -> Run:
 def _request(
     run: Run, entries: list[_Entry], rays: list[int] | None, baselines: list[str], seed: int | None
 ) -> EvaluationRequest:
-    from lidardesign.cli.layouts import layouts_of, may_need_samples, twin_without_visibility
+    from lidardesign.cli.layouts import layouts_of, learned_density, may_need_samples, twin_without_visibility
     from lidardesign.design.samples import FILE_NAME, load_samples
     from lidardesign.evaluate.score import EvaluationRequest
 
@@ -274,6 +276,7 @@ def _request(
         test=run.scenes("test", seed),
         lay_out=layouts,
         without_visibility=(lambda: twin_without_visibility(*made[0], layouts)) if made else None,
+        density=cache(lambda: learned_density(made[0][1] if made else run)),
     )
 
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from lidardesign.density.target import Target
     from lidardesign.design.samples import Samples
     from lidardesign.design.sensor import Design
+    from lidardesign.evaluate.catalog import Density
     from lidardesign.simulate.returns import Rays
 
 # As many samples as the standard preset of `learn` leaves.
@@ -96,6 +97,14 @@ def twin_without_visibility(design: Design, run: Run, layouts: Layouts) -> tuple
         raise DataError("no ray of the design space comes near a target", where=f"--baseline {TWIN_NAME}")
     target = layouts.targets[TWIN_NAME]
     return fitted_twin(design, samples, name=TWIN_NAME, retarget=target), samples
+
+
+def learned_density(run: Run) -> Density | None:
+    """What a run has learned; None where it has no samples."""
+    from lidardesign.design.samples import FILE_NAME, load_samples
+    from lidardesign.evaluate.catalog import Density
+
+    return Density(load_samples(run.folder), RunTarget(run)) if (run.folder / FILE_NAME).exists() else None
 
 
 def layouts_of(runs: Sequence[tuple[str, Run]]) -> Layouts:

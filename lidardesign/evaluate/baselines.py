@@ -11,6 +11,7 @@ more candidate layouts; where there are several, the best on training scenes is 
 - `bounding`: see `lidardesign.evaluate.bounding`.
 - `occupancy`: see `lidardesign.evaluate.occupancy`.
 - `no-visibility`: see `lidardesign.evaluate.ablation`.
+- `catalog:NAME`: see `lidardesign.evaluate.catalog`.
 
 Where the density has conditions, every baseline is laid out at each of their values, in what is left free there.
 """
@@ -26,6 +27,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.bounding import bounding
 from lidardesign.evaluate.candidates import Candidate, Layout, Positions, Spot, whole_range
+from lidardesign.evaluate.catalog import Density, part_candidates, split_argument
 from lidardesign.evaluate.observed import TrainingViews
 from lidardesign.evaluate.occupancy import occupancy
 from lidardesign.evaluate.placement import RAY_AXES, even_placement
@@ -56,6 +58,7 @@ class Baselines:
         judge: What lists of rays are worth on training scenes, lower is better; None counts missing returns.
         conditions: The condition values that rays are laid out at.
         without_visibility: Makes the layout that stands for `no-visibility`; called when that is asked for.
+        density: What a run has learned, or None where it has no samples; called when a baseline looks there.
     """
 
     def __init__(
@@ -67,11 +70,12 @@ class Baselines:
         *,
         conditions: Sequence[Mapping[str, float]] = ({},),
         without_visibility: Callable[[], Candidate] | None = None,
+        density: Callable[[], Density | None] | None = None,
     ) -> None:
         self.space, self.train, self.seed = space, train, seed
         self.spaces = [space.at(condition) for condition in conditions]
         self.views = TrainingViews(space, train)
-        self.without_visibility = without_visibility
+        self.without_visibility, self.density = without_visibility, density
         self._judge = judge or self.views.missing_returns
         self._candidates: dict[str, list[Candidate]] = {}
         self._worth: dict[tuple[str, str, int], float] = {}
@@ -179,6 +183,10 @@ def _no_visibility(source: Baselines, argument: str) -> list[Candidate]:
     return [source.without_visibility()]
 
 
+def _catalog(source: Baselines, argument: str) -> list[Candidate]:
+    return list(part_candidates(source, argument))
+
+
 class Family(NamedTuple):
     """A kind of baseline: its name on the command line is `NAME`, or `NAME:ARGUMENT` where it takes one.
 
@@ -205,6 +213,7 @@ BASELINES: dict[str, Family] = {
     "bounding": Family(_bounding),
     "occupancy": Family(_occupancy),
     NO_VISIBILITY: Family(_no_visibility),
+    "catalog": Family(_catalog, "NAME", check=split_argument),
 }
 
 

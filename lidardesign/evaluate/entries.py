@@ -139,6 +139,7 @@ def _baselines(request: EvaluationRequest) -> Baselines:
         _judge(request),
         conditions=_conditions(request),
         without_visibility=_twin(request),
+        density=request.density,
     )
 
 
