@@ -62,6 +62,7 @@ HOMES = {
     "torch": ("lidardesign.density.",),
     "zuko": ("lidardesign.density.",),
     "embreex": ("lidardesign.simulate.triangles",),
+    "cma": ("lidardesign.evaluate.cma_search",),
     "mujoco": (),
     "mink": (),
     "typer": ("lidardesign.cli.",),
@@ -79,6 +80,7 @@ HOMES = {
 TORCH_SIDE_FILES = ("lidardesign.run.checkpoint",)
 SLOW_AT_TOP = {
     "torch",
+    "cma",
     "numba",
     "trimesh",
     "matplotlib",

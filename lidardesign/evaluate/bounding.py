@@ -56,7 +56,7 @@ def _parallel(views: TrainingViews, observed: Observed) -> Layout | None:
     return nothing.
     """
     space = views.space
-    azimuth, elevation = _parallel_angles(space, observed)
+    azimuth, elevation = parallel_angles(space, observed)
     looking = direction(azimuth, elevation)
     low, high = central(observed.hits_m)
     low, high = (np.clip(end, space.low[:3], space.high[:3]) for end in (low, high))
@@ -70,7 +70,7 @@ def _parallel(views: TrainingViews, observed: Observed) -> Layout | None:
     return _boxed("parallel", space, low, high, opened_gate(float(nearest), float(furthest)))
 
 
-def _parallel_angles(space: DesignSpace, observed: Observed) -> tuple[float, float]:
+def parallel_angles(space: DesignSpace, observed: Observed) -> tuple[float, float]:
     """Straight down where the space allows it, else straight up, else the median direction of the returns."""
     middle = np.median(observed.points[:, AZIMUTH])
     pole = math.pi / 2
