@@ -9,6 +9,7 @@ import typer
 
 from lidardesign import __version__
 from lidardesign.cli.capture import capture
+from lidardesign.cli.catalog import catalog_app
 from lidardesign.cli.console import EXIT_BROKEN_PIPE, Console, forget_stdout, print_json, report_error, tell
 from lidardesign.cli.constrain import constrain
 from lidardesign.cli.environment import make_streams_tolerant, set_cache_default, set_thread_defaults, terminate_cleanly
@@ -34,6 +35,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(tasks_app, name="tasks")
+app.add_typer(catalog_app, name="catalog")
 EXAMPLES = {
     learn: (
         "lidardesign learn face --preset draft --out runs/face",

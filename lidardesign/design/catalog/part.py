@@ -17,6 +17,7 @@ from lidardesign.errors import ConfigError
 
 BITS_PER_MEGABIT = 1e6
 BITS_PER_BYTE = 8
+CONDITIONS = ("reflectance_percent", "illuminance_klux", "detection_percent", "at")
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,3 +194,25 @@ def conditions_of(statement: Statement) -> str:
     if statement.detection_percent is not None:
         parts.append(f"{statement.detection_percent:g} % detected")
     return ", ".join(part for part in parts if part)
+
+
+def disagreements(part: Part) -> list[str]:
+    """Fields of which two sources give different figures for the same conditions."""
+    return [name for name, statements in part.figures.items() if _disagree(statements)]
+
+
+def _disagree(statements: Sequence[Statement]) -> bool:
+    """Whether two statements differ in what they say, but neither in conditions nor by having one source."""
+    told: dict[tuple[Any, ...], list[tuple[str, Any]]] = {}
+    for one in statements:
+        given = one.model_dump()
+        conditions = tuple(given.pop(name) for name in CONDITIONS)
+        source = given.pop("source")
+        given.pop("note")
+        told.setdefault(conditions, []).append((source, given))
+    return any(
+        first[0] != second[0] and first[1] != second[1]
+        for same in told.values()
+        for index, first in enumerate(same)
+        for second in same[index + 1 :]
+    )

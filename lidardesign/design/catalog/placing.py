@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from lidardesign.design.catalog.part import Part
 from lidardesign.design.catalog.thinning import thinned
-from lidardesign.design.grid import grid_rows, low_discrepancy
+from lidardesign.design.grid import grid_rows, grid_tangent
 from lidardesign.design.sensor import (
     DEFAULT_LEVEL,
     MOST_RAYS,
@@ -213,21 +213,27 @@ def part_design(
 
 
 def side_by_side(part: Part, pose: Pose, number: int) -> list[Pose]:
-    """Poses at one place whose fields of view stand beside each other around that of one pose."""
+    """Poses at one place whose fields of view stand beside each other, around that of one pose.
+
+    Fields of more than half a turn stand above each other; line scanners are rolled evenly over half a turn.
+    """
     horizontal, vertical = part.field_of_view_rad
-    rows = grid_rows(horizontal, vertical, number)
+    if vertical == 0:
+        return [replace(pose, roll_rad=pose.roll_rad + math.pi * index / number) for index in range(number)]
+    rows = np.ones(number, dtype=np.int64) if horizontal > math.pi else grid_rows(horizontal, vertical, number)
     across = np.concatenate([np.arange(n) - (n - 1) / 2 for n in rows])
     up = np.repeat(np.arange(len(rows)) - (len(rows) - 1) / 2, rows)
     return [_turned(pose, *shift) for shift in zip(across * horizontal, up * vertical, strict=True)]
 
 
 def interleaved(part: Part, pose: Pose, number: int) -> list[Pose]:
-    """Poses at one place that see the same, each with its rays between those of the others."""
+    """Poses at one place that see the same, each with its rays between those of the others.
+
+    The shifts are an even grid in one cell of the pattern: four parts of 8 x 8 zones have 16 x 16.
+    """
     horizontal, vertical = part.field_of_view_rad
     columns, rows = part.grid
-    shifts = np.mod(low_discrepancy(number, 2) - low_discrepancy(1, 2) + 0.5, 1.0) - 0.5
-    pitch = np.array([horizontal / columns, vertical / rows])
-    return [_turned(pose, *shift) for shift in shifts * pitch]
+    return [_turned(pose, *shift) for shift in grid_tangent(horizontal / columns, vertical / rows, number)]
 
 
 def _turned(pose: Pose, azimuth_rad: float, elevation_rad: float) -> Pose:
