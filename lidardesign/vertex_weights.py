@@ -80,14 +80,19 @@ def brightness(part: trimesh.Trimesh, where: str) -> np.ndarray:
 
 def vertex_properties(part: trimesh.Trimesh) -> dict[str, np.ndarray]:
     """The properties of a mesh's vertices by name, besides positions, normals and colours."""
-    found = {name: np.asarray(values) for name, values in part.vertex_attributes.items()}
+    found = {name: _alone(values) for name, values in part.vertex_attributes.items()}
     data = part.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
     names = getattr(getattr(data, "dtype", None), "names", None) or (data if isinstance(data, dict) else ())
     for name in names:
         if name not in POSITIONS:
-            values = np.asarray(data[name])
-            found[name] = values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
+            found[name] = _alone(data[name])
     return found
+
+
+def _alone(values: np.ndarray) -> np.ndarray:
+    """The values of a property; a column of one number each as a list of numbers."""
+    values = np.asarray(values)
+    return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
 
 
 def _checked(weights: np.ndarray, name: str, where: str) -> np.ndarray:

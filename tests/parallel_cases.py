@@ -26,7 +26,7 @@ SPACE = DesignSpace(LOW, HIGH)
 SETTINGS = DensitySettings(sigma_m=0.05, field_resolution=16)
 POINTS = 200
 SCENES = 5
-CASES = ("spheres", "frames", "meshes", "quadrature", "receiver")
+CASES = ("spheres", "frames", "meshes", "quadrature", "receiver", "importance")
 TRAINED = ("frames", "meshes", "receiver")
 STEPS = 10
 
@@ -42,11 +42,13 @@ def scenes_of_case(case: str) -> list[Scene]:
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.3)
     closed = Mesh(ball.vertices, ball.faces, sign="solid")
     opened = Mesh(ball.vertices, ball.faces[9:], sign="unsigned")
-    shape = closed if case in ("meshes", "quadrature") else Sphere(0.3)
+    shape = closed if case in ("meshes", "quadrature", "importance") else Sphere(0.3)
     receiver = Receiver((0.0, 0.3, 0.0), 0.0, 0.0, 1.5, 1.5, (0.1, 3.0)) if case == "receiver" else None
     shapes = [shape] * SCENES
     if case == "quadrature":  # an open surface in one scene widens the margin in all of them
         shapes[1] = opened
+    if case == "importance":  # one scene counts otherwise than the rest, on one rank
+        shapes[1] = Mesh(ball.vertices, ball.faces, importance=np.exp(5 * ball.vertices[:, 1]))
     bodies = [Body(one, poses=rigid(translation_m=place)) for one, place in zip(shapes, places, strict=True)]
     return [Scene((body, screen), receiver=receiver) for body in bodies]
 

@@ -13,14 +13,19 @@ from lidardesign.density.device_target import DeviceTarget, on_device
 from lidardesign.density.grids import grid_around
 from lidardesign.density.importance import BodyWeights, TableWeights, UnionWeights, is_weighted
 from lidardesign.density.independent import independent_points
+from lidardesign.density.learn import learn
 from lidardesign.density.objective import Coordinates, log_target
-from lidardesign.density.settings import DensitySettings
+from lidardesign.density.prepare import prepare_target
+from lidardesign.density.settings import DensitySettings, LearningSettings
 from lidardesign.density.target import build_target
 from lidardesign.density.weight_grids import barycentric, log_weight_grid
+from lidardesign.design.samples import load_samples
 from lidardesign.errors import DataError
 from lidardesign.numerics import logsumexp
+from lidardesign.run.config import RunConfig
 from lidardesign.scene import LARGEST_WEIGHT, Body, Box, Capsule, Mesh, Receiver, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, observed_point
+from lidardesign.task import Defaults, Metric, TaskConfig
 
 SPACE = DesignSpace((0, -0.1, -0.1, -0.5, -0.4, 0.3), (0, 0.1, 0.1, 0.5, 0.4, 2.2))
 SETTINGS = DensitySettings(sigma_m=0.05, field_resolution=24, quadrature_points=24)
@@ -352,3 +357,86 @@ def test_a_mesh_in_another_pose_counts_as_before():
     moved = mesh.transformed(rigid(translation_m=(1, 2, 3)))
     assert np.array_equal(moved.importance, mesh.importance)
     assert moved.importance_hash == mesh.importance_hash != ball().importance_hash == ""
+
+
+PATCH = trimesh.creation.box((0.02, 0.3, 0.3))
+PATCHES = DesignSpace((0, 0, 0, -0.5, -0.2, 0.6), (0, 0, 0, 0.5, 0.2, 1.4))
+
+
+class PatchesTask:
+    """Two equal patches side by side, of which the left one counts three times as much."""
+
+    name, summary, api_version = "patches", "two patches", 1
+    Config = TaskConfig
+    metric = Metric("hits", "-", "higher", 0.0, 0.0)
+    defaults = Defaults()
+
+    def space(self, config):
+        return PATCHES
+
+    def scenes(self, config, split, seed):
+        mesh = Mesh(PATCH.vertices, PATCH.faces)
+        heavy = replace(mesh, importance=np.full(len(mesh.vertices), 3.0))
+        poses = [rigid(translation_m=(1.0, y, 0)) for y in (0.25, -0.25)]
+        return [Scene((Body(heavy, poses=poses[0]), Body(mesh, poses=poses[1])))]
+
+    def score(self, scene, returns):
+        raise NotImplementedError
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    run = tmp_path_factory.mktemp("patches")
+    settings = LearningSettings(
+        steps=300, batch=256, layers=2, hidden=24, bins=12, samples=20_000, balance_proposals=8192, balance=0.6,
+        coverage_proposals=2048,
+    )  # fmt: skip
+    config = RunConfig(
+        task_name="patches", seed=1, preset="draft", task=TaskConfig(), space=PATCHES,
+        density=DensitySettings(sigma_m=0.03, field_resolution=48), learning=settings,
+    )  # fmt: skip
+    return learn(PatchesTask(), config, run), load_samples(run), config
+
+
+def test_a_patch_that_counts_three_times_gets_three_times_the_mass(learned):
+    result, samples, _ = learned
+    left = samples.points[:, 3] > 0
+    weighted = float(samples.weights[left].sum())
+    error = float(np.sqrt(np.square(samples.weights * (left - weighted)).sum()))
+    assert abs(weighted - 0.75) < 4 * error
+    assert error < 0.01
+    # and the flow itself, by no more than it has in the wrong place
+    assert abs(left.mean() - 0.75) < result.misplaced + 4 * np.sqrt(0.75 * 0.25 / len(left))
+
+
+def test_what_a_density_is_worth_is_measured_against_the_weighted_target(learned):
+    result, samples, config = learned
+    scenes = PatchesTask().scenes(config.task, "train", 1)
+    target = prepare_target(scenes, config, visibility="off")[0]
+    uniform = PATCHES.sample(400_000, np.random.default_rng(12))
+    values = np.exp(target.log_density(uniform))
+    log_z = np.log(values.mean()) + PATCHES.log_volume
+    error = values.std() / values.mean() / np.sqrt(len(values)) + result.error_estimates["log_z"].error
+    assert abs(result.log_z - log_z) < 4 * error
+    plain = replace(target, importance=None).log_density(samples.points)
+    assert np.allclose(samples.log_target, target.log_density(samples.points), atol=1e-6)
+    # left of the middle all that is near the left patch counts three times
+    sure = np.abs(samples.points[:, 3]) > 0.1
+    grown = (samples.log_target - plain)[sure]
+    assert np.allclose(grown, np.where(samples.points[sure, 3] > 0, np.log(3.0), 0.0), atol=0.01)
+    assert result.ess > 0.8
+    assert result.coverage > 0.97
+
+
+def test_samples_of_the_plain_density_reweighted_are_those_of_the_weighted_one(learned):
+    _, samples, config = learned
+    scenes = PatchesTask().scenes(config.task, "train", 1)
+    target = prepare_target(scenes, config, visibility="off")[0]
+    factors = replace(target, importance=None).log_density(samples.points) - target.log_density(samples.points)
+    back = samples.reweighted(factors)
+    share = float(back.weights[back.points[:, 3] > 0].sum())
+    assert share == pytest.approx(0.5, abs=0.02)
+    # shares of 3/4 and 1/4 weighted to halves: ESS = 1 / sum (1/2)^2 / share
+    halves = np.array([0.75, 0.25])
+    expected = 1.0 / (np.square(0.5 / halves) * halves).sum()
+    assert back.effective_sample_size == pytest.approx(expected * samples.effective_sample_size, abs=0.06)
