@@ -18,6 +18,7 @@ from lidardesign.cli.designs import number
 from lidardesign.cli.physics import Detector, Effects, RangeTolerance, ReturnTolerance, planner_of
 from lidardesign.cli.runs import open_run, read_design, run_of
 from lidardesign.cli.scores import show_evaluation
+from lidardesign.cli.searches import CmaSeconds, check_cma_seconds, searching, told
 from lidardesign.cli.times import keep_times
 from lidardesign.errors import ConfigError, DataError, ThresholdError
 from lidardesign.run.clock import phase
@@ -35,7 +36,8 @@ BASELINE_HELP = (
     "A further baseline beside uniform, random and bounding: occupancy (rays towards cells that targets occupy) or "
     "no-visibility (the first design fitted anew to the density without its occlusion term, from samples drawn for it: "
     "some seconds), catalog:NAME (a real part of `lidardesign catalog list` where it sees most; at a pose, in metres "
-    "and degrees: catalog:NAME@X,Y,Z,AZIMUTH,ELEVATION). Repeatable."
+    "and degrees: catalog:NAME@X,Y,Z,AZIMUTH,ELEVATION), cma (direct optimisation of the first design's sensors on "
+    "training scenes, for --cma-seconds). Repeatable."
 )
 
 
@@ -118,6 +120,7 @@ def evaluate(
     targets: Targets,
     rays: RayCounts = None,
     baseline: Baseline = None,
+    cma_seconds: CmaSeconds = None,
     effects: Effects = "auto",
     detector: Detector = "ideal",
     range_tolerance_mm: RangeTolerance = None,
@@ -145,6 +148,7 @@ def evaluate(
 
         wanted = check_workers(workers)
         _check_baselines(baseline or [])
+        check_cma_seconds(cma_seconds, baseline or [])
         planner, audit = planner_of(effects, detector, range_tolerance_mm, return_tolerance)
         entries, runs = _collect(targets, console)
         run = learned = _common_run(_named_apart(entries), runs)
@@ -155,7 +159,7 @@ def evaluate(
         if range_tolerance_mm is None:
             planner = replace(planner, tolerance=planner.tolerated.within(run.task.metric))
         request = replace(_request(run, entries, rays, baseline or [], seed), planner=planner, audit=audit)
-        evaluation = _evaluate_with(wanted, request, console)
+        evaluation = _evaluate_with(wanted, replace(request, cma=searching(cma_seconds)), console)
         written = _write_files(evaluation, request, report, plots, csv)
         if accuracy:  # it takes minutes: what was scored by then is written already
             evaluation = _with_accuracy(evaluation, request, learned, console)
@@ -301,7 +305,7 @@ def _evaluate(request: EvaluationRequest, console: Console) -> Evaluation:
             if bar is not None and line is not None:
                 bar.update(line, completed=done, total=total, row=row)
 
-        return score(request, progress=show)
+        return score(replace(request, cma=told(request.cma, request.task.metric, console, bar)), progress=show)
 
 
 def _check_measurable(run: Run) -> None:

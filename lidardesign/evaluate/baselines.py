@@ -12,6 +12,7 @@ more candidate layouts; where there are several, the best on training scenes is 
 - `occupancy`: see `lidardesign.evaluate.occupancy`.
 - `no-visibility`: see `lidardesign.evaluate.ablation`.
 - `catalog:NAME`: see `lidardesign.evaluate.catalog`.
+- `cma`: see `lidardesign.evaluate.cma_candidate`.
 
 Where the density has conditions, every baseline is laid out at each of their values, in what is left free there.
 """
@@ -39,6 +40,7 @@ from lidardesign.task import random_generator
 
 Judge = Callable[[Sequence[Positions]], Sequence[float]]
 NO_VISIBILITY = "no-visibility"
+CMA = "cma"
 
 
 class Option(NamedTuple):
@@ -59,6 +61,7 @@ class Baselines:
         conditions: The condition values that rays are laid out at.
         without_visibility: Makes the layout that stands for `no-visibility`; called when that is asked for.
         density: What a run has learned, or None where it has no samples; called when a baseline looks there.
+        optimised: Makes the layout that stands for `cma`; called when that is asked for.
     """
 
     def __init__(
@@ -71,11 +74,12 @@ class Baselines:
         conditions: Sequence[Mapping[str, float]] = ({},),
         without_visibility: Callable[[], Candidate] | None = None,
         density: Callable[[], Density | None] | None = None,
+        optimised: Callable[[TrainingViews], Candidate] | None = None,
     ) -> None:
         self.space, self.train, self.seed = space, train, seed
         self.spaces = [space.at(condition) for condition in conditions]
         self.views = TrainingViews(space, train)
-        self.without_visibility, self.density = without_visibility, density
+        self.without_visibility, self.density, self.optimised = without_visibility, density, optimised
         self._judge = judge or self.views.missing_returns
         self._candidates: dict[str, list[Candidate]] = {}
         self._worth: dict[tuple[str, str, int], float] = {}
@@ -187,6 +191,16 @@ def _catalog(source: Baselines, argument: str) -> list[Candidate]:
     return list(part_candidates(source, argument))
 
 
+def _cma(source: Baselines, argument: str) -> list[Candidate]:
+    if source.optimised is None:
+        raise ConfigError(
+            "there is no design whose sensors could be varied",
+            where=f"--baseline {CMA}",
+            allowed="at least one design",
+        )
+    return [source.optimised(source.views)]
+
+
 class Family(NamedTuple):
     """A kind of baseline: its name on the command line is `NAME`, or `NAME:ARGUMENT` where it takes one.
 
@@ -214,6 +228,7 @@ BASELINES: dict[str, Family] = {
     "occupancy": Family(_occupancy),
     NO_VISIBILITY: Family(_no_visibility),
     "catalog": Family(_catalog, "NAME", check=split_argument),
+    CMA: Family(_cma),
 }
 
 

@@ -31,7 +31,7 @@ from lidardesign.evaluate.placement import opened_gate
 from lidardesign.run.clock import phase
 from lidardesign.simulate.detector import IDEAL
 from lidardesign.space import DIMENSIONS, DesignSpace
-from lidardesign.task import random_generator
+from lidardesign.task import Metric, random_generator
 
 NAME = "cma"
 # Rays of a track are given at so many places, linear in between.
@@ -39,7 +39,22 @@ TRACK_PLACES = 2
 # A scan within a bandwidth has at most so many times the rays of the design that it follows.
 MOST_RAYS_FACTOR = 4
 
+DEFAULT_SECONDS = 60.0
+
 Show = Callable[[str, Progress], None]
+
+
+@dataclass(frozen=True)
+class CmaSettings:
+    """How the baseline `cma` searches.
+
+    Arguments:
+        budget: Of each search: every number of rays, and every bandwidth, is one.
+        show: Told where each search stands, with what it is for.
+    """
+
+    budget: Budget = field(default_factory=lambda: Budget(DEFAULT_SECONDS))
+    show: Show | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +76,22 @@ class Record:
     broken: Sequence[str]
     parameters: int
     design: Design
+
+    def note(self, followed: str, metric: Metric) -> str:
+        """What people are told of it.
+
+        Arguments:
+            followed: The name of the design whose sensors it varied.
+            metric: Of the values.
+        """
+        found = self.found
+        limit = "" if self.limit_mbps is None else f" in {self.limit_mbps:.3g} Mbit/s"
+        broken = f"; it breaks {', '.join(self.broken)}" * bool(self.broken)
+        return (
+            f"cma at {self.rays} rays{limit}: {self.parameters} numbers of the sensors of {followed} varied for "
+            f"{found.seconds:.0f} s, {found.candidates} candidates, {found.start_value:.4g} to {found.value:.4g} "
+            f"{metric.unit} on {found.scenes} training scenes{broken}"
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """The JSON form."""
@@ -94,10 +125,8 @@ class CmaCandidate:
         conditions: The condition values that rays are laid out at.
         views: The training scenes.
         objective: The metric on them.
-        budget: Of each search.
+        settings: How long each search takes.
         seed: Root of the random numbers.
-        show: Told where each search stands, with what it is for.
-        records: All searches so far.
     """
 
     followed: Design
@@ -105,13 +134,11 @@ class CmaCandidate:
     conditions: Sequence[Mapping[str, float]]
     views: TrainingViews
     objective: TrainingObjective
-    budget: Budget
+    settings: CmaSettings
     seed: int
-    show: Show | None = None
-    records: list[Record] = field(default_factory=list)
     name: str = NAME
     drawn_anew: bool = False
-    _known: dict[tuple[int | None, float | None], Positions] = field(default_factory=dict)
+    _known: dict[tuple[int | None, float | None], tuple[Positions, Record]] = field(default_factory=dict)
 
     def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
         """See `lidardesign.evaluate.candidates.Candidate`."""
@@ -127,13 +154,17 @@ class CmaCandidate:
             models = self._models(amount)
             generator = random_generator(self.seed, "cma", str(key))
             label = f"cma, {amount.count} rays" if amount.count else f"cma, {amount.limit_mbps:.3g} Mbit/s"
-            show = None if self.show is None else (lambda progress: self.show(label, progress))
-            found = Search(models, amount, self.objective, self.budget, generator, show).run()
+            told = self.settings.show
+            show = None if told is None else (lambda progress: told(label, progress))
+            found = Search(models, amount, self.objective, self.settings.budget, generator, show).run()
             if not self._varies_gates(amount):
                 found = self._cropped(found, amount)
-            self._known[key] = found.model.positions(found.vector, amount)
-            self.records.append(self._record(found, amount))
-        return self._known[key]
+            self._known[key] = found.model.positions(found.vector, amount), self._record(found, amount)
+        return self._known[key][0]
+
+    def record_of(self, positions: Positions) -> Record | None:
+        """How these rays were found."""
+        return next((record for known, record in self._known.values() if known is positions), None)
 
     def _varies_gates(self, amount: Amount) -> bool:
         """Whether a wider gate could be worse: where it costs, where it is bounded, or where light is counted."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -13,8 +13,11 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.track import travels
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.ablation import TwinCandidate
-from lidardesign.evaluate.baselines import Baselines, Judge, Option
+from lidardesign.evaluate.baselines import CMA, Baselines, Judge, Option
 from lidardesign.evaluate.candidates import Candidate, Positions, mean_mbps
+from lidardesign.evaluate.cma_candidate import CmaCandidate, Record
+from lidardesign.evaluate.cma_objective import TrainingObjective
+from lidardesign.evaluate.observed import TrainingViews
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.scoring import score_lists
 from lidardesign.registry import plugin_guard
@@ -38,6 +41,7 @@ class Entry:
         baseline: Whether it is a baseline.
         redraw: Rays of a scene, for what is drawn anew in each.
         matched_to, matched_rays: The design and its number of rays whose bandwidth this baseline was given.
+        search: How a direct search found its rays.
     """
 
     name: str
@@ -46,6 +50,7 @@ class Entry:
     redraw: Callable[[int], Positions] | None = None
     matched_to: str | None = None
     matched_rays: int | None = None
+    search: Record | None = None
 
     @property
     def rays(self) -> int:
@@ -88,6 +93,7 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
             _Wanted(name, baselines.options_within(name, entry.mbps(request.bandwidth), request.bandwidth), entry)
             for entry in designs
             for name in request.baselines
+            if name != CMA or entry.name == request.designs[0].name
         ]
     chosen = baselines.best([(one.name, one.options) for one in wanted])
     return designs + [_entry(baselines, one, option) for one, option in zip(wanted, chosen, strict=True)]
@@ -125,10 +131,10 @@ def _entry(baselines: Baselines, wanted: _Wanted, option: Option) -> Entry:
         def redraw(scene: int) -> Positions:
             return candidate.positions(baselines.spaces, count, scene)
 
+    search = candidate.record_of(option.positions) if isinstance(candidate, CmaCandidate) else None
+    made = Entry(wanted.name, option.positions, True, redraw, search=search)
     matched = wanted.matched
-    if matched is None:
-        return Entry(wanted.name, option.positions, True, redraw)
-    return Entry(wanted.name, option.positions, True, redraw, matched.name, matched.rays)
+    return made if matched is None else replace(made, matched_to=matched.name, matched_rays=matched.rays)
 
 
 def _baselines(request: EvaluationRequest) -> Baselines:
@@ -140,6 +146,7 @@ def _baselines(request: EvaluationRequest) -> Baselines:
         conditions=_conditions(request),
         without_visibility=_twin(request),
         density=request.density,
+        optimised=_optimised(request),
     )
 
 
@@ -167,6 +174,25 @@ def _twin(request: EvaluationRequest) -> Callable[[], Candidate] | None:
     def candidate() -> Candidate:
         design, samples = make()
         return TwinCandidate(design, samples, _conditions(request), request.lay_out)
+
+    return candidate
+
+
+def _optimised(request: EvaluationRequest) -> Callable[[TrainingViews], Candidate] | None:
+    """What makes the layout of `cma`, about the first design."""
+    if not request.designs:
+        return None
+
+    def candidate(views: TrainingViews) -> Candidate:
+        return CmaCandidate(
+            followed=request.designs[0],
+            space=request.space,
+            conditions=_conditions(request),
+            views=views,
+            objective=TrainingObjective(request.task, request.train, request.planner, request.seed),
+            settings=request.cma,
+            seed=request.seed,
+        )
 
     return candidate
 

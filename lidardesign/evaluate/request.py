@@ -15,6 +15,7 @@ from lidardesign.errors import ConfigError, PluginError
 from lidardesign.evaluate.ablation import LayOut
 from lidardesign.evaluate.baselines import baseline_of, is_baseline
 from lidardesign.evaluate.catalog import Density
+from lidardesign.evaluate.cma_candidate import CmaSettings
 from lidardesign.evaluate.passes import Scorer, score_here
 from lidardesign.scene import Scene
 from lidardesign.simulate.plan import Planner
@@ -42,6 +43,7 @@ class EvaluationRequest:
         without_visibility: The design that stands for the baseline `no-visibility`, and the samples that it was
             fitted to; called when that is asked for.
         density: What was learned, for baselines that look where it is; None where a run has no samples.
+        cma: How long the baseline `cma` searches, and who is told how it stands.
         planner: The detector, and how the effects that are simulated are chosen.
         audit: Whether all rows are scored under all effects too.
         scorer: What scores the held-out scenes: this process, or workers (`evaluate.workers`) to the same numbers.
@@ -62,6 +64,7 @@ class EvaluationRequest:
     lay_out: LayOut = lay_out
     without_visibility: Callable[[], tuple[Design, Samples]] | None = None
     density: Callable[[], Density | None] | None = None
+    cma: CmaSettings = field(default_factory=CmaSettings)
     planner: Planner = field(default_factory=Planner)
     audit: bool = False
     scorer: Scorer = score_here

@@ -18,6 +18,7 @@ from lidardesign.task import Metric
 if TYPE_CHECKING:
     from lidardesign.evaluate.accuracy import Accuracy
     from lidardesign.evaluate.audit import Audit
+    from lidardesign.evaluate.cma_candidate import Record
     from lidardesign.evaluate.effects import EffectSummary
 
 
@@ -127,6 +128,7 @@ class Evaluation:
         planning_seconds: Time to find that out [s].
         audit: The same rows under all effects, where that was asked for.
         accuracy: What accuracy costs in time, where that was asked for.
+        searches: How the rows of `cma` were found, where they were asked for.
     """
 
     metric: Metric
@@ -141,6 +143,7 @@ class Evaluation:
     planning_seconds: float = 0.0
     audit: Audit | None = None
     accuracy: Accuracy | None = None
+    searches: Sequence[Record] = ()
 
     def estimates(self) -> dict[str, Estimate]:
         """The designs' values and their differences to the baselines with half of their intervals, by what they are."""
@@ -180,6 +183,7 @@ class Evaluation:
             "planning_seconds": self.planning_seconds,
             "accuracy": [] if self.accuracy is None else self.accuracy.as_rows(),
             "notes": list(self.notes),
+            "cma": [search.as_dict() for search in self.searches],
             "error_estimates": as_documents(self.estimates()),
         }
         return values if self.audit is None else {**values, "audit": self.audit.as_dict()}

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.evaluate.audit import Audit, audit_rows
+from lidardesign.evaluate.cma_candidate import Record
 from lidardesign.evaluate.effects import effect_notes, summaries
 from lidardesign.evaluate.entries import Entry, entries_of
 from lidardesign.evaluate.passes import Progress, ScenePass
@@ -81,6 +82,7 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
     rows = _rows(request, entries, scored)
     effects = summaries(scored.plans)
     audit = _audit(request, entries, rows, scored.plans, _part(progress, 1, passes)) if request.audit else None
+    searches = [entry.search for entry in entries if entry.search is not None]
     plain = [row for row in rows if row.matched_to is None]
     matched = [row for row in rows if row.matched_to is not None]
     return Evaluation(
@@ -92,6 +94,7 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
         paired_bandwidth=_bandwidth_pairs(plain, matched, request.seed),
         notes=[
             *_notes(request, entries, matched),
+            *search_notes(searches, request),
             *slipped_notes(scored.second_casts),
             *effect_notes(effects, request.planner.choice),
         ],
@@ -99,6 +102,7 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
         effects=effects,
         planning_seconds=scored.planning_seconds,
         audit=audit,
+        searches=searches,
     )
 
 
@@ -225,6 +229,11 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
             f"at equal bandwidth not one ray of {names} fits in {len(empty)} rows, which fail in every scene"
         )
     return notes
+
+
+def search_notes(searches: Sequence[Record], request: EvaluationRequest) -> list[str]:
+    """How the rows of `cma` were found."""
+    return [record.note(request.designs[0].name, request.task.metric) for record in searches]
 
 
 def slipped_notes(casts: SecondCasts) -> list[str]:
