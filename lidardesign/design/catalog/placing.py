@@ -52,17 +52,12 @@ class Pose:
 
 
 def looking_at(part: Part, origin_m: np.ndarray, azimuth_rad: float, elevation_rad: float) -> Pose:
-    """The pose, without roll where its field is centred, in which the centre of a part's field looks somewhere.
+    """The pose in which the centre of a part's field looks somewhere, with its field upright there.
 
-    A field that is not centred on the forward axis is turned with the part: the axis tilts by what the centre is off.
+    A part whose field is not centred on its forward axis is tilted by what the centre is off.
     """
-    azimuth, elevation = part.centre_rad
-    tilted = math.remainder(elevation_rad - elevation, 2 * math.pi)
-    if abs(tilted) <= math.pi / 2:
-        return Pose(np.asarray(origin_m, dtype=np.float64), azimuth_rad - azimuth, tilted)
-    # over the zenith: the part stands on its head on the other side
-    over = math.copysign(math.pi, tilted) - tilted
-    return Pose(np.asarray(origin_m, dtype=np.float64), azimuth_rad - azimuth + math.pi, over, math.pi)
+    frame = boresight_frame(*part.centre_rad).T @ boresight_frame(azimuth_rad, elevation_rad)
+    return Pose(np.asarray(origin_m, dtype=np.float64), *boresight_of(frame))
 
 
 def covered(part: Part, pose: Pose, points: np.ndarray) -> np.ndarray:

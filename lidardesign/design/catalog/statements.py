@@ -8,15 +8,25 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from lidardesign.design.sensor import MOST_RAYS
+from lidardesign.run.kinds import is_name
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Percent = Annotated[float, Field(gt=0, le=100)]
 Count = Annotated[int, Field(ge=1, le=MOST_RAYS)]
-Text = Annotated[str, Field(min_length=1, max_length=500, pattern=r"^[^\x00-\x1f\x7f]*\S[^\x00-\x1f\x7f]*$")]
+
+
+def _shown(text: str) -> str:
+    """Text that may be shown: not blank, and without characters that steer a terminal."""
+    if not is_name(text):
+        raise ValueError("is blank, or has characters that steer a terminal")
+    return text
+
+
+Text = Annotated[str, Field(max_length=500), AfterValidator(_shown)]
 Angle = Annotated[float, Field(ge=-180, le=180)]
 Elevation = Annotated[float, Field(ge=-90, le=90)]
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
@@ -226,7 +236,7 @@ class PartFile(Figures):
     product: Text
     kind: Literal["single zone", "multi-zone", "flash", "spinning", "scanner", "line scanner", "rosette"]
     summary: Text
-    sources: dict[str, Source]
+    sources: dict[Text, Source]
     modes: dict[Annotated[str, Field(pattern=MODE_NAME)], Figures] = {}
 
     def figures(self, mode: str | None) -> dict[str, list[Any]]:
