@@ -11,6 +11,7 @@ What the bounds mean, here and in `check`, which verifies them on the finished f
   each axis, and no start of a ray; samples are taken from outside them, and where one takes part of the origin box
   the intervals keep to that box too (see `origins`);
 - `boresight.azimuth_deg` is an interval on the circle: with `min` above `max` it passes through 0;
+- `snap` replaces sensors by real parts (see `snap`), whose fields of view and gates then keep these bounds;
 - every gate stays inside the range bounds of the design space, whatever the file says.
 
 Entries of `each` apply to the first, second, ... sensor over the common keys.
@@ -19,9 +20,16 @@ Entries of `each` apply to the first, second, ... sensor over the common keys.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
 from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import ConfigError
@@ -32,6 +40,8 @@ Distance = Annotated[float, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
 # The boxes between excluded ones grow faster than their number: with so many a fit still takes seconds.
 MOST_EXCLUDED = 32
+# The short form of `snap`.
+CATALOG = "catalog"
 # So many components of a mixture over all samples fill some 100 MB; a scan has its rays instead.
 MOST_FITTED = 1000
 Count = Annotated[int, Field(ge=1, le=MOST_FITTED)]
@@ -157,6 +167,31 @@ class Budget(_Keys):
     rate_hz: Annotated[float, Field(ge=0.001, le=1e12)] = 10.0
 
 
+class Snap(_Keys):
+    """Which parts sensors are replaced by; the text `catalog` says all that are shipped.
+
+    Arguments:
+        parts: Names, `NAME:MODE`, or paths of part files and folders; None is the whole catalogue.
+        otherwise: What becomes of a sensor for which no part keeps its constraints: `refuse`, or `keep` it as fitted.
+        pose: Whether parts look where the sensors did (`fitted`), or where they are likeliest (`refitted`).
+    """
+
+    parts: Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)] | None = None
+    otherwise: Literal["refuse", "keep"] = "refuse"
+    pose: Literal["fitted", "refitted"] = "refitted"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short_form(cls, value: Any) -> Any:
+        if isinstance(value, str) and value != CATALOG:
+            raise ValueError(f"{value!r} is no mapping; the short form is {CATALOG!r}")
+        return {} if value == CATALOG else value
+
+    @model_serializer(mode="wrap")
+    def _short_text(self, handler: SerializerFunctionWrapHandler) -> Any:
+        return handler(self) or CATALOG
+
+
 class SensorConstraints(_Keys):
     """The keys that may also stand under `each`."""
 
@@ -164,6 +199,7 @@ class SensorConstraints(_Keys):
     boresight: Boresight = Boresight()
     field_of_view: FieldOfView = FieldOfView()
     gate: Gate = Gate()
+    snap: Snap | None = None
 
 
 class Constraints(SensorConstraints):

@@ -53,7 +53,9 @@ COVARIANCE_ROUNDING = SLACK
 REQUIRED = ("schema_version", "sensors")
 OPTIONAL = ("name", "layout", "level", "rays", "at", "ray_table", "track", "constraints", "provenance")
 SENSOR_REQUIRED = ("origin_m", "boresight")
-SENSOR_OPTIONAL = ("name", "weight", "field_of_view_rad", "gate_m", "range_m", "spread", "travel_m", "coupling", "rays")
+SENSOR_OPTIONAL = (
+    "name", "part", "weight", "field_of_view_rad", "gate_m", "range_m", "spread", "travel_m", "coupling", "rays",
+)  # fmt: skip
 COUPLING_KEYS = ("direction_rad_per_m", "range_m_per_m", "range_m_per_rad", "spread_rad", "spread_m")
 TABLE_KEYS = (
     "origin_x_m",
@@ -273,6 +275,7 @@ def _sensor(node: Node, index: int, level: float) -> Sensor:
         level=level,
         rays=keys["rays"].integer(0, MOST_RAYS) if "rays" in keys else None,
         coupling=_coupling(keys["coupling"]) if "coupling" in keys else None,
+        part=keys["part"].text() if "part" in keys else None,
     )
     if "travel_m" in keys:
         _check_travel(keys["travel_m"], sensor)

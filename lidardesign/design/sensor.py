@@ -111,6 +111,7 @@ class Sensor:
         level: The share of each marginal that its reported interval holds.
         rays: Rays per frame, where the design fixes them.
         coupling: How direction and range follow from the origin; None where they are independent.
+        part: The part of the catalogue that it is, where it is one.
     """
 
     name: str
@@ -127,6 +128,7 @@ class Sensor:
     level: float = DEFAULT_LEVEL
     rays: int | None = None
     coupling: Coupling | None = None
+    part: str | None = None
 
     @cached_property
     def frame(self) -> np.ndarray:
@@ -168,8 +170,10 @@ class Sensor:
         horizontal, vertical = self.field_of_view_rad
         start, end = self.gate_m
         length, along = self.travel_m
+        part = {} if self.part is None else {"part": self.part}
         return {
             "name": self.name,
+            **part,
             "weight": float(self.weight),
             "origin_m": {
                 "mean": [float(v) for v in self.origin_m],

@@ -17,26 +17,24 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.catalog.library import find_part
 from lidardesign.design.catalog.part import Part
 from lidardesign.design.catalog.placing import Pose, interleaved, part_rays, parts_for, side_by_side
+from lidardesign.design.part_views import worth_firing
 from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.design.shapes import gate_inside
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.candidates import Positions, whole_range
 from lidardesign.evaluate.observed import TrainingViews, dense_points
-from lidardesign.evaluate.part_poses import POINTS, PosedPart, Retarget, ScenePoints, in_view
+from lidardesign.evaluate.part_poses import POINTS, PosedPart, Retarget, ScenePoints
 from lidardesign.numerics import EPSILON, systematic_draw
 from lidardesign.simulate.returns import Rays
-from lidardesign.space import AZIMUTH, DesignSpace, aim, direction, observed_point
+from lidardesign.space import DesignSpace
 from lidardesign.task import random_generator
 
-# Rays are worth firing that see this share of what the part could see: the rest are strays.
-SEEN_SHARE = 0.99
 POSE_NUMBERS = (5, 6)
 FORM = "NAME@X,Y,Z,AZIMUTH,ELEVATION[,ROLL] in metres and degrees"
 
@@ -180,9 +178,11 @@ class PartCandidate:
 
     def _fired(self, count: int) -> Rays:
         poses = self._poses(parts_for(self.part, count))
+        points = self.scene.brought_back()
+        even = np.ones(len(points))
         shares = [count // len(poses) + (index < count % len(poses)) for index in range(len(poses))]
         lists = [
-            part_rays(self.part, pose, share, wanted=None if share == self.part.rays else self._wanted(pose))
+            part_rays(self.part, pose, share, wanted=worth_firing(self.part, pose, points, even))
             for pose, share in zip(poses, shares, strict=True)
         ]
         return Rays(
@@ -192,25 +192,6 @@ class PartCandidate:
             np.repeat(np.arange(len(poses)), shares),
             np.concatenate([rays.time_s for rays in lists]),
         )
-
-    def _wanted(self, pose: Pose) -> Callable[[np.ndarray], np.ndarray]:
-        """Which rays of a part at a pose look where the scene points are."""
-        points = self.scene.brought_back()
-        aimed = aim(np.tile(pose.origin_m, (len(points), 1)), observed_point(points))
-        looking = direction(aimed[:, AZIMUTH], aimed[:, AZIMUTH + 1])
-        looking = looking[in_view(self.part, looking @ pose.frame.T)]
-
-        def wanted(directions: np.ndarray) -> np.ndarray:
-            if not len(looking):
-                return np.zeros(len(directions), dtype=bool)
-            seen = np.bincount(cKDTree(directions).query(looking)[1], minlength=len(directions))
-            order = np.argsort(-seen, kind="stable")
-            enough = int(np.searchsorted(np.cumsum(seen[order]), SEEN_SHARE * len(looking))) + 1
-            mask = np.zeros(len(directions), dtype=bool)
-            mask[order[:enough]] = True
-            return mask & (seen > 0)
-
-        return wanted
 
 
 def _carried(rays: Rays, space: DesignSpace, axes: Sequence[int]) -> Rays:

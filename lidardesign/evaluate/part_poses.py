@@ -19,13 +19,13 @@ from functools import cached_property
 import numpy as np
 
 from lidardesign.design.catalog.part import Part
-from lidardesign.design.catalog.pattern import to_angles
 from lidardesign.design.catalog.placing import Pose, interleaved
 from lidardesign.design.constraints import Constraints
 from lidardesign.design.em import fit_mixture
 from lidardesign.design.features import Axes, Features
 from lidardesign.design.grid import low_discrepancy
 from lidardesign.design.mixture import Mixture
+from lidardesign.design.part_views import in_view
 from lidardesign.design.resolve import bounds_of
 from lidardesign.design.sensor import DEFAULT_LEVEL, interval_factor
 from lidardesign.design.shapes import Shape, shaped_bounds, shapes_of
@@ -47,8 +47,6 @@ MOST_APART = 16
 RESTARTS = 4
 # The share of scene points that is taken for clutter.
 CLUTTER = 0.05
-# A ray counts as coming near what is this close to it: a line scanner's beam is as high.
-LEAST_REACH_RAD = 0.005
 # Fewer effective points than this tell nothing about where to look.
 LEAST_POINTS = 10.0
 
@@ -204,21 +202,6 @@ def _repeated(part: Part, poses: list[Pose]) -> list[Pose]:
     for pose in dict.fromkeys(poses):
         found += interleaved(part, pose, poses.count(pose))
     return found
-
-
-def in_view(part: Part, directions: np.ndarray) -> np.ndarray:
-    """Which unit vectors in a part's frame its rays come near to, (N, 3) to bool (N,).
-
-    Its field of view and half a cell around it: the field of a line scanner has no height.
-    """
-    columns, rows = part.grid
-    horizontal, vertical = part.field_of_view_rad
-    reach = np.maximum(np.array([horizontal / columns, vertical / rows]) / 2, LEAST_REACH_RAD)
-    offset = to_angles(part.projection, directions) - np.array(part.centre_rad)
-    half = np.array([horizontal, vertical]) / 2 + reach
-    if part.view.shape == "ellipse":
-        return np.square(offset / half).sum(axis=1) <= 1
-    return (np.abs(offset) <= half).all(axis=1)
 
 
 def places(space: DesignSpace) -> np.ndarray:

@@ -169,6 +169,7 @@ def part_sensor(
         spread_range_m=(far - near) / (2 * half),
         level=level,
         rays=rays,
+        part=part.name,
     )
 
 

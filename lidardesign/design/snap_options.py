@@ -1,0 +1,161 @@
+"""Which parts may stand in for a sensor: those whose own field of view and range keep its constraints.
+
+A part's field of view and range cannot be narrowed; only outside the design space's range, where no task has anything,
+does its read-out stop. So a constraint that no part keeps is said by name.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lidardesign.design.catalog.library import SUFFIX, Library, load_library
+from lidardesign.design.catalog.part import Part
+from lidardesign.design.constraints import Constraints, SensorConstraints, Snap
+from lidardesign.design.shapes import Shape, shapes_of
+from lidardesign.errors import InfeasibleError
+from lidardesign.numerics import SLACK
+from lidardesign.space import DesignSpace
+
+SPACE_RANGE = "space.range_m"
+BOUNDED = ("field_of_view.horizontal_deg", "field_of_view.vertical_deg", "gate.start_m", "gate.end_m", "gate.width_m")
+
+
+@dataclass(frozen=True, eq=False)
+class Options:
+    """The parts that a sensor may become.
+
+    Arguments:
+        shapes: The parts, each upright and turned where that differs; empty where the sensor stays as it is.
+        snapped: Whether the sensor is to become a part.
+        lacking: Names of a smallest set of constraints that no part keeps together; empty where some do.
+    """
+
+    shapes: list[Shape]
+    snapped: bool
+    lacking: tuple[str, ...] = ()
+
+
+def wants_parts(constraints: Constraints) -> bool:
+    """Whether any sensor is to become a part."""
+    return any(constraints.of_sensor(index).snap is not None for index in range(len(constraints.each) + 1))
+
+
+def options_of(constraints: Constraints, space: DesignSpace, count: int) -> list[Options]:
+    """What each of `count` sensors may become.
+
+    Raises:
+        InfeasibleError: No part keeps a sensor's constraints, and it is not said that it may stay as it is.
+        ConfigError: A part that is not there, or no part file.
+    """
+    last = len(constraints.each)
+    known = {index: _options(constraints, index, space) for index in sorted({min(i, last) for i in range(count)})}
+    options = [known[min(index, last)] for index in range(count)]
+    refused = [
+        index
+        for index, one in enumerate(options)
+        if one.lacking and (snap := constraints.of_sensor(index).snap) is not None and snap.otherwise == "refuse"
+    ]
+    if refused:
+        names = tuple(dict.fromkeys(name for index in refused for name in options[index].lacking))
+        which = ", ".join(str(index) for index in refused)
+        raise InfeasibleError(
+            f"no part can stand in for sensors {which} and keep {', '.join(names)}",
+            conflicts=[*names, constraints.name_of(refused[0], "snap")],
+            hint="loosen one of the constraints named, or snap.otherwise=keep leaves such sensors as they are",
+        )
+    return options
+
+
+def parts_of(snap: Snap) -> list[Part]:
+    """The parts, in all modes where none is named, that a constraint file chooses from.
+
+    Raises:
+        ConfigError: A name or path that is no part.
+    """
+    if snap.parts is None:
+        return load_library().every_mode()
+    found: dict[str, Part] = {}
+    for text in snap.parts:
+        found |= {part.name: part for part in _named(text)}
+    return list(found.values())
+
+
+def library_of(snap: Snap | None) -> Library:
+    """The shipped parts and those that a constraint file names by their paths."""
+    named = [] if snap is None else snap.parts or []
+    return load_library([path for path, _ in map(_split, named) if path is not None])
+
+
+def _split(text: str) -> tuple[Path | None, str]:
+    """The path that a text names, None where it is a name, and the mode behind it."""
+    path, mode = text.rsplit(":", 1) if f"{SUFFIX}:" in text else (text, "")
+    return (Path(path) if path.endswith(SUFFIX) or Path(path).is_dir() else None), mode
+
+
+def _named(text: str) -> list[Part]:
+    """The parts of a name, of `NAME:MODE`, or of the path of a file or folder; all modes where none is named."""
+    path, mode = _split(text)
+    if path is None:
+        library, stems, mode = load_library(), [text.partition(":")[0]], text.partition(":")[2]
+    else:
+        library = load_library([path])
+        files = {str(file) for file in _inside(path)}
+        stems = [name for name, origin in library.origins.items() if origin in files]
+    if mode:
+        return [library.part(f"{stem}:{mode}") for stem in stems]
+    return [part for stem in stems for part in _modes(library, library.part(stem))]
+
+
+def _inside(path: Path) -> list[Path]:
+    return sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]
+
+
+def _modes(library: Library, part: Part) -> list[Part]:
+    stem = part.name.partition(":")[0]
+    return [library.part(f"{stem}:{mode}") for mode in part.modes] or [part]
+
+
+def _options(constraints: Constraints, index: int, space: DesignSpace) -> Options:
+    one = constraints.of_sensor(index)
+    if one.snap is None:
+        return Options([], snapped=False)
+    broken = {}
+    shapes: list[Shape] = []
+    for part in parts_of(one.snap):
+        found = shapes_of(part, space)
+        broken[part.name] = _broken(found[0], one) if found else {SPACE_RANGE}
+        shapes += found if not broken[part.name] else []
+    if shapes:
+        return Options(shapes, snapped=True)
+    lacking = _smallest_lacking(list(broken.values()))
+    names = tuple(SPACE_RANGE if key == SPACE_RANGE else constraints.name_of(index, key) for key in lacking)
+    return Options([], snapped=False, lacking=names)
+
+
+def _broken(shape: Shape, one: SensorConstraints) -> set[str]:
+    """Keys of the constraints that a part does not keep."""
+    horizontal, vertical = (math.degrees(angle) for angle in shape.part.field_of_view_rad)
+    start, end = shape.gate_m
+    values = (horizontal, vertical, start, end, end - start)
+    found = set()
+    for key, value in zip(BOUNDED, values, strict=True):
+        bounds: Any = one
+        for part in key.split("."):
+            bounds = getattr(bounds, part)
+        if bounds.min is not None and value < bounds.min * (1 - SLACK):
+            found.add(f"{key}.min")
+        if bounds.max is not None and value > bounds.max * (1 + SLACK):
+            found.add(f"{key}.max")
+    return found
+
+
+def _smallest_lacking(broken: Sequence[set[str]]) -> tuple[str, ...]:
+    """The fewest constraints of which every part breaks at least one."""
+    every = sorted(set().union(*broken))
+    sizes = (itertools.combinations(every, size) for size in range(1, len(every) + 1))
+    return next(names for one in sizes for names in one if all(set(names) & found for found in broken))
