@@ -11,6 +11,7 @@ from lidardesign.cli import options
 from lidardesign.cli.console import command
 from lidardesign.cli.fit import GATES, LAYOUTS, check_level, check_sensors, fit_and_write, load_libraries, usual_layout
 from lidardesign.cli.runs import check_choice, check_name, need_run, open_target, parse_at, sensor_count
+from lidardesign.cli.weighting import Weighting
 
 if TYPE_CHECKING:
     from lidardesign.design.constraints import Constraints
@@ -41,6 +42,8 @@ def constrain(
     gates: options.Gates = None,
     level: options.Level = None,
     at: options.At = None,
+    weights: options.Weights = None,
+    refine: options.Refine = None,
     name: options.Name = "constrained",
     seed: options.Seed = None,
     json: options.Json = False,
@@ -76,7 +79,16 @@ def constrain(
             gates=gates,
             level=check_level(_level(level, design, run.task.defaults.level)),
             at={**(design.at if design else {}), **condition},
+            weighting=_weighting(weights, design),
+            refine=refine,
         )
+
+
+def _weighting(given: list[str] | None, design: Design | None) -> Weighting:
+    """How samples are weighted: by the options, else as they were for the design."""
+    if given:
+        return Weighting(tuple(given))
+    return Weighting.of(design) if design else Weighting()
 
 
 def _level(given: float | None, design: Design | None, usual: float) -> float:

@@ -248,25 +248,21 @@ def _request(
     run: Run, entries: list[_Entry], rays: list[int] | None, baselines: list[str], seed: int | None
 ) -> EvaluationRequest:
     from lidardesign.cli.layouts import layouts_of, learned_density, may_need_samples, twin_without_visibility
-    from lidardesign.design.samples import FILE_NAME, load_samples
+    from lidardesign.cli.weighting import designs_samples
+    from lidardesign.design.samples import FILE_NAME
     from lidardesign.evaluate.score import EvaluationRequest
 
     config, task = run.config, run.task
     seed = config.seed if seed is None else seed
-    # designs of one run share its samples, and what is worked out from them
-    folders = {
-        entry.run.folder
-        for entry in entries
-        if entry.run is not None and may_need_samples(entry.design) and (entry.run.folder / FILE_NAME).exists()
-    }
-    known = {folder: load_samples(folder) for folder in folders}
-    samples = {
-        entry.design.name: known[entry.run.folder]
-        for entry in entries
-        if entry.run is not None and entry.run.folder in known
-    }
     made = [(entry.design, entry.run) for entry in entries if entry.run is not None]
-    layouts = layouts_of([(design.name, origin) for design, origin in made])
+    layouts = layouts_of(made)
+    # designs of one run and weighting share its samples, and what is worked out from them
+    laid_out = [
+        (design, origin)
+        for design, origin in made
+        if may_need_samples(design) and (origin.folder / FILE_NAME).exists()
+    ]
+    samples = designs_samples(laid_out, layouts.targets)
     return EvaluationRequest(
         task=task,
         config=config.task,

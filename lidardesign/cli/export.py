@@ -174,10 +174,12 @@ def design_and_rays(
 def _samples(run: Run, design: Design, at: Mapping[str, float]) -> tuple[Samples, Retarget]:
     """The samples that a design follows from: of all conditions for a track, else of the design's own."""
     from lidardesign.cli.layouts import RunTarget
+    from lidardesign.cli.weighting import Weighting, weighted_samples
     from lidardesign.design.conditions import conditioned
-    from lidardesign.design.samples import load_samples
 
-    samples, retarget = load_samples(run.folder), RunTarget(run)
+    weighting = Weighting.of(design)
+    retarget = RunTarget(run, weighting=weighting)
+    samples = weighted_samples(run, weighting, retarget)
     if design.track is None and samples.space.conditioned:
         samples = conditioned(samples, {**at, **design.at}, retarget)
     return samples, retarget

@@ -12,16 +12,16 @@ from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
 from lidardesign.cli.runs import check_choice, check_name, open_run, parse_at, provenance, sensor_count
 from lidardesign.cli.times import keep_times
-from lidardesign.errors import ConfigError, DataError
+from lidardesign.cli.weighting import Weighting
+from lidardesign.errors import ConfigError
 from lidardesign.run.clock import WAIT_S, phase
 
 if TYPE_CHECKING:
-    from lidardesign.cli.layouts import RunTarget
+    from rich.console import Console as RichConsole
+
     from lidardesign.cli.runs import Run
     from lidardesign.design.check import ConstraintCheck
     from lidardesign.design.constraints import Constraints
-    from lidardesign.design.fit import FitResult
-    from lidardesign.design.samples import Samples
     from lidardesign.design.sensor import Design
     from lidardesign.space import DesignSpace
 
@@ -37,6 +37,8 @@ def fit(
     gates: options.Gates = None,
     level: options.Level = None,
     at: options.At = None,
+    weights: options.Weights = None,
+    refine: options.Refine = None,
     name: options.Name = "fit",
     seed: options.Seed = None,
     json: options.Json = False,
@@ -69,6 +71,8 @@ def fit(
             gates=gates,
             level=check_level(opened.task.defaults.level if level is None else level),
             at=condition,
+            weighting=Weighting(tuple(weights or ())),
+            refine=refine,
         )
 
 
@@ -126,9 +130,11 @@ def fit_and_write(
     seed: int,
     constraints: Any = None,
     at: Mapping[str, float] | None = None,
+    weighting: Weighting,
+    refine: int | None = None,
     **choices: Any,
 ) -> None:
-    """Fit a design to a run's samples, write it, and give the result.
+    """Fit a design to a run's samples, refine it if asked to, write it, and give the result.
 
     Arguments:
         run: An opened run.
@@ -138,28 +144,26 @@ def fit_and_write(
         seed: Root of the random streams.
         constraints: Checked constraints, or None.
         at: Condition values that the design is for; without any, one for all of them.
+        weighting: What the density is multiplied by.
+        refine: Rounds of refinement, or None.
         choices: sensors, layout, rays, gates and level, as `lidardesign.design.fit.fit` takes them.
     """
     from dataclasses import replace
 
     from lidardesign.cli.designs import show_fit, write_design
-    from lidardesign.cli.layouts import RunTarget
-    from lidardesign.design.fit import fit as fit_design
+    from lidardesign.cli.refine import FitOrder, fitted, refined, show_refinement
+    from lidardesign.cli.weighting import KEY
 
-    path, target = run.design_path(name), RunTarget(run)
-    samples = _samples_at(run, at or {}, seed, choices.get("rays"), target, console)
-    with phase("fitting"):
-        result: FitResult = fit_design(
-            samples,
-            constraints=constraints,
-            seed=seed,
-            name=name,
-            retarget=target,
-            **choices,
-        )
+    path = run.design_path(name)
+    order = FitOrder(run, name, seed, constraints, at or {}, choices)
+    further: dict[str, Any] = {}
+    if refine is None:
+        result, weighting = fitted(order, weighting, console)
+    else:
+        (result, weighting), further = refined(order, weighting, refine, console)
     for note in result.notes:
         console.note(f"note: {note}")
-    made_by = provenance(run, path, command_name, seed)
+    made_by = provenance(run, path, command_name, seed, **({KEY: weighting.as_document()} if weighting else {}))
     design = replace(result.design, provenance={**result.design.provenance, **made_by})
     with phase("writing"):
         checks = check_written(design, constraints, run.config.space)
@@ -168,55 +172,16 @@ def fit_and_write(
         **result.as_dict(),
         "design": str(path),
         "constraints": [_check_dict(check) for check in checks],
+        **further,
     }
     document["satisfied"] = all(check.satisfied for check in checks)
     keep_times(run.folder, command_name, console, wait_s=WAIT_S)
-    console.result(document, lambda rich: show_fit(document, design, checks, rich))
 
+    def show(rich: RichConsole) -> None:
+        show_refinement(document, rich)
+        show_fit(document, design, checks, rich)
 
-@phase("samples")
-def _samples_at(
-    run: Run, at: Mapping[str, float], seed: int, rays: int | None, target: RunTarget, console: Console
-) -> Samples:
-    """The samples of a run, given its conditions where they have values.
-
-    Raises:
-        ConfigError: A name that is no condition of the density, or a value outside its bounds.
-        DataError: The samples are worth too few.
-    """
-    from lidardesign.design.conditions import MOVED_SAMPLES, at_condition, shown
-    from lidardesign.design.quantise import SAMPLES_PER_RAY
-    from lidardesign.design.samples import load_samples
-    from lidardesign.task import random_generator
-
-    run.config.space.at(at)
-    samples = load_samples(run.folder)
-    _check_worth(samples, run)
-    if not at:
-        return samples
-    count = max(MOVED_SAMPLES, SAMPLES_PER_RAY * (rays or 0))
-    generator = random_generator(seed, "condition")
-    moved = at_condition(samples, at, target, count, generator)
-    console.note(f"note: at {shown(at)} {len(moved)} samples have ESS {moved.effective_sample_size:.2f}")
-    return moved
-
-
-def _check_worth(samples: Samples, run: Run) -> None:
-    """Refuse a density that was learned too badly to fit anything to, whatever the constraints.
-
-    Raises:
-        DataError: Its samples are worth fewer than a fit needs.
-    """
-    from lidardesign.design.support import LEAST_SAMPLES
-
-    worth = samples.effective_sample_size * len(samples)
-    if worth < LEAST_SAMPLES:
-        raise DataError(
-            f"the density is too rough: its {len(samples)} samples are worth {worth:.0f}",
-            where=str(run.folder),
-            allowed=f"at least {LEAST_SAMPLES}",
-            hint="learn longer (--preset standard or fine), or with a larger density.sigma_m",
-        )
+    console.result(document, show)
 
 
 def check_written(design: Design, constraints: Constraints | None, space: DesignSpace) -> list[ConstraintCheck]:

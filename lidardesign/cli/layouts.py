@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
+from lidardesign.cli.weighting import Weighting
 from lidardesign.errors import DataError
 
 if TYPE_CHECKING:
@@ -30,24 +31,37 @@ class RunTarget:
     Arguments:
         run: The run.
         visibility: The visibility to take instead of what the run decided.
+        weighting: Settings of the task whose scenes it is of instead, and a factor.
     """
 
-    def __init__(self, run: Run, visibility: str | None = None) -> None:
+    def __init__(self, run: Run, visibility: str | None = None, weighting: Weighting | None = None) -> None:
         self._run, self._visibility = run, visibility
+        self._weighting = Weighting() if weighting is None else weighting
 
     @cached_property
     def _target(self) -> Target:
         from lidardesign.density.prepare import prepare_target
         from lidardesign.run.manifest import read_manifest
 
-        run = self._run
+        run = self._weighed()
         decided = self._visibility or read_manifest(run.folder).get("visibility")
         scenes = run.scenes("train", run.config.seed)
         return prepare_target(scenes, run.config, visibility=decided, compiled=False)[0]
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Design points (N, 6) to (N,)."""
-        return self._target.log_density(points)
+        values = self._target.log_density(points)
+        factor = self._weighting.reweighting
+        return values if factor is None else values + factor.log_factor(points)
+
+    def _weighed(self) -> Run:
+        """The run with the settings of its weighting."""
+        from lidardesign.run.config import judged_by
+
+        run, settings = self._run, self._weighting.settings
+        if not settings:
+            return run
+        return replace(run, config=judged_by(run.task, run.config, settings, option="--weight"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,10 +121,13 @@ def learned_density(run: Run) -> Density | None:
     return Density(load_samples(run.folder), RunTarget(run)) if (run.folder / FILE_NAME).exists() else None
 
 
-def layouts_of(runs: Sequence[tuple[str, Run]]) -> Layouts:
-    """The layouts of designs by name and run; the twin takes the first run's target without occlusion."""
-    by_folder = {run.folder: RunTarget(run) for _, run in runs}
-    targets = {name: by_folder[run.folder] for name, run in runs}
-    if runs:
-        targets[TWIN_NAME] = RunTarget(runs[0][1], visibility="off")
+def layouts_of(made: Sequence[tuple[Design, Run]]) -> Layouts:
+    """The layouts of designs by their runs; the twin takes the first run's target without occlusion."""
+    by_folder = {run.folder: RunTarget(run) for _, run in made}
+    targets = {}
+    for design, run in made:
+        weighting = Weighting.of(design)
+        targets[design.name] = RunTarget(run, weighting=weighting) if weighting else by_folder[run.folder]
+    if made:
+        targets[TWIN_NAME] = RunTarget(made[0][1], visibility="off")
     return Layouts(targets)

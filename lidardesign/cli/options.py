@@ -72,6 +72,27 @@ Sensors = Annotated[
         show_default="the task's",
     ),
 ]
+Weights = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--weight",
+        metavar="KEY=VALUE",
+        help="Weigh the learned density towards the task with another setting, as importance; nothing is learned "
+        "again. Repeatable.",
+        show_default=False,
+    ),
+]
+Refine = Annotated[
+    int | None,
+    typer.Option(
+        "--refine",
+        metavar="N",
+        min=1,
+        max=100,
+        help="Then up to N rounds: look where the error is on training scenes, weigh, fit again, keep the best.",
+        show_default=False,
+    ),
+]
 Overrides = Annotated[
     list[str] | None,
     typer.Option(

@@ -15,7 +15,7 @@ from lidardesign.numerics import normalised_weights, systematic_draw
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import verify, write_recorded
 from lidardesign.run.npz import guarded, read_npz
-from lidardesign.space import DesignSpace
+from lidardesign.space import RANGE, DesignSpace
 
 FILE_NAME = "samples.npz"
 NUMBERS = ("points", "log_prob", "log_target")
@@ -75,6 +75,16 @@ class Samples:
     def reweighted(self, log_factors: np.ndarray) -> Samples:
         """The samples with log p* moved by so much at each of them, shape (N,): of another target density."""
         return replace(self, log_target=self.log_target + log_factors)
+
+    def spread_in_range(self, spread_m: float, generator: np.random.Generator) -> Samples:
+        """The samples with normal noise on their ranges, inside the space: what scenes that were not seen may be.
+
+        Weights stay; log p* is no longer that of the moved points.
+        """
+        low, high = self.space.low[RANGE], self.space.high[RANGE]
+        points = self.points.copy()
+        points[:, RANGE] = np.clip(points[:, RANGE] + spread_m * generator.normal(size=len(self)), low, high)
+        return replace(self, points=points)
 
     def resample(self, count: int, generator: np.random.Generator) -> np.ndarray:
         """Design points drawn from p* by systematic importance resampling, shape (count, 6)."""

@@ -154,16 +154,16 @@ def resolve(
     return _build(task, header, layers)
 
 
-def judged_by(task: Task, config: RunConfig, overrides: Sequence[str]) -> RunConfig:
+def judged_by(task: Task, config: RunConfig, overrides: Sequence[str], *, option: str = "--set") -> RunConfig:
     """A run's configuration with other values of the task's own keys, to judge its designs by.
 
     Raises:
-        ConfigError: At the `--set` option; also where the value would change the design space.
+        ConfigError: At the option; also where the value would change the design space.
     """
     layers = _Layers({section: {} for section in SECTIONS})
     layers.merge("task", config.task.model_dump(mode="json"), FILE_NAME)
     for text in overrides:
-        override = parse_override(text)
+        override = parse_override(text, option)
         if override.path[0] in SECTIONS[1:] and len(override.path) > 1:
             allowed = f"keys of the task {task.name}"
             raise ConfigError("what was learned cannot be changed", where=override.where, allowed=allowed)
@@ -174,7 +174,7 @@ def judged_by(task: Task, config: RunConfig, overrides: Sequence[str]) -> RunCon
     if not same:
         raise ConfigError(
             "changes the design space that the run was learned in",
-            where="--set " + ", ".join(overrides),
+            where=f"{option} " + ", ".join(overrides),
             hint=f"learn another run with it: lidardesign learn {task.name} --set KEY=VALUE",
         )
     return replace(config, task=judged)

@@ -26,14 +26,14 @@ class Override:
     where: str
 
 
-def parse_override(text: str) -> Override:
+def parse_override(text: str, option: str = "--set") -> Override:
     """Read `KEY=VALUE`; the value is a YAML scalar, or a list or mapping in brackets, and else text.
 
     Raises:
         ConfigError: There is no key or no equals sign, or the brackets do not close.
     """
     key, equals, value = text.partition("=")
-    where = f"--set {text}"
+    where = f"{option} {text}"
     parts = key.strip().split(".")
     if not equals or not all(parts):
         raise ConfigError("is not of the form KEY=VALUE", where=where, allowed="a dotted key, as density.sigma_m=0.005")
