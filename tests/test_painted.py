@@ -9,7 +9,13 @@ import pytest
 import trimesh
 from lidardesign_tasks.emitter import EmitterConfig, EmitterTask
 from lidardesign_tasks.face import FaceConfig, FaceTask
-from lidardesign_tasks.importance import LEAST_ROUGHNESS, Importance, relative_roughness, vertex_roughness
+from lidardesign_tasks.importance import (
+    LEAST_ROUGHNESS,
+    Importance,
+    relative_area,
+    relative_roughness,
+    vertex_roughness,
+)
 from lidardesign_tasks.meshes import MeshesConfig, MeshesTask
 from lidardesign_tasks.pose import rotation_matrix
 from pydantic import ValidationError
@@ -18,6 +24,7 @@ from lidardesign.errors import DataError
 from lidardesign.meshio import check_mesh, load_mesh
 from lidardesign.vertex_weights import Painted
 
+SENSOR = np.array([3.0, 0.5, 0.2])
 COLOURED = ("ply", "glb", "gltf", "obj")
 
 
@@ -187,12 +194,40 @@ def test_a_surface_that_is_flat_everywhere_counts_evenly():
 def test_nothing_is_asked_for_by_default_and_the_exponent_is_one():
     made = trimesh.creation.capsule(height=0.6, radius=0.2)
     vertices, faces = np.asarray(made.vertices), np.asarray(made.faces)
-    assert Importance().weights(vertices, faces) is None
+    assert Importance().weights(vertices, faces, SENSOR) is None
     once, twice = (
-        Importance(roughness_exponent=e, roughness_radius_m=0.1).weights(vertices, faces) for e in (1.0, 2.0)
+        Importance(roughness_exponent=e, roughness_radius_m=0.1).weights(vertices, faces, SENSOR) for e in (1.0, 2.0)
     )
     assert np.allclose(once**2, twice)
     assert once.min() >= LEAST_ROUGHNESS
+
+
+def test_rays_weighted_by_the_area_that_they_see_are_even_over_the_surface():
+    # a tilted plate: r^2 / cos is the area in a solid angle, in closed form
+    plate = trimesh.creation.box((1.0, 1.0, 0.01))
+    vertices, faces = trimesh.remesh.subdivide_to_size(plate.vertices, plate.faces, 0.1)
+    vertices = vertices @ rotation_matrix(np.array([0.0, 0.7, 0.0])).T
+    found = relative_area(vertices, faces, SENSOR)
+    normal = rotation_matrix(np.array([0.0, 0.7, 0.0])) @ [0, 0, 1]
+    look = vertices - SENSOR
+    exact = np.linalg.norm(look, axis=1) ** 3 / np.abs(look @ normal)
+    inner = np.abs(vertices @ rotation_matrix(np.array([0.0, 0.7, 0.0]))).max(axis=1) < 0.45
+    assert inner.sum() > 100
+    ratio = found[inner] / exact[inner]
+    assert np.ptp(ratio) < 1e-9 * ratio.mean()
+    assert np.median(found) == pytest.approx(1.0)
+    half = Importance(area_exponent=0.5).weights(vertices, faces, SENSOR)
+    assert np.allclose(half**2, found)
+
+
+def test_the_rim_of_a_ball_counts_no_more_than_tenfold():
+    made = ball(subdivisions=4)
+    found = relative_area(np.asarray(made.vertices), np.asarray(made.faces), np.array([1e4, 0.0, 0.0]))
+    # the middle of what is seen counts least, the rim ten times as much
+    cosine = np.abs(np.asarray(made.vertices)[:, 0])
+    relative = found / found.min()
+    assert np.allclose(1 / relative, np.maximum(cosine, 0.1), atol=0.01)
+    assert relative.max() == pytest.approx(10.0, rel=1e-3)
 
 
 @pytest.mark.parametrize("shape", [{"region_radius_m": 0.1}, {"region_half_size_m": (0.1, 0.1, 0.1)}])
@@ -200,7 +235,7 @@ def test_nothing_is_asked_for_by_default_and_the_exponent_is_one():
 def test_a_region_counts_its_weight_inside_and_nothing_more_beyond_its_edge(shape, edge):
     config = Importance(region_centre_m=(1, 2, 3), region_weight=9.0, region_edge_m=edge, **shape)
     along = np.array([0.0, 0.09, 0.0999, 0.125, 0.1501, 1.0])
-    found = config.weights(np.array([1, 2, 3]) + along[:, None] * [0, -1, 0], np.zeros((0, 3), dtype=int))
+    found = config.weights(np.array([1, 2, 3]) + along[:, None] * [0, -1, 0], np.zeros((0, 3), dtype=int), SENSOR)
     expected = [9, 9, 9, 3, 1, 1] if edge else [9, 9, 9, 1, 1, 1]
     assert np.allclose(found, expected)
 
@@ -214,6 +249,7 @@ def test_a_region_counts_its_weight_inside_and_nothing_more_beyond_its_edge(shap
         {"region_centre_m": (0, 0, 0), "region_half_size_m": (1, 0, 1)},
         {"region_centre_m": (0, 0, 0), "region_radius_m": 0.0},
         {"roughness_exponent": -1},
+        {"area_exponent": -0.1},
         {"roughness_radius_m": 0},
         {"region_weight": 0},
     ],
@@ -256,11 +292,12 @@ def test_meshes_of_a_folder_count_by_their_paint_their_roughness_and_a_region(tm
     assert sorted(np.unique(paint.round(9))) == [1.0, 5.0]
     region = weights(region_centre_m=(0, 0, 1), region_radius_m=0.5)
     rough = weights(roughness_exponent=1.0, roughness_radius_m=0.5)
+    area = weights(area_exponent=0.5)
     every = weights(
         importance="colours", colour_contrast=5.0, region_centre_m=(0, 0, 1), region_radius_m=0.5,
-        roughness_exponent=1.0, roughness_radius_m=0.5,
+        roughness_exponent=1.0, roughness_radius_m=0.5, area_exponent=0.5,
     )  # fmt: skip
-    assert np.allclose(every, paint * region * rough)
+    assert np.allclose(every, paint * region * rough * area)
     with pytest.raises(DataError, match="no vertex property 'care'"):
         weights(importance="care")
 

@@ -200,6 +200,15 @@ def is_weighted(scenes: Sequence[Scene]) -> bool:
     return any(log_weight_range(body) != (0.0, 0.0) for scene in scenes for body in scene.bodies if body.is_target)
 
 
+def importance_notes(scenes: Sequence[Scene]) -> list[str]:
+    """From what to what targets count, where they do not all count 1."""
+    if not is_weighted(scenes):
+        return []
+    ranges = np.array([log_weight_range(body) for scene in scenes for body in scene.bodies if body.is_target])
+    least, largest = np.exp([ranges[:, 0].min(), ranges[:, 1].max()])
+    return [f"importance: parts of the targets count from {least:.2g} to {largest:.2g}"]
+
+
 def log_weight_range(body: Body) -> tuple[float, float]:
     """The least and the largest log importance of a body's surface."""
     constant = float(np.log(body.importance))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from lidardesign.density.importance import importance_notes
 from lidardesign.density.parallel import ALONE, Ranks
 from lidardesign.density.parallel_target import SharedTarget, build_shared_target
 from lidardesign.density.proposals import occluded_share, propose
@@ -53,6 +54,7 @@ def prepare_target(
         notes.extend(refined)
     notes.extend(resolution_notes(target, settings.sigma_m))
     notes.extend(flatness_notes(target, settings.sigma_m, random_generator(config.seed, "flatness")))
+    notes.extend(importance_notes(scenes))
     notes.extend(dict.fromkeys(line for scene in scenes for line in scene.notes))
     shapes = [body.shape for scene in scenes for body in scene.bodies]
     notes.extend(sorted({line for shape in shapes for line in getattr(shape, "notes", ())}))

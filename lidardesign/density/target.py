@@ -96,7 +96,7 @@ class Target:
             rows = slice(start, start + self.rows_at_once)
             observed = observed_point(points[rows])
             distances = self.field.distances(observed).astype(np.float64)
-            values[rows] = logsumexp(self._surface_terms(observed, distances, sigma_m), axis=1)
+            values[rows] = logsumexp(self.surface_terms(observed, distances, sigma_m), axis=1)
         return values
 
     def log_density(self, points: np.ndarray, sigma_m: float | None = None) -> np.ndarray:
@@ -130,7 +130,7 @@ class Target:
         rays = RayBatch.of(points)
         observed = rays.observed
         distances = self.field.distances(observed).astype(np.float64)
-        surface = self._surface_terms(observed, distances, optics.sigma_m)
+        surface = self.surface_terms(observed, distances, optics.sigma_m)
         active = surface >= self._best(surface) - self.surface_tolerance_nats
         passed = self.visibility.transmittance(rays, active, optics, differentiable=gradient)
         terms = np.where(active, surface + passed.log_values, -np.inf)
@@ -144,7 +144,7 @@ class Target:
         by_ray.add_by_point(by_point, rays)
         return values, self._by_chart(points, by_ray)
 
-    def _surface_terms(self, observed: np.ndarray, distances: np.ndarray, sigma_m: float) -> np.ndarray:
+    def surface_terms(self, observed: np.ndarray, distances: np.ndarray, sigma_m: float) -> np.ndarray:
         """log w - distance^2 / (2 sigma^2) at scene points (N, 3), shape (N, columns)."""
         terms = self.log_column_weights - np.square(distances / sigma_m) / 2
         return terms if self.importance is None else terms + self.importance.values(observed)

@@ -25,7 +25,7 @@ from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Residuals, Score, Split, random_generator
 from lidardesign_tasks.basel import MorphableModel, Unit, load_model
-from lidardesign_tasks.importance import Importance
+from lidardesign_tasks.importance import Importance, middle_of_origins
 from lidardesign_tasks.pose import jittered_pose
 from lidardesign_tasks.surface import surface_residuals, surface_score, with_visible_truth
 from lidardesign_tasks.surroundings import any_direction, moving
@@ -134,6 +134,7 @@ def head_scenes(
             hint="set identity_scale, jitter_rotation_deg or jitter_translation_m above 0",
         )
     heads = HeadFamily.load(config)
+    heads.weigh(config, middle_of_origins(space))
     count = config.train if split == "train" else config.test
     return [heads.scene(config, space, split, seed, index, receiver) for index in range(count)]
 
@@ -144,7 +145,7 @@ class HeadFamily:
     What counts is measured on the mean head, and holds for the same vertices of all heads.
     """
 
-    def __init__(self, model: MorphableModel, sign: Sign, where: str, importance: Importance | None = None) -> None:
+    def __init__(self, model: MorphableModel, sign: Sign, where: str) -> None:
         self.model = model
         notes = list(model.notes)
         self.faces = usable_faces(model.mean, model.faces, notes)
@@ -153,7 +154,7 @@ class HeadFamily:
         mean = model.mean[:, WORLD_AXES]
         self.nose_tip = mean[mean[:, 0].argmax()]
         self.centre = (mean - self.nose_tip)[np.unique(self.faces)].mean(axis=0)
-        self.weights = None if importance is None else importance.weights(mean - self.nose_tip, self.faces)
+        self.weights: np.ndarray | None = None
 
     @classmethod
     def load(cls, config: HeadConfig) -> HeadFamily:
@@ -164,8 +165,12 @@ class HeadFamily:
         """
         if config.model is not None:
             model = load_model(config.model, unit=config.unit, modes=config.modes)
-            return cls(model, config.sign, str(config.model), config)
-        return cls(_embedded_model(config.modes), config.sign, "the embedded head model", config)
+            return cls(model, config.sign, str(config.model))
+        return cls(_embedded_model(config.modes), config.sign, "the embedded head model")
+
+    def weigh(self, importance: Importance, viewpoint_m: np.ndarray) -> None:
+        """Let all heads count as the mean one does by a configuration, seen from a place (3,) [m]."""
+        self.weights = importance.weights(self.mesh(np.zeros(0)).vertices, self.faces, viewpoint_m)
 
     def mesh(self, coefficients: np.ndarray) -> Mesh:
         """The head with standardised coefficients, in the world frame before its pose."""

@@ -1,8 +1,10 @@
-"""How much the parts of a surface count: by how rough they are, and by a region of interest.
+"""How much the parts of a surface count: by how obliquely they are seen, how rough they are, and where they are.
 
-Roughness is the rms distance of the surface from its own best plane within a ball, as CloudCompare and other tools for
-scans define it: what straight lines between returns miss there. With the exponent e a part counts as
-(roughness / mean roughness)^e.
+A density of rays that count alike is even over angles: what is far away or seen obliquely gets few rays for its area.
+With the exponent e of the area a part counts as (r^2 / cos(incidence))^e, the area in a solid angle: 1 spreads returns
+evenly over the surface. Roughness is the rms distance of the surface from its own best plane within a ball, as
+CloudCompare and other tools for scans define it: what straight lines between returns miss there. With its exponent e a
+part counts as (roughness / mean roughness)^e.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import math
 import numpy as np
 from pydantic import Field, model_validator
 
+from lidardesign.space import DesignSpace
 from lidardesign.surface import sample_triangles
 from lidardesign.task import random_generator
 from lidardesign_tasks.surroundings import Surroundings
@@ -19,6 +22,8 @@ from lidardesign_tasks.surroundings import Surroundings
 Vector = tuple[float, float, float]
 # What is flatter than this share of the mean roughness counts as if it were so rough: no part counts nothing.
 LEAST_ROUGHNESS = 0.1
+# At the rim of a surface the area in a solid angle has no bound; next to the sensor it vanishes.
+FLATTEST_COSINE, NEAREST_SHARE = 0.1, 0.01
 # A plane through so many points has an rms distance good to a tenth.
 POINTS_PER_BALL = 100
 LEAST_POINTS, MOST_POINTS = 2_000, 400_000
@@ -30,6 +35,13 @@ ROUNDINGS = 64
 class Importance(Surroundings):
     """What of a surface counts more than the rest, if anything."""
 
+    area_exponent: float = Field(
+        0.0,
+        ge=0,
+        le=2,
+        description="the surface counts as the area that a solid angle covers of it, seen from the middle of the "
+        "sensors' places, to this power: 0 spreads rays evenly over angles, 1 evenly over the surface",
+    )
     roughness_exponent: float = Field(
         0.0, ge=0, le=4, description="the surface counts as its local roughness to this power; 0: evenly"
     )
@@ -58,15 +70,16 @@ class Importance(Surroundings):
             raise ValueError("half sizes of a region are above 0 m")
         return self
 
-    def weights(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
-        """How much a surface counts at its vertices (V, 3) [m], shape (V,); None: evenly."""
-        found = None
+    def weights(self, vertices: np.ndarray, faces: np.ndarray, viewpoint_m: np.ndarray) -> np.ndarray | None:
+        """How much a surface counts at its vertices (V, 3) [m], seen from a place (3,), shape (V,); None: evenly."""
+        factors = []
+        if self.area_exponent > 0:
+            factors.append(relative_area(vertices, faces, viewpoint_m) ** self.area_exponent)
         if self.roughness_exponent > 0:
-            found = relative_roughness(vertices, faces, self.roughness_radius_m) ** self.roughness_exponent
+            factors.append(relative_roughness(vertices, faces, self.roughness_radius_m) ** self.roughness_exponent)
         if self.region_centre_m is not None:
-            inside = self.region_weight ** self.share_of_region(vertices)
-            found = inside if found is None else found * inside
-        return found
+            factors.append(self.region_weight ** self.share_of_region(vertices))
+        return np.prod(factors, axis=0) if factors else None
 
     def share_of_region(self, points: np.ndarray) -> np.ndarray:
         """1 in the region and 0 beyond its edge, linear between, at points (N, 3) [m], shape (N,)."""
@@ -78,6 +91,25 @@ class Importance(Surroundings):
         if self.region_edge_m == 0:
             return (outside_m <= 0).astype(np.float64)
         return np.clip(1.0 - outside_m / self.region_edge_m, 0.0, 1.0)
+
+
+def middle_of_origins(space: DesignSpace) -> np.ndarray:
+    """The middle of a design space's origins, shape (3,) [m]."""
+    return (np.array(space.low[:3]) + np.array(space.high[:3])) / 2
+
+
+def relative_area(vertices: np.ndarray, faces: np.ndarray, viewpoint_m: np.ndarray) -> np.ndarray:
+    """The area that a solid angle covers of a surface at its vertices (V, 3), over its median, shape (V,).
+
+    Surfaces count as seen no more flatly than `FLATTEST_COSINE`, from whichever side.
+    """
+    facing = _facing(vertices, faces)
+    look = vertices - viewpoint_m
+    distance = np.linalg.norm(look, axis=1)
+    length = np.linalg.norm(facing, axis=1) * distance
+    cosine = np.abs(np.einsum("vk,vk->v", facing, look)) / np.where(length > 0, length, 1.0)
+    area = np.maximum(distance, distance.max() * NEAREST_SHARE) ** 2 / np.maximum(cosine, FLATTEST_COSINE)
+    return area / np.median(area)
 
 
 def relative_roughness(vertices: np.ndarray, faces: np.ndarray, radius_m: float) -> np.ndarray:
@@ -106,9 +138,7 @@ def vertex_roughness(vertices: np.ndarray, faces: np.ndarray, radius_m: float) -
     asked = POINTS_PER_BALL * np.linalg.norm(doubled, axis=1).sum() / (2 * math.pi * radius_m**2)
     count = int(np.clip(asked, LEAST_POINTS, MOST_POINTS))
     points, face = sample_triangles(vertices, faces, count, random_generator(0, "roughness"))
-    tree, facing, normals = cKDTree(points), np.zeros_like(vertices), doubled[face]
-    for corner in range(3):
-        np.add.at(facing, faces[:, corner], doubled)
+    tree, facing, normals = cKDTree(points), _facing(vertices, faces), doubled[face]
     roughness = np.zeros(len(vertices))
     for start in range(0, len(vertices), VERTICES_AT_ONCE):
         centres = np.arange(start, min(start + VERTICES_AT_ONCE, len(vertices)))
@@ -125,6 +155,14 @@ def _doubled_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Normals of faces as long as twice their areas, shape (F, 3) [m^2]."""
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     return np.cross(b - a, c - a)
+
+
+def _facing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Normals of vertices, the sum of those of their faces by area, shape (V, 3) [m^2]."""
+    facing, doubled = np.zeros_like(vertices), _doubled_normals(vertices, faces)
+    for corner in range(3):
+        np.add.at(facing, faces[:, corner], doubled)
+    return facing
 
 
 def _off_plane(row: np.ndarray, offset: np.ndarray, count: int) -> np.ndarray:

@@ -27,7 +27,7 @@ from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace, aim
 from lidardesign.task import Defaults, Metric, Residuals, Score, Split, random_generator
 from lidardesign.vertex_weights import Painted
-from lidardesign_tasks.importance import Importance
+from lidardesign_tasks.importance import Importance, middle_of_origins
 from lidardesign_tasks.pose import jittered_pose
 from lidardesign_tasks.surface import surface_residuals, surface_score, with_visible_truth
 from lidardesign_tasks.surroundings import any_direction, moving
@@ -113,9 +113,8 @@ class MeshesTask:
                 hint="add meshes, or set jitter_rotation_deg or jitter_translation_m above 0",
             )
         scenes = []
-        for (name, mesh), pose in itertools.product(
-            split_meshes(meshes, config, split, seed), range(config.poses)
-        ):
+        chosen = [(name, weighted(mesh, config, space)) for name, mesh in split_meshes(meshes, config, split, seed)]
+        for (name, mesh), pose in itertools.product(chosen, range(config.poses)):
             generator = random_generator(seed, "meshes", split, name, pose)
             centre = mesh.bounds_m.mean(axis=0)
             placed = Body(
@@ -141,8 +140,7 @@ def load_folder(config: MeshesConfig) -> list[tuple[str, Mesh]]:
     if config.folder is None:
         raise ConfigError("no folder of meshes is set", where="task.folder", hint="--set folder=PATH")
     painted = None if config.importance is None else Painted(config.importance, config.colour_contrast)
-    meshes = _load(str(config.folder), config, config.sign, config.centre, painted)
-    return [(name, _weighted(mesh, config)) for name, mesh in meshes]
+    return _load(str(config.folder), config, config.sign, config.centre, painted)
 
 
 def load_occluders(config: MeshesConfig) -> list[tuple[str, Mesh]]:
@@ -150,9 +148,9 @@ def load_occluders(config: MeshesConfig) -> list[tuple[str, Mesh]]:
     return _load(str(config.occluders), config, "auto", False) if config.occluders is not None else []
 
 
-def _weighted(mesh: Mesh, config: MeshesConfig) -> Mesh:
+def weighted(mesh: Mesh, config: MeshesConfig, space: DesignSpace) -> Mesh:
     """A mesh with what the configuration says of its importance, besides what its file says."""
-    weights = config.weights(mesh.vertices, mesh.faces)
+    weights = config.weights(mesh.vertices, mesh.faces, middle_of_origins(space))
     if weights is None:
         return mesh
     return replace(mesh, importance=weights if mesh.importance is None else weights * mesh.importance)

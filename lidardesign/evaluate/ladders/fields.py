@@ -14,6 +14,7 @@ import numpy as np
 
 from lidardesign.density.compared_fields import ExactField, InterpolatedField, fresh_bodies, fresh_table
 from lidardesign.density.fields import Field, TableField, scene_columns
+from lidardesign.density.importance import build_log_weights
 from lidardesign.density.receiver import HeardVisibility, common_receiver
 from lidardesign.density.settings import DensitySettings
 from lidardesign.density.target import PADDING_SIGMAS, Target
@@ -80,13 +81,15 @@ class Case:
         few = few_columns(scenes, COLUMNS)
         receiver, way = common_receiver(few), NoVisibility() if visibility == "off" else Raycast(few)
         frames = np.array([few[index].frames for index, _ in scene_columns(few)], dtype=np.float64)
+        field = fresh(few, scenes, settings.field_resolution, settings)
         target = Target(
-            field=fresh(few, scenes, settings.field_resolution, settings),
+            field=field,
             visibility=way if receiver is None else HeardVisibility(way, receiver),
             log_column_weights=-np.log(frames),
             optics=Optics.of(settings),
             space=space,
             surface_tolerance_nats=settings.surface_tolerance_nats,
+            importance=build_log_weights(few, field, around=scenes),
         )
         probes = draw_probes(target, few, PROBES, seed, "fields", widening=WIDENING)
         if not len(probes.points):
@@ -99,7 +102,7 @@ class Case:
 
     def log_density(self, distances: np.ndarray) -> np.ndarray:
         """log p* at the probes from their distances (N, columns)."""
-        surface = self.target.log_column_weights - np.square(distances / self.target.optics.sigma_m) / 2
+        surface = self.target.surface_terms(self.observed, distances, self.target.optics.sigma_m)
         return logsumexp(surface + self.log_transmittance, axis=1)
 
     def errors(self, field: Field) -> tuple[float, float, dict[str, float]]:
