@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,6 +30,7 @@ from lidardesign.design.catalog.placing import (
     parts_for,
     side_by_side,
 )
+from lidardesign.design.catalog.statements import FIELDS, Statement
 from lidardesign.design.catalog.thinning import thinned
 from lidardesign.design.files import SCHEMA_FILE, design_document, design_from_document, load_design, save_design
 from lidardesign.design.grid import grid_rows
@@ -644,3 +646,46 @@ def test_a_part_of_more_rays_than_a_file_takes_says_what_to_do(call):
     assert result.code == 2
     assert "--rays N takes an evenly spread subset" in result.err
     assert call("catalog", "show", "os1-128", "--out", "o.yaml", "--rays", "1000", "--json").json["sensors"] == 1
+
+
+# the guide
+
+GUIDE = (Path(__file__).parents[1] / "docs" / "catalog.md").read_text(encoding="utf-8")
+
+
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", GUIDE, re.DOTALL)
+
+
+def test_the_part_file_of_the_guide_is_one(tmp_path):
+    (text,) = blocks("yaml")
+    path = tmp_path / "ranger.yaml"
+    path.write_text(text)
+    fine, fast = find_part(path), find_part(f"{path}:fast")
+    assert (fine.rays, fast.rays) == (6, 3)
+    assert fine.histogram_mbps == pytest.approx(6 * 64 * 16 * 20 / 1e6)
+    assert fine.under(reflectance_percent=50, illuminance_klux=1).range_m == (0.05, 0.9)
+
+
+def test_the_guide_names_every_key_and_every_kind_of_pattern():
+    keys = set(re.findall(r"`([a-z_]+)`", GUIDE))
+    patterns = {part.pattern.kind for part in PARTS.values()} | {"raster"}
+    assert {*FIELDS, *Statement.model_fields, *patterns} - {"value"} <= keys
+
+
+def test_the_ranges_of_the_guide_are_the_parts(call):
+    rows = re.findall(r"\| `vl53l5cx( --[^`]*)`? ?\| ([\d.]+) - ([\d.]+) m", GUIDE)
+    assert len(rows) == 2
+    for options, start, end in rows:
+        shown = call("catalog", "show", "vl53l5cx", *options.split(), "--json").json
+        assert shown["range_m"] == {"near": float(start), "far": float(end)}
+    assert PARTS["vl53l5cx"].range_m == (0.02, 3.5)
+
+
+def test_the_program_of_the_guide_runs():
+    (text,) = blocks("python")
+    made = {}
+    exec(text, made)  # the guide's own text
+    assert len(made["rays"]) == 64
+    assert len(made["design"].sensors) == 4
+    assert np.allclose(made["sensor"].boresight, [-1, 0, 0])
