@@ -47,6 +47,40 @@ Klux = Annotated[
     ),
 ]
 
+Out = Annotated[
+    Path | None, typer.Option("--out", metavar="FILE.yaml", help="Write a design of the part.", show_default=False)
+]
+AtOrigin = Annotated[
+    str | None, typer.Option("--at-origin", metavar="X,Y,Z", help="Where it stands [m].", show_default="0,0,0")
+]
+Azimuth = Annotated[
+    float | None, typer.Option("--azimuth-deg", metavar="DEG", help="Azimuth of its forward axis.", show_default="0")
+]
+Elevation = Annotated[
+    float | None,
+    typer.Option("--elevation-deg", metavar="DEG", help="Elevation of its forward axis.", show_default="0"),
+]
+Roll = Annotated[
+    float | None, typer.Option("--roll-deg", metavar="DEG", help="Roll about its forward axis.", show_default="0")
+]
+Rays = Annotated[
+    int | None,
+    typer.Option("--rays", metavar="N", min=1, max=1_000_000, help="Rays per frame.", show_default="all that it has"),
+]
+Parts = Annotated[
+    int | None,
+    typer.Option("--parts", metavar="N", min=1, max=1000, help="Parts.", show_default="as many as the rays need"),
+]
+Arrange = Annotated[
+    str | None,
+    typer.Option(
+        "--arrange",
+        metavar="interleaved|beside",
+        help="Several parts see the same with rays between each other's, or fields side by side.",
+        show_default="interleaved",
+    ),
+]
+
 catalog_app = typer.Typer(help="List real parts, or show one and write a design of it.", invoke_without_command=True)
 
 
@@ -103,45 +137,14 @@ def show(
     own: Own = None,
     reflectance: Reflectance = None,
     klux: Klux = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="FILE.yaml", help="Write a design of the part.", show_default=False),
-    ] = None,
-    at_origin: Annotated[
-        str | None,
-        typer.Option("--at-origin", metavar="X,Y,Z", help="Where it stands [m].", show_default="0,0,0"),
-    ] = None,
-    azimuth: Annotated[
-        float | None,
-        typer.Option("--azimuth-deg", metavar="DEG", help="Azimuth of its forward axis.", show_default="0"),
-    ] = None,
-    elevation: Annotated[
-        float | None,
-        typer.Option("--elevation-deg", metavar="DEG", help="Elevation of its forward axis.", show_default="0"),
-    ] = None,
-    roll: Annotated[
-        float | None,
-        typer.Option("--roll-deg", metavar="DEG", help="Roll about its forward axis.", show_default="0"),
-    ] = None,
-    rays: Annotated[
-        int | None,
-        typer.Option(
-            "--rays", metavar="N", min=1, max=1_000_000, help="Rays per frame.", show_default="all that it has"
-        ),
-    ] = None,
-    parts: Annotated[
-        int | None,
-        typer.Option("--parts", metavar="N", min=1, max=1000, help="Parts.", show_default="as many as the rays need"),
-    ] = None,
-    arrange: Annotated[
-        str | None,
-        typer.Option(
-            "--arrange",
-            metavar="interleaved|beside",
-            help="Several parts see the same with rays between each other's, or fields side by side.",
-            show_default="interleaved",
-        ),
-    ] = None,
+    out: Out = None,
+    at_origin: AtOrigin = None,
+    azimuth: Azimuth = None,
+    elevation: Elevation = None,
+    roll: Roll = None,
+    rays: Rays = None,
+    parts: Parts = None,
+    arrange: Arrange = None,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
