@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +20,7 @@ from lidardesign_tasks.importance import (
 )
 from lidardesign_tasks.meshes import MeshesConfig, MeshesTask
 from lidardesign_tasks.pose import rotation_matrix
+from lidardesign_tasks.surroundings import Surroundings
 from pydantic import ValidationError
 
 from lidardesign.errors import DataError
@@ -311,3 +314,22 @@ def test_gltf_text_that_names_weights_it_does_not_have_is_refused(tmp_path):
     path.write_text(json.dumps(document))
     with pytest.raises(DataError, match=r"ball\.gltf"):
         load_mesh(path, painted=Painted("_care"))
+
+
+def test_the_example_of_the_page_paints_a_mesh_that_loads(tmp_path, monkeypatch):
+    page = (Path(__file__).parents[1] / "docs" / "importance.md").read_text(encoding="utf-8")
+    block = next(text for text in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "trimesh.load" in text)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cups").mkdir()
+    trimesh.creation.box((0.08, 0.12, 0.1)).export("cup.stl")
+    exec(block, {})
+    mesh = load_mesh("cups/cup.ply", painted=Painted("care"))
+    assert np.allclose(mesh.importance, np.where(mesh.vertices[:, 1] > 0.04, 10.0, 1.0))
+
+
+@pytest.mark.parametrize("kind", [FaceConfig, EmitterConfig, MeshesConfig])
+def test_every_key_of_importance_is_on_the_page(kind):
+    page = (Path(__file__).parents[1] / "docs" / "importance.md").read_text(encoding="utf-8")
+    inherited = set(kind.model_fields) & set(Importance.model_fields) - set(Surroundings.model_fields)
+    assert len(inherited) == 8
+    assert all(f"`{key}`" in page for key in inherited)

@@ -205,15 +205,25 @@ def _table_grid(
     return grid_around(np.stack([corners.min(axis=0), corners.max(axis=0)]), resolution, padding_m)
 
 
-def _table_field(bodies: list[tuple[int, Body]], columns: int, grid: Grid) -> TableField:
-    meshes = [body.shape.transformed(body.pose()) for _, body in bodies]
-    if grid.size * columns * 4 > MAXIMUM_TABLE_BYTES:
+def check_table(grid: Grid, columns: int, tables: int = 1) -> None:
+    """Refuse tables that no memory holds.
+
+    Raises:
+        ConfigError: So it is.
+    """
+    size = grid.size * columns * 4 * tables
+    if size > MAXIMUM_TABLE_BYTES:
         raise ConfigError(
-            f"fields of {columns} scenes at {grid.size} points need {grid.size * columns * 4 / 2**30:.1f} GiB",
+            f"fields of {columns} scenes at {grid.size} points need {size / 2**30:.1f} GiB",
             where="density.field_resolution",
             allowed=f"{MAXIMUM_TABLE_BYTES / 2**30:.0f} GiB",
             hint="lower density.field_resolution or use fewer scenes",
         )
+
+
+def _table_field(bodies: list[tuple[int, Body]], columns: int, grid: Grid) -> TableField:
+    meshes = [body.shape.transformed(body.pose()) for _, body in bodies]
+    check_table(grid, columns)
     table = np.full((grid.size, columns), FAR_M, dtype=np.float32)
     shell_m = np.zeros(columns)
     for (column, _), mesh, values in zip(bodies, meshes, cached_distance_grids(meshes, grid), strict=True):

@@ -15,7 +15,7 @@ import numpy as np
 
 from lidardesign.density import interpolation
 from lidardesign.density.bodies import Bodies
-from lidardesign.density.fields import BodyField, Field, TableField, UnionField, scene_columns
+from lidardesign.density.fields import BodyField, Field, TableField, UnionField, check_table, scene_columns
 from lidardesign.density.grids import Grid, cached_distance_grids
 from lidardesign.density.occlusion import Pairs
 from lidardesign.density.weight_grids import cached_log_weight_grids
@@ -265,6 +265,7 @@ def build_log_weights(scenes: Sequence[Scene], field: Field, *, around: Sequence
 
 
 def _table_weights(field: TableField, bodies: list[tuple[int, Body]], columns: int) -> TableWeights:
+    check_table(field.grid, columns, tables=2)
     meshes = [body.shape.transformed(body.pose()) for _, body in bodies]
     table = np.zeros((field.grid.size, columns), dtype=np.float32)
     alone = np.bincount([column for column, _ in bodies], minlength=columns) < 2
