@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidardesign.design.catalog.library import FOLDER, find_part, load_library
-from lidardesign.design.catalog.part import conditions_of, disagreements
+from lidardesign.design.catalog.part import Part, conditions_of, disagreements
 from lidardesign.design.catalog.pattern import to_angles, to_directions
 from lidardesign.design.catalog.placing import (
     Pose,
@@ -30,13 +30,15 @@ from lidardesign.design.catalog.placing import (
     parts_for,
     side_by_side,
 )
-from lidardesign.design.catalog.statements import FIELDS, Statement
+from lidardesign.design.catalog.statements import FIELDS, PartFile, Statement
 from lidardesign.design.catalog.thinning import thinned
 from lidardesign.design.files import SCHEMA_FILE, design_document, design_from_document, load_design, save_design
 from lidardesign.design.grid import grid_rows
 from lidardesign.design.rays import lay_out
 from lidardesign.design.sensor import boresight_frame, fitted_layout
 from lidardesign.errors import ConfigError
+from lidardesign.run.validation import check_model
+from lidardesign.run.yaml import parse_yaml
 from lidardesign.space import angles, direction
 
 LIBRARY = load_library()
@@ -109,6 +111,7 @@ def test_the_rays_of_a_part_are_unit_vectors_inside_its_field_and_as_many_as_it_
     part = PARTS[name]
     assert np.allclose(np.linalg.norm(part.directions, axis=1), 1, atol=1e-12)
     assert part.inside(part.directions).all()
+    assert len(part.directions) == part.rays
     assert len(np.unique(np.round(part.directions, 9), axis=0)) == part.rays
     columns, rows = part.grid
     assert columns * rows >= part.rays > (columns - 1) * (rows - 1)
@@ -387,6 +390,11 @@ def test_more_rays_than_a_part_has_take_more_parts_that_share_them(count, parts,
     assert np.bincount(rays.sensor).tolist() == shares
 
 
+def test_parts_that_stand_nowhere_fire_nothing():
+    with pytest.raises(ConfigError, match="no pose for vl53l8cx"):
+        part_rays(PARTS["vl53l8cx"], [])
+
+
 def test_one_part_cannot_fire_more_rays_than_it_has():
     with pytest.raises(ConfigError, match="65 rays of 1 x vl53l8cx") as caught:
         part_rays(PARTS["vl53l8cx"], Pose(), 65)
@@ -511,6 +519,7 @@ def test_two_own_parts_of_one_name_are_refused(tmp_path):
         ("vlp16", "there is no part 'vlp16'"),
         ("vlp-16:4x4", "vlp-16 has no mode '4x4'"),
         ("vl53l5cx:9x9", "vl53l5cx has no mode '9x9'"),
+        ("vl53l5cx:", "vl53l5cx has no mode ''"),
         ("", "there is no part ''"),
         ("nowhere/part.yaml", "cannot be read"),
         ("no such.yaml", "'no such' is no name of a part"),
@@ -545,7 +554,15 @@ def test_an_empty_folder_holds_no_parts(tmp_path):
         ("schema_version: 1", "schema_version: 2", "schema_version"),
         ("kind: zones", "kind: spiral", "pattern"),
         ("{kind: zones, columns: 3, rows: 2,", "{kind: rings, columns: 3,", "give either rings or elevations_deg"),
-        ("{kind: zones, columns: 3, rows: 2,", "{kind: zones, columns: 3000, rows: 3000,", None),
+        ("{kind: zones, columns: 3, rows: 2,", "{kind: zones, columns: 3000, rows: 3000,", "9000000 rays a frame"),
+        (
+            "{kind: zones, columns: 3, rows: 2,",
+            "{kind: rings, columns: 3, elevations_deg: [0, 11],",
+            "a beam at 11 deg",
+        ),
+        ("elevation: [-10, 10]", "elevation: [0, 0]", "2 rays across an elevation without width"),
+        ("azimuth: [-15, 15]", "azimuth: [-180, 180]", "beyond 180 degrees from the forward axis"),
+        ("elevation: [-10, 10]", "elevation: [-10, 10], shape: ellipse", "its pattern has corners"),
         ("product: Homemade", 'product: "\\x1b[2J"', "product"),
     ],
 )
@@ -561,6 +578,38 @@ def test_files_that_are_no_parts_are_refused(own, text):
     own.write_text(text)
     with pytest.raises(ConfigError):
         find_part(own)
+
+
+LEAVES = st.one_of(
+    st.none(), st.booleans(), st.integers(-3, 3), st.integers(10**5, 10**9), st.floats(), st.text(max_size=5),
+    st.just([]), st.just({}), st.lists(st.floats(-400, 400), max_size=3),
+)  # fmt: skip
+
+
+def leaves(value, path=()):
+    yield path
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, inside in items:
+        yield from leaves(inside, (*path, key))
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.data())
+def test_a_part_file_with_anything_in_any_place_is_a_part_or_refused(data):
+    document = parse_yaml(OWN, where="own").value
+    path = data.draw(st.sampled_from([one for one in leaves(document) if one]))
+    target = document
+    for key in path[:-1]:
+        target = target[key]
+    target[path[-1]] = data.draw(LEAVES)
+    try:
+        part = Part.of_file("own", check_model(PartFile, document, lambda where, *, key=False: "own"), None, "own")
+        rays = part_rays(part, Pose())
+    except ConfigError:
+        return
+    assert len(rays) == part.rays >= 1
+    assert part.inside(part.directions).all()
+    design_from_document(design_document(part_design(part, Pose(), min(part.rays, 50))))
 
 
 # the commands

@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 
 # How several parts at one place are turned against each other.
 ARRANGEMENTS = ("interleaved", "beside")
+LIST_EXAMPLES = "Examples:\n\nlidardesign catalog list --reflectance 10 --klux 100"
+SHOW_EXAMPLES = (
+    "Examples:\n\nlidardesign catalog show vl53l5cx:4x4\n\n"
+    "lidardesign catalog show vl53l8cx --out bought.yaml --rays 196 --at-origin 0.4,0,0 --azimuth-deg 180"
+)
 
 Own = Annotated[
     list[Path] | None,
@@ -51,7 +56,7 @@ Out = Annotated[
     Path | None, typer.Option("--out", metavar="FILE.yaml", help="Write a design of the part.", show_default=False)
 ]
 AtOrigin = Annotated[
-    str | None, typer.Option("--at-origin", metavar="X,Y,Z", help="Where it stands [m].", show_default="0,0,0")
+    str | None, typer.Option("--at-origin", metavar="X,Y,Z", help="Where it stands, in metres.", show_default="0,0,0")
 ]
 Azimuth = Annotated[
     float | None, typer.Option("--azimuth-deg", metavar="DEG", help="Azimuth of its forward axis.", show_default="0")
@@ -105,7 +110,7 @@ def catalog(
             )
 
 
-@catalog_app.command("list")
+@catalog_app.command("list", epilog=LIST_EXAMPLES)
 def list_(
     own: Own = None,
     reflectance: Reflectance = None,
@@ -131,7 +136,7 @@ def list_(
             console.note(f"note: {left_out} of {len(parts)} parts and modes have no range stated for such conditions")
 
 
-@catalog_app.command("show")
+@catalog_app.command("show", epilog=SHOW_EXAMPLES)
 def show(
     name: Annotated[str, typer.Argument(metavar="NAME", help="A part's name, NAME:MODE, or a part file.")],
     own: Own = None,

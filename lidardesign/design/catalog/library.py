@@ -44,14 +44,14 @@ class Library:
         Raises:
             ConfigError: There is no such part or mode.
         """
-        stem, _, mode = name.partition(":")
+        stem, colon, mode = name.partition(":")
         if stem not in self.files:
             hint = (
                 suggest(stem, self.files) or "lidardesign catalog list shows all, and a path names a file of your own"
             )
             raise ConfigError(f"there is no part {stem!r}", where="catalog", allowed=", ".join(self.names), hint=hint)
         file = self.files[stem]
-        if mode and mode not in file.modes:
+        if colon and mode not in file.modes:
             allowed = ", ".join(file.modes) or f"{stem} alone: it has one mode"
             raise ConfigError(
                 f"{stem} has no mode {mode!r}", where="catalog", allowed=allowed, hint=suggest(mode, file.modes)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.design.catalog.pattern import Projection, inside, pattern_directions, projection_of
-from lidardesign.design.catalog.statements import FieldOfView, PartFile, Source, Statement
+from lidardesign.design.catalog.statements import FieldOfView, PartFile, Source, Statement, ray_count
 from lidardesign.design.grid import grid_rows
 from lidardesign.errors import ConfigError
 
@@ -105,7 +105,7 @@ class Part:
     @property
     def rays(self) -> int:
         """Rays per frame."""
-        return len(self.directions)
+        return ray_count(self.pattern, self.rate_hz)
 
     @property
     def grid(self) -> tuple[int, int]:

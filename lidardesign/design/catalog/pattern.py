@@ -12,10 +12,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from lidardesign.design.catalog.statements import Even, FieldOfView, Pixels, Rings, Rosette, Zones
+from lidardesign.design.catalog.statements import Even, FieldOfView, Pixels, Rings, Rosette, Zones, ray_count
 from lidardesign.design.grid import low_discrepancy
-from lidardesign.design.sensor import MOST_RAYS
-from lidardesign.errors import ConfigError
 from lidardesign.numerics import COARSE_SLACK, sphere_exp, sphere_log
 from lidardesign.space import direction
 
@@ -56,11 +54,7 @@ def to_directions(projection: Projection, angles: np.ndarray) -> np.ndarray:
 
 
 def pattern_directions(pattern: Any, view: FieldOfView, rate_hz: float) -> np.ndarray:
-    """The unit vectors of a frame in the part's frame, in the order in which they fire, shape (M, 3).
-
-    Raises:
-        ConfigError: A frame of more rays than a design holds.
-    """
+    """The unit vectors of a frame in the part's frame, in the order in which they fire, shape (M, 3)."""
     return to_directions(projection_of(pattern, view), np.radians(_angles_deg(pattern, view, rate_hz)))
 
 
@@ -71,7 +65,6 @@ def _angles_deg(pattern: Any, view: FieldOfView, rate_hz: float) -> np.ndarray:
         return _even(pattern.rays, view)
     if isinstance(pattern, Rings):
         return _rings(pattern, view)
-    _check_count(pattern.columns * pattern.rows)
     across, up = _centres(*view.azimuth, pattern.columns), _centres(*view.elevation, pattern.rows)
     if isinstance(pattern, Pixels):
         across, up = _focal_plane(*view.azimuth, pattern.columns), _focal_plane(*view.elevation, pattern.rows)
@@ -96,7 +89,6 @@ def _focal_plane(low_deg: float, high_deg: float, count: int) -> np.ndarray:
 def _rings(pattern: Rings, view: FieldOfView) -> np.ndarray:
     """Column by column, as a head turns; all beams of a column fire at about the same time."""
     elevations = pattern.elevations_deg or _ends_included(*view.elevation, pattern.rings or 1)
-    _check_count(pattern.columns * len(elevations))
     low, high = view.azimuth
     whole = high - low >= FULL_TURN_DEG - COARSE_SLACK
     across = _centres(low, high, pattern.columns) if whole else _ends_included(low, high, pattern.columns)
@@ -109,8 +101,7 @@ def _ends_included(low: float, high: float, count: int) -> np.ndarray:
 
 def _rosette(pattern: Rosette, rate_hz: float) -> np.ndarray:
     """Thin prisms: each adds a fixed deflection in the direction in which it stands (first order in the wedge)."""
-    count = round(pattern.points_per_s / rate_hz)
-    _check_count(count)
+    count = ray_count(pattern, rate_hz)
     time_s = np.arange(count) / pattern.points_per_s
     angles = np.zeros((count, 2))
     for turns_hz, deflection_deg in zip(pattern.rotor_hz, pattern.deflection_deg, strict=True):
@@ -131,11 +122,6 @@ def _even(count: int, view: FieldOfView) -> np.ndarray:
     low, high = math.sin(math.radians(bottom)), math.sin(math.radians(top))
     up = np.degrees(np.arcsin(np.clip(low + (high - low) * unit[:, 1], -1.0, 1.0)))
     return np.stack([left + (right - left) * unit[:, 0], up], axis=1)
-
-
-def _check_count(count: int) -> None:
-    if not 1 <= count <= MOST_RAYS:
-        raise ConfigError(f"a frame of {count} rays", where="pattern", allowed=f"1 to {MOST_RAYS:,}")
 
 
 def inside(view: FieldOfView, projection: Projection, directions: np.ndarray) -> np.ndarray:

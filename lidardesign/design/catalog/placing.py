@@ -92,9 +92,11 @@ def part_rays(
             where there are enough, and other rays fill it up.
 
     Raises:
-        ConfigError: More rays than the parts have, or than any design may.
+        ConfigError: No pose; more rays than the parts have, or than any design may.
     """
     poses = [poses] if isinstance(poses, Pose) else list(poses)
+    if not poses:
+        raise ConfigError(f"no pose for {part.name}", where="catalog", allowed="at least one")
     capacity = part.rays * len(poses)
     total = capacity if count is None else count
     if not 0 <= total <= min(capacity, MOST_RAYS):

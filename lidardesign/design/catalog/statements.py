@@ -6,6 +6,7 @@ disagree, and ranges under other conditions, stay visible.
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
@@ -216,7 +217,61 @@ class Figures(_Keys):
 
 FIELDS = tuple(Figures.model_fields)
 REQUIRED = ("pattern", "field_of_view_deg", "far_m", "rate_hz")
+STRAIGHT_DEG = 180.0
+RIGHT_DEG = 90.0
 MODE_NAME = r"^[a-z0-9][a-z0-9.-]{0,30}$"
+
+
+def ray_count(pattern: Any, rate_hz: float) -> int:
+    """Rays of one frame of a pattern."""
+    if isinstance(pattern, Even):
+        return pattern.rays
+    if isinstance(pattern, Rosette):
+        return round(pattern.points_per_s / rate_hz)
+    if isinstance(pattern, Rings):
+        return pattern.columns * (pattern.rings or len(pattern.elevations_deg or ()))
+    return pattern.columns * pattern.rows
+
+
+def check_pattern(pattern: Any, view: FieldOfView, rate_hz: float, of_mode: str) -> None:
+    """Refuse a pattern that its field of view cannot hold.
+
+    Raises:
+        ValueError: Too many rays, several in a field without width, rays outside of the field, or a field that its kind
+            of pattern cannot have.
+    """
+    count = ray_count(pattern, rate_hz)
+    if not 1 <= count <= MOST_RAYS:
+        raise ValueError(f"pattern{of_mode} has {count} rays a frame, allowed are 1 to {MOST_RAYS:,}")
+    widest = [max(map(abs, interval)) for interval in (view.azimuth, view.elevation)]
+    if isinstance(pattern, Zones | Rosette) and math.hypot(*widest) > STRAIGHT_DEG:
+        raise ValueError(f"field_of_view_deg{of_mode} reaches beyond {STRAIGHT_DEG:g} degrees from the forward axis")
+    if isinstance(pattern, Pixels) and max(widest) >= RIGHT_DEG:
+        raise ValueError(f"field_of_view_deg{of_mode} reaches {RIGHT_DEG:g} degrees, which no flat sensor sees")
+    if isinstance(pattern, Rosette):
+        _check_rosette(pattern, view, of_mode)
+    elif not isinstance(pattern, Even):
+        _check_grid(pattern, view, of_mode)
+
+
+def _check_rosette(pattern: Rosette, view: FieldOfView, of_mode: str) -> None:
+    reach = sum(pattern.deflection_deg)
+    if any(low > -reach or high < reach for low, high in (view.azimuth, view.elevation)):
+        raise ValueError(f"pattern{of_mode} reaches {reach:g} degrees, outside of field_of_view_deg")
+
+
+def _check_grid(pattern: Zones | Pixels | Raster | Rings, view: FieldOfView, of_mode: str) -> None:
+    rows = pattern.rings or 1 if isinstance(pattern, Rings) else pattern.rows
+    for name, number, (low, high) in (("azimuth", pattern.columns, view.azimuth), ("elevation", rows, view.elevation)):
+        if number > 1 and low == high:
+            raise ValueError(f"pattern{of_mode} has {number} rays across an {name} without width")
+    if view.shape == "ellipse" and pattern.columns * rows > 1:
+        raise ValueError(f"field_of_view_deg{of_mode} is an ellipse, but its pattern has corners")
+    bottom, top = view.elevation
+    if isinstance(pattern, Rings) and pattern.elevations_deg is not None:
+        outside = [one for one in pattern.elevations_deg if not bottom <= one <= top]
+        if outside:
+            raise ValueError(f"pattern{of_mode} has a beam at {outside[0]:g} degrees, outside of field_of_view_deg")
 
 
 class PartFile(Figures):
@@ -259,6 +314,7 @@ class PartFile(Figures):
                     if statement.source not in self.sources:
                         known = ", ".join(self.sources)
                         raise ValueError(f"{name}{of_mode} names the source {statement.source!r}, known are {known}")
+            check_pattern(figures["pattern"][0], figures["field_of_view_deg"][0], figures["rate_hz"][0].value, of_mode)
             near = figures["near_m"][0].value if "near_m" in figures else 0.0
             if near >= figures["far_m"][0].value:
                 raise ValueError(f"near_m{of_mode} is not below far_m")
