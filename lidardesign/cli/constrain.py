@@ -14,6 +14,7 @@ from lidardesign.cli.runs import check_choice, check_name, need_run, open_target
 from lidardesign.cli.weighting import Weighting
 
 if TYPE_CHECKING:
+    from lidardesign.cli.runs import Run
     from lidardesign.design.constraints import Constraints
     from lidardesign.design.sensor import Design
     from lidardesign.run.yaml import KeyPath
@@ -54,17 +55,12 @@ def constrain(
     with command(json=json, quiet=quiet, debug=debug) as console:
         check_name(name)
         load_libraries()
-        from lidardesign.design.sensor import fitted_layout
-
-        if gates is not None:
-            check_choice(gates, "--gates", GATES)
-        if layout is not None:
-            check_choice(layout, "--layout", LAYOUTS)
+        _check_choices(gates, layout)
         count, condition = sensor_count(sensors, None), parse_at(at)
         checked = load_constraints(constraints, overrides or [])
         opened, design = open_target(target, console)
         run = need_run(opened, target)
-        layout = layout or (fitted_layout(design.layout) if design else usual_layout(run))
+        layout = layout or _usual(checked, design, run)
         check_sensors(count, layout)
         fit_and_write(
             run,
@@ -82,6 +78,23 @@ def constrain(
             weighting=_weighting(weights, design),
             refine=refine,
         )
+
+
+def _check_choices(gates: str | None, layout: str | None) -> None:
+    if gates is not None:
+        check_choice(gates, "--gates", GATES)
+    if layout is not None:
+        check_choice(layout, "--layout", LAYOUTS)
+
+
+def _usual(constraints: Constraints, design: Design | None, run: Run) -> str:
+    """The layout where none is named: the design's, else the task's; sensors that become parts are fitted as grids."""
+    from lidardesign.design.sensor import fitted_layout
+    from lidardesign.design.snap_options import wants_parts
+
+    if wants_parts(constraints):
+        return "grid"
+    return fitted_layout(design.layout) if design else usual_layout(run)
 
 
 def _weighting(given: list[str] | None, design: Design | None) -> Weighting:
@@ -104,7 +117,7 @@ def load_constraints(file: Path | None, overrides: list[str]) -> Constraints:
     Raises:
         ConfigError: At file:line:column, or at the `--set` option.
     """
-    from lidardesign.design.constraints import Constraints
+    from lidardesign.design.constraints import CATALOG, Constraints
     from lidardesign.run.overrides import apply_override, parse_override
     from lidardesign.run.yaml import Document, load_yaml
 
@@ -113,6 +126,9 @@ def load_constraints(file: Path | None, overrides: list[str]) -> Constraints:
     origins: dict[KeyPath, str] = {}
     for text in overrides:
         override = parse_override(text)
+        if len(override.path) > 1 and override.path[0] == "snap" and values.get("snap") == CATALOG:
+            # the short form of a mapping without keys
+            values["snap"] = {}
         origins[apply_override(values, override)] = override.where
 
     def locate(path: KeyPath, *, key: bool = False) -> str:
@@ -146,8 +162,10 @@ def _rays(
     may_stay_open: bool,
     budgets: tuple[int, ...],
 ) -> int | None:
-    """The number of rays: the option's, then the constraints', the design's; a ray table needs one."""
-    if given is not None:
+    """The number of rays: the option's, then the constraints', the design's; a ray table needs one, parts have some."""
+    from lidardesign.design.snap_options import wants_parts
+
+    if given is not None or wants_parts(constraints):
         return given
     if constraints.budget.rays is not None:
         return constraints.budget.rays

@@ -165,6 +165,10 @@ def show_fit(document: dict[str, Any], design: Design, checks: Sequence[Any], ri
     from rich.markup import escape
 
     show_design(design, rich)
+    if "snap" in document:
+        from lidardesign.cli.snaps import show_snap
+
+        show_snap(document["snap"], rich)
     show_constraints(checks, rich)
     figures = {"log-likelihood": "log_likelihood", "ESS": "ess", "admissible mass": "admissible_mass"}
     estimates = document["error_estimates"]

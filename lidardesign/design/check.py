@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.design.check_excluded import excluded_rows, excluded_starts, excluded_travel
+from lidardesign.design.check_snap import snap_rows
 from lidardesign.numerics import COARSE_SLACK, ROUNDING, SLACK
 
 # Rounding of the checker's own conversions between radians and degrees, as a share of the bound.
@@ -72,6 +73,7 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
         checks += _origin(name, sensor, own) + _boresight(name, sensor, own, bounds)
         checks += [ConstraintCheck(*row) for row in excluded_rows(name, sensor, own, z)]
         checks += _intervals(name, sensor, own, z)
+        checks += [ConstraintCheck(*row) for row in snap_rows(name, index, document, own.get("snap"))]
         if bounds is not None:
             checks += _inside_space(name, sensor, bounds)
     checks += _table(document, rules)

@@ -26,6 +26,8 @@ from lidardesign.design.resolve import bounds_of, groups
 from lidardesign.design.samples import Samples
 from lidardesign.design.scan import fit_scan, rays_of
 from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, Design, Layout, Sensor, interval_factor
+from lidardesign.design.snap_fit import Snapped, at_one_place, snapped
+from lidardesign.design.snap_options import wants_parts
 from lidardesign.design.support import Retarget, Support, check_support, pinned, restricted
 from lidardesign.design.track_fit import fit_track
 from lidardesign.design.uncertainty import fit_estimates, likelihood_error
@@ -42,6 +44,7 @@ EM_SAMPLES = 20_000
 RESTARTS = 12
 # `auto` tries up to this many sensors.
 MOST_SENSORS = 12
+ONE_PLACE = "every part is at one place: sensors were fixed at the middle of their origins, and fitted anew there"
 # It stops after this many counts in a row that gain less than one standard error.
 PATIENCE = 2
 HELD_OUT_SHARE = 1 / 3
@@ -108,8 +111,7 @@ def fit(
         return _along_condition(samples, constraints, rays, level, seed, name)
     request = _Request(samples, constraints, seed, restarts, em_samples, level, retarget)
     read_out = ReadOut.of(constraints, rays)
-    supports, fitted, total, ensemble = _solved(request, read_out, sensors, layout)
-    design = _design(fitted, layout, total, request, name, gates or own_gates(layout))
+    supports, ensemble, design, snap = _made(request, read_out, sensors, layout, gates or own_gates(layout), name)
     checks = _checked(design, constraints, samples)
     score = Estimate(ensemble.log_likelihood, likelihood_error(ensemble, supports), "nats")
     return FitResult(
@@ -120,8 +122,9 @@ def fit(
         satisfied=all(check.satisfied for check in checks),
         constraints=checks,
         seconds=time.perf_counter() - started,
-        notes=(*placement_notes(constraints), *ensemble.notes),
+        notes=(*placement_notes(constraints), *ensemble.notes, *(snap.notes if snap else ())),
         error_estimates=fit_estimates(score, supports, samples, design.sensors),
+        snap=snap.report if snap else None,
     )
 
 
@@ -170,6 +173,34 @@ def _solved(
     return supports, fitted, total, ensemble
 
 
+def _made(
+    request: _Request, read_out: ReadOut, sensors: int | str | None, layout: Layout, gates: Gates, name: str
+) -> tuple[list[Support], Ensemble, Design, Snapped | None]:
+    """Samples, what was fitted to them, and the design that it stands for."""
+    if wants_parts(request.constraints):
+        supports, snap = _snapped(request, read_out, sensors, name)
+        return supports, snap.ensemble, snap.design, snap
+    supports, fitted, total, ensemble = _solved(request, read_out, sensors, layout)
+    return supports, ensemble, _design(fitted, layout, total, request, name, gates), None
+
+
+def _snapped(
+    request: _Request, read_out: ReadOut, sensors: int | str | None, name: str
+) -> tuple[list[Support], Snapped]:
+    """Samples, and the design of the parts that sensors become."""
+    constraints, space = request.constraints, request.samples.space
+    # the parts have gates of their own: the budget is theirs
+    free = replace(read_out, limit_mbps=None, rays=None)
+    supports, fitted, _, ensemble = _solved(request, free, sensors, "grid")
+    fixed = at_one_place(constraints, fitted)
+    if fixed is not None:
+        supports, fitted, _, ensemble = _solved(replace(request, constraints=fixed), free, len(fitted), "grid")
+    parts = snapped(ensemble, constraints, space, read_out, level=request.level, seed=request.seed, name=name)
+    moved = () if fixed is None else (ONE_PLACE,)
+    design = replace(parts.design, at=fixed_conditions(space))
+    return supports, replace(parts, design=design, notes=(*moved, *parts.notes))
+
+
 def _check_options(
     constraints: Constraints, samples: Samples, sensors: int | str | None, layout: str, rays: int | None
 ) -> None:
@@ -192,6 +223,12 @@ def _check_options(
             hint=f"--layout scan, or {' '.join(f'--at {condition}=VALUE' for condition in names)}",
         )
     if layout == "scan":
+        if wants_parts(constraints):
+            raise ConfigError(
+                "every ray of a scan is a sensor of its own, and no part has a single steered ray",
+                where="snap",
+                hint="--layout grid --sensors N",
+            )
         if is_mounted(constraints):
             raise ConfigError(
                 "the rays of a scan have origins of their own",

@@ -25,6 +25,7 @@ class FitResult:
         seconds: Wall time [s].
         notes: What happened to sensors, one line each.
         error_estimates: How far log_likelihood, ess and admissible_mass may be off, and the rays of sensors.
+        snap: What sensors lost that became parts, as plain values; None where none did.
     """
 
     design: Design
@@ -36,9 +37,11 @@ class FitResult:
     seconds: float
     notes: tuple[str, ...] = field(default=())
     error_estimates: Mapping[str, Estimate] = field(default_factory=dict)
+    snap: Mapping[str, Any] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """The contract's JSON keys; the path of the design is for the caller to fill."""
+        snap = {} if self.snap is None else {"snap": dict(self.snap)}
         return {
             "design": self.design.name,
             "sensors": [sensor.as_dict() for sensor in self.design.sensors],
@@ -49,4 +52,5 @@ class FitResult:
             "constraints": [check.as_dict() for check in self.constraints],
             "seconds": self.seconds,
             "error_estimates": as_documents(self.error_estimates),
+            **snap,
         }

@@ -45,16 +45,19 @@ def wants_parts(constraints: Constraints) -> bool:
     return any(constraints.of_sensor(index).snap is not None for index in range(len(constraints.each) + 1))
 
 
-def options_of(constraints: Constraints, space: DesignSpace, count: int) -> list[Options]:
-    """What each of `count` sensors may become.
+def options_of(constraints: Constraints, space: DesignSpace, middles_m: Sequence[float]) -> list[Options]:
+    """What each of some sensors may become.
+
+    Arguments:
+        constraints: The constraint file.
+        space: The design space.
+        middles_m: The mean range of each sensor: a part that does not measure there is none for it.
 
     Raises:
         InfeasibleError: No part keeps a sensor's constraints, and it is not said that it may stay as it is.
         ConfigError: A part that is not there, or no part file.
     """
-    last = len(constraints.each)
-    known = {index: _options(constraints, index, space) for index in sorted({min(i, last) for i in range(count)})}
-    options = [known[min(index, last)] for index in range(count)]
+    options = [_options(constraints, index, space, middle) for index, middle in enumerate(middles_m)]
     refused = [
         index
         for index, one in enumerate(options)
@@ -62,11 +65,11 @@ def options_of(constraints: Constraints, space: DesignSpace, count: int) -> list
     ]
     if refused:
         names = tuple(dict.fromkeys(name for index in refused for name in options[index].lacking))
-        which = ", ".join(str(index) for index in refused)
+        which = ", ".join(f"s{index}" for index in refused)
         raise InfeasibleError(
-            f"no part can stand in for sensors {which} and keep {', '.join(names)}",
+            f"no part can stand in for {which} and keep {', '.join(names)}",
             conflicts=[*names, constraints.name_of(refused[0], "snap")],
-            hint="loosen one of the constraints named, or snap.otherwise=keep leaves such sensors as they are",
+            hint="loosen one of the constraints named, or leave such sensors as they are: --set snap.otherwise=keep",
         )
     return options
 
@@ -74,11 +77,13 @@ def options_of(constraints: Constraints, space: DesignSpace, count: int) -> list
 def parts_of(snap: Snap) -> list[Part]:
     """The parts, in all modes where none is named, that a constraint file chooses from.
 
+    Of the whole catalogue, those of which a source says from where they measure.
+
     Raises:
         ConfigError: A name or path that is no part.
     """
     if snap.parts is None:
-        return load_library().every_mode()
+        return [part for part in load_library().every_mode() if part.value("near_m") is not None]
     found: dict[str, Part] = {}
     for text in snap.parts:
         found |= {part.name: part for part in _named(text)}
@@ -120,21 +125,20 @@ def _modes(library: Library, part: Part) -> list[Part]:
     return [library.part(f"{stem}:{mode}") for mode in part.modes] or [part]
 
 
-def _options(constraints: Constraints, index: int, space: DesignSpace) -> Options:
+def _options(constraints: Constraints, index: int, space: DesignSpace, middle_m: float) -> Options:
     one = constraints.of_sensor(index)
     if one.snap is None:
         return Options([], snapped=False)
-    broken = {}
-    shapes: list[Shape] = []
-    for part in parts_of(one.snap):
-        found = shapes_of(part, space)
-        broken[part.name] = _broken(found[0], one) if found else {SPACE_RANGE}
-        shapes += found if not broken[part.name] else []
-    if shapes:
-        return Options(shapes, snapped=True)
-    lacking = _smallest_lacking(list(broken.values()))
-    names = tuple(SPACE_RANGE if key == SPACE_RANGE else constraints.name_of(index, key) for key in lacking)
-    return Options([], snapped=False, lacking=names)
+    every = [shapes_of(part, space) for part in parts_of(one.snap)]
+    heard = [shapes for shapes in every if shapes and shapes[0].gate_m[0] <= middle_m <= shapes[0].gate_m[1]]
+    broken = [_broken(shapes[0], one) for shapes in heard]
+    kept = [shape for shapes, found in zip(heard, broken, strict=True) if not found for shape in shapes]
+    if kept:
+        return Options(kept, snapped=True)
+    lacking = _smallest_lacking(broken) if broken else ()
+    return Options(
+        [], snapped=False, lacking=tuple(constraints.name_of(index, key) for key in lacking) or (SPACE_RANGE,)
+    )
 
 
 def _broken(shape: Shape, one: SensorConstraints) -> set[str]:
