@@ -20,14 +20,15 @@ from lidardesign.design.constraints import Constraints, Gate
 from lidardesign.design.files import design_document
 from lidardesign.design.sensor import MOST_RAYS, Design
 from lidardesign.evaluate.candidates import Positions, whole_range
+from lidardesign.evaluate.cma_figures import Setting
 from lidardesign.evaluate.cma_models import Amount, Model, SensorModel
 from lidardesign.evaluate.cma_objective import TrainingObjective
-from lidardesign.evaluate.cma_parameters import Setting
 from lidardesign.evaluate.cma_search import Budget, Found, Progress, Search
 from lidardesign.evaluate.cma_starts import scan_starts, starts
 from lidardesign.evaluate.cma_track import TrackFigures, TrackModel, Way
 from lidardesign.evaluate.observed import TrainingViews, dense_points
 from lidardesign.evaluate.placement import opened_gate
+from lidardesign.numerics import COARSE_SLACK
 from lidardesign.run.clock import phase
 from lidardesign.simulate.detector import IDEAL
 from lidardesign.space import DIMENSIONS, DesignSpace
@@ -180,7 +181,8 @@ class CmaCandidate:
         gates = np.tile(whole_range(self.space), (int(max(rays.sensor.max() for rays in positions)) + 1, 1))
         for index in np.unique(sensor):
             own = range_m[sensor == index]
-            gates[index] = opened_gate(float(own.min()), float(own.max()))
+            # a gate goes through its mean and spread: rounding must not cut the outermost returns off
+            gates[index] = opened_gate((1 - COARSE_SLACK) * float(own.min()), (1 + COARSE_SLACK) * float(own.max()))
         model = found.model.with_gates(found.vector, gates)
         return replace(found, model=model, vector=model.zero)
 

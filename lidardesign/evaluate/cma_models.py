@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -14,7 +14,8 @@ from lidardesign.design.budget import BIN_MARGIN, ReadOut
 from lidardesign.design.rays import lay_out, split_budget
 from lidardesign.design.sensor import MOST_RAYS, Design, Sensor, interval_factor
 from lidardesign.evaluate.candidates import Positions, mean_mbps
-from lidardesign.evaluate.cma_parameters import Figures, SensorCoordinates, Setting, sensors_of
+from lidardesign.evaluate.cma_figures import Figures, Setting, sensors_of
+from lidardesign.evaluate.cma_parameters import SensorCoordinates
 from lidardesign.numerics import safe_divide
 
 # Rays whose gates are their own cost less than their sensors' gates: so often is the number of rays raised.
@@ -87,6 +88,18 @@ def with_gate(sensor: Sensor, start_m: float, end_m: float) -> Sensor:
     return replace(sensor, range_m=(start_m + end_m) / 2, spread_range_m=spread, coupling=coupling)
 
 
+def starting_inside(document: Mapping[str, Any], setting: Setting) -> dict[str, Any]:
+    """Constraints that say where rays may start: where sensors are spread out, they do not leave the space."""
+    kept = dict(document)
+    if not setting.spread_axes:
+        return kept
+    origin = dict(kept.get("origin") or {})
+    low, high = (list(map(float, end[:3])) for end in (setting.space.low, setting.space.high))
+    origin["low_m"] = [max(pair) for pair in zip(low, origin.get("low_m", low), strict=True)]
+    origin["high_m"] = [min(pair) for pair in zip(high, origin.get("high_m", high), strict=True)]
+    return {**kept, "origin": origin}
+
+
 class SensorModel:
     """Designs of a few sensors, or of one per ray.
 
@@ -102,9 +115,9 @@ class SensorModel:
         setting: Setting,
         start: Sequence[Sensor],
         conditions: Sequence[Mapping[str, float]],
-        document: Mapping[str, object],
+        document: Mapping[str, Any],
     ) -> None:
-        self.setting, self.conditions, self._document = setting, conditions, dict(document)
+        self.setting, self.conditions, self._document = setting, conditions, starting_inside(document, setting)
         self.coordinates = SensorCoordinates(setting, start)
         self.size, self.zero = self.coordinates.size, self.coordinates.zero
 

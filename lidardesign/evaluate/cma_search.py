@@ -23,15 +23,16 @@ from lidardesign.evaluate.cma_models import Amount, Model
 from lidardesign.evaluate.cma_objective import OutOfTimeError, TrainingObjective
 from lidardesign.numerics import TINY
 
-# Scenes that the first steps see: at first many candidates tell more than many scenes.
-FIRST_SCENES = 4
+# Scenes that the first steps see; as many as baselines are compared on. With 4, tracks of an arm that were best there
+# were more than twice as far off on 16.
+FIRST_SCENES = 8
 # More training scenes than these tell finalists no better apart, and cost the search its time.
 MOST_SCENES = 40
 # The share of the budget in which finalists are compared, at most.
-FINAL_SHARE = 0.1
+FINAL_SHARE = 0.2
 # Stages end after shares of 1 - 2^(-n / pace) of the budget: 0.37, 0.6, 0.75, ... of it.
 STAGE_PACE = 1.5
-STEP = 1.0  # the first standard deviation, in units of the parameters' own steps
+STEP = 0.3  # the first standard deviation, in units of the parameters' own steps
 # Beyond so many numbers a full covariance takes longer to learn than any budget lasts: variances alone are adapted.
 MOST_CORRELATED = 250
 MOST_POPULATION = 4  # times the usual one
@@ -145,7 +146,7 @@ class Search:
         start = _Best(best.model, best.vector, best.value)
         self._finalists = [start]
         strategy = _Strategy(best.model, best.vector, self._generator)
-        while best.model.size and not self._over():
+        while best.model.size and not self._over(strategy.population * self._stages[stage]):
             wanted = self._stage()
             if wanted > stage:
                 stage = wanted
@@ -213,16 +214,18 @@ class Search:
         self._per_evaluation = spent if not self._per_evaluation else 0.7 * self._per_evaluation + 0.3 * spent
         return values.mean(axis=1)
 
-    def _share(self) -> float:
-        """The share of the budget that is used up, with what comparing the finalists will take."""
+    def _share(self, ahead: int = 0) -> float:
+        """The share of the budget that is used up with so many evaluations more, and those of the finalists."""
         finalists = (len(self._finalists) + 2) * self._last
+        # more than that, and they are compared on fewer scenes
         kept = min(finalists * self._per_evaluation, FINAL_SHARE * self._budget.seconds)
-        elapsed = (self._budget.clock() - self._began + kept) / self._budget.seconds
-        counted = (self._evaluations + finalists) / self._budget.evaluations
+        finalists = min(finalists, FINAL_SHARE * self._budget.evaluations)
+        elapsed = (self._budget.clock() - self._began + kept + ahead * self._per_evaluation) / self._budget.seconds
+        counted = (self._evaluations + finalists + ahead) / self._budget.evaluations
         return max(elapsed, counted)
 
-    def _over(self) -> bool:
-        return self._share() >= 1.0
+    def _over(self, ahead: int = 0) -> bool:
+        return self._share(ahead) >= 1.0
 
     def _stage(self) -> int:
         """The number of the stage: each takes half as large a share of what is left as the one before had."""
@@ -232,13 +235,14 @@ class Search:
         """The best finalist on all scenes."""
         unique = {(id(one.model), one.vector.tobytes()): one for one in self._finalists}
         lists = [one.model.positions(one.vector, self._amount) for one in unique.values()]
-        values = self._objective.values(lists, range(self._last)).mean(axis=1)
-        self._evaluations += len(lists) * self._last
+        scenes = self._final_scenes(len(lists))
+        values = self._objective.values(lists, range(scenes)).mean(axis=1)
+        self._evaluations += len(lists) * scenes
         worth = dict(zip(unique, (float(value) for value in values), strict=True))
         best = min(worth, key=lambda key: worth[key])
         sign = self._objective.sign
         seconds = self._budget.clock() - self._began
-        self._curve.append((seconds, self._evaluations, self._last, sign * worth[best]))
+        self._curve.append((seconds, self._evaluations, scenes, sign * worth[best]))
         return Found(
             model=unique[best].model,
             vector=unique[best].vector,
@@ -247,10 +251,17 @@ class Search:
             seconds=seconds,
             candidates=self._candidates,
             evaluations=self._evaluations,
-            scenes=self._last,
+            scenes=scenes,
             restarts=self._restarts,
             curve=_thinned(self._curve),
         )
+
+    def _final_scenes(self, finalists: int) -> int:
+        """The number of scenes that finalists can be compared on: all, or as many as time and evaluations are left."""
+        left = self._budget.seconds - (self._budget.clock() - self._began)
+        affordable = left / max(finalists * self._per_evaluation, TINY)
+        affordable = min(affordable, (self._budget.evaluations - self._evaluations) / finalists)
+        return int(np.clip(affordable, self._stages[0], self._last))
 
     def _note(self, best: _Best, scenes: int) -> None:
         value = self._objective.sign * best.value
@@ -299,14 +310,20 @@ class _Strategy:
         import cma
 
         usual = 4 + int(3 * math.log(max(self.model.size, 2)))
+        population = usual * min(2**self.restart, MOST_POPULATION)
         options = {
-            "popsize": usual * min(2**self.restart, MOST_POPULATION),
+            "popsize": population,
             "CMA_diagonal": self.model.size > MOST_CORRELATED,
             "seed": math.nan,  # the generator below is the only source of random numbers
             "randn": lambda *shape: self.generator.standard_normal(shape),
             "verbose": -9,
         }
         self._inner = cma.CMAEvolutionStrategy(self.mean_at_start, STEP, options)
+
+    @property
+    def population(self) -> int:
+        """The number of vectors that it asks for at a time."""
+        return int(self._inner.popsize)
 
     @property
     def mean(self) -> np.ndarray:

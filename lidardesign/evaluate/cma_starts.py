@@ -21,9 +21,9 @@ from lidardesign.design.grid import low_discrepancy
 from lidardesign.design.sensor import Coupling, Sensor, boresight_frame
 from lidardesign.evaluate.bounding import bounding, parallel_angles
 from lidardesign.evaluate.candidates import Spot, central, whole_range
+from lidardesign.evaluate.cma_figures import NARROWEST_RAD, Setting
 from lidardesign.evaluate.cma_models import with_gate
 from lidardesign.evaluate.cma_origins import admitted_origins
-from lidardesign.evaluate.cma_parameters import NARROWEST_RAD, Setting
 from lidardesign.evaluate.observed import Observed, TrainingViews, dense_points, unrolled
 from lidardesign.evaluate.placement import RAY_AXES, even_placement, opened_gate
 from lidardesign.numerics import TINY, sphere_exp, sphere_log

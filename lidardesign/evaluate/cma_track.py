@@ -20,8 +20,9 @@ from lidardesign.design.rays import lay_out
 from lidardesign.design.sensor import Design, Sensor, Track
 from lidardesign.design.track import boresight_azimuth
 from lidardesign.evaluate.candidates import Positions
+from lidardesign.evaluate.cma_figures import NARROWEST_RAD, Setting
 from lidardesign.evaluate.cma_models import Amount, widest_bins
-from lidardesign.evaluate.cma_parameters import GATE_SHARE, LOG_WIDTH, NARROWEST_RAD, Setting
+from lidardesign.evaluate.cma_parameters import GATE_SHARE, LOG_WIDTH
 from lidardesign.numerics import TINY, wrap_angle
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION
 

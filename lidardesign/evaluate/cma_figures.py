@@ -1,0 +1,374 @@
+"""Sensors as arrays of numbers in their own units, and their projection onto the constraints.
+
+Every constraint that binds `fit` binds here: the same bounds, each kept by moving to the nearest number that keeps it,
+one after the other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidardesign.design.bounds import Bounds, clip_azimuth
+from lidardesign.design.constraints import Constraints
+from lidardesign.design.features import Axes
+from lidardesign.design.gates import admissible_gates
+from lidardesign.design.resolve import bounds_of
+from lidardesign.design.sensor import Coupling, Sensor, boresight_frame, interval_factor
+from lidardesign.evaluate.cma_origins import admitted_covariances, admitted_origins, held_still
+from lidardesign.numerics import SLACK, TINY, safe_divide
+from lidardesign.space import DesignSpace, angles, direction
+
+# Weights that differ by more nats leave sensors without a ray.
+MOST_LOG_WEIGHT = 5.0
+NARROWEST_RAD = 1e-3
+WIDEST_RAD = math.pi / 2
+# Rays that meet nearer than a quarter of their range, or behind the sensor as near, are no design that anybody wants.
+MOST_FOCUS = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """What all candidates of a search share.
+
+    Arguments:
+        space: The design space, at the condition values of the design that is followed.
+        constraints: Its constraints.
+        level: The share of each marginal that fields of view and gates hold.
+        layout: `grid`, `scan` or `distributed`.
+        at: The condition values that it is for.
+        gates: Whether gates are varied; otherwise they are as wide as is admitted, and cropped in the end.
+    """
+
+    space: DesignSpace
+    constraints: Constraints
+    level: float
+    layout: str
+    at: Mapping[str, float]
+    gates: bool = True
+
+    @property
+    def interval(self) -> float:
+        """z, half an interval in standard deviations."""
+        return interval_factor(self.level)
+
+    @property
+    def axes(self) -> Axes:
+        """Which dimensions are free."""
+        return Axes.of(self.space)
+
+    @property
+    def spread_axes(self) -> tuple[int, ...]:
+        """The axes along which a sensor's rays start at different places."""
+        return self.axes.origin if self.layout == "distributed" else ()
+
+    def bounds(self, count: int) -> Bounds:
+        """The bounds of the first sensors."""
+        return bounds_of(self.constraints, self.space, tuple(range(count)), self.interval)
+
+
+@dataclass(frozen=True, eq=False)
+class Figures:
+    """The numbers of G sensors in their own units.
+
+    Arguments:
+        origin: Mean origins [m], shape (G, 3).
+        carried: The start's frames, rows forward, horizontal, vertical, shape (G, 3, 3).
+        looking: Boresights, unit vectors, shape (G, 3).
+        roll: About the boresight, from the start's frame carried along [rad], shape (G,).
+        spread: Angular standard deviations given the origin [rad], shape (G, 2).
+        gate: Start and end [m], shape (G, 2).
+        log_weight: Shape (G,).
+        covariance: Of the origin along the spread axes [m^2], shape (G, k, k).
+        focus: Mean range over the distance at which rays meet, shape (G, 2).
+        log_share: Logarithm of the part of the gate's spread that the origin leaves, at most 0, shape (G,).
+    """
+
+    origin: np.ndarray
+    carried: np.ndarray
+    looking: np.ndarray
+    roll: np.ndarray
+    spread: np.ndarray
+    gate: np.ndarray
+    log_weight: np.ndarray
+    covariance: np.ndarray
+    focus: np.ndarray
+    log_share: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.origin)
+
+
+def projected(self, vector: np.ndarray) -> np.ndarray:
+        """The nearest vector, step by step, that keeps the constraints."""
+        return self._encoded(self.figures(vector))
+
+    def figures(self, vector: np.ndarray, narrowed_m: float = math.inf) -> Figures:
+        """The numbers that a vector stands for, projected; gates no wider than a cap [m]."""
+        bounds = self._bounds if math.isinf(narrowed_m) else self._bounds.narrowed(narrowed_m)
+        return projected(self._decoded(vector), self.setting, bounds)
+
+    def _parts(self, vector: np.ndarray) -> dict[str, np.ndarray]:
+        rows = np.asarray(vector, dtype=np.float64).reshape(len(self._start), -1)
+        parts, start = {}, 0
+        for name, width in self._columns:
+            parts[name] = rows[:, start : start + width]
+            start += width
+        return parts
+
+    def _units(self) -> dict[str, np.ndarray]:
+        """One unit of each column, shape (G, 1 or width)."""
+        start, axes = self._start, self.setting.axes
+        field = 2 * self.setting.interval * np.maximum(start.spread.max(axis=1, keepdims=True), NARROWEST_RAD)
+        width = np.diff(start.gate, axis=1)
+        box = (self._bounds.origin_high - self._bounds.origin_low)[:, list(axes.origin)]
+        shift = BOX_SHARE * box
+        if self.setting.spread_axes:
+            spread = np.sqrt(np.einsum("gii->gi", start.covariance))
+            shift = np.where(spread > 0, ORIGIN_SHARE * spread, shift)
+        constants = {
+            "roll": ROLL_RAD, "spread": LOG_SPREAD, "width": LOG_WIDTH, "log_weight": LOG_WEIGHT,
+            "covariance": LOG_COVARIANCE, "focus": FOCUS, "log_share": LOG_SHARE,
+        }  # fmt: skip
+        units = {name: np.full((1, 1), value) for name, value in constants.items()}
+        return units | {
+            "origin": np.where(shift > 0, shift, 1.0),
+            "looking": DIRECTION_SHARE * field,
+            "middle": GATE_SHARE * np.maximum(width, TINY),
+        }
+
+    def _decoded(self, vector: np.ndarray) -> Figures:
+        units = self._units()
+        parts = {name: values * units[name] for name, values in self._parts(vector).items()}
+        start, axes = self._start, self.setting.axes
+        changes: dict[str, np.ndarray] = {}
+        if "origin" in parts:
+            changes["origin"] = start.origin.copy()
+            changes["origin"][:, list(axes.origin)] += parts["origin"]
+        free = [axes.horizontal, axes.vertical]
+        if "looking" in parts:
+            turn = np.zeros((len(start), 2))
+            turn[:, free] = parts["looking"]
+            changes["looking"] = np.einsum("gi,gij->gj", sphere_exp(turn), start.carried)
+        if "spread" in parts:
+            changes["spread"] = start.spread.copy()
+            changes["spread"][:, free] *= np.exp(parts["spread"])
+        if "middle" in parts:
+            middle = start.gate.mean(axis=1) + parts["middle"][:, 0]
+            half = np.diff(start.gate, axis=1)[:, 0] / 2 * np.exp(parts["width"][:, 0])
+            changes["gate"] = np.stack([middle - half, middle + half], axis=1)
+        if "covariance" in parts:
+            logarithm = log_matrix(start.covariance) + _symmetric(parts["covariance"], len(axes.origin))
+            changes["covariance"] = exp_matrix(logarithm)
+        if "focus" in parts:
+            changes["focus"] = start.focus.copy()
+            changes["focus"][:, free] += parts["focus"]
+        for name in ("roll", "log_weight", "log_share"):
+            if name in parts:
+                changes[name] = getattr(start, name) + parts[name][:, 0]
+        return replace(start, **changes)
+
+    def _encoded(self, figures: Figures) -> np.ndarray:
+        """The vector of projected numbers."""
+        start, axes, units = self._start, self.setting.axes, self._units()
+        free = [axes.horizontal, axes.vertical]
+        turned = np.einsum("gij,gj->gi", start.carried, figures.looking)
+        widths = [np.diff(one.gate, axis=1) for one in (figures, start)]
+        values = {
+            "origin": (figures.origin - start.origin)[:, list(axes.origin)],
+            "looking": sphere_log(turned)[:, free],
+            "roll": (figures.roll - start.roll)[:, None],
+            "spread": np.log(np.maximum(figures.spread / np.maximum(start.spread, TINY), TINY))[:, free],
+            "middle": (figures.gate.mean(axis=1) - start.gate.mean(axis=1))[:, None],
+            "width": np.log(np.maximum(widths[0] / np.maximum(widths[1], TINY), TINY)),
+            "log_weight": (figures.log_weight - start.log_weight)[:, None],
+            "focus": (figures.focus - start.focus)[:, free],
+            "log_share": (figures.log_share - start.log_share)[:, None],
+        }
+        if self.setting.spread_axes:
+            moved = log_matrix(figures.covariance) - log_matrix(start.covariance)
+            rows, columns = np.triu_indices(moved.shape[1])
+            values["covariance"] = moved[:, rows, columns]
+        return np.concatenate([values[name] / units[name] for name, _ in self._columns], axis=1).ravel()
+
+
+def _symmetric(upper: np.ndarray, size: int) -> np.ndarray:
+    """Upper triangles (G, k (k + 1) / 2) as symmetric matrices (G, k, k)."""
+    rows, columns = np.triu_indices(size)
+    full = np.zeros((len(upper), size, size))
+    full[:, rows, columns] = full[:, columns, rows] = upper
+    return full
+
+
+def projected(figures: Figures, setting: Setting, bounds: Bounds) -> Figures:
+    """Numbers moved to where the constraints admit them, one after the other."""
+    axes, space = setting.axes, setting.space
+    origin = admitted_origins(figures.origin, bounds, setting.constraints)
+    azimuth, elevation = angles(figures.looking)
+    azimuth = clip_azimuth(azimuth, bounds) if axes.horizontal else np.full(len(figures), space.low[3])
+    low, high = bounds.elevation_low, bounds.elevation_high
+    elevation = np.clip(elevation, low, high) if axes.vertical else np.full(len(figures), space.low[4])
+    covariance = figures.covariance
+    if setting.spread_axes:
+        still = held_still(setting.constraints, bounds)
+        covariance = admitted_covariances(origin, covariance, setting.spread_axes, bounds) * ~still[:, None, None]
+    gate = figures.gate
+    if axes.range:
+        centre, spread_m = admissible_gates(gate, bounds)
+        half = bounds.interval * spread_m
+        gate = np.stack([centre - half, centre + half], axis=1)
+    looking = direction(azimuth, elevation)
+    weight = figures.log_weight - np.logaddexp.reduce(figures.log_weight)
+    weight = np.maximum(weight, weight.max() - MOST_LOG_WEIGHT)
+    moved = replace(
+        figures,
+        origin=origin,
+        looking=looking,
+        gate=gate,
+        covariance=covariance,
+        log_weight=weight - np.logaddexp.reduce(weight),
+        focus=np.clip(figures.focus, -MOST_FOCUS, MOST_FOCUS),
+        log_share=np.minimum(figures.log_share, 0.0),
+    )
+    return _within_fields(moved, setting, bounds)
+
+
+def _within_fields(figures: Figures, setting: Setting, bounds: Bounds) -> Figures:
+    """Spreads and focus such that the fields of view keep their bounds: what moves with the origin counts in them."""
+    axes = setting.axes
+    scale = np.array([axes.angle_scale, 1.0])
+    low, high = bounds.spread_low * scale, np.minimum(bounds.spread_high * scale, WIDEST_RAD / bounds.interval)
+    high = np.maximum(high, low)
+    moving = np.abs(figures.focus) * _spread_with_origin(figures, setting)
+    shrink = np.minimum(1.0, high / np.maximum(np.hypot(figures.spread, moving), TINY))
+    free = np.array([axes.horizontal, axes.vertical], dtype=np.float64)
+    least = np.minimum(NARROWEST_RAD * scale / bounds.interval, high / 2)
+    spread = free * np.clip(shrink * figures.spread, least, high)
+    kept = np.minimum(shrink * moving, np.sqrt(np.square(high) - np.square(spread)))
+    needed = np.sqrt(np.maximum(np.square(low) - np.square(kept), 0.0))
+    focus = figures.focus * free * safe_divide(kept, moving, 1.0)
+    return replace(figures, spread=free * np.maximum(spread, needed), focus=focus)
+
+
+def _spread_with_origin(figures: Figures, setting: Setting) -> np.ndarray:
+    """Standard deviation of the tangent angles that follow from the origin at focus 1, shape (G, 2) [rad]."""
+    if not setting.spread_axes:
+        return np.zeros((len(figures), 2))
+    slopes = _slopes(figures, setting)[:, :, list(setting.spread_axes)]
+    return np.sqrt(np.maximum(np.einsum("gai,gij,gaj->ga", slopes, figures.covariance, slopes), 0.0))
+
+
+def _slopes(figures: Figures, setting: Setting) -> np.ndarray:
+    """How tangent angles follow from the origin at focus 1 [rad / m], shape (G, 2, 3)."""
+    reach = np.maximum(figures.gate.mean(axis=1), NARROWEST_RAD)
+    return -frames_of(figures, setting)[:, 1:] / reach[:, None, None]
+
+
+def frames_of(figures: Figures, setting: Setting) -> np.ndarray:
+    """Rows forward, horizontal, vertical of each sensor, shape (G, 3, 3).
+
+    The start's frame is carried along by the smallest turn, then rolled: near the poles azimuths jump, this does not.
+    """
+    if setting.axes.angular < 2:
+        return _level_frames(figures.looking)
+    forward, level = figures.carried[:, 0], figures.carried[:, 1]
+    ahead = 1.0 + np.einsum("gi,gi->g", forward, figures.looking)
+    along = np.einsum("gi,gi->g", level, figures.looking)
+    carried = level - (along / np.maximum(ahead, SLACK))[:, None] * (forward + figures.looking)
+    carried /= np.linalg.norm(carried, axis=1, keepdims=True)
+    upright = np.cross(figures.looking, carried)
+    cosine, sine = np.cos(figures.roll)[:, None], np.sin(figures.roll)[:, None]
+    rolled = cosine * carried + sine * upright, cosine * upright - sine * carried
+    return np.stack([figures.looking, *rolled], axis=1)
+
+
+def _level_frames(looking: np.ndarray) -> np.ndarray:
+    """The frames without roll, shape (G, 3, 3)."""
+    return np.array([boresight_frame(a, e) for a, e in zip(*angles(looking), strict=True)])
+
+
+def figures_of(sensors: Sequence[Sensor], setting: Setting) -> Figures:
+    """The numbers of sensors; those with spread origins have rays that meet where their coupling says."""
+    along = list(setting.spread_axes)
+    frames = np.array([sensor.frame for sensor in sensors])
+    weights = np.array([sensor.weight for sensor in sensors])
+    spreads = [(sensor.spread_horizontal_rad, sensor.spread_vertical_rad) for sensor in sensors]
+    if along:
+        spreads = [
+            spread if s.coupling is None else s.coupling.spread_rad for s, spread in zip(sensors, spreads, strict=True)
+        ]
+    return Figures(
+        origin=np.array([sensor.origin_m for sensor in sensors], dtype=np.float64),
+        carried=frames,
+        looking=frames[:, 0],
+        roll=np.zeros(len(sensors)),
+        spread=np.array(spreads, dtype=np.float64),
+        gate=np.array([sensor.gate_m for sensor in sensors]),
+        log_weight=np.log(np.maximum(weights / weights.sum(), TINY)),
+        covariance=np.array([np.asarray(sensor.origin_covariance_m2)[np.ix_(along, along)] for sensor in sensors]),
+        focus=np.array([_focus(sensor) for sensor in sensors]),
+        log_share=np.zeros(len(sensors)),
+    )
+
+
+def _focus(sensor: Sensor) -> np.ndarray:
+    """How near a sensor's rays meet, horizontally and vertically, shape (2,)."""
+    if sensor.coupling is None:
+        return np.zeros(2)
+    return -sensor.range_m * np.einsum("ai,ai->a", np.asarray(sensor.coupling.direction_per_m), sensor.frame[1:])
+
+
+def sensors_of(figures: Figures, setting: Setting, rays: Sequence[int] | None = None) -> tuple[Sensor, ...]:
+    """The sensors of projected numbers, each with its rays where they are known."""
+    azimuth, elevation = angles(figures.looking)
+    frames, level = frames_of(figures, setting), _level_frames(figures.looking)
+    roll = np.arctan2(*(np.einsum("gi,gi->g", frames[:, 1], level[:, axis]) for axis in (2, 1)))
+    moving = np.abs(figures.focus) * _spread_with_origin(figures, setting)
+    spread = np.hypot(figures.spread, moving)
+    slopes = figures.focus[:, :, None] * _slopes(figures, setting)
+    weight = np.exp(figures.log_weight)
+    spread_m = np.diff(figures.gate, axis=1)[:, 0] / (2 * setting.interval)
+    return tuple(
+        Sensor(
+            name=f"s{index}",
+            weight=float(weight[index] / weight.sum()),
+            origin_m=figures.origin[index],
+            origin_covariance_m2=_covariance(figures, setting, index),
+            azimuth_rad=float(azimuth[index]),
+            elevation_rad=float(elevation[index]),
+            roll_rad=float(roll[index]),
+            spread_horizontal_rad=float(spread[index, 0]),
+            spread_vertical_rad=float(spread[index, 1]),
+            range_m=float(figures.gate[index].mean()),
+            spread_range_m=float(spread_m[index]),
+            level=setting.level,
+            rays=None if rays is None else int(rays[index]),
+            coupling=_coupling(figures, setting, index, slopes[index], float(spread_m[index])),
+        )
+        for index in range(len(figures))
+    )
+
+
+def _covariance(figures: Figures, setting: Setting, index: int) -> np.ndarray:
+    covariance = np.zeros((3, 3))
+    along = list(setting.spread_axes)
+    covariance[np.ix_(along, along)] = figures.covariance[index]
+    return covariance
+
+
+def _coupling(figures: Figures, setting: Setting, index: int, slopes: np.ndarray, spread_m: float) -> Coupling | None:
+    """Rays that start off the mean origin look where they meet the others, and listen at the same plane."""
+    if not setting.spread_axes:
+        return None
+    free = np.isin(np.arange(3), setting.spread_axes)
+    share = math.exp(figures.log_share[index])
+    return Coupling(
+        direction_per_m=np.where(free, slopes, 0.0),
+        range_per_m=np.where(free, -figures.looking[index], 0.0),
+        range_per_rad=np.zeros(2),
+        spread_rad=figures.spread[index],
+        spread_m=share * spread_m,
+    )
