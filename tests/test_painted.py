@@ -23,7 +23,7 @@ from lidardesign_tasks.pose import rotation_matrix
 from lidardesign_tasks.surroundings import Surroundings
 from pydantic import ValidationError
 
-from lidardesign.errors import DataError
+from lidardesign.errors import ConfigError, DataError
 from lidardesign.meshio import check_mesh, load_mesh
 from lidardesign.vertex_weights import Painted
 
@@ -189,6 +189,14 @@ def test_the_far_side_of_a_thin_plate_makes_it_no_rougher():
     assert found.max() > 1e-4  # the rim
 
 
+def test_balls_too_small_to_measure_with_are_refused_with_the_least():
+    made = ball(radius=1.0)
+    vertices, faces = np.asarray(made.vertices), np.asarray(made.faces)
+    with pytest.raises(ConfigError, match=r"(?s)roughness_radius_m.*at least 0\.016 m"):
+        vertex_roughness(vertices, faces, 0.001)
+    assert vertex_roughness(vertices, faces, 0.02).max() > 0
+
+
 def test_a_surface_that_is_flat_everywhere_counts_evenly():
     vertices = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], dtype=float) + 10.0
     assert np.array_equal(relative_roughness(vertices, np.array([(0, 1, 2), (0, 2, 3)]), 0.3), np.ones(4))
@@ -251,6 +259,7 @@ def test_a_region_counts_its_weight_inside_and_nothing_more_beyond_its_edge(shap
         {"region_centre_m": (0, 0, 0), "region_radius_m": 0.1, "region_half_size_m": (1, 1, 1)},
         {"region_centre_m": (0, 0, 0), "region_half_size_m": (1, 0, 1)},
         {"region_centre_m": (0, 0, 0), "region_radius_m": 0.0},
+        {"region_centre_m": (0, 1e300, 0), "region_radius_m": 1.0},
         {"roughness_exponent": -1},
         {"area_exponent": -0.1},
         {"roughness_radius_m": 0},

@@ -14,7 +14,8 @@ import math
 import numpy as np
 from pydantic import Field, model_validator
 
-from lidardesign.space import DesignSpace
+from lidardesign.errors import ConfigError
+from lidardesign.space import FARTHEST_M, DesignSpace
 from lidardesign.surface import sample_triangles
 from lidardesign.task import random_generator
 from lidardesign_tasks.surroundings import Surroundings
@@ -26,6 +27,7 @@ LEAST_ROUGHNESS = 0.1
 FLATTEST_COSINE, NEAREST_SHARE = 0.1, 0.01
 # A plane through so many points has an rms distance good to a tenth.
 POINTS_PER_BALL = 100
+LEAST_PER_BALL = 25
 LEAST_POINTS, MOST_POINTS = 2_000, 400_000
 VERTICES_AT_ONCE = 2048
 # Roundings of coordinates that a distance from a plane passes through.
@@ -51,12 +53,12 @@ class Importance(Surroundings):
     region_centre_m: Vector | None = Field(
         None, description="centre of a region of interest, in the frame of the surface before its pose [m]"
     )
-    region_radius_m: float | None = Field(None, gt=0, description="its radius: a ball [m]")
+    region_radius_m: float | None = Field(None, gt=0, le=1e6, description="its radius: a ball [m]")
     region_half_size_m: Vector | None = Field(None, description="or its half size along x, y, z: a box [m]")
     region_weight: float = Field(
         4.0, gt=1e-3, le=1e3, description="how many times as much the region counts as the rest"
     )
-    region_edge_m: float = Field(0.01, ge=0, description="over what distance around it this fades [m]")
+    region_edge_m: float = Field(0.01, ge=0, le=1e6, description="over what distance around it this fades [m]")
 
     @model_validator(mode="after")
     def _one_region(self) -> Importance:
@@ -68,6 +70,8 @@ class Importance(Surroundings):
             raise ValueError("a region is a ball or a box: give region_radius_m or region_half_size_m, not both")
         if self.region_half_size_m is not None and min(self.region_half_size_m) <= 0:
             raise ValueError("half sizes of a region are above 0 m")
+        if np.abs([*(self.region_centre_m or ()), *(self.region_half_size_m or ())]).max(initial=0.0) > FARTHEST_M:
+            raise ValueError(f"a region lies within {FARTHEST_M:g} m")
         return self
 
     def weights(self, vertices: np.ndarray, faces: np.ndarray, viewpoint_m: np.ndarray) -> np.ndarray | None:
@@ -131,12 +135,22 @@ def vertex_roughness(vertices: np.ndarray, faces: np.ndarray, radius_m: float) -
 
     Only what faces the same half space as the vertex is its surface: not the far side of a thin part, nor what lies
     under the skin. The surface is that of `POINTS_PER_BALL` even points per ball, as far as `MOST_POINTS` go.
+
+    Raises:
+        ConfigError: They leave fewer than `LEAST_PER_BALL` in a ball.
     """
     from scipy.spatial import cKDTree
 
     doubled = _doubled_normals(vertices, faces)
-    asked = POINTS_PER_BALL * np.linalg.norm(doubled, axis=1).sum() / (2 * math.pi * radius_m**2)
-    count = int(np.clip(asked, LEAST_POINTS, MOST_POINTS))
+    area_m2 = float(np.linalg.norm(doubled, axis=1).sum()) / 2
+    count = int(np.clip(POINTS_PER_BALL * area_m2 / (math.pi * radius_m**2), LEAST_POINTS, MOST_POINTS))
+    least_m = math.sqrt(LEAST_PER_BALL * area_m2 / (math.pi * MOST_POINTS))
+    if radius_m < least_m:
+        raise ConfigError(
+            f"balls of {radius_m:g} m are too small to measure {area_m2:.3g} m^2 of surface with",
+            where="task.roughness_radius_m",
+            allowed=f"at least {least_m:.2g} m here",
+        )
     points, face = sample_triangles(vertices, faces, count, random_generator(0, "roughness"))
     tree, facing, normals = cKDTree(points), _facing(vertices, faces), doubled[face]
     roughness = np.zeros(len(vertices))
