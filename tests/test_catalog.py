@@ -35,7 +35,7 @@ from lidardesign.design.catalog.thinning import thinned
 from lidardesign.design.files import SCHEMA_FILE, design_document, design_from_document, load_design, save_design
 from lidardesign.design.grid import grid_rows
 from lidardesign.design.rays import lay_out
-from lidardesign.design.sensor import boresight_frame, fitted_layout
+from lidardesign.design.sensor import RayTable, boresight_frame, fitted_layout
 from lidardesign.errors import ConfigError
 from lidardesign.run.validation import check_model
 from lidardesign.run.yaml import parse_yaml
@@ -186,6 +186,19 @@ def test_a_pattern_that_is_not_published_is_even_per_solid_angle():
         assert share == pytest.approx(split, abs=0.002)
 
 
+def test_an_unpublished_pattern_in_a_round_field_is_even_over_its_disc(own):
+    text = OWN.replace("kind: zones, columns: 3, rows: 2", "kind: even, rays: 3000")
+    own.write_text(text.replace("elevation: [-10, 10]", "elevation: [-10, 10], shape: ellipse"))
+    part = find_part(own)
+    across, up = np.degrees(to_angles(part.projection, part.directions)).T
+    radius = np.hypot(across / 15, up / 10)
+    assert radius.max() <= 1
+    for inner in (0.3, 0.5, 0.9):
+        assert (radius < inner).mean() == pytest.approx(inner**2, abs=0.01)
+    assert (across > 0).mean() == pytest.approx(0.5, abs=0.01)
+    assert (up > 0).mean() == pytest.approx(0.5, abs=0.01)
+
+
 @pytest.mark.parametrize("projection", ["tangent", "sphere", "plane"])
 def test_angles_and_directions_undo_each_other(projection):
     angle = np.random.default_rng(0).uniform(-1.2, 1.2, (200, 2))
@@ -215,6 +228,19 @@ def test_sources_that_disagree_stay_visible():
     assert disagreements(PARTS["vl53l5cx"]) == []
     # other conditions are no contradiction
     assert "far_m" not in disagreements(PARTS["mid-40"])
+
+
+def test_one_source_with_several_figures_does_not_disagree_with_itself(own):
+    own.write_text(OWN.replace("  - {value: 0.1, source: bench}", "  - {value: 0.1, source: bench}\n" * 2))
+    assert disagreements(find_part(own)) == []
+    twice = "  - {value: 0.1, source: bench}\n  - {value: 0.2, source: bench}"
+    own.write_text(OWN.replace("  - {value: 0.1, source: bench}", twice))
+    assert disagreements(find_part(own)) == []
+    other = OWN.replace("  bench: {", "  list: {title: A list, kind: list}\n  bench: {")
+    own.write_text(
+        other.replace("  - {value: 0.1, source: bench}", twice.replace("0.2, source: bench", "0.2, source: list"))
+    )
+    assert disagreements(find_part(own)) == ["near_m"]
 
 
 def test_the_range_under_conditions_is_the_farthest_that_a_source_vouches_for():
@@ -352,6 +378,12 @@ def test_a_quarter_of_the_zones_is_one_of_every_block_of_four():
     assert len(blocks) == 16
 
 
+def test_one_ray_of_each_quarter_stands_in_its_middle():
+    kept = thinned(PARTS["vl53l5cx"].directions, 4)
+    assert {(index // 8 // 4, index % 8 // 4) for index in kept} == {(0, 0), (0, 1), (1, 0), (1, 1)}
+    assert all(index // 8 % 4 in (1, 2) and index % 4 in (1, 2) for index in kept)
+
+
 def test_a_subset_leaves_smaller_gaps_than_one_drawn_at_random():
     everything = PARTS["vlp-16"].directions
     kept = everything[thinned(everything, 300)]
@@ -451,6 +483,16 @@ def test_a_fixed_design_at_fewer_rays_fires_a_subset_of_its_own_each_sensor_in_p
     mine = {tuple(row) for row in np.column_stack([everything.direction, everything.gate_m, everything.sensor])}
     assert all(tuple(row) in mine for row in np.column_stack([few.direction, few.gate_m, few.sensor]))
     assert len(lay_out(design, 0)) == 0
+
+
+def test_sensors_of_different_size_lose_rays_in_proportion():
+    part = PARTS["vl53l8cx"]
+    whole = part_design(part, side_by_side(part, Pose(), 2))
+    kept = np.flatnonzero((whole.ray_table.sensor == 0) | (np.arange(128) % 2 == 0))
+    columns = {name: getattr(whole.ray_table, name)[kept] for name in RayTable.__dataclass_fields__}
+    sensors = tuple(replace(sensor, rays=None) for sensor in whole.sensors)
+    uneven = replace(whole, rays=96, ray_table=RayTable(**columns), sensors=sensors)
+    assert np.bincount(lay_out(uneven, 48).sensor).tolist() == [32, 16]
 
 
 def test_a_fixed_design_has_no_more_rays_than_its_pattern():
@@ -661,6 +703,10 @@ def test_a_part_is_written_as_a_design_that_other_commands_read(call, tmp_path):
     pose = Pose(np.array([-1, 0, 0.5]), math.radians(-20), math.radians(10))
     wanted = part_rays(part, interleaved(part, pose, 4), 196)
     assert np.allclose(lay_out(design).direction, wanted.direction, atol=1e-12)
+    beside = call("catalog", "show", "vl53l8cx", "--out", "wide.yaml", "--parts", "2", "--arrange", "beside")
+    assert beside.code == 0, beside.err
+    one, other = load_design(tmp_path / "wide.yaml").sensors
+    assert math.acos(one.boresight @ other.boresight) == pytest.approx(math.radians(45))
     assert call("export", "bought.yaml", "--format", "csv", "--rays", "100").code == 0
     assert len(Path("bought.csv").read_text().splitlines()) >= 100
 

@@ -31,16 +31,14 @@ def projection_of(pattern: Any, view: FieldOfView) -> Projection:
 
 
 def to_angles(projection: Projection, directions: np.ndarray) -> np.ndarray:
-    """The two angles of unit vectors in the part's frame: (N, 3) to (N, 2) [rad]; NaN where a camera cannot see."""
+    """The two angles of unit vectors in the part's frame: (N, 3) to (N, 2) [rad]."""
     if projection == "tangent":
         return sphere_log(directions)
     x, y, z = directions.T
     if projection == "sphere":
         return np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))], axis=1)
-    behind = x <= 0
-    found = np.stack([np.arctan2(y, x), np.arctan2(z, x)], axis=1)
-    found[behind] = np.nan
-    return found
+    # what is behind a camera has angles beyond a right one, which no field of it has
+    return np.stack([np.arctan2(y, x), np.arctan2(z, x)], axis=1)
 
 
 def to_directions(projection: Projection, angles: np.ndarray) -> np.ndarray:
