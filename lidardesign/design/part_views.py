@@ -33,16 +33,19 @@ def in_view(part: Part, directions: np.ndarray) -> np.ndarray:
     return (np.abs(offset) <= half).all(axis=1)
 
 
-def worth_firing(part: Part, pose: Pose, points: np.ndarray, weights: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+def worth_firing(
+    part: Part, pose: Pose, points: np.ndarray, weights: np.ndarray, *, least: int = 0
+) -> Callable[[np.ndarray], np.ndarray]:
     """Which rays of a part at a pose look where scene points are: unit vectors (N, 3) of the world to bool (N,).
 
-    The fewest that are nearest to 99 % of the weight that the part has in view.
+    The fewest that are nearest to 99 % of the weight that the part has in view; none where nothing is.
 
     Arguments:
         part: The part.
         pose: Where it stands.
         points: Design points that observe the scene points, shape (M, 6).
         weights: Non-negative, shape (M,).
+        least: So many rays in any case, where something is in view: then those that look nearest to it, too.
     """
     offset = observed_point(points) - pose.origin_m
     range_m = np.linalg.norm(offset, axis=1)
@@ -59,6 +62,10 @@ def worth_firing(part: Part, pose: Pose, points: np.ndarray, weights: np.ndarray
             enough = int(np.searchsorted(np.cumsum(share[order]), SEEN_SHARE * mass.sum())) + 1
             mask[order[:enough]] = True
             mask &= share > 0
+            others = np.flatnonzero(~mask)
+            lacking = max(min(least, len(directions)) - int(mask.sum()), 0)
+            away = cKDTree(looking).query(directions[others])[0]
+            mask[others[np.argsort(away, kind="stable")[:lacking]]] = True
         return mask
 
     return wanted

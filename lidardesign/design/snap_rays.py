@@ -126,7 +126,8 @@ def fired(shape_pose: tuple[Choice, Pose | None], sensor: Sensor, count: int, se
     if choice.shape is None or pose is None:
         return tangent_directions(sensor.frame, grid_tangent(*field_on_sphere(sensor), count))
     part = choice.shape.part
-    return part_rays(part, pose, count, wanted=worth_firing(part, pose, seen.points, seen.weights)).direction
+    wanted = worth_firing(part, pose, seen.points, seen.weights, least=count)
+    return part_rays(part, pose, count, wanted=wanted).direction
 
 
 def useful_rays(choice: Choice, pose: Pose, seen: Features) -> int:

@@ -182,7 +182,7 @@ class PartCandidate:
         even = np.ones(len(points))
         shares = [count // len(poses) + (index < count % len(poses)) for index in range(len(poses))]
         lists = [
-            part_rays(self.part, pose, share, wanted=worth_firing(self.part, pose, points, even))
+            part_rays(self.part, pose, share, wanted=worth_firing(self.part, pose, points, even, least=share))
             for pose, share in zip(poses, shares, strict=True)
         ]
         return Rays(

@@ -206,7 +206,7 @@ def _repeated(part: Part, poses: list[Pose]) -> list[Pose]:
 
 def places(space: DesignSpace) -> np.ndarray:
     """Origins that are tried: the only one, or an even set over the admissible box, shape (M, 3) [m]."""
-    low, high = np.array(space.low[:3]), np.array(space.high[:3])
+    low, high = (np.array(bounds[:3], dtype=np.float64) for bounds in (space.low, space.high))
     free = np.flatnonzero(high > low)
     if not len(free):
         return low[None]
