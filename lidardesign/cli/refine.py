@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from lidardesign.design.reweighting import Reweighting
     from lidardesign.design.samples import Samples
     from lidardesign.evaluate.refinement import Refinement, Round, Shape, Trial
+    from lidardesign.evaluate.regating import Gating
     from lidardesign.scene import Scene
 
 # The share of the training scenes whose residuals are looked at; the others judge.
@@ -190,6 +191,7 @@ def _refine(fitter: Fitter, weighting: Weighting, rounds: int, console: Console)
     order = fitter.order
     unit, seed = order.run.task.metric.unit, order.seed
     look, judge = _scenes(order)
+    gating = _Gating(fitter, look)
     drawn = fitter.base.resample(ANCHOR_POOL, random_generator(seed, "anchor places"))
     attention = Attention.over(observed_point(drawn), random_generator(seed, "anchors"))
 
@@ -198,7 +200,7 @@ def _refine(fitter: Fitter, weighting: Weighting, rounds: int, console: Console)
 
     refiner = Refiner(
         order.run.task,
-        lambda factor, shape: _trial(fitter, replace(weighting, reweighting=factor), shape),
+        lambda factor, shape: _trial(fitter, replace(weighting, reweighting=factor), shape, gating),
         look,
         judge,
         attention,
@@ -209,7 +211,24 @@ def _refine(fitter: Fitter, weighting: Weighting, rounds: int, console: Console)
     return refiner.run(rounds, Shape(order.choices["level"], weighting.range_spread_m))
 
 
-def _trial(fitter: Fitter, weighting: Weighting, shape: Shape) -> Trial:
+class _Gating:
+    """Gates by returns, from the scenes that are looked at and those that were learned from; made when asked for."""
+
+    def __init__(self, fitter: Fitter, look: list[Scene]) -> None:
+        self._fitter, self._look = fitter, look
+
+    @cached_property
+    def made(self) -> Gating:
+        """The gating, with casters of all scenes."""
+        from lidardesign.evaluate.regating import Gating
+        from lidardesign.simulate.simulate import build_casters
+
+        run = self._fitter.order.run
+        scenes = [*self._look, *run.scenes("train", run.config.seed)]
+        return Gating([(s, build_casters(s)) for s in scenes], run.config.space, run.config.density.sigma_m)
+
+
+def _trial(fitter: Fitter, weighting: Weighting, shape: Shape, gating: _Gating) -> Trial:
     """A design of a weighting, and its rays at every condition."""
     from lidardesign.design.bandwidth import Bandwidth
     from lidardesign.evaluate.candidates import mean_mbps
@@ -223,6 +242,9 @@ def _trial(fitter: Fitter, weighting: Weighting, shape: Shape) -> Trial:
     result = fitter.fit(weighting, samples, level=shape.level)
     layouts = Layouts({order.name: fitter.retarget(weighting.reweighting)})
     conditions = conditions_of(run.task, run.config.task, run.config.space)
+    if shape.traced_gates:
+        rays = layouts(result.design, result.design.rays or order.count, samples, at=conditions[0])
+        result = replace(result, design=gating.made(result.design, rays))
     positions = tuple(layouts(result.design, order.count, samples, at=condition) for condition in conditions)
     return Trial(result, positions, mean_mbps(positions, Bandwidth()))
 
@@ -271,6 +293,7 @@ def _document(found: Refinement, unit: str) -> dict[str, Any]:
         "unit": unit,
         "level": found.shape.level,
         "range_spread_m": found.shape.range_spread_m,
+        "traced_gates": found.shape.traced_gates,
         "scenes": {"looked_at": found.looked_at, "judged_on": found.judged_on},
         "rounds": [one.as_dict() for one in found.rounds],
     }

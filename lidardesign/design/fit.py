@@ -180,6 +180,9 @@ def _made(
     if wants_parts(request.constraints):
         supports, snap = _snapped(request, read_out, sensors, name)
         return supports, snap.ensemble, snap.design, snap
+    if layout == "density" and gates == "ray" and read_out.rays is not None:
+        # the gates of rays keep the budget, not those of sensors
+        read_out = replace(read_out, limit_mbps=None)
     supports, fitted, total, ensemble = _solved(request, read_out, sensors, layout)
     return supports, ensemble, _design(fitted, layout, total, request, name, gates), None
 
@@ -386,7 +389,9 @@ def _design(
     if layout == "scan":
         return design
     table = make_ray_table(design, total, request.samples, gates, seed=request.seed)
-    return replace(design, ray_table=table)
+    counts = np.bincount(table.sensor, minlength=len(sensors))
+    sensors = tuple(replace(s, rays=int(n)) for s, n in zip(sensors, counts, strict=True))
+    return replace(design, sensors=sensors, ray_table=table)
 
 
 def _document(design: Design) -> dict[str, Any]:

@@ -26,10 +26,11 @@ from lidardesign.design.quantise import lloyd, samples_for
 from lidardesign.design.resolve import bounds_of, groups
 from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import MOST_RAYS, Design, Layout, RayTable, Sensor, interval_factor, tangent_directions
+from lidardesign.design.shared_fields import shared_rays
 from lidardesign.design.support import Retarget
 from lidardesign.design.track import moved, placed
 from lidardesign.errors import ConfigError
-from lidardesign.numerics import systematic_draw
+from lidardesign.numerics import sphere_exp, sphere_log, systematic_draw, unit_vectors
 from lidardesign.run.clock import phase
 from lidardesign.simulate.returns import Rays
 from lidardesign.space import DesignSpace, angles, direction
@@ -155,6 +156,11 @@ def _laid_out(
     shares = _shares(design, total)
     if design.layout == "distributed":
         return _distributed_rays(design, shares, samples, gates, rate_hz, seed)
+    if design.layout == "density" and gates == "ray" and samples is not None and total:
+        shared = shared_rays(design, shares, samples, seed)
+        if shared is not None:
+            origin = np.array([s.origin_m for s in design.sensors], dtype=np.float64)[shared.sensor]
+            return Rays(origin, shared.direction, shared.gate_m, shared.sensor, fire_times(int(total), rate_hz))
     seen = None
     if total and (gates == "ray" or design.layout == "density"):
         if samples is None:
@@ -343,8 +349,9 @@ def _tangent(layout: str, sensor: Sensor, count: int, seen: Members | None, seed
 def _density_tangent(sensor: Sensor, count: int, seen: Members, seed: int, even: np.ndarray) -> np.ndarray:
     """Rays at the centres of Lloyd's cells of the samples inside a sensor; an even grid where too few.
 
-    In two dimensions the centres' density follows the square root of the samples' (Zador 1982): more rays
-    where the density is, and none of its thin parts left without.
+    Cells divide the sphere around the sensor by chords, and centres are drawn out to it: a tangent plane stretches
+    wide fields at their rims, and rays would be sparse there. In two dimensions the centres' density follows the
+    square root of the samples' (Zador 1982): more rays where the density is, and none of its thin parts left without.
     """
     generator = random_generator(seed, "density layout")
     tangent, weights = seen.tangent, seen.weights
@@ -353,9 +360,16 @@ def _density_tangent(sensor: Sensor, count: int, seen: Members, seed: int, even:
         tangent, weights = tangent[systematic_draw(weights, most, generator)], np.ones(most)
     if len(np.unique(tangent, axis=0)) < count:
         return even
-    centres, _ = lloyd(tangent, weights, count, generator)
+    chords, _ = lloyd(sphere_exp(tangent), weights, count, generator)
+    centres = np.clip(sphere_log(unit_vectors(chords)), *_field_ends(sensor))
     # row by row upwards, as the grid is: an order that depends on where the rays are, not on the seeding
     return centres[np.lexsort((centres[:, 0], centres[:, 1]))]
+
+
+def _field_ends(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest angles in a sensor's tangent plane, shape (2,) each [rad]: cells of wide fields may bulge."""
+    half = np.array(field_on_sphere(sensor)) / 2
+    return -half, half
 
 
 def _ray_gates(design: Design, tangents: list[np.ndarray], seen: list[Members], space: DesignSpace) -> np.ndarray:

@@ -1,9 +1,10 @@
 """Refinement: a design looks at training scenes, and its density learns where the error is.
 
-Each round takes the residuals of the best design so far on some training scenes, moves the density towards them (see
-`attention`), and fits again under the same constraints; then it tries how wide intervals should be: another level, or
-samples spread further in range, because scenes that were not learned from are elsewhere. Whatever scores better on
-other training scenes is kept. A round that gains nothing halves the step; after two of them in a row it ends.
+Each round tries how wide intervals should be: another level, or samples spread further in range, because scenes that
+were not learned from are elsewhere; where every ray has a gate of its own, the first one also tries gates by what rays
+meet in training scenes. Then it takes the residuals of the best design so far on some training scenes, moves the
+density towards them (see `attention`), and fits again under the same constraints. Whatever scores better on other
+training scenes is kept. A step that gains nothing is halved; after two rounds in a row without a gain it ends.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from lidardesign.design.reweighting import Reweighting
 from lidardesign.errors import InfeasibleError, NumericalError
 from lidardesign.evaluate.attention import Attention
 from lidardesign.evaluate.candidates import Positions
+from lidardesign.evaluate.regating import has_ray_gates
 from lidardesign.evaluate.scoring import checked_residuals, checked_score
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
@@ -46,10 +48,12 @@ class Shape:
     Arguments:
         level: The share that intervals hold.
         range_spread_m: Standard deviation by which samples are spread in range [m].
+        traced_gates: Whether rays get gates by what they would hear themselves on training scenes.
     """
 
     level: float
     range_spread_m: float = 0.0
+    traced_gates: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,6 +195,9 @@ class Refiner:
         step, idle, gains = FIRST_STEP, 0, None
         for number in range(1, rounds + 1):
             before = best
+            if number == 1 and _may_be_traced(best.trial):
+                shape = replace(best.shape, traced_gates=True)
+                best = self._tried(number, "gates by traced returns", best, shape=shape)
             best = self._climbed(number, best, "range_spread_m" if number % 2 else "level")
             gains = self._gains(best) if gains is None or best is not before else gains
             found = self._stepped(number, best, gains, step)
@@ -271,6 +278,11 @@ class Refiner:
         self.rounds.append(one)
         if self.progress:
             self.progress(one)
+
+
+def _may_be_traced(trial: Trial) -> bool:
+    """Whether every ray has a gate of its own, at one place."""
+    return len(trial.positions) == 1 and has_ray_gates(trial.result.design)
 
 
 def _words(name: str, value: float) -> str:

@@ -1,0 +1,113 @@
+"""Gates of single rays under a bandwidth: every metre of gate, wherever it is, holds as many returns as it costs.
+
+The interval [a, b] of a ray that maximises its returns less a price per metre, P(a, b) - price * (b - a), listens where
+the density of returns along the ray is above the price. The same price for all rays holds the most returns for the
+bins that they take together; the price is found by bisection.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.bounds import Bounds
+from lidardesign.design.gates import admissible_gates, central_intervals
+from lidardesign.numerics import TINY
+
+# Prices are bisected on a logarithmic scale between these shares of a return per metre.
+CHEAPEST, DEAREST = 1e-4, 1e4
+BISECTIONS = 24
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """Ranges that rays would measure, over scenes or samples.
+
+    Arguments:
+        range_m: Shape (M,) [m].
+        weights: How often, shape (M,), not negative.
+        ray: Which ray each belongs to, shape (M,).
+        count: Number of rays N.
+    """
+
+    range_m: np.ndarray
+    weights: np.ndarray
+    ray: np.ndarray
+    count: int
+
+
+def gates_within(heard: Heard, bounds: Bounds, level: float, model: Bandwidth, most_bins: int | None) -> np.ndarray:
+    """Gates that hold the level of what each ray hears, or less where their bins would be too many.
+
+    Arguments:
+        heard: What rays would measure, of every ray something.
+        bounds: One row per ray.
+        level: The share that a gate holds where bandwidth allows it.
+        model: Bins of gates.
+        most_bins: Bins of all rays together; None is no limit.
+
+    Returns:
+        Gates (N, 2) [m]. Bounds that do not admit narrow gates may need more bins, which is for the caller to check.
+    """
+    wide, _ = central_intervals(heard.range_m, heard.weights, heard.ray, heard.count, level)
+
+    def admitted(gates: np.ndarray) -> np.ndarray:
+        centre, spread = admissible_gates(gates, bounds)
+        half = bounds.interval * spread
+        return np.maximum(np.stack([centre - half, centre + half], axis=1), 0.0)
+
+    def fits(gates: np.ndarray) -> bool:
+        return most_bins is None or int(model.bins(gates[:, 1] - gates[:, 0]).sum()) <= most_bins
+
+    found = admitted(wide)
+    if fits(found):
+        return found
+    prices = _Prices.of(heard, wide)
+    cheap, dear = np.log(CHEAPEST), np.log(DEAREST)
+    for _ in range(BISECTIONS):
+        middle = (cheap + dear) / 2
+        gates = admitted(prices.gates(float(np.exp(middle))))
+        cheap, dear = (cheap, middle) if fits(gates) else (middle, dear)
+    return admitted(prices.gates(float(np.exp(dear))))
+
+
+@dataclass(frozen=True, eq=False)
+class _Prices:
+    """What rays hear in the order of their ranges, within their widest gates, one row each, shape (N, W)."""
+
+    range_m: np.ndarray
+    before: np.ndarray
+    until: np.ndarray
+
+    @classmethod
+    def of(cls, heard: Heard, wide: np.ndarray) -> _Prices:
+        start, end = wide[heard.ray].T
+        inside = (heard.range_m >= start) & (heard.range_m <= end) & (heard.weights > 0)
+        ranges, weights, ray = heard.range_m[inside], heard.weights[inside], heard.ray[inside]
+        order = np.lexsort((ranges, ray))
+        ranges, weights, ray = ranges[order], weights[order], ray[order]
+        starts = np.searchsorted(ray, np.arange(heard.count))
+        place = np.arange(len(ray)) - starts[ray]
+        width = int(place.max(initial=0)) + 1
+        # rows are filled up with their own last range, which holds nothing more
+        table = np.tile(wide.mean(axis=1)[:, None], (1, width))
+        held = np.zeros((heard.count, width))
+        table[ray, place], held[ray, place] = ranges, weights
+        lengths = np.bincount(ray, minlength=heard.count)
+        last = table[np.arange(heard.count), np.maximum(lengths - 1, 0)]
+        table = np.where(np.arange(width) < np.maximum(lengths, 1)[:, None], table, last[:, None])
+        mean = max(held.sum() / heard.count, TINY)
+        until = np.cumsum(held, axis=1) / mean
+        return cls(table, until - held / mean, until)
+
+    def gates(self, price: float) -> np.ndarray:
+        """The gates of a price per metre, shape (N, 2) [m]."""
+        opening = self.before - price * self.range_m
+        lowest = np.minimum.accumulate(opening, axis=1)
+        end = (self.until - price * self.range_m - lowest).argmax(axis=1)
+        rows = np.arange(len(end))
+        reached = np.arange(opening.shape[1]) <= end[:, None]
+        start = np.where(reached, opening, np.inf).argmin(axis=1)
+        return np.stack([self.range_m[rows, start], self.range_m[rows, end]], axis=1)

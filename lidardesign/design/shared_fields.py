@@ -1,0 +1,140 @@
+"""Rays of sensors at one place with gates of their own: divided over all their fields together.
+
+Sensors of a mixture overlap in direction where surfaces lie behind each other, and each listens at its own ranges. Once
+every ray has its own gate that division means nothing any more: what counts is which directions are looked at. So the
+samples of all sensors at a place are quantised together, a ray goes to the sensor that owns most of its cell, and its
+gate holds what the cell sees. Measured on 50 held-out faces with 361 rays of 10 sensors in half the bandwidth of a grid
+cropped to the training returns, after refinement: 9 % less error than that grid, 6 % with each sensor's rays by itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.constraints import Constraints
+from lidardesign.design.membership import members
+from lidardesign.design.priced_gates import Heard, gates_within
+from lidardesign.design.quantise import lloyd, samples_for
+from lidardesign.design.resolve import bounds_of
+from lidardesign.design.samples import Samples
+from lidardesign.design.sensor import Design, interval_factor, tangent_directions
+from lidardesign.numerics import systematic_draw, unit_vectors
+from lidardesign.task import random_generator
+
+# Heights of directions that are told apart when rays are put in order.
+ORDER_DECIMALS = 9
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Samples inside some sensors' fields and gates: unit vectors (M, 3), ranges, weights and owners (M,)."""
+
+    looking: np.ndarray
+    range_m: np.ndarray
+    weights: np.ndarray
+    owner: np.ndarray
+
+    def take(self, rows: np.ndarray) -> _Seen:
+        return _Seen(self.looking[rows], self.range_m[rows], self.weights[rows], self.owner[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class SharedRays:
+    """Rays in the order of their sensors: direction (N, 3), gate (N, 2) [m] and sensor (N,)."""
+
+    direction: np.ndarray
+    gate_m: np.ndarray
+    sensor: np.ndarray
+
+
+def shared_rays(design: Design, shares: np.ndarray, samples: Samples, seed: int) -> SharedRays | None:
+    """The rays of a design whose sensors stand at one place or at a few; None where its samples are too few.
+
+    Arguments:
+        design: G sensors.
+        shares: Rays of each by weight, shape (G,); sensors at one place share theirs out anew.
+        samples: Samples of the density.
+        seed: For the quantisation.
+    """
+    seen = _seen(design, samples)
+    place = np.unique([sensor.origin_m for sensor in design.sensors], axis=0, return_inverse=True)[1].reshape(-1)
+    looking, ray_sensor, heard = [], [], []
+    first = 0
+    for index in range(int(place.max()) + 1):
+        count = int(shares[place == index].sum())
+        own = seen.take(np.flatnonzero(place[seen.owner] == index))
+        generator = random_generator(seed, "shared fields", index)
+        if len(own.weights) > samples_for(count):
+            drawn = systematic_draw(own.weights, samples_for(count), generator)
+            own = _evenly(own.take(drawn))
+        if count and len(np.unique(own.looking, axis=0)) < count:
+            return None
+        if count:
+            directions, owners, labels = _cells(own, count, len(shares), generator)
+            looking.append(directions)
+            ray_sensor.append(owners)
+            heard.append(Heard(own.range_m, own.weights, first + labels, count))
+            first += count
+    if not looking:
+        return None
+    sensor, directions = np.concatenate(ray_sensor), np.concatenate(looking)
+    everything = Heard(
+        *(np.concatenate([getattr(one, name) for one in heard]) for name in ("range_m", "weights", "ray")), first
+    )
+    gate = ray_gates(design, everything, sensor, samples)
+    order = np.lexsort((directions[:, 0], directions[:, 1], np.round(directions[:, 2], ORDER_DECIMALS), sensor))
+    return SharedRays(directions[order], gate[order], sensor[order])
+
+
+def _evenly(seen: _Seen) -> _Seen:
+    """Samples that were drawn by weight count alike."""
+    return _Seen(seen.looking, seen.range_m, np.ones(len(seen.weights)), seen.owner)
+
+
+def ray_gates(design: Design, heard: Heard, sensor: np.ndarray, samples: Samples) -> np.ndarray:
+    """Gates by what rays hear, inside their sensors' bounds and the design's bandwidth, shape (N, 2) [m]."""
+    constraints = Constraints.from_mapping(design.constraints, where=f"constraints of {design.name}")
+    count = len(design.sensors)
+    bounds = bounds_of(constraints, samples.space, tuple(range(count)), interval_factor(design.level)).take(sensor)
+    model, limit = bandwidth_limit(design, constraints, len(sensor))
+    return gates_within(heard, bounds, design.level, model, limit)
+
+
+def bandwidth_limit(design: Design, constraints: Constraints, rays: int) -> tuple[Bandwidth, int | None]:
+    """The read-out model, and how many bins a number of rays may take: in proportion to the design's own number."""
+    budget = constraints.budget
+    model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
+    if budget.bandwidth_mbps is None:
+        return model, None
+    one_bin = model.mbps_of_widths(np.zeros(1))
+    share = rays / (design.rays or rays)
+    return model, max(int(share * budget.bandwidth_mbps / one_bin), rays)
+
+
+def _seen(design: Design, samples: Samples) -> _Seen:
+    """The samples inside the fields and gates of sensors, each with one of them."""
+    parts = members(design, samples.points, samples.weights)
+    return _Seen(
+        np.concatenate([tangent_directions(s.frame, m.tangent) for s, m in zip(design.sensors, parts, strict=True)]),
+        np.concatenate([part.range_m for part in parts]),
+        np.concatenate([part.weights for part in parts]),
+        np.concatenate([np.full(len(part), index) for index, part in enumerate(parts)]),
+    )
+
+
+def _cells(
+    seen: _Seen, count: int, sensors: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Directions (N, 3) of rays, the sensor of each (N,), and the ray of each sample (M,).
+
+    A ray looks at the middle of its own sensor's samples in the cell, which lie in that sensor's field.
+    """
+    _, labels = lloyd(seen.looking, seen.weights, count, generator)
+    votes = np.bincount(labels * sensors + seen.owner, seen.weights, count * sensors).reshape(count, sensors)
+    owner = votes.argmax(axis=1)
+    own = seen.owner == owner[labels]
+    sums = [np.bincount(labels[own], seen.weights[own] * axis[own], count) for axis in seen.looking.T]
+    return unit_vectors(np.stack(sums, axis=1)), owner, labels
