@@ -158,12 +158,6 @@ def test_every_command_explains_itself_and_has_the_common_options(lidardesign, n
         assert option in result.out
 
 
-def test_options_of_later_parts_are_absent(lidardesign):
-    text = "".join(lidardesign(name, "--help").out for name in ("fit", "constrain", "evaluate", "export", "learn"))
-    for option in ("--refine",):
-        assert option not in text
-
-
 def test_the_version_is_printed(lidardesign):
     assert lidardesign("--version").out == f"lidardesign {__version__}\n"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from lidardesign.cli.runs import Run
     from lidardesign.design.check import ConstraintCheck
     from lidardesign.design.constraints import Constraints
+    from lidardesign.design.fit import FitResult
     from lidardesign.design.sensor import Design
     from lidardesign.space import DesignSpace
 
@@ -168,13 +169,7 @@ def fit_and_write(
     with phase("writing"):
         checks = check_written(design, constraints, run.config.space)
         write_design(design, run.folder, path)
-    document = {
-        **result.as_dict(),
-        "design": str(path),
-        "constraints": [_check_dict(check) for check in checks],
-        **further,
-    }
-    document["satisfied"] = all(check.satisfied for check in checks)
+    document = {**_document(result, path, checks), **further}
     keep_times(run.folder, command_name, console, wait_s=WAIT_S)
 
     def show(rich: RichConsole) -> None:
@@ -182,6 +177,16 @@ def fit_and_write(
         show_fit(document, design, checks, rich)
 
     console.result(document, show)
+
+
+def _document(result: FitResult, path: Path, checks: Sequence[ConstraintCheck]) -> dict[str, Any]:
+    """The JSON form of a fit whose design was written and checked."""
+    return {
+        **result.as_dict(),
+        "design": str(path),
+        "constraints": [_check_dict(check) for check in checks],
+        "satisfied": all(check.satisfied for check in checks),
+    }
 
 
 def check_written(design: Design, constraints: Constraints | None, space: DesignSpace) -> list[ConstraintCheck]:

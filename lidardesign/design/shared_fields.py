@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints import Constraints
@@ -61,32 +62,48 @@ def shared_rays(design: Design, shares: np.ndarray, samples: Samples, seed: int)
     """
     seen = _seen(design, samples)
     place = np.unique([sensor.origin_m for sensor in design.sensors], axis=0, return_inverse=True)[1].reshape(-1)
-    looking, ray_sensor, heard = [], [], []
-    first = 0
+    found = []
     for index in range(int(place.max()) + 1):
         count = int(shares[place == index].sum())
         own = seen.take(np.flatnonzero(place[seen.owner] == index))
-        generator = random_generator(seed, "shared fields", index)
-        if len(own.weights) > samples_for(count):
-            drawn = systematic_draw(own.weights, samples_for(count), generator)
-            own = _evenly(own.take(drawn))
-        if count and len(np.unique(own.looking, axis=0)) < count:
+        if not count:
+            continue
+        if len(np.unique(own.looking, axis=0)) < count:
             return None
-        if count:
-            directions, owners, labels = _cells(own, count, len(shares), generator)
-            looking.append(directions)
-            ray_sensor.append(owners)
-            heard.append(Heard(own.range_m, own.weights, first + labels, count))
-            first += count
-    if not looking:
+        found.append(_at_one_place(own, count, len(shares), random_generator(seed, "shared fields", index)))
+    if not found:
         return None
-    sensor, directions = np.concatenate(ray_sensor), np.concatenate(looking)
-    everything = Heard(
-        *(np.concatenate([getattr(one, name) for one in heard]) for name in ("range_m", "weights", "ray")), first
-    )
-    gate = ray_gates(design, everything, sensor, samples)
+    directions, sensor = (np.concatenate([one[part] for one in found]) for part in (0, 1))
+    gate = ray_gates(design, _together([one[2] for one in found]), sensor, samples)
     order = np.lexsort((directions[:, 0], directions[:, 1], np.round(directions[:, 2], ORDER_DECIMALS), sensor))
     return SharedRays(directions[order], gate[order], sensor[order])
+
+
+def _at_one_place(
+    seen: _Seen, count: int, sensors: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, Heard]:
+    """Directions (N, 3) of the rays from one place, the sensor of each (N,), and what they hear."""
+    drawn = seen
+    if len(seen.weights) > samples_for(count):
+        drawn = _evenly(seen.take(systematic_draw(seen.weights, samples_for(count), generator)))
+    directions, sensor = _cells(drawn, count, sensors, generator)
+    # gates rest on all samples: their ends are rare
+    ray = cKDTree(directions).query(seen.looking)[1]
+    silent = np.setdiff1d(np.arange(count), ray)
+    if not len(silent):
+        return directions, sensor, Heard(seen.range_m, seen.weights, ray, count)
+    # a ray between two that are nearer to all of its samples hears what its nearest sample does
+    nearest = cKDTree(seen.looking).query(directions[silent])[1]
+    ranges, weights = (np.concatenate([v, v[nearest]]) for v in (seen.range_m, seen.weights))
+    return directions, sensor, Heard(ranges, weights, np.concatenate([ray, silent]), count)
+
+
+def _together(heard: list[Heard]) -> Heard:
+    """What the rays of several places hear, one after the other."""
+    firsts = np.cumsum([0, *(one.count for one in heard)])
+    ray = np.concatenate([one.ray + first for one, first in zip(heard, firsts[:-1], strict=True)])
+    ranges, weights = (np.concatenate([getattr(one, name) for one in heard]) for name in ("range_m", "weights"))
+    return Heard(ranges, weights, ray, int(firsts[-1]))
 
 
 def _evenly(seen: _Seen) -> _Seen:
@@ -125,10 +142,8 @@ def _seen(design: Design, samples: Samples) -> _Seen:
     )
 
 
-def _cells(
-    seen: _Seen, count: int, sensors: int, generator: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Directions (N, 3) of rays, the sensor of each (N,), and the ray of each sample (M,).
+def _cells(seen: _Seen, count: int, sensors: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Directions (N, 3) of rays and the sensor of each (N,).
 
     A ray looks at the middle of its own sensor's samples in the cell, which lie in that sensor's field.
     """
@@ -137,4 +152,4 @@ def _cells(
     owner = votes.argmax(axis=1)
     own = seen.owner == owner[labels]
     sums = [np.bincount(labels[own], seen.weights[own] * axis[own], count) for axis in seen.looking.T]
-    return unit_vectors(np.stack(sums, axis=1)), owner, labels
+    return unit_vectors(np.stack(sums, axis=1)), owner
