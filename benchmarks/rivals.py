@@ -1,0 +1,392 @@
+"""Our designs against every rival on faces, the arm and the warehouse, at equal rays and at equal bandwidth.
+
+For each number of rays designs are fitted to one run and scored on held-out scenes beside uniform, random and bounding
+rays, an occupancy grid, real parts, and direct optimisation by CMA-ES about the first design (`refined`), with as much
+wall time for one answer as learning, ten changes of a constraint and refining the last one take here; `--long` gives it
+ten times as much besides. Differences are of the same scenes, with their 95 % intervals. What was measured is kept in the folder, and
+measured again only where it is missing.
+
+    python benchmarks/rivals.py --folder rivals --long --page docs/rivals.md --picture docs/rivals.png
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from common import face_settings, fitted, learned, lidardesign, parser, report, run_process, table, verdict
+
+CHANGES = 10
+LONG = 10
+LONG_NAME = "cma, 10 times as long"
+LEAST_FACTOR = 50.0
+FIRST = "refined"
+RIVALS = ("uniform", "random", "bounding", "occupancy", "no-visibility", "cma")
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is compared on one task.
+
+    Arguments:
+        title: For tables.
+        designs: What `fit` is told for each of our designs; the number of rays comes on top. The first is `refined`.
+        rays: Numbers of rays.
+        baselines: Rivals beside those that `evaluate` always has.
+        change: The constraint whose change is timed.
+    """
+
+    title: str
+    designs: Mapping[str, tuple[str, ...]]
+    rays: tuple[int, ...]
+    baselines: tuple[str, ...]
+    change: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+AREA = ("--weight", "area_exponent=0.25")
+CASES = {
+    "face": Case(
+        "Faces",
+        {
+            FIRST: ("--sensors", "10", *AREA, "--refine", "5"),
+            "plain": ("--sensors", "10"),
+            "importance": ("--sensors", "10", *AREA),
+            "scan": ("--layout", "scan", *AREA, "--refine", "5"),
+        },
+        (196, 361, 576),
+        ("occupancy", "catalog:vl53l5cx", "catalog:azure-kinect"),
+        "gate.width_m.max=0.12",
+    ),
+    "arm": Case(
+        "Arm",
+        {FIRST: ("--sensors", "8", "--refine", "5"), "plain": ("--sensors", "8")},
+        (400, 1000, 1200),
+        ("occupancy", "no-visibility", "catalog:vl53l5cx"),
+        "gate.width_m.max=0.5",
+    ),
+    "warehouse": Case(
+        "Warehouse",
+        {FIRST: ("--layout", "scan", "--refine", "5"), "plain": ("--layout", "scan")},
+        (6, 12, 18),
+        ("occupancy", "no-visibility"),
+        "gate.width_m.max=0.3",
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Times:
+    """What things take here [s], wall clock of whole processes.
+
+    Arguments:
+        learning: Learning the density, as the run has it.
+        change: A change of a constraint of `plain`: fitting anew under it.
+        refined: The same, refined.
+    """
+
+    learning: float
+    change: float
+    refined: float
+
+    @property
+    def ours(self) -> float:
+        """Learning once, ten changes, and refining the last: what one search of `cma` is given."""
+        return self.learning + CHANGES * self.change + self.refined
+
+
+def kept(path: Path, measure: Any) -> Any:
+    """What a file has, measured and written where it is missing."""
+    if not path.exists():
+        found = measure()
+        path.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def run_of(task: str, folder: Path, options: Any) -> Path:
+    """A run of a task in the folder: learned there, or copied from where `--run` says."""
+    target = folder / task / "run"
+    given = dict(one.split("=", 1) for one in options.run)
+    if not target.exists():
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if task in given:
+            shutil.copytree(given[task], target)
+        else:
+            settings = face_settings(options.model) if task == "face" else {}
+            options.run, asked = None, options.run
+            learned(task, target.parent, options, settings)
+            options.run = asked
+    return target
+
+
+def designs_of(case: Case, run: Path, rays: int) -> list[Path]:
+    """Our designs for a number of rays, fitted where they are missing; the first of them is refined."""
+    found = []
+    for name, words in case.designs.items():
+        path = run / "designs" / f"{name}-{rays}.yaml"
+        if not path.exists():
+            fitted(run, path.stem, *words, "--rays", str(rays))
+        found.append(path)
+    return found
+
+
+def times_of(case: Case, run: Path) -> dict[str, float]:
+    """What learning and a change of a constraint take, see `Times`."""
+    learning = json.loads((run / "manifest.json").read_text(encoding="utf-8"))["learn"]["seconds"]
+    spent = {}
+    for key, words in (("change", case.designs["plain"]), ("refined", case.designs[FIRST])):
+        command = lidardesign("constrain", run, "--set", case.change, "--name", f"changed-{key}", "--json", *words)
+        spent[key] = run_process([*command, "--rays", str(case.rays[len(case.rays) // 2])])
+        spent[key].document()
+    return {"learning": learning, **{key: one.wall for key, one in spent.items()}}
+
+
+def evaluated(designs: Sequence[Path], rays: int, baselines: Sequence[str], seconds: float) -> dict[str, Any]:
+    """What `evaluate` prints about designs at one number of rays."""
+    words: list[str | Path] = ["evaluate", *designs, "--rays", str(rays), "--cma-seconds", f"{seconds:.1f}", "--json"]
+    for name in (*baselines, "cma"):
+        words += ["--baseline", name]
+    return run_process(lidardesign(*words)).document()
+
+
+def measured(task: str, options: Any) -> dict[str, Any]:
+    """Everything about one task: its times, and what `evaluate` found at each number of rays."""
+    case, folder = CASES[task], options.folder / task
+    rays = options.rays or case.rays
+    run = run_of(task, options.folder, options)
+    times = kept(folder / "times.json", lambda: times_of(case, run))
+    seconds = options.cma_seconds or Times(**times).ours
+    found: dict[str, Any] = {"times": times, "seconds": seconds, "rays": {}}
+    for count in rays:
+        designs = designs_of(case, run, count)
+        print(f"{task}: {count} rays ...", file=sys.stderr, flush=True)
+        document = kept(folder / f"{count}.json", lambda d=designs, n=count: evaluated(d, n, case.baselines, seconds))
+        longer = folder / f"{count}-long.json"
+        if options.long or longer.exists():
+            again = kept(longer, lambda d=designs, n=count: evaluated(d[:1], n, (), LONG * seconds))
+            document = joined(document, again)
+        found["rays"][count] = named(document, count)
+    return found
+
+
+def named(document: dict[str, Any], count: int) -> dict[str, Any]:
+    """The document with our designs by what they are, without the number of rays that they were made for."""
+    text = json.dumps(document)
+    for name in {name for case in CASES.values() for name in case.designs}:
+        text = text.replace(f'"{name}-{count}"', f'"{name}"')
+    return json.loads(text)
+
+
+def joined(document: dict[str, Any], longer: dict[str, Any]) -> dict[str, Any]:
+    """An evaluation with the rows of `cma` of another one, under a name of their own."""
+    merged = json.loads(json.dumps(document))
+    for key in ("rows", "equal_bandwidth"):
+        merged[key] += [{**row, "design": LONG_NAME} for row in longer[key] if row["design"] == "cma"]
+    for key in ("paired", "paired_equal_bandwidth"):
+        merged[key] += [{**pair, "b": LONG_NAME} for pair in longer[key] if pair["b"] == "cma"]
+    return merged
+
+
+def standing(pair: Mapping[str, Any], better: str) -> str:
+    """Whether `a` is better than `b` by more than the interval."""
+    if pair["ci_low"] * pair["ci_high"] <= 0:
+        return "not told apart"
+    lower = pair["difference"] < 0
+    return "better" if lower == (better == "lower") else "worse"
+
+
+def percent(pair: Mapping[str, Any], other: float) -> str:
+    """A paired difference with its interval, in percent of the other's value."""
+    if not other:
+        return "-"
+    low, middle, high = (100 * pair[key] / other for key in ("ci_low", "difference", "ci_high"))
+    return f"{middle:+.1f} ({low:+.1f} to {high:+.1f})"
+
+
+def equal_rays(found: dict[str, Any]) -> list[list[object]]:
+    """One row per number of rays and design or rival, with how much better `refined` is."""
+    rows = []
+    for count, document in found["rays"].items():
+        pairs = {pair["b"]: pair for pair in document["paired"] if pair["a"] == FIRST}
+        for row in document["rows"]:
+            pair = pairs.get(row["design"])
+            rows.append(
+                [
+                    count,
+                    row["design"],
+                    row["value"],
+                    f"{row['ci_low']:.3g} to {row['ci_high']:.3g}",
+                    row["bandwidth_mbps"],
+                    "" if pair is None else percent(pair, row["value"]),
+                    "" if pair is None else standing(pair, document["metric"]["better"]),
+                ]
+            )
+    return rows
+
+
+def equal_bandwidth(found: dict[str, Any]) -> list[list[object]]:
+    """One row per number of rays and rival in the bandwidth of `refined`."""
+    rows = []
+    for count, document in found["rays"].items():
+        pairs = {pair["b"]: pair for pair in document["paired_equal_bandwidth"] if pair["a"] == FIRST}
+        for row in document["equal_bandwidth"]:
+            if row["matched_to"] != FIRST:
+                continue
+            pair = pairs[row["design"]]
+            better = document["metric"]["better"]
+            difference = percent(pair, row["value"])
+            limit = next(one["bandwidth_mbps"] for one in document["rows"] if one["design"] == FIRST)
+            rows.append([count, limit, row["design"], row["rays"], row["value"], difference, standing(pair, better)])
+    return rows
+
+
+def searches(found: dict[str, Any]) -> list[list[object]]:
+    """One row per search of `cma`."""
+    return [
+        [
+            count,
+            one["limit_mbps"] or "",
+            one["parameters"],
+            one["seconds"],
+            one["cpu_seconds"],
+            one["candidates"],
+            one["evaluations"],
+            one["start_value"],
+            one["value"],
+        ]
+        for count, document in found["rays"].items()
+        for one in document["cma"]
+    ]
+
+
+def verdicts(found: dict[str, Any]) -> list[str]:
+    """What is claimed of `refined`, over all numbers of rays."""
+    rays, bandwidth = {}, {}
+    for count, document in found["rays"].items():
+        better = document["metric"]["better"]
+        rivals = {row["design"] for row in document["rows"]} - set().union(*(case.designs for case in CASES.values()))
+        for pair in document["paired"]:
+            if pair["a"] == FIRST and pair["b"] in rivals:
+                rays[f"{count} rays, {pair['b']}"] = standing(pair, better) == "better"
+        for pair in document["paired_equal_bandwidth"]:
+            if pair["a"] == FIRST:
+                bandwidth[f"{count} rays, {pair['b']}"] = standing(pair, better) == "better"
+    times = found["times"]
+    faster = {"fitting anew": found["seconds"] / times["change"] >= LEAST_FACTOR}
+    return [
+        verdict("better than every rival at equal rays, by more than the interval", rays),
+        verdict("better than every rival at equal bandwidth, by more than the interval", bandwidth),
+        f"a change of a constraint takes {times['change']:.2g} s, refined {times['refined']:.2g} s, and cma "
+        f"{found['seconds']:.0f} s: {found['seconds'] / times['change']:.0f} and "
+        f"{found['seconds'] / times['refined']:.0f} times as long",
+        verdict(f"at least {LEAST_FACTOR:g} times faster per change of a constraint than cma", faster),
+    ]
+
+
+def tables_of(title: str, found: dict[str, Any]) -> dict[str, tuple[list[str], list[list[object]]]]:
+    """Captions, columns and rows of one task."""
+    document = next(iter(found["rays"].values()))
+    metric = f"{document['metric']['name']} {document['metric']['unit']}"
+    scenes = f"{document['scenes']} held-out scenes"
+    against = "refined against it, %"
+    return {
+        f"{title}, equal rays, {scenes}": (
+            ["rays", "design", metric, "95 % interval", "Mbit/s", against, "refined is"],
+            equal_rays(found),
+        ),
+        f"{title}, equal bandwidth, {scenes}": (
+            ["rays of refined", "Mbit/s", "rival", "its rays", metric, against, "refined is"],
+            equal_bandwidth(found),
+        ),
+        f"{title}, searches of cma on training scenes": (
+            ["rays", "within Mbit/s", "numbers", "s", "CPU s", "candidates", "scores", "start", "best"],
+            searches(found),
+        ),
+    }
+
+
+def draw(everything: Mapping[str, dict[str, Any]], path: Path) -> None:
+    """Scores against rays and against bandwidth, one row of axes per task."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 3.6 * len(everything)), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(len(everything), 2, squeeze=False)
+    for (task, found), (left, right) in zip(everything.items(), grid, strict=True):
+        document = next(iter(found["rays"].values()))
+        metric = document["metric"]
+        for name, points in curves(found).items():
+            ours = name in CASES[task].designs
+            style = {"marker": "o" if ours else "s", "lw": 2.2 if ours else 1.0, "ms": 6 if ours else 4}
+            style |= {"ls": "-" if ours else "--", "label": name}
+            left.plot(points["rays"], points["value"], **style)
+            right.plot(points["bandwidth_mbps"], points["value"], **style)
+        left.set(xlabel="rays", ylabel=f"{metric['name']} [{metric['unit']}]", yscale="log", title=CASES[task].title)
+        right.set(xlabel="Mbit/s", xscale="log", yscale="log")
+        right.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
+        for axes in (left, right):
+            axes.grid(True, which="both", alpha=0.25)
+    figure.savefig(path, dpi=110)
+
+
+def curves(found: dict[str, Any]) -> dict[str, dict[str, list[float]]]:
+    """Rays, bandwidths and scores of each design and rival, at ascending numbers of rays."""
+    lines: dict[str, dict[str, list[float]]] = {}
+    for document in found["rays"].values():
+        for row in document["rows"]:
+            line = lines.setdefault(row["design"], {"rays": [], "bandwidth_mbps": [], "value": []})
+            for key, values in line.items():
+                values.append(row[key])
+    return lines
+
+
+def write_page(page: Path, everything: Mapping[str, dict[str, Any]]) -> None:
+    """Put tables and verdicts between the marks of the tasks that were measured."""
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+    from fill_benchmarks import filled
+
+    text = page.read_text(encoding="utf-8")
+    for task, found in everything.items():
+        parts = [
+            f"**{caption}**\n\n{table(*content)}" for caption, content in tables_of(CASES[task].title, found).items()
+        ]
+        text = filled(text, task, "\n\n".join([*parts, *(f"- {line}" for line in verdicts(found))]))
+    page.write_text(text, encoding="utf-8")
+
+
+def main() -> None:
+    """Measure what is missing, and print everything."""
+    made = parser(__doc__, rounds=1)
+    made.add_argument("--folder", type=Path, required=True, help="where runs, designs and results are kept")
+    made.add_argument("--task", choices=list(CASES), action="append", help="only this task; repeatable")
+    made.add_argument("--run", action="append", default=[], metavar="TASK=RUN", help="a run to copy; repeatable")
+    made.add_argument("--model", default="ict", help="face model: ict, embedded, or a file (default %(default)s)")
+    made.add_argument("--preset", help="what is learned (default standard)")
+    made.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="passed to learn; repeatable")
+    made.add_argument("--rays", type=int, nargs="+", help="numbers of rays (default: three of each task)")
+    made.add_argument("--cma-seconds", type=float, help="of each search (default: as long as ours takes)")
+    made.add_argument("--long", action="store_true", help=f"also searches that take {LONG} times as long")
+    made.add_argument("--page", type=Path, metavar="FILE.md", help="put the tables between this page's marks")
+    made.add_argument("--picture", type=Path, metavar="FILE.png", help="draw scores against rays and bandwidth")
+    options = made.parse_args()
+    everything = {task: measured(task, options) for task in options.task or CASES}
+    tables: dict[str, tuple[list[str], list[list[object]]]] = {}
+    lines = []
+    for task, found in everything.items():
+        tables |= tables_of(CASES[task].title, found)
+        lines += [f"{CASES[task].title}: {line}" for line in verdicts(found)]
+    report("Rivals", tables, lines, options.json)
+    if options.page is not None:
+        write_page(options.page, everything)
+    if options.picture is not None:
+        draw(everything, options.picture)
+
+
+if __name__ == "__main__":
+    main()
