@@ -183,6 +183,7 @@ class Refiner:
         self.progress = progress
         self.sign = 1.0 if task.metric.better == "lower" else -1.0
         self.rounds: list[Round] = []
+        self._tested: set[tuple[bytes, Shape]] = set()
 
     @phase("refinement")
     def run(self, rounds: int, shape: Shape) -> Refinement:
@@ -254,6 +255,10 @@ class Refiner:
         """The better of a design and a changed one; more bandwidth has to be worth it."""
         started = time.perf_counter()
         wanted = replace(best, **changed)
+        key = (wanted.log_factors.tobytes(), wanted.shape)
+        if key in self._tested:  # it was not better than a design that this one is no worse than
+            return best
+        self._tested.add(key)
         factors = self.attention.reweighting(wanted.log_factors) if np.any(wanted.log_factors) else None
         try:
             trial = self.refit(factors, wanted.shape)
