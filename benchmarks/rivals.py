@@ -3,8 +3,8 @@
 For each number of rays designs are fitted to one run and scored on held-out scenes beside uniform, random and bounding
 rays, an occupancy grid, real parts, and direct optimisation by CMA-ES about the first design (`refined`), with as much
 wall time for one answer as learning, ten changes of a constraint and refining the last one take here; `--long` gives it
-ten times as much besides. Differences are of the same scenes, with their 95 % intervals. What was measured is kept in the folder, and
-measured again only where it is missing.
+ten times as much besides. Differences are of the same scenes, with their 95 % intervals. What was measured is kept in
+the folder, and measured again only where it is missing.
 
     python benchmarks/rivals.py --folder rivals --long --page docs/rivals.md --picture docs/rivals.png
 """
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import statistics
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -135,15 +136,17 @@ def designs_of(case: Case, run: Path, rays: int) -> list[Path]:
     return found
 
 
-def times_of(case: Case, run: Path) -> dict[str, float]:
-    """What learning and a change of a constraint take, see `Times`."""
+def times_of(case: Case, run: Path, rounds: int) -> dict[str, float]:
+    """What learning and a change of a constraint take, see `Times`: medians over rounds."""
     learning = json.loads((run / "manifest.json").read_text(encoding="utf-8"))["learn"]["seconds"]
     spent = {}
+    rays = case.rays[len(case.rays) // 2]
     for key, words in (("change", case.designs["plain"]), ("refined", case.designs[FIRST])):
         command = lidardesign("constrain", run, "--set", case.change, "--name", f"changed-{key}", "--json", *words)
-        spent[key] = run_process([*command, "--rays", str(case.rays[len(case.rays) // 2])])
-        spent[key].document()
-    return {"learning": learning, **{key: one.wall for key, one in spent.items()}}
+        results = [run_process([*command, "--rays", str(rays)]) for _ in range(rounds)]
+        results[0].document()
+        spent[key] = statistics.median(result.wall for result in results)
+    return {"learning": learning, **spent}
 
 
 def evaluated(designs: Sequence[Path], rays: int, baselines: Sequence[str], seconds: float) -> dict[str, Any]:
@@ -159,7 +162,7 @@ def measured(task: str, options: Any) -> dict[str, Any]:
     case, folder = CASES[task], options.folder / task
     rays = options.rays or case.rays
     run = run_of(task, options.folder, options)
-    times = kept(folder / "times.json", lambda: times_of(case, run))
+    times = kept(folder / "times.json", lambda: times_of(case, run, options.rounds))
     seconds = options.cma_seconds or Times(**times).ours
     found: dict[str, Any] = {"times": times, "seconds": seconds, "rays": {}}
     for count in rays:

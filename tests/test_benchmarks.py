@@ -208,6 +208,70 @@ def test_the_log_density_of_every_flow_that_is_compared_is_that_of_its_jacobian(
         assert flow.jacobian_error(contestant, base) < 1e-9, name
 
 
+def rival_documents(difference=-0.5, low=-0.9, high=-0.1):
+    """What `evaluate` prints about `refined` against one rival, at one number of rays."""
+    row = {"rays": 10, "ci_low": 0.0, "ci_high": 9.0, "bandwidth_mbps": 2.0}
+    pair = {"a": "refined", "b": "cma", "rays": 10, "difference": difference, "ci_low": low, "ci_high": high}
+    document = {
+        "metric": {"name": "error", "unit": "mm", "better": "lower"},
+        "scenes": 3,
+        "rows": [{**row, "design": "refined", "value": 4.5}, {**row, "design": "cma", "value": 5.0}],
+        "paired": [pair],
+        "equal_bandwidth": [{**row, "design": "cma", "value": 5.0, "matched_to": "refined", "matched_rays": 10}],
+        "paired_equal_bandwidth": [{**pair, "rays_b": 8}],
+        "cma": [],
+    }
+    return {"rays": {10: document}, "seconds": 100.0, "times": {"learning": 90.0, "change": 1.0, "refined": 9.0}}
+
+
+def test_a_rival_is_beaten_where_the_interval_says_so(script):
+    rivals = script("rivals")
+    for numbers, word in (((-0.5, -0.9, -0.1), "better"), ((0.5, 0.1, 0.9), "worse"), ((-0.1, -0.5, 0.4), "not told")):
+        found = rival_documents(*numbers)
+        (row,) = [row for row in rivals.equal_rays(found) if row[1] == "cma"]
+        assert row[-1].startswith(word)
+        assert row[-2].startswith(f"{100 * numbers[0] / 5:+.1f} (")
+        (matched,) = rivals.equal_bandwidth(found)
+        assert matched[-1].startswith(word)
+        assert all(line.startswith("holds") == (word == "better") for line in rivals.verdicts(found)[:2])
+
+
+def test_where_higher_is_better_a_positive_difference_is(script):
+    pair = {"difference": 0.5, "ci_low": 0.1, "ci_high": 0.9}
+    assert script("rivals").standing(pair, "higher") == "better"
+    assert script("rivals").standing(pair, "lower") == "worse"
+
+
+def test_a_search_has_the_time_of_learning_ten_changes_and_a_refinement(script):
+    rivals = script("rivals")
+    assert rivals.Times(90.0, 1.0, 9.0).ours == 90 + 10 * 1 + 9
+    assert rivals.verdicts(rival_documents())[-1].startswith("holds: at least 50 times faster")
+
+
+def test_longer_searches_stand_beside_the_others(script):
+    rivals = script("rivals")
+    document = rival_documents()["rays"][10]
+    merged = rivals.joined(document, rival_documents(-0.4)["rays"][10])
+    assert [row["design"] for row in merged["rows"]] == ["refined", "cma", rivals.LONG_NAME]
+    assert [pair["b"] for pair in merged["paired"]] == ["cma", rivals.LONG_NAME]
+    assert merged["paired"][1]["difference"] == -0.4
+    assert len(document["rows"]) == 2
+
+
+def test_designs_are_named_by_what_they_are(script):
+    text = {"rows": [{"design": "refined-361"}, {"design": "scan-361"}, {"design": "bounding"}]}
+    named = script("rivals").named(text, 361)
+    assert [row["design"] for row in named["rows"]] == ["refined", "scan", "bounding"]
+
+
+def test_what_was_measured_is_not_measured_again(script, tmp_path):
+    calls = []
+    for _ in range(2):
+        found = script("rivals").kept(tmp_path / "x.json", lambda: calls.append(1) or {"a": 1})
+    assert found == {"a": 1}
+    assert calls == [1]
+
+
 def test_rays_are_counted_over_designs_budgets_and_scenes(script):
     found = {"scenes": 3, "rows": [{"rays": 10}, {"rays": 20}], "equal_bandwidth": [{"rays": 5}]}
     assert script("evaluate").rays_scored(found) == 3 * 35
@@ -356,6 +420,24 @@ def test_the_warehouse_is_measured(tmp_path):
     rows = next(rows for caption, rows in found["tables"].items() if caption.startswith("Fits"))
     assert [row["x m"] for row in rows] == [0.0, 0.37]
     assert any("exit code 2" in line for line in found["conclusions"])
+
+
+@pytest.mark.slow
+def test_rivals_are_measured_drawn_and_put_on_their_page(tmp_path):
+    page, picture = tmp_path / "page.md", tmp_path / "picture.png"
+    page.write_text("before\n\n<!-- warehouse -->\n\n<!-- warehouse -->\n\nafter\n")
+    words = ["--folder", tmp_path / "kept", "--task", "warehouse", "--preset", "draft", *SMALL_WAREHOUSE]
+    words += ["--set", "learning.steps=200", "--set", "learning.samples=20000"]
+    words += ["--rays", "4", "--cma-seconds", "1", "--page", page, "--picture", picture]
+    found = run_script("rivals", tmp_path, *words)
+    rows = next(rows for caption, rows in found["tables"].items() if "equal rays" in caption)
+    assert [row["design"] for row in rows][:2] == ["refined", "plain"]
+    assert "cma" in {row["design"] for row in rows}
+    assert picture.stat().st_size > 10_000
+    text = page.read_text()
+    assert "| refined " in text
+    assert text.startswith("before")
+    assert text.endswith("after\n")
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 It varies the sensors that the first design has, under the design's constraints and with its layout of rays, and asks
 the task's metric on training scenes alone (see `cma_search`). A design whose rays follow from samples of the density
-(layout `density`) is followed with even rays in its sensors' fields: there is no density here.
+(layout `density`), or from the pattern of a part (`fixed`), is followed with even rays in its sensors' fields.
 """
 
 from __future__ import annotations
@@ -41,6 +41,8 @@ TRACK_PLACES = 2
 MOST_RAYS_FACTOR = 4
 
 DEFAULT_SECONDS = 60.0
+# Layouts whose rays follow from the sensors alone.
+OWN_LAYOUTS = ("grid", "scan", "distributed")
 
 Show = Callable[[str, Progress], None]
 
@@ -104,6 +106,7 @@ class Record:
             "sensors": len(self.design.sensors),
             "parameters": self.parameters,
             "seconds": found.seconds,
+            "cpu_seconds": found.cpu_seconds,
             "candidates": found.candidates,
             "evaluations": found.evaluations,
             "restarts": found.restarts,
@@ -199,7 +202,7 @@ class CmaCandidate:
 
     def _setting(self, amount: Amount) -> Setting:
         design = self.followed
-        layout = "grid" if design.layout == "density" else design.layout
+        layout = design.layout if design.layout in OWN_LAYOUTS else "grid"
         space = self.space
         if design.track is None and space.conditioned:
             space = space.at({**self.conditions[len(self.conditions) // 2], **design.at})
