@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.errors import ConfigError
+from lidardesign.space import FARTHEST_M
 
 if TYPE_CHECKING:
     from lidardesign.cli.layouts import RunTarget
@@ -16,7 +17,8 @@ if TYPE_CHECKING:
     from lidardesign.design.sensor import Design
 
 KEY = "weighting"
-WIDEST_SPREAD_M = 100.0
+# Refinement spreads by a few sigma of the density, which is at most the largest length.
+WIDEST_SPREAD_M = 10 * FARTHEST_M
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,14 +57,15 @@ class Weighting:
         if not isinstance(document, Mapping) or not set(document) <= known:
             raise ConfigError("is no weighting", where=where, allowed=f"some of the keys {', '.join(sorted(known))}")
         settings, spread = document.get("set", ()), document.get("range_spread_m", 0.0)
-        if isinstance(settings, str) or not isinstance(settings, Sequence):
+        listed = isinstance(settings, Sequence) and not isinstance(settings, str)
+        if not (listed and all(isinstance(text, str) for text in settings)):
             raise ConfigError(f"set is {settings!r}", where=where, allowed="a list of KEY=VALUE")
         number = isinstance(spread, int | float) and not isinstance(spread, bool)
         if not (number and 0 <= spread <= WIDEST_SPREAD_M):
             raise ConfigError(f"range_spread_m is {spread!r}", where=where, allowed=f"0 to {WIDEST_SPREAD_M:g}")
         factors = document.get("factors")
         reweighting = None if factors is None else Reweighting.from_document(factors, f"{where}: factors")
-        return cls(tuple(str(text) for text in settings), reweighting, float(spread))
+        return cls(tuple(settings), reweighting, float(spread))
 
     def as_document(self) -> dict[str, Any]:
         """Plain values, as they stand in the provenance of a design."""
@@ -78,7 +81,7 @@ class Weighting:
     def log_target(self, samples: Samples, target: RunTarget) -> Samples:
         """The samples with the log p* that they have under the settings and the factor; ranges stay."""
         if self.settings:
-            return samples.reweighted(target(samples.points) - samples.log_target)
+            return samples.retargeted(target(samples.points))
         if self.reweighting is not None:
             return samples.reweighted(self.reweighting.log_factor(samples.points))
         return samples

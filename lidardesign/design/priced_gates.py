@@ -16,9 +16,9 @@ from lidardesign.design.bounds import Bounds
 from lidardesign.design.gates import admissible_gates, central_intervals
 from lidardesign.numerics import TINY
 
-# Prices are bisected on a logarithmic scale between these shares of a return per metre.
-CHEAPEST, DEAREST = 1e-4, 1e4
-BISECTIONS = 24
+# Prices are bisected on a logarithmic scale, from this share of the dearest one.
+CHEAPEST = 1 / 2**36
+BISECTIONS = 26
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +36,11 @@ class Heard:
     weights: np.ndarray
     ray: np.ndarray
     count: int
+
+    def held_by(self, gates: np.ndarray) -> float:
+        """The weight that gates (N, 2) hold, ends included."""
+        start, end = gates[self.ray].T
+        return float(self.weights[(self.range_m >= start) & (self.range_m <= end)].sum())
 
 
 def gates_within(heard: Heard, bounds: Bounds, level: float, model: Bandwidth, most_bins: int | None) -> np.ndarray:
@@ -65,7 +70,9 @@ def gates_within(heard: Heard, bounds: Bounds, level: float, model: Bandwidth, m
     if fits(found):
         return found
     prices = _Prices.of(heard, wide)
-    cheap, dear = np.log(CHEAPEST), np.log(DEAREST)
+    # no interval as long as a bin is worth this price
+    dear = float(np.log(2 * max(prices.until.max(), TINY) / model.bin_m))
+    cheap = dear + float(np.log(CHEAPEST))
     for _ in range(BISECTIONS):
         middle = (cheap + dear) / 2
         gates = admitted(prices.gates(float(np.exp(middle))))

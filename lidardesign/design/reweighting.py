@@ -11,14 +11,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lidardesign.errors import ConfigError
-from lidardesign.numerics import logsumexp
-from lidardesign.space import observed_point
+from lidardesign.space import FARTHEST_M, observed_point
 
 # So many anchors around a point decide its factor.
 NEIGHBOURS = 4
-# Anchors are kept to a tenth of a millimetre and factors to a thousandth: what is written is what was used.
-POINT_DECIMALS = 4
-FACTOR_DECIMALS = 3
 # No weight is changed by more than the factor exp of this.
 LARGEST_LOG_FACTOR = 20.0
 
@@ -32,7 +28,7 @@ class Reweighting:
         log_factors: log of the factor at each, shape (K,).
 
     Raises:
-        ConfigError: No anchors, shapes that do not fit, or values that are not finite or beyond exp(+-20).
+        ConfigError: No anchors, shapes that do not fit, or values that are not finite or too large.
     """
 
     points_m: np.ndarray
@@ -40,16 +36,17 @@ class Reweighting:
     where: str = field(default="reweighting")
 
     def __post_init__(self) -> None:
-        points = np.round(np.asarray(self.points_m, dtype=np.float64), POINT_DECIMALS)
-        factors = np.round(np.asarray(self.log_factors, dtype=np.float64), FACTOR_DECIMALS)
+        points = np.asarray(self.points_m, dtype=np.float64)
+        factors = np.asarray(self.log_factors, dtype=np.float64)
         if points.ndim != 2 or points.shape[1:] != (3,) or factors.shape != points.shape[:1] or not len(factors):
             found = f"log factors of shape {factors.shape} at points of shape {points.shape}"
             raise ConfigError(found, where=self.where, allowed="(K,) at (K, 3), K at least 1")
-        if not (np.isfinite(points).all() and np.abs(factors).max() <= LARGEST_LOG_FACTOR):
+        if not (np.abs(points).max() <= FARTHEST_M and np.abs(factors).max() <= LARGEST_LOG_FACTOR):
             raise ConfigError(
                 "points or log factors are not finite or too large",
                 where=self.where,
-                allowed=f"factors of at most exp({LARGEST_LOG_FACTOR:g})",
+                allowed=f"log factors of -{LARGEST_LOG_FACTOR:g} to {LARGEST_LOG_FACTOR:g}, "
+                f"points at most {FARTHEST_M:g} m away",
             )
         object.__setattr__(self, "points_m", points)
         object.__setattr__(self, "log_factors", factors)
@@ -62,7 +59,7 @@ class Reweighting:
             raise ConfigError("is no reweighting", where=where, allowed=f"the keys {', '.join(sorted(keys))}")
         try:
             points, factors = (np.asarray(document[key], dtype=np.float64) for key in ("points_m", "log_factors"))
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise ConfigError("holds something that is no list of numbers", where=where) from None
         return cls(points, factors, where)
 
@@ -94,5 +91,5 @@ class Reweighting:
         distance, nearest = (v.reshape(len(places_m), count) for v in self.tree.query(places_m, k=count))
         log_shares = -np.square(distance / self.reach_m) / 2
         # far from all anchors every share underflows: relative to the nearest one they do not
-        shares = np.exp(log_shares - logsumexp(log_shares, axis=1)[:, None])
-        return (shares * self.log_factors[nearest]).sum(axis=1)
+        shares = np.exp(log_shares - log_shares.max(axis=1, keepdims=True))
+        return (shares * self.log_factors[nearest]).sum(axis=1) / shares.sum(axis=1)

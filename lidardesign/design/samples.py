@@ -76,6 +76,10 @@ class Samples:
         """The samples with log p* moved by so much at each of them, shape (N,): of another target density."""
         return replace(self, log_target=self.log_target + log_factors)
 
+    def retargeted(self, log_target: np.ndarray) -> Samples:
+        """The samples with another log p*, shape (N,), which they may have where the old one is -inf."""
+        return replace(self, log_target=log_target)
+
     def spread_in_range(self, spread_m: float, generator: np.random.Generator) -> Samples:
         """The samples with normal noise on their ranges, inside the space: what scenes that were not seen may be.
 

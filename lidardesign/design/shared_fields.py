@@ -9,6 +9,7 @@ cropped to the training returns, after refinement: 9 % less error than that grid
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,12 +17,12 @@ from scipy.spatial import cKDTree
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints import Constraints
-from lidardesign.design.membership import members
+from lidardesign.design.membership import FIELD_ROUNDING_RAD, members
 from lidardesign.design.priced_gates import Heard, gates_within
 from lidardesign.design.quantise import lloyd, samples_for
 from lidardesign.design.resolve import bounds_of
 from lidardesign.design.samples import Samples
-from lidardesign.design.sensor import Design, interval_factor, tangent_directions
+from lidardesign.design.sensor import Design, Sensor, interval_factor, tangent_coordinates, tangent_directions
 from lidardesign.numerics import systematic_draw, unit_vectors
 from lidardesign.task import random_generator
 
@@ -70,7 +71,7 @@ def shared_rays(design: Design, shares: np.ndarray, samples: Samples, seed: int)
             continue
         if len(np.unique(own.looking, axis=0)) < count:
             return None
-        found.append(_at_one_place(own, count, len(shares), random_generator(seed, "shared fields", index)))
+        found.append(_at_one_place(own, count, design.sensors, random_generator(seed, "shared fields", index)))
     if not found:
         return None
     directions, sensor = (np.concatenate([one[part] for one in found]) for part in (0, 1))
@@ -80,13 +81,11 @@ def shared_rays(design: Design, shares: np.ndarray, samples: Samples, seed: int)
 
 
 def _at_one_place(
-    seen: _Seen, count: int, sensors: int, generator: np.random.Generator
+    seen: _Seen, count: int, sensors: Sequence[Sensor], generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, Heard]:
     """Directions (N, 3) of the rays from one place, the sensor of each (N,), and what they hear."""
-    drawn = seen
-    if len(seen.weights) > samples_for(count):
-        drawn = _evenly(seen.take(systematic_draw(seen.weights, samples_for(count), generator)))
-    directions, sensor = _cells(drawn, count, sensors, generator)
+    directions, sensor = _cells(_thinned(seen, count, generator), count, len(sensors), generator)
+    directions = _in_fields(directions, sensor, sensors)
     # gates rest on all samples: their ends are rare
     ray = cKDTree(directions).query(seen.looking)[1]
     silent = np.setdiff1d(np.arange(count), ray)
@@ -106,9 +105,26 @@ def _together(heard: list[Heard]) -> Heard:
     return Heard(ranges, weights, ray, int(firsts[-1]))
 
 
-def _evenly(seen: _Seen) -> _Seen:
-    """Samples that were drawn by weight count alike."""
-    return _Seen(seen.looking, seen.range_m, np.ones(len(seen.weights)), seen.owner)
+def _thinned(seen: _Seen, count: int, generator: np.random.Generator) -> _Seen:
+    """As many samples as a number of cells needs, drawn by weight, so that they count alike."""
+    if len(seen.weights) <= samples_for(count):
+        return seen
+    drawn = seen.take(systematic_draw(seen.weights, samples_for(count), generator))
+    # where a few samples have nearly all weight they are drawn again and again, and cells would be left without
+    if len(np.unique(drawn.looking, axis=0)) < count:
+        return seen
+    return _Seen(drawn.looking, drawn.range_m, np.ones(len(drawn.weights)), drawn.owner)
+
+
+def _in_fields(directions: np.ndarray, sensor: np.ndarray, sensors: Sequence[Sensor]) -> np.ndarray:
+    """Directions (N, 3) inside the fields of their sensors: means of samples at the edge of a wide field bulge."""
+    inside = directions.copy()
+    for index, one in enumerate(sensors):
+        own = np.flatnonzero(sensor == index)
+        tangent, half = tangent_coordinates(one.frame, directions[own]), np.array(one.field_of_view_rad) / 2
+        beyond = (np.abs(tangent) > half + FIELD_ROUNDING_RAD).any(axis=1)
+        inside[own[beyond]] = tangent_directions(one.frame, np.clip(tangent[beyond], -half, half))
+    return inside
 
 
 def ray_gates(design: Design, heard: Heard, sensor: np.ndarray, samples: Samples) -> np.ndarray:
@@ -145,7 +161,7 @@ def _seen(design: Design, samples: Samples) -> _Seen:
 def _cells(seen: _Seen, count: int, sensors: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Directions (N, 3) of rays and the sensor of each (N,).
 
-    A ray looks at the middle of its own sensor's samples in the cell, which lie in that sensor's field.
+    A ray looks at the middle of its own sensor's samples in the cell.
     """
     _, labels = lloyd(seen.looking, seen.weights, count, generator)
     votes = np.bincount(labels * sensors + seen.owner, seen.weights, count * sensors).reshape(count, sensors)

@@ -48,7 +48,7 @@ class Gating:
     def __call__(self, design: Design, rays: Rays) -> Design:
         """The design with gates by returns, in its bandwidth budget or else in no more than it had.
 
-        A ray without returns keeps its own gate.
+        A ray without returns keeps its own gate, and all keep theirs where new ones would hold fewer returns.
 
         Arguments:
             design: With a gate per ray: a scan, or a table of rays.
@@ -69,7 +69,8 @@ class Gating:
         own = Heard(heard.range_m, heard.weights, place[heard.ray], len(known))
         gates = rays.gate_m.copy()
         gates[known] = gates_within(own, bounds, EVERYTHING, model, most)
-        if int(model.bins(gates[:, 1] - gates[:, 0])[known].sum()) > most:
+        too_wide = int(model.bins(gates[:, 1] - gates[:, 0])[known].sum()) > most
+        if too_wide or heard.held_by(gates) < heard.held_by(rays.gate_m):
             return design
         return _with_gates(design, gates)
 
