@@ -183,17 +183,18 @@ def refined(
 
 
 def _refine(fitter: Fitter, weighting: Weighting, rounds: int, console: Console) -> Refinement:
-    from lidardesign.evaluate.attention import Attention
+    from lidardesign.evaluate.attention import Attention, anchors_for
     from lidardesign.evaluate.refinement import Refiner, Shape
     from lidardesign.space import observed_point
-    from lidardesign.task import random_generator
+    from lidardesign.task import conditions_of, random_generator
 
     order = fitter.order
     unit, seed = order.run.task.metric.unit, order.seed
     look, judge = _scenes(order)
     gating = _Gating(fitter, look)
     drawn = fitter.base.resample(ANCHOR_POOL, random_generator(seed, "anchor places"))
-    attention = Attention.over(observed_point(drawn), random_generator(seed, "anchors"))
+    positions = len(conditions_of(order.run.task, order.run.config.task, order.run.config.space))
+    attention = Attention.over(observed_point(drawn), random_generator(seed, "anchors"), anchors_for(positions))
 
     def told(one: Round) -> None:
         console.note(f"refine {one.number}: {_shown(one, unit)}")

@@ -33,11 +33,11 @@ from lidardesign.task import Task
 FIRST_STEP = 0.5
 # So many rounds in a row without a gain end it.
 PATIENCE = 2
-# A wider interval costs bandwidth: it is kept where the score gains at least this share of its value.
-WORTH_SHARE = 0.005
+# A wider interval costs bandwidth: ten percent more of it have to bring at least one percent of the score.
+WORTH_SHARE = 0.1
 # Levels that are tried, and how far samples are spread in range, in the density's own sigma.
 LEVELS = (0.8, 0.9, 0.95, 0.98, 0.99)
-SPREADS = (0.0, 1.0, 2.0, 4.0)
+SPREADS = (0.0, 2.0, 4.0)
 MILLIMETRES = 1000.0
 
 
@@ -184,6 +184,7 @@ class Refiner:
         self.sign = 1.0 if task.metric.better == "lower" else -1.0
         self.rounds: list[Round] = []
         self._tested: set[tuple[bytes, Shape]] = set()
+        self._favoured = ""
 
     @phase("refinement")
     def run(self, rounds: int, shape: Shape) -> Refinement:
@@ -236,20 +237,25 @@ class Refiner:
                 break
         return best
 
-    def _gains(self, best: _State) -> np.ndarray:
-        """Where the error of a design is, per ray."""
+    def _gains(self, best: _State) -> dict[str, np.ndarray]:
+        """Where the error of a design is, in each sense that a step may follow."""
         seen = []
         for scene, casters in self.look:
             returns = _returns(scene, casters, best.trial.positions)
             seen.append((checked_residuals(self.task, scene, returns), returns))
         return self.attention.gains(seen)
 
-    def _stepped(self, number: int, best: _State, gains: np.ndarray, step: float) -> _State:
-        """The design after a step towards its error, where that is better."""
-        factors = self.attention.moved(best.log_factors, gains, step)
-        if not np.any(factors - best.log_factors):
-            return best
-        return self._tried(number, f"towards the error, step {step:g}", best, log_factors=factors)
+    def _stepped(self, number: int, best: _State, gains: dict[str, np.ndarray], step: float) -> _State:
+        """The design after a step towards its error, where that is better; what was better last goes first."""
+        for name in sorted(gains, key=lambda name: name != self._favoured):
+            factors = self.attention.moved(best.log_factors, gains[name], step)
+            if not np.any(factors - best.log_factors):
+                continue
+            found = self._tried(number, f"towards {name}, step {step:g}", best, log_factors=factors)
+            if found is not best:
+                self._favoured = name
+                return found
+        return best
 
     def _tried(self, number: int, change: str, best: _State, **changed: Any) -> _State:
         """The better of a design and a changed one; more bandwidth has to be worth it."""
@@ -266,8 +272,8 @@ class Refiner:
             self._note(Round(number, f"{change}: {error.message}", None, None, False, _since(started)))
             return best
         found = replace(wanted, trial=trial, score=self._score(trial))
-        wider = wanted.shape != best.shape and trial.bandwidth_mbps > best.trial.bandwidth_mbps
-        kept = found.score < best.score - (WORTH_SHARE * abs(best.score) if wider else 0.0)
+        more = trial.bandwidth_mbps / best.trial.bandwidth_mbps - 1 if wanted.shape != best.shape else 0.0
+        kept = found.score < best.score - WORTH_SHARE * max(more, 0.0) * abs(best.score)
         self._note(Round(number, change, self.sign * found.score, trial.bandwidth_mbps, kept, _since(started)))
         return found if kept else best
 
