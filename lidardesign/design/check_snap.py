@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.design.catalog.library import SUFFIX, find_part, load_library
+from lidardesign.design.catalog.library import SUFFIX, load_library
 from lidardesign.design.catalog.part import Part
 from lidardesign.design.sensor import boresight_frame
 from lidardesign.errors import ConfigError
@@ -46,16 +46,31 @@ def snap_rows(name: str, index: int, document: Mapping[str, Any], snap: Any) -> 
 
 def _found(name: str, named: list[str]) -> Part | None:
     """The part that a sensor names, if the constraints admit it."""
-    paths = [text.partition(f"{SUFFIX}:")[0] + SUFFIX if f"{SUFFIX}:" in text else text for text in named]
-    own = [Path(path) for path in paths if path.endswith(SUFFIX) or Path(path).is_dir()]
+    own = [path for path, _ in map(_path_and_mode, named) if path is not None]
     try:
-        part = load_library(own).part(name)
+        library = load_library(own)
+        part = library.part(name)
     except ConfigError:
         return None
     stem = name.partition(":")[0]
-    plain = [text for text in named if text.partition(":")[0] == stem and find_part(text).mode in (None, part.mode)]
-    whole = [text for text in named if text == stem]
-    return part if not named or own or plain or whole else None
+    admitted = not named
+    for text in named:
+        path, mode = _path_and_mode(text)
+        same = text.partition(":")[0] == stem if path is None else _lies_in(library.origins[stem], path)
+        admitted |= same and mode in ("", part.mode)
+    return part if admitted else None
+
+
+def _path_and_mode(text: str) -> tuple[Path | None, str]:
+    """The path that an entry of `parts` is, None where it is a name, and the mode behind it."""
+    path, mode = text.rsplit(":", 1) if f"{SUFFIX}:" in text else (text, "")
+    if path.endswith(SUFFIX) or Path(path).is_dir():
+        return Path(path), mode
+    return None, text.partition(":")[2]
+
+
+def _lies_in(origin: str, path: Path) -> bool:
+    return Path(origin) == path or Path(origin).parent == path
 
 
 def _compared(part: Part, index: int, sensor: Mapping[str, Any], document: Mapping[str, Any]) -> tuple[str, bool]:

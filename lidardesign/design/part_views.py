@@ -16,6 +16,8 @@ from lidardesign.space import observed_point
 LEAST_REACH_RAD = 0.005
 # Rays are worth firing that see this share of what the part could see: the rest are strays.
 SEEN_SHARE = 0.99
+# Of so many things in view the nearest says how far from them a ray looks.
+NEAR_POINTS = 400
 
 
 def in_view(part: Part, directions: np.ndarray) -> np.ndarray:
@@ -62,10 +64,11 @@ def worth_firing(
             enough = int(np.searchsorted(np.cumsum(share[order]), SEEN_SHARE * mass.sum())) + 1
             mask[order[:enough]] = True
             mask &= share > 0
-            others = np.flatnonzero(~mask)
-            lacking = max(min(least, len(directions)) - int(mask.sum()), 0)
-            away = cKDTree(looking).query(directions[others])[0]
-            mask[others[np.argsort(away, kind="stable")[:lacking]]] = True
+            lacking = min(least, len(directions)) - int(mask.sum())
+            if lacking > 0:
+                others = np.flatnonzero(~mask)
+                away = cKDTree(looking[:: -(-len(looking) // NEAR_POINTS)]).query(directions[others])[0]
+                mask[others[np.argsort(away, kind="stable")[:lacking]]] = True
         return mask
 
     return wanted

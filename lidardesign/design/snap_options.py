@@ -10,6 +10,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,10 @@ def options_of(constraints: Constraints, space: DesignSpace, middles_m: Sequence
         InfeasibleError: No part keeps a sensor's constraints, and it is not said that it may stay as it is.
         ConfigError: A part that is not there, or no part file.
     """
-    options = [_options(constraints, index, space, middle) for index, middle in enumerate(middles_m)]
+    last = len(constraints.each)
+    snaps = [constraints.of_sensor(min(index, last)).snap for index in range(min(len(middles_m), last + 1))]
+    parts = [[] if snap is None else parts_of(snap) for snap in snaps]
+    options = [_options(constraints, i, space, middle, parts[min(i, last)]) for i, middle in enumerate(middles_m)]
     refused = [
         index
         for index, one in enumerate(options)
@@ -83,17 +87,17 @@ def parts_of(snap: Snap) -> list[Part]:
         ConfigError: A name or path that is no part.
     """
     if snap.parts is None:
-        return [part for part in load_library().every_mode() if part.value("near_m") is not None]
+        return list(_catalogue())
     found: dict[str, Part] = {}
     for text in snap.parts:
         found |= {part.name: part for part in _named(text)}
     return list(found.values())
 
 
-def library_of(snap: Snap | None) -> Library:
-    """The shipped parts and those that a constraint file names by their paths."""
-    named = [] if snap is None else snap.parts or []
-    return load_library([path for path, _ in map(_split, named) if path is not None])
+@lru_cache(maxsize=1)
+def _catalogue() -> tuple[Part, ...]:
+    # kept, because patterns of hundred thousands of rays take a while
+    return tuple(part for part in load_library().every_mode() if part.value("near_m") is not None)
 
 
 def _split(text: str) -> tuple[Path | None, str]:
@@ -125,11 +129,13 @@ def _modes(library: Library, part: Part) -> list[Part]:
     return [library.part(f"{stem}:{mode}") for mode in part.modes] or [part]
 
 
-def _options(constraints: Constraints, index: int, space: DesignSpace, middle_m: float) -> Options:
+def _options(
+    constraints: Constraints, index: int, space: DesignSpace, middle_m: float, parts: Sequence[Part]
+) -> Options:
     one = constraints.of_sensor(index)
     if one.snap is None:
         return Options([], snapped=False)
-    every = [shapes_of(part, space) for part in parts_of(one.snap)]
+    every = [shapes_of(part, space) for part in parts]
     heard = [shapes for shapes in every if shapes and shapes[0].gate_m[0] <= middle_m <= shapes[0].gate_m[1]]
     broken = [_broken(shapes[0], one) for shapes in heard]
     kept = [shape for shapes, found in zip(heard, broken, strict=True) if not found for shape in shapes]
