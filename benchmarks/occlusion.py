@@ -67,7 +67,7 @@ def rays_needed(rays: Sequence[int], distance_m: Sequence[float], reached_m: flo
 
 def curves(run_folder: Path, layout: str, sensors: int, rays: Sequence[int], seed: int) -> tuple[Curve, Curve]:
     """Of a design fitted with a seed, and of its twin."""
-    from lidardesign.cli.layouts import TWIN_NAME, layouts_of, twin_without_visibility
+    from lidardesign.cli.layouts import TWIN_NAME, RunTarget, layouts_of, twin_without_visibility
     from lidardesign.cli.runs import open_run
     from lidardesign.design.constraints import Constraints
     from lidardesign.design.fit import fit
@@ -78,7 +78,6 @@ def curves(run_folder: Path, layout: str, sensors: int, rays: Sequence[int], see
     config, samples = run.config, load_samples(run.folder)
     level = run.task.defaults.level
     most = max(rays)
-    layouts = layouts_of([(AWARE, run)])
     mounted = layout == "mounted"
     design = fit(
         samples,
@@ -89,9 +88,10 @@ def curves(run_folder: Path, layout: str, sensors: int, rays: Sequence[int], see
         level=level,
         seed=seed,
         name=AWARE,
-        retarget=layouts.targets[AWARE],
+        retarget=RunTarget(run),
     ).design
     design = replace(design, provenance={**design.provenance, "seed": seed})
+    layouts = layouts_of([(design, run)])
     request = EvaluationRequest(
         task=run.task,
         config=config.task,

@@ -79,7 +79,7 @@ def miss_rates(run_folder: Path, designs: list[Path], x_m: float, rays: int) -> 
     samples = load_samples(run.folder)
     space = config.space.at({"x_m": x_m})
     train, test = (scenes_of(run.task, config.task, split, config.seed, space) for split in ("train", "test"))
-    layouts = layouts_of([(design.name, run) for design in loaded])
+    layouts = layouts_of([(design, run) for design in loaded])
     request = EvaluationRequest(
         task=run.task,
         config=config.task,
