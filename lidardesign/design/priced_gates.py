@@ -13,7 +13,7 @@ import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.bounds import Bounds
-from lidardesign.design.gates import admissible_gates, central_intervals
+from lidardesign.design.gates import THINNEST_GATE_M, admissible_gates, central_intervals
 from lidardesign.numerics import TINY
 
 # Prices are bisected on a logarithmic scale, from this share of the dearest one.
@@ -38,9 +38,10 @@ class Heard:
     count: int
 
     def held_by(self, gates: np.ndarray) -> float:
-        """The weight that gates (N, 2) hold, ends included."""
+        """The weight that gates (N, 2) hold; what lies on their very ends counts, whatever rounding did to these."""
         start, end = gates[self.ray].T
-        return float(self.weights[(self.range_m >= start) & (self.range_m <= end)].sum())
+        held = (self.range_m >= start - THINNEST_GATE_M) & (self.range_m <= end + THINNEST_GATE_M)
+        return float(self.weights[held].sum())
 
 
 def gates_within(heard: Heard, bounds: Bounds, level: float, model: Bandwidth, most_bins: int | None) -> np.ndarray:
@@ -56,7 +57,7 @@ def gates_within(heard: Heard, bounds: Bounds, level: float, model: Bandwidth, m
     Returns:
         Gates (N, 2) [m]. Bounds that do not admit narrow gates may need more bins, which is for the caller to check.
     """
-    wide, _ = central_intervals(heard.range_m, heard.weights, heard.ray, heard.count, level)
+    heard, wide = _admissible(heard, bounds, level)
 
     def admitted(gates: np.ndarray) -> np.ndarray:
         centre, spread = admissible_gates(gates, bounds)
@@ -78,6 +79,16 @@ def gates_within(heard: Heard, bounds: Bounds, level: float, model: Bandwidth, m
         gates = admitted(prices.gates(float(np.exp(middle))))
         cheap, dear = (cheap, middle) if fits(gates) else (middle, dear)
     return admitted(prices.gates(float(np.exp(dear))))
+
+
+def _admissible(heard: Heard, bounds: Bounds, level: float) -> tuple[Heard, np.ndarray]:
+    """What gates may hear at all, and the gates (N, 2) [m] that hold the level of it; narrow where it is nothing."""
+    low, high = np.maximum(bounds.start_low, 0.0), bounds.end_high
+    kept = (heard.weights > 0) & (heard.range_m >= low[heard.ray]) & (heard.range_m <= high[heard.ray])
+    inside = Heard(heard.range_m[kept], heard.weights[kept], heard.ray[kept], heard.count)
+    wide, _ = central_intervals(inside.range_m, inside.weights, inside.ray, heard.count, level)
+    middle = np.bincount(heard.ray, heard.range_m, heard.count) / np.bincount(heard.ray, minlength=heard.count)
+    return inside, np.where(np.isnan(wide), np.clip(middle, low, high)[:, None], wide)
 
 
 @dataclass(frozen=True, eq=False)
