@@ -59,7 +59,7 @@ Gates = Annotated[
     typer.Option(
         "--gates",
         metavar="sensor|ray",
-        help="One gate per sensor, or one per ray.",
+        help="One gate per sensor, or one per ray; in a scan every ray is a sensor.",
         show_default="sensor; ray in the layout distributed",
     ),
 ]

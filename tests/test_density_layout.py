@@ -1,0 +1,143 @@
+"""The layout `density`: rays on the sphere as far from each other as random ones never are, where the density is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from lidardesign.design.rays import lay_out
+from lidardesign.design.samples import Samples
+from lidardesign.design.sensor import Design, Sensor
+from lidardesign.space import DesignSpace, angles
+
+SPACE = DesignSpace((0, 0, 0, 0, -math.pi / 2, 0), (0, 0, 0, 2 * math.pi, math.pi / 2, 10))
+SAMPLES = 30_000
+HEXAGONAL = 2.149  # mean nearest distance of a hexagonal lattice over that of random points of the same density
+
+
+def cap(half_angle, count, seed=0):
+    """Unit vectors even in solid angle within an angle of the x axis."""
+    generator = np.random.default_rng(seed)
+    forward = generator.uniform(math.cos(half_angle), 1.0, count)
+    turn, sideways = generator.uniform(0, 2 * math.pi, count), np.sqrt(1 - forward**2)
+    return np.stack([forward, sideways * np.cos(turn), sideways * np.sin(turn)], axis=1)
+
+
+def looking_along(directions, azimuth=0.0, elevation=0.0, half_angle=1.6, log_weights=None):
+    """A sensor that sees all directions at 1 m, and their samples."""
+    spread = half_angle / 1.95
+    sensor = Sensor(
+        "s", 1.0, np.zeros(3), np.zeros((3, 3)), azimuth, elevation, 0.0, spread, spread, range_m=1.0,
+        spread_range_m=0.1,
+    )  # fmt: skip
+    along = np.column_stack([np.zeros((len(directions), 3)), *angles(directions), np.ones(len(directions))])
+    level = np.zeros(len(along))
+    samples = Samples(along, level, level if log_weights is None else log_weights, SPACE)
+    return Design("d", (sensor,), layout="density"), samples
+
+
+def nearest(directions):
+    """Chords to the nearest other ray."""
+    return cKDTree(directions).query(directions, k=2)[0][:, 1]
+
+
+def evenness(directions, area):
+    """Mean nearest distance over that of random points of the same density: 1 for those, 2.15 at most."""
+    return nearest(directions).mean() / (0.5 * math.sqrt(area / len(directions)))
+
+
+@pytest.mark.parametrize("half_angle", [0.2, 1.5])
+def test_rays_keep_their_distance_as_blue_noise_does(half_angle):
+    area = 2 * math.pi * (1 - math.cos(half_angle))
+    design, samples = looking_along(cap(half_angle, SAMPLES), half_angle=half_angle)
+    rays = lay_out(design, 200, samples).direction
+    random = cap(half_angle, 200, seed=1)
+    assert evenness(random, area) < 1.2
+    assert 1.65 < evenness(rays, area) < HEXAGONAL
+    # what is nearest is nearly equally near for all: 0.52 for random points
+    spacing = nearest(rays)
+    assert spacing.std() / spacing.mean() < 0.16
+    assert spacing.min() > 0.55 * spacing.mean()
+
+
+def power(points, box, frequencies):
+    """The spectrum of points (N, 2) tapered towards the edges of a box (half sizes), per point: 1 for random ones."""
+    window = np.prod(np.cos(np.pi / 2 * np.clip(points / box, -1, 1)) ** 2, axis=1)
+    # the window's own transform at these frequencies, by a fine grid
+    axis = (np.arange(200) + 0.5) / 100 - 1
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2) * box
+    taper = np.prod(np.cos(np.pi / 2 * grid / box) ** 2, axis=1)
+    expected = window.sum() * (np.exp(1j * grid @ frequencies.T) * taper[:, None]).sum(axis=0) / taper.sum()
+    return (
+        np.abs((np.exp(1j * points @ frequencies.T) * window[:, None]).sum(axis=0) - expected) ** 2 / (window**2).sum()
+    )
+
+
+def test_rays_have_little_power_at_low_frequencies_and_as_much_as_random_ones_at_high_ones():
+    half_angle, count = 0.2, 400
+    design, samples = looking_along(cap(half_angle, SAMPLES), half_angle=half_angle)
+    spacing = math.sqrt(math.pi * half_angle**2 / count)
+    inside = np.full(2, half_angle / math.sqrt(2))
+    turn = np.linspace(0, math.pi, 24, endpoint=False)
+    ring = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+
+    def mean_power(share, directions):
+        flat = directions[:, 1:][(np.abs(directions[:, 1:]) < inside).all(axis=1)]
+        return power(flat, inside, share * 2 * math.pi / spacing * ring).mean()
+
+    rays = lay_out(design, count, samples).direction
+    random = cap(half_angle, count, seed=2)
+    low, high = np.linspace(0.3, 0.6, 4), np.linspace(2.5, 4.0, 6)
+    assert np.mean([mean_power(share, random) for share in low]) > 0.5
+    assert np.mean([mean_power(share, rays) for share in low]) < 0.1
+    assert 0.5 < np.mean([mean_power(share, rays) for share in high]) < 2.0
+
+
+def test_a_wide_field_has_as_many_rays_per_solid_angle_at_its_rim_as_in_its_middle():
+    design, samples = looking_along(cap(1.5, SAMPLES), half_angle=1.5)
+    rays = lay_out(design, 400, samples).direction
+    inner_half = (1 + math.cos(1.5)) / 2
+    assert (rays[:, 0] > inner_half).mean() == pytest.approx(0.5, abs=0.025)
+
+
+def test_the_density_of_rays_follows_the_root_of_that_of_samples():
+    # nine times as dense to the left as to the right: three times as many rays there
+    directions = cap(0.2, SAMPLES)
+    log_weights = np.where(directions[:, 1] > 0, math.log(9.0), 0.0)
+    design, samples = looking_along(directions, half_angle=0.2, log_weights=log_weights)
+    rays = lay_out(design, 400, samples).direction
+    assert (rays[:, 1] > 0).sum() / (rays[:, 1] < 0).sum() == pytest.approx(3.0, rel=0.12)
+
+
+def test_rays_turn_with_their_sensor_to_the_pole_and_across_north():
+    directions = cap(0.4, 8000)
+    design, samples = looking_along(directions, half_angle=0.4)
+    rays = lay_out(design, 60, samples).direction
+    for azimuth, elevation in ((0.0, -math.pi / 2), (math.pi, 0.7)):
+        turned, _ = looking_along(directions, azimuth, elevation, half_angle=0.4)
+        frame = turned.sensors[0].frame
+        moved = looking_along(directions @ frame, azimuth, elevation, half_angle=0.4)
+        np.testing.assert_allclose(lay_out(*_call(moved, 60)).direction, rays @ frame, atol=1e-9)
+
+
+def _call(made, count):
+    design, samples = made
+    return design, count, samples
+
+
+def test_the_same_samples_and_seed_give_the_same_bits_and_every_ray_is_inside_the_field():
+    design, samples = looking_along(cap(0.6, 6000), half_angle=0.3)
+    first, again = (lay_out(design, 150, samples, seed=4) for _ in range(2))
+    assert first.direction.tobytes() == again.direction.tobytes()
+    assert first.gate_m.tobytes() == again.gate_m.tobytes()
+    azimuth, elevation = angles(first.direction)
+    horizontal, vertical = design.sensors[0].field_of_view_rad
+    assert (np.abs((azimuth + math.pi) % (2 * math.pi) - math.pi) <= horizontal / 2 + 0.02).all()
+    assert (np.abs(elevation) <= vertical / 2 + 1e-9).all()
+    assert len(np.unique(first.direction, axis=0)) == 150
+    narrow = replace(design, sensors=(replace(design.sensors[0], spread_horizontal_rad=0.05),))
+    assert np.abs(lay_out(narrow, 150, samples).direction[:, 1]).max() < np.abs(first.direction[:, 1]).max()
