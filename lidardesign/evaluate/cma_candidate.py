@@ -155,12 +155,14 @@ class CmaCandidate:
     @phase("cma")
     def _searched(self, key: tuple[int | None, float | None], amount: Amount) -> Positions:
         if key not in self._known:
+            budget = self.settings.budget
+            began = budget.clock()
             models = self._models(amount)
             generator = random_generator(self.seed, "cma", str(key))
             label = f"cma, {amount.count} rays" if amount.count else f"cma, {amount.limit_mbps:.3g} Mbit/s"
             told = self.settings.show
             show = None if told is None else (lambda progress: told(label, progress))
-            found = Search(models, amount, self.objective, self.settings.budget, generator, show).run()
+            found = Search(models, amount, self.objective, budget, generator, show, began).run()
             if not self._varies_gates(amount):
                 found = self._cropped(found, amount)
             self._known[key] = found.model.positions(found.vector, amount), self._record(found, amount)

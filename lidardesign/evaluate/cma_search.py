@@ -119,6 +119,7 @@ class Search:
         budget: When to end.
         generator: Of all its random numbers.
         show: Told where the search stands after every step.
+        began: When the budget's clock showed that work began, as on the starts; None: now.
     """
 
     def __init__(
@@ -129,10 +130,11 @@ class Search:
         budget: Budget,
         generator: np.random.Generator,
         show: Callable[[Progress], None] | None = None,
+        began: float | None = None,
     ) -> None:
         self._starts, self._amount, self._objective, self._budget = starts, amount, objective, budget
         self._generator, self._show = generator, show
-        self._began, self._worked = budget.clock(), time.process_time()
+        self._began, self._worked = budget.clock() if began is None else began, time.process_time()
         self._candidates = self._evaluations = self._restarts = 0
         self._last = min(len(objective.scenes), MOST_SCENES)
         self._stages = _stages(self._last)

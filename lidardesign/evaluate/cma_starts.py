@@ -87,8 +87,15 @@ def _tilings(setting: Setting, observed: Observed, count: int) -> Iterator[Start
     if not len(observed.points):
         return
     for origins in _origin_sets(setting, observed, count):
+        distinct, which = np.unique(origins, axis=0, return_inverse=True)
+        views = [_seen(setting, observed, origin) for origin in distinct]
+        ends = [central(view.places) for view in views]
         for rows in range(1, count + 1):
-            sensors = [_tile_sensor(setting, observed, origins[i], (i, count, rows)) for i in range(count)]
+            parts = [tiles(*end, count, rows) for end in ends]
+            sensors = [
+                _tile_sensor(setting, views[view], parts[view][index], index, 1.0 / count)
+                for index, view in enumerate(which.ravel())
+            ]
             yield tuple(sensor for sensor, _ in sensors)
             returns = np.array([seen for _, seen in sensors], dtype=np.float64)
             if count > 1 and returns.min() > 0:
@@ -109,35 +116,41 @@ def _origin_sets(setting: Setting, observed: Observed, count: int) -> list[np.nd
     return sets
 
 
-def _tile_sensor(
-    setting: Setting, observed: Observed, origin: np.ndarray, part: tuple[int, int, int]
-) -> tuple[Sensor, int]:
-    """The sensor of one tile of the returns as an origin sees them, and how many returns lie in it."""
-    index, count, rows = part
+class _Seen(NamedTuple):
+    """The returns as an origin sees them: where in a plane (K, 2), how far (K,), and the frame of a tangent plane.
+
+    Without a frame the plane is that of azimuth and elevation.
+    """
+
+    origin: np.ndarray
+    places: np.ndarray
+    distance: np.ndarray
+    frame: np.ndarray | None
+
+
+def _seen(setting: Setting, observed: Observed, origin: np.ndarray) -> _Seen:
     away = observed.hits_m - origin
     distance = np.linalg.norm(away, axis=1)
     looking = away / np.maximum(distance, TINY)[:, None]
-    middle = looking.mean(axis=0)
-    frame = boresight_frame(*(float(angle) for angle in angles(middle)))
-    if _free_angles(setting) == 2 and (looking @ frame[0]).min() > math.cos(TANGENT_RAD):
-        places = sphere_log(looking @ frame.T)
-        tile = tiles(*central(places), count, rows)[index]
-        centre = sphere_exp((tile.low + tile.high)[None] / 2) @ frame
-        azimuth, elevation = (float(angle[0]) for angle in angles(centre))
-        field = tile.high - tile.low
-    else:
-        turned, raised = angles(looking)
-        places = np.stack([unrolled(turned), raised], axis=1)
-        tile = tiles(*central(places), count, rows)[index]
-        azimuth, elevation = ((tile.low + tile.high) / 2).tolist()
+    frame = boresight_frame(*(float(angle) for angle in angles(looking.mean(axis=0))))
+    if setting.axes.angular == 2 and (looking @ frame[0]).min() > math.cos(TANGENT_RAD):
+        return _Seen(origin, sphere_log(looking @ frame.T), distance, frame)
+    turned, raised = angles(looking)
+    return _Seen(origin, np.stack([unrolled(turned), raised], axis=1), distance, None)
+
+
+def _tile_sensor(setting: Setting, seen: _Seen, tile: Tile, index: int, weight: float) -> tuple[Sensor, int]:
+    """The sensor of one tile of the returns, and how many returns lie in it."""
+    middle = (tile.low + tile.high) / 2
+    if seen.frame is None:
+        azimuth, elevation = middle.tolist()
         field = (tile.high - tile.low) * [math.cos(elevation), 1.0]
-    inside = ((places >= tile.low) & (places <= tile.high)).all(axis=1)
-    gate = _gate(setting, distance[inside] if inside.sum() >= FEWEST_RETURNS else distance)
-    return _sensor(setting, index, 1.0 / count, origin, (azimuth, elevation), field, gate), int(inside.sum())
-
-
-def _free_angles(setting: Setting) -> int:
-    return setting.axes.angular
+    else:
+        azimuth, elevation = (float(angle[0]) for angle in angles(sphere_exp(middle[None]) @ seen.frame))
+        field = tile.high - tile.low
+    inside = ((seen.places >= tile.low) & (seen.places <= tile.high)).all(axis=1)
+    gate = _gate(setting, seen.distance[inside] if inside.sum() >= FEWEST_RETURNS else seen.distance)
+    return _sensor(setting, index, weight, seen.origin, (azimuth, elevation), field, gate), int(inside.sum())
 
 
 def _gate(setting: Setting, range_m: np.ndarray) -> np.ndarray:
