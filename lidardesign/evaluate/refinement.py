@@ -36,7 +36,7 @@ PATIENCE = 2
 # A wider interval costs bandwidth: ten percent more of it have to bring at least one percent of the score.
 WORTH_SHARE = 0.1
 # Levels that are tried, and how far samples are spread in range, in the density's own sigma.
-LEVELS = (0.8, 0.9, 0.95, 0.98, 0.99)
+LEVELS = (0.8, 0.9, 0.95, 0.98, 0.99, 0.999)
 SPREADS = (0.0, 2.0, 4.0)
 MILLIMETRES = 1000.0
 
