@@ -199,11 +199,20 @@ def check_written(design: Design, constraints: Constraints | None, space: Design
         return []
     from lidardesign.design.check import check_design
     from lidardesign.design.files import design_document
-    from lidardesign.errors import InfeasibleError
     from lidardesign.run.yaml import dump_yaml, parse_yaml
 
     written = parse_yaml(dump_yaml(design_document(design)), where=design.name).value
-    checks = list(check_design(written, constraints, space))
+    return refuse_broken(list(check_design(written, constraints, space)))
+
+
+def refuse_broken(checks: list[ConstraintCheck]) -> list[ConstraintCheck]:
+    """The checks of a design that keeps its constraints.
+
+    Raises:
+        InfeasibleError: One does not hold.
+    """
+    from lidardesign.errors import InfeasibleError
+
     broken = [check for check in checks if not check.satisfied]
     if broken:
         first = broken[0]

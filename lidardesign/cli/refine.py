@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from lidardesign.design.fit import FitResult
     from lidardesign.design.reweighting import Reweighting
     from lidardesign.design.samples import Samples
+    from lidardesign.evaluate.attention import Attention
     from lidardesign.evaluate.refinement import Refinement, Round, Shape, Trial
     from lidardesign.evaluate.regating import Gating
     from lidardesign.scene import Scene
@@ -76,6 +77,7 @@ class Fitter:
         self.target = RunTarget(order.run, weighting=Weighting(settings))
         order.run.config.space.at(order.at)
         self.base = self._base(settings)
+        self._told = False
 
     @phase("samples")
     def _base(self, settings: tuple[str, ...]) -> Samples:
@@ -83,9 +85,7 @@ class Fitter:
         from lidardesign.design.samples import load_samples
 
         samples = load_samples(self.order.run.folder)
-        _check_worth(
-            samples, self.order.run, "learn longer (--preset standard or fine), or with a larger density.sigma_m"
-        )
+        _check_worth(samples, self.order.run, LEARN_LONGER)
         if not settings:
             return samples
         weighed = Weighting(settings).log_target(samples, self.target)
@@ -133,7 +133,9 @@ class Fitter:
         count = max(MOVED_SAMPLES, SAMPLES_PER_RAY * (order.choices.get("rays") or 0))
         moved = at_condition(samples, order.at, retarget, count, random_generator(order.seed, "condition"))
         worth = moved.effective_sample_size
-        self.console.note(f"note: at {shown(order.at)} {len(moved)} samples have ESS {worth:.2f}")
+        if not self._told:
+            self.console.note(f"note: at {shown(order.at)} {len(moved)} samples have ESS {worth:.2f}")
+        self._told = True
         return moved
 
     @cached_property
@@ -183,18 +185,12 @@ def refined(
 
 
 def _refine(fitter: Fitter, weighting: Weighting, rounds: int, console: Console) -> Refinement:
-    from lidardesign.evaluate.attention import Attention, anchors_for
     from lidardesign.evaluate.refinement import Refiner, Shape
-    from lidardesign.space import observed_point
-    from lidardesign.task import conditions_of, random_generator
 
-    order = fitter.order
-    unit, seed = order.run.task.metric.unit, order.seed
+    order, start = fitter.order, weighting.reweighting
+    unit = order.run.task.metric.unit
     look, judge = _scenes(order)
     gating = _Gating(fitter, look)
-    drawn = fitter.base.resample(ANCHOR_POOL, random_generator(seed, "anchor places"))
-    positions = len(conditions_of(order.run.task, order.run.config.task, order.run.config.space))
-    attention = Attention.over(observed_point(drawn), random_generator(seed, "anchors"), anchors_for(positions))
 
     def told(one: Round) -> None:
         console.note(f"refine {one.number}: {_shown(one, unit)}")
@@ -204,12 +200,27 @@ def _refine(fitter: Fitter, weighting: Weighting, rounds: int, console: Console)
         lambda factor, shape: _trial(fitter, replace(weighting, reweighting=factor), shape, gating),
         look,
         judge,
-        attention,
+        _attention(fitter, start),
         sigma_m=order.run.config.density.sigma_m,
         spreads=fitter.may_spread,
         progress=told,
     )
-    return refiner.run(rounds, Shape(order.choices["level"], weighting.range_spread_m))
+    shape = Shape(order.choices["level"], weighting.range_spread_m)
+    return refiner.run(rounds, shape, None if start is None else start.log_factors)
+
+
+def _attention(fitter: Fitter, start: Reweighting | None) -> Attention:
+    """Anchors over the density, or those of what was found before, which then goes on."""
+    from lidardesign.evaluate.attention import Attention, anchors_for
+    from lidardesign.space import observed_point
+    from lidardesign.task import conditions_of, random_generator
+
+    run, seed = fitter.order.run, fitter.order.seed
+    places = observed_point(fitter.base.resample(ANCHOR_POOL, random_generator(seed, "anchor places")))
+    if start is not None:
+        return Attention.at(start.points_m, places)
+    positions = len(conditions_of(run.task, run.config.task, run.config.space))
+    return Attention.over(places, random_generator(seed, "anchors"), anchors_for(positions))
 
 
 class _Gating:
@@ -230,7 +241,12 @@ class _Gating:
 
 
 def _trial(fitter: Fitter, weighting: Weighting, shape: Shape, gating: _Gating) -> Trial:
-    """A design of a weighting, and its rays at every condition."""
+    """A design of a weighting, and its rays at every condition.
+
+    Raises:
+        InfeasibleError: It cannot be fitted, or breaks a constraint.
+    """
+    from lidardesign.cli.fit import refuse_broken
     from lidardesign.design.bandwidth import Bandwidth
     from lidardesign.evaluate.candidates import mean_mbps
     from lidardesign.evaluate.refinement import Trial
@@ -243,11 +259,25 @@ def _trial(fitter: Fitter, weighting: Weighting, shape: Shape, gating: _Gating) 
     result = fitter.fit(weighting, samples, level=shape.level)
     layouts = Layouts({order.name: fitter.retarget(weighting.reweighting)})
     conditions = conditions_of(run.task, run.config.task, run.config.space)
+    count = result.design.rays or order.count
     if shape.traced_gates:
-        rays = layouts(result.design, result.design.rays or order.count, samples, at=conditions[0])
-        result = replace(result, design=gating.made(result.design, rays))
-    positions = tuple(layouts(result.design, order.count, samples, at=condition) for condition in conditions)
+        rays = layouts(result.design, count, samples, at=conditions[0])
+        design = gating.made(result.design, rays, shape.range_spread_m)
+        result = _checked(replace(result, design=design), order)
+    refuse_broken(result.constraints)
+    positions = tuple(layouts(result.design, count, samples, at=condition) for condition in conditions)
     return Trial(result, positions, mean_mbps(positions, Bandwidth()))
+
+
+def _checked(result: FitResult, order: FitOrder) -> FitResult:
+    """A fit whose design was changed, checked anew."""
+    from lidardesign.design.check import check_design
+    from lidardesign.design.files import design_document
+
+    constraints = order.constraints
+    document = design_document(result.design)
+    found = [] if constraints is None else check_design(document, constraints, order.run.config.space)
+    return replace(result, constraints=list(found))
 
 
 def _scenes(order: FitOrder) -> tuple[list[Scene], list[Scene]]:
@@ -312,6 +342,7 @@ def _shown(one: Round, unit: str) -> str:
 
 def show_refinement(document: Mapping[str, Any], rich: RichConsole) -> None:
     """Print what every round of a refinement brought."""
+    from rich.markup import escape
     from rich.table import Table
 
     found = document.get("refinement")
@@ -327,5 +358,5 @@ def show_refinement(document: Mapping[str, Any], rich: RichConsole) -> None:
         table.add_column(heading, justify="left" if heading == "change" else "right")
     for one in found["rounds"]:
         figures = (number(one["score"]), number(one["bandwidth_mbps"], 3), "yes" if one["kept"] else "no")
-        table.add_row(str(one["round"]), one["change"], *figures, number(one["seconds"], 2))
+        table.add_row(str(one["round"]), escape(one["change"]), *figures, number(one["seconds"], 2))
     rich.print(table)

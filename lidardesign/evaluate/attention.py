@@ -64,10 +64,16 @@ class Attention:
     def over(cls, places_m: np.ndarray, generator: np.random.Generator, count: int = ANCHORS) -> Attention:
         """Anchors that stand for places (N, 3) drawn from the density."""
         count = min(count, len(np.unique(places_m, axis=0)))
-        anchors, cell = lloyd(places_m, np.ones(len(places_m)), count, generator, iterations=ANCHOR_ITERATIONS)
-        anchors = _rounded(anchors)
-        near = cKDTree(anchors).query(anchors, k=min(SMOOTHED_OVER, count))[1]
-        return cls(anchors, near.reshape(count, -1), np.bincount(cell, minlength=count) / len(cell))
+        anchors, _ = lloyd(places_m, np.ones(len(places_m)), count, generator, iterations=ANCHOR_ITERATIONS)
+        return cls.at(_rounded(anchors), places_m)
+
+    @classmethod
+    def at(cls, anchors_m: np.ndarray, places_m: np.ndarray) -> Attention:
+        """Anchors (K, 3) that are known, for places (N, 3) drawn from the density."""
+        tree, count = cKDTree(anchors_m), len(anchors_m)
+        near = tree.query(anchors_m, k=min(SMOOTHED_OVER, count))[1]
+        shares = np.bincount(tree.query(places_m)[1], minlength=count) / len(places_m)
+        return cls(anchors_m, near.reshape(count, -1), shares)
 
     def gains(self, seen: Sequence[tuple[Residuals, Sequence[Returns]]]) -> dict[str, np.ndarray]:
         """log of the error at each anchor, per fired ray and per density, relative to its mean, shape (K,) each.
@@ -79,10 +85,12 @@ class Attention:
         """
         tree, count = cKDTree(self.points_m), len(self.points_m)
         error, rays = np.zeros(count), np.zeros(count)
+        # in units of the largest one, whatever unit residuals have
+        largest = max((residuals.values.max(initial=0.0) for residuals, _ in seen), default=0.0)
         for residuals, returns in seen:
-            if len(residuals.values):
+            if largest > 0 and len(residuals.values):
                 nearest = tree.query(residuals.points_m)[1]
-                error += np.bincount(nearest, residuals.values, minlength=count)
+                error += np.bincount(nearest, residuals.values / largest, minlength=count)
             for places in _fired_places(returns):
                 rays += np.bincount(tree.query(places)[1], minlength=count)
         if error.sum() <= 0 or rays.sum() <= 0:

@@ -187,13 +187,18 @@ class Refiner:
         self._favoured = ""
 
     @phase("refinement")
-    def run(self, rounds: int, shape: Shape) -> Refinement:
+    def run(self, rounds: int, shape: Shape, log_factors: np.ndarray | None = None) -> Refinement:
         """Refine a design by at most so many rounds.
+
+        Arguments:
+            rounds: At most so many.
+            shape: What it starts with.
+            log_factors: What the density is multiplied by at the anchors to start with, shape (K,); None is 1.
 
         Raises:
             InfeasibleError, ConfigError: The design that it starts with cannot be fitted.
         """
-        best = self._started(shape)
+        best = self._started(shape, np.zeros(len(self.attention.points_m)) if log_factors is None else log_factors)
         step, idle, gains = FIRST_STEP, 0, None
         for number in range(1, rounds + 1):
             before = best
@@ -210,14 +215,16 @@ class Refiner:
                 best, gains = found, None
             if idle == PATIENCE:
                 break
-        changed = bool(np.any(best.log_factors))
-        reweighting = self.attention.reweighting(best.log_factors) if changed else None
-        return Refinement(best.trial, reweighting, best.shape, tuple(self.rounds), len(self.look), len(self.judge))
+        found = self._reweighting(best.log_factors)
+        return Refinement(best.trial, found, best.shape, tuple(self.rounds), len(self.look), len(self.judge))
 
-    def _started(self, shape: Shape) -> _State:
+    def _reweighting(self, log_factors: np.ndarray) -> Reweighting | None:
+        return self.attention.reweighting(log_factors) if np.any(log_factors) else None
+
+    def _started(self, shape: Shape, log_factors: np.ndarray) -> _State:
         started = time.perf_counter()
-        first = self.refit(None, shape)
-        best = _State(first, self._score(first), np.zeros(len(self.attention.points_m)), shape)
+        first = self.refit(self._reweighting(log_factors), shape)
+        best = _State(first, self._score(first), log_factors, shape)
         self._note(Round(0, "start", self.sign * best.score, first.bandwidth_mbps, True, _since(started)))
         return best
 
@@ -265,9 +272,8 @@ class Refiner:
         if key in self._tested:  # it was not better than a design that this one is no worse than
             return best
         self._tested.add(key)
-        factors = self.attention.reweighting(wanted.log_factors) if np.any(wanted.log_factors) else None
         try:
-            trial = self.refit(factors, wanted.shape)
+            trial = self.refit(self._reweighting(wanted.log_factors), wanted.shape)
         except (InfeasibleError, NumericalError) as error:
             self._note(Round(number, f"{change}: {error.message}", None, None, False, _since(started)))
             return best

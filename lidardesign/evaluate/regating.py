@@ -24,7 +24,7 @@ from lidardesign.simulate.returns import Rays
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import RANGE, DesignSpace
 
-# Every return stands for so many, spread by the density's own sigma: scenes that were not traced are elsewhere.
+# Every return stands for so many, spread about it: scenes that were not traced are elsewhere.
 QUANTILES = 5
 # Bandwidth alone limits the gates.
 EVERYTHING = 1.0
@@ -37,15 +37,15 @@ class Gating:
     Arguments:
         scenes: Training scenes with their casters.
         space: The design space; its ranges are what an open gate hears.
-        spread_m: Standard deviation by which returns are spread [m].
+        sigma_m: Standard deviation by which returns are spread at least: the density's own [m].
     """
 
     scenes: Sequence[tuple[Scene, Sequence[SceneCaster]]]
     space: DesignSpace
-    spread_m: float
+    sigma_m: float
 
     @phase("gates")
-    def __call__(self, design: Design, rays: Rays) -> Design:
+    def __call__(self, design: Design, rays: Rays, spread_m: float = 0.0) -> Design:
         """The design with gates by returns, in its bandwidth budget or else in no more than it had.
 
         A ray without returns keeps its own gate, and all keep theirs where new ones would hold fewer returns.
@@ -53,8 +53,9 @@ class Gating:
         Arguments:
             design: With a gate per ray: a scan, or a table of rays.
             rays: Its own rays.
+            spread_m: Standard deviation by which the design's samples are spread in range [m]; returns are, too.
         """
-        heard = self._heard(rays)
+        heard = self._heard(rays, max(spread_m, self.sigma_m))
         known = np.flatnonzero(np.bincount(heard.ray, minlength=len(rays)))
         if not len(known):
             return design
@@ -74,7 +75,7 @@ class Gating:
             return design
         return _with_gates(design, gates)
 
-    def _heard(self, rays: Rays) -> Heard:
+    def _heard(self, rays: Rays, spread_m: float) -> Heard:
         """The targets that rays meet with open gates, over all scenes and their frames."""
         low, high = self.space.low[RANGE], self.space.high[RANGE]
         gates = np.tile([low, high], (len(rays), 1))
@@ -87,7 +88,7 @@ class Gating:
                 hit = hit[is_target[frame.body[hit]]]
                 ranges.append(frame.range_m[hit])
                 indices.append(hit)
-        offsets = self.spread_m * ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES)
+        offsets = spread_m * ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES)
         spread = np.clip(np.concatenate(ranges)[:, None] + offsets, low, high).reshape(-1)
         return Heard(spread, np.ones(len(spread)), np.repeat(np.concatenate(indices), QUANTILES), len(rays))
 
