@@ -9,8 +9,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from command_line import caller
 
-from lidardesign.cli.searches import check_cma_seconds
+from lidardesign.cli.console import Console
+from lidardesign.cli.searches import check_cma_seconds, told
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.check import check_design
 from lidardesign.design.constraints import Constraints
@@ -520,3 +522,55 @@ def test_a_time_that_is_none_or_that_nothing_takes_is_refused(seconds, names):
 def test_a_time_is_taken_where_it_is_asked_for_or_left_out():
     check_cma_seconds(5.0, ["cma"])
     check_cma_seconds(None, [])
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--cma-seconds", "5"], "nothing is searched for"),
+        (["--cma-seconds", "0", "--baseline", "cma"], "--cma-seconds"),
+        (["--baseline", "cma:5"], "takes nothing after its name"),
+    ],
+)
+def test_the_command_refuses_it_before_anything_is_read(lidardesign, words, message):
+    result = lidardesign("evaluate", "nowhere", *words)
+    assert result.code == 2
+    assert message in result.err
+
+
+class Bar:
+    """A progress bar that remembers what it was told."""
+
+    def __init__(self):
+        self.lines, self.updates = [], []
+
+    def add_task(self, label, **fields):
+        self.lines.append(label)
+        return len(self.lines) - 1
+
+    def update(self, line, **fields):
+        self.updates.append((self.lines[line], fields))
+
+
+def test_each_search_has_a_line_that_shows_how_far_it_is_and_its_best_score():
+    bar = Bar()
+    settings = told(CmaSettings(FAST), MissTask.metric, Console(), bar)
+    candidate_of("grid", settings).positions([], 12)
+    candidate_of("grid", settings).positions([], 13)
+    assert bar.lines == ["cma, 12 rays", "cma, 13 rays"]
+    shares = [fields["completed"] for label, fields in bar.updates if label == "cma, 12 rays"]
+    assert shares == sorted(shares)
+    assert bar.updates[-1][1]["row"].startswith("best ")
+    assert bar.updates[-1][1]["row"].endswith(" %")
+
+
+def test_without_a_terminal_a_search_is_announced_once(capsys):
+    settings = told(CmaSettings(FAST), MissTask.metric, Console(), None)
+    candidate_of("grid", settings).positions([], 12)
+    said = capsys.readouterr().err
+    assert said.count("cma, 12 rays: searching") == 1

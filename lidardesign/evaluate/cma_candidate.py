@@ -206,8 +206,9 @@ class CmaCandidate:
         design = self.followed
         layout = design.layout if design.layout in OWN_LAYOUTS else "grid"
         space = self.space
-        if design.track is None and space.conditioned:
-            space = space.at({**self.conditions[len(self.conditions) // 2], **design.at})
+        if space.conditioned:
+            bolted = self.conditions[len(self.conditions) // 2] if design.track is None else {}
+            space = space.at({**bolted, **design.at})
         return Setting(space, self._constraints(), design.level, layout, design.at, self._varies_gates(amount))
 
     def _document(self) -> dict[str, Any]:

@@ -311,8 +311,7 @@ def scan_layouts(
     space: DesignSpace, views: TrainingViews, observed: Observed, count: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Points (N, 5) and one gate (2,) each: those of `bounding`, at equal shares of the returns, and of `uniform`."""
-    layouts = bounding(views) if views.space == space else bounding(TrainingViews(space, views.train))
-    found = [(layout.place(count, Spot(space)), layout.gate_m) for layout in layouts]
+    found = [(layout.place(count, Spot(space)), layout.gate_m) for layout in bounding(views)]
     angular = [axis for axis in (AZIMUTH, ELEVATION) if axis in space.free]
     if len(angular) == 1 and len(observed.points) and found:
         points = found[0][0].copy()
