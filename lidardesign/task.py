@@ -114,7 +114,8 @@ class Defaults:
 class Task(Protocol):
     """What a task plugin provides; see the module docstring.
 
-    `scenes` is deterministic in (config, split, seed), and the splits are disjoint. `score` may use
+    `scenes` is deterministic in (config, split, seed), and the splits are disjoint, also those of two seeds: more
+    training scenes are drawn with other seeds. `score` may use
     `scene.truth` for judging only; the estimate is built from the returns alone.
 
     A task whose space has conditions may also give `conditions(config)`, the condition values that designs are

@@ -347,6 +347,21 @@ def test_each_mesh_is_in_exactly_one_split(folders):
     assert len(names[0] | names[1]) == 3
 
 
+def test_what_is_held_out_stays_held_out_whatever_the_seed_of_training_scenes(case):
+    task, config, scenes = case
+    for seed in (1, 2, 3):
+        for train in task.scenes(config, "train", seed):
+            assert not any(bodies_equal(train, test) for test in scenes["test"])
+
+
+def test_meshes_that_are_held_out_are_so_with_every_seed(folders):
+    config = MeshesTask.Config(folder=str(folders / "three"), poses=1, truth_points=100)
+    held_out = {scene.bodies[0].name for scene in MeshesTask().scenes(config, "test", 0)}
+    for seed in range(1, 9):
+        trained = {scene.bodies[0].name for scene in MeshesTask().scenes(config, "train", seed)}
+        assert not trained & held_out
+
+
 @pytest.mark.parametrize("up", ["x", "y", "z"])
 def test_turning_the_up_axis_keeps_handedness(folders, up):
     config = MeshesTask.Config(folder=str(folders / "one"), up=up, truth_points=100, poses=1)

@@ -39,6 +39,7 @@ WORLD_AXES = {"x": [1, 2, 0], "y": [2, 0, 1], "z": [0, 1, 2]}
 RELATIVE_JITTER = 0.02  # of the largest extent, where no shift is given
 SENSOR_DISTANCE = 2.0  # extents
 DOUBTFUL_EXTENT_M = 20.0  # an object that large is more likely in another unit
+SPLIT_SEED = 0  # of which meshes are held out, whatever the seed of a run
 ROOM = 1.1  # around the bounding sphere, for the pose jitter
 
 
@@ -113,7 +114,7 @@ class MeshesTask:
                 hint="add meshes, or set jitter_rotation_deg or jitter_translation_m above 0",
             )
         scenes = []
-        chosen = [(name, weighted(mesh, config, space)) for name, mesh in split_meshes(meshes, config, split, seed)]
+        chosen = [(name, weighted(mesh, config, space)) for name, mesh in split_meshes(meshes, config, split)]
         for (name, mesh), pose in itertools.product(chosen, range(config.poses)):
             generator = random_generator(seed, "meshes", split, name, pose)
             centre = mesh.bounds_m.mean(axis=0)
@@ -188,13 +189,14 @@ def _doubts_about_unit(vertices: np.ndarray, scale: float) -> list[str]:
     return [f"is {extent:.4g} m long; if the file is in millimetres, set scale=0.001"]
 
 
-def split_meshes(
-    meshes: Sequence[tuple[str, Mesh]], config: MeshesConfig, split: Split, seed: int
-) -> list[tuple[str, Mesh]]:
-    """The meshes of a split, each in exactly one; a single mesh is in both, told apart by its poses."""
+def split_meshes(meshes: Sequence[tuple[str, Mesh]], config: MeshesConfig, split: Split) -> list[tuple[str, Mesh]]:
+    """The meshes of a split, each in exactly one; a single mesh is in both, told apart by its poses.
+
+    The seed moves poses alone: what is held out stays held out where scenes of another seed are trained on.
+    """
     if len(meshes) == 1:
         return list(meshes)
-    order = random_generator(seed, "meshes", "split").permutation(len(meshes))
+    order = random_generator(SPLIT_SEED, "meshes", "split").permutation(len(meshes))
     held_out = min(max(round(config.test_share * len(meshes)), 1), len(meshes) - 1)
     chosen = order[:held_out] if split == "test" else order[held_out:]
     return [meshes[i] for i in np.sort(chosen)]
