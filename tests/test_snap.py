@@ -26,7 +26,7 @@ from lidardesign.design.sensor import tangent_coordinates
 from lidardesign.design.shapes import shapes_of
 from lidardesign.design.snap import Choice, nearest_parts, with_parts
 from lidardesign.design.snap_options import Options, options_of, parts_of, wants_parts
-from lidardesign.design.snap_rays import affordable, capped_split, counts_of
+from lidardesign.design.snap_rays import affordable, capped_split, counts_of, useful_split
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.space import DesignSpace, aim
 
@@ -402,6 +402,14 @@ def test_a_capped_split_sums_exactly_and_never_passes_a_cap(weights, most, count
         assert shares.sum() == count
         assert (shares <= caps).all()
         assert (shares >= 0).all()
+
+
+def test_rays_that_look_at_something_go_first():
+    weights, useful, most = np.array([0.9, 0.1]), np.array([10, 30]), np.array([64, 64])
+    assert useful_split(weights, 10, useful, most).tolist() == [9, 1]
+    assert useful_split(weights, 40, useful, most).tolist() == [10, 30]
+    assert useful_split(weights, 50, useful, most).tolist() == [19, 31]
+    assert useful_split(weights, 128, useful, most).tolist() == [64, 64]
 
 
 def test_rays_that_nobody_asked_for_are_those_that_see_something():

@@ -20,7 +20,7 @@ from lidardesign.design.rays import split_budget
 from lidardesign.design.sensor import Design, RayTable, Sensor, interval_factor
 from lidardesign.design.snap import Choice, nearest_parts, with_parts
 from lidardesign.design.snap_options import Options, options_of
-from lidardesign.design.snap_rays import affordable, capped_split, counts_of, fired, gate_widths, useful_rays
+from lidardesign.design.snap_rays import affordable, counts_of, fired, gate_widths, useful_rays, useful_split
 from lidardesign.errors import ConfigError
 from lidardesign.space import DesignSpace, angles
 
@@ -201,7 +201,12 @@ def _counts(placed: Sequence[_Placed], read_out: ReadOut) -> np.ndarray:
     if read_out.rays is None:
         return counts_of(useful, weights, widths, read_out)
     most = np.array([read_out.rays if c.shape is None else min(c.shape.part.rays, read_out.rays) for c in choices])
-    return capped_split(weights, read_out.rays, most)
+    first = np.where(useful > 0, np.minimum(useful, most), most)
+    counts = useful_split(weights, read_out.rays, first, most)
+    if read_out.limit_mbps is not None and read_out.model.mbps_of_widths(widths, counts) > read_out.limit_mbps:
+        # so the parts were found affordable
+        counts = useful_split(weights, read_out.rays, most, most)
+    return counts
 
 
 def _design(placed: Sequence[_Placed], counts: np.ndarray, constraints: Constraints, level: float, name: str) -> Design:

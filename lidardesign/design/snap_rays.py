@@ -46,6 +46,21 @@ def capped_split(weights: np.ndarray, count: int, most: np.ndarray) -> np.ndarra
         free &= ~over
 
 
+def useful_split(weights: np.ndarray, count: int, useful: np.ndarray, most: np.ndarray) -> np.ndarray:
+    """Whole rays in proportion to weights, first of those that look at something, shape (G,) int64.
+
+    Arguments:
+        weights: Shares of the rays, shape (G,).
+        count: How many in all; no more than `most` sums to.
+        useful: Rays that look at something, shape (G,).
+        most: Rays that there are, at least the useful ones, shape (G,).
+    """
+    first = capped_split(weights, count, useful)
+    if first is not None:
+        return first
+    return useful + capped_split(weights, count - int(useful.sum()), most - useful)
+
+
 def affordable(
     choices: Sequence[Choice], options: Sequence[Options], weights: np.ndarray, widths_m: np.ndarray, read_out: ReadOut
 ) -> list[Choice]:
