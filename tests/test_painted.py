@@ -259,6 +259,8 @@ def test_a_region_counts_its_weight_inside_and_nothing_more_beyond_its_edge(shap
         {"region_centre_m": (0, 0, 0), "region_radius_m": 0.1, "region_half_size_m": (1, 1, 1)},
         {"region_centre_m": (0, 0, 0), "region_half_size_m": (1, 0, 1)},
         {"region_centre_m": (0, 0, 0), "region_radius_m": 0.0},
+        {"region_weight": 8.0},
+        {"region_edge_m": 0.02},
         {"region_centre_m": (0, 1e300, 0), "region_radius_m": 1.0},
         {"roughness_exponent": -1},
         {"area_exponent": -0.1},
@@ -312,6 +314,20 @@ def test_meshes_of_a_folder_count_by_their_paint_their_roughness_and_a_region(tm
     assert np.allclose(every, paint * region * rough * area)
     with pytest.raises(DataError, match="no vertex property 'care'"):
         weights(importance="care")
+
+
+def test_a_region_beside_all_surfaces_is_refused_with_where_these_are(tmp_path):
+    save(painted_ball(lambda v: 0 * v[:, 0]), tmp_path / "ball.ply")
+    beside = {"region_centre_m": (0, 0, 30), "region_radius_m": 0.5}
+    with pytest.raises(ConfigError, match=r"(?s)region holds no vertex.*z -1 to 1 m"):
+        MeshesTask().scenes(MeshesConfig(folder=tmp_path, **beside), "train", 0)
+    with pytest.raises(ConfigError, match="region holds no vertex"):
+        FaceTask().scenes(FaceConfig(train=1, **beside), "train", 0)
+
+
+def test_a_contrast_without_colours_is_refused():
+    with pytest.raises(ValidationError, match="importance=colours"):
+        MeshesConfig(importance="care", colour_contrast=3.0)
 
 
 def test_gltf_text_that_names_weights_it_does_not_have_is_refused(tmp_path):

@@ -169,8 +169,14 @@ class HeadFamily:
         return cls(_embedded_model(config.modes), config.sign, "the embedded head model")
 
     def weigh(self, importance: Importance, viewpoint_m: np.ndarray) -> None:
-        """Let all heads count as the mean one does by a configuration, seen from a place (3,) [m]."""
-        self.weights = importance.weights(self.mesh(np.zeros(0)).vertices, self.faces, viewpoint_m)
+        """Let all heads count as the mean one does by a configuration, seen from a place (3,) [m].
+
+        Raises:
+            ConfigError: The region of interest is beside the head, or roughness cannot be measured.
+        """
+        mean = self.mesh(np.zeros(0)).vertices
+        importance.refuse_empty_region([mean])
+        self.weights = importance.weights(mean, self.faces, viewpoint_m)
 
     def mesh(self, coefficients: np.ndarray) -> Mesh:
         """The head with standardised coefficients, in the world frame before its pose."""

@@ -10,6 +10,7 @@ part counts as (roughness / mean roughness)^e.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -62,11 +63,12 @@ class Importance(Surroundings):
 
     @model_validator(mode="after")
     def _one_region(self) -> Importance:
-        shapes = [self.region_radius_m, self.region_half_size_m]
-        given = sum(shape is not None for shape in shapes)
+        given = sum(shape is not None for shape in (self.region_radius_m, self.region_half_size_m))
+        fields = type(self).model_fields
+        given += sum(getattr(self, key) != fields[key].default for key in ("region_weight", "region_edge_m"))
         if self.region_centre_m is None and given:
             raise ValueError("a region needs its centre: region_centre_m")
-        if self.region_centre_m is not None and given != 1:
+        if self.region_centre_m is not None and (self.region_radius_m is None) == (self.region_half_size_m is None):
             raise ValueError("a region is a ball or a box: give region_radius_m or region_half_size_m, not both")
         if self.region_half_size_m is not None and min(self.region_half_size_m) <= 0:
             raise ValueError("half sizes of a region are above 0 m")
@@ -84,6 +86,24 @@ class Importance(Surroundings):
         if self.region_centre_m is not None:
             factors.append(self.region_weight ** self.share_of_region(vertices))
         return np.prod(factors, axis=0) if factors else None
+
+    def refuse_empty_region(self, surfaces: Sequence[np.ndarray]) -> None:
+        """Refuse a region that no surface has a vertex in; vertices of each, shapes (V, 3) [m].
+
+        Raises:
+            ConfigError: So it is.
+        """
+        if self.region_centre_m is None or any(self.share_of_region(vertices).any() for vertices in surfaces):
+            return
+        every = np.concatenate(surfaces)
+        low, high = every.min(axis=0), every.max(axis=0)
+        spans = ", ".join(f"{name} {a:.3g} to {b:.3g}" for name, a, b in zip("xyz", low, high, strict=True))
+        raise ConfigError(
+            "the region holds no vertex of any surface",
+            where="task.region_centre_m",
+            allowed=f"the surfaces reach from {spans} m",
+            hint="move or widen the region, or subdivide the mesh",
+        )
 
     def share_of_region(self, points: np.ndarray) -> np.ndarray:
         """1 in the region and 0 beyond its edge, linear between, at points (N, 3) [m], shape (N,)."""

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lidardesign.errors import ConfigError
 from lidardesign.meshio import list_mesh_files, load_mesh
@@ -26,7 +26,7 @@ from lidardesign.scene import Body, Mesh, Scene, Sign
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace, aim
 from lidardesign.task import Defaults, Metric, Residuals, Score, Split, random_generator
-from lidardesign.vertex_weights import Painted
+from lidardesign.vertex_weights import COLOURS, Painted
 from lidardesign_tasks.importance import Importance, middle_of_origins
 from lidardesign_tasks.pose import jittered_pose
 from lidardesign_tasks.surface import surface_residuals, surface_score, with_visible_truth
@@ -75,6 +75,12 @@ class MeshesConfig(Importance):
         10.0, gt=1e-3, le=1e3, description="how many times as much white counts as black, with importance=colours"
     )
 
+    @model_validator(mode="after")
+    def _contrast_of_colours(self) -> MeshesConfig:
+        if self.importance != COLOURS and self.colour_contrast != type(self).model_fields["colour_contrast"].default:
+            raise ValueError("colour_contrast is that of importance=colours")
+        return self
+
 
 class MeshesTask:
     """Reconstruct the surface of your objects from few rays."""
@@ -114,6 +120,7 @@ class MeshesTask:
                 hint="add meshes, or set jitter_rotation_deg or jitter_translation_m above 0",
             )
         scenes = []
+        config.refuse_empty_region([mesh.vertices for _, mesh in meshes])
         chosen = [(name, weighted(mesh, config, space)) for name, mesh in split_meshes(meshes, config, split)]
         for (name, mesh), pose in itertools.product(chosen, range(config.poses)):
             generator = random_generator(seed, "meshes", split, name, pose)
