@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.errors import ConfigError
-from lidardesign.space import FARTHEST_M
 
 if TYPE_CHECKING:
     from lidardesign.cli.layouts import RunTarget
@@ -17,8 +16,9 @@ if TYPE_CHECKING:
     from lidardesign.design.sensor import Design
 
 KEY = "weighting"
-# Refinement spreads by a few sigma of the density, which is at most the largest length.
-WIDEST_SPREAD_M = 10 * FARTHEST_M
+# Refinement spreads by a few sigma of the density, which is at most the largest length: ten times `space.FARTHEST_M`,
+# which stands here as a number because --help loads no numpy.
+WIDEST_SPREAD_M = 1e10
 
 
 @dataclass(frozen=True, eq=False)
