@@ -19,7 +19,7 @@ from lidardesign.design.sensor import boresight_frame
 from lidardesign.design.shapes import Shape, gate_inside, shapes_of
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines import Baselines, baseline_of
-from lidardesign.evaluate.catalog import Density, split_argument
+from lidardesign.evaluate.catalog import Density, part_notes, split_argument
 from lidardesign.evaluate.part_poses import CLUTTER, PosedPart, ScenePoints, places
 from lidardesign.numerics import effective_count
 from lidardesign.scene import Body, Box, Scene, Sphere, rigid
@@ -290,6 +290,13 @@ def test_a_learned_density_stands_before_training_returns():
     source = Baselines(*CASES["fixed origin"], seed=0, density=lambda: Density(samples))
     (rays,) = source.positions("catalog:vl53l5cx", 4)
     assert (rays.direction @ direction(0.35, -0.3)).min() > math.cos(math.radians(10))
+
+
+def test_rows_of_several_parts_say_how_many():
+    source = Baselines(*CASES["fixed origin"], seed=0)
+    rows = [(name, source.positions(name, count)) for count in (10, 150) for name in ("catalog:vl53l5cx", "uniform")]
+    assert part_notes(rows) == ["catalog:vl53l5cx is 3 parts at 150 rays"]
+    assert part_notes(rows[:2]) == []
 
 
 # views and shapes

@@ -28,7 +28,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.bounding import bounding
 from lidardesign.evaluate.candidates import Candidate, Layout, Positions, Spot, whole_range
-from lidardesign.evaluate.catalog import Density, part_candidates, split_argument
+from lidardesign.evaluate.catalog import FAMILY, Density, part_candidates, split_argument
 from lidardesign.evaluate.observed import TrainingViews
 from lidardesign.evaluate.occupancy import occupancy
 from lidardesign.evaluate.placement import RAY_AXES, even_placement
@@ -227,7 +227,7 @@ BASELINES: dict[str, Family] = {
     "bounding": Family(_bounding),
     "occupancy": Family(_occupancy),
     NO_VISIBILITY: Family(_no_visibility),
-    "catalog": Family(_catalog, "NAME", check=split_argument),
+    FAMILY: Family(_catalog, "NAME", check=split_argument),
     CMA: Family(_cma),
 }
 

@@ -35,6 +35,7 @@ from lidardesign.simulate.returns import Rays
 from lidardesign.space import DesignSpace
 from lidardesign.task import random_generator
 
+FAMILY = "catalog"
 POSE_NUMBERS = (5, 6)
 FORM = "NAME@X,Y,Z,AZIMUTH,ELEVATION[,ROLL] in metres and degrees"
 
@@ -103,6 +104,19 @@ def part_candidates(source: Surroundings, argument: str) -> list[PartCandidate]:
         PartCandidate("apart", part, scene, posed.best),
         PartCandidate("interleaved", part, scene, lambda number: interleaved(part, posed.best(1)[0], number)),
         PartCandidate("side by side", part, scene, lambda number: side_by_side(part, posed.best(1)[0], number)),
+    ]
+
+
+def part_notes(rows: Sequence[tuple[str, Positions]]) -> list[str]:
+    """How many parts the rows of `catalog:NAME` took, by their names and rays; silent where one was enough."""
+    parts: dict[str, dict[int, int]] = {}
+    for name, positions in rows:
+        if name.startswith(f"{FAMILY}:"):
+            parts.setdefault(name, {})[len(positions[0])] = len(np.unique(positions[0].sensor))
+    return [
+        f"{name} is {', '.join(f'{number} parts at {rays} rays' for rays, number in found.items() if number > 1)}"
+        for name, found in parts.items()
+        if max(found.values()) > 1
     ]
 
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.evaluate.audit import Audit, audit_rows
+from lidardesign.evaluate.catalog import part_notes
 from lidardesign.evaluate.cma_candidate import Record
 from lidardesign.evaluate.effects import effect_notes, summaries
 from lidardesign.evaluate.entries import Entry, entries_of
@@ -95,6 +96,7 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
         notes=[
             *_notes(request, entries, matched),
             *search_notes(searches, request),
+            *part_notes([(entry.name, entry.positions) for entry in entries if entry.matched_to is None]),
             *slipped_notes(scored.second_casts),
             *effect_notes(effects, request.planner.choice),
         ],
