@@ -38,6 +38,8 @@ MOST_CORRELATED = 250
 MOST_POPULATION = 4  # times the usual one
 CURVE_POINTS = 200
 STARTS_AT_ONCE = 8
+# Of more starts than that, the best in so many scenes are looked at in more.
+START_SCENES = 2
 
 
 @dataclass(frozen=True)
@@ -168,19 +170,29 @@ class Search:
         return self._chosen(start)
 
     def _best_start(self, scenes: int) -> _Best:
-        """The best of all starts; the first one where the time ends before they are scored."""
-        best = _Best(self._starts[0], self._starts[0].zero, math.inf)
-        for first in range(0, len(self._starts), STARTS_AT_ONCE):
-            models = self._starts[first : first + STARTS_AT_ONCE]
-            try:
-                values = self._values([one.positions(one.zero, self._amount) for one in models], scenes)
-            except OutOfTimeError:
-                break
-            for model, value in zip(models, values, strict=True):
-                if value < best.value:
-                    best = _Best(model, model.zero, float(value))
+        """The best of all starts: of many, the best on few scenes are compared on more.
+
+        The first one where the time ends before they are scored.
+        """
+        starts = [_Best(model, model.zero, math.inf) for model in self._starts]
+        if len(starts) > STARTS_AT_ONCE:
+            starts = self._ranked(starts, min(START_SCENES, scenes))[:STARTS_AT_ONCE]
+        best = self._ranked(starts, scenes)[0]
         self._note(best, scenes)
         return best
+
+    def _ranked(self, starts: Sequence[_Best], scenes: int) -> list[_Best]:
+        """Starts by what they are worth in the first scenes, the best first; those that are not scored come last."""
+        found = [_Best(one.model, one.vector, math.inf) for one in starts]
+        for first in range(0, len(found), STARTS_AT_ONCE):
+            group = found[first : first + STARTS_AT_ONCE]
+            try:
+                values = self._values([one.model.positions(one.vector, self._amount) for one in group], scenes)
+            except OutOfTimeError:
+                break
+            for one, value in zip(group, values, strict=True):
+                one.value = float(value)
+        return sorted(found, key=lambda one: one.value)
 
     def _rescored(self, best: _Best, scenes: int) -> _Best:
         try:
