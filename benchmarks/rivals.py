@@ -16,18 +16,18 @@ import shutil
 import statistics
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from common import face_settings, fitted, learned, lidardesign, parser, report, run_process, table, verdict
+from common import face_settings, learned, lidardesign, parser, report, run_process, table, verdict
 
 CHANGES = 10
 LONG = 10
 LONG_NAME = "cma, 10 times as long"
 LEAST_FACTOR = 50.0
 FIRST = "refined"
-RIVALS = ("uniform", "random", "bounding", "occupancy", "no-visibility", "cma")
+OURS = (FIRST, "scan")  # that the rivals are held against
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,12 @@ class Case:
 
     Arguments:
         title: For tables.
-        designs: What `fit` is told for each of our designs; the number of rays comes on top. The first is `refined`.
+        designs: What `constrain` is told for each of our designs, with {mbps} for the bandwidth of that many rays; the
+            number of rays comes on top. The first is `refined`.
         rays: Numbers of rays.
         baselines: Rivals beside those that `evaluate` always has.
         change: The constraint whose change is timed.
+        kbps_per_ray: What {mbps} is [kbit/s].
     """
 
     title: str
@@ -47,22 +49,29 @@ class Case:
     rays: tuple[int, ...]
     baselines: tuple[str, ...]
     change: str
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    kbps_per_ray: float = 0.0
+
+    def words(self, name: str, rays: int) -> list[str]:
+        """What `constrain` is told for a design of so many rays."""
+        mbps = f"{rays * self.kbps_per_ray / 1000:.4g}"
+        return [word.format(mbps=mbps) for word in self.designs[name]] + ["--rays", str(rays)]
 
 
 AREA = ("--weight", "area_exponent=0.25")
+TEN = ("--sensors", "10", "--layout", "density", "--gates", "ray")
 CASES = {
     "face": Case(
         "Faces",
         {
-            FIRST: ("--sensors", "10", *AREA, "--refine", "5"),
-            "plain": ("--sensors", "10"),
-            "importance": ("--sensors", "10", *AREA),
+            FIRST: (*TEN, *AREA, "--set", "budget.bandwidth_mbps={mbps}", "--refine", "5"),
+            "plain": TEN,
+            "importance": (*TEN, *AREA),
             "scan": ("--layout", "scan", *AREA, "--refine", "5"),
         },
         (196, 361, 576),
         ("occupancy", "catalog:vl53l5cx", "catalog:azure-kinect"),
         "gate.width_m.max=0.12",
+        kbps_per_ray=2.77,  # bounding takes 14 bins of 400 bit/s a ray: a little less than half of that
     ),
     "arm": Case(
         "Arm",
@@ -128,10 +137,12 @@ def run_of(task: str, folder: Path, options: Any) -> Path:
 def designs_of(case: Case, run: Path, rays: int) -> list[Path]:
     """Our designs for a number of rays, fitted where they are missing; the first of them is refined."""
     found = []
-    for name, words in case.designs.items():
+    for name in case.designs:
         path = run / "designs" / f"{name}-{rays}.yaml"
         if not path.exists():
-            fitted(run, path.stem, *words, "--rays", str(rays))
+            run_process(
+                lidardesign("constrain", run, "--name", path.stem, "--json", *case.words(name, rays))
+            ).document()
         found.append(path)
     return found
 
@@ -141,9 +152,9 @@ def times_of(case: Case, run: Path, rounds: int) -> dict[str, float]:
     learning = json.loads((run / "manifest.json").read_text(encoding="utf-8"))["learn"]["seconds"]
     spent = {}
     rays = case.rays[len(case.rays) // 2]
-    for key, words in (("change", case.designs["plain"]), ("refined", case.designs[FIRST])):
-        command = lidardesign("constrain", run, "--set", case.change, "--name", f"changed-{key}", "--json", *words)
-        results = [run_process([*command, "--rays", str(rays)]) for _ in range(rounds)]
+    for key, name in (("change", "plain"), ("refined", FIRST)):
+        command = lidardesign("constrain", run, "--set", case.change, "--name", f"changed-{key}", "--json")
+        results = [run_process([*command, *case.words(name, rays)]) for _ in range(rounds)]
         results[0].document()
         spent[key] = statistics.median(result.wall for result in results)
     return {"learning": learning, **spent}
@@ -203,48 +214,52 @@ def standing(pair: Mapping[str, Any], better: str) -> str:
     return "better" if lower == (better == "lower") else "worse"
 
 
-def percent(pair: Mapping[str, Any], other: float) -> str:
-    """A paired difference with its interval, in percent of the other's value."""
+def told(pair: Mapping[str, Any] | None, other: float, better: str) -> str:
+    """A paired difference with its interval, in percent of the other's value, and what it says."""
+    if pair is None:
+        return ""
     if not other:
-        return "-"
+        return standing(pair, better)
     low, middle, high = (100 * pair[key] / other for key in ("ci_low", "difference", "ci_high"))
-    return f"{middle:+.1f} ({low:+.1f} to {high:+.1f})"
+    return f"{middle:+.1f} ({low:+.1f} to {high:+.1f}), {standing(pair, better)}"
+
+
+def ours_of(found: dict[str, Any]) -> list[str]:
+    """Which of our designs the rivals are held against."""
+    there = {row["design"] for document in found["rays"].values() for row in document["rows"]}
+    return [name for name in OURS if name in there]
+
+
+def pairs_of(document: dict[str, Any], key: str) -> dict[tuple[str, str], dict[str, Any]]:
+    """Differences by the names of both."""
+    return {(pair["a"], pair["b"]): pair for pair in document[key]}
 
 
 def equal_rays(found: dict[str, Any]) -> list[list[object]]:
-    """One row per number of rays and design or rival, with how much better `refined` is."""
+    """One row per number of rays and design or rival, with how much better ours are."""
     rows = []
     for count, document in found["rays"].items():
-        pairs = {pair["b"]: pair for pair in document["paired"] if pair["a"] == FIRST}
+        pairs, better = pairs_of(document, "paired"), document["metric"]["better"]
         for row in document["rows"]:
-            pair = pairs.get(row["design"])
-            rows.append(
-                [
-                    count,
-                    row["design"],
-                    row["value"],
-                    f"{row['ci_low']:.3g} to {row['ci_high']:.3g}",
-                    row["bandwidth_mbps"],
-                    "" if pair is None else percent(pair, row["value"]),
-                    "" if pair is None else standing(pair, document["metric"]["better"]),
-                ]
-            )
+            interval = f"{row['ci_low']:.3g} to {row['ci_high']:.3g}"
+            against = [told(pairs.get((name, row["design"])), row["value"], better) for name in ours_of(found)]
+            rows.append([count, row["design"], row["value"], interval, row["bandwidth_mbps"], *against])
     return rows
 
 
 def equal_bandwidth(found: dict[str, Any]) -> list[list[object]]:
-    """One row per number of rays and rival in the bandwidth of `refined`."""
+    """One row per number of rays, design and rival in its bandwidth."""
     rows = []
     for count, document in found["rays"].items():
-        pairs = {pair["b"]: pair for pair in document["paired_equal_bandwidth"] if pair["a"] == FIRST}
+        better = document["metric"]["better"]
+        spent = {row["design"]: row["bandwidth_mbps"] for row in document["rows"]}
+        # a design may meet a rival at several numbers of its rays; here there is one
+        pairs = pairs_of(document, "paired_equal_bandwidth")
         for row in document["equal_bandwidth"]:
-            if row["matched_to"] != FIRST:
-                continue
-            pair = pairs[row["design"]]
-            better = document["metric"]["better"]
-            difference = percent(pair, row["value"])
-            limit = next(one["bandwidth_mbps"] for one in document["rows"] if one["design"] == FIRST)
-            rows.append([count, limit, row["design"], row["rays"], row["value"], difference, standing(pair, better)])
+            name = row["matched_to"]
+            if name in OURS:
+                against = told(pairs[name, row["design"]], row["value"], better)
+                rows.append([count, name, spent[name], row["design"], row["rays"], row["value"], against])
     return rows
 
 
@@ -268,25 +283,26 @@ def searches(found: dict[str, Any]) -> list[list[object]]:
 
 
 def verdicts(found: dict[str, Any]) -> list[str]:
-    """What is claimed of `refined`, over all numbers of rays."""
-    rays, bandwidth = {}, {}
-    for count, document in found["rays"].items():
-        better = document["metric"]["better"]
-        rivals = {row["design"] for row in document["rows"]} - set().union(*(case.designs for case in CASES.values()))
-        for pair in document["paired"]:
-            if pair["a"] == FIRST and pair["b"] in rivals:
-                rays[f"{count} rays, {pair['b']}"] = standing(pair, better) == "better"
-        for pair in document["paired_equal_bandwidth"]:
-            if pair["a"] == FIRST:
-                bandwidth[f"{count} rays, {pair['b']}"] = standing(pair, better) == "better"
-    times = found["times"]
-    faster = {"fitting anew": found["seconds"] / times["change"] >= LEAST_FACTOR}
+    """What is claimed of our designs, over all numbers of rays."""
+    designs = set().union(*(case.designs for case in CASES.values()))
+    lines = []
+    for name in ours_of(found):
+        for key, where in (("paired", "rays"), ("paired_equal_bandwidth", "bandwidth")):
+            cases = {
+                f"{count} rays, {other}": standing(pair, document["metric"]["better"]) == "better"
+                for count, document in found["rays"].items()
+                for (own, other), pair in pairs_of(document, key).items()
+                if own == name and other not in designs
+            }
+            lines.append(
+                verdict(f"{name} is better than every rival at equal {where}, by more than the interval", cases)
+            )
+    times, seconds = found["times"], found["seconds"]
+    faster = {"fitting anew": seconds / times["change"] >= LEAST_FACTOR}
     return [
-        verdict("better than every rival at equal rays, by more than the interval", rays),
-        verdict("better than every rival at equal bandwidth, by more than the interval", bandwidth),
+        *lines,
         f"a change of a constraint takes {times['change']:.2g} s, refined {times['refined']:.2g} s, and cma "
-        f"{found['seconds']:.0f} s: {found['seconds'] / times['change']:.0f} and "
-        f"{found['seconds'] / times['refined']:.0f} times as long",
+        f"{seconds:.0f} s: {seconds / times['change']:.0f} and {seconds / times['refined']:.0f} times as long",
         verdict(f"at least {LEAST_FACTOR:g} times faster per change of a constraint than cma", faster),
     ]
 
@@ -296,14 +312,14 @@ def tables_of(title: str, found: dict[str, Any]) -> dict[str, tuple[list[str], l
     document = next(iter(found["rays"].values()))
     metric = f"{document['metric']['name']} {document['metric']['unit']}"
     scenes = f"{document['scenes']} held-out scenes"
-    against = "refined against it, %"
+    against = [f"{name} against it, %" for name in ours_of(found)]
     return {
         f"{title}, equal rays, {scenes}": (
-            ["rays", "design", metric, "95 % interval", "Mbit/s", against, "refined is"],
+            ["rays", "design", metric, "95 % interval", "Mbit/s", *against],
             equal_rays(found),
         ),
         f"{title}, equal bandwidth, {scenes}": (
-            ["rays of refined", "Mbit/s", "rival", "its rays", metric, against, "refined is"],
+            ["rays", "design", "Mbit/s", "rival", "its rays", metric, "design against it, %"],
             equal_bandwidth(found),
         ),
         f"{title}, searches of cma on training scenes": (
