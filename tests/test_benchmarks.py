@@ -229,10 +229,10 @@ def test_a_rival_is_beaten_where_the_interval_says_so(script):
     for numbers, word in (((-0.5, -0.9, -0.1), "better"), ((0.5, 0.1, 0.9), "worse"), ((-0.1, -0.5, 0.4), "not told")):
         found = rival_documents(*numbers)
         (row,) = [row for row in rivals.equal_rays(found) if row[1] == "cma"]
-        assert row[-1].startswith(word)
-        assert row[-2].startswith(f"{100 * numbers[0] / 5:+.1f} (")
+        assert word in row[-1]
+        assert row[-1].startswith(f"{100 * numbers[0] / 5:+.1f} (")
         (matched,) = rivals.equal_bandwidth(found)
-        assert matched[-1].startswith(word)
+        assert word in matched[-1]
         assert all(line.startswith("holds") == (word == "better") for line in rivals.verdicts(found)[:2])
 
 
