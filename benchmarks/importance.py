@@ -190,20 +190,21 @@ def draw(path: Path, scene: Any, scans: Mapping[tuple[str, int], Measured], coun
     for offset, part in enumerate(("inside", "outside")):
         values = [getattr(scans[name, count], part).mean() for name in shown]
         axes[3].bar(np.arange(3) + 0.4 * offset, values, 0.38, label=part, color=("#f4a261", "#90a4ae")[offset])
-    axes[3].set_xticks(np.arange(3) + 0.2, [name.replace("none", "no weights") for name in shown])
+    axes[3].set_xticks(np.arange(3) + 0.2, [name.replace(" ", "\n") for name in shown])
     axes[3].set_ylabel("distance to the reconstruction [mm]")
+    axes[3].set_ylim(0, 1.3 * axes[3].get_ylim()[1])
     axes[3].legend(title="the region")
-    figure.savefig(path, dpi=90)
+    figure.savefig(path, dpi=80)
     plt.close(figure)
 
 
 def main() -> None:
     """Measure and print."""
-    made = parser(__doc__, rounds=3)
+    made = parser(__doc__, rounds=2)
     model_option(made)
     run_options(made)
     made.add_argument("--rays", type=int, nargs="+", default=[196, 361, 576])
-    made.add_argument("--spread-mm", type=float, default=10.0, help="of samples in range (default %(default)s)")
+    made.add_argument("--spread-mm", type=float, default=20.0, help="of samples in range (default %(default)s)")
     made.add_argument("--picture", type=Path, metavar="FILE", help="also draw where rays go")
     options = made.parse_args()
     from lidardesign.cli.runs import open_run
