@@ -182,7 +182,8 @@ def measured(task: str, options: Any) -> dict[str, Any]:
         document = kept(folder / f"{count}.json", lambda d=designs, n=count: evaluated(d, n, case.baselines, seconds))
         longer = folder / f"{count}-long.json"
         if options.long or longer.exists():
-            again = kept(longer, lambda d=designs, n=count: evaluated(d[:1], n, (), LONG * seconds))
+            held = [path for path in designs if path.stem.rpartition("-")[0] in OURS]
+            again = kept(longer, lambda d=held, n=count: evaluated(d, n, (), LONG * seconds))
             document = joined(document, again)
         found["rays"][count] = named(document, count)
     return found
