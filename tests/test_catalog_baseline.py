@@ -38,6 +38,7 @@ PAIRS = (
     ("ceiling", "tmf8828"),
     ("ceiling", "vl53l1x"),
     ("aisle", "vl53l1x"),
+    ("flatland", "rplidar-c1"),
     ("aisle", "tmf8821:3x6"),
 )
 
@@ -57,7 +58,11 @@ def shelf(x_m):
     return Scene((Body(Box((3.0, 0.2, 0.3)), "shelf", "both", pose),))
 
 
+FLAT = DesignSpace((0, 0, 0, math.pi / 4, 0, 0), (1, 0, 0, 3 * math.pi / 4, 0, 1.2))
+FROZEN = DesignSpace((0, 0, 0, 0, 0, 3), (0, 0, 0, 0, 0, 3))
+
 CASES = {
+    "flatland": (FLAT, [ball([0.5, 0.8, 0.0], 0.15)]),
     "fixed origin": (FIXED, [ball([2.0, 0.1, 0.2]), ball([2.0, -0.1, 0.2])]),
     "full turn": (TURN, [ball([-1.5, 0.6, 0.0])]),
     "ceiling": (CEILING, [ball([0.3, 0.2, 0.0], 0.2)]),
@@ -269,6 +274,12 @@ def test_a_pose_may_be_given():
 def test_what_is_no_part_or_pose_is_refused_before_anything_is_built(name, message):
     with pytest.raises(ConfigError, match=message):
         baseline_of(name)
+
+
+def test_a_space_of_one_ray_has_a_part_look_along_it():
+    (rays,) = Baselines(FROZEN, [ball([3.4, 0, 0])], seed=0).positions("catalog:vl53l5cx", 1)
+    np.testing.assert_allclose(rays.direction, [[1, 0, 0]], atol=1e-12)
+    assert rays.gate_m[0, 0] < 3.0 < rays.gate_m[0, 1]
 
 
 def test_a_part_that_measures_elsewhere_says_so():

@@ -20,6 +20,7 @@ Where the density has conditions, every baseline is laid out at each of their va
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -28,9 +29,10 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.bounding import bounding
 from lidardesign.evaluate.candidates import Candidate, Layout, Positions, Spot, whole_range
-from lidardesign.evaluate.catalog import FAMILY, Density, part_candidates, split_argument
+from lidardesign.evaluate.catalog import FAMILY, Density, part_candidates, scene_points, split_argument
 from lidardesign.evaluate.observed import TrainingViews
 from lidardesign.evaluate.occupancy import occupancy
+from lidardesign.evaluate.part_poses import ScenePoints
 from lidardesign.evaluate.placement import RAY_AXES, even_placement
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
@@ -83,6 +85,11 @@ class Baselines:
         self._judge = judge or self.views.missing_returns
         self._candidates: dict[str, list[Candidate]] = {}
         self._worth: dict[tuple[str, str, int], float] = {}
+
+    @cached_property
+    def scene_points(self) -> ScenePoints:
+        """What parts of the catalogue are to see, the same for all."""
+        return scene_points(self)
 
     def positions(self, name: str, count: int) -> Positions:
         """A baseline at exactly `count` rays."""

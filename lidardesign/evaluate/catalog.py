@@ -60,6 +60,11 @@ class Surroundings(Protocol):
     views: TrainingViews
     density: Callable[[], Density | None] | None
 
+    @property
+    def scene_points(self) -> ScenePoints:
+        """What parts are to see."""
+        ...
+
 
 def split_argument(argument: str) -> tuple[Part, Pose | None]:
     """The part and the pose that `NAME` or `NAME@POSE` names.
@@ -96,7 +101,7 @@ def part_candidates(source: Surroundings, argument: str) -> list[PartCandidate]:
             where=f"catalog:{argument}",
             hint="a part that measures there: lidardesign catalog list",
         )
-    scene = scene_points(source)
+    scene = source.scene_points
     if given is not None:
         return [PartCandidate("given", part, scene, lambda number: interleaved(part, given, number))]
     posed = PosedPart(part, scene, source.seed)

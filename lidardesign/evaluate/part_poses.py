@@ -13,7 +13,7 @@ other, each time the one that gains most.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -66,6 +66,7 @@ class ScenePoints:
     log_target: np.ndarray
     space: DesignSpace
     retarget: Retarget | None = None
+    _seen: dict[tuple[float, ...], np.ndarray] = field(default_factory=dict, repr=False)
 
     @property
     def travelled(self) -> list[int]:
@@ -89,6 +90,12 @@ class ScenePoints:
 
     def visible(self, origin_m: np.ndarray) -> np.ndarray:
         """How visible each scene point is from an origin, relative to where it was seen from, (N,) in [0, 1]."""
+        place = tuple(float(value) for value in origin_m)
+        if place not in self._seen:
+            self._seen[place] = self._visible(origin_m)
+        return self._seen[place]
+
+    def _visible(self, origin_m: np.ndarray) -> np.ndarray:
         origins = np.tile(origin_m, (len(self.points), 1))
         origins[:, self.travelled] = self.points[:, self.travelled]
         if self.retarget is None or np.array_equal(origins, self.points[:, :3]):
@@ -128,7 +135,6 @@ class PosedPart:
         self.places_m = places(scene.still)
         self._points = scene.brought_back()
         self._fits: dict[tuple[int, int], list[Pose]] = {}
-        self._visible: dict[int, np.ndarray] = {}
 
     @phase("poses")
     def best(self, number: int) -> list[Pose]:
@@ -153,7 +159,7 @@ class PosedPart:
 
     def _fitted(self, place: int, number: int) -> list[Pose]:
         if (place, number) not in self._fits:
-            self._fits[place, number] = self._fit(place, number, self._seen(place))
+            self._fits[place, number] = self._fit(place, number, self.scene.visible(self.places_m[place]))
         return self._fits[place, number]
 
     def _fit(self, place: int, number: int, visible: np.ndarray) -> list[Pose]:
@@ -161,14 +167,8 @@ class PosedPart:
         here, space = self.places_m[place], self.scene.still
         return fitted_poses(self.part, self._points, visible, here, space, number, generator)
 
-    def _seen(self, place: int) -> np.ndarray:
-        if place not in self._visible:
-            self._visible[place] = self.scene.visible(self.places_m[place])
-        return self._visible[place]
-
     def _proposals(self, poses: list[Pose]) -> Proposals:
-        numbers = {tuple(place): number for number, place in enumerate(self.places_m)}
-        rows = [self._density(pose, self._seen(numbers[tuple(pose.origin_m)])) for pose in poses]
+        rows = [self._density(pose, self.scene.visible(pose.origin_m)) for pose in poses]
         return Proposals(poses, np.stack(rows))
 
     def _density(self, pose: Pose, visible: np.ndarray) -> np.ndarray:
