@@ -122,6 +122,9 @@ class Task(Protocol):
     evaluated at, as [{"x_m": 0.0}, {"x_m": 1.2}]. `score` then gets one `Returns` per condition value (and, within
     each, per time frame), in this order.
 
+    A task may name `weighing_keys`, keys of its configuration that only say what counts more in the density: designs
+    of runs that differ in them alone are judged side by side.
+
     A task may also give `residuals(scene, returns) -> Residuals`, where the error of what `score` judges is; designs
     of a task without them cannot be refined.
     """
@@ -168,6 +171,11 @@ def scenes_of(task: Task, config: Any, split: Split, seed: int, space: DesignSpa
             found = f"scenes gave one {type(scene).__name__}"
             raise PluginError(found, where=f"task {task.name}", allowed="lidardesign.scene.Scene")
     return scenes
+
+
+def judged_by_keys(task: Task, config: Any) -> dict[str, Any]:
+    """The settings of a task that decide its scenes and scores: all but its `weighing_keys`."""
+    return config.model_dump(mode="json", exclude=set(getattr(task, "weighing_keys", ())))
 
 
 # Conditions that a task does not name are evaluated at so many even places.

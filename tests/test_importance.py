@@ -25,7 +25,8 @@ from lidardesign.numerics import logsumexp
 from lidardesign.run.config import RunConfig
 from lidardesign.scene import LARGEST_WEIGHT, Body, Box, Capsule, Mesh, Receiver, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, observed_point
-from lidardesign.task import Defaults, Metric, TaskConfig
+from lidardesign.task import Defaults, Metric, TaskConfig, judged_by_keys
+from lidardesign_tasks.face import FaceConfig, FaceTask
 
 SPACE = DesignSpace((0, -0.1, -0.1, -0.5, -0.4, 0.3), (0, 0.1, 0.1, 0.5, 0.4, 2.2))
 SETTINGS = DensitySettings(sigma_m=0.05, field_resolution=24, quadrature_points=24)
@@ -441,3 +442,11 @@ def test_samples_of_the_plain_density_reweighted_are_those_of_the_weighted_one(l
     halves = np.array([0.75, 0.25])
     expected = 1.0 / (np.square(0.5 / halves) * halves).sum()
     assert back.effective_sample_size == pytest.approx(expected * samples.effective_sample_size, abs=0.06)
+
+
+def test_settings_that_only_weigh_do_not_keep_designs_from_being_judged_together():
+    task = FaceTask()
+    plain, weighed, elsewhere = (FaceConfig(**keys) for keys in ({}, {"area_exponent": 0.5}, {"distance_m": 0.5}))
+    assert judged_by_keys(task, plain) == judged_by_keys(task, weighed)
+    assert judged_by_keys(task, plain) != judged_by_keys(task, elsewhere)
+    assert set(task.weighing_keys) < set(FaceConfig.model_fields)

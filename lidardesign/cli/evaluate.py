@@ -230,11 +230,7 @@ def _common_run(entries: list[_Entry], runs: list[Run]) -> Run:
         )
     first = candidates[0]
     for other in candidates[1:]:
-        if (other.config.task_name, other.config.task, other.config.space) != (
-            first.config.task_name,
-            first.config.task,
-            first.config.space,
-        ):
+        if _judged_by(other) != _judged_by(first):
             raise ConfigError(
                 f"{first.folder} and {other.folder} differ in task, configuration or design space",
                 hint="evaluate them one by one: scores of different scenes do not compare",
@@ -242,6 +238,14 @@ def _common_run(entries: list[_Entry], runs: list[Run]) -> Run:
     if not entries:
         raise DataError("the run has no designs yet", where=str(first.folder), hint=f"lidardesign fit {first.folder}")
     return first
+
+
+def _judged_by(run: Run) -> tuple[Any, ...]:
+    """What runs share whose designs are scored in the same scenes."""
+    from lidardesign.task import judged_by_keys
+
+    config = run.config
+    return config.task_name, judged_by_keys(run.task, config.task), config.space
 
 
 def _request(

@@ -21,6 +21,7 @@ from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Residuals, Score, Split
 from lidardesign_tasks.face import FaceTask, HeadConfig, Vector, head_scenes
+from lidardesign_tasks.importance import WEIGHING_KEYS
 from lidardesign_tasks.surface import surface_residuals, surface_score
 
 
@@ -84,6 +85,7 @@ class EmitterTask:
     name: ClassVar[str] = "emitter"
     summary: ClassVar[str] = "emitters around a fixed smartphone-like detector, 0.40 m in front of a face"
     api_version: ClassVar[int] = 1
+    weighing_keys: ClassVar[tuple[str, ...]] = WEIGHING_KEYS
     Config: ClassVar[type[EmitterConfig]] = EmitterConfig
     metric: ClassVar[Metric] = FaceTask.metric
     defaults: ClassVar[Defaults] = Defaults(

@@ -25,7 +25,7 @@ from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Residuals, Score, Split, random_generator
 from lidardesign_tasks.basel import MorphableModel, Unit, load_model
-from lidardesign_tasks.importance import Importance, middle_of_origins
+from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_origins
 from lidardesign_tasks.pose import jittered_pose
 from lidardesign_tasks.surface import surface_residuals, surface_score, with_visible_truth
 from lidardesign_tasks.surroundings import any_direction, moving
@@ -81,6 +81,7 @@ class FaceTask:
         "flash-LiDAR face scanning on heads of a morphable model, 0.40 m in front of the face"
     )
     api_version: ClassVar[int] = 1
+    weighing_keys: ClassVar[tuple[str, ...]] = WEIGHING_KEYS
     Config: ClassVar[type[FaceConfig]] = FaceConfig
     metric: ClassVar[Metric] = Metric("Chamfer distance", "mm", "lower", worst=200.0, tolerance=0.1)
     defaults: ClassVar[Defaults] = Defaults(

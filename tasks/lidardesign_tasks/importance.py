@@ -117,6 +117,10 @@ class Importance(Surroundings):
         return np.clip(1.0 - outside_m / self.region_edge_m, 0.0, 1.0)
 
 
+# Keys that say what counts more, and nothing about the scenes.
+WEIGHING_KEYS = tuple(key for key in Importance.model_fields if key not in Surroundings.model_fields)
+
+
 def middle_of_origins(space: DesignSpace) -> np.ndarray:
     """The middle of a design space's origins, shape (3,) [m]."""
     return (np.array(space.low[:3]) + np.array(space.high[:3])) / 2

@@ -27,7 +27,7 @@ from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace, aim
 from lidardesign.task import Defaults, Metric, Residuals, Score, Split, random_generator
 from lidardesign.vertex_weights import COLOURS, Painted
-from lidardesign_tasks.importance import Importance, middle_of_origins
+from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_origins
 from lidardesign_tasks.pose import jittered_pose
 from lidardesign_tasks.surface import surface_residuals, surface_score, with_visible_truth
 from lidardesign_tasks.surroundings import any_direction, moving
@@ -90,6 +90,7 @@ class MeshesTask:
         "your own folder of meshes, with a design space in YAML or one derived from their size"
     )
     api_version: ClassVar[int] = 1
+    weighing_keys: ClassVar[tuple[str, ...]] = (*WEIGHING_KEYS, "importance", "colour_contrast")
     Config: ClassVar[type[MeshesConfig]] = MeshesConfig
     metric: ClassVar[Metric] = Metric("Chamfer distance", "mm", "lower", worst=1000.0, tolerance=0.1)
     defaults: ClassVar[Defaults] = Defaults(
