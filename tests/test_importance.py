@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from lidardesign_tasks.face import FaceConfig, FaceTask
 
 from lidardesign.density.device_target import DeviceTarget, on_device
 from lidardesign.density.grids import grid_around
@@ -26,7 +27,6 @@ from lidardesign.run.config import RunConfig
 from lidardesign.scene import LARGEST_WEIGHT, Body, Box, Capsule, Mesh, Receiver, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, observed_point
 from lidardesign.task import Defaults, Metric, TaskConfig, judged_by_keys
-from lidardesign_tasks.face import FaceConfig, FaceTask
 
 SPACE = DesignSpace((0, -0.1, -0.1, -0.5, -0.4, 0.3), (0, 0.1, 0.1, 0.5, 0.4, 2.2))
 SETTINGS = DensitySettings(sigma_m=0.05, field_resolution=24, quadrature_points=24)
