@@ -90,8 +90,8 @@ class Fitter:
             return samples
         weighed = Weighting(settings).log_target(samples, self.target)
         _check_worth(weighed, self.order.run, "a setting nearer to what was learned, or learn with it")
-        share = weighed.effective_sample_size
-        self.console.note(f"note: with {', '.join(settings)} the samples have ESS {share:.2f}, learned for it or not")
+        now, before = weighed.effective_sample_size, samples.effective_sample_size
+        self.console.note(f"note: with {', '.join(settings)} the samples have ESS {now:.2f}, as learned {before:.2f}")
         return weighed
 
     def samples(self, weighting: Weighting) -> Samples:
