@@ -160,11 +160,13 @@ def times_of(case: Case, run: Path, rounds: int) -> dict[str, float]:
     return {"learning": learning, **spent}
 
 
-def evaluated(designs: Sequence[Path], rays: int, baselines: Sequence[str], seconds: float) -> dict[str, Any]:
-    """What `evaluate` prints about designs at one number of rays."""
-    words: list[str | Path] = ["evaluate", *designs, "--rays", str(rays), "--cma-seconds", f"{seconds:.1f}", "--json"]
-    for name in (*baselines, "cma"):
+def evaluated(designs: Sequence[Path], rays: int, baselines: Sequence[str], seconds: float | None) -> dict[str, Any]:
+    """What `evaluate` prints about designs at one number of rays; without seconds nothing is searched for."""
+    words: list[str | Path] = ["evaluate", *designs, "--rays", str(rays), "--json"]
+    for name in baselines:
         words += ["--baseline", name]
+    if seconds is not None:
+        words += ["--baseline", "cma", "--cma-seconds", f"{seconds:.1f}"]
     return run_process(lidardesign(*words)).document()
 
 
@@ -179,9 +181,12 @@ def measured(task: str, options: Any) -> dict[str, Any]:
     for count in rays:
         designs = designs_of(case, run, count)
         print(f"{task}: {count} rays ...", file=sys.stderr, flush=True)
-        document = kept(folder / f"{count}.json", lambda d=designs, n=count: evaluated(d, n, case.baselines, seconds))
+        searched = seconds if not options.cma_rays or count in options.cma_rays else None
+        document = kept(
+            folder / f"{count}.json", lambda d=designs, n=count, s=searched: evaluated(d, n, case.baselines, s)
+        )
         longer = folder / f"{count}-long.json"
-        if options.long or longer.exists():
+        if (options.long and searched) or longer.exists():
             held = [path for path in designs if path.stem.rpartition("-")[0] in OURS]
             again = kept(longer, lambda d=held, n=count: evaluated(d, n, (), LONG * seconds))
             document = joined(document, again)
@@ -279,7 +284,7 @@ def searches(found: dict[str, Any]) -> list[list[object]]:
             one["value"],
         ]
         for count, document in found["rays"].items()
-        for one in document["cma"]
+        for one in document.get("cma", [])
     ]
 
 
@@ -391,6 +396,7 @@ def main() -> None:
     made.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="passed to learn; repeatable")
     made.add_argument("--rays", type=int, nargs="+", help="numbers of rays (default: three of each task)")
     made.add_argument("--cma-seconds", type=float, help="of each search (default: as long as ours takes)")
+    made.add_argument("--cma-rays", type=int, nargs="+", help="numbers of rays at which it searches (default: all)")
     made.add_argument("--long", action="store_true", help=f"also searches that take {LONG} times as long")
     made.add_argument("--page", type=Path, metavar="FILE.md", help="put the tables between this page's marks")
     made.add_argument("--picture", type=Path, metavar="FILE.png", help="draw scores against rays and bandwidth")
