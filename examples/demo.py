@@ -71,7 +71,12 @@ def main() -> None:
         "constrain", run, "--constraints", constraints, "--sensors", "4", "--name", "buyable",
     )  # fmt: skip
     step(
-        "Score both on held-out scenes against what one would build without learning.",
+        "Ten sensors with a gate per ray, refined by where the error is on training scenes.",
+        "fit", run, "--sensors", "10", "--layout", "density", "--gates", "ray", "--rays", "361", "--refine", "3",
+        "--name", "refined",
+    )  # fmt: skip
+    step(
+        "Score all on held-out scenes against what one would build without learning.",
         "evaluate", run, "--report", folder / "report.html", "--csv", folder / "scores.csv",
     )  # fmt: skip
     step(
