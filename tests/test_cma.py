@@ -17,7 +17,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.check import check_design
 from lidardesign.design.constraints import Constraints
 from lidardesign.design.files import design_document
-from lidardesign.design.sensor import Design, Sensor, Track
+from lidardesign.design.sensor import Design, Sensor, Track, tangent_coordinates
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.candidates import mean_mbps, whole_range
 from lidardesign.evaluate.cma_candidate import CmaCandidate, CmaSettings
@@ -28,7 +28,7 @@ from lidardesign.evaluate.cma_origins import exp_matrix, log_matrix
 from lidardesign.evaluate.cma_search import Budget, Search
 from lidardesign.evaluate.cma_starts import starts, tiles
 from lidardesign.evaluate.cma_track import TrackFigures, TrackModel, Way
-from lidardesign.evaluate.observed import TrainingViews
+from lidardesign.evaluate.observed import TrainingViews, dense_points
 from lidardesign.evaluate.score import EvaluationRequest, evaluate
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.simulate.plan import Planner
@@ -574,3 +574,16 @@ def test_without_a_terminal_a_search_is_announced_once(capsys):
     candidate_of("grid", settings).positions([], 12)
     said = capsys.readouterr().err
     assert said.count("cma, 12 rays: searching") == 1
+
+
+def test_from_several_places_every_sensor_may_look_at_all_returns():
+    setting = setting_of(CEILING, "distributed", CEILING_PLACES["mounts"])
+    views = TrainingViews(CEILING, BELOW)
+    hits = views.hits(dense_points(CEILING)).hits_m
+    first = starts(setting, views, 3)[0]
+    assert len({tuple(sensor.origin_m) for sensor in first}) == 3
+    for sensor in first:
+        away = hits - sensor.origin_m
+        tangent = tangent_coordinates(sensor.frame, away / np.linalg.norm(away, axis=1, keepdims=True))
+        assert (np.abs(tangent) <= np.array(sensor.field_of_view_rad) / 2 * 1.2).all(axis=1).mean() > 0.95
+        assert sensor.weight == pytest.approx(1 / 3)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -60,10 +61,12 @@ class Setting:
         """Which dimensions are free."""
         return Axes.of(self.space)
 
-    @property
+    @cached_property
     def spread_axes(self) -> tuple[int, ...]:
-        """The axes along which a sensor's rays start at different places."""
-        return self.axes.origin if self.layout == "distributed" else ()
+        """The axes along which sensors' rays start at different places; none where all sensors are held still."""
+        rules = [self.constraints.of_sensor(sensor).origin for sensor in range(len(self.constraints.each) + 1)]
+        still = all(one.fixed_m is not None or one.mounts_m for one in rules)
+        return () if self.layout != "distributed" or still else self.axes.origin
 
     def bounds(self, count: int) -> Bounds:
         """The bounds of the first sensors."""

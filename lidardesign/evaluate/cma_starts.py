@@ -89,11 +89,14 @@ def _tilings(setting: Setting, observed: Observed, count: int) -> Iterator[Start
     for origins in _origin_sets(setting, observed, count):
         distinct, which = np.unique(origins, axis=0, return_inverse=True)
         views = [_seen(setting, observed, origin) for origin in distinct]
-        ends = [central(view.places) for view in views]
+        ends = [Tile(*central(view.places)) for view in views]
+        if len(distinct) > 1:  # from several places, each may look at everything
+            parts = enumerate(which.ravel())
+            yield tuple(_tile_sensor(setting, views[v], ends[v], index, 1.0 / count)[0] for index, v in parts)
         for rows in range(1, count + 1):
-            parts = [tiles(*end, count, rows) for end in ends]
+            split = [tiles(*end, count, rows) for end in ends]
             sensors = [
-                _tile_sensor(setting, views[view], parts[view][index], index, 1.0 / count)
+                _tile_sensor(setting, views[view], split[view][index], index, 1.0 / count)
                 for index, view in enumerate(which.ravel())
             ]
             yield tuple(sensor for sensor, _ in sensors)
