@@ -11,16 +11,18 @@ the folder, and measured again only where it is missing.
 
 from __future__ import annotations
 
+import datetime
 import json
 import shutil
 import statistics
 import sys
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from common import face_settings, learned, lidardesign, parser, report, run_process, table, verdict
+from common import face_settings, learned, lidardesign, machine, parser, report, run_process, table, verdict
 
 CHANGES = 10
 LONG = 10
@@ -134,6 +136,15 @@ def run_of(task: str, folder: Path, options: Any) -> Path:
     return target
 
 
+def measured_on() -> str:
+    """When and on what something was measured."""
+    found = machine()
+    return (
+        f"Measured on {datetime.date.today():%Y-%m-%d}: {found['processor']}, {found['cores']} cores, {found['threads']} "
+        f"thread(s), Python {found['python']}, load {found['load_at_start']} at the start."
+    )
+
+
 def designs_of(case: Case, run: Path, rays: int) -> list[Path]:
     """Our designs for a number of rays, fitted where they are missing; the first of them is refined."""
     found = []
@@ -177,7 +188,8 @@ def measured(task: str, options: Any) -> dict[str, Any]:
     run = run_of(task, options.folder, options)
     times = kept(folder / "times.json", lambda: times_of(case, run, options.rounds))
     seconds = options.cma_seconds or Times(**times).ours
-    found: dict[str, Any] = {"times": times, "seconds": seconds, "rays": {}}
+    where = kept(folder / "where.json", measured_on)
+    found: dict[str, Any] = {"times": times, "seconds": seconds, "where": where, "rays": {}}
     for count in rays:
         designs = designs_of(case, run, count)
         print(f"{task}: {count} rays ...", file=sys.stderr, flush=True)
@@ -381,7 +393,8 @@ def write_page(page: Path, everything: Mapping[str, dict[str, Any]]) -> None:
         parts = [
             f"**{caption}**\n\n{table(*content)}" for caption, content in tables_of(CASES[task].title, found).items()
         ]
-        text = filled(text, task, "\n\n".join([*parts, *(f"- {line}" for line in verdicts(found))]))
+        listed = "\n".join(textwrap.fill(f"- {line}", 120, subsequent_indent="  ") for line in verdicts(found))
+        text = filled(text, task, "\n\n".join([textwrap.fill(found["where"], 120), *parts, listed]))
     page.write_text(text, encoding="utf-8")
 
 
