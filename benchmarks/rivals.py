@@ -140,8 +140,8 @@ def measured_on() -> str:
     """When and on what something was measured."""
     found = machine()
     return (
-        f"Measured on {datetime.date.today():%Y-%m-%d}: {found['processor']}, {found['cores']} cores, {found['threads']} "
-        f"thread(s), Python {found['python']}, load {found['load_at_start']} at the start."
+        f"Measured on {datetime.date.today():%Y-%m-%d}: {found['processor']}, {found['cores']} cores, "
+        f"{found['threads']} thread(s), Python {found['python']}, load {found['load_at_start']} at the start."
     )
 
 
@@ -349,19 +349,23 @@ def tables_of(title: str, found: dict[str, Any]) -> dict[str, tuple[list[str], l
 
 def draw(everything: Mapping[str, dict[str, Any]], path: Path) -> None:
     """Scores against rays and against bandwidth, one row of axes per task."""
+    from matplotlib import colormaps
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     figure = Figure(figsize=(11, 3.6 * len(everything)), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(len(everything), 2, squeeze=False)
+    names = list(dict.fromkeys(name for found in everything.values() for name in curves(found)))
+    colours = {name: colormaps["tab20"](index % 20) for index, name in enumerate(names)}
     for (task, found), (left, right) in zip(everything.items(), grid, strict=True):
         document = next(iter(found["rays"].values()))
         metric = document["metric"]
         for name, points in curves(found).items():
             ours = name in CASES[task].designs
             style = {"marker": "o" if ours else "s", "lw": 2.2 if ours else 1.0, "ms": 6 if ours else 4}
-            style |= {"ls": "-" if ours else "--", "label": name}
+            style |= {"ls": "-" if ours else "--", "label": name, "color": colours[name]}
             left.plot(points["rays"], points["value"], **style)
             right.plot(points["bandwidth_mbps"], points["value"], **style)
         left.set(xlabel="rays", ylabel=f"{metric['name']} [{metric['unit']}]", yscale="log", title=CASES[task].title)
@@ -369,6 +373,10 @@ def draw(everything: Mapping[str, dict[str, Any]], path: Path) -> None:
         right.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
         for axes in (left, right):
             axes.grid(True, which="both", alpha=0.25)
+            for axis in (axes.yaxis, *([axes.xaxis] if axes is right else [])):
+                axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
+                axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+                axis.set_minor_formatter(NullFormatter())
     figure.savefig(path, dpi=110)
 
 
