@@ -217,6 +217,21 @@ def test_rays_of_several_places_start_at_the_origins_of_their_sensors():
     assert counts[3] == shares[3]
 
 
+@pytest.mark.parametrize("name", ["none", "bandwidth", "all"])
+def test_where_samples_are_too_few_for_so_many_rays_bandwidth_and_bounds_are_kept_all_the_same(name):
+    few = spots(900)
+    constraints = Constraints.from_mapping(RULES[name], where="test")
+    result = made(rays=880, constraints=RULES[name], samples=few)
+    assert shared_rays(result.design, np.array([s.rays for s in result.design.sensors]), few, 0) is None
+    checks = check_design(design_document(result.design), constraints, SPACE)
+    assert all(check.satisfied for check in checks), [c.name for c in checks if not c.satisfied]
+    gates = result.design.ray_table.gate_m
+    if name == "none":
+        assert gates[:, 1].max() <= max(sensor.gate_m[1] for sensor in result.design.sensors)
+    else:
+        assert Bandwidth().mbps(lay_out(result.design)) > 0.7 * RULES[name]["budget"]["bandwidth_mbps"]
+
+
 def test_sensors_with_gates_of_their_own_keep_their_own_rays():
     rays = lay_out(replace(DESIGN, ray_table=None), 60, SAMPLES, gates="sensor")
     for sensor, gate in zip(rays.sensor, rays.gate_m, strict=True):

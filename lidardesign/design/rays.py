@@ -26,7 +26,7 @@ from lidardesign.design.quantise import lloyd, samples_for
 from lidardesign.design.resolve import bounds_of, groups
 from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import MOST_RAYS, Design, Layout, RayTable, Sensor, interval_factor, tangent_directions
-from lidardesign.design.shared_fields import shared_rays
+from lidardesign.design.shared_fields import narrowed, shared_rays
 from lidardesign.design.support import Retarget
 from lidardesign.design.track import moved, placed
 from lidardesign.errors import ConfigError
@@ -174,6 +174,7 @@ def _laid_out(
     gate = np.array([s.gate_m for s in design.sensors])[sensor]
     if gates == "ray" and seen is not None and samples is not None:
         gate = _ray_gates(design, tangents, seen, samples.space)
+        gate = narrowed(design, gate, sensor, samples) if design.layout == "density" else gate
     looking = [tangent_directions(s.frame, t) for s, t in zip(design.sensors, tangents, strict=True)]
     origin = np.array([s.origin_m for s in design.sensors], dtype=np.float64)[sensor]
     return Rays(origin, np.concatenate(looking), gate, sensor, fire_times(int(total), rate_hz))

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import ndtri
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints import Constraints
@@ -26,6 +27,8 @@ from lidardesign.design.sensor import Design, Sensor, interval_factor, tangent_c
 from lidardesign.numerics import systematic_draw, unit_vectors
 from lidardesign.task import random_generator
 
+# Of a normal distribution, where nothing better is known of what a ray hears.
+QUANTILES = 31
 # Heights of directions that are told apart when rays are put in order.
 ORDER_DECIMALS = 9
 
@@ -134,6 +137,21 @@ def ray_gates(design: Design, heard: Heard, sensor: np.ndarray, samples: Samples
     bounds = bounds_of(constraints, samples.space, tuple(range(count)), interval_factor(design.level)).take(sensor)
     model, limit = bandwidth_limit(design, constraints, len(sensor))
     return gates_within(heard, bounds, design.level, model, limit)
+
+
+def narrowed(design: Design, gates: np.ndarray, sensor: np.ndarray, samples: Samples) -> np.ndarray:
+    """Gates (N, 2) [m] that were not priced, where they are too wide for the design's bandwidth: towards their middles.
+
+    Rays of which too little is known count as hearing most in the middle of their gates.
+    """
+    constraints = Constraints.from_mapping(design.constraints, where=f"constraints of {design.name}")
+    model, limit = bandwidth_limit(design, constraints, len(gates))
+    if limit is None or int(model.bins(gates[:, 1] - gates[:, 0]).sum()) <= limit:
+        return gates
+    shape = ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES)
+    ranges = gates.mean(axis=1)[:, None] + np.diff(gates, axis=1) / 2 * shape / shape[-1]
+    ray = np.repeat(np.arange(len(gates)), QUANTILES)
+    return ray_gates(design, Heard(ranges.reshape(-1), np.ones(ranges.size), ray, len(gates)), sensor, samples)
 
 
 def bandwidth_limit(design: Design, constraints: Constraints, rays: int) -> tuple[Bandwidth, int | None]:
