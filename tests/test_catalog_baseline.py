@@ -268,6 +268,7 @@ def test_a_pose_may_be_given():
         ("catalog:vl53l5cx@a,b,c,d,e", "is no pose"),
         ("catalog:vl53l5cx@0,0,0,0,91", "is no pose"),
         ("catalog:vl53l5cx@0,0,0,nan,0", "is no pose"),
+        ("catalog:vl53l5cx@0,-1e300,0,0,0", "is too far away"),
         ("catalog:vl53l5cx@0,0,0,0,0,0,0", "is no pose"),
     ],
 )

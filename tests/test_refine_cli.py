@@ -7,6 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
+import yaml
 from command_line import caller, make_run
 from lidardesign_tasks.flatland import FlatlandTask
 
@@ -314,6 +315,17 @@ def test_a_weighting_that_was_damaged_is_refused_wherever_it_is_read(lidardesign
         assert result.code == 2, command
         assert "weighting of design w" in result.err
         assert "Traceback" not in result.err
+
+
+@pytest.mark.parametrize("command", ["evaluate", "constrain"])
+def test_settings_in_a_design_that_cannot_be_are_not_blamed_on_an_option(lidardesign, flat, weighted, command):
+    document = yaml.safe_load(weighted.read_text())
+    document["provenance"]["weighting"] = {"set": ["colour=3"]}
+    weighted.write_text(yaml.safe_dump(document))
+    result = lidardesign(command, weighted, "--rays", "7")
+    assert result.code == 2
+    assert "weighting of design w: set colour=3: unknown key" in result.err
+    assert "--weight" not in result.err
 
 
 WRONG = {

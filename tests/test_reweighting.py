@@ -133,6 +133,8 @@ MALFORMED = {
     "a factor too many": {"points_m": [[0, 0, 0]], "log_factors": [0, 1]},
     "ragged points": {"points_m": [[0, 0, 0], [1]], "log_factors": [0, 1]},
     "text": {"points_m": [["here", 0, 0]], "log_factors": [0]},
+    "a number as text": {"points_m": [[0, 0, 0]], "log_factors": ["1"]},
+    "true among numbers": {"points_m": [[0, 0, True]], "log_factors": [0]},
     "nothing among numbers": {"points_m": [[0, 0, 0]], "log_factors": [None]},
     "a mapping among numbers": {"points_m": [[0, 0, {}]], "log_factors": [0]},
     "a factor that is none": {"points_m": [[0, 0, 0]], "log_factors": [float("nan")]},
@@ -263,3 +265,5 @@ def test_what_is_no_weighting_is_refused_by_the_designs_name(name):
     with pytest.raises(ConfigError) as caught:
         Weighting.of(design_with(NO_WEIGHTINGS[name]))
     assert "weighting of design d" in caught.value.where
+    assert caught.value.allowed
+    assert "fit the design again" in caught.value.hint

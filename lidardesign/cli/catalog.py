@@ -257,7 +257,8 @@ def _origin(text: str | None) -> np.ndarray:
     except ValueError:
         origin = np.zeros(0)
     if origin.shape != (3,) or not np.isfinite(origin).all() or np.abs(origin).max() > FARTHEST_M:
-        raise ConfigError(f"found {text!r}", where="--at-origin", allowed="three numbers, as 0.5,0,1.8 [m]")
+        allowed = f"three numbers, as 0.5,0,1.8 [m], each at most {FARTHEST_M:g}"
+        raise ConfigError(f"found {text!r}", where="--at-origin", allowed=allowed)
     return origin
 
 

@@ -61,7 +61,7 @@ class RunTarget:
         run, settings = self._run, self._weighting.settings
         if not settings:
             return run
-        return replace(run, config=judged_by(run.task, run.config, settings, option="--weight"))
+        return replace(run, config=judged_by(run.task, run.config, settings, option=self._weighting.origin))
 
 
 @dataclass(frozen=True, eq=False)

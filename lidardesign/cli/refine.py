@@ -72,23 +72,25 @@ class Fitter:
         DataError: The density is too rough, with or without the settings.
     """
 
-    def __init__(self, order: FitOrder, settings: tuple[str, ...], console: Console) -> None:
+    def __init__(self, order: FitOrder, weighting: Weighting, console: Console) -> None:
         self.order, self.console = order, console
-        self.target = RunTarget(order.run, weighting=Weighting(settings))
+        settings_alone = replace(weighting, reweighting=None, range_spread_m=0.0)
+        self.target = RunTarget(order.run, weighting=settings_alone)
         order.run.config.space.at(order.at)
-        self.base = self._base(settings)
+        self.base = self._base(settings_alone)
         self._told = False
 
     @phase("samples")
-    def _base(self, settings: tuple[str, ...]) -> Samples:
+    def _base(self, weighting: Weighting) -> Samples:
         """The samples of the run under the settings."""
         from lidardesign.design.samples import load_samples
 
         samples = load_samples(self.order.run.folder)
         _check_worth(samples, self.order.run, LEARN_LONGER)
+        settings = weighting.settings
         if not settings:
             return samples
-        weighed = Weighting(settings).log_target(samples, self.target)
+        weighed = weighting.log_target(samples, self.target)
         _check_worth(weighed, self.order.run, "a setting nearer to what was learned, or learn with it")
         now, before = weighed.effective_sample_size, samples.effective_sample_size
         self.console.note(f"note: with {', '.join(settings)} the samples have ESS {now:.2f}, as learned {before:.2f}")
@@ -155,7 +157,7 @@ class Fitter:
 
 def fitted(order: FitOrder, weighting: Weighting, console: Console) -> tuple[FitResult, Weighting]:
     """A design as it was ordered."""
-    fitter = Fitter(order, weighting.settings, console)
+    fitter = Fitter(order, weighting, console)
     return fitter.fit(weighting, fitter.samples(weighting)), weighting
 
 
@@ -177,7 +179,7 @@ def refined(
             allowed="tasks with residuals",
             hint="leave --refine out, or give the task a method residuals(scene, returns)",
         )
-    fitter = Fitter(order, weighting.settings, console)
+    fitter = Fitter(order, weighting, console)
     found = _refine(fitter, weighting, rounds, console)
     shape = found.shape
     used = Weighting(weighting.settings, found.reweighting, shape.range_spread_m)
@@ -203,6 +205,7 @@ def _refine(fitter: Fitter, weighting: Weighting, rounds: int, console: Console)
         _attention(fitter, start),
         sigma_m=order.run.config.density.sigma_m,
         spreads=fitter.may_spread,
+        more=lambda draw: _drawn(order, draw + 1),
         progress=told,
     )
     shape = Shape(order.choices["level"], weighting.range_spread_m)
@@ -286,10 +289,7 @@ def _scenes(order: FitOrder) -> tuple[list[Scene], list[Scene]]:
     Raises:
         ConfigError: There are too few.
     """
-    from lidardesign.task import random_generator
-
-    seed = int(random_generator(order.seed, "refinement scenes").integers(2**31))
-    scenes = order.run.scenes("train", seed)
+    scenes = _drawn(order, 0)
     if len(scenes) < FEWEST_SCENES:
         raise ConfigError(
             f"{len(scenes)} training scene", where="--refine", allowed=f"at least {FEWEST_SCENES}",
@@ -297,6 +297,14 @@ def _scenes(order: FitOrder) -> tuple[list[Scene], list[Scene]]:
         )  # fmt: skip
     looked = min(max(round(LOOK_SHARE * len(scenes)), 1), len(scenes) - 1)
     return scenes[:looked], scenes[looked:]
+
+
+def _drawn(order: FitOrder, draw: int) -> list[Scene]:
+    """A draw of training scenes that nothing was learned from."""
+    from lidardesign.task import random_generator
+
+    further = [draw] if draw else []
+    return order.run.scenes("train", int(random_generator(order.seed, "refinement scenes", *further).integers(2**31)))
 
 
 def _check_worth(samples: Samples, run: Run, hint: str) -> None:

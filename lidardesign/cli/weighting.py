@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from lidardesign.design.sensor import Design
 
 KEY = "weighting"
+OPTION = "--weight"
 # Refinement spreads by a few sigma of the density, which is at most the largest length: ten times `space.FARTHEST_M`,
 # which stands here as a number because --help loads no numpy.
 WIDEST_SPREAD_M = 1e10
@@ -29,11 +30,13 @@ class Weighting:
         settings: Settings of the task, as KEY=VALUE: the target becomes that of their scenes.
         reweighting: A factor over the scene, by refinement.
         range_spread_m: Standard deviation by which samples are spread in range, by refinement [m].
+        origin: Where the settings were said: an option, or a design.
     """
 
     settings: tuple[str, ...] = ()
     reweighting: Reweighting | None = None
     range_spread_m: float = 0.0
+    origin: str = OPTION
 
     def __bool__(self) -> bool:
         return bool(self.settings or self.reweighting is not None or self.range_spread_m)
@@ -51,21 +54,23 @@ class Weighting:
     @classmethod
     def from_document(cls, document: Any, where: str) -> Weighting:
         """What `as_document` gave."""
-        from lidardesign.design.reweighting import Reweighting
+        from lidardesign.design.reweighting import FIT_AGAIN, Reweighting
 
         known = {"set", "factors", "range_spread_m"}
         if not isinstance(document, Mapping) or not set(document) <= known:
-            raise ConfigError("is no weighting", where=where, allowed=f"some of the keys {', '.join(sorted(known))}")
+            allowed = f"some of the keys {', '.join(sorted(known))}"
+            raise ConfigError("is no weighting", where=where, allowed=allowed, hint=FIT_AGAIN)
         settings, spread = document.get("set", ()), document.get("range_spread_m", 0.0)
         listed = isinstance(settings, Sequence) and not isinstance(settings, str)
         if not (listed and all(isinstance(text, str) for text in settings)):
-            raise ConfigError(f"set is {settings!r}", where=where, allowed="a list of KEY=VALUE")
+            raise ConfigError(f"set is {settings!r}", where=where, allowed="a list of KEY=VALUE", hint=FIT_AGAIN)
         number = isinstance(spread, int | float) and not isinstance(spread, bool)
         if not (number and 0 <= spread <= WIDEST_SPREAD_M):
-            raise ConfigError(f"range_spread_m is {spread!r}", where=where, allowed=f"0 to {WIDEST_SPREAD_M:g}")
+            allowed = f"0 to {WIDEST_SPREAD_M:g}"
+            raise ConfigError(f"range_spread_m is {spread!r}", where=where, allowed=allowed, hint=FIT_AGAIN)
         factors = document.get("factors")
         reweighting = None if factors is None else Reweighting.from_document(factors, f"{where}: factors")
-        return cls(tuple(settings), reweighting, float(spread))
+        return cls(tuple(settings), reweighting, float(spread), f"{where}: set")
 
     def as_document(self) -> dict[str, Any]:
         """Plain values, as they stand in the provenance of a design."""

@@ -17,6 +17,7 @@ from lidardesign.space import FARTHEST_M, observed_point
 NEIGHBOURS = 4
 # No weight is changed by more than the factor exp of this.
 LARGEST_LOG_FACTOR = 20.0
+FIT_AGAIN = "fit the design again: its file was changed by hand"
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +41,7 @@ class Reweighting:
         factors = np.asarray(self.log_factors, dtype=np.float64)
         if points.ndim != 2 or points.shape[1:] != (3,) or factors.shape != points.shape[:1] or not len(factors):
             found = f"log factors of shape {factors.shape} at points of shape {points.shape}"
-            raise ConfigError(found, where=self.where, allowed="(K,) at (K, 3), K at least 1")
+            raise ConfigError(found, where=self.where, allowed="(K,) at (K, 3), K at least 1", hint=FIT_AGAIN)
         if not (np.abs(points).max() <= FARTHEST_M and np.abs(factors).max() <= LARGEST_LOG_FACTOR):
             raise ConfigError(
                 "points or log factors are not finite or too large",
@@ -56,12 +57,9 @@ class Reweighting:
         """What `as_document` gave; anything else is refused with its place."""
         keys = {"points_m", "log_factors"}
         if not isinstance(document, Mapping) or set(document) != keys:
-            raise ConfigError("is no reweighting", where=where, allowed=f"the keys {', '.join(sorted(keys))}")
-        try:
-            points, factors = (np.asarray(document[key], dtype=np.float64) for key in ("points_m", "log_factors"))
-        except (TypeError, ValueError, OverflowError):
-            raise ConfigError("holds something that is no list of numbers", where=where) from None
-        return cls(points, factors, where)
+            allowed = f"the keys {', '.join(sorted(keys))}"
+            raise ConfigError("is no reweighting", where=where, allowed=allowed, hint=FIT_AGAIN)
+        return cls(*(_numbers(document[key], f"{where}: {key}") for key in ("points_m", "log_factors")), where)
 
     def as_document(self) -> dict[str, Any]:
         """Plain lists, as they stand in a design's file."""
@@ -93,3 +91,23 @@ class Reweighting:
         # far from all anchors every share underflows: relative to the nearest one they do not
         shares = np.exp(log_shares - log_shares.max(axis=1, keepdims=True))
         return (shares * self.log_factors[nearest]).sum(axis=1) / shares.sum(axis=1)
+
+
+def _numbers(rows: Any, where: str) -> np.ndarray:
+    """Nested lists of numbers as an array; text and truth values are none, though numpy would take them.
+
+    Raises:
+        ConfigError: Something is no number, or rows differ in length.
+    """
+    if not _all_numbers(rows):
+        raise ConfigError("holds something that is no number", where=where, allowed="lists of numbers", hint=FIT_AGAIN)
+    try:
+        return np.asarray(rows, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise ConfigError("is no table of numbers", where=where, allowed="rows of one length", hint=FIT_AGAIN) from None
+
+
+def _all_numbers(rows: Any) -> bool:
+    if isinstance(rows, list | tuple):
+        return all(_all_numbers(one) for one in rows)
+    return isinstance(rows, int | float) and not isinstance(rows, bool)

@@ -32,7 +32,7 @@ from lidardesign.evaluate.observed import TrainingViews, dense_points
 from lidardesign.evaluate.part_poses import POINTS, PosedPart, Retarget, ScenePoints
 from lidardesign.numerics import EPSILON, systematic_draw
 from lidardesign.simulate.returns import Rays
-from lidardesign.space import DesignSpace
+from lidardesign.space import FARTHEST_M, DesignSpace
 from lidardesign.task import random_generator
 
 FAMILY = "catalog"
@@ -70,7 +70,7 @@ def split_argument(argument: str) -> tuple[Part, Pose | None]:
     """The part and the pose that `NAME` or `NAME@POSE` names.
 
     Raises:
-        ConfigError: There is no such part, or the pose is not 5 or 6 numbers.
+        ConfigError: There is no such part, or the pose is not 5 or 6 numbers, or farther away than anything.
     """
     name, at, text = argument.partition("@")
     part = find_part(name)
@@ -82,6 +82,9 @@ def split_argument(argument: str) -> tuple[Part, Pose | None]:
         numbers = []
     if len(numbers) not in POSE_NUMBERS or not np.isfinite(numbers).all() or abs(numbers[4]) > 90:
         raise ConfigError(f"{text!r} is no pose", where=f"catalog:{name}", allowed=FORM)
+    if np.abs(numbers[:3]).max() > FARTHEST_M:
+        allowed = f"at most {FARTHEST_M:g} m along each axis"
+        raise ConfigError(f"{text!r} is too far away", where=f"catalog:{name}", allowed=allowed)
     azimuth, elevation, roll = (math.radians(value) for value in [*numbers[3:], 0.0][:3])
     return part, Pose(np.array(numbers[:3]), azimuth, elevation, roll)
 
