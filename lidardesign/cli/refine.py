@@ -205,7 +205,6 @@ def _refine(fitter: Fitter, weighting: Weighting, rounds: int, console: Console)
         _attention(fitter, start),
         sigma_m=order.run.config.density.sigma_m,
         spreads=fitter.may_spread,
-        more=lambda draw: _drawn(order, draw + 1),
         progress=told,
     )
     shape = Shape(order.choices["level"], weighting.range_spread_m)
@@ -289,7 +288,10 @@ def _scenes(order: FitOrder) -> tuple[list[Scene], list[Scene]]:
     Raises:
         ConfigError: There are too few.
     """
-    scenes = _drawn(order, 0)
+    from lidardesign.task import random_generator
+
+    seed = int(random_generator(order.seed, "refinement scenes").integers(2**31))
+    scenes = order.run.scenes("train", seed)
     if len(scenes) < FEWEST_SCENES:
         raise ConfigError(
             f"{len(scenes)} training scene", where="--refine", allowed=f"at least {FEWEST_SCENES}",
@@ -297,14 +299,6 @@ def _scenes(order: FitOrder) -> tuple[list[Scene], list[Scene]]:
         )  # fmt: skip
     looked = min(max(round(LOOK_SHARE * len(scenes)), 1), len(scenes) - 1)
     return scenes[:looked], scenes[looked:]
-
-
-def _drawn(order: FitOrder, draw: int) -> list[Scene]:
-    """A draw of training scenes that nothing was learned from."""
-    from lidardesign.task import random_generator
-
-    further = [draw] if draw else []
-    return order.run.scenes("train", int(random_generator(order.seed, "refinement scenes", *further).integers(2**31)))
 
 
 def _check_worth(samples: Samples, run: Run, hint: str) -> None:
