@@ -71,7 +71,7 @@ CASES = {
             "scan": ("--layout", "scan", *AREA, "--refine", "5"),
         },
         (196, 361, 576),
-        ("occupancy", "catalog:vl53l5cx", "catalog:azure-kinect"),
+        ("occupancy", "catalog:vl53l5cx", "catalog:azure-kinect:wide-binned"),
         "gate.width_m.max=0.12",
         kbps_per_ray=2.77,  # bounding takes 14 bins of 400 bit/s a ray: a little less than half of that
     ),

@@ -175,6 +175,23 @@ def test_where_rays_side_by_side_saw_nothing_there_is_no_surface():
     assert area_through(points[seen], None) == pytest.approx(0.36), "without the rays that saw nothing it is bridged"
 
 
+@pytest.mark.parametrize("aspect", [1, 6, 10, 16])
+def test_a_plane_seen_by_rings_of_rays_is_whole_although_rings_are_far_apart(aspect):
+    azimuth, elevation = np.meshgrid(np.arange(12 * aspect) * 0.004, np.arange(8) * 0.004 * aspect)
+    rays = np.stack([np.ones(azimuth.size), np.tan(azimuth.ravel() - 0.1), np.tan(elevation.ravel() - 0.1)], axis=1)
+    directions = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    whole = area_through(rays, None)
+    assert area_through(rays, ray_spacing(directions)) > 0.95 * whole
+
+
+def test_rays_that_look_at_nearly_the_same_points_do_not_cut_the_surface():
+    _, points = plane_of_rays()
+    steps = np.pad(generator(1).normal(0, 1e-6, (8, 2)), ((0, 0), (1, 0)))
+    moved = (points[None] + steps[:, None]).reshape(-1, 3)
+    seen = moved / np.linalg.norm(moved, axis=1, keepdims=True)
+    assert area_through(moved, ray_spacing(seen)) == pytest.approx(0.36, rel=0.01)
+
+
 def test_a_single_lost_ray_leaves_no_hole():
     directions, points = plane_of_rays()
     seen = np.ones(169, dtype=bool)
@@ -187,8 +204,10 @@ def test_the_spacing_of_rays_is_that_of_their_grid_and_of_different_directions_a
     grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     directions = np.column_stack([np.sqrt(1 - (grid**2).sum(axis=1)), grid])
     inside = (np.abs(grid) < 0.06).all(axis=1)
-    # four at one step and two of the four at its diagonal
-    np.testing.assert_allclose(ray_spacing(directions)[inside], 0.01 * (4 + 2 * math.sqrt(2)) / 6, rtol=0.01)
+    # four at one step and up to four at its diagonal, two on average
+    spacing = ray_spacing(directions)[inside]
+    assert ((spacing > 0.0099) & (spacing < 0.01 * (1 + math.sqrt(2)) / 2 * 1.02)).all()
+    assert spacing.mean() == pytest.approx(0.01 * (4 + 2 * math.sqrt(2)) / 6, rel=0.03)
     twice = np.concatenate([directions, directions])
     np.testing.assert_array_equal(ray_spacing(twice)[:441], ray_spacing(directions))
     assert np.isinf(ray_spacing(directions[:1])).all()

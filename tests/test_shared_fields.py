@@ -166,15 +166,15 @@ def test_designs_pass_the_independent_checker(name):
 
 @pytest.mark.parametrize("name", ["bandwidth", "bins", "all"])
 @pytest.mark.parametrize("count", [15, 60, 151])
-def test_a_bandwidth_holds_at_the_own_count_and_in_proportion_at_others(name, count):
+def test_a_bandwidth_holds_at_every_number_of_rays(name, count):
     budget = {"bin_ps": 100.0, "bits_per_bin": 40, "rate_hz": 10, **RULES[name]["budget"]}
     model = Bandwidth(budget["bin_ps"], budget["bits_per_bin"], budget["rate_hz"])
     design = made(constraints=RULES[name]).design
     rays = lay_out(design, count, SAMPLES, gates="ray")
-    allowed = budget["bandwidth_mbps"] * count / 60
+    allowed = budget["bandwidth_mbps"]
     assert model.mbps(rays) <= allowed * (1 + 1e-12)
-    # and is made use of: fewer gates than the budget pays for would be a waste
-    assert model.mbps(rays) > 0.85 * allowed
+    # and is made use of: fewer gates than the budget pays for would be a waste, unless few rays need no more
+    assert model.mbps(rays) > 0.85 * allowed or count < 60
 
 
 def test_each_ray_keeps_the_bounds_of_its_own_sensor():
@@ -186,14 +186,14 @@ def test_each_ray_keeps_the_bounds_of_its_own_sensor():
 
 
 def test_a_bandwidth_is_no_limit_where_there_is_none():
-    model, limit = bandwidth_limit(DESIGN, Constraints(), 60)
+    model, limit = bandwidth_limit(Constraints(), 60)
     assert limit is None
     assert model == Bandwidth()
 
 
 def test_one_bin_per_ray_is_the_least():
     rules = Constraints.from_mapping({"budget": {"bandwidth_mbps": 0.001}}, where="test")
-    assert bandwidth_limit(DESIGN, rules, 60)[1] == 60
+    assert bandwidth_limit(rules, 60)[1] == 60
 
 
 def test_rays_of_several_places_start_at_the_origins_of_their_sensors():

@@ -102,6 +102,13 @@ class Fitter:
         samples = self.base if factor is None else self.base.reweighted(factor.log_factor(self.base.points))
         return weighting.spread(samples, self.order.run.config.seed)
 
+    def usable(self, weighting: Weighting) -> Weighting:
+        """The weighting without its spread in range where samples are moved and weighed anew."""
+        if not weighting.range_spread_m or self.may_spread:
+            return weighting
+        self.console.note("note: samples that are aimed anew are not spread in range, as they were for the design")
+        return replace(weighting, range_spread_m=0.0)
+
     def retarget(self, factor: Reweighting | None) -> Callable[[np.ndarray], np.ndarray]:
         """log p* with a factor; the target itself is prepared once."""
         if factor is None:

@@ -135,7 +135,7 @@ def ray_gates(design: Design, heard: Heard, sensor: np.ndarray, samples: Samples
     constraints = Constraints.from_mapping(design.constraints, where=f"constraints of {design.name}")
     count = len(design.sensors)
     bounds = bounds_of(constraints, samples.space, tuple(range(count)), interval_factor(design.level)).take(sensor)
-    model, limit = bandwidth_limit(design, constraints, len(sensor))
+    model, limit = bandwidth_limit(constraints, len(sensor))
     return gates_within(heard, bounds, design.level, model, limit)
 
 
@@ -145,7 +145,7 @@ def narrowed(design: Design, gates: np.ndarray, sensor: np.ndarray, samples: Sam
     Rays of which too little is known count as hearing most in the middle of their gates.
     """
     constraints = Constraints.from_mapping(design.constraints, where=f"constraints of {design.name}")
-    model, limit = bandwidth_limit(design, constraints, len(gates))
+    model, limit = bandwidth_limit(constraints, len(gates))
     if limit is None or int(model.bins(gates[:, 1] - gates[:, 0]).sum()) <= limit:
         return gates
     shape = ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES)
@@ -154,15 +154,14 @@ def narrowed(design: Design, gates: np.ndarray, sensor: np.ndarray, samples: Sam
     return ray_gates(design, Heard(ranges.reshape(-1), np.ones(ranges.size), ray, len(gates)), sensor, samples)
 
 
-def bandwidth_limit(design: Design, constraints: Constraints, rays: int) -> tuple[Bandwidth, int | None]:
-    """The read-out model, and how many bins a number of rays may take: in proportion to the design's own number."""
+def bandwidth_limit(constraints: Constraints, rays: int) -> tuple[Bandwidth, int | None]:
+    """The read-out model, and how many bins a number of rays may take in the bandwidth budget."""
     budget = constraints.budget
     model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
     if budget.bandwidth_mbps is None:
         return model, None
     one_bin = model.mbps_of_widths(np.zeros(1))
-    share = rays / (design.rays or rays)
-    return model, max(int(share * budget.bandwidth_mbps / one_bin), rays)
+    return model, max(int(budget.bandwidth_mbps / one_bin), rays)
 
 
 def _seen(design: Design, samples: Samples) -> _Seen:

@@ -28,8 +28,6 @@ LARGEST_DRAW = 200_000  # candidates per round; bounds memory
 DRAW_ROUNDS = 12
 # One place in a thousand is so many mean spacings of a cloud's points from all of them: 2 sqrt(ln(1000) / pi)
 GAP_SPACINGS = 2.97
-# A ray is surrounded by six others on a hexagonal grid, the densest there is.
-SPACING_NEIGHBOURS = 6
 # Of 2.5, 3, 3.5, 4 and 5 spacings this one gives the plain cropped grid its least error on faces, from 100 to 576 rays.
 MOST_SPACINGS = 3.0
 
@@ -170,22 +168,35 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def ray_spacing(directions: np.ndarray) -> np.ndarray:
-    """How far apart rays are where each of them looks: the mean distance to its nearest others on the unit sphere.
+    """How far apart rays are where each of them looks: the mean distance to its neighbours on the unit sphere.
+
+    Neighbours are those of the Delaunay triangulation of all rays: the rings of a spinning scanner have neighbours in
+    other rings, although many rays of their own are nearer.
 
     Arguments:
         directions: Unit vectors of all rays that were fired, with a return or without, shape (N, 3).
 
     Returns:
-        Chords of the unit sphere, shape (N,); infinite for one direction alone.
+        Chords of the unit sphere, shape (N,); infinite where fewer than three directions, or all on a line, have no
+        triangles.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import Delaunay, QhullError
 
     distinct, inverse = np.unique(directions, axis=0, return_inverse=True)
-    count = min(SPACING_NEIGHBOURS, len(distinct) - 1)
-    if count < 1:
-        return np.full(len(directions), np.inf)
-    apart = cKDTree(distinct).query(distinct, k=count + 1)[0][:, 1:].mean(axis=1)
-    return apart[inverse.reshape(-1)]
+    spacing = np.full(len(distinct), np.inf)
+    if len(distinct) >= 3:
+        plane, seen = _stereographic(distinct)
+        try:
+            faces = Delaunay(plane[seen]).simplices
+        except QhullError:  # all of them collinear
+            return spacing[inverse.reshape(-1)]
+        edges = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+        length = np.linalg.norm(np.subtract(*distinct[seen][edges].transpose(1, 0, 2)), axis=1)
+        ends, count = edges.reshape(-1), int(seen.sum())
+        met = np.bincount(ends, minlength=count)
+        total = np.bincount(ends, np.repeat(length, 2), count)
+        spacing[seen] = np.divide(total, met, out=np.full(count, np.inf), where=met > 0)
+    return spacing[inverse.reshape(-1)]
 
 
 def delaunay_surface(

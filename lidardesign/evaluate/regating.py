@@ -64,7 +64,7 @@ class Gating:
         constraints = Constraints.from_mapping(design.constraints, where=f"constraints of {design.name}")
         sensors = tuple(range(len(design.sensors)))
         bounds = bounds_of(constraints, self.space, sensors, interval_factor(design.level)).take(rays.sensor[known])
-        model, limit = bandwidth_limit(design, constraints, len(rays))
+        model, limit = bandwidth_limit(constraints, len(rays))
         bins = model.bins(np.diff(rays.gate_m, axis=1)[:, 0])
         most = (int(bins.sum()) if limit is None else limit) - int(bins.sum() - bins[known].sum())
         own = Heard(heard.range_m, heard.weights, place[heard.ray], len(known))
