@@ -14,6 +14,7 @@ from lidardesign.cli.runs import check_choice, check_name, need_run, open_target
 from lidardesign.cli.weighting import Weighting
 
 if TYPE_CHECKING:
+    from lidardesign.cli.console import Console
     from lidardesign.cli.runs import Run
     from lidardesign.design.constraints import Constraints
     from lidardesign.design.sensor import Design
@@ -75,7 +76,7 @@ def constrain(
             gates=gates,
             level=check_level(_level(level, design, run.task.defaults.level)),
             at={**(design.at if design else {}), **condition},
-            weighting=_weighting(weights, design),
+            weighting=_weighting(weights, design, console),
             refine=refine,
         )
 
@@ -97,11 +98,14 @@ def _usual(constraints: Constraints, design: Design | None, run: Run) -> str:
     return fitted_layout(design.layout) if design else usual_layout(run)
 
 
-def _weighting(given: list[str] | None, design: Design | None) -> Weighting:
+def _weighting(given: list[str] | None, design: Design | None, console: Console) -> Weighting:
     """How samples are weighted: by the options, else as they were for the design."""
-    if given:
-        return Weighting(tuple(given))
-    return Weighting.of(design) if design else Weighting()
+    own = Weighting.of(design) if design else Weighting()
+    if not given:
+        return own
+    if own.reweighting is not None:
+        console.note("note: with --weight the design's refinement is left out; --refine finds another")
+    return Weighting(tuple(given))
 
 
 def _level(given: float | None, design: Design | None, usual: float) -> float:
