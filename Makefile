@@ -1,4 +1,4 @@
-# make demo   sets everything up in .venv and runs the whole chain on the built-in face task, about two minutes
+# make demo   sets everything up in .venv and runs the whole chain on the built-in face task, about three minutes
 # make test   sets up, lints and runs the tests, a few minutes; also installs the light-transport simulator, 200 MB
 # make fuzz   reads 100,000 damaged files, an hour on two cores; the result goes to docs/soak
 # make coverage  measures the lines and branches that the tests take, an hour
