@@ -377,7 +377,7 @@ def draw(everything: Mapping[str, dict[str, Any]], path: Path) -> None:
                 axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
                 axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
                 axis.set_minor_formatter(NullFormatter())
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=100)
 
 
 def curves(found: dict[str, Any]) -> dict[str, dict[str, list[float]]]:
