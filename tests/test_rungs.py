@@ -1,5 +1,7 @@
 """Which rung of a ladder is chosen, and what its verdict says."""
 
+import gc
+
 import numpy as np
 
 from lidardesign.evaluate.rungs import Ladder, Rung, timed
