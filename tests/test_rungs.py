@@ -2,8 +2,6 @@
 
 import mmap
 
-import numpy as np
-
 from lidardesign.evaluate.rungs import Ladder, Rung, timed
 
 
