@@ -29,6 +29,8 @@ BEGUN = b"begun\n"
 START_SECONDS = 60.0
 # An import that can be interrupted was interrupted by then, and said so [s].
 GRACE_SECONDS = 2.0
+# The exit code of a probing process that could not say what it found.
+UNHEARD = 117
 
 
 @dataclass(frozen=True)
@@ -76,10 +78,11 @@ class Probing:
         begun, line = self._next(time.monotonic() + START_SECONDS)
         if line != BEGUN:
             return None
-        _, line = self._next(begun + self._seconds + GRACE_SECONDS)
+        deadline = begun + self._seconds + GRACE_SECONDS
+        _, line = self._next(deadline)
         if line:
             return _read(line)
-        died_of = None if line is None else self._died_of()
+        died_of = None if line is None else self._died_of(deadline)
         return Probe(error=died_of or f"was not imported within {self._seconds:g} s", contained=True)
 
     def end(self) -> None:
@@ -103,12 +106,14 @@ class Probing:
                 self._lines.put((time.monotonic(), line))
         self._lines.put((time.monotonic(), b""))
 
-    def _died_of(self) -> str | None:
-        """How it ended; None where it only closed its pipe and hangs."""
+    def _died_of(self, deadline: float) -> str | None:
+        """How it ended; None where it only closed its pipe and hangs until the deadline and a little longer."""
         try:
-            code = self._process.wait(GRACE_SECONDS)
+            code = self._process.wait(max(deadline - time.monotonic(), 0.0) + GRACE_SECONDS)
         except subprocess.TimeoutExpired:
             return None
+        if code == UNHEARD:
+            return "closes files that are not its own while it is imported"
         if code < 0:
             return f"crashes while it is imported ({signal.strsignal(-code)})"
         return f"ends the program while it is imported (exit code {code})"
@@ -144,6 +149,9 @@ def probed(offers: list[EntryPoint], seconds: float) -> list[Probe | None]:
 
 def answer(result: Any, document: dict[str, Any]) -> None:
     """Write a probe's answer and end the probing process: threads and exit handlers of the plugin end with it."""
-    result.write(json.dumps(document).encode() + b"\n")
-    result.flush()
+    try:
+        result.write(json.dumps(document).encode() + b"\n")
+        result.flush()
+    except OSError:
+        os._exit(UNHEARD)
     os._exit(0)

@@ -19,7 +19,7 @@ from importlib.metadata import EntryPoint, distributions, entry_points
 from typing import Any
 
 from lidardesign.errors import ConfigError, LidardesignError, PluginError
-from lidardesign.probe import BEGUN, PROBING, Probe, answer, probed
+from lidardesign.probe import BEGUN, PROBING, START_SECONDS, Probe, answer, probed
 from lidardesign.run.clock import phase
 from lidardesign.task import API_VERSION, Defaults, Metric, Task, TaskConfig
 
@@ -186,8 +186,8 @@ def answer_probe(request: dict[str, Any]) -> None:
     name, seconds = request["name"], request["seconds"]
     result.write(BEGUN)
     result.flush()
-    # ends this process even where nobody is left to do it
-    faulthandler.dump_traceback_later(2 * seconds + IMPORT_SECONDS, exit=True, file=nowhere)
+    # ends this process even where nobody is left to do it, and long after whoever asked has stopped waiting
+    faulthandler.dump_traceback_later(seconds + START_SECONDS, exit=True, file=nowhere)
     try:
         answer(result, {"summary": _imported(name, EntryPoint(name, request["value"], GROUP), seconds).summary})
     except PluginError as error:
