@@ -33,7 +33,13 @@ $(BIN)/.transport: $(BIN)/.ready
 		&& touch $@ || echo "It could not be installed; its tests are skipped"
 	@tools/install-llvm.sh $(BIN)/python
 
-test: $(BIN)/.ready $(BIN)/.transport
+$(BIN)/.consumers: $(BIN)/.ready
+	@echo "Adding the readers of exported files: once, 200 MB"
+	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[consumers]' \
+		&& touch $@ || echo "They could not be installed; their tests are skipped"
+	@tools/install-consumers.sh
+
+test: $(BIN)/.ready $(BIN)/.transport $(BIN)/.consumers
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 

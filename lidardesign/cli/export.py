@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -30,6 +32,16 @@ if TYPE_CHECKING:
 WITHOUT_RAYS = ("sensors-csv",)
 
 
+@dataclass(frozen=True)
+class _Asked:
+    """What is exported of a design: how many rays, at which condition, at how many frames per second."""
+
+    rays: int | None
+    at: Mapping[str, float]
+    rate_hz: float | None
+    seed: int
+
+
 def export(
     design: Annotated[Path | None, typer.Argument(metavar="DESIGN", help="A design file.", show_default=False)] = None,
     format_: Annotated[
@@ -42,6 +54,15 @@ def export(
     ] = None,
     rays: options.RayCount = None,
     at: options.At = None,
+    rate_hz: Annotated[
+        float | None,
+        typer.Option(
+            "--rate-hz",
+            metavar="HZ",
+            help="Frames per second, in formats that hold it.",
+            show_default="10, as in the read-out model",
+        ),
+    ] = None,
     list_formats: Annotated[bool, typer.Option("--list", help="List the formats.")] = False,
     seed: options.Seed = None,
     json: options.Json = False,
@@ -50,26 +71,36 @@ def export(
 ) -> None:
     """Write a design in another program's format."""
     with command(json=json, quiet=quiet, debug=debug) as console:
+        if rate_hz is not None and not (math.isfinite(rate_hz) and rate_hz > 0):
+            raise ConfigError(f"{rate_hz}", where="--rate-hz", allowed="a finite number above 0")
         if list_formats:
             _list(console)
         else:
-            _export(design, format_, out, rays, parse_at(at), seed or 0, console)
+            _export(design, format_, out, _Asked(rays, parse_at(at), rate_hz, seed or 0), console)
 
 
 def _list(console: Console) -> None:
     from lidardesign.export.registry import EXPORTERS
 
     formats = [
-        {"name": name, "suffix": exporter.suffix, "summary": exporter.summary} for name, exporter in EXPORTERS.items()
+        {
+            "name": name,
+            "suffix": exporter.suffix,
+            "summary": exporter.summary,
+            "reader": exporter.reader,
+            "checked": exporter.checked,
+            "folder": exporter.folder,
+        }
+        for name, exporter in EXPORTERS.items()
     ]
 
     def show(rich: RichConsole) -> None:
         from rich.markup import escape
         from rich.table import Table
 
-        table = Table("format", "suffix", "what it is")
+        table = Table("format", "suffix", "what it is", "for", "how that is checked")
         for entry in formats:
-            table.add_row(*(escape(entry[key]) for key in ("name", "suffix", "summary")))
+            table.add_row(*(escape(str(entry[key])) for key in ("name", "suffix", "summary", "reader", "checked")))
         rich.print(table)
 
     console.result({"formats": formats}, show, show_costs=False)
@@ -79,9 +110,7 @@ def _export(
     path: Path | None,
     name: str | None,
     out: Path | None,
-    rays: int | None,
-    at: Mapping[str, float],
-    seed: int,
+    asked: _Asked,
     console: Console,
 ) -> None:
     with phase("libraries"):
@@ -101,16 +130,16 @@ def _export(
     if target.exists() and path.exists() and target.samefile(path):
         raise ConfigError("would overwrite the design itself", where=str(target), hint="give another --out")
     folder = folder_of(design, path)
-    design, laid_out = design_and_rays(design, path, exporter.name, rays, at, seed, console)
+    design, laid_out = design_and_rays(design, path, exporter.name, asked.rays, asked.at, asked.seed, console)
     with phase("writing"):
-        notes = list(exporter.write(design, laid_out, target))
+        notes = list(exporter.write(design, laid_out, target, asked.rate_hz))
     with phase("reading back"):
         rounding = exporter.rounding(design, laid_out, target)
     for note in notes:
         console.note(f"note: {note}")
     document = {
         "design": str(path), "format": name, "out": str(target), "rays": len(laid_out),
-        "bytes": target.stat().st_size if target.is_file() else None, "notes": notes,
+        "bytes": _bytes_of(target), "notes": notes,
         "error_estimates": as_documents(rounding),
     }  # fmt: skip
     content = f"{len(laid_out)} rays" if len(laid_out) else f"{len(design.sensors)} sensors"
@@ -123,6 +152,13 @@ def _export(
         rich.print(_shown_rounding(rounding), soft_wrap=True, markup=False)
 
     console.result(document, show)
+
+
+def _bytes_of(target: Path) -> int | None:
+    """What was written [bytes], of a folder all files; None for what is no file, as a pipe."""
+    if target.is_dir():
+        return sum(path.stat().st_size for path in target.rglob("*") if path.is_file())
+    return target.stat().st_size if target.is_file() else None
 
 
 def _shown_rounding(rounding: Mapping[str, Estimate]) -> str:
