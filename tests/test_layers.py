@@ -22,6 +22,8 @@ LAYERS = {
     "lidardesign.estimates": 1,
     "lidardesign.numerics": 0,
     "lidardesign.run": 0,
+    "lidardesign.deprecation": 1,
+    "lidardesign.run.streams": 1,
     "lidardesign.run.files": 1,
     "lidardesign.run.processes": 1,
     "lidardesign.run.npz": 1,

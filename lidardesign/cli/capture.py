@@ -13,9 +13,11 @@ from lidardesign.cli.console import Console, command
 from lidardesign.cli.designs import number
 from lidardesign.cli.grids import print_table
 from lidardesign.cli.runs import check_choice, folder_of, parse_at, read_design
+from lidardesign.cli.streams import claim_stdout, written_file
 from lidardesign.cli.times import keep_times
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.clock import phase
+from lidardesign.run.streams import is_input, is_there
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
@@ -94,6 +96,7 @@ def capture(
 ) -> None:
     """Score designs by a captured scan: with their gates, without, and beside even rays."""
     with command(json=json, quiet=quiet, debug=debug) as console:
+        claim_stdout(console, csv=csv)
         _check_numbers(false_alarm, within_deg, outlier_mm)
         check_choice(estimator, "--estimator", ESTIMATORS)
         with phase("libraries"):
@@ -114,8 +117,8 @@ def capture(
         if csv is not None:
             from lidardesign.evaluate.capture_table import write_csv
 
-            with phase("writing"):
-                write_csv(found, csv)
+            with phase("writing"), written_file(csv) as file:
+                write_csv(found, file)
         for folder in _folders(designs):
             keep_times(folder, "capture", console)
         document = {"capture": str(file), **found.as_dict(), "files": [] if csv is None else [str(csv)]}
@@ -159,9 +162,9 @@ def _listed_rays(path: Path, count: int | None, at: dict[str, float], seed: int,
     from lidardesign.cli.export import design_and_rays
     from lidardesign.export.galvo import is_galvo_file, read
 
-    if not path.exists():
+    if not is_there(path):
         raise DataError("no such design", where=str(path), hint="give design files or files of export --format galvo")
-    if is_galvo_file(path):
+    if not is_input(path) and is_galvo_file(path):
         if count is not None or at:
             raise ConfigError(
                 "holds its rays already",
@@ -178,7 +181,8 @@ def _folders(designs: list[Path]) -> list[Path]:
     from lidardesign.design.files import load_design
     from lidardesign.export.galvo import is_galvo_file
 
-    found = [folder_of(load_design(path), path) for path in designs if not is_galvo_file(path)]
+    files = [path for path in designs if not (is_input(path) or is_galvo_file(path))]
+    found = [folder_of(load_design(path), path) for path in files]
     return list(dict.fromkeys(folder for folder in found if folder is not None))
 
 

@@ -20,6 +20,7 @@ from lidardesign.cli.environment import TerminatedError
 from lidardesign.cli.times import show_times
 from lidardesign.errors import LidardesignError
 from lidardesign.run.clock import Clock, peak_memory_bytes, running
+from lidardesign.run.streams import offered_input
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
@@ -143,7 +144,8 @@ def command(*, json: bool, quiet: bool, debug: bool) -> Iterator[Console]:
     """
     console = Console(json=json, quiet=quiet, debug=debug, output=sys.stdout)
     try:
-        with contextlib.redirect_stdout(sys.stderr) if json else contextlib.nullcontext(), running(console.clock):
+        aside = contextlib.redirect_stdout(sys.stderr) if json else contextlib.nullcontext()
+        with aside, running(console.clock), offered_input():
             yield console
         console.output.flush()
     except typer.Exit:

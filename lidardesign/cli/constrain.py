@@ -9,6 +9,7 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.console import command
+from lidardesign.cli.dry_run import DryRun
 from lidardesign.cli.fit import GATES, LAYOUTS, check_level, check_sensors, fit_and_write, load_libraries, usual_layout
 from lidardesign.cli.runs import check_choice, check_name, need_run, open_target, parse_at, sensor_count
 from lidardesign.cli.weighting import Weighting
@@ -47,6 +48,7 @@ def constrain(
     weights: options.Weights = None,
     refine: options.Refine = None,
     name: options.Name = "constrained",
+    dry_run: DryRun = False,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -78,6 +80,7 @@ def constrain(
             at={**(design.at if design else {}), **condition},
             weighting=_weighting(weights, design, console),
             refine=refine,
+            dry_run=dry_run,
         )
 
 

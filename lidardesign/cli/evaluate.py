@@ -15,17 +15,21 @@ import typer
 from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
 from lidardesign.cli.designs import number
+from lidardesign.cli.dry_run import DryRun, tell_plan
 from lidardesign.cli.physics import Detector, Effects, RangeTolerance, ReturnTolerance, planner_of
 from lidardesign.cli.runs import open_run, read_design, run_of
 from lidardesign.cli.scores import show_evaluation
 from lidardesign.cli.searches import CmaSeconds, check_cma_seconds, searching, told
+from lidardesign.cli.streams import claim_stdout, is_output, written_file
 from lidardesign.cli.times import keep_times
 from lidardesign.errors import ConfigError, DataError, ThresholdError
 from lidardesign.run.clock import phase
+from lidardesign.run.streams import is_there
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
+    from lidardesign.cli.dry_run import Plan
     from lidardesign.cli.runs import Run
     from lidardesign.design.sensor import Design
     from lidardesign.evaluate.score import Evaluation, EvaluationRequest
@@ -132,6 +136,7 @@ def evaluate(
     fail_above: FailAbove = None,
     workers: Workers = "1",
     accuracy: WithAccuracy = False,
+    dry_run: DryRun = False,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -139,16 +144,12 @@ def evaluate(
 ) -> None:
     """Score designs on held-out scenes against the baselines uniform, random and bounding."""
     with command(json=json, quiet=quiet, debug=debug) as console:
-        if fail_above is not None and not math.isfinite(fail_above):
-            raise ConfigError(f"{fail_above}", where="--fail-above", allowed="a finite number")
+        claim_stdout(console, dry_run=dry_run, csv=csv, report=report)
         with phase("libraries"):
             import lidardesign.evaluate.score  # noqa: F401
-            from lidardesign.evaluate.workers import check_workers
             from lidardesign.run.config import judged_by
 
-        wanted = check_workers(workers)
-        _check_baselines(baseline or [])
-        check_cma_seconds(cma_seconds, baseline or [])
+        wanted = _checked(workers, baseline or [], cma_seconds, fail_above)
         planner, audit = planner_of(effects, detector, range_tolerance_mm, return_tolerance)
         entries, runs = _collect(targets, console)
         run = learned = _common_run(_named_apart(entries), runs)
@@ -158,12 +159,18 @@ def evaluate(
             run = replace(run, config=judged_by(run.task, run.config, overrides))
         if range_tolerance_mm is None:
             planner = replace(planner, tolerance=planner.tolerated.within(run.task.metric))
+        if dry_run:
+            outputs = {"--report": report, "--plots": plots, "--csv": csv}
+            further = {"--effects": effects, "--detector": detector, "--set": overrides, "--accuracy": accuracy}
+            return tell_plan(_plan(run, entries, rays, baseline or [], outputs, further), console)
         request = replace(_request(run, entries, rays, baseline or [], seed), planner=planner, audit=audit)
+        files = (report, plots, csv)
         evaluation = _evaluate_with(wanted, replace(request, cma=searching(cma_seconds)), console)
-        written = _write_files(evaluation, request, report, plots, csv)
-        if accuracy:  # it takes minutes: what was scored by then is written already
+        # accuracy takes minutes: what was scored by then is written already
+        written = _write_files(evaluation, request, *(None if accuracy and is_output(path) else path for path in files))
+        if accuracy:
             evaluation = _with_accuracy(evaluation, request, learned, console)
-            written = _write_files(evaluation, request, report, plots, csv)
+            written = _write_files(evaluation, request, *files)
         document = {**evaluation.as_dict(), "set": overrides or [], "files": [str(path) for path in written]}
         keep_times(run.folder, "evaluate", console)
         console.result(document, lambda rich: _show(evaluation, document, written, rich))
@@ -179,11 +186,45 @@ def _show(evaluation: Evaluation, document: dict[str, Any], written: list[Path],
     show_evaluation(document, written, rich)
 
 
-def _check_baselines(names: list[str]) -> None:
-    from lidardesign.evaluate.baselines import baseline_of
+def _checked(
+    workers: str, baselines: list[str], cma_seconds: float | None, fail_above: float | None
+) -> int | str | None:
+    """What the options of an evaluation say where nothing has to be read for it; returns the workers.
 
-    for name in names:
+    Raises:
+        ConfigError: One of them says nothing that can be done.
+    """
+    from lidardesign.evaluate.baselines import baseline_of
+    from lidardesign.evaluate.workers import check_workers
+
+    if fail_above is not None and not math.isfinite(fail_above):
+        raise ConfigError(f"{fail_above}", where="--fail-above", allowed="a finite number")
+    wanted = check_workers(workers)
+    for name in baselines:
         baseline_of(name, where="--baseline")
+    check_cma_seconds(cma_seconds, baselines)
+    return wanted
+
+
+def _plan(
+    run: Run,
+    entries: list[_Entry],
+    rays: list[int] | None,
+    baselines: list[str],
+    outputs: dict[str, Path | None],
+    settings: dict[str, Any],
+) -> Plan:
+    """What this evaluation would do."""
+    from lidardesign.cli.dry_designs import evaluate_plan
+
+    return evaluate_plan(
+        run,
+        [(entry.design.name, entry.path) for entry in entries],
+        rays=sorted(set(rays or run.task.defaults.rays)),
+        baselines=tuple(dict.fromkeys([*ALWAYS, *baselines])),
+        outputs=outputs,
+        settings=settings,
+    )
 
 
 @phase("designs")
@@ -195,7 +236,7 @@ def _collect(targets: list[Path], console: Console) -> tuple[list[_Entry], list[
         if target.is_dir():
             runs.append(open_run(target))
             entries += [_Entry(read_design(path, console), path, runs[-1]) for path in runs[-1].designs()]
-        elif not target.exists():
+        elif not is_there(target):
             raise DataError("no such run or design", where=str(target), hint="give run folders or design files")
         else:
             design = read_design(target, console)
@@ -347,14 +388,16 @@ def _write_files(
     if csv is not None:
         from lidardesign.evaluate.tables import write_csv
 
-        write_csv(evaluation, csv)
+        with written_file(csv) as file:
+            write_csv(evaluation, file)
         written.append(csv)
     if plots is not None:
         from lidardesign.evaluate.plots import write_plots
 
         written += write_plots(evaluation, plots)
     if report is not None:
-        _write_report(evaluation, request, report)
+        with written_file(report) as file:
+            _write_report(evaluation, request, file)
         written.append(report)
     return written
 

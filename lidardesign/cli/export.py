@@ -12,19 +12,24 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
+from lidardesign.cli.dry_run import DryRun, tell_plan
 from lidardesign.cli.runs import folder_of, parse_at, read_design
+from lidardesign.cli.streams import claim_stdout, is_output, written_file
 from lidardesign.cli.times import keep_times
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
+from lidardesign.run.streams import is_input
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
+    from lidardesign.cli.dry_run import Plan
     from lidardesign.cli.runs import Run
     from lidardesign.design.samples import Samples
     from lidardesign.design.sensor import Design
     from lidardesign.design.support import Retarget
     from lidardesign.estimates import Estimate
+    from lidardesign.export.registry import Exporter
     from lidardesign.simulate.returns import Rays
 
 
@@ -64,6 +69,7 @@ def export(
         ),
     ] = None,
     list_formats: Annotated[bool, typer.Option("--list", help="List the formats.")] = False,
+    dry_run: DryRun = False,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -76,7 +82,8 @@ def export(
         if list_formats:
             _list(console)
         else:
-            _export(design, format_, out, _Asked(rays, parse_at(at), rate_hz, seed or 0), console)
+            claim_stdout(console, dry_run=dry_run, out=out)
+            _export(design, format_, out, _Asked(rays, parse_at(at), rate_hz, seed or 0), console, dry_run=dry_run)
 
 
 def _list(console: Console) -> None:
@@ -112,34 +119,33 @@ def _export(
     out: Path | None,
     asked: _Asked,
     console: Console,
+    *,
+    dry_run: bool,
 ) -> None:
     with phase("libraries"):
         import lidardesign.cli.layouts
         import lidardesign.design.rays  # noqa: F401
         from lidardesign.estimates import as_documents
-        from lidardesign.export.registry import EXPORTERS
 
     if path is None:
         raise ConfigError("no design was given", where="DESIGN", hint="lidardesign export --list shows the formats")
-    if name not in EXPORTERS:
-        found = "no format was given" if name is None else f"unknown format {name!r}"
-        raise ConfigError(found, where="--format", allowed=", ".join(EXPORTERS))
+    exporter = _exporter(name)
     design = read_design(path, console)
-    exporter = EXPORTERS[name]
-    target = out if out is not None else path.with_suffix(exporter.suffix)
-    if target.exists() and path.exists() and target.samefile(path):
-        raise ConfigError("would overwrite the design itself", where=str(target), hint="give another --out")
+    target = _target(path, out, exporter)
     folder = folder_of(design, path)
+    if dry_run:
+        return tell_plan(_plan(design, path, target, exporter, asked), console)
     design, laid_out = design_and_rays(design, path, exporter.name, asked.rays, asked.at, asked.seed, console)
-    with phase("writing"):
-        notes = list(exporter.write(design, laid_out, target, asked.rate_hz))
-    with phase("reading back"):
-        rounding = exporter.rounding(design, laid_out, target)
+    with written_file(target, exporter.suffix) as file:
+        with phase("writing"):
+            notes = list(exporter.write(design, laid_out, file, asked.rate_hz))
+        with phase("reading back"):
+            rounding = exporter.rounding(design, laid_out, file)
+        size = _bytes_of(file)
     for note in notes:
         console.note(f"note: {note}")
     document = {
-        "design": str(path), "format": name, "out": str(target), "rays": len(laid_out),
-        "bytes": _bytes_of(target), "notes": notes,
+        "design": str(path), "format": name, "out": str(target), "rays": len(laid_out), "bytes": size, "notes": notes,
         "error_estimates": as_documents(rounding),
     }  # fmt: skip
     content = f"{len(laid_out)} rays" if len(laid_out) else f"{len(design.sensors)} sensors"
@@ -152,6 +158,76 @@ def _export(
         rich.print(_shown_rounding(rounding), soft_wrap=True, markup=False)
 
     console.result(document, show)
+
+
+def _exporter(name: str | None) -> Exporter:
+    from lidardesign.export.registry import EXPORTERS
+
+    if name not in EXPORTERS:
+        found = "no format was given" if name is None else f"unknown format {name!r}"
+        raise ConfigError(found, where="--format", allowed=", ".join(EXPORTERS))
+    return EXPORTERS[name]
+
+
+def _target(path: Path, out: Path | None, exporter: Exporter) -> Path:
+    """Where to write.
+
+    Raises:
+        ConfigError: Over the design, to standard output a folder, or nowhere that is known.
+    """
+    if out is None and is_input(path):
+        raise ConfigError(
+            "a design from standard input stands beside nothing", where="DESIGN -", hint="give --out PATH"
+        )
+    target = out if out is not None else path.with_suffix(exporter.suffix)
+    if is_output(target) and exporter.folder:
+        raise ConfigError(f"{exporter.name} is a folder of files", where="--out -", hint="give --out FOLDER")
+    if target.exists() and path.exists() and target.samefile(path):
+        raise ConfigError("would overwrite the design itself", where=str(target), hint="give another --out")
+    return target
+
+
+def _plan(design: Design, path: Path, target: Path, exporter: Exporter, asked: _Asked) -> Plan:
+    """What this export would do.
+
+    Raises:
+        ConfigError: The design is nowhere at such a condition, or leaves its rays open without a run.
+    """
+    from lidardesign.cli.dry_designs import export_plan
+    from lidardesign.design.rays import own_count
+    from lidardesign.design.track import placed
+
+    if asked.at or design.track is not None:
+        placed(design, asked.at)
+    count = asked.rays
+    if exporter.name in WITHOUT_RAYS:
+        count = None
+    elif count is None:
+        count = _largest_budget(design, path) if _is_open(design) else own_count(design)
+    return export_plan(
+        path,
+        target,
+        name=exporter.name,
+        summary=exporter.summary,
+        count=count,
+        at=asked.at,
+        folder=folder_of(design, path),
+        writes_folder=exporter.folder,
+    )
+
+
+def _largest_budget(design: Design, path: Path) -> int:
+    """The rays of a design that leaves them open: the largest number that its task is evaluated at.
+
+    Raises:
+        ConfigError: Its run is not there.
+    """
+    from lidardesign.cli.runs import run_of
+
+    run = run_of(design, path)
+    if run is None:
+        raise ConfigError("the design leaves the number of rays open", where=str(path), hint="give --rays N")
+    return max(run.task.defaults.rays)
 
 
 def _bytes_of(target: Path) -> int | None:
@@ -189,10 +265,7 @@ def design_and_rays(
         # refuses a wrong place before anything is fitted
         placed(design, at)
     if count is None and _is_open(design) and name not in WITHOUT_RAYS:
-        run = run_of(design, path)
-        if run is None:
-            raise ConfigError("the design leaves the number of rays open", where=str(path), hint="give --rays N")
-        count = max(run.task.defaults.rays)
+        count = _largest_budget(design, path)
         console.note(f"note: the design leaves the number of rays open; {count} is the task's largest budget")
     samples, retarget = None, None
     if count is not None and may_need_samples(design) and (_is_open(design) or count != own_count(design)):

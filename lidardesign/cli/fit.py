@@ -10,6 +10,7 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
+from lidardesign.cli.dry_run import DryRun, tell_plan
 from lidardesign.cli.runs import check_choice, check_name, open_run, parse_at, provenance, sensor_count
 from lidardesign.cli.times import keep_times
 from lidardesign.cli.weighting import Weighting
@@ -41,6 +42,7 @@ def fit(
     weights: options.Weights = None,
     refine: options.Refine = None,
     name: options.Name = "fit",
+    dry_run: DryRun = False,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -74,6 +76,7 @@ def fit(
             at=condition,
             weighting=Weighting(tuple(weights or ())),
             refine=refine,
+            dry_run=dry_run,
         )
 
 
@@ -133,6 +136,7 @@ def fit_and_write(
     at: Mapping[str, float] | None = None,
     weighting: Weighting,
     refine: int | None = None,
+    dry_run: bool = False,
     **choices: Any,
 ) -> None:
     """Fit a design to a run's samples, refine it if asked to, write it, and give the result.
@@ -147,8 +151,14 @@ def fit_and_write(
         at: Condition values that the design is for; without any, one for all of them.
         weighting: What the density is multiplied by.
         refine: Rounds of refinement, or None.
+        dry_run: Only say what would be done.
         choices: sensors, layout, rays, gates and level, as `lidardesign.design.fit.fit` takes them.
     """
+    if dry_run:
+        from lidardesign.cli.dry_designs import fit_plan
+
+        given = {"constraints": constraints, "at": at or {}, "weighting": weighting, "refine": refine}
+        return tell_plan(fit_plan(run, command_name, name, seed=seed, choices=choices, **given), console)
     from dataclasses import replace
 
     from lidardesign.cli.designs import show_fit, write_design

@@ -12,6 +12,7 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
+from lidardesign.cli.dry_run import DryRun, tell_plan
 from lidardesign.cli.goals import Learner, TimeBudget, Tolerance, check_met, checked_goal
 from lidardesign.cli.ranks import joined_ranks
 from lidardesign.cli.runs import check_choice
@@ -71,6 +72,7 @@ def learn(
     ] = False,
     tolerance: Tolerance = None,
     time_budget: TimeBudget = None,
+    dry_run: DryRun = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
     debug: options.Debug = False,
@@ -87,6 +89,11 @@ def learn(
         plugin = load_task(task)
         run = out if out is not None else Path("runs") / task
         job = resumed(plugin, run, goal, choices, console) if resume else started(plugin, run, goal, choices)
+        if dry_run:
+            from lidardesign.cli.dry_learn import learn_plan
+
+            tell_plan(learn_plan(job, device, config), console)
+            return
         result = _learn_in_folder(job, device, console, ranks)
         keep_times(run, "learn", console, wait_s=WAIT_S)
         result = replace(result, notes=(*result.notes, *_advice(result)))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.clock import phase
+from lidardesign.run.streams import is_there
 
 if TYPE_CHECKING:
     from lidardesign.cli.console import Console
@@ -68,16 +69,20 @@ def open_run(folder: Path) -> Run:
 
 
 def read_design(path: Path, console: Console) -> Design:
-    """A design file. One of a run that is not as it was written says so: it may be cut, or mended by hand.
+    """A design file, or standard input for `-`.
+
+    One of a run that is not as it was written says so: it may be cut, or mended by hand.
 
     Raises:
         ConfigError, DataError: It cannot be read.
     """
+    from lidardesign.cli.streams import readable
     from lidardesign.design.files import load_design
 
     difference = _difference(path)
     try:
-        design = load_design(path)
+        with readable(path) as file:
+            design = load_design(file)
     except (ConfigError, DataError) as error:
         if difference is None:
             raise
@@ -112,7 +117,7 @@ def open_target(path: Path, console: Console) -> tuple[Run | None, Design | None
     """
     if path.is_dir():
         return open_run(path), None
-    if not path.exists():
+    if not is_there(path):
         raise DataError("no such run or design", where=str(path), hint="give a run folder or a design file")
     design = read_design(path, console)
     return run_of(design, path), design

@@ -19,6 +19,7 @@ from typing import Any
 import yaml
 
 from lidardesign.errors import ConfigError, NumericalError
+from lidardesign.run.streams import is_input, read_input
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 32
@@ -84,12 +85,22 @@ class Document:
 
 
 def load_yaml(path: Path, *, max_bytes: int = MAX_BYTES) -> Document:
-    """Read a YAML file.
+    """Read a YAML file; in a command `-` is standard input.
 
     Raises:
         ConfigError: The file cannot be read, is too large, is not UTF-8, or is not in the accepted subset.
     """
     path = Path(path)
+    content = read_input("a YAML file", max_bytes) if is_input(path) else _bytes_of(path, max_bytes)
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise ConfigError("is not UTF-8 text", where=f"{path}:{line}:1", hint="save it as UTF-8") from None
+    return parse_yaml(text, where=str(path))
+
+
+def _bytes_of(path: Path, max_bytes: int) -> bytes:
     try:
         with path.open("rb") as file:
             content = file.read(max_bytes + 1)
@@ -97,12 +108,7 @@ def load_yaml(path: Path, *, max_bytes: int = MAX_BYTES) -> Document:
         raise ConfigError(f"cannot be read: {error.strerror or error}", where=str(path)) from None
     if len(content) > max_bytes:
         raise ConfigError("the file is too large", where=str(path), allowed=f"at most {max_bytes} bytes")
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = content.count(b"\n", 0, error.start) + 1
-        raise ConfigError("is not UTF-8 text", where=f"{path}:{line}:1", hint="save it as UTF-8") from None
-    return parse_yaml(text, where=str(path))
+    return content
 
 
 def parse_yaml(text: str, *, where: str) -> Document:

@@ -1,0 +1,107 @@
+"""`-` for a file: standard input as a file for who reads one, and files that go to standard output."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lidardesign.errors import ConfigError, LidardesignError
+from lidardesign.run.streams import STDIO, is_input, read_input
+
+if TYPE_CHECKING:
+    from lidardesign.cli.console import Console
+
+# A design from standard input has no file that it could be called by.
+NAME = "stdin"
+MAX_BYTES = 64_000_000
+
+
+@contextlib.contextmanager
+def readable(path: Path, kind: str = "a design") -> Iterator[Path]:
+    """The file to read for a path: of standard input, a copy for as long as it is read.
+
+    Errors inside name standard input, not the copy.
+
+    Raises:
+        ConfigError: Standard input is too large, or was read as something else.
+    """
+    if not is_input(path):
+        yield path
+        return
+    content = read_input(kind, MAX_BYTES)
+    with tempfile.TemporaryDirectory(prefix="lidardesign-") as folder:
+        copy = Path(folder) / NAME
+        copy.write_bytes(content)
+        try:
+            yield copy
+        except LidardesignError as error:
+            error.where = (error.where or STDIO).replace(str(copy), STDIO)
+            error.message = error.message.replace(str(copy), STDIO)
+            error.args = (error.render(),)
+            raise
+
+
+def claim_stdout(console: Console, *, dry_run: bool = False, **files: Path | None) -> None:
+    """Give standard output to the file that is `-`, if one is; what people are told then goes to stderr.
+
+    Arguments:
+        console: The command's.
+        dry_run: Whether the files are only spoken of, so that standard output stays with what is told.
+        files: What would be written, by the option that says so, with _ for -.
+
+    Raises:
+        ConfigError: Several want standard output, or --json has it.
+    """
+    asking = ["--" + name.replace("_", "-") for name, path in files.items() if path is not None and str(path) == STDIO]
+    if not asking:
+        return
+    if console.json:
+        asking.append("--json")
+    if len(asking) > 1:
+        hint = f"give {asking[0]} a file"
+        raise ConfigError(f"{' and '.join(asking)} both write to standard output", where=asking[0], hint=hint)
+    if not dry_run:
+        console.output = sys.stderr
+
+
+def is_output(path: Path | None) -> bool:
+    """Whether what is written there goes to standard output."""
+    return str(path) == STDIO
+
+
+@contextlib.contextmanager
+def written_file(path: Path, suffix: str = "") -> Iterator[Path]:
+    """The file to write for a path: for `-` one that is copied to standard output when it is whole.
+
+    Raises:
+        ConfigError: What was written is no text, and standard output is a terminal.
+    """
+    if not is_output(path):
+        yield path
+        return
+    with tempfile.TemporaryDirectory(prefix="lidardesign-") as folder:
+        staged = Path(folder) / f"stdout{suffix}"
+        yield staged
+        content = staged.read_bytes()
+    put_on_stdout(content)
+
+
+def put_on_stdout(content: bytes) -> None:
+    """Write bytes to standard output.
+
+    Raises:
+        ConfigError: They are no text, and it is a terminal.
+    """
+    if sys.stdout.isatty() and b"\0" in content:
+        raise ConfigError("is no text; a terminal cannot show it", where=STDIO, hint="send it to a file: > FILE")
+    sys.stdout.flush()
+    stream = getattr(sys.stdout, "buffer", None)
+    if stream is None:
+        sys.stdout.write(content.decode(errors="backslashreplace"))
+    else:
+        stream.write(content)
+        stream.flush()
