@@ -36,6 +36,7 @@ LAYERS = {
     "lidardesign.run.validation": 2,
     "lidardesign.run.checkpoint": 3,
     "lidardesign.space": 2,
+    "lidardesign.rotations": 0,
     "lidardesign.scene": 3,
     "lidardesign.orientation": 2,
     "lidardesign.vertex_weights": 3,

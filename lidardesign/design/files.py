@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 
 from lidardesign.design.document import Locate, Node
+from lidardesign.design.readers.dispatch import read_rig
+from lidardesign.design.readers.rig import rig_design
 from lidardesign.design.sensor import (
     DEFAULT_LEVEL,
     LEVELS,
@@ -148,13 +150,18 @@ def design_text(design: Design, path: Path) -> str:
 
 
 @phase("designs")
-def load_design(path: Path) -> Design:
-    """Read a design from a design file or from the research code's sensor CSV, told apart by content.
+def load_design(path: Path, reach_m: float | None = None) -> Design:
+    """Read a design from a design file, the research code's sensor CSV or a rig of others, told apart by content.
 
-    The design takes the file's stem as its name, as tables name designs by their files.
+    The design takes the file's stem as its name, as tables name designs by their files. `readers.dispatch` has the
+    kinds of files that rigs are read from.
+
+    Arguments:
+        path: The file.
+        reach_m: How far the rays of a rig are heard where its file does not say so [m].
 
     Raises:
-        DataError: The file cannot be read, or a CSV holds what cannot be used (exit 3).
+        DataError: The file cannot be read, or a CSV, an NPZ or an XML file holds what cannot be used (exit 3).
         ConfigError: The file is not YAML, or not a design (exit 2).
     """
     path = Path(path)
@@ -164,6 +171,9 @@ def load_design(path: Path) -> Design:
     except OSError as error:
         hint = "give a design file, as RUN/designs/NAME.yaml"
         raise DataError(f"cannot be read: {error.strerror or error}", where=str(path), hint=hint) from None
+    rig = read_rig(path, head)
+    if rig is not None:
+        return rig_design(rig, path, reach_m)
     if looks_like_sensor_csv(head):
         return read_sensor_csv(path)
     document = load_yaml(path, max_bytes=MAX_BYTES)

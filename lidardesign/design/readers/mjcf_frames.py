@@ -1,0 +1,101 @@
+"""The part of a MuJoCo model that says where its rangefinders are: a model of its own, without any other file.
+
+Bodies, frames, sites and their defaults are kept; shapes, joints, meshes, actuators and plugins are left out, so that
+MuJoCo compiles what is left from text alone, reads nothing from disk and runs nothing. Without joints bodies stand
+where the model puts them, which is where they are when a simulation begins.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+from lidardesign.design.readers.xml_text import Element, read_xml
+from lidardesign.errors import DataError
+
+ALLOWED = "an MJCF model"
+PLACE = ("pos", "quat", "axisangle", "xyaxes", "zaxis", "euler")
+KEPT = {
+    "compiler": ("angle", "eulerseq"),
+    "default": ("class",),
+    "worldbody": ("childclass",),
+    "body": ("name", "childclass", *PLACE),
+    "frame": ("name", "childclass", *PLACE),
+    "replicate": ("count", "sep", "offset", "euler"),
+    "site": ("name", "class", "size", "type", "fromto", *PLACE),
+    "sensor": (),
+    "rangefinder": ("name", "site", "cutoff", "user"),
+}
+CAMERA = "camera"
+MOST_INCLUDES = 100
+# What `replicate` makes of a few lines must stay a rig.
+MOST_COPIES = 100_000
+
+
+def stripped_model(path: Path) -> ElementTree.Element:
+    """The model of a file as it is left, with what it includes from its own folder.
+
+    Raises:
+        DataError: A file is no XML, lies outside the model's folder, or the model is one that cannot be read so.
+    """
+    root = read_xml(path, ALLOWED)
+    seen = [path.resolve()]
+    model = ElementTree.Element("mujoco", {"model": "rig"})
+    copies = [0]
+    _copy_children(root, model, path, seen, 1, copies)
+    return model
+
+
+def _copy_children(
+    source: ElementTree.Element,
+    target: ElementTree.Element,
+    path: Path,
+    seen: list[Path],
+    times: int,
+    copies: list[int],
+) -> None:
+    """Append what is kept of an element's children; `times` is how often it is replicated."""
+    for child in source:
+        if child.tag == "include":
+            included, file = _included(child, path, seen)
+            _copy_children(included, target, file, seen, times, copies)
+            continue
+        where = f"{path}:{child.line if isinstance(child, Element) else 1}"
+        if child.tag == "attach":
+            raise DataError("attaches another model", where=where, allowed="one model, or <include>")
+        if child.tag == "rangefinder" and CAMERA in child.attrib:
+            raise DataError("has a rangefinder of a camera", where=where, allowed="rangefinders of sites: one ray each")
+        if child.tag not in KEPT:
+            continue
+        kept = ElementTree.SubElement(
+            target, child.tag, {name: child.attrib[name] for name in KEPT[child.tag] if name in child.attrib}
+        )
+        inner = times * _count(child, where) if child.tag == "replicate" else times
+        copies[0] += inner
+        if copies[0] > MOST_COPIES:
+            raise DataError("replicates too much", where=where, allowed=f"at most {MOST_COPIES} bodies and sites")
+        _copy_children(child, kept, path, seen, inner, copies)
+
+
+def _count(element: ElementTree.Element, where: str) -> int:
+    text = element.attrib.get("count", "")
+    if not text.strip().isdecimal() or len(text) > len(str(MOST_COPIES)):
+        raise DataError(f"count is {text[:40]!r}", where=where, allowed=f"a whole number up to {MOST_COPIES}")
+    return int(text)
+
+
+def _included(element: ElementTree.Element, path: Path, seen: list[Path]) -> tuple[Element, Path]:
+    """The root of an included file, which lies in the first file's folder, links followed, and is included once."""
+    where = f"{path}:{element.line if isinstance(element, Element) else 1}"
+    name = element.attrib.get("file", "")
+    folder = seen[0].parent
+    found = (folder / name).resolve()
+    if not name or not found.is_relative_to(folder):
+        raise DataError(
+            f"includes {name!r}, which is outside the model's folder", where=where,
+            hint="copy the file into the model's folder and name it from there",
+        )  # fmt: skip
+    if found in seen or len(seen) > MOST_INCLUDES:
+        raise DataError(f"includes {name!r} again", where=where, allowed=f"each file once, at most {MOST_INCLUDES}")
+    seen.append(found)
+    return read_xml(found, ALLOWED), found

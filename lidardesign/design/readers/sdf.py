@@ -1,0 +1,187 @@
+"""The lidars of an SDF file (Gazebo): sensors of the types gpu_lidar, lidar, gpu_ray and ray, read without Gazebo.
+
+A scan fires `samples` rays from `min_angle` to `max_angle`, both ends included, in every of its rows from the lowest
+up; sensors look along their own +x.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from lidardesign.design.readers.rig import Aim, Rig, RigSensor
+from lidardesign.design.readers.sdf_poses import Scope
+from lidardesign.design.readers.xml_text import numbers_of, read_xml
+from lidardesign.design.sensor import MOST_RAYS, boresight_frame
+from lidardesign.errors import DataError
+from lidardesign.space import FULL_TURN, angles, direction
+
+KIND = "SDF file"
+ALLOWED = "an SDF file"
+TYPES = ("gpu_lidar", "lidar", "gpu_ray", "ray")
+# Most angles of a scan [rad]: a turn, a little more for rounding.
+WIDEST = 1.001 * FULL_TURN
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """One axis of a scan: so many angles from the first to the last [rad]."""
+
+    samples: int
+    low: float
+    high: float
+
+    @property
+    def angles_rad(self) -> np.ndarray:
+        """Shape (samples,); a single one is the first."""
+        return np.linspace(self.low, self.high, self.samples)
+
+    @property
+    def middle(self) -> float:
+        return (self.low + self.high) / 2 if self.samples > 1 else self.low
+
+    @property
+    def width(self) -> float:
+        return self.high - self.low if self.samples > 1 else 0.0
+
+
+def read_sdf(path: Path) -> Rig:
+    """The lidars of a file.
+
+    Raises:
+        DataError: The file is no SDF, has no lidar, or an element of one cannot be used; with file and line.
+    """
+    root = read_xml(path, ALLOWED)
+    notes: dict[str, None] = {}
+    sensors: list[RigSensor] = []
+    longer: list[str] = []
+    for scope, link, element in _lidars(root, path):
+        sensor = _sensor(scope, link, element, notes)
+        sensors.append(sensor)
+        longer.append("::".join((scope.element.get("name", ""), link.get("name", ""), sensor.name)))
+        if sum(len(one.azimuth_rad) for one in sensors) > MOST_RAYS:
+            raise DataError("has more rays than a design", where=scope.where(element), allowed=f"at most {MOST_RAYS}")
+    if any(True for _ in root.iter("include")):
+        notes["models that the file includes are not read; copy their lidars into it"] = None
+    if not sensors:
+        found = "has no lidar" + (": models that it includes are not read" if notes else "")
+        raise DataError(found, where=str(path), allowed=f"<sensor> of type {', '.join(TYPES)}")
+    often = Counter(sensor.name for sensor in sensors)
+    named = [
+        replace(sensor, name=full) if often[sensor.name] > 1 else sensor
+        for sensor, full in zip(sensors, longer, strict=True)
+    ]
+    return Rig(KIND, named, list(notes), "give <range> a <max>")
+
+
+def _lidars(root: ElementTree.Element, path: Path) -> Iterator[tuple[Scope, ElementTree.Element, ElementTree.Element]]:
+    """Scope, link and sensor of every lidar, in the order of the file."""
+    open_scopes = []
+    for child in root:
+        if child.tag == "world":
+            world = Scope(child, path)
+            open_scopes += [Scope(model, path, world) for model in child.findall("model")]
+        elif child.tag == "model":
+            open_scopes.append(Scope(child, path))
+    while open_scopes:
+        scope = open_scopes.pop(0)
+        for link in scope.element.findall("link"):
+            for sensor in link.findall("sensor"):
+                if sensor.get("type") in TYPES:
+                    yield scope, link, sensor
+        open_scopes[:0] = [Scope(model, path, scope) for model in scope.element.findall("model")]
+
+
+def _sensor(scope: Scope, link: ElementTree.Element, element: ElementTree.Element, notes: dict[str, None]) -> RigSensor:
+    """One lidar; `notes` takes what a design does not hold of it."""
+    where = scope.where(element)
+    lidar = element.find("lidar") if element.find("lidar") is not None else element.find("ray")
+    if lidar is None:
+        raise DataError("a lidar has neither <lidar> nor <ray>", where=where)
+    scan = _needed(lidar, "scan", scope)
+    across = _axis(_needed(scan, "horizontal", scope), scope, notes, WIDEST)
+    rows = scan.find("vertical")
+    up = _Axis(1, 0.0, 0.0) if rows is None else _axis(rows, scope, notes, math.pi)
+    if across.samples * up.samples > MOST_RAYS:
+        found = f"{across.samples} x {up.samples} rays"
+        raise DataError(found, where=scope.where(scan), allowed=f"at most {MOST_RAYS}")
+    if not link.get("name"):
+        raise DataError("a link has no name", where=scope.where(link))
+    pose = scope.in_world() @ scope.placed(element, link.get("name", ""))
+    azimuth, elevation = (values.reshape(-1) for values in np.meshgrid(across.angles_rad, up.angles_rad))
+    world = angles(direction(azimuth, elevation) @ pose[:3, :3].T)
+    gate = np.tile(_gate(_needed(lidar, "range", scope), scope, notes), (len(azimuth), 1))
+    for tag, note in (
+        ("noise", "noise is not held: --detector says how well ranges are measured"),
+        ("visibility_mask", "visibility_mask is not held: rays see every body"),
+    ):
+        if lidar.find(tag) is not None:
+            notes[note] = None
+    origin = np.tile(pose[:3, 3], (len(azimuth), 1))
+    return RigSensor(element.get("name", ""), origin, *world, gate, aim=_aim(pose[:3, :3], across, up))
+
+
+def _needed(element: ElementTree.Element, tag: str, scope: Scope) -> ElementTree.Element:
+    found = element.find(tag)
+    if found is None:
+        raise DataError(f"<{element.tag}> has no <{tag}>", where=scope.where(element))
+    return found
+
+
+def _number(element: ElementTree.Element, tag: str, scope: Scope) -> float:
+    """The number in a child that must be there."""
+    child = _needed(element, tag, scope)
+    return numbers_of(child.text, 1, scope.where(child), tag)[0]
+
+
+def _axis(element: ElementTree.Element, scope: Scope, notes: dict[str, None], widest: float) -> _Axis:
+    samples = _number(element, "samples", scope)
+    if not (1 <= samples <= MOST_RAYS and samples % 1 == 0):
+        raise DataError(f"samples is {samples:g}", where=scope.where(element), allowed=f"1 to {MOST_RAYS}")
+    low, high = _number(element, "min_angle", scope), _number(element, "max_angle", scope)
+    if not (low <= high and high - low <= widest and max(-low, high) <= widest):
+        found = f"min_angle {low:g}, max_angle {high:g}"
+        raise DataError(found, where=scope.where(element), allowed=f"radians, ascending, at most {widest:.4g} wide")
+    if element.tag == "vertical" and max(-low, high) > math.pi / 2:
+        found = f"vertical angles from {low:g} to {high:g}"
+        raise DataError(found, where=scope.where(element), allowed="-pi/2 to pi/2 rad")
+    resolution = element.find("resolution")
+    if resolution is not None and numbers_of(resolution.text, 1, scope.where(resolution), "resolution")[0] != 1:
+        notes["resolution is not held: Gazebo interpolates between the rays that are fired, `samples` of them"] = None
+    if samples == 1 and low < high:
+        notes["a scan of one sample looks along its min_angle, as in Gazebo"] = None
+    return _Axis(int(samples), low, high)
+
+
+def _gate(element: ElementTree.Element, scope: Scope, notes: dict[str, None]) -> np.ndarray:
+    """Start and end of the gate, shape (2,) [m]; an end that is not said is infinite."""
+    bounds = {"min": 0.0, "max": math.inf}
+    for tag in bounds:
+        child = element.find(tag)
+        if child is not None and not (tag == "max" and _is_infinite(child)):
+            bounds[tag] = numbers_of(child.text, 1, scope.where(child), tag)[0]
+    if element.find("min") is None:
+        notes["when gates start is not said: rays are heard from 0 m on"] = None
+    if not 0 <= bounds["min"] <= bounds["max"]:
+        found = f"range from {bounds['min']:g} to {bounds['max']:g} m"
+        raise DataError(found, where=scope.where(element), allowed="0 <= min <= max")
+    return np.array([bounds["min"], bounds["max"]])
+
+
+def _is_infinite(element: ElementTree.Element) -> bool:
+    return (element.text or "").strip().lower().lstrip("+") in ("inf", "infinity")
+
+
+def _aim(rotation: np.ndarray, across: _Axis, up: _Axis) -> Aim:
+    """The boresight in the middle of a scan, upright as its sensor is, and the angles that the scan covers."""
+    middle = boresight_frame(across.middle, up.middle) @ rotation.T
+    azimuth, elevation = (float(angle) for angle in angles(middle[0]))
+    upright = boresight_frame(azimuth, elevation)
+    roll = math.atan2(float(middle[1] @ upright[2]), float(middle[1] @ upright[1]))
+    return Aim(azimuth, elevation, roll, (math.cos(up.middle) * across.width, up.width))

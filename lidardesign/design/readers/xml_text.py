@@ -1,0 +1,107 @@
+"""XML as a tree whose elements know their lines, read without following anything outside the text.
+
+Document types are refused, and with them every entity: nothing is fetched, and nothing expands.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from xml.parsers import expat
+
+from lidardesign.errors import DataError
+
+LARGEST_BYTES = 16_000_000
+DEEPEST = 200
+MOST_ELEMENTS = 500_000
+LONGEST_QUOTE = 80
+
+
+class Element(ElementTree.Element):
+    """An element with the line on which it begins."""
+
+    line: int = 0
+
+
+def read_xml(path: Path, allowed: str) -> Element:
+    """The root element of a file.
+
+    Raises:
+        DataError: The file cannot be read, is too large, is no XML, has a document type, or is nested too deep.
+    """
+    try:
+        if path.exists() and not path.is_file():
+            raise DataError("is no regular file", where=str(path), allowed=allowed)
+        with path.open("rb") as file:
+            content = file.read(LARGEST_BYTES + 1)
+    except OSError as error:
+        raise DataError(f"cannot be read: {error.strerror or error}", where=str(path), allowed=allowed) from None
+    if len(content) > LARGEST_BYTES:
+        raise DataError("the file is too large", where=str(path), allowed=f"at most {LARGEST_BYTES} bytes")
+    try:
+        return _Builder(path).build(content)
+    except expat.ExpatError as error:
+        position = f"{path}:{error.lineno}:{error.offset + 1}"
+        raise DataError(f"is no XML: {expat.ErrorString(error.code)}", where=position, allowed=allowed) from None
+    except (LookupError, ValueError) as error:
+        raise DataError(f"is no XML: {error}", where=str(path), allowed=allowed) from None
+
+
+class _Builder:
+    """Builds the tree from the parser's events."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._count = path, 0
+        # the root stays below the elements that are open
+        self._open: list[Element] = []
+        self._parser = expat.ParserCreate()
+        self._parser.StartDoctypeDeclHandler = self._doctype
+        self._parser.StartElementHandler = self._start
+        self._parser.EndElementHandler = self._end
+        self._parser.CharacterDataHandler = self._text
+
+    def build(self, content: bytes) -> Element:
+        self._parser.Parse(content, True)
+        return self._open[0]
+
+    def _doctype(self, *_: object) -> None:
+        where = f"{self._path}:{self._parser.CurrentLineNumber}"
+        raise DataError("has a document type", where=where, allowed="plain XML: entities are not read")
+
+    def _start(self, tag: str, attributes: dict[str, str]) -> None:
+        self._count += 1
+        if len(self._open) >= DEEPEST or self._count > MOST_ELEMENTS:
+            where = f"{self._path}:{self._parser.CurrentLineNumber}"
+            raise DataError("is nested too deep or has too many elements", where=where, allowed=f"{DEEPEST} levels")
+        element = Element(tag, attributes)
+        element.line = self._parser.CurrentLineNumber
+        if self._open:
+            self._open[-1].append(element)
+        self._open.append(element)
+
+    def _end(self, _: str) -> None:
+        if len(self._open) > 1:
+            self._open.pop()
+
+    def _text(self, text: str) -> None:
+        element = self._open[-1]
+        if not len(element):
+            element.text = (element.text or "") + text
+
+
+def numbers_of(text: str | None, count: int, where: str, name: str) -> list[float]:
+    """So many finite numbers, separated by blanks.
+
+    Raises:
+        DataError: They are more or fewer, or none.
+    """
+    try:
+        values = [float(part) for part in (text or "").split()]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(math.isfinite(value) for value in values):
+        shown = repr((text or "").strip()[:LONGEST_QUOTE])
+        allowed = "a finite number" if count == 1 else f"{count} finite numbers"
+        raise DataError(f"{name} is {shown}", where=where, allowed=allowed)
+    return values
