@@ -41,7 +41,7 @@ $(BIN)/.consumers: $(BIN)/.ready
 
 test: $(BIN)/.ready $(BIN)/.transport $(BIN)/.consumers
 	$(BIN)/python -m ruff check .
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 # The suite with every line and branch that it takes; what numba compiles, apart, in a run without the compiler
 KERNELS := NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage

@@ -19,6 +19,29 @@ settings.register_profile("ci", max_examples=100, deadline=None, derandomize=Tru
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci" if os.environ.get("CI") else "dev"))
 
 
+# Files that take longest, which are begun first: a worker that begins one last is waited for by the others.
+LONGEST = (
+    "test_benchmarks.py",
+    "test_examples.py",
+    "test_docs_run.py",
+    "test_bad_input.py",
+    "test_cases_of_learning.py",
+    "test_cases_of_fields.py",
+    "test_cases_of_space.py",
+    "test_cases_of_processes.py",
+    "test_hard_plugins.py",
+    "test_cluster.py",
+    "test_worker_processes.py",
+    "test_parallel.py",
+)
+
+
+def pytest_collection_modifyitems(items):
+    """Begin with the files that take longest; everything else stays as it is."""
+    order = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: order.get(item.path.name, len(LONGEST)))
+
+
 def _torch_state() -> tuple[object, ...] | None:
     torch = sys.modules.get("torch")
     if torch is None or not hasattr(torch, "get_rng_state"):
