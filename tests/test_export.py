@@ -96,15 +96,24 @@ def test_every_format_is_written_whole_or_not_at_all(tmp_path, name):
     assert exporter.suffix.startswith(".")
     path = tmp_path / f"a design{exporter.suffix}"
     exporter.write(design(), lay_out(design()), path)
-    first = path.read_bytes()
+    first = contents(path)
     exporter.write(design(), lay_out(design()), path)
-    assert path.read_bytes() == first
+    assert contents(path) == first
     assert list(tmp_path.iterdir()) == [path]
-    folder = tmp_path / "folder"
-    folder.mkdir()
+    assert path.is_dir() == exporter.folder
+    other = tmp_path / "other"
+    other.write_text("kept") if exporter.folder else other.mkdir()
+    before = contents(tmp_path)
     with pytest.raises(DataError):
-        exporter.write(design(), lay_out(design()), folder)
-    assert not list(folder.iterdir())
+        exporter.write(design(), lay_out(design()), other)
+    assert contents(tmp_path) == before
+
+
+def contents(path):
+    """The bytes of a file, or of all files of a folder by their paths."""
+    if path.is_file():
+        return path.read_bytes()
+    return {str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*")) if file.is_file()}
 
 
 def test_an_unknown_format_names_the_known_ones():

@@ -1,0 +1,53 @@
+"""Names of designs and sensors as other programs take them: plain identifiers, or text without control characters."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Sequence
+
+# Of what a name becomes; topics and prim paths are built of several.
+LONGEST_NAME = 64
+# So many changed names are quoted in a note.
+QUOTED = 3
+# What XML 1.0 cannot hold, not even escaped.
+_NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def identifier(name: str) -> str:
+    """A name of letters, digits and underscores that begins with a letter; accents are dropped.
+
+    No underscore follows another or ends it: such names are reserved in SDF and in ROS.
+    """
+    plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
+    word = re.sub(r"[^A-Za-z0-9]+", "_", plain).strip("_")[:LONGEST_NAME].rstrip("_")
+    return word if word[:1].isalpha() else f"s_{word}".rstrip("_")
+
+
+def identifiers(names: Sequence[str]) -> list[str]:
+    """An identifier of each name, no two alike, whatever their case."""
+    taken: set[str] = set()
+    found = []
+    for name in names:
+        word, number = identifier(name), 2
+        chosen = word
+        while chosen.lower() in taken:
+            chosen, number = f"{word}_{number}", number + 1
+        taken.add(chosen.lower())
+        found.append(chosen)
+    return found
+
+
+def renamed_note(names: Sequence[str], written: Sequence[str]) -> list[str]:
+    """A note of the names that had to change, if any."""
+    changed = [(old, new) for old, new in zip(names, written, strict=True) if old != new]
+    if not changed:
+        return []
+    shown = ", ".join(f"{old!r} is {new}" for old, new in changed[:QUOTED])
+    more = f", and {len(changed) - QUOTED} more" if len(changed) > QUOTED else ""
+    return [f"names are letters, digits and underscores there: {shown}{more}"]
+
+
+def xml_text(text: str) -> str:
+    """Text that XML can hold once it is escaped: characters that it cannot become U+FFFD."""
+    return _NOT_XML.sub("\ufffd", text)

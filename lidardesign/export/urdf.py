@@ -1,0 +1,90 @@
+"""ROS: a link per sensor, fixed to one base link, and Gazebo's gpu_lidar on each, as URDF.
+
+Links follow REP 103: x forward, y to the left, z up, in metres and radians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.sensor import Design
+from lidardesign.errors import DataError
+from lidardesign.estimates import Estimate
+from lidardesign.export.names import identifier
+from lidardesign.export.poses import Held, Mount, held_rounding, mounts
+from lidardesign.export.sdf import held, losses, matched, sensor_element
+from lidardesign.export.xml import element, numbers, read_xml, write_xml
+from lidardesign.simulate.returns import Rays
+
+# No sensor's link is called so: those end in _link.
+BASE = "lidar_base"
+
+
+def write(design: Design, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+    """Write the description, atomically; returns notes of what the format cannot hold."""
+    mounted = mounts(design, rays)
+    parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent=BASE)]
+    root = element("robot", {"name": identifier(design.name)}, [element("link", {"name": BASE}), *parts])
+    write_xml(path, root)
+    return notes(design, mounted, rays)
+
+
+def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+    """How far the rays of the described sensors are from the design's."""
+    mounted = mounts(design, rays)
+    found = held_sensors(read_xml(path, "robot"), path)
+    return held_rounding(rays, mounted, matched(found, mounted, path))
+
+
+def notes(design: Design, mounted: Sequence[Mount], rays: Rays) -> list[str]:
+    """Notes of what a description of links and Gazebo sensors cannot hold."""
+    return [
+        *losses(design, mounted, rays),
+        "URDF has no sensors of its own: rays, gates and rates stand in <gazebo> extensions, which Gazebo reads",
+    ]
+
+
+def mounted_parts(mount: Mount, rate_hz: float, *, parent: str, prefix: str = "") -> list[Element]:
+    """The link of a sensor, the joint that fixes it to a parent, and what Gazebo simulates on it."""
+    name = f"{prefix}{mount.name}_link"
+    origin = {"xyz": numbers(mount.origin_m), "rpy": numbers(mount.roll_pitch_yaw_rad)}
+    joint = element(
+        "joint",
+        {"name": f"{prefix}{mount.name}_joint", "type": "fixed"},
+        [
+            element("parent", {"link": parent}),
+            element("child", {"link": name}),
+            element("origin", origin),
+        ],
+    )
+    sensor = sensor_element(mount, rate_hz, posed=False, name=f"{prefix}{mount.name}")
+    # what Gazebo publishes is then in the frame of the link, whose name ROS knows
+    sensor.append(element("gz_frame_id", text=name))
+    return [element("link", {"name": name}), joint, element("gazebo", {"reference": name}, [sensor])]
+
+
+def held_sensors(root: Element, path: Path) -> list[Held]:
+    """What the joints and Gazebo sensors below an element hold, in their order.
+
+    Raises:
+        DataError: A joint is missing, or has no origin.
+    """
+    joints = {}
+    for joint in root.iterfind("joint"):
+        child = joint.find("child")
+        if child is not None:
+            joints[child.attrib.get("link", "")] = joint
+    found = []
+    for extension in root.iterfind("gazebo"):
+        try:
+            origin = next(joints[extension.attrib["reference"]].iterfind("origin"))
+            values = f"{origin.attrib['xyz']} {origin.attrib['rpy']}".split()
+            found.append(held(extension[0], path, np.array(values, dtype=np.float64)))
+        except (KeyError, StopIteration, IndexError, ValueError) as error:
+            raise DataError(f"holds no joint for a sensor: {error!r}", where=str(path)) from error
+    return found
