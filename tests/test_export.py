@@ -89,6 +89,12 @@ def test_the_sensor_table_is_a_design_again(tmp_path):
     np.testing.assert_allclose(lay_out(loaded, 37).direction, lay_out(design()).direction, atol=1e-12)
 
 
+def contents(path):
+    """Every file of an export by its place in it; a single file has none."""
+    files = [file for file in sorted(path.rglob("*")) if file.is_file()] if path.is_dir() else [path]
+    return {str(file.relative_to(path)): file.read_bytes() for file in files}
+
+
 @pytest.mark.parametrize("name", EXPORTERS)
 def test_every_format_is_written_whole_or_not_at_all(tmp_path, name):
     exporter = EXPORTERS[name]
@@ -96,24 +102,23 @@ def test_every_format_is_written_whole_or_not_at_all(tmp_path, name):
     assert exporter.suffix.startswith(".")
     path = tmp_path / f"a design{exporter.suffix}"
     exporter.write(design(), lay_out(design()), path)
+    assert path.is_dir() == exporter.folder
     first = contents(path)
     exporter.write(design(), lay_out(design()), path)
     assert contents(path) == first
     assert list(tmp_path.iterdir()) == [path]
-    assert path.is_dir() == exporter.folder
-    other = tmp_path / "other"
-    other.write_text("kept") if exporter.folder else other.mkdir()
-    before = contents(tmp_path)
-    with pytest.raises(DataError):
-        exporter.write(design(), lay_out(design()), other)
-    assert contents(tmp_path) == before
 
 
-def contents(path):
-    """The bytes of a file, or of all files of a folder by their paths."""
-    if path.is_file():
-        return path.read_bytes()
-    return {str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*")) if file.is_file()}
+@pytest.mark.parametrize("name", EXPORTERS)
+def test_a_file_is_never_written_over_a_folder_nor_a_folder_over_a_file(tmp_path, name):
+    exporter, path = EXPORTERS[name], tmp_path / "taken"
+    if exporter.folder:
+        path.write_text("mine", encoding="utf-8")
+    else:
+        path.mkdir()
+    with pytest.raises(DataError, match="taken"):
+        exporter.write(design(), lay_out(design()), path)
+    assert contents(path) == ({".": b"mine"} if exporter.folder else {})
 
 
 def test_an_unknown_format_names_the_known_ones():

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 # Formats that hold sensors only, so that the number of rays may stay open.
-WITHOUT_RAYS = ("sensors-csv",)
+WITHOUT_RAYS = ("sensors-csv", "stl")
 
 
 @dataclass(frozen=True)

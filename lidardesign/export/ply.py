@@ -1,0 +1,163 @@
+"""Rays, beams and fields of view as PLY files, for CloudCompare, Blender and MeshLab; metres in the task's own frame.
+
+`rays.ply` has a point per ray: where it starts, its direction as the normal, its gate, time and sensor as properties.
+`beams.ply` has the part of each ray inside its gate as an edge, `frusta.ply` the fields of view between start and end
+of their gates as surfaces. Numbers are float64, colours tell sensors apart.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lidardesign.design.grid import field_on_sphere
+from lidardesign.design.sensor import Design, tangent_directions
+from lidardesign.errors import DataError
+from lidardesign.export.folders import write_folder
+from lidardesign.export.read_back import rays_rounding
+from lidardesign.simulate.returns import Rays
+
+if TYPE_CHECKING:
+    from lidardesign.design.sensor import Sensor
+    from lidardesign.estimates import Estimate
+
+RAYS, BEAMS, FRUSTA = "rays.ply", "beams.ply", "frusta.ply"
+PLACE = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
+COLOUR = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+NORMAL = [("nx", "<f8"), ("ny", "<f8"), ("nz", "<f8")]
+RAY = [("gate_start", "<f8"), ("gate_end", "<f8"), ("time", "<f8"), ("sensor", "<i4")]
+FACE = [("corners", "u1"), ("vertex_indices", "<i4", (4,))]
+EDGE = [("vertex1", "<i4"), ("vertex2", "<i4")]
+TYPES = {"f8": "double", "u1": "uchar", "i4": "int"}
+# Told apart in every kind of colour vision (Okabe and Ito 2008).
+COLOURS = np.array(
+    [(0, 114, 178), (230, 159, 0), (0, 158, 115), (204, 121, 167), (86, 180, 233), (213, 94, 0), (240, 228, 66)]
+)
+# Parts of each side of a shell: a field of 90 degrees bulges by 0.2 % of its range less than the sphere does.
+PARTS = 12
+
+
+def write(design: Design, rays: Rays, path: Path) -> list[str]:
+    """Write the folder; returns notes of what the format cannot hold."""
+    comments = [f"comment sensor {index} {json.dumps(one.name)}" for index, one in enumerate(design.sensors)]
+    seen = [(index, one) for index, one in enumerate(design.sensors) if min(one.field_of_view_rad) > 0]
+    files = {RAYS: _file(comments, vertex=_ray_points(rays)), BEAMS: _beams(rays, comments)}
+    if seen:
+        files[FRUSTA] = _frusta(seen, comments)
+    notes = [*write_folder(path, files), "weights, spreads and origin covariances of the sensors are not held"]
+    if len(seen) < len(design.sensors):
+        notes.append(f"{len(design.sensors) - len(seen)} of {len(design.sensors)} sensors have no width, so no frustum")
+    if design.constraints:
+        notes.append("the constraints of the design are not held")
+    return notes
+
+
+def _file(comments: list[str], **elements: np.ndarray) -> bytes:
+    """A binary file of elements, each a structured array."""
+    header = ["ply", "format binary_little_endian 1.0", "comment lidardesign, metres, z up", *comments]
+    for name, table in elements.items():
+        header.append(f"element {name} {len(table)}")
+        header += _properties(table.dtype)
+    return "\n".join([*header, "end_header", ""]).encode("ascii") + b"".join(
+        table.tobytes() for table in elements.values()
+    )
+
+
+def _properties(kinds: np.dtype) -> list[str]:
+    if kinds == np.dtype(FACE):
+        return ["property list uchar int vertex_indices"]
+    return [f"property {TYPES[kinds[name].str[1:]]} {name}" for name in kinds.names or ()]
+
+
+def _points(places: np.ndarray, sensor: np.ndarray, kinds: list[tuple[str, str]]) -> np.ndarray:
+    """Points with the colours of their sensors, and room for more."""
+    table = np.zeros(len(places), dtype=kinds)
+    for name, column in zip("xyz", places.T, strict=True):
+        table[name] = column
+    for (name, _), column in zip(COLOUR, COLOURS[sensor % len(COLOURS)].T, strict=True):
+        table[name] = column
+    return table
+
+
+def _ray_points(rays: Rays) -> np.ndarray:
+    table = _points(rays.origin_m, rays.sensor, PLACE + NORMAL + COLOUR + RAY)
+    for (name, _), column in zip(NORMAL, rays.direction.T, strict=True):
+        table[name] = column
+    for (name, _), column in zip(RAY, (*rays.gate_m.T, rays.time_s, rays.sensor), strict=True):
+        table[name] = column
+    return table
+
+
+def _beams(rays: Rays, comments: list[str]) -> bytes:
+    """Two points per ray, where its gate starts and ends, and the edge between them."""
+    places = rays.origin_m[:, None] + rays.gate_m[:, :, None] * rays.direction[:, None]
+    edges = np.zeros(len(rays), dtype=EDGE)
+    edges["vertex1"], edges["vertex2"] = np.arange(2 * len(rays)).reshape(-1, 2).T
+    points = _points(places.reshape(-1, 3), np.repeat(rays.sensor, 2), PLACE + COLOUR)
+    return _file(comments, vertex=points, edge=edges)
+
+
+def _frusta(sensors: list[tuple[int, Sensor]], comments: list[str]) -> bytes:
+    """Fields of view between the gates' ends: two shells and four sides each, as quadrilaterals."""
+    corners = _shell_faces()
+    points, faces = [], []
+    for number, (index, sensor) in enumerate(sensors):
+        places = _frustum(sensor)
+        points.append(_points(places, np.full(len(places), index), PLACE + COLOUR))
+        faces.append(corners + number * len(places))
+    table = np.zeros(len(faces) * len(corners), dtype=FACE)
+    table["corners"], table["vertex_indices"] = 4, np.concatenate(faces)
+    return _file(comments, vertex=np.concatenate(points), face=table)
+
+
+def _frustum(sensor: Sensor) -> np.ndarray:
+    """Points of the shell at the gate's start, then of that at its end, row by row upwards: 2 (PARTS + 1)^2."""
+    across, up = (np.linspace(-extent / 2, extent / 2, PARTS + 1) for extent in field_on_sphere(sensor))
+    tangent = np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2)
+    looking = tangent_directions(sensor.frame, tangent)
+    return np.concatenate([np.asarray(sensor.origin_m) + end * looking for end in sensor.gate_m])
+
+
+def _shell_faces() -> np.ndarray:
+    """Corners of the faces of `_frustum`, seen from outside against the clock, shape (F, 4)."""
+    side = PARTS + 1
+    near = np.arange(side * side).reshape(side, side)
+    far = near + side * side
+    inner = np.stack([near[:-1, :-1], near[:-1, 1:], near[1:, 1:], near[1:, :-1]], axis=-1).reshape(-1, 4)
+    outer = np.stack([far[:-1, :-1], far[1:, :-1], far[1:, 1:], far[:-1, 1:]], axis=-1).reshape(-1, 4)
+    # once around the rim, seen from the sensor: right, up, left, down
+    rim = [near[0], near[:, -1], near[-1, ::-1], near[::-1, 0]]
+    walls = [np.stack([one[:-1], one[:-1] + side * side, one[1:] + side * side, one[1:]], axis=-1) for one in rim]
+    return np.concatenate([inner, outer, *walls])
+
+
+def read(path: Path) -> Rays:
+    """The rays of a folder that `write` made.
+
+    Raises:
+        DataError: The folder cannot be read, or holds something else.
+    """
+    kinds = np.dtype(PLACE + NORMAL + COLOUR + RAY)
+    where = Path(path) / RAYS
+    try:
+        header, found, content = where.read_bytes().partition(b"end_header\n")
+        if not found or [line for line in header.decode().split("\n") if line.startswith("property")] != _properties(
+            kinds
+        ):
+            raise DataError("holds no rays", where=str(where), hint="export it again")
+        table = np.frombuffer(content, dtype=kinds)
+    except (OSError, ValueError) as error:
+        raise DataError(f"cannot be read as rays: {error}", where=str(where), hint="export it again") from error
+    origin, looking, gate = (
+        np.stack([table[name] for name in names], axis=1)
+        for names in (("x", "y", "z"), ("nx", "ny", "nz"), ("gate_start", "gate_end"))
+    )
+    return Rays(origin, looking, gate, table["sensor"], table["time"])
+
+
+def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+    """What the written numbers lose: nothing, they are kept bit for bit."""
+    return rays_rounding(rays, read(path), path)
