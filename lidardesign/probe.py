@@ -48,20 +48,18 @@ class Probe:
     contained: bool = False
 
 
-class Probing:
-    """A plugin that is being imported elsewhere; to be ended in any case.
+class Apart:
+    """A process of its own that runs a plugin's code and answers by lines; to be ended in any case.
 
     Arguments:
-        offer: Its entry point.
-        seconds: How long the import may take.
+        code: Python that reads the request, one line of JSON, from standard input.
+        request: What it is asked.
     """
 
-    def __init__(self, offer: EntryPoint, seconds: float) -> None:
-        self._seconds = seconds
+    def __init__(self, code: str, request: dict[str, Any]) -> None:
         self._lines: queue.SimpleQueue[tuple[float, bytes]] = queue.SimpleQueue()
-        request = {"name": offer.name, "value": offer.value, "path": sys.path, "seconds": seconds}
         self._process = subprocess.Popen(
-            [sys.executable, "-c", CHILD],
+            [sys.executable, "-c", code],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -73,18 +71,6 @@ class Probing:
         with contextlib.suppress(OSError), self._process.stdin as pipe:  # type: ignore[union-attr]
             pipe.write(json.dumps(request).encode() + b"\n")
 
-    def result(self) -> Probe | None:
-        """What came of it, waited for; None where nothing could be found out."""
-        begun, line = self._next(time.monotonic() + START_SECONDS)
-        if line != BEGUN:
-            return None
-        deadline = begun + self._seconds + GRACE_SECONDS
-        _, line = self._next(deadline)
-        if line:
-            return _read(line)
-        died_of = None if line is None else self._died_of(deadline)
-        return Probe(error=died_of or f"was not imported within {self._seconds:g} s", contained=True)
-
     def end(self) -> None:
         """End the process and what it started."""
         if self._process.returncode is None and hasattr(os, "killpg"):
@@ -93,7 +79,7 @@ class Probing:
         self._process.kill()
         self._process.wait()
 
-    def _next(self, deadline: float) -> tuple[float, bytes | None]:
+    def next_line(self, deadline: float) -> tuple[float, bytes | None]:
         """The next line and when it came: empty at the end, None where none came in time."""
         try:
             return self._lines.get(timeout=max(deadline - time.monotonic(), 0.0))
@@ -106,17 +92,47 @@ class Probing:
                 self._lines.put((time.monotonic(), line))
         self._lines.put((time.monotonic(), b""))
 
-    def _died_of(self, deadline: float) -> str | None:
-        """How it ended; None where it only closed its pipe and hangs until the deadline and a little longer."""
+    def died_of(self, deadline: float, when: str) -> str | None:
+        """How it ended; None where it only closed its pipe and hangs until the deadline and a little longer.
+
+        Arguments:
+            deadline: On the monotonic clock [s].
+            when: What the plugin did meanwhile, as "while it is imported".
+        """
         try:
             code = self._process.wait(max(deadline - time.monotonic(), 0.0) + GRACE_SECONDS)
         except subprocess.TimeoutExpired:
             return None
         if code == UNHEARD:
-            return "closes files that are not its own while it is imported"
+            return f"closes files that are not its own {when}"
         if code < 0:
-            return f"crashes while it is imported ({signal.strsignal(-code)})"
-        return f"ends the program while it is imported (exit code {code})"
+            return f"crashes {when} ({signal.strsignal(-code)})"
+        return f"ends the program {when} (exit code {code})"
+
+
+class Probing(Apart):
+    """A plugin that is being imported elsewhere.
+
+    Arguments:
+        offer: Its entry point.
+        seconds: How long the import may take.
+    """
+
+    def __init__(self, offer: EntryPoint, seconds: float) -> None:
+        self._seconds = seconds
+        super().__init__(CHILD, {"name": offer.name, "value": offer.value, "path": sys.path, "seconds": seconds})
+
+    def result(self) -> Probe | None:
+        """What came of it, waited for; None where nothing could be found out."""
+        begun, line = self.next_line(time.monotonic() + START_SECONDS)
+        if line != BEGUN:
+            return None
+        deadline = begun + self._seconds + GRACE_SECONDS
+        _, line = self.next_line(deadline)
+        if line:
+            return _read(line)
+        died_of = None if line is None else self.died_of(deadline, "while it is imported")
+        return Probe(error=died_of or f"was not imported within {self._seconds:g} s", contained=True)
 
 
 def _read(line: bytes) -> Probe:

@@ -79,12 +79,16 @@ def load_task(name: str) -> Task:
         ConfigError: No installed package offers it; the message lists what there is.
         PluginError: The plugin cannot be loaded, or does not keep the contract.
     """
+    return _load(name, _known(name))
+
+
+def _known(name: str) -> list[EntryPoint]:
     offers = _offers()
     if name not in offers:
         close = difflib.get_close_matches(name, offers, n=1)
         hint = f"did you mean {close[0]!r}?" if close else LIST_HINT
         raise ConfigError(f"unknown task {name!r}", where="TASK", allowed=", ".join(sorted(offers)), hint=hint)
-    return _load(name, offers[name])
+    return offers[name]
 
 
 @contextlib.contextmanager
@@ -145,19 +149,24 @@ def _distribution(offer: EntryPoint) -> str:
 
 
 def _load(name: str, offers: list[EntryPoint]) -> Task:
+    offer = _only(name, offers)
+    if _is_foreign(offer):
+        _check_containable(name, offer.value, tuple(sys.path))
+    return _imported(name, offer, IMPORT_SECONDS)
+
+
+def _only(name: str, offers: list[EntryPoint]) -> EntryPoint:
     if len(offers) > 1:
         packages = " and ".join(f"{_distribution(offer)} ({offer.value})" for offer in offers)
         raise PluginError(f"is offered by {packages}", where=f"task {name}", hint="uninstall one of them")
-    if _is_foreign(offers[0]):
-        _check_containable(name, offers[0].value, tuple(sys.path))
-    return _imported(name, offers[0], IMPORT_SECONDS)
+    return offers[0]
 
 
 def _imported(name: str, offer: EntryPoint, seconds: float) -> Task:
     with plugin_guard(name), _time_limit(name, seconds):
         plugin = offer.load()
         task = plugin() if callable(plugin) else plugin
-        _check(name, task)
+        check_interface(name, task)
     return task
 
 
@@ -176,6 +185,30 @@ def _check_containable(name: str, value: str, path: tuple[str, ...]) -> None:
     (probe,) = probed([EntryPoint(name, value, GROUP)], IMPORT_SECONDS)
     if probe is not None and probe.contained:
         raise PluginError(str(probe.error), where=f"task {name}", hint=AUTHOR_HINT)
+
+
+def task_names() -> list[str]:
+    """The names of all installed tasks, with nothing imported."""
+    return sorted(_offers())
+
+
+def offer_of(name: str) -> EntryPoint:
+    """The one entry point of a name, with nothing imported.
+
+    Raises:
+        ConfigError: No installed package offers it; the message lists what there is.
+        PluginError: Several do.
+    """
+    return _only(name, _known(name))
+
+
+def import_task(offer: EntryPoint, seconds: float) -> Task:
+    """The task of an entry point, imported here and now: for a process that may be lost with it.
+
+    Raises:
+        PluginError: It cannot be loaded in time, or does not keep the contract.
+    """
+    return _imported(offer.name, offer, seconds)
 
 
 def answer_probe(request: dict[str, Any]) -> None:
@@ -215,7 +248,7 @@ def _time_limit(name: str, seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, previous)
 
 
-def _check(name: str, task: Any) -> None:
+def check_interface(name: str, task: Any) -> None:
     """Check that an object keeps the task contract.
 
     Raises:

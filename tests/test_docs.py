@@ -91,7 +91,7 @@ def test_the_example_task_keeps_the_contract_and_scores_a_ray():
     namespace: dict[str, object] = {}
     exec(blocks("python")[0], namespace)  # the README's own text
     task = namespace["RoverTask"]()
-    registry._check("rover", task)
+    registry.check_interface("rover", task)
     assert isinstance(task, Task)
     config = task.Config()
     scene = task.scenes(config, "test", 0)[0]
@@ -110,7 +110,7 @@ def moving_scene_of(name: str, block: int):
     namespace: dict[str, object] = {}
     exec(blocks("python", WRITING_TASKS)[block], namespace)  # the page's own text
     task = namespace[name]()
-    registry._check(task.name, task)
+    registry.check_interface(task.name, task)
     config = task.Config()
     first, again = (task.scenes(config, "test", 0)[0] for _ in range(2))
     for one, other in zip(first.bodies, again.bodies, strict=True):

@@ -11,6 +11,8 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.console import command
+from lidardesign.cli.tasks_check import check
+from lidardesign.cli.tasks_new import new
 from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 
 KINDS = {int: "whole number", float: "number", str: "text", bool: "true or false", type(None): "null"}
 
-tasks_app = typer.Typer(help="List the installed tasks, or show one.", invoke_without_command=True)
+tasks_app = typer.Typer(help="List, show, check or begin tasks.", invoke_without_command=True)
 
 
 @tasks_app.callback()
@@ -34,7 +36,7 @@ def tasks(
     quiet: options.Quiet = False,
     debug: options.Debug = False,
 ) -> None:
-    """List the installed tasks, or show one."""
+    """List, show, check or begin tasks."""
     if context.invoked_subcommand is None:
         list_(seed=seed, json=json, quiet=quiet, debug=debug)
     context.obj = json
@@ -221,3 +223,10 @@ def _shown_default(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return "[" + ", ".join(map(str, value)) + "]" if isinstance(value, list | tuple) else str(value)
+
+
+for subcommand, examples in {
+    check: ("lidardesign tasks check face", "lidardesign tasks check meshes --set folder=scans --json"),
+    new: ("lidardesign tasks new landmark", "lidardesign tasks new landmark --out work/landmark"),
+}.items():
+    tasks_app.command(epilog="\n\n".join(("Examples:", *examples)))(subcommand)

@@ -1,0 +1,76 @@
+"""Laws of what a task does to the process that runs it: random state, files, environment, time and memory."""
+
+from __future__ import annotations
+
+from lidardesign.run.clock import peak_memory_bytes
+from lidardesign.testing.law import BrokenLawError, Held, Law, NotApplicable
+from lidardesign.testing.subject import GIBIBYTE, Subject
+
+MEBIBYTE = 2**20
+
+
+def check_random(subject: Subject) -> Held:
+    """No global random state is drawn from or seeded."""
+    if subject.watch.drawn:
+        raise BrokenLawError(
+            f"uses {', '.join(subject.watch.drawn)}",
+            hint="draw from lidardesign.task.random_generator(seed, ...) and pass the generator on",
+        )
+    return Held("Python's, numpy's and torch's random states are as they were")
+
+
+def check_files(subject: Subject) -> Held:
+    """Nothing is written but temporary files and caches."""
+    found = subject.watch.found_written()
+    if found:
+        raise BrokenLawError(f"writes {', '.join(found)}", allowed="temporary files and the user's caches")
+    return Held("nothing but temporary files and caches")
+
+
+def check_surroundings(subject: Subject) -> Held:
+    """The working folder, the environment and numpy's error settings stay."""
+    if subject.watch.changed:
+        raise BrokenLawError(f"changes {', '.join(subject.watch.changed)}", hint="put back what you change")
+    return Held("working folder, environment and numpy's error settings are as they were")
+
+
+def check_time(subject: Subject) -> Held:
+    """Every call of the task's code ends within the limit."""
+    limit = subject.limits.seconds
+    slow = [what for what, seconds in subject.seconds.items() if seconds > limit]
+    if slow:
+        raise BrokenLawError(
+            f"{slow[0]} took {subject.seconds[slow[0]]:.1f} s",
+            allowed=f"{limit:g} s",
+            hint="check fewer or smaller scenes (--set), or allow more (--seconds)",
+        )
+    said = ", ".join(f"{what} {_shown_seconds(seconds)}" for what, seconds in subject.seconds.items())
+    return Held(f"at most: {said}", {f"{what}_s": round(seconds, 4) for what, seconds in subject.seconds.items()})
+
+
+def _shown_seconds(seconds: float) -> str:
+    return f"{seconds:.2g} s" if seconds >= 1 else f"{1000 * seconds:.2g} ms"
+
+
+def check_memory(subject: Subject) -> Held | NotApplicable:
+    """The process holds no more memory than the limit."""
+    peak = peak_memory_bytes()
+    if peak is None:
+        return NotApplicable("this system does not tell what a process holds")
+    if peak > subject.limits.memory_bytes:
+        raise BrokenLawError(
+            f"the process held {peak / GIBIBYTE:.2f} GiB",
+            allowed=f"{subject.limits.memory_bytes / GIBIBYTE:.2f} GiB",
+            hint="check fewer or smaller scenes (--set), or allow more (--memory-mb)",
+        )
+    return Held(f"the process held {peak / MEBIBYTE:.0f} MiB at most", {"peak_bytes": peak})
+
+
+_NEEDS = ("scores are numbers",)
+LAWS = (
+    Law("no global random state", "conduct", "no global random state is used", check_random, _NEEDS),
+    Law("nothing is written", "conduct", "only temporary files and caches are written", check_files, _NEEDS),
+    Law("nothing else is changed", "conduct", "working folder and environment stay", check_surroundings, _NEEDS),
+    Law("within time", "conduct", "every call ends in time", check_time, _NEEDS),
+    Law("within memory", "conduct", "the process stays within memory", check_memory, _NEEDS),
+)

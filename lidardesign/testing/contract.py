@@ -1,0 +1,142 @@
+"""The whole contract of a task plugin, law by law, each tried once."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+
+from lidardesign import registry
+from lidardesign.errors import ConfigError, LidardesignError
+from lidardesign.run.config import RunConfig, resolve
+from lidardesign.task import Task
+from lidardesign.testing import conduct, geometry, interface, scenes, scoring
+from lidardesign.testing.law import BrokenLawError, Finding, Held, Law, NotApplicable
+from lidardesign.testing.subject import Limits, Subject
+from lidardesign.testing.watch import Watch
+
+LAWS: tuple[Law, ...] = (*interface.LAWS, *scenes.LAWS, *geometry.LAWS, *scoring.LAWS, *conduct.LAWS)
+# What comes before all laws: the plugin is imported and its configuration resolved.
+LOADS = ("plugin loads", "interface", "the plugin is imported and has the members of the task interface")
+
+
+class Contract:
+    """The laws of one task with one configuration, each tried when it is asked for, and once.
+
+    Arguments:
+        subject: The task.
+    """
+
+    def __init__(self, subject: Subject) -> None:
+        self.subject = subject
+        self._laws: Mapping[str, Law] = {law.name: law for law in LAWS}
+        self._findings: dict[str, Finding] = {}
+
+    def finding(self, name: str) -> Finding:
+        """What became of a law.
+
+        Raises:
+            ConfigError: There is no law of this name.
+        """
+        if name not in self._laws:
+            raise ConfigError(f"unknown law {name!r}", where="law", allowed=", ".join(self._laws))
+        if name not in self._findings:
+            self._findings[name] = self._tried(self._laws[name])
+        return self._findings[name]
+
+    def findings(self) -> Iterator[Finding]:
+        """What became of each law, in order."""
+        for law in LAWS:
+            yield self.finding(law.name)
+
+    def _tried(self, law: Law) -> Finding:
+        known = (law.name, law.group, law.statement)
+        for needed in law.needs:
+            if self.finding(needed).outcome != "pass" and not self._says_nothing(needed):
+                return Finding(*known, "skip", f"needs: {needed}")
+        started = time.perf_counter()
+        try:
+            found = law.check(self.subject)
+        except LidardesignError as error:
+            return Finding(*known, "fail", said(error), time.perf_counter() - started)
+        except MemoryError:
+            limit = self.subject.limits.memory_bytes
+            return Finding(*known, "fail", f"needs more than {limit / 2**20:.0f} MiB", time.perf_counter() - started)
+        seconds = time.perf_counter() - started
+        if isinstance(found, NotApplicable):
+            return Finding(*known, "skip", found.reason, seconds)
+        return Finding(*known, "pass", found.words, seconds, found.figures)
+
+    def _says_nothing(self, name: str) -> bool:
+        """Whether a law does not apply, which is no reason not to try others."""
+        return self.finding(name).outcome == "skip" and not self.finding(name).detail.startswith("needs: ")
+
+
+def said(error: LidardesignError) -> str:
+    """A finding's words for an error: what was found, what is allowed, what to do."""
+    parts = [error.message]
+    if error.allowed:
+        parts.append(f"allowed: {error.allowed}")
+    if error.hint:
+        parts.append(f"try: {error.hint}")
+    return "; ".join(parts)
+
+
+def contract_of(
+    task: Task,
+    *,
+    overrides: Sequence[str] = (),
+    config: RunConfig | None = None,
+    limits: Limits | None = None,
+    watch: Watch | None = None,
+) -> Contract:
+    """The contract of a task object, registered or not.
+
+    Arguments:
+        task: The task.
+        overrides: `KEY=VALUE` as `--set` takes it.
+        config: A whole configuration instead.
+        limits: What the task's code may take.
+        watch: Notes what its code does.
+
+    Raises:
+        PluginError: The task lacks a member of the interface.
+        ConfigError: The configuration is refused.
+    """
+    with registry.plugin_guard(str(getattr(task, "name", type(task).__name__))):
+        registry.check_interface(str(getattr(task, "name", "")), task)
+    watch = watch or Watch()
+    if config is None:
+        with watch.during("space"):
+            config = resolve(task, overrides=overrides)
+    return Contract(Subject(task, config, limits or Limits(), watch))
+
+
+def check_task(task: Task, *, overrides: Sequence[str] = (), limits: Limits | None = None) -> list[Finding]:
+    """Try the whole contract on a task object, in this process.
+
+    Arguments:
+        task: The task.
+        overrides: `KEY=VALUE` as `--set` takes it.
+        limits: What the task's code may take.
+
+    Raises:
+        BrokenLawError: A law does not hold; the message names all that do not.
+    """
+    findings = list(contract_of(task, overrides=overrides, limits=limits).findings())
+    refuse_broken(task.name, findings)
+    return findings
+
+
+def refuse_broken(name: str, findings: Sequence[Finding]) -> None:
+    """Name the laws that do not hold.
+
+    Raises:
+        BrokenLawError: There are some.
+    """
+    broken = [finding for finding in findings if finding.outcome == "fail"]
+    if broken:
+        listed = "; ".join(f"{finding.law}: {finding.detail}" for finding in broken)
+        raise BrokenLawError(f"{len(broken)} of {len(findings)} laws do not hold: {listed}", where=f"task {name}")
+
+
+__all__ = ["LAWS", "BrokenLawError", "Contract", "Held", "check_task", "contract_of"]

@@ -1,0 +1,85 @@
+"""Laws of the task contract, and what became of one: it holds, it does not, or it does not apply."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+from lidardesign.errors import PluginError
+
+if TYPE_CHECKING:
+    from lidardesign.testing.subject import Subject
+
+Outcome = Literal["pass", "fail", "skip"]
+
+
+class BrokenLawError(PluginError):
+    """A law of the contract that a task does not keep; the message says how, with figures (exit 6)."""
+
+
+class Held(NamedTuple):
+    """A law that holds: what was measured, in words, and the same as numbers by name with their unit."""
+
+    words: str
+    figures: Mapping[str, float] = {}
+
+
+class NotApplicable(NamedTuple):
+    """A law that says nothing about this task, and why."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Law:
+    """One law of the contract.
+
+    Arguments:
+        name: Short and unique, for tables and test names.
+        group: The part of the contract that it belongs to.
+        statement: What a task keeps to, in one sentence.
+        check: Tries it on a task; raises BrokenLawError where it does not hold.
+        needs: Names of laws without which it cannot be tried.
+    """
+
+    name: str
+    group: str
+    statement: str
+    check: Callable[[Subject], Held | NotApplicable]
+    needs: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What became of a law.
+
+    Arguments:
+        law: Its name.
+        group: Its group.
+        statement: What it says.
+        outcome: Whether it holds.
+        detail: What was measured where it holds; else why it does not, or was not tried.
+        seconds: How long that took [s].
+        figures: Numbers by name.
+    """
+
+    law: str
+    group: str
+    statement: str
+    outcome: Outcome
+    detail: str
+    seconds: float = 0.0
+    figures: Mapping[str, float] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The form that it has in JSON."""
+        return {
+            "law": self.law,
+            "group": self.group,
+            "statement": self.statement,
+            "outcome": self.outcome,
+            "detail": self.detail,
+            "seconds": round(self.seconds, 3),
+            "figures": {name: float(value) for name, value in self.figures.items()},
+        }

@@ -1,0 +1,118 @@
+"""Rays that see a scene's targets, and what becomes of their returns when they are disturbed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from lidardesign.scene import Scene
+from lidardesign.simulate.hits import Hits
+from lidardesign.simulate.raycast import SceneCaster
+from lidardesign.simulate.returns import Outcome, Rays, Returns
+from lidardesign.space import AZIMUTH, ELEVATION, FARTHEST_M, RANGE, DesignSpace, aim, direction
+from lidardesign.surface import sample_body
+
+DRAW_ROUNDS = 12
+# Of a scene that moves, so many frames are aimed at.
+MOST_FRAMES = 8
+# Half the gate where the space fixes the range, as a share of it.
+HALF_GATE = 0.05
+SEED = 20_251
+
+
+def rays_at_targets(scene: Scene, space: DesignSpace, casters: Sequence[SceneCaster], count: int) -> Rays:
+    """Rays of a design space to visible points of targets, even over their area, listening all the way.
+
+    Arguments:
+        scene: Whose targets; of moving ones, places in several frames.
+        space: The design space at one condition value.
+        casters: One per frame.
+        count: How many at most; fewer where little can be seen.
+    """
+    generator = np.random.default_rng(SEED)
+    frames = np.unique(np.linspace(0, scene.frames - 1, min(scene.frames, MOST_FRAMES)).astype(int))
+    found: list[np.ndarray] = []
+    for _ in range(DRAW_ROUNDS):
+        for frame in frames:
+            per = -(-count // len(frames))
+            found.append(rays_that_meet(scene, space, casters[frame], int(frame), per, generator)[0])
+        if sum(map(len, found)) >= count:
+            break
+    points = generator.permutation(np.concatenate(found))[:count]
+    return full_rays(points, space)
+
+
+def full_rays(points: np.ndarray, space: DesignSpace) -> Rays:
+    """Rays of design points (N, 6) that listen over the whole range of a design space."""
+    low, high = space.low[RANGE], space.high[RANGE]
+    gate = (low, high) if low < high else (low * (1 - HALF_GATE), high * (1 + HALF_GATE))
+    looking = direction(points[:, AZIMUTH], points[:, ELEVATION])
+    count = len(points)
+    return Rays(points[:, :3], looking, np.tile(gate, (count, 1)), np.zeros(count), np.zeros(count))
+
+
+def rays_that_meet(
+    scene: Scene, space: DesignSpace, caster: SceneCaster, frame: int, count: int, generator: np.random.Generator
+) -> tuple[np.ndarray, Hits]:
+    """Rays of a design space towards targets that meet a target first.
+
+    Arguments:
+        scene: Whose targets, at one of its frames.
+        space: The design space at one condition value.
+        caster: Of that frame.
+        frame: Its number.
+        count: How many are tried.
+        generator: Draws origins and places.
+
+    Returns:
+        The observed design points, shape (K, 6), and their hits.
+    """
+    origins = space.sample(count, generator)[:, :3]
+    points = sample_body([body for body in scene.bodies if body.is_target], space, count, generator, frame).points
+    design = aim(origins, points)
+    low, high = np.array(space.low), np.array(space.high)
+    # a space of fewer dimensions hardly ever holds the ray to a point drawn in all three
+    design = np.where(low == high, low, design)
+    hits = caster.first_hit(design[:, :3], direction(design[:, AZIMUTH], design[:, ELEVATION]))
+    design[:, RANGE] = np.where(np.isfinite(hits.range_m), hits.range_m, 2 * FARTHEST_M)
+    of_target = np.array([*(body.is_target for body in scene.bodies), False])
+    kept = of_target[hits.body] & space.contains(design)
+    return design[kept], Hits(hits.range_m[kept], hits.body[kept], hits.normal[kept])
+
+
+def with_noise(returns: Sequence[Returns], share: float, generator: np.random.Generator) -> list[Returns]:
+    """The same returns with normal noise on their ranges; its spread is a share of their median range."""
+    heard = np.concatenate([one.range_m[one.returned] for one in returns])
+    spread_m = share * float(np.median(heard)) if len(heard) else 0.0
+    noise = [spread_m * generator.normal(size=len(one.range_m)) for one in returns]
+    return [
+        replace(one, range_m=np.maximum(one.range_m + added, one.rays.gate_m[:, 0]))
+        for one, added in zip(returns, noise, strict=True)
+    ]
+
+
+def shuffled(returns: Sequence[Returns], generator: np.random.Generator) -> list[Returns]:
+    """The same returns with their rays in another order, each list in one of its own."""
+    found = []
+    for one in returns:
+        order = generator.permutation(len(one.rays))
+        found.append(
+            Returns(one.rays.subset(order), one.outcome[order], one.range_m[order], one.body[order], one.frame)
+        )
+    return found
+
+
+def without_returns(returns: Sequence[Returns]) -> list[Returns]:
+    """The same rays, none of which heard anything."""
+    return [
+        Returns(
+            one.rays,
+            np.full_like(one.outcome, Outcome.MISS),
+            np.full_like(one.range_m, np.nan),
+            np.full_like(one.body, -1),
+            one.frame,
+        )
+        for one in returns
+    ]

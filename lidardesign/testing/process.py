@@ -1,0 +1,222 @@
+"""The contract tried in a process of its own, with limits: a plugin that hangs, crashes or hogs harms nobody.
+
+The process says by lines of JSON which law it begins and what it found; whoever asks waits for each line no longer than
+a law may take. It works in an empty folder, has temporary files of its own, and is told how much memory it may take.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from lidardesign import registry
+from lidardesign.errors import ConfigError, DataError, LidardesignError
+from lidardesign.probe import BEGUN, GRACE_SECONDS, START_SECONDS, Apart, answer
+from lidardesign.run.config import resolve
+from lidardesign.testing.contract import LAWS, LOADS, Contract, said
+from lidardesign.testing.law import Finding
+from lidardesign.testing.subject import Limits, Subject
+from lidardesign.testing.watch import Watch
+
+CHILD = (
+    "import json, sys; request = json.loads(sys.stdin.readline()); sys.path[:] = request['path']; "
+    "from lidardesign.testing.process import answer_check; answer_check(request)"
+)
+# Libraries are loaded in the first law that needs them, and a law calls the task's code many times.
+LAW_CALLS = 3
+REFUSALS = {"config": ConfigError, "data": DataError}
+
+
+@dataclass(frozen=True)
+class CheckRequest:
+    """What to check.
+
+    Arguments:
+        name: The task, as `learn` takes it.
+        config_file: A YAML file of its configuration.
+        overrides: `KEY=VALUE` as `--set` takes it.
+        seed: Root of all chance.
+        limits: What the task's code may take.
+    """
+
+    name: str
+    config_file: Path | None = None
+    overrides: Sequence[str] = ()
+    seed: int | None = None
+    limits: Limits = field(default_factory=Limits)
+
+
+def check_apart(request: CheckRequest) -> Iterator[Finding]:
+    """What became of each law, as it is found; the first is that the plugin loads.
+
+    Raises:
+        ConfigError, DataError: There is no such task, or its configuration is refused.
+    """
+    try:
+        offer = registry.offer_of(request.name)
+    except registry.PluginError as error:
+        yield from _all_lost(0, said(error))
+        return
+    with tempfile.TemporaryDirectory(prefix="lidardesign-check-") as folder:
+        child = Apart(CHILD, _as_document(request, offer, folder))
+        try:
+            yield from _heard(child, request.limits.seconds)
+        finally:
+            child.end()
+
+
+def _as_document(request: CheckRequest, offer: EntryPoint, folder: str) -> dict[str, Any]:
+    return {
+        "path": sys.path,
+        "folder": folder,
+        "name": offer.name,
+        "value": offer.value,
+        "config_file": str(request.config_file) if request.config_file else None,
+        "overrides": list(request.overrides),
+        "seed": request.seed,
+        "seconds": request.limits.seconds,
+        "memory_bytes": request.limits.memory_bytes,
+    }
+
+
+def _heard(child: Apart, seconds: float) -> Iterator[Finding]:
+    """Findings as they come; where the process is lost, the law that it tried does not hold."""
+    started, line = child.next_line(time.monotonic() + START_SECONDS)
+    if line != BEGUN:
+        reason = "the process that checks could not be started"
+        yield from _all_lost(0, reason)
+        return
+    for number in range(len(LAWS) + 1):
+        allowed = seconds * (1 if number == 0 else LAW_CALLS)
+        deadline = max(started, time.monotonic()) + allowed + GRACE_SECONDS
+        _, line = child.next_line(deadline)
+        found = _read(line) if line else None
+        if found is None:
+            died_of = None if line is None else child.died_of(deadline, "while this is tried")
+            written = "writes into what is not its own while this is tried" if line else None
+            yield from _all_lost(number, written or died_of or f"did not end within {allowed:g} s")
+            return
+        if "refused" in found:
+            raise REFUSALS.get(found["refused"]["kind"], ConfigError)(
+                found["refused"]["message"], **{key: found["refused"].get(key) for key in ("where", "allowed", "hint")}
+            )
+        finding = Finding(**found)
+        yield finding
+        if number == 0 and finding.outcome == "fail":
+            yield from _not_reached(1)
+            return
+
+
+def _read(line: bytes) -> dict[str, Any] | None:
+    """The content of a line; None where a plugin wrote it, which knows neither its form nor that it is read."""
+    try:
+        found = json.loads(line)
+    except ValueError:
+        return None
+    return found if isinstance(found, dict) and ("refused" in found or set(found) == FINDING_KEYS) else None
+
+
+FINDING_KEYS = {"law", "group", "statement", "outcome", "detail", "seconds", "figures"}
+
+
+def _all_lost(number: int, reason: str) -> Iterator[Finding]:
+    """The law that was tried does not hold, and those behind it are not reached; number 0 is that it loads."""
+    name, group, statement = LOADS if number == 0 else _named(number)
+    yield Finding(name, group, statement, "fail", reason)
+    yield from _not_reached(number + 1)
+
+
+def _not_reached(number: int) -> Iterator[Finding]:
+    for later in range(number, len(LAWS) + 1):
+        yield Finding(*_named(later), "skip", "not reached")
+
+
+def _named(number: int) -> tuple[str, str, str]:
+    law = LAWS[number - 1]
+    return law.name, law.group, law.statement
+
+
+def answer_check(request: dict[str, Any]) -> None:
+    """In that process: try all laws, say what was found on stdout, and end."""
+    result = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    nowhere = open(os.devnull, "w")  # noqa: SIM115 - lives as long as the process
+    os.dup2(nowhere.fileno(), sys.stdout.fileno())
+    _settle(request)
+    result.write(BEGUN)
+    result.flush()
+    contract = _begin(request, result)
+    if contract is None:
+        os._exit(0)
+    contract.subject.watch.empty_folder = Path(_made(request, "work"))
+    os.chdir(contract.subject.watch.empty_folder)
+    for finding in contract.findings():
+        _tell(result, finding)
+    answer(result, {})
+
+
+def _settle(request: dict[str, Any]) -> None:
+    """Limits on memory, a place for temporary files, and no compiled Python beside the plugin's sources."""
+    temporary = _made(request, "temporary")
+    tempfile.tempdir = os.environ["TMPDIR"] = temporary
+    sys.dont_write_bytecode = True
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return
+    _, most = resource.getrlimit(resource.RLIMIT_DATA)
+    wanted = request["memory_bytes"]
+    resource.setrlimit(resource.RLIMIT_DATA, (wanted if most == resource.RLIM_INFINITY else min(wanted, most), most))
+
+
+def _made(request: dict[str, Any], name: str) -> str:
+    path = Path(request["folder"]) / name
+    path.mkdir()
+    return str(path)
+
+
+def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
+    """Import the plugin and resolve its configuration; None where that is the end of it, which is told."""
+    watch = Watch(all_threads=True)
+    limits = Limits(request["seconds"], request["memory_bytes"])
+    started = time.perf_counter()
+    offer = EntryPoint(request["name"], request["value"], registry.GROUP)
+    try:
+        with watch.during("import"):
+            task = registry.import_task(offer, limits.seconds)
+        seconds = time.perf_counter() - started
+        config_file = Path(request["config_file"]) if request["config_file"] else None
+        with watch.during("space"):
+            config = resolve(
+                task, preset="draft", config_file=config_file, overrides=request["overrides"], seed=request["seed"]
+            )
+    except registry.PluginError as error:
+        _tell(result, Finding(*LOADS, "fail", said(error)))
+        return None
+    except LidardesignError as error:
+        _write(result, {"refused": error.as_dict()})
+        return None
+    except BaseException as error:
+        _tell(result, Finding(*LOADS, "fail", f"{type(error).__name__}: {error}"))
+        return None
+    subject = Subject(task, config, limits, watch)
+    subject.seconds["import"] = seconds
+    version = f"version {task.api_version} of the task interface"
+    _tell(result, Finding(*LOADS, "pass", f"{version}, {type(task).__module__}", seconds))
+    return Contract(subject)
+
+
+def _tell(result: BinaryIO, finding: Finding) -> None:
+    _write(result, finding.as_dict())
+
+
+def _write(result: BinaryIO, document: dict[str, Any]) -> None:
+    result.write(json.dumps(document).encode() + b"\n")
+    result.flush()

@@ -1,0 +1,137 @@
+"""Laws of a task's scenes: made again they are the same, splits share none, and they travel to other processes."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Sequence
+
+from lidardesign.errors import LidardesignError
+from lidardesign.scene import Scene
+from lidardesign.task import Split
+from lidardesign.testing.elsewhere import fingerprints_elsewhere
+from lidardesign.testing.fingerprint import fingerprint, geometry_fingerprint
+from lidardesign.testing.law import BrokenLawError, Held, Law, NotApplicable
+from lidardesign.testing.subject import Subject
+
+# Training scenes are drawn with other seeds for refinement; so many further seeds are tried.
+FURTHER_SEEDS = 2
+SPLITS: tuple[Split, ...] = ("train", "test")
+
+
+def check_scenes(subject: Subject) -> Held:
+    """Both splits have scenes, and their bodies are within the program's bounds."""
+    counts = {split: len(subject.scenes(split)) for split in SPLITS}
+    for split, count in counts.items():
+        if not count:
+            raise BrokenLawError(f"the split {split} has no scenes", allowed="1 or more")
+    frames = max(scene.frames for split in SPLITS for scene in subject.scenes(split))
+    moving = f", up to {frames} frames" if frames > 1 else ""
+    return Held(f"{counts['train']} to train on, {counts['test']} held out{moving}", {**counts, "frames": frames})
+
+
+def check_repeatable(subject: Subject) -> Held:
+    """The same configuration, split and seed give the same scenes, to the bit."""
+    for split in SPLITS:
+        first, again = subject.scenes(split), subject.new_scenes(split, subject.config.seed)
+        _compare(first, again, f"the second time the split {split}")
+    return Held("made twice, the same to the bit")
+
+
+def _compare(first: Sequence[Scene], again: Sequence[Scene], when: str) -> None:
+    if len(first) != len(again):
+        raise BrokenLawError(f"{when} has {len(again)} scenes, not {len(first)}")
+    for number, (one, other) in enumerate(zip(first, again, strict=True)):
+        if fingerprint(one) != fingerprint(other):
+            raise BrokenLawError(
+                f"{when} has another scene {number} ({one.name!r})",
+                hint="draw all chance from lidardesign.task.random_generator(seed, ...)",
+            )
+
+
+def check_seeds(subject: Subject) -> Held | NotApplicable:
+    """Another seed gives other training scenes, as refinement draws them."""
+    first = {geometry_fingerprint(scene) for scene in subject.scenes("train")}
+    other = {geometry_fingerprint(scene) for scene in subject.scenes("train", subject.config.seed + 1)}
+    shared = len(first & other)
+    if shared == len(first):
+        return NotApplicable("another seed gives the same training scenes: designs cannot be refined on new ones")
+    return Held(f"{shared} of {len(first)} training scenes are the same with another seed", {"shared": shared})
+
+
+def check_disjoint(subject: Subject) -> Held:
+    """No held-out scene is trained on, whatever the seed of the training scenes."""
+    held_out = {geometry_fingerprint(scene): scene.name for scene in subject.scenes("test")}
+    seeds = range(subject.config.seed, subject.config.seed + FURTHER_SEEDS + 1)
+    for seed in seeds:
+        for scene in subject.scenes("train", seed):
+            name = held_out.get(geometry_fingerprint(scene))
+            if name is not None:
+                raise BrokenLawError(
+                    f"the training scene {scene.name!r} of seed {seed} is the held-out scene {name!r}",
+                    hint="name the split where chance is drawn: random_generator(seed, self.name, split, index)",
+                )
+    return Held(f"{len(held_out)} held out, none met with {len(seeds)} seeds", {"seeds": len(seeds)})
+
+
+def check_elsewhere(subject: Subject) -> Held | NotApplicable:
+    """A worker process makes the same scenes: nothing hangs on the order of sets or on what ran before."""
+    kind = type(subject.task)
+    if kind.__module__ == "__main__" or "<locals>" in kind.__qualname__:
+        return NotApplicable("the task's class cannot be imported in another process")
+    started = subject.limits.seconds
+    found = fingerprints_elsewhere(subject.config, kind, started)
+    for split in SPLITS:
+        mine = [fingerprint(scene) for scene in subject.scenes(split)]
+        if found[split] != mine:
+            number = next((i for i, (a, b) in enumerate(zip(mine, found[split], strict=False)) if a != b), len(mine))
+            raise BrokenLawError(
+                f"another process makes another scene {number} of the split {split}",
+                hint="do not use hash(), the order of sets, the time or the process in scenes",
+            )
+    return Held("another process makes them the same to the bit")
+
+
+def check_picklable(subject: Subject) -> Held:
+    """Scenes and the configuration survive pickling, which any engine of workers may do with them."""
+    size = 0
+    for scene in (*subject.looked_at, subject.config.task):
+        try:
+            content = pickle.dumps(scene)
+            again = pickle.loads(content)
+        except LidardesignError:
+            raise
+        except Exception as error:
+            what = getattr(scene, "name", "the configuration")
+            raise BrokenLawError(f"{what!r} cannot be pickled: {type(error).__name__}: {error}") from error
+        if fingerprint(again) != fingerprint(scene):
+            raise BrokenLawError(f"{scene!r:.80} is another one after pickling")
+        size = max(size, len(content))
+    return Held(f"{size / 1000:.3g} kB at most", {"bytes": size})
+
+
+LAWS = (
+    Law("scenes are made", "scenes", "both splits have scenes", check_scenes, needs=("space is fixed",)),
+    Law(
+        "scenes repeat",
+        "scenes",
+        "the same configuration, split and seed give the same scenes",
+        check_repeatable,
+        needs=("scenes are made",),
+    ),
+    Law(
+        "scenes repeat elsewhere",
+        "scenes",
+        "another process makes the same scenes",
+        check_elsewhere,
+        needs=("scenes repeat",),
+    ),
+    Law("seeds differ", "scenes", "another seed gives other training scenes", check_seeds, needs=("scenes are made",)),
+    Law(
+        "splits are disjoint",
+        "scenes",
+        "no held-out scene is trained on, whatever the seed",
+        check_disjoint,
+        needs=("scenes are made",),
+    ),
+    Law("scenes are picklable", "scenes", "scenes survive pickling", check_picklable, needs=("scenes are made",)),
+)

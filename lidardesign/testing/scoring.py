@@ -1,0 +1,211 @@
+"""Laws of a task's score: always a number, best on the truth, worse for less, and moved by nothing but returns."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidardesign.evaluate.scoring import checked_residuals, gives_residuals
+from lidardesign.scene import Scene
+from lidardesign.simulate.returns import Returns
+from lidardesign.testing.fingerprint import fingerprint
+from lidardesign.testing.law import BrokenLawError, Held, Law, NotApplicable
+from lidardesign.testing.probing import full_rays, shuffled, with_noise, without_returns
+from lidardesign.testing.subject import Subject
+
+DENSE, SPARSE = 400, 12
+SEED = 20_253
+# The spread of noise on ranges, as shares of the median range: from what a sensor has to what spoils any estimate.
+NOISE_SHARES = (0.01, 0.1)
+# Of the metric's tolerance: what another order of the same additions may change.
+ORDER_SHARE = 0.01
+
+
+def _dense(subject: Subject, number: int) -> list[Returns]:
+    return subject.returns(number, subject.rays(number, DENSE))
+
+
+def _worse(subject: Subject, value: float, than: float) -> float:
+    """By how much a value is worse than another, in the metric's unit; negative where it is better."""
+    return value - than if subject.task.metric.better == "lower" else than - value
+
+
+def _scenes(subject: Subject) -> list[tuple[int, Scene]]:
+    return list(enumerate(subject.looked_at))
+
+
+def check_number(subject: Subject) -> Held:
+    """Returns of dense, of sparse and of random rays are scored by a finite number or fail."""
+    values = []
+    for number, scene in _scenes(subject):
+        space, generator = subject.config.space, np.random.default_rng([SEED, number])
+        anywhere = [full_rays(space.at(one).sample(DENSE, generator), space) for one in subject.conditions]
+        for lists in (subject.rays(number, DENSE), subject.rays(number, SPARSE), anywhere):
+            values.append(subject.score(scene, subject.returns(number, lists)).value)
+    unit = subject.task.metric.unit
+    words = f"{len(values)} scores from {min(values):.4g} to {max(values):.4g} {unit}"
+    return Held(words, {"least": min(values), "most": max(values)})
+
+
+def check_nothing(subject: Subject) -> Held:
+    """No rays at all and rays that hear nothing are scored, and no better than returns are."""
+    found = []
+    for number, scene in _scenes(subject):
+        none = [rays.subset(np.zeros(0, dtype=int)) for rays in subject.rays(number, SPARSE)]
+        silent = without_returns(_dense(subject, number))
+        dense = subject.score(scene, _dense(subject, number))
+        for what, returns in (("no rays", subject.returns(number, none)), ("rays without a return", silent)):
+            score = subject.score(scene, returns)
+            if _worse(subject, dense.value, score.value) > subject.task.metric.tolerance:
+                raise BrokenLawError(
+                    f"scene {scene.name!r}: {what} score {score.value:.4g}, better than {dense.value:.4g} of "
+                    f"{DENSE} returns from targets",
+                    hint="where there is too little to compute anything, return Score(metric.worst, failed=True)",
+                )
+            found.append(score.failed)
+    words = "counts as failed" if all(found) else "scored as a number" if not any(found) else "failed or a number"
+    return Held(words, {"failed": float(np.mean(found))})
+
+
+def check_best(subject: Subject) -> Held:
+    """Many exact returns from targets score at least as well as few, and better than none."""
+    dense, sparse, none = [], [], []
+    for number, scene in _scenes(subject):
+        returns = _dense(subject, number)
+        dense.append(subject.score(scene, returns).value)
+        sparse.append(subject.score(scene, subject.returns(number, subject.rays(number, SPARSE))).value)
+        none.append(subject.score(scene, without_returns(returns)).value)
+    best, few, nothing = (float(np.mean(values)) for values in (dense, sparse, none))
+    metric = subject.task.metric
+    figures = {"dense": best, "sparse": few, "none": nothing}
+    said = f"{best:.4g} of {DENSE} rays at targets, {few:.4g} of {SPARSE}, {nothing:.4g} of none [{metric.unit}]"
+    if _worse(subject, best, few) > metric.tolerance or not _worse(subject, nothing, best) > 0:
+        raise BrokenLawError(
+            f"the score does not reward seeing the targets: {said}",
+            allowed=f"the first is the best ({metric.better} is better)",
+            hint="check metric.better and what score() compares",
+        )
+    return Held(said, figures)
+
+
+def check_noise(subject: Subject) -> Held:
+    """Noise on ranges makes scores worse, or leaves those alone that do not depend on ranges."""
+    exact, noisy = [], []
+    for number, scene in _scenes(subject):
+        returns = _dense(subject, number)
+        exact.append(subject.score(scene, returns).value)
+        disturbed = [with_noise(returns, share, np.random.default_rng([SEED, number])) for share in NOISE_SHARES]
+        noisy.append([subject.score(scene, one).value for one in disturbed])
+    value, found = float(np.mean(exact)), np.mean(noisy, axis=0)
+    metric, losses = subject.task.metric, [_worse(subject, float(mean), value) for mean in found]
+    steps = ", ".join(f"{mean:.4g} with {share:.0%} noise" for share, mean in zip(NOISE_SHARES, found, strict=True))
+    said = f"{value:.4g} exact, {steps} [{metric.unit}]"
+    if min(losses) < -metric.tolerance:
+        raise BrokenLawError(f"noise on the ranges makes the score better: {said}")
+    figures = {"exact": value, "noisy": float(found[-1])}
+    return Held(said if max(losses) > 0 else f"{said}: ranges do not enter", figures)
+
+
+def check_order(subject: Subject) -> Held:
+    """The order in which rays are listed does not matter."""
+    worst = 0.0
+    for number, scene in _scenes(subject):
+        returns = _dense(subject, number)
+        value = subject.score(scene, returns).value
+        other = subject.score(scene, shuffled(returns, np.random.default_rng([SEED, number]))).value
+        worst = max(worst, abs(other - value))
+    limit = ORDER_SHARE * subject.task.metric.tolerance
+    if worst > limit:
+        unit = subject.task.metric.unit
+        raise BrokenLawError(f"rays in another order change the score by {worst:.3g} {unit}", allowed=f"{limit:.3g}")
+    return Held(f"changes by at most {worst:.1g} {subject.task.metric.unit}", {"difference": worst})
+
+
+def check_repeats(subject: Subject) -> Held:
+    """The same returns have the same score every time, to the bit."""
+    for number, scene in _scenes(subject):
+        returns = _dense(subject, number)
+        first, again = subject.score(scene, returns), subject.score(scene, returns)
+        if fingerprint(first) != fingerprint(again):
+            raise BrokenLawError(f"scene {scene.name!r}: {first.value!r}, then {again.value!r} for the same returns")
+    return Held("scored twice, the same to the bit")
+
+
+def check_untouched(subject: Subject) -> Held:
+    """Scoring changes neither the scene nor the returns."""
+    for number, scene in _scenes(subject):
+        returns = _dense(subject, number)
+        before, heard = fingerprint(scene), fingerprint(returns)
+        subject.score(scene, returns)
+        for what, was, now in (("the scene", before, fingerprint(scene)), ("returns", heard, fingerprint(returns))):
+            if was != now:
+                raise BrokenLawError(
+                    f"score changed {what} ({scene.name!r})", hint="work on copies: the next design is scored there too"
+                )
+    return Held(f"{len(subject.looked_at)} scenes and their returns are as they were")
+
+
+def check_residuals(subject: Subject) -> Held | NotApplicable:
+    """Residuals are places and values of 0 or more, also where nothing was heard."""
+    if not gives_residuals(subject.task):
+        return NotApplicable("the task gives no residuals: its designs cannot be refined")
+    count = 0
+    for number, scene in _scenes(subject):
+        returns = _dense(subject, number)
+        for heard in (returns, without_returns(returns)):
+            with subject.calling("residuals"):
+                count += len(checked_residuals(subject.task, scene, heard).values)
+    return Held(f"{count} places", {"places": count})
+
+
+LAWS = (
+    Law(
+        "scores are numbers",
+        "score",
+        "a finite number, or failed, for dense, sparse and random rays",
+        check_number,
+        needs=("targets are in reach",),
+    ),
+    Law(
+        "nothing heard is scored",
+        "score",
+        "no rays and no returns are scored, no better than returns",
+        check_nothing,
+        needs=("scores are numbers",),
+    ),
+    Law(
+        "best on the truth",
+        "score",
+        "many exact returns score best, none worst",
+        check_best,
+        needs=("scores are numbers",),
+    ),
+    Law(
+        "worse under noise",
+        "score",
+        "noise on ranges never makes a score better",
+        check_noise,
+        needs=("scores are numbers",),
+    ),
+    Law(
+        "order does not matter",
+        "score",
+        "rays in another order have the same score",
+        check_order,
+        needs=("scores are numbers",),
+    ),
+    Law("scores repeat", "score", "the same returns have the same score", check_repeats, needs=("scores are numbers",)),
+    Law(
+        "scores change nothing",
+        "score",
+        "scenes and returns are as they were after scoring",
+        check_untouched,
+        needs=("scores are numbers",),
+    ),
+    Law(
+        "residuals are places",
+        "score",
+        "residuals are places and values of 0 or more",
+        check_residuals,
+        needs=("scores are numbers",),
+    ),
+)
