@@ -11,6 +11,7 @@ from lidardesign.cli import options
 from lidardesign.cli.console import command
 from lidardesign.cli.dry_run import DryRun
 from lidardesign.cli.fit import GATES, LAYOUTS, check_level, check_sensors, fit_and_write, load_libraries, usual_layout
+from lidardesign.cli.likes import likeness
 from lidardesign.cli.runs import check_choice, check_name, need_run, open_target, parse_at, sensor_count
 from lidardesign.cli.weighting import Weighting
 
@@ -47,6 +48,7 @@ def constrain(
     at: options.At = None,
     weights: options.Weights = None,
     refine: options.Refine = None,
+    like: options.Like = None,
     name: options.Name = "constrained",
     dry_run: DryRun = False,
     seed: options.Seed = None,
@@ -63,6 +65,7 @@ def constrain(
         checked = load_constraints(constraints, overrides or [])
         opened, design = open_target(target, console)
         run = need_run(opened, target)
+        checked, layout = likeness(like, checked, layout, rays, run, console)
         layout = layout or _usual(checked, design, run)
         check_sensors(count, layout)
         fit_and_write(

@@ -21,7 +21,7 @@ from lidardesign.cli.runs import open_run, read_design, run_of
 from lidardesign.cli.scores import show_evaluation
 from lidardesign.cli.searches import CmaSeconds, check_cma_seconds, searching, told
 from lidardesign.cli.streams import claim_stdout, is_output, written_file
-from lidardesign.cli.times import keep_times
+from lidardesign.cli.times import keep_times, times_so_far
 from lidardesign.errors import ConfigError, DataError, ThresholdError
 from lidardesign.run.clock import phase
 from lidardesign.run.streams import is_there
@@ -79,7 +79,13 @@ Report = Annotated[
 ]
 Plots = Annotated[
     Path | None,
-    typer.Option("--plots", metavar="DIR", help="Write PNG curves into this folder.", show_default=False),
+    typer.Option(
+        "--plots",
+        metavar="DIR",
+        help="Write pictures for papers into this folder, as PNG and SVG: scene, density, scores, differences, "
+        "constraints, effects, accuracy, times.",
+        show_default=False,
+    ),
 ]
 Csv = Annotated[Path | None, typer.Option("--csv", metavar="FILE", help="Write the rows as CSV.", show_default=False)]
 Surroundings = Annotated[
@@ -147,12 +153,14 @@ def evaluate(
         claim_stdout(console, dry_run=dry_run, csv=csv, report=report)
         with phase("libraries"):
             import lidardesign.evaluate.score  # noqa: F401
+            from lidardesign.cli.rigs import budgets_within
             from lidardesign.run.config import judged_by
 
         wanted = _checked(workers, baseline or [], cma_seconds, fail_above)
         planner, audit = planner_of(effects, detector, range_tolerance_mm, return_tolerance)
         entries, runs = _collect(targets, console)
         run = learned = _common_run(_named_apart(entries), runs)
+        rays = rays or budgets_within([entry.design for entry in entries], run.task.defaults.rays, console)
         if accuracy:
             _check_measurable(learned)
         if overrides:
@@ -167,10 +175,11 @@ def evaluate(
         files = (report, plots, csv)
         evaluation = _evaluate_with(wanted, replace(request, cma=searching(cma_seconds)), console)
         # accuracy takes minutes: what was scored by then is written already
-        written = _write_files(evaluation, request, *(None if accuracy and is_output(path) else path for path in files))
+        early = (None if accuracy and is_output(path) else path for path in files)
+        written = _write_files(evaluation, request, times_so_far(run.folder, "evaluate", console), *early)
         if accuracy:
             evaluation = _with_accuracy(evaluation, request, learned, console)
-            written = _write_files(evaluation, request, *files)
+            written = _write_files(evaluation, request, times_so_far(run.folder, "evaluate", console), *files)
         document = {**evaluation.as_dict(), "set": overrides or [], "files": [str(path) for path in written]}
         keep_times(run.folder, "evaluate", console)
         console.result(document, lambda rich: _show(evaluation, document, written, rich))
@@ -230,16 +239,20 @@ def _plan(
 @phase("designs")
 def _collect(targets: list[Path], console: Console) -> tuple[list[_Entry], list[Run]]:
     """The designs that were named, and the runs: of folders all designs, of files the file."""
+    from lidardesign.cli.rigs import reach_of
+
     entries: list[_Entry] = []
-    runs: list[Run] = []
+    opened = {target: open_run(target) for target in targets if target.is_dir()}
+    runs = list(opened.values())
+    reach_m = reach_of(runs)
     for target in targets:
-        if target.is_dir():
-            runs.append(open_run(target))
-            entries += [_Entry(read_design(path, console), path, runs[-1]) for path in runs[-1].designs()]
+        if target in opened:
+            run = opened[target]
+            entries += [_Entry(read_design(path, console), path, run) for path in run.designs()]
         elif not is_there(target):
             raise DataError("no such run or design", where=str(target), hint="give run folders or design files")
         else:
-            design = read_design(target, console)
+            design = read_design(target, console, reach_m)
             entries.append(_Entry(design, target, run_of(design, target)))
     seen: dict[Path, _Entry] = {}
     for entry in entries:
@@ -380,6 +393,7 @@ def _with_accuracy(evaluation: Evaluation, request: EvaluationRequest, run: Run,
 def _write_files(
     evaluation: Evaluation,
     request: EvaluationRequest,
+    times: dict[str, dict[str, float]],
     report: Path | None,
     plots: Path | None,
     csv: Path | None,
@@ -392,9 +406,10 @@ def _write_files(
             write_csv(evaluation, file)
         written.append(csv)
     if plots is not None:
+        from lidardesign.evaluate.pictured import pictured_of
         from lidardesign.evaluate.plots import write_plots
 
-        written += write_plots(evaluation, plots)
+        written += write_plots(evaluation, plots, pictured_of(request, times))
     if report is not None:
         with written_file(report) as file:
             _write_report(evaluation, request, file)

@@ -11,6 +11,7 @@ import typer
 from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
 from lidardesign.cli.dry_run import DryRun, tell_plan
+from lidardesign.cli.likes import likeness
 from lidardesign.cli.runs import check_choice, check_name, open_run, parse_at, provenance, sensor_count
 from lidardesign.cli.times import keep_times
 from lidardesign.cli.weighting import Weighting
@@ -41,6 +42,7 @@ def fit(
     at: options.At = None,
     weights: options.Weights = None,
     refine: options.Refine = None,
+    like: options.Like = None,
     name: options.Name = "fit",
     dry_run: DryRun = False,
     seed: options.Seed = None,
@@ -58,8 +60,11 @@ def fit(
             check_choice(gates, "--gates", GATES)
         count, condition = sensor_count(sensors, None), parse_at(at)
         opened = open_run(run)
+        constraints, layout = likeness(like, None, layout, rays, opened, console)
         layout = layout or usual_layout(opened)
         check_sensors(count, layout)
+        rays = rays or (constraints.budget.rays if constraints else None)
+        usual = constraints.sensors.count if constraints else opened.task.defaults.sensors
         open_budget = layout == "grid" and gates != "ray"
         budget = rays if rays is not None or open_budget else max(opened.task.defaults.rays)
         fit_and_write(
@@ -68,7 +73,8 @@ def fit(
             command_name="fit",
             name=name,
             seed=opened.config.seed if seed is None else seed,
-            sensors=opened.task.defaults.sensors if count is None else count,
+            constraints=constraints,
+            sensors=usual if count is None else count,
             layout=layout,
             rays=budget,
             gates=gates,

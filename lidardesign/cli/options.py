@@ -93,6 +93,25 @@ Refine = Annotated[
         show_default=False,
     ),
 ]
+Preset = Annotated[
+    str | None,
+    typer.Option(
+        "--preset",
+        metavar="draft|standard|fine",
+        help="Effort: about half a minute, minutes, or tens of minutes.",
+        show_default="standard",
+    ),
+]
+Like = Annotated[
+    Path | None,
+    typer.Option(
+        "--like",
+        metavar="RIG",
+        help="Be as a rig that there is (a design, rays as CSV or NPZ, a MuJoCo model, an SDF file): as many sensors "
+        "at its places, fields of view and gates no wider, as many rays. Constraints of your own go before.",
+        show_default=False,
+    ),
+]
 Overrides = Annotated[
     list[str] | None,
     typer.Option(

@@ -68,21 +68,28 @@ def open_run(folder: Path) -> Run:
     return Run(folder, task, config)
 
 
-def read_design(path: Path, console: Console) -> Design:
-    """A design file, or standard input for `-`.
+def read_design(path: Path, console: Console, reach_m: float | None = None) -> Design:
+    """A design file or a rig of others, or standard input for `-`.
 
-    One of a run that is not as it was written says so: it may be cut, or mended by hand.
+    One of a run that is not as it was written says so: it may be cut, or mended by hand. A rig says what its file
+    does not.
+
+    Arguments:
+        path: The file.
+        console: Where notes go.
+        reach_m: How far the rays of a rig are heard where its file does not say so [m].
 
     Raises:
         ConfigError, DataError: It cannot be read.
     """
+    from lidardesign.cli.rigs import tell_notes
     from lidardesign.cli.streams import readable
     from lidardesign.design.files import load_design
 
     difference = _difference(path)
     try:
         with readable(path) as file:
-            design = load_design(file)
+            design = load_design(file, reach_m)
     except (ConfigError, DataError) as error:
         if difference is None:
             raise
@@ -90,6 +97,7 @@ def read_design(path: Path, console: Console) -> Design:
         raise type(error)(error.message, where=error.where, allowed=error.allowed, hint=hint) from None
     if difference is not None:
         console.note(f"note: {path} {difference}")
+    tell_notes(design, str(path), console)
     return design
 
 

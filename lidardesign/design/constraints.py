@@ -242,7 +242,7 @@ class Constraints(SensorConstraints):
         """The constraints of one sensor: its entry of `each` over the common keys."""
         common = self.model_dump(exclude_none=True, include=set(SensorConstraints.model_fields))
         if index < len(self.each):
-            common = _merged(common, self.each[index].model_dump(exclude_none=True))
+            common = merged(common, self.each[index].model_dump(exclude_none=True))
         return SensorConstraints.model_validate(common)
 
     def name_of(self, index: int, key: str) -> str:
@@ -260,11 +260,12 @@ class Constraints(SensorConstraints):
         return self.model_dump(exclude_none=True, exclude_unset=True)
 
 
-def _merged(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain values with others laid over them, key by key at every depth."""
     result = dict(base)
     for key, value in over.items():
         both = isinstance(value, Mapping) and isinstance(result.get(key), dict)
-        result[key] = _merged(result[key], value) if both else value
+        result[key] = merged(result[key], value) if both else value
     return result
 
 

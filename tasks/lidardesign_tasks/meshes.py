@@ -3,7 +3,7 @@
 Every file is one object of a class (or one scan). Files are split into training and held-out ones; each is
 shown in a few slightly different poses. With a single file the poses alone make the splits. The world's z
 axis is up, and unless told otherwise one sensor place is in front (+x) of the objects, at twice their extent,
-and looks at them.
+and looks at them. With a CSV of poses over time objects and occluders move, and every frame is judged.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ from lidardesign.space import DesignSpace, aim
 from lidardesign.task import Defaults, Metric, Residuals, Score, Split, random_generator
 from lidardesign.vertex_weights import COLOURS, Painted
 from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_origins
+from lidardesign_tasks.motion import Motion, load_motion, moved_bounds_m
+from lidardesign_tasks.moving_surface import SURFACES, moving_residuals, moving_score, with_moving_truth
 from lidardesign_tasks.pose import jittered_pose
 from lidardesign_tasks.surface import surface_residuals, surface_score, with_visible_truth
 from lidardesign_tasks.surroundings import any_direction, moving
@@ -67,6 +69,10 @@ class MeshesConfig(Importance):
     truth_points: int = Field(
         5000, ge=100, le=200_000, description="points of the visible surface to judge by"
     )
+    motion: Path | None = Field(
+        None, description="CSV of poses over time: time_s, body, x_m, y_m, z_m, and qw..qz or roll, pitch, yaw"
+    )
+    frame_rate_hz: float = Field(10.0, gt=0, le=10_000, description="frames per second of a motion [Hz]")
     speed_m_s: float = Field(0.0, ge=0, le=100, description="how fast objects move within a frame, in any direction")
     importance: str | None = Field(
         None, min_length=1, description="vertex property of the files that says how much the surface counts, or colours"
@@ -79,6 +85,14 @@ class MeshesConfig(Importance):
     def _contrast_of_colours(self) -> MeshesConfig:
         if self.importance != COLOURS and self.colour_contrast != type(self).model_fields["colour_contrast"].default:
             raise ValueError("colour_contrast is that of importance=colours")
+        return self
+
+    @model_validator(mode="after")
+    def _one_way_to_move(self) -> MeshesConfig:
+        if self.motion is not None and self.speed_m_s:
+            raise ValueError("speed_m_s is that of objects without a motion: leave one of them out")
+        if self.motion is None and self.frame_rate_hz != type(self).model_fields["frame_rate_hz"].default:
+            raise ValueError("frame_rate_hz is that of a motion: set motion=FILE.csv too")
         return self
 
 
@@ -99,7 +113,8 @@ class MeshesTask:
 
     def space(self, config: MeshesConfig) -> DesignSpace:
         """A sensor in front of all meshes that sees every one of them whole."""
-        return derived_space(config, [mesh for _, mesh in load_folder(config)])
+        meshes = load_folder(config)
+        return derived_space(config, meshes, motion_of(config, meshes))
 
     def scenes(
         self, config: MeshesConfig, split: Split, seed: int, space: DesignSpace | None = None
@@ -111,8 +126,9 @@ class MeshesTask:
             ConfigError: No folder is set, or one mesh without pose jitter would make both splits the same.
         """
         meshes = load_folder(config)
-        space = space or derived_space(config, [mesh for _, mesh in meshes])
-        occluders = tuple(Body(mesh, name, "occluder") for name, mesh in load_occluders(config))
+        motion = motion_of(config, meshes)
+        space = space or derived_space(config, meshes, motion)
+        occluders = tuple(_occluder(name, mesh, motion) for name, mesh in load_occluders(config))
         shift = jitter_m(config, [mesh for _, mesh in meshes])
         if len(meshes) == 1 and config.jitter_rotation_deg == 0 and shift == 0:
             raise ConfigError(
@@ -126,22 +142,28 @@ class MeshesTask:
         for (name, mesh), pose in itertools.product(chosen, range(config.poses)):
             generator = random_generator(seed, "meshes", split, name, pose)
             centre = mesh.bounds_m.mean(axis=0)
-            placed = Body(
-                mesh, name, "both", jittered_pose(generator, config.jitter_rotation_deg, shift, centre)
-            )
-            scene = Scene((placed, *occluders), f"{split} {name} pose {pose}")
-            judged = with_visible_truth(scene, space, config.truth_points, generator)
+            jitter = jittered_pose(generator, config.jitter_rotation_deg, shift, centre)
+            path = None if motion is None else motion.of_object(name)
+            placed = Body(mesh, name, "both", jitter if path is None else path @ jitter)
+            scene = Scene((placed, *occluders), f"{split} {name} pose {pose}", frame_rate_hz=config.frame_rate_hz)
+            judge = with_visible_truth if motion is None else with_moving_truth
+            judged = judge(scene, space, config.truth_points, generator)
+            if motion is not None:
+                scenes.append(config.around(judged))
+                continue
             velocity = config.speed_m_s * any_direction(random_generator(seed, "meshes", split, name, pose, "velocity"))
             scenes.append(config.around(replace(judged, bodies=(moving(placed, velocity), *occluders))))
         return scenes
 
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """Chamfer distance [mm] between the reconstruction and the part of the surface that could be seen."""
-        return surface_score(self.metric, scene, returns)
+        score = moving_score if SURFACES in scene.truth else surface_score
+        return score(self.metric, scene, returns)
 
     def residuals(self, scene: Scene, returns: Sequence[Returns]) -> Residuals:
         """Where the Chamfer distance is [mm]."""
-        return surface_residuals(self.metric, scene, returns)
+        residuals = moving_residuals if SURFACES in scene.truth else surface_residuals
+        return residuals(self.metric, scene, returns)
 
 
 def load_folder(config: MeshesConfig) -> list[tuple[str, Mesh]]:
@@ -155,6 +177,20 @@ def load_folder(config: MeshesConfig) -> list[tuple[str, Mesh]]:
 def load_occluders(config: MeshesConfig) -> list[tuple[str, Mesh]]:
     """Name and mesh of every occluder, in metres, z up, where the files put them."""
     return _load(str(config.occluders), config, "auto", False) if config.occluders is not None else []
+
+
+def motion_of(config: MeshesConfig, meshes: Sequence[tuple[str, Mesh]]) -> Motion | None:
+    """The motion of a configuration in frames; None where everything rests."""
+    if config.motion is None:
+        return None
+    others = [name for name, _ in load_occluders(config)]
+    return load_motion(config.motion, config.frame_rate_hz, [name for name, _ in meshes], others)
+
+
+def _occluder(name: str, mesh: Mesh, motion: Motion | None) -> Body:
+    """An occluder where its file puts it, or along its own poses."""
+    path = None if motion is None else motion.of(name)
+    return Body(mesh, name, "occluder") if path is None else Body(mesh, name, "occluder", path)
 
 
 def weighted(mesh: Mesh, config: MeshesConfig, space: DesignSpace) -> Mesh:
@@ -212,7 +248,7 @@ def split_meshes(meshes: Sequence[tuple[str, Mesh]], config: MeshesConfig, split
 
 def extent_m(meshes: Sequence[Mesh]) -> float:
     """The longest side of the box around all meshes [m]."""
-    low, high = _bounds(meshes)
+    low, high = _bounds([mesh.bounds_m for mesh in meshes])
     return float((high - low).max())
 
 
@@ -222,17 +258,22 @@ def jitter_m(config: MeshesConfig, meshes: Sequence[Mesh]) -> float:
     return RELATIVE_JITTER * extent_m(meshes) if given is None else given
 
 
-def _bounds(meshes: Sequence[Mesh]) -> tuple[np.ndarray, np.ndarray]:
-    corners = np.concatenate([mesh.bounds_m for mesh in meshes])
+def _bounds(boxes: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    corners = np.concatenate(boxes)
     return corners.min(axis=0), corners.max(axis=0)
 
 
-def derived_space(config: MeshesConfig, meshes: Sequence[Mesh]) -> DesignSpace:
-    """The directions and ranges in which the sphere around all meshes lies, from every origin of the box.
+def derived_space(
+    config: MeshesConfig, named: Sequence[tuple[str, Mesh]], motion: Motion | None = None
+) -> DesignSpace:
+    """The directions and ranges in which the sphere around all meshes lies wherever they move, from every origin.
 
     An origin inside that sphere looks everywhere.
     """
-    low, high = _bounds(meshes)
+    meshes = [mesh for _, mesh in named]
+    low, high = _bounds(
+        [moved_bounds_m(mesh, None if motion is None else motion.of_object(name)) for name, mesh in named]
+    )
     centre = (low + high) / 2
     radius = ROOM * (float(np.linalg.norm(high - low)) / 2 + 2 * jitter_m(config, meshes))
     ahead = centre + np.array([max(SENSOR_DISTANCE * extent_m(meshes), 2 * radius), 0.0, 0.0])

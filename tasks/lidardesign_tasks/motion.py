@@ -1,0 +1,104 @@
+"""Which meshes of a folder move along a CSV of poses, and where each is in every frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.scene import Mesh
+from lidardesign_tasks.poses_csv import BodyPath, read_poses, span_s
+
+EVERY = "*"
+MOST_FRAMES = 500
+# A motion of whole frames ends in the last of them, whatever the product rounds to.
+ROUNDING_FRAMES = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Bodies' poses in the frames of a scene.
+
+    Arguments:
+        poses: Body to world by the name in the file, shape (T, 4, 4) each, T from 1.
+    """
+
+    poses: Mapping[str, np.ndarray]
+
+    def of(self, name: str) -> np.ndarray | None:
+        """The poses of a mesh file (T, 4, 4): by its name with or without its ending, or those of every object."""
+        return next((self.poses[key] for key in (name, Path(name).stem) if key in self.poses), None)
+
+    def of_object(self, name: str) -> np.ndarray | None:
+        """The poses of a target: its own, or those of every object."""
+        own = self.of(name)
+        return self.poses.get(EVERY) if own is None else own
+
+
+def load_motion(path: Path, frame_rate_hz: float, objects: Iterable[str], others: Iterable[str]) -> Motion:
+    """The motion of a file in frames, from its first time to its last.
+
+    Arguments:
+        path: The CSV.
+        frame_rate_hz: Frames per second [Hz].
+        objects: Names of the mesh files that are targets; the body `*` is each of them.
+        others: Names of the mesh files that are occluders.
+
+    Raises:
+        DataError: The file cannot be used, or names a body that no mesh is called.
+        ConfigError: More frames than a scene takes.
+    """
+    try:
+        state = path.stat()
+    except OSError as error:
+        raise DataError(f"cannot be read: {error.strerror or error}", where=str(path)) from None
+    paths = _read(path, state.st_mtime_ns, state.st_size)
+    _check_bodies(paths, path, [*objects], [*others])
+    first, last = span_s(paths)
+    frames = int((last - first) * frame_rate_hz + ROUNDING_FRAMES) + 1
+    if frames > MOST_FRAMES:
+        raise ConfigError(
+            f"{last - first:g} s of motion at {frame_rate_hz:g} frames per second are {frames} frames",
+            where="task.frame_rate_hz",
+            allowed=f"at most {MOST_FRAMES} frames",
+            hint=f"at most {(MOST_FRAMES - 1) / (last - first):.3g} Hz, or fewer seconds",
+        )
+    times = first + np.arange(frames) / frame_rate_hz
+    return Motion({name: one.at(times) for name, one in paths.items()})
+
+
+@lru_cache(maxsize=8)
+def _read(path: Path, changed_ns: int, size: int) -> dict[str, BodyPath]:
+    """One file; space and both splits need it."""
+    return read_poses(path)
+
+
+def _check_bodies(paths: Mapping[str, BodyPath], path: Path, objects: list[str], others: list[str]) -> None:
+    """Every body of the file is one mesh file, or `*`, and none moves in two ways."""
+    every = [*objects, *others]
+    for name, one in paths.items():
+        called = [mesh for mesh in every if name in (mesh, Path(mesh).stem)]
+        if name == EVERY and objects:
+            continue
+        if len(called) != 1:
+            found = f"no mesh is called {name!r}" if not called else f"{name!r} is {' and '.join(called)}"
+            allowed = ", ".join([EVERY, *every][:12])
+            raise DataError(found, where=f"{path}:{one.line}", allowed=allowed, hint="name one mesh file, or * for all")
+    for mesh in every:
+        both = [name for name in paths if name in (mesh, Path(mesh).stem)]
+        if len(both) > 1:
+            raise DataError(f"{both[0]!r} and {both[1]!r} are one mesh", where=f"{path}:{paths[both[1]].line}")
+
+
+def moved_bounds_m(mesh: Mesh, poses: np.ndarray | None) -> np.ndarray:
+    """The corners of a box around a mesh in all of its poses (T, 4, 4), shape (2, 3) [m]."""
+    if poses is None:
+        return mesh.bounds_m
+    low, high = mesh.bounds_m
+    corners = np.array([[(low, high)[(index >> axis) & 1][axis] for axis in range(3)] for index in range(8)])
+    places = np.einsum("tij,kj->tki", poses[:, :3, :3], corners) + poses[:, None, :3, 3]
+    return np.stack([places.min(axis=(0, 1)), places.max(axis=(0, 1))])

@@ -1,0 +1,108 @@
+"""The truth and the score of surfaces that move: every frame is a surface of its own, and counts alike.
+
+A frame in which no admissible ray sees any of the targets has nothing to be judged by and is left out; a frame with too
+few returns has the metric's worst value, and a scene fails where all of its frames do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from lidardesign.errors import DataError
+from lidardesign.evaluate.metrics import SurfaceCloud, visible_surface
+from lidardesign.scene import Scene
+from lidardesign.simulate.returns import Returns
+from lidardesign.space import DesignSpace
+from lidardesign.task import Metric, Residuals, Score, random_generator
+from lidardesign_tasks.surface import surface_residuals, surface_score
+
+SURFACES = "surfaces"
+
+
+@dataclass(frozen=True, eq=False)
+class MovingTruth(Mapping[str, "tuple[SurfaceCloud | None, ...]"]):
+    """The truth of a scene under the key `surfaces`, one per frame, found when it is first asked for.
+
+    Arguments:
+        scene: The scene without a truth.
+        space: What the sensors may do.
+        points: Points of each cloud.
+        seed: Of their random places.
+    """
+
+    scene: Scene
+    space: DesignSpace
+    points: int
+    seed: int
+
+    @cached_property
+    def surfaces(self) -> tuple[SurfaceCloud | None, ...]:
+        """What some admissible ray sees of the targets in each frame; raises DataError where that is nothing in all."""
+        found = [self._surface(frame) for frame in range(self.scene.frames)]
+        if all(surface is None for surface in found):
+            raise DataError(
+                "no admissible ray sees any part of a target in any frame",
+                where=f"scene {self.scene.name!r}",
+                hint="move the sensors, or the poses of the bodies",
+            )
+        return tuple(found)
+
+    def _surface(self, frame: int) -> SurfaceCloud | None:
+        generator = random_generator(self.seed, "truth", frame)
+        try:
+            return visible_surface(self.scene, self.space, self.points, generator, frame=frame)
+        except DataError:
+            # nothing of it is in view
+            return None
+
+    def __getitem__(self, key: str) -> tuple[SurfaceCloud | None, ...]:
+        if key != SURFACES:
+            raise KeyError(key)
+        return self.surfaces
+
+    def __iter__(self) -> Iterator[str]:
+        return iter((SURFACES,))
+
+    def __len__(self) -> int:
+        return 1
+
+
+def with_moving_truth(scene: Scene, space: DesignSpace, points: int, generator: np.random.Generator) -> Scene:
+    """The scene with what some admissible ray can see in each frame as its truth: `surfaces`."""
+    return replace(scene, truth=MovingTruth(scene, space, points, int(generator.integers(2**62))))
+
+
+def moving_score(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Score:
+    """The mean over frames of the Chamfer distance [mm] of each frame's returns to its visible surface.
+
+    Details are means over frames; `failed_frames` counts those with too few returns.
+    """
+    scores = [surface_score(metric, still, seen) for still, seen in _frames(scene, returns)]
+    names = dict.fromkeys(name for score in scores for name in score.details)
+    details = {
+        name: float(np.mean([score.details[name] for score in scores if name in score.details])) for name in names
+    }
+    failed = sum(score.failed for score in scores)
+    value = float(np.mean([score.value for score in scores]))
+    return Score(value, failed=failed == len(scores), details={**details, "failed_frames": float(failed)})
+
+
+def moving_residuals(metric: Metric, scene: Scene, returns: Sequence[Returns]) -> Residuals:
+    """Where the Chamfer distances are [mm], of all frames; they sum to the score before it is cut."""
+    found = [surface_residuals(metric, still, seen) for still, seen in _frames(scene, returns)]
+    values = np.concatenate([residuals.values for residuals in found]) / len(found)
+    return Residuals(np.concatenate([residuals.points_m for residuals in found]), values)
+
+
+def _frames(scene: Scene, returns: Sequence[Returns]) -> list[tuple[Scene, list[Returns]]]:
+    """Every frame with something to see as a scene of its own, and its returns from all positions of a robot."""
+    surfaces = scene.truth[SURFACES]
+    return [
+        (replace(scene, truth={"surface": surface}), [one for one in returns if one.frame == frame])
+        for frame, surface in enumerate(surfaces)
+        if surface is not None
+    ]
