@@ -55,7 +55,7 @@ class EvenGrid:
     def distance_rad(self, azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> np.ndarray:
         """How far rays are from the grid's ray in whose cell they lie, shape (N,)."""
         nearest = direction(
-            _nearest(azimuth_rad, self.azimuth_rad, self.columns),
+            _nearest(cut_behind(azimuth_rad), self.azimuth_rad, self.columns),
             _nearest(elevation_rad, self.elevation_rad, self.rows),
         )
         return angles_between(nearest, direction(azimuth_rad, elevation_rad))

@@ -1,6 +1,7 @@
 """ROS: a link per sensor, fixed to one base link, and Gazebo's gpu_lidar on each, as URDF.
 
-Links follow REP 103: x forward, y to the left, z up, in metres and radians.
+Links follow REP 103: x forward, y to the left, z up, in metres and radians. The base link is fixed to `world`, and has
+a nominal mass: Gazebo leaves out links without one, with all that is fixed to them.
 """
 
 from __future__ import annotations
@@ -22,16 +23,18 @@ from lidardesign.export.xml import element, numbers, read_xml, write_xml
 from lidardesign.simulate.returns import Rays
 
 # No sensor's link is called so: those end in _link.
-BASE = "lidar_base"
+WORLD, BASE = "world", "lidar_base"
+_MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+BASE_MASS_KG, BASE_INERTIA_KG_M2 = 0.1, 0.0001
 
 
 def write(design: Design, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the description, atomically; returns notes of what the format cannot hold."""
     mounted = mounts(design, rays)
     parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent=BASE)]
-    root = element("robot", {"name": identifier(design.name)}, [element("link", {"name": BASE}), *parts])
-    write_xml(path, root)
-    return notes(design, mounted, rays)
+    write_xml(path, element("robot", {"name": identifier(design.name)}, [*_base(), *parts]))
+    mass = f"{BASE} has a nominal mass of {BASE_MASS_KG:g} kg, without which Gazebo would leave the sensors out"
+    return [*notes(design, mounted, rays), mass]
 
 
 def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
@@ -47,6 +50,16 @@ def notes(design: Design, mounted: Sequence[Mount], rays: Rays) -> list[str]:
         *losses(design, mounted, rays),
         "URDF has no sensors of its own: rays, gates and rates stand in <gazebo> extensions, which Gazebo reads",
     ]
+
+
+def _base() -> list[Element]:
+    """The base link, which has a mass, and what fixes it to the world."""
+    moments = {name: numbers([BASE_INERTIA_KG_M2 * (name[1] == name[2])]) for name in _MOMENTS}
+    mass = element("mass", {"value": numbers([BASE_MASS_KG])})
+    inertial = element("inertial", children=[mass, element("inertia", moments)])
+    ends = [element("parent", {"link": WORLD}), element("child", {"link": BASE})]
+    joint = element("joint", {"name": f"{BASE}_joint", "type": "fixed"}, ends)
+    return [element("link", {"name": WORLD}), element("link", {"name": BASE}, [inertial]), joint]
 
 
 def mounted_parts(mount: Mount, rate_hz: float, *, parent: str, prefix: str = "") -> list[Element]:
