@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lidardesign.design.nearest import Nearest
 from lidardesign.design.quantise import lloyd
 from lidardesign.errors import ConfigError
 
@@ -135,3 +136,19 @@ def test_weights_of_any_size_stay_finite():
 def test_what_cannot_be_quantised_is_refused(features, weights, count):
     with pytest.raises(ConfigError, match="quantisation"):
         lloyd(features, weights, count, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("moved", [1e-6, 0.02, 1.0])
+@pytest.mark.parametrize("count", [1, 2, 40])
+def test_bounds_spare_searches_and_change_no_answer(count, moved):
+    points, _ = cloud(11, count=600, dimensions=3)
+    centres = points[:count].copy()
+    nearest, generator = Nearest(points), np.random.default_rng(4)
+    for _ in range(12):
+        distance, labels = nearest.of(centres)
+        squared = np.square(points[:, None] - centres[None]).sum(-1)
+        assert (labels == squared.argmin(axis=1)).all()
+        np.testing.assert_allclose(distance, np.sqrt(squared.min(axis=1)), rtol=1e-9, atol=1e-12)
+        # what is asked for may be changed by who asks
+        labels[:] = 0
+        centres = centres + moved * generator.normal(size=centres.shape) * (generator.random((count, 1)) < 0.5)

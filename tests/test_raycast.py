@@ -390,3 +390,17 @@ def test_casting_for_many_scenes_at_once_is_casting_for_each(with_a_sphere):
         part = caster.trace(origins[begin:end], directions[begin:end], limit_m[begin:end])
         for name in ("range_m", "body", "normal"):
             np.testing.assert_array_equal(getattr(found, name)[begin:end], getattr(part, name))
+
+
+def test_scenes_of_the_same_bodies_share_what_is_built_of_their_meshes_and_others_do_not():
+    ball = solid_mesh(trimesh.creation.icosphere(subdivisions=1, radius=0.4))
+    balls = [Body(ball, f"ball {i}", poses=rigid(translation_m=(2.0 + i, 0, 0))) for i in range(2)]
+    first, second = Scene(tuple(balls), "first"), Scene(tuple(balls), "second")
+    alone = Scene((balls[0],), "alone")
+    resting = [SceneCaster(scene).resting for scene in (first, second, alone)]
+    assert resting[0] is resting[1]
+    assert resting[2] is not resting[0]
+    turned = Scene(tuple(balls[::-1]), "turned")
+    ray = np.zeros((1, 3)), np.array([[1.0, 0, 0]])
+    assert SceneCaster(first).first_hit(*ray).body[0] == 0
+    assert SceneCaster(turned).first_hit(*ray).body[0] == 1

@@ -54,12 +54,14 @@ class Trace:
         log_likelihood: Weighted mean log density [nats].
         history: Log-likelihood after every accepted step; it never decreases.
         notes: What happened to components, one line each.
+        values: The log density of each sample [nats], shape (N,), where it is at hand.
     """
 
     mixture: Mixture
     log_likelihood: float
     history: tuple[float, ...]
     notes: tuple[str, ...] = field(default=())
+    values: np.ndarray | None = None
 
 
 def climb(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from lidardesign.design.nearest import Nearest
 from lidardesign.errors import ConfigError
 from lidardesign.numerics import COARSE_SLACK, SQUARABLE
 
@@ -70,14 +71,15 @@ def lloyd(
     points = distinct - offset
     tolerance = MOVEMENT_TOLERANCE * np.ptp(points, axis=0).max()
     centres = _seed(points, merged, count, generator) if start is None else _started(start, count, offset)
+    nearest = Nearest(points)
     for _ in range(iterations):
-        labels, _ = _assign(points, merged, centres)
+        labels, _ = _assign(nearest, merged, centres)
         moved = _centroids(points, merged, labels, count)
         shift = np.abs(moved - centres).max()
         centres = moved
         if shift <= tolerance:
             break
-    labels, refilled = _assign(points, merged, centres)
+    labels, refilled = _assign(nearest, merged, centres)
     centres[refilled] = _centroids(points, merged, labels, count)[refilled]
     return centres + offset, labels[inverse]
 
@@ -166,13 +168,13 @@ def _centroids(points: np.ndarray, weights: np.ndarray, labels: np.ndarray, coun
     return np.stack(sums, axis=1) / mass[:, None]
 
 
-def _assign(points: np.ndarray, weights: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _assign(nearest: Nearest, weights: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The nearest centre of each point, shape (N,), and the cells that had to be refilled.
 
     A cell without points takes the point with the largest weighted squared distance from its centre that is
     not alone in its cell; this can only lower the cost.
     """
-    distance, labels = cKDTree(centres).query(points)
+    distance, labels = nearest.of(centres)
     counts = np.bincount(labels, minlength=len(centres))
     empty = np.flatnonzero(counts == 0)
     waiting = list(empty)

@@ -85,8 +85,9 @@ def fit_scan(
     def scan(limits: Bounds) -> Ensemble:
         mixture = from_labels(features, labels, limits).with_weights(np.full(count, 1.0 / count))
         mixture = _with_gates(mixture, features, labels, limits, level)
-        score = float(features.weights @ log_density(mixture, features))
-        return Ensemble((part,), (Trace(mixture, score, (score,)),))
+        values = log_density(mixture, features)
+        score = float(features.weights @ values)
+        return Ensemble((part,), (Trace(mixture, score, (score,), values=values),))
 
     fitted, _ = within_budget(
         scan(bounds),

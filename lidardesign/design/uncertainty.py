@@ -56,7 +56,9 @@ def likelihood_error(ensemble: Ensemble, supports: Sequence[Support]) -> float:
     """
     variance = 0.0
     for part, trace, support in zip(ensemble.parts, ensemble.traces, supports, strict=True):
-        weights, values = part.features.weights, log_density(trace.mixture, part.features)
+        weights = part.features.weights
+        # as long as finding the components took, where there are hundreds of them
+        values = log_density(trace.mixture, part.features) if trace.values is None else trace.values
         spread = float(weights @ np.square(values - weights @ values))
         variance += part.share**2 * spread / min(support.effective, len(values))
     return math.sqrt(variance)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Literal
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, ref
 
 import numpy as np
 
@@ -192,16 +192,18 @@ def _traced_at_rest(
     return hits
 
 
-_at_rest: WeakKeyDictionary[Scene, dict[tuple[int, ...], _AtRest]] = WeakKeyDictionary()
+# By the first of its bodies: what they are in their scene, and what was built of them.
+_at_rest: WeakKeyDictionary[Body, list[tuple[list[tuple[int, ref[Body]]], _AtRest]]] = WeakKeyDictionary()
 
 
-def _shared_at_rest(scene: Scene, bodies: Sequence[tuple[int, Body]]) -> _AtRest:
-    """What does not move is built once for all frames of a scene."""
-    known = _at_rest.setdefault(scene, {})
-    key = tuple(index for index, _ in bodies)
-    if key not in known:
-        known[key] = _AtRest(bodies)
-    return known[key]
+def _shared_at_rest(bodies: Sequence[tuple[int, Body]]) -> _AtRest:
+    """What does not move is built once for all frames of a scene, and for scenes of the same bodies."""
+    known = _at_rest.setdefault(bodies[0][1], [])
+    for members, built in known:
+        if [(index, member()) for index, member in members] == list(bodies):
+            return built
+    known.append(([(index, ref(body)) for index, body in bodies], _AtRest(bodies)))
+    return known[-1][1]
 
 
 class _Moving:
@@ -256,7 +258,7 @@ class _Meshes:
     def __init__(self, scene: Scene, bodies: list[tuple[int, Body]], frame: int) -> None:
         resting = [(index, body) for index, body in bodies if body.poses.ndim == 2]
         moving = [(index, body) for index, body in bodies if body.poses.ndim == 3]
-        self.resting = _shared_at_rest(scene, resting) if resting else None
+        self.resting = _shared_at_rest(resting) if resting else None
         self.moving = _Moving(moving, frame) if moving else None
 
     def trace(
