@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 SCANNERS, PLATFORMS, SURVEY, SCENE = "scanners.xml", "platforms.xml", ".survey.xml", "scene.xml#scene"
 # HELIOS++ drops echoes whose rise begins before the gate does: a short pulse, in fine bins, loses little.
 PULSE_NS, BIN_NS = 0.1, 0.01
+# Peaks are told apart over a quarter of a pulse.
+WINDOW_NS = PULSE_NS / 4
 NS_PER_S = 1e9
 MM_PER_M = 1000
 QUARTER_TURN_DEG = 90.0
@@ -78,7 +80,7 @@ def _add_scanner(root: Element, mount: Mount, rays: Rays, pulse_hz: int) -> None
         pulseFreqs_Hz=pulse_hz, pulseLength_ns=PULSE_NS, scanAngleMax_deg=1, scanAngleEffectiveMax_deg=1,
         scanFreqMin_Hz=0, scanFreqMax_Hz=0, maxNOR=1, headRotatePerSecMax_deg=pulse_hz,
     )  # fmt: skip
-    child(scanner, "FWFSettings", beamSampleQuality=1, binSize_ns=BIN_NS)
+    child(scanner, "FWFSettings", beamSampleQuality=1, binSize_ns=BIN_NS, winSize_ns=WINDOW_NS)
     child(scanner, "headRotateAxis", x=0, y=0, z=1)
     channels = child(scanner, "channels")
     azimuth_deg, elevation_deg = (np.degrees(values) for values in angles(rays.direction))
@@ -105,7 +107,7 @@ def _survey(design: Design, mount: Mount, rays: Rays, pulse_hz: int) -> Element:
         root, "survey", name=f"{design.name}: {mount.sensor.name}", scene=SCENE,
         platform=f"{PLATFORMS}#fixed", scanner=f"{SCANNERS}#{mount.name}",
     )  # fmt: skip
-    child(survey, "FWFSettings", beamSampleQuality=1, binSize_ns=BIN_NS)
+    child(survey, "FWFSettings", beamSampleQuality=1, binSize_ns=BIN_NS, winSize_ns=WINDOW_NS)
     leg = child(survey, "leg")
     x, y, z = rays.origin_m[mount.ray[0]].tolist()
     child(leg, "platformSettings", x=x, y=y, z=z, onGround=False)

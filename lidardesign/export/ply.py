@@ -126,11 +126,10 @@ def _shell_faces() -> np.ndarray:
     side = PARTS + 1
     near = np.arange(side * side).reshape(side, side)
     far = near + side * side
-    inner = np.stack([near[:-1, :-1], near[:-1, 1:], near[1:, 1:], near[1:, :-1]], axis=-1).reshape(-1, 4)
-    outer = np.stack([far[:-1, :-1], far[1:, :-1], far[1:, 1:], far[:-1, 1:]], axis=-1).reshape(-1, 4)
-    # once around the rim, seen from the sensor: right, up, left, down
+    inner = np.stack([near[:-1, :-1], near[1:, :-1], near[1:, 1:], near[:-1, 1:]], axis=-1).reshape(-1, 4)
+    outer = np.stack([far[:-1, :-1], far[:-1, 1:], far[1:, 1:], far[1:, :-1]], axis=-1).reshape(-1, 4)
     rim = [near[0], near[:, -1], near[-1, ::-1], near[::-1, 0]]
-    walls = [np.stack([one[:-1], one[:-1] + side * side, one[1:] + side * side, one[1:]], axis=-1) for one in rim]
+    walls = [np.stack([one[:-1], one[1:], one[1:] + side * side, one[:-1] + side * side], axis=-1) for one in rim]
     return np.concatenate([inner, outer, *walls])
 
 

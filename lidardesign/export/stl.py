@@ -76,7 +76,7 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise DataError(f"cannot be read as STL: {error}", where=str(path), hint="export it again") from error
     # corner k of the solid, wherever it is first
     first = [int((corner == FACETS).argmax()) for corner in range(len(CORNERS_MM))]
-    tip, right, right_up, left_up, left = corners.reshape(len(corners), -1, 3)[:, first].transpose(1, 0, 2)
+    tip, right, right_up, left_up, left = corners.reshape(len(corners), FACETS.size, 3)[:, first].transpose(1, 0, 2)
     across = unit_vectors(left - right)
     up = unit_vectors((left_up + right_up) - (left + right))
     return tip / MM_PER_M, np.stack([np.cross(across, up), across, up], axis=1)
