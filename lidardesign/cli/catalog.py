@@ -21,12 +21,6 @@ if TYPE_CHECKING:
 
 # How several parts at one place are turned against each other.
 ARRANGEMENTS = ("interleaved", "beside")
-LIST_EXAMPLES = "Examples:\n\nlidardesign catalog list --reflectance 10 --klux 100"
-SHOW_EXAMPLES = (
-    "Examples:\n\nlidardesign catalog show vl53l5cx:4x4\n\n"
-    "lidardesign catalog show vl53l8cx --out bought.yaml --rays 196 --at-origin 0.4,0,0 --azimuth-deg 180"
-)
-
 Own = Annotated[
     list[Path] | None,
     typer.Option(
@@ -110,7 +104,7 @@ def catalog(
             )
 
 
-@catalog_app.command("list", epilog=LIST_EXAMPLES)
+@catalog_app.command("list")
 def list_(
     own: Own = None,
     reflectance: Reflectance = None,
@@ -136,7 +130,7 @@ def list_(
             console.note(f"note: {left_out} of {len(parts)} parts and modes have no range stated for such conditions")
 
 
-@catalog_app.command("show", epilog=SHOW_EXAMPLES)
+@catalog_app.command("show")
 def show(
     name: Annotated[str, typer.Argument(metavar="NAME", help="A part's name, NAME:MODE, or a part file.")],
     own: Own = None,

@@ -49,15 +49,7 @@ def learn(
         Path | None,
         typer.Option("--out", metavar="RUN", help="Run folder to make.", show_default="runs/TASK"),
     ] = None,
-    preset: Annotated[
-        str | None,
-        typer.Option(
-            "--preset",
-            metavar="draft|standard|fine",
-            help="Effort: about half a minute, minutes, or tens of minutes.",
-            show_default="standard",
-        ),
-    ] = None,
+    preset: options.Preset = None,
     config: options.ConfigFile = None,
     overrides: options.Overrides = None,
     seed: options.Seed = None,

@@ -10,13 +10,19 @@ import typer
 from lidardesign import __version__
 from lidardesign.cli.capture import capture
 from lidardesign.cli.catalog import catalog_app
+from lidardesign.cli.completion import answer, completion, is_asked
+from lidardesign.cli.config import config_app
 from lidardesign.cli.console import EXIT_BROKEN_PIPE, Console, forget_stdout, print_json, report_error, tell
 from lidardesign.cli.constrain import constrain
+from lidardesign.cli.deprecations import deprecations_told, with_new_names
 from lidardesign.cli.environment import make_streams_tolerant, set_cache_default, set_thread_defaults, terminate_cleanly
 from lidardesign.cli.evaluate import evaluate
 from lidardesign.cli.export import export
 from lidardesign.cli.fit import fit
 from lidardesign.cli.learn import learn
+from lidardesign.cli.manual import add_manuals
+from lidardesign.cli.manual_pages import PAGES
+from lidardesign.cli.mistakes import hint_of
 from lidardesign.cli.ranks import refuse_ranks
 from lidardesign.cli.show import show
 from lidardesign.cli.tasks import tasks_app
@@ -28,7 +34,8 @@ app = typer.Typer(
     name="lidardesign",
     help="Design LiDARs: learn which rays are worth firing, fit sensors, prove what they are worth.",
     epilog="Exit codes: 0 ok, 1 threshold missed, 2 usage or config, 3 bad input data, "
-    "4 infeasible constraints, 5 numerical failure, 6 plugin failure, 70 internal error, 130 interrupted.",
+    "4 infeasible constraints, 5 numerical failure, 6 plugin failure, 70 internal error, 130 interrupted, "
+    "141 output closed, 143 terminated. `lidardesign COMMAND --help` has examples; docs/commands.md has all of it.",
     context_settings=SETTINGS,
     add_completion=False,
     no_args_is_help=True,
@@ -36,47 +43,10 @@ app = typer.Typer(
 )
 app.add_typer(tasks_app, name="tasks")
 app.add_typer(catalog_app, name="catalog")
-EXAMPLES = {
-    learn: (
-        "lidardesign learn face --preset draft --out runs/face",
-        "torchrun --nproc-per-node 2 -m lidardesign learn face --out runs/face",
-        "lidardesign learn meshes --set folder=scans --set scale=0.001 --out runs/scans",
-        "lidardesign learn face --tolerance 0.15 --out runs/good_enough",
-        "lidardesign learn face --time-budget 60 --out runs/minute",
-        "lidardesign learn face --out runs/face --resume",
-    ),
-    fit: (
-        "lidardesign fit runs/face --sensors 4 --name free",
-        "lidardesign fit runs/face --layout scan --rays 576 --name beams",
-        "lidardesign fit runs/warehouse --rays 12 --at x_m=0.37 --name here",
-    ),
-    constrain: (
-        "lidardesign constrain runs/face --set gate.width_m.max=0.1 --set sensors.count=6 --name tight",
-        "lidardesign constrain runs/face --constraints buyable.yaml --name buyable",
-    ),
-    evaluate: (
-        "lidardesign evaluate runs/face --report report.html",
-        "lidardesign evaluate runs/face/designs/free.yaml --rays 100 --rays 576 --fail-above 8",
-        "lidardesign evaluate runs/face --detector single-photon --effects audit",
-        "lidardesign evaluate runs/arm --baseline occupancy --baseline no-visibility",
-        "lidardesign evaluate runs/face --workers 8",
-        "lidardesign evaluate runs/face --accuracy --plots pictures",
-    ),
-    export: (
-        "lidardesign export runs/face/designs/free.yaml --format csv --rays 576 --out rays.csv",
-        "lidardesign export --list",
-    ),
-    capture: (
-        "lidardesign capture scan.npz runs/face/designs/free.yaml --rays 576",
-        "lidardesign capture scan.mat free.galvo.csv --reference head.ply --csv points.csv",
-    ),
-    show: (
-        "lidardesign show runs/face/designs/free.yaml",
-        "lidardesign show runs/warehouse/designs/track.yaml --at x_m=3.91",
-    ),
-}
-for subcommand, examples in EXAMPLES.items():
-    app.command(context_settings=SETTINGS, epilog="\n\n".join(("Examples:", *examples)))(subcommand)
+app.add_typer(config_app, name="config")
+for subcommand in (learn, fit, constrain, evaluate, export, capture, show, completion):
+    app.command(context_settings=SETTINGS)(subcommand)
+add_manuals({"": app, "tasks": tasks_app, "catalog": catalog_app, "config": config_app}, PAGES)
 
 
 def _print_version(wanted: bool) -> None:
@@ -98,14 +68,17 @@ def program(
 
 
 def run(arguments: list[str] | None = None) -> None:
-    """Run the program on command line arguments and exit."""
+    """Run the program on command line arguments and exit; where a shell asks what to complete, answer it."""
     set_thread_defaults()
+    if is_asked():
+        sys.exit(answer(app))
     set_cache_default()
     make_streams_tolerant()
     terminate_cleanly()
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
-        code = _invoke(arguments)
+        with deprecations_told():
+            code = _invoke(with_new_names(arguments))
         sys.stdout.flush()
     except BrokenPipeError:
         forget_stdout()
@@ -133,15 +106,15 @@ def _invoke(arguments: list[str]) -> int:
     except Exception as error:
         if not hasattr(error, "format_message"):
             return report_error(error, console)
-        return _report_usage(error, console)
+        return _report_usage(error, console, arguments)
     return code if isinstance(code, int) else 0
 
 
-def _report_usage(error: Any, console: Console) -> int:
+def _report_usage(error: Any, console: Console, arguments: list[str]) -> int:
     """One message for what typer finds wrong with the command line."""
     context = getattr(error, "ctx", None)
     path = context.command_path if context else "lidardesign"
-    message, hint = error.format_message().rstrip(), f"{path} --help"
+    message, hint = error.format_message().rstrip(), hint_of(arguments, error, typer.main.get_command(app))
     if type(error).__name__ == "NoArgsIsHelpError":
         tell(message)
         message = "no command was given"
