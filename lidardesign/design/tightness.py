@@ -89,6 +89,21 @@ def room_of(check: ConstraintCheck) -> tuple[float | None, float | None]:
     return None, None
 
 
+def room_left(check: ConstraintCheck) -> float | None:
+    """How far the value is inside its bound, in the bound's unit; negative beyond it, None without a distance."""
+    return room_of(check)[0]
+
+
+def share_left(check: ConstraintCheck) -> float | None:
+    """The room left as a share of the bound; None without a bound of some size."""
+    return room_of(check)[1]
+
+
+def is_tight(check: ConstraintCheck) -> bool:
+    """Whether next to nothing of a bound is left."""
+    return _is_tight(*room_of(check))
+
+
 def _on_circle(low: float, high: float, value: float) -> tuple[float, float | None]:
     """Room of an azimuth between two others [deg]."""
     width = high - low if high - low >= FULL_TURN_DEG else (high - low) % FULL_TURN_DEG
