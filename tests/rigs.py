@@ -102,7 +102,7 @@ def read_sdf(program: Path, path: Path) -> list[dict]:
         name, kind, topic, *numbers = line.split()
         keys = ("x", "y", "z", "qw", "qx", "qy", "qz", "rate", "columns", "left", "right", "rows", "low", "high",
                 "horizontal_resolution", "vertical_resolution", "start", "end")  # fmt: skip
-        sensors.append(
-            {"name": name, "kind": kind, "topic": topic, **dict(zip(keys, map(float, numbers), strict=True))}
-        )
+        # of sensors that are none of its own it knows the pose only
+        values = dict(zip(keys, map(float, numbers), strict=kind != "custom"))
+        sensors.append({"name": name, "kind": kind, "topic": topic, **values})
     return sensors

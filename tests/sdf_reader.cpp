@@ -1,4 +1,4 @@
-// Prints what libsdformat makes of a file: one line per sensor, its pose in the model, its rays and its range.
+// Prints what libsdformat makes of a file: one line per sensor, its pose in the model, and of lidars their rays and range.
 #include <iomanip>
 #include <iostream>
 
@@ -28,12 +28,18 @@ int main(int, char **arguments)
       for (const auto &fault : sensor->SemanticPose().Resolve(pose, "__model__"))
         std::cerr << fault.Message() << "\n";
       const auto *lidar = sensor->LidarSensor();
-      if (lidar == nullptr)
+      if (lidar == nullptr && sensor->Type() != sdf::SensorType::CUSTOM)
         return 1;
       const auto &turn = pose.Rot();
-      std::cout << sensor->Name() << " " << sensor->TypeStr() << " " << sensor->Topic() << " " << pose.Pos().X() << " "
-                << pose.Pos().Y() << " " << pose.Pos().Z() << " " << turn.W() << " " << turn.X() << " " << turn.Y()
-                << " " << turn.Z() << " " << sensor->UpdateRate() << " " << lidar->HorizontalScanSamples() << " "
+      std::cout << sensor->Name() << " " << sensor->TypeStr() << " " << (lidar ? sensor->Topic() : "-") << " "
+                << pose.Pos().X() << " " << pose.Pos().Y() << " " << pose.Pos().Z() << " " << turn.W() << " " << turn.X()
+                << " " << turn.Y() << " " << turn.Z();
+      if (lidar == nullptr)
+      {
+        std::cout << "\n";
+        continue;
+      }
+      std::cout << " " << sensor->UpdateRate() << " " << lidar->HorizontalScanSamples() << " "
                 << lidar->HorizontalScanMinAngle().Radian() << " " << lidar->HorizontalScanMaxAngle().Radian() << " "
                 << lidar->VerticalScanSamples() << " " << lidar->VerticalScanMinAngle().Radian() << " "
                 << lidar->VerticalScanMaxAngle().Radian() << " " << lidar->HorizontalScanResolution() << " "

@@ -13,6 +13,7 @@ from lidardesign.design.rays import lay_out
 from lidardesign.design.sensor import Design
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.export import mjcf
+from lidardesign.export.poses import mounts
 from lidardesign.export.registry import EXPORTERS
 from lidardesign.scene import Body, Box, Mesh, Scene, Sphere, rigid
 from lidardesign.simulate.raycast import SceneCaster
@@ -321,3 +322,15 @@ def test_names_cannot_leave_their_attribute(exported, name):
     assert "</script>" not in text
     assert "${y}" not in text or name == "mjcf"
     assert any("letters, digits and underscores" in note for note in notes) == (name != "mjcf")
+
+
+def test_libsdformat_finds_the_sensors_of_a_ray_pattern_plugin_where_they_stand(reader, tmp_path):
+    EXPORTERS["rgl"].write(DESIGN, RAYS, tmp_path / "rig.rgl")
+    found = read_sdf(reader, tmp_path / "rig.rgl" / "model.sdf")
+    assert [sensor["name"] for sensor in found] == [mount.name for mount in mounts(DESIGN, RAYS)]
+    for sensor, mount in zip(found, mounts(DESIGN, RAYS), strict=True):
+        assert sensor["kind"] == "custom"
+        place = RAYS.origin_m[mount.ray[0]]
+        np.testing.assert_allclose([sensor[axis] for axis in "xyz"], place, atol=1e-12)
+        quaternion = np.array([sensor[f"q{axis}"] for axis in "wxyz"])
+        assert abs(quaternion @ mount.quaternion) == pytest.approx(1, abs=1e-9)
