@@ -126,7 +126,7 @@ def _offers() -> dict[str, list[EntryPoint]]:
         same_name = found.setdefault(offer.name, [])
         if all(offer.value != other.value for other in same_name):
             same_name.append(offer)
-    return found
+    return {name: sorted(same_name, key=_distribution) for name, same_name in found.items()}
 
 
 def _all_offers() -> list[EntryPoint]:

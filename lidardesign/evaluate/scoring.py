@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lidardesign.errors import PluginError
-from lidardesign.evaluate.candidates import Positions
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
@@ -18,6 +18,9 @@ from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.returns import Rays, Returns
 from lidardesign.simulate.simulate import simulate, simulate_many
 from lidardesign.task import Residuals, Score, Task
+
+if TYPE_CHECKING:
+    from lidardesign.evaluate.candidates import Positions
 
 # Rays times frames that are traced together: their returns take 24 bytes each.
 MOST_RETURNS = 4_000_000

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from lidardesign.run.clock import peak_memory_bytes
 from lidardesign.testing.law import BrokenLawError, Held, Law, NotApplicable
-from lidardesign.testing.subject import GIBIBYTE, Subject
+from lidardesign.testing.limits import GIBIBYTE
+from lidardesign.testing.subject import Subject
 
 MEBIBYTE = 2**20
 

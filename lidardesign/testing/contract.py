@@ -10,13 +10,12 @@ from lidardesign.errors import ConfigError, LidardesignError
 from lidardesign.run.config import RunConfig, resolve
 from lidardesign.task import Task
 from lidardesign.testing import conduct, geometry, interface, scenes, scoring
-from lidardesign.testing.law import BrokenLawError, Finding, Held, Law, NotApplicable
-from lidardesign.testing.subject import Limits, Subject
+from lidardesign.testing.law import BrokenLawError, Finding, Law, NotApplicable, said
+from lidardesign.testing.limits import Limits
+from lidardesign.testing.subject import Subject
 from lidardesign.testing.watch import Watch
 
 LAWS: tuple[Law, ...] = (*interface.LAWS, *scenes.LAWS, *geometry.LAWS, *scoring.LAWS, *conduct.LAWS)
-# What comes before all laws: the plugin is imported and its configuration resolved.
-LOADS = ("plugin loads", "interface", "the plugin is imported and has the members of the task interface")
 
 
 class Contract:
@@ -69,16 +68,6 @@ class Contract:
     def _says_nothing(self, name: str) -> bool:
         """Whether a law does not apply, which is no reason not to try others."""
         return self.finding(name).outcome == "skip" and not self.finding(name).detail.startswith("needs: ")
-
-
-def said(error: LidardesignError) -> str:
-    """A finding's words for an error: what was found, what is allowed, what to do."""
-    parts = [error.message]
-    if error.allowed:
-        parts.append(f"allowed: {error.allowed}")
-    if error.hint:
-        parts.append(f"try: {error.hint}")
-    return "; ".join(parts)
 
 
 def contract_of(
@@ -137,6 +126,3 @@ def refuse_broken(name: str, findings: Sequence[Finding]) -> None:
     if broken:
         listed = "; ".join(f"{finding.law}: {finding.detail}" for finding in broken)
         raise BrokenLawError(f"{len(broken)} of {len(findings)} laws do not hold: {listed}", where=f"task {name}")
-
-
-__all__ = ["LAWS", "BrokenLawError", "Contract", "Held", "check_task", "contract_of"]

@@ -6,12 +6,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from lidardesign.errors import PluginError
+from lidardesign.errors import LidardesignError, PluginError
 
 if TYPE_CHECKING:
     from lidardesign.testing.subject import Subject
 
 Outcome = Literal["pass", "fail", "skip"]
+# What comes before all laws: name, group and statement.
+LOADS = ("plugin loads", "interface", "the plugin is imported and has the members of the task interface")
 
 
 class BrokenLawError(PluginError):
@@ -83,3 +85,13 @@ class Finding:
             "seconds": round(self.seconds, 3),
             "figures": {name: float(value) for name, value in self.figures.items()},
         }
+
+
+def said(error: LidardesignError) -> str:
+    """A finding's words for an error: what was found, what is allowed, what to do."""
+    parts = [error.message]
+    if error.allowed:
+        parts.append(f"allowed: {error.allowed}")
+    if error.hint:
+        parts.append(f"try: {error.hint}")
+    return "; ".join(parts)

@@ -15,16 +15,18 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from lidardesign import registry
 from lidardesign.errors import ConfigError, DataError, LidardesignError
 from lidardesign.probe import BEGUN, GRACE_SECONDS, START_SECONDS, Apart, answer
 from lidardesign.run.config import resolve
-from lidardesign.testing.contract import LAWS, LOADS, Contract, said
-from lidardesign.testing.law import Finding
-from lidardesign.testing.subject import Limits, Subject
+from lidardesign.testing.law import LOADS, Finding, Law, said
+from lidardesign.testing.limits import Limits
 from lidardesign.testing.watch import Watch
+
+if TYPE_CHECKING:
+    from lidardesign.testing.contract import Contract
 
 CHILD = (
     "import json, sys; request = json.loads(sys.stdin.readline()); sys.path[:] = request['path']; "
@@ -94,7 +96,7 @@ def _heard(child: Apart, seconds: float) -> Iterator[Finding]:
         reason = "the process that checks could not be started"
         yield from _all_lost(0, reason)
         return
-    for number in range(len(LAWS) + 1):
+    for number in range(len(_laws()) + 1):
         allowed = seconds * (1 if number == 0 else LAW_CALLS)
         deadline = max(started, time.monotonic()) + allowed + GRACE_SECONDS
         _, line = child.next_line(deadline)
@@ -135,12 +137,18 @@ def _all_lost(number: int, reason: str) -> Iterator[Finding]:
 
 
 def _not_reached(number: int) -> Iterator[Finding]:
-    for later in range(number, len(LAWS) + 1):
+    for later in range(number, len(_laws()) + 1):
         yield Finding(*_named(later), "skip", "not reached")
 
 
+def _laws() -> Sequence[Law]:
+    from lidardesign.testing.contract import LAWS
+
+    return LAWS
+
+
 def _named(number: int) -> tuple[str, str, str]:
-    law = LAWS[number - 1]
+    law = _laws()[number - 1]
     return law.name, law.group, law.statement
 
 
@@ -206,6 +214,10 @@ def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
     except BaseException as error:
         _tell(result, Finding(*LOADS, "fail", f"{type(error).__name__}: {error}"))
         return None
+    # not before: a plugin that fails to load is named without the libraries that the laws need
+    from lidardesign.testing.contract import Contract
+    from lidardesign.testing.subject import Subject
+
     subject = Subject(task, config, limits, watch)
     subject.seconds["import"] = seconds
     version = f"version {task.api_version} of the task interface"

@@ -13,7 +13,7 @@ from lidardesign.run.files import write_atomic
 from lidardesign.task import API_VERSION
 
 NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
-LONGEST_NAME = 40
+LONGEST_NAME = 30
 # Templates by the file that they become; names of files have the same tokens as their contents.
 FILES = {
     "pyproject.toml": "pyproject.toml.txt",

@@ -17,26 +17,14 @@ from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.returns import Rays, Returns
 from lidardesign.simulate.simulate import build_casters, simulate
 from lidardesign.task import Score, Split, Task, conditions_of, scenes_of
+from lidardesign.testing.fingerprint import fingerprint
 from lidardesign.testing.law import BrokenLawError
+from lidardesign.testing.limits import Limits
 from lidardesign.testing.probing import rays_at_targets
 from lidardesign.testing.watch import Watch
 
 # The geometry and the scores of so many training scenes are looked at.
 LOOKED_AT = 3
-GIBIBYTE = 2**30
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What a task's code may take.
-
-    Arguments:
-        seconds: One call of it [s].
-        memory_bytes: The process that runs it.
-    """
-
-    seconds: float = 60.0
-    memory_bytes: int = 4 * GIBIBYTE
 
 
 @dataclass(eq=False)
@@ -58,6 +46,7 @@ class Subject:
     def __post_init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self._scenes: dict[tuple[Split, int], list[Scene]] = {}
+        self._as_made: list[str] = []
         self._casters: dict[int, list[SceneCaster]] = {}
         self._rays: dict[tuple[int, int], list[Rays]] = {}
 
@@ -92,7 +81,16 @@ class Subject:
     @property
     def looked_at(self) -> list[Scene]:
         """The first training scenes."""
-        return self.scenes("train")[:LOOKED_AT]
+        scenes = self.scenes("train")[:LOOKED_AT]
+        if not self._as_made:
+            self._as_made = [fingerprint(scene) for scene in scenes]
+        return scenes
+
+    def touched(self) -> list[str]:
+        """The names of scenes that are looked at and are not as they were made."""
+        return [
+            scene.name for scene, made in zip(self.looked_at, self._as_made, strict=True) if fingerprint(scene) != made
+        ]
 
     @cached_property
     def conditions(self) -> list[dict[str, float]]:

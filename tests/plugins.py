@@ -1,0 +1,58 @@
+"""Installing task plugins for tests: a folder on the path with packages and their entry points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+# A small whole task that keeps the contract; broken ones are made of it by replacing words.
+GOOD = '''
+import numpy as np
+from lidardesign.scene import Body, Scene, Sphere, rigid
+from lidardesign.space import DesignSpace
+from lidardesign.task import Defaults, Metric, Score, TaskConfig, random_generator
+
+
+class Task:
+    name = "NAME"
+    summary = "how much of a ball is seen"
+    api_version = 1
+    Config = TaskConfig
+    metric = Metric("radius error", "mm", "lower", worst=100.0, tolerance=0.5)
+    defaults = Defaults(density={"sigma_m": 0.05})
+
+    def space(self, config):
+        return DesignSpace(low=(0, 0, 0, -0.5, -0.4, 0.1), high=(0, 0, 0, 0.5, 0.4, 4.0))
+
+    def scenes(self, config, split, seed):
+        return [self.scene(random_generator(seed, self.name, split, i), f"{split} {i}") for i in range(2)]
+
+    def scene(self, generator, name):
+        centre = np.array([generator.uniform(2.0, 3.0), generator.uniform(-0.5, 0.5), 0.0])
+        return Scene((Body(Sphere(0.3), "ball", "target", rigid(translation_m=centre)),), name, truth={"at": centre})
+
+    def score(self, scene, returns):
+        points = np.concatenate([one.points_m for one in returns])
+        if len(points) == 0:
+            return Score(self.metric.worst, failed=True)
+        off = np.abs(np.linalg.norm(points - scene.truth["at"], axis=1) - 0.3).mean()
+        return Score(min(1000 * off + 50 / len(points), 100.0))
+'''
+
+
+def install_plugins(place: Path, sources: dict[str, str], package: str = "plugins", module: str = "") -> None:
+    """Install a package of plugins by name into a folder that is on the path.
+
+    Arguments:
+        place: The folder.
+        sources: Python by the name of the entry point; NAME in it becomes that name.
+        package: Its name.
+        module: What its modules' names begin with; by default the package's name.
+    """
+    made = place / f"{package}-1.0.dist-info"
+    made.mkdir(parents=True)
+    (made / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    prefix = module or package
+    lines = [f"{name} = {prefix}_{name}:Task" for name in sources]
+    (made / "entry_points.txt").write_text("\n".join(["[lidardesign.tasks]", *lines, ""]))
+    for name, source in sources.items():
+        (place / f"{prefix}_{name}.py").write_text(source.replace("NAME", name))
