@@ -84,7 +84,9 @@ def nearest_grid(azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> EvenGrid
 def cut_behind(azimuth_rad: np.ndarray) -> np.ndarray:
     """Azimuths from -pi up to below pi; what is straight behind to rounding is at -pi."""
     start = -np.pi - ON_GRID_RAD
-    return np.mod(azimuth_rad - start, 2 * np.pi) + start
+    there = (azimuth_rad >= start) & (azimuth_rad < start + 2 * np.pi)
+    # what is there already stays as it is, to the last bit
+    return np.where(there, azimuth_rad, np.mod(azimuth_rad - start, 2 * np.pi) + start)
 
 
 def _row_counts(azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> list[int]:
