@@ -150,14 +150,30 @@ def show_constraints(checks: Sequence[ConstraintCheck], rich: RichConsole) -> No
 
     if not checks:
         return
-    table = Table("constraint", "bound", "value", "holds", title="constraints", title_justify="left")
+    from lidardesign.design.tightness import is_tight
+
+    table = Table("constraint", "bound", "value", "left", "holds", title="constraints", title_justify="left")
     for check in checks:
         if SPACE_MARK in check.name and check.satisfied:
             continue
         holds = "yes" if check.satisfied else "[bold]no[/bold]"
-        table.add_row(escape(check.name), escape(number(check.bound, 6)), escape(number(check.value, 6)), holds)
+        holds += ", tight" if check.satisfied and is_tight(check) else ""
+        bound, value = (escape(number(figure, 6)) for figure in (check.bound, check.value))
+        table.add_row(escape(check.name), bound, value, _left(check), holds)
     if table.row_count:
         rich.print(table)
+
+
+def _left(check: ConstraintCheck) -> str:
+    """How far a value is inside its bound, with the share of the bound that this is."""
+    from lidardesign.design.tightness import room_left, share_left
+
+    room, share = room_left(check), share_left(check)
+    if room is None or room < 0:
+        return "-"
+    # what is left below the rounding of the checks themselves is nothing
+    shown = "0" if share is not None and share < SMALLEST_ERROR else number(room, 3)
+    return shown if share is None else f"{shown} ({number(100 * share, 2)} %)"
 
 
 def show_fit(document: dict[str, Any], design: Design, checks: Sequence[Any], rich: RichConsole) -> None:

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import math
-import shlex
-import sys
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,26 +13,23 @@ from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
 from lidardesign.cli.designs import number
 from lidardesign.cli.dry_run import DryRun, tell_plan
+from lidardesign.cli.judged import ALWAYS, JudgedDesign, collect, common_run, named_apart, request_of
 from lidardesign.cli.physics import Detector, Effects, RangeTolerance, ReturnTolerance, planner_of
-from lidardesign.cli.runs import open_run, read_design, run_of
 from lidardesign.cli.scores import show_evaluation
 from lidardesign.cli.searches import CmaSeconds, check_cma_seconds, searching, told
 from lidardesign.cli.streams import claim_stdout, is_output, written_file
 from lidardesign.cli.times import keep_times, times_so_far
-from lidardesign.errors import ConfigError, DataError, ThresholdError
+from lidardesign.errors import ConfigError, ThresholdError
 from lidardesign.run.clock import phase
-from lidardesign.run.streams import is_there
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
     from lidardesign.cli.dry_run import Plan
     from lidardesign.cli.runs import Run
-    from lidardesign.design.sensor import Design
     from lidardesign.evaluate.score import Evaluation, EvaluationRequest
 
 
-ALWAYS = ("uniform", "random", "bounding")
 BASELINE_HELP = (
     "A further baseline beside uniform, random and bounding: occupancy (rays towards cells that targets occupy) or "
     "no-visibility (the first design fitted anew to the density without its occlusion term, from samples drawn for it: "
@@ -43,15 +37,6 @@ BASELINE_HELP = (
     "and degrees: catalog:NAME@X,Y,Z,AZIMUTH,ELEVATION), cma (direct optimisation of the first design's sensors on "
     "training scenes, for --cma-seconds). Repeatable."
 )
-
-
-@dataclass
-class _Entry:
-    """One design to evaluate and the run that it came from."""
-
-    design: Design
-    path: Path
-    run: Run | None
 
 
 Targets = Annotated[
@@ -158,8 +143,8 @@ def evaluate(
 
         wanted = _checked(workers, baseline or [], cma_seconds, fail_above)
         planner, audit = planner_of(effects, detector, range_tolerance_mm, return_tolerance)
-        entries, runs = _collect(targets, console)
-        run = learned = _common_run(_named_apart(entries), runs)
+        entries, runs = collect(targets, console)
+        run = learned = common_run(named_apart(entries), runs)
         rays = rays or budgets_within([entry.design for entry in entries], run.task.defaults.rays, console)
         if accuracy:
             _check_measurable(learned)
@@ -171,15 +156,16 @@ def evaluate(
             outputs = {"--report": report, "--plots": plots, "--csv": csv}
             further = {"--effects": effects, "--detector": detector, "--set": overrides, "--accuracy": accuracy}
             return tell_plan(_plan(run, entries, rays, baseline or [], outputs, further), console)
-        request = replace(_request(run, entries, rays, baseline or [], seed), planner=planner, audit=audit)
+        request = request_of(run, entries, rays, [*ALWAYS, *(baseline or [])], seed)
+        request = replace(request, planner=planner, audit=audit)
         files = (report, plots, csv)
         evaluation = _evaluate_with(wanted, replace(request, cma=searching(cma_seconds)), console)
         # accuracy takes minutes: what was scored by then is written already
         early = (None if accuracy and is_output(path) else path for path in files)
-        written = _write_files(evaluation, request, times_so_far(run.folder, "evaluate", console), *early)
+        written = _write_files(evaluation, request, learned, times_so_far(run.folder, "evaluate", console), *early)
         if accuracy:
             evaluation = _with_accuracy(evaluation, request, learned, console)
-            written = _write_files(evaluation, request, times_so_far(run.folder, "evaluate", console), *files)
+            written = _write_files(evaluation, request, learned, times_so_far(run.folder, "evaluate", console), *files)
         document = {**evaluation.as_dict(), "set": overrides or [], "files": [str(path) for path in written]}
         keep_times(run.folder, "evaluate", console)
         console.result(document, lambda rich: _show(evaluation, document, written, rich))
@@ -217,7 +203,7 @@ def _checked(
 
 def _plan(
     run: Run,
-    entries: list[_Entry],
+    entries: list[JudgedDesign],
     rays: list[int] | None,
     baselines: list[str],
     outputs: dict[str, Path | None],
@@ -233,108 +219,6 @@ def _plan(
         baselines=tuple(dict.fromkeys([*ALWAYS, *baselines])),
         outputs=outputs,
         settings=settings,
-    )
-
-
-@phase("designs")
-def _collect(targets: list[Path], console: Console) -> tuple[list[_Entry], list[Run]]:
-    """The designs that were named, and the runs: of folders all designs, of files the file."""
-    from lidardesign.cli.rigs import reach_of
-
-    entries: list[_Entry] = []
-    opened = {target: open_run(target) for target in targets if target.is_dir()}
-    runs = list(opened.values())
-    reach_m = reach_of(runs)
-    for target in targets:
-        if target in opened:
-            run = opened[target]
-            entries += [_Entry(read_design(path, console), path, run) for path in run.designs()]
-        elif not is_there(target):
-            raise DataError("no such run or design", where=str(target), hint="give run folders or design files")
-        else:
-            design = read_design(target, console, reach_m)
-            entries.append(_Entry(design, target, run_of(design, target)))
-    seen: dict[Path, _Entry] = {}
-    for entry in entries:
-        seen.setdefault(entry.path.resolve(), entry)
-    return list(seen.values()), runs
-
-
-def _named_apart(entries: list[_Entry]) -> list[_Entry]:
-    """Designs of different runs that share a name take their run's name in front."""
-    names = [entry.design.name for entry in entries]
-    for entry in entries:
-        if names.count(entry.design.name) > 1:
-            folder = entry.run.folder if entry.run else entry.path.parent
-            entry.design = replace(entry.design, name=f"{folder.resolve().name}/{entry.design.name}")
-    names = [entry.design.name for entry in entries]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice:
-        raise ConfigError(f"two designs are called {twice!r}", hint="rename one of the files")
-    return entries
-
-
-def _common_run(entries: list[_Entry], runs: list[Run]) -> Run:
-    """The run whose task and configuration all designs are judged by."""
-    candidates = [*runs, *(entry.run for entry in entries if entry.run is not None)]
-    if not candidates:
-        raise ConfigError(
-            "no design names a run that is there, so the task is unknown",
-            hint="give the run folder too: lidardesign evaluate RUN DESIGN",
-        )
-    first = candidates[0]
-    for other in candidates[1:]:
-        if _judged_by(other) != _judged_by(first):
-            raise ConfigError(
-                f"{first.folder} and {other.folder} differ in task, configuration or design space",
-                hint="evaluate them one by one: scores of different scenes do not compare",
-            )
-    if not entries:
-        raise DataError("the run has no designs yet", where=str(first.folder), hint=f"lidardesign fit {first.folder}")
-    return first
-
-
-def _judged_by(run: Run) -> tuple[Any, ...]:
-    """What runs share whose designs are scored in the same scenes."""
-    from lidardesign.task import judged_by_keys
-
-    config = run.config
-    return config.task_name, judged_by_keys(run.task, config.task), config.space
-
-
-def _request(
-    run: Run, entries: list[_Entry], rays: list[int] | None, baselines: list[str], seed: int | None
-) -> EvaluationRequest:
-    from lidardesign.cli.layouts import layouts_of, learned_density, may_need_samples, twin_without_visibility
-    from lidardesign.cli.weighting import designs_samples
-    from lidardesign.design.samples import FILE_NAME
-    from lidardesign.evaluate.score import EvaluationRequest
-
-    config, task = run.config, run.task
-    seed = config.seed if seed is None else seed
-    made = [(entry.design, entry.run) for entry in entries if entry.run is not None]
-    layouts = layouts_of(made)
-    # designs of one run and weighting share its samples, and what is worked out from them
-    laid_out = [
-        (design, origin)
-        for design, origin in made
-        if may_need_samples(design) and (origin.folder / FILE_NAME).exists()
-    ]
-    samples = designs_samples(laid_out, layouts.targets)
-    return EvaluationRequest(
-        task=task,
-        config=config.task,
-        space=config.space,
-        seed=seed,
-        designs=[entry.design for entry in entries],
-        rays=sorted(set(rays or task.defaults.rays)),
-        baselines=tuple(dict.fromkeys([*ALWAYS, *baselines])),
-        samples=samples,
-        train=run.scenes("train", seed),
-        test=run.scenes("test", seed),
-        lay_out=layouts,
-        without_visibility=(lambda: twin_without_visibility(*made[0], layouts)) if made else None,
-        density=cache(lambda: learned_density(made[0][1] if made else run)),
     )
 
 
@@ -393,6 +277,7 @@ def _with_accuracy(evaluation: Evaluation, request: EvaluationRequest, run: Run,
 def _write_files(
     evaluation: Evaluation,
     request: EvaluationRequest,
+    run: Run,
     times: dict[str, dict[str, float]],
     report: Path | None,
     plots: Path | None,
@@ -409,30 +294,14 @@ def _write_files(
         from lidardesign.evaluate.pictured import pictured_of
         from lidardesign.evaluate.plots import write_plots
 
-        written += write_plots(evaluation, plots, pictured_of(request, times))
+        written += write_plots(evaluation, plots, pictured_of(evaluation, request, times))
     if report is not None:
+        from lidardesign.cli.pages import write_page
+
         with written_file(report) as file:
-            _write_report(evaluation, request, file)
+            write_page(evaluation, request, run, times, file)
         written.append(report)
     return written
-
-
-def _write_report(evaluation: Evaluation, request: EvaluationRequest, path: Path) -> None:
-    from lidardesign.design.track import placed
-    from lidardesign.evaluate.entries import middle_condition
-    from lidardesign.evaluate.report import write_report
-    from lidardesign.run.manifest import versions
-
-    at = middle_condition(request)
-    rays = {
-        design.name: request.lay_out(
-            design, design.rays or max(request.rays), request.samples.get(design.name), at=at
-        )
-        for design in request.designs
-    }
-    shown = [placed(design, at) for design in request.designs]
-    reproduce = {"command": shlex.join(["lidardesign", *sys.argv[1:]]), "seed": request.seed, **versions()}
-    write_report(evaluation, shown, rays, request.test[0], path, reproduce=reproduce, at=at)
 
 
 def _check_threshold(evaluation: Evaluation, limit: float | None) -> None:

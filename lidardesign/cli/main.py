@@ -10,6 +10,7 @@ import typer
 from lidardesign import __version__
 from lidardesign.cli.capture import capture
 from lidardesign.cli.catalog import catalog_app
+from lidardesign.cli.compare import compare
 from lidardesign.cli.completion import answer, completion, is_asked
 from lidardesign.cli.config import config_app
 from lidardesign.cli.console import EXIT_BROKEN_PIPE, Console, forget_stdout, print_json, report_error, tell
@@ -44,7 +45,7 @@ app = typer.Typer(
 app.add_typer(tasks_app, name="tasks")
 app.add_typer(catalog_app, name="catalog")
 app.add_typer(config_app, name="config")
-for subcommand in (learn, fit, constrain, evaluate, export, capture, show, completion):
+for subcommand in (learn, fit, constrain, evaluate, export, capture, show, compare, completion):
     app.command(context_settings=SETTINGS)(subcommand)
 add_manuals({"": app, "tasks": tasks_app, "catalog": catalog_app, "config": config_app}, PAGES)
 

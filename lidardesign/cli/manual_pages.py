@@ -32,6 +32,7 @@ PAGES: dict[str, Manual] = {
             "lidardesign fit runs/face --sensors 4 --name free": "four sensors, rays left open",
             "lidardesign fit runs/face --layout scan --rays 576 --name beams": "one steerable beam per ray",
             "lidardesign fit runs/face --layout scan --rays 361 --refine 5 --name steered": "led by the task's error",
+            "lidardesign fit runs/face --like robot.sdf --name instead": "no more than a rig that there is",
             "lidardesign fit runs/warehouse --rays 12 --at x_m=0.37 --name here": "for one position of a robot",
         },
         about="Reads sensors off the learned density: a mixture is fitted to its samples, and its components are "
@@ -103,8 +104,24 @@ PAGES: dict[str, Manual] = {
         {
             "lidardesign show runs/face/designs/free.yaml": "its sensors, constraints and cost",
             "lidardesign show runs/warehouse/designs/track.yaml --at x_m=3.91": "its rays at one position",
+            "lidardesign show robot.sdf": "the lidars of a Gazebo model",
         },
-        see=("design-file.md",),
+        files=(
+            "DESIGN: a design, the research code's sensor CSV, or a rig of others: rays as CSV or NPZ, a MuJoCo model "
+            "with rangefinders, an SDF file with lidars",
+        ),
+        see=("design-file.md", "formats.md"),
+    ),
+    "compare": Manual(
+        {
+            "lidardesign compare runs/face/designs/free.yaml runs/face/designs/beams.yaml": "two designs of a run",
+            "lidardesign compare robot.sdf runs/face/designs/free.yaml --rays 100": "a rig that there is, and a design",
+            "lidardesign compare rig.csv other.csv --in runs/face": "two rigs in the scenes of a run",
+        },
+        about="Shows what differs, sensor by sensor, and what that is worth: both are scored in the same held-out "
+        "scenes, and the differences scene by scene have the intervals that tell two designs apart.",
+        exits=FROM_A_RUN,
+        see=("design-file.md", "evaluate.md"),
     ),
     "catalog list": Manual(
         {"lidardesign catalog list --reflectance 10 --klux 100": "ranges stated for dark targets in the sun"},

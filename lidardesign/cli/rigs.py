@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lidardesign.design.rays import own_count
-from lidardesign.space import RANGE
+from lidardesign.errors import LidardesignError
+from lidardesign.run.streams import is_input
 
 if TYPE_CHECKING:
     from lidardesign.cli.console import Console
@@ -16,7 +17,29 @@ if TYPE_CHECKING:
 
 def reach_of(runs: Sequence[Run]) -> float | None:
     """How far any ray of the first run's design space may be heard [m]; None without a run."""
+    from lidardesign.space import RANGE
+
     return runs[0].config.space.high[RANGE] if runs else None
+
+
+def reach_beside(files: Iterable[Path], runs: Sequence[Run]) -> float | None:
+    """How far rays may be heard in the first of the runs, or in that of the first design that came from one [m]."""
+    from lidardesign.cli.runs import run_of
+    from lidardesign.design.files import load_design
+
+    if runs:
+        return reach_of(runs)
+    for path in files:
+        if is_input(path):
+            continue
+        try:
+            run = run_of(load_design(path), path)
+        except LidardesignError:
+            # whoever reads it for good says what is wrong with it
+            continue
+        if run is not None:
+            return reach_of([run])
+    return None
 
 
 def tell_notes(design: Design, shown: str, console: Console) -> None:
@@ -32,6 +55,8 @@ def budgets_within(designs: Iterable[Design], budgets: Sequence[int], console: C
 
     Where a rig has fewer rays than the task's largest budget, its own number takes the place of those beyond it.
     """
+    from lidardesign.design.rays import own_count
+
     fixed = {design.name: own_count(design) for design in designs if design.layout == "fixed"}
     usual = sorted(set(budgets))
     if not fixed or min(fixed.values()) >= usual[-1]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,36 +11,103 @@ from lidardesign.cli import options
 from lidardesign.cli.console import command
 from lidardesign.run.clock import phase
 
+if TYPE_CHECKING:
+    from rich.console import Console as RichConsole
+
+    from lidardesign.cli.console import Console
+    from lidardesign.cli.runs import Run
+    from lidardesign.design.check import ConstraintCheck
+    from lidardesign.design.readout import Readout
+    from lidardesign.design.sensor import Design
+
+SpaceOf = Annotated[
+    Path | None,
+    typer.Option(
+        "--in",
+        metavar="RUN",
+        help="Take the design space and the task of this run.",
+        show_default="the run that a design came from",
+    ),
+]
+
 
 def show(
-    design: Annotated[Path, typer.Argument(metavar="DESIGN", help="A design file.")],
+    design: Annotated[Path, typer.Argument(metavar="DESIGN", help="A design file, or the file of a rig.")],
     at: options.At = None,
+    space_of: SpaceOf = None,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
     debug: options.Debug = False,
 ) -> None:
-    """Print a design for people (or, with --json, for scripts), all of it or its rays at a condition."""
+    """Print a design for people (or, with --json, for scripts): its sensors, rays, bandwidth and constraints."""
     with command(json=json, quiet=quiet, debug=debug) as console:
         with phase("libraries"):
-            from lidardesign.cli.designs import show_design
-            from lidardesign.cli.runs import parse_at, read_design
+            from lidardesign.cli.designs import show_constraints, show_design
+            from lidardesign.cli.rigs import reach_of
+            from lidardesign.cli.runs import open_run, parse_at, read_design
+            from lidardesign.design.readout import readout_of
             from lidardesign.design.track import placed
-            from lidardesign.design.track_document import track_document
 
         condition = parse_at(at)
-        loaded = read_design(design, console)
+        run = None if space_of is None else open_run(space_of)
+        loaded = read_design(design, console, reach_of([run]) if run else None)
+        checks = _checks(loaded, design, run, console)
         loaded = placed(loaded, condition) if condition else loaded
-        document = {
-            "design": str(design),
-            "name": loaded.name,
-            "layout": loaded.layout,
-            "rays": loaded.rays,
-            "level": loaded.level,
-            "at": dict(loaded.at),
-            "sensors": [sensor.as_dict() for sensor in loaded.sensors],
-            "track": track_document(loaded.track) if loaded.track is not None else None,
-            "constraints": loaded.constraints,
-            "provenance": loaded.provenance,
-        }
-        console.result(document, lambda rich: show_design(loaded, rich), show_costs=False)
+        readout = readout_of(loaded)
+
+        def print_all(rich: RichConsole) -> None:
+            show_design(loaded, rich)
+            show_constraints(checks, rich)
+            rich.print(_shown_readout(readout), soft_wrap=True, markup=False)
+
+        console.result(_document(loaded, design, checks, readout), print_all, show_costs=False)
+
+
+def _document(loaded: Design, path: Path, checks: list[ConstraintCheck], readout: Readout) -> dict[str, Any]:
+    from lidardesign.design.tightness import is_tight, room_left
+    from lidardesign.design.track_document import track_document
+
+    return {
+        "design": str(path),
+        "name": loaded.name,
+        "layout": loaded.layout,
+        "rays": loaded.rays,
+        "level": loaded.level,
+        "at": dict(loaded.at),
+        "sensors": [sensor.as_dict() for sensor in loaded.sensors],
+        "track": track_document(loaded.track) if loaded.track is not None else None,
+        "constraints": loaded.constraints,
+        "checks": [{**check.as_dict(), "room": room_left(check), "tight": is_tight(check)} for check in checks],
+        "bandwidth": readout.as_dict(),
+        "provenance": loaded.provenance,
+    }
+
+
+def _checks(design: Design, path: Path, run: Run | None, console: Console) -> list[ConstraintCheck]:
+    """Every constraint that the design was made under, checked anew; in its run's design space where that is there."""
+    from lidardesign.cli.runs import run_of
+    from lidardesign.design.check import check_design
+    from lidardesign.design.files import design_document
+    from lidardesign.errors import LidardesignError
+
+    if not design.constraints:
+        return []
+    try:
+        run = run or run_of(design, path)
+    except LidardesignError as error:
+        console.note(f"note: the design space is not checked: {error}")
+    return check_design(design_document(design), design.constraints, None if run is None else run.config.space)
+
+
+def _shown_readout(readout: Readout) -> str:
+    """Rays and bandwidth in one line."""
+    from lidardesign.cli.designs import number
+
+    model = readout.model
+    said = f"{number(model.bin_ps)} ps bins of {number(model.bits_per_bin)} bits, {number(model.rate_hz)} frames/s"
+    low, high = number(readout.low_mbps), number(readout.high_mbps)
+    span = low if low == high else f"{low} .. {high}"
+    if readout.rays is None:
+        return f"bandwidth: {span} Mbit/s per ray in a frame ({said})"
+    return f"bandwidth: {span} Mbit/s for {readout.rays} rays per frame ({said})"
