@@ -49,7 +49,13 @@ def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
 def losses(design: Design, mounted: Sequence[Mount], rays: Rays) -> list[str]:
     """Notes of what gpu_lidar sensors cannot hold."""
     near = [one for one in mounted if one.gate_m[0] < NEAREST_M]
+    late = [one.gate_m[0] for one in mounted if one.gate_m[0] >= NEAREST_M]
     notes = grid_sensor_losses(design, mounted, rays)
+    if late:
+        notes.append(
+            f"Gazebo does not draw what is nearer than a gate's start: {len(late)} of {len(mounted)} sensors look "
+            f"through it, up to {max(late):.3g} m away, where this design's are blind behind it"
+        )
     if near:
         notes.append(
             f"gates of {len(near)} of {len(mounted)} sensors start below {NEAREST_M:g} m, where Gazebo's depth camera "
