@@ -19,7 +19,7 @@ FILE_NAMES = "FILE", "FILE.html", "FILE.yaml", "MESH", "CAPTURE", "PATH"
 WITH_FILES = frozenset((*FILE_NAMES, "NAME|FILE", "auto|all|none|audit|LIST"))
 WITH_FOLDERS = frozenset(("DIR", "FOLDER"))
 WITH_RUNS = frozenset(("RUN",))
-WITH_DESIGNS = frozenset(("DESIGN", "RUN|DESIGN", "RIG", "A", "B"))
+WITH_DESIGNS = frozenset(("DESIGN", "OTHER", "RUN|DESIGN", "RIG"))
 
 
 def values_of(line: Line, parameter: Any, current: str) -> Answer:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -46,7 +47,8 @@ def readable(path: Path, kind: str = "a design") -> Iterator[Path]:
 
 
 def claim_stdout(console: Console, *, dry_run: bool = False, **files: Path | None) -> None:
-    """Give standard output to the file that is `-`, if one is; what people are told then goes to stderr.
+    """Give standard output to the file that is `-`, if one is; what people are told then goes to stderr, or
+    nowhere with --quiet.
 
     Arguments:
         console: The command's.
@@ -65,7 +67,8 @@ def claim_stdout(console: Console, *, dry_run: bool = False, **files: Path | Non
         hint = f"give {asking[0]} a file"
         raise ConfigError(f"{' and '.join(asking)} both write to standard output", where=asking[0], hint=hint)
     if not dry_run:
-        console.output = sys.stderr
+        # who is to be told nothing by the way gets the file alone
+        console.output = io.StringIO() if console.quiet else sys.stderr
 
 
 def is_output(path: Path | None) -> bool:
