@@ -14,8 +14,9 @@ from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.returns import Outcome, Rays
 from lidardesign.simulate.simulate import gate_outcomes
 
-MOST_FACES = 60_000  # of a scene; more would make the page large and slow to open
+MOST_FACES = 40_000  # of a scene's meshes, and of its round bodies; more would make the page large and slow to open
 STEPS = 24  # round a sphere or capsule
+FEWEST_STEPS = 4  # where a scene has very many of them
 SHELL_STEPS = 8  # along each side of a gate's shell
 SMALLEST_SPREAD_M = 1e-3  # of origins; less looks like one place
 PLANE_MARGIN = 0.1  # of the scene's extent, beyond which an infinite plane is not drawn
@@ -34,19 +35,35 @@ def body_triangles(
 
     Of a mesh about a share of its triangles is drawn.
     """
-    shape, pose = body.shape, body.pose(frame)
+    pose = body.pose(frame)
+    vertices, faces = own_triangles(body, pose, bounds_m, share)
+    return (vertices @ pose[:3, :3].T + pose[:3, 3]).astype(np.float32), faces
+
+
+def own_triangles(
+    body: Body, pose: np.ndarray, bounds_m: np.ndarray, share: float = 1.0, steps: int = STEPS
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same in the body's own frame, with so many steps round spheres and capsules; the pose is for planes."""
+    shape = body.shape
     if isinstance(shape, Mesh):
         vertices, faces = thinned(shape.vertices, shape.faces, math.ceil(share * len(shape.faces)))
     elif isinstance(shape, Sphere):
-        vertices, faces = _capsule(shape.radius_m, 0.0)
+        vertices, faces = _capsule(shape.radius_m, 0.0, steps)
     elif isinstance(shape, Capsule):
-        vertices, faces = _capsule(shape.radius_m, shape.half_length_m)
+        vertices, faces = _capsule(shape.radius_m, shape.half_length_m, steps)
     elif isinstance(shape, Box):
         vertices, faces = _box(np.asarray(shape.half_extents_m))
     else:
         vertices, faces = _square(pose, bounds_m)
-    world = vertices @ pose[:3, :3].T + pose[:3, 3]
-    return world.astype(np.float32), faces.astype(np.int32)
+    return vertices, faces.astype(np.int32)
+
+
+def round_steps(scene: Scene) -> int:
+    """Steps round spheres and capsules: fewer where a scene has very many of them."""
+    count = sum(isinstance(body.shape, Sphere | Capsule) for body in scene.bodies)
+    # a ball of n steps has about n (n + 2) triangles
+    most = math.sqrt(MOST_FACES / max(count, 1)) - 1
+    return int(min(STEPS, max(FEWEST_STEPS, 4 * (most // 4))))
 
 
 def thinned(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
@@ -154,9 +171,9 @@ def _grid_faces(rows: int, columns: int) -> np.ndarray:
     return np.concatenate([lower, upper])
 
 
-def _capsule(radius_m: float, half_length_m: float) -> tuple[np.ndarray, np.ndarray]:
-    turn = np.linspace(0.0, 2 * np.pi, STEPS + 1)
-    half = np.linspace(0.0, np.pi / 2, STEPS // 4 + 1)
+def _capsule(radius_m: float, half_length_m: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    turn = np.linspace(0.0, 2 * np.pi, steps + 1)
+    half = np.linspace(0.0, np.pi / 2, steps // 4 + 1)
     latitude = np.concatenate([half[::-1], -half])[:, None]
     height = radius_m * np.sin(latitude) + np.repeat([half_length_m, -half_length_m], len(half))[:, None]
     ring = radius_m * np.cos(latitude)

@@ -155,9 +155,14 @@ def _conditions(request: EvaluationRequest) -> list[dict[str, float]]:
         return conditions_of(request.task, request.config, request.space)
 
 
+def ordered_conditions(request: EvaluationRequest) -> list[dict[str, float]]:
+    """The condition values that are evaluated at, ascending; one empty entry without conditions."""
+    return sorted(_conditions(request), key=lambda condition: tuple(condition.values()))
+
+
 def middle_condition(request: EvaluationRequest) -> dict[str, float]:
     """The condition value in the middle of those that are evaluated at, for drawings; empty without conditions."""
-    ordered = sorted(_conditions(request), key=lambda condition: tuple(condition.values()))
+    ordered = ordered_conditions(request)
     return ordered[len(ordered) // 2]
 
 

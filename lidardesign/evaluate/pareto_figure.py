@@ -208,7 +208,7 @@ def _table(ladder: Ladder) -> str:
     words = {"better": "to choose", "open": ""}
     return (
         f"<h3>{html.escape(ladder.knob)}: {html.escape(ladder.verdict)}</h3><p>{html.escape(about)}</p>"
-        + table(headings, lines, text_columns=1, words=words)
+        + table(headings, lines, text_columns=1, words=words, caption=f"Settings of {ladder.knob}.")
     )
 
 

@@ -27,8 +27,9 @@ def effects_section(evaluation: Evaluation) -> str:
         f"{MILLIMETRES * tolerance.range_m:.3g} mm and {tolerance.lost:.2g} of the returns together.</p>"
     )
     headings = ["effect", "simulated", "reason", "range [mm]", "returns", "cost [s]"]
+    caption = "The plan of effects: what was simulated, why, and what it costs."
     lines = [(_effect_cells(effect), "", False) for effect in effects]
-    return f'{head}<div class="reasons">{table(headings, lines, text_columns=3)}</div>'
+    return f'{head}<div class="reasons">{table(headings, lines, text_columns=3, caption=caption)}</div>'
 
 
 def audit_section(evaluation: Evaluation, audit: Audit) -> str:
@@ -50,7 +51,8 @@ def audit_section(evaluation: Evaluation, audit: Audit) -> str:
         for index, row in enumerate(audit.rows)
     ]
     words = {"worse": "too far", "better": "within"}
-    return head + table([*headings, "planned [s]", "all [s]", "moved"], lines, text_columns=1, words=words)
+    headings += ["planned [s]", "all [s]", "moved"]
+    return head + table(headings, lines, text_columns=1, words=words, caption="Every row under the plan and under all.")
 
 
 def _starts(rows: Sequence[AuditRow], index: int) -> bool:

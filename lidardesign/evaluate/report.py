@@ -1,4 +1,4 @@
-"""One HTML page about an evaluation: tables, curves, and the designs in a scene.
+"""One HTML page about an evaluation: result, designs in a scene, curves, rivals, density, constraints, costs.
 
 The page is one file that works offline and makes no network request: plotly is inside it, and its content
 security policy forbids every connection. All names are escaped.
@@ -7,19 +7,32 @@ security policy forbids every connection. All names are escaped.
 from __future__ import annotations
 
 import html
-import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
-from lidardesign.design.sensor import Design
-from lidardesign.evaluate.drawing import MOST_FACES, drawn_share
-from lidardesign.evaluate.figures import curve_figure, scene_figure
+import numpy as np
+
+from lidardesign.design.tightness import Tightness
+from lidardesign.evaluate.curves import DASHES, Series, series
+from lidardesign.evaluate.density_figures import MOST_DESIGNS, marginal_figure, plane_figure
+from lidardesign.evaluate.density_views import DensityView
+from lidardesign.evaluate.figures import FONT, curve_figure
 from lidardesign.evaluate.page import page
 from lidardesign.evaluate.pareto_figure import accuracy_tables, pareto_figure, pareto_height_px
 from lidardesign.evaluate.physics_tables import audit_section, effects_section
+from lidardesign.evaluate.report_parts import embedded, figure, folded, paragraphs, section, swatch, switch
+from lidardesign.evaluate.report_tables import (
+    CommandTimes,
+    Reproduction,
+    constraints_table,
+    reproduction,
+    times_tables,
+)
+from lidardesign.evaluate.report_view import view_section
 from lidardesign.evaluate.results import Evaluation
 from lidardesign.evaluate.rungs import Ladder
+from lidardesign.evaluate.shown import Shown
 from lidardesign.evaluate.verdicts import (
     bandwidth_table,
     paired_table,
@@ -28,161 +41,162 @@ from lidardesign.evaluate.verdicts import (
     summary_sentences,
 )
 from lidardesign.run.files import write_atomic
-from lidardesign.scene import Scene
-from lidardesign.simulate.returns import Rays
 
-SCENE_ID, RAYS_ID, BANDWIDTH_ID = "view-scene", "curve-rays", "curve-bandwidth"
-ACCURACY_ID = "accuracy"
+RAYS_ID, BANDWIDTH_ID, ACCURACY_ID = "curve-rays", "curve-bandwidth", "accuracy-figure"
+CURVE_PX, SMALL_PX, PLANE_PX = 440, 250, 400
 
 
-def write_report(
-    evaluation: Evaluation,
-    designs: Sequence[Design],
-    rays_by_design: Mapping[str, Rays],
-    scene: Scene,
-    path: Path,
-    *,
-    title: str | None = None,
-    reproduce: Mapping[str, Any] | None = None,
-    at: Mapping[str, float] | None = None,
-) -> None:
-    """Write the report, whole or not at all.
+@dataclass(frozen=True, eq=False)
+class Report:
+    """Everything that a report is made of.
 
     Arguments:
         evaluation: What was found.
-        designs: The designs to list and draw.
-        rays_by_design: The rays to draw for each design, by name.
-        scene: The scene to draw them in, at the frame in the middle of its time.
-        path: The HTML file.
-        title: The page's title; the metric's name by default.
-        reproduce: Command, seed, versions and the like, shown as they are at the end.
-        at: The condition values that designs and rays are drawn at.
+        shown: The designs in a held-out scene.
+        title: The page's title.
+        density: The learned density as it can be looked at; None where a run has no samples.
+        density_m: Points that it observes, drawn by their weights, shape (K, 3) [m].
+        constraints: How tight each constraint is, by the name of the design.
+        times: Where the time of each command went.
+        reproduce: How to get the same figures again.
     """
-    write_atomic(Path(path), report_html(evaluation, designs, rays_by_design, scene, title, reproduce, at))
+
+    evaluation: Evaluation
+    shown: Shown
+    title: str
+    density: DensityView | None = None
+    density_m: np.ndarray | None = None
+    constraints: Mapping[str, Sequence[Tightness]] = field(default_factory=dict)
+    times: Sequence[CommandTimes] = ()
+    reproduce: Reproduction = field(default_factory=Reproduction)
 
 
-def report_html(
-    evaluation: Evaluation,
-    designs: Sequence[Design],
-    rays_by_design: Mapping[str, Rays],
-    scene: Scene,
-    title: str | None = None,
-    reproduce: Mapping[str, Any] | None = None,
-    at: Mapping[str, float] | None = None,
-) -> str:
-    """The report as text; see `write_report`."""
+def write_report(report: Report, path: Path) -> None:
+    """Write the page, whole or not at all."""
+    write_atomic(Path(path), report_html(report))
+
+
+def report_html(report: Report) -> str:
+    """The page as text."""
+    evaluation = report.evaluation
     metric = evaluation.metric
-    heading = title or f"{metric.name} on {evaluation.scenes} held-out scenes"
-    frame = scene.frames // 2
-    figure, masks = scene_figure(scene, designs, rays_by_design, frame)
+    parts = [part for part in _parts(report) if part[2]]
+    body = "\n".join(section(heading, content, identifier) for identifier, heading, content in parts)
+    lead = f"{metric.name} in {metric.unit}, {metric.better} is better."
+    links = [(identifier, heading) for identifier, heading, _ in parts]
+    return page(report.title, lead, embedded(FONT, id="page-font") + body, _plotly_source(), links)
+
+
+def _parts(report: Report) -> list[tuple[str, str, str]]:
+    """Identifier, heading and content of every section; empty content where there is nothing to tell."""
+    evaluation = report.evaluation
+    # lines without marks are told apart by their dashes
+    looks = {curve.name: curve for curve in series(evaluation)}
+    looks = {name: replace(look, dash=DASHES[index % len(DASHES)]) for index, (name, look) in enumerate(looks.items())}
+    shown = [looks[one.design.name] for one in report.shown.designs]
     ladders = evaluation.accuracy.ladders if evaluation.accuracy else ()
-    sections = [
-        _section("Result", _paragraphs(summary_sentences(evaluation)) + _notes(evaluation.notes)),
-        _section("Score against rays", _figure(curve_figure(evaluation, "rays"), RAYS_ID, 440)),
-        _section(
-            "Score against bandwidth", _figure(curve_figure(evaluation, "bandwidth"), BANDWIDTH_ID, 440)
-        ),
-        _section(
-            "Designs in a scene",
-            f"<p>{html.escape(_drawn(scene, frame, at or {}))} Lines run from where each ray starts to its first hit, "
-            f"or to the end of its gate; tinted shells are the gates, ellipses where the rays of a sensor start.</p>"
-            f"{_chooser(masks)}{_figure(figure, SCENE_ID, 560, tools=True)}",
-        ),
-        _section("All scores", rows_table(evaluation)),
-        _section("Paired differences at equal rays", paired_table(evaluation)),
-        _section("At equal bandwidth", bandwidth_table(evaluation)) if evaluation.equal_bandwidth else "",
-        _section("Physics", effects_section(evaluation)) if evaluation.effects else "",
-        _section("Audit of the physics", audit_section(evaluation, evaluation.audit)) if evaluation.audit else "",
-        _section("What accuracy costs", _accuracy(ladders)) if ladders else "",
-        *(_section(f"Sensors of {design.name}", sensors_table(design)) for design in designs),
-        _section("How to reproduce", _definitions(reproduce)) if reproduce else "",
+    result = paragraphs(summary_sentences(evaluation)) + paragraphs(evaluation.notes, "note")
+    return [
+        ("result", "Result", result),
+        ("scene", "Designs in a scene", view_section(report.shown, shown, report.density_m)),
+        ("curves", "Score against rays and bandwidth", _curves(evaluation)),
+        ("scores", "All scores", rows_table(evaluation)),
+        ("rivals", "Against the rivals at equal rays", _rivals(evaluation)),
+        ("bandwidth", "Against the rivals at equal bandwidth", _at_equal_bandwidth(evaluation)),
+        ("density", "The learned density", _density(report.density, looks) if report.density else ""),
+        ("constraints", "Constraints and how tight each is", _constraints(report.constraints)),
+        ("physics", "Physics", effects_section(evaluation) if evaluation.effects else ""),
+        ("audit", "Audit of the physics", audit_section(evaluation, evaluation.audit) if evaluation.audit else ""),
+        ("accuracy", "What accuracy costs", _accuracy(ladders)),
+        ("sensors", "Sensors", _sensors(report.shown)),
+        ("time", "Where the time went", times_tables(report.times)),
+        ("reproduce", "How to reproduce this", reproduction(report.reproduce)),
     ]
-    return page(heading, "\n".join(section for section in sections if section), _plotly_source())
+
+
+def _curves(evaluation: Evaluation) -> str:
+    """Both curves with one legend, whose boxes switch curves in both."""
+    legend = "".join(
+        switch(curve.name, picture=swatch(curve.colour, curve.dash, curve.marker), curve=str(index))
+        for index, curve in enumerate(series(evaluation))
+    )
+    scenes = f"over {evaluation.scenes} held-out scenes"
+    return (
+        f'<fieldset><legend>Curves shown</legend><div class="curves-shown">{legend}</div></fieldset>'
+        + figure(curve_figure(evaluation, "rays"), RAYS_ID, CURVE_PX, f"Score against rays per frame: means {scenes}, "
+                 "with 95 % bootstrap intervals as bands.", "curves")
+        + figure(curve_figure(evaluation, "bandwidth"), BANDWIDTH_ID, CURVE_PX, "The same scores against the bandwidth "
+                 "that it takes to read the gates out.", "curves")
+    )  # fmt: skip
+
+
+def _rivals(evaluation: Evaluation) -> str:
+    return folded(paired_table(evaluation), len(evaluation.paired), "All paired differences")
+
+
+def _at_equal_bandwidth(evaluation: Evaluation) -> str:
+    if not evaluation.equal_bandwidth:
+        return ""
+    return folded(bandwidth_table(evaluation), len(evaluation.equal_bandwidth), "All rows at equal bandwidth")
+
+
+def _density(view: DensityView, looks: Mapping[str, Series]) -> str:
+    """Marginals, and the field in space, side by side where there is room."""
+    names = list(view.marginals[0].designs) if view.marginals else []
+    drawn = [name for name in names if name in looks][:MOST_DESIGNS]
+    legend = "".join(
+        f'<span class="switch">{swatch(looks[name].colour, looks[name].dash)}<span>{html.escape(name)}</span></span>'
+        for name in drawn
+    )
+    legend = f'<span class="switch">{swatch("#b8c1cb", None)}<span>learned density</span></span>{legend}'
+    about = (
+        f"Drawn from {view.samples:,} weighted samples, worth {view.effective:,.0f} equal ones. "
+        "Below, how much of the density observes each place, seen along an axis, over the outlines of targets (solid) "
+        f"and occluders (dotted) of {view.scene}."
+    )
+    marginals = "".join(
+        figure(marginal_figure(one, looks), f"marginal-{index}", SMALL_PX, f"Share of the density along {one.label}")
+        for index, one in enumerate(view.marginals)
+    )
+    planes = "".join(
+        figure(plane_figure(one), f"plane-{index}", PLANE_PX, f"What is observed, {one.labels[0]} and {one.labels[1]}")
+        for index, one in enumerate(view.planes)
+    )
+    more = len(names) - len(drawn)
+    further = f"<p>{more} further designs are not drawn here.</p>" if more else ""
+    return (
+        f'<p>{html.escape(about)}</p><div class="curves-shown">{legend}</div>{further}'
+        f'<div class="tiles">{marginals}</div><div class="tiles wide">{planes}</div>'
+    )
+
+
+def _constraints(found: Mapping[str, Sequence[Tightness]]) -> str:
+    return "".join(constraints_table(name, bounds) for name, bounds in found.items())
+
+
+def _sensors(shown: Shown) -> str:
+    parts = []
+    for one in shown.designs:
+        parts.append(folded(sensors_table(one.design), len(one.design.sensors), f"Sensors of {one.design.name}"))
+    return "".join(parts)
 
 
 def _accuracy(ladders: Sequence[Ladder]) -> str:
     """The figure of all ladders, how to read it, and their tables."""
+    if not ladders:
+        return "<p>It was not measured: <code>lidardesign evaluate --accuracy</code> does, in some minutes.</p>"
     read = (
         "Error against seconds on this machine, one panel per numerical choice. Orange is the cheapest setting inside "
         "the tolerance (dashed), a ring the one of this run; pale settings are beaten in both; triangles on the lower "
         "edge have no error to show, references among them."
     )
     height = pareto_height_px(ladders)
-    picture = _figure(pareto_figure(ladders), ACCURACY_ID, height) if height else ""
-    wide = f'<div class="scroll"><div class="panels">{picture}</div></div>'
+    picture = figure(pareto_figure(ladders), ACCURACY_ID, height, "Error against seconds") if height else ""
+    wide = f'<div class="scroll" tabindex="0"><div class="panels">{picture}</div></div>'
     return f"<p>{read}</p>{wide}{accuracy_tables(ladders)}"
-
-
-def _drawn(scene: Scene, frame: int, at: Mapping[str, float]) -> str:
-    """Which scene is shown, and when and where it is seen."""
-    shown = f"Held-out scene {scene.name}"
-    if scene.frames > 1:
-        shown += f", frame {frame + 1} of {scene.frames}"
-    if at:
-        shown += ", seen from " + ", ".join(f"{name}={value:g}" for name, value in at.items())
-    if drawn_share(scene) < 1:
-        shown += f" (drawn coarser: {MOST_FACES} of its triangles)"
-    return f"{shown}."
 
 
 def _plotly_source() -> str:
     from plotly.offline import get_plotlyjs
 
     return get_plotlyjs()
-
-
-def _figure(figure: dict[str, Any], identifier: str, height_px: int, *, tools: bool = False) -> str:
-    """A figure's division and script; plotly is loaded in the page's head, tools are buttons."""
-    import plotly.graph_objects as go
-    from plotly.io import to_html
-
-    return to_html(
-        go.Figure(figure),
-        include_plotlyjs=False,
-        full_html=False,
-        div_id=identifier,
-        default_width="100%",
-        default_height=f"{height_px}px",
-        config={
-            "responsive": True,
-            "displaylogo": False,
-            "displayModeBar": tools,
-            "plotlyServerURL": "",
-            "showTips": False,
-        },
-    )
-
-
-def _section(heading: str, content: str) -> str:
-    return f"<section><h2>{html.escape(heading)}</h2>\n{content}</section>"
-
-
-def _paragraphs(sentences: Sequence[str]) -> str:
-    return "".join(f"<p>{html.escape(sentence)}</p>" for sentence in sentences)
-
-
-def _notes(notes: Sequence[str]) -> str:
-    return "".join(f'<p class="note">{html.escape(note)}</p>' for note in notes)
-
-
-def _definitions(values: Mapping[str, Any]) -> str:
-    items = (
-        f"<dt>{html.escape(str(key))}</dt><dd><code>{html.escape(str(value))}</code></dd>"
-        for key, value in values.items()
-    )
-    return f"<dl>{''.join(items)}</dl>"
-
-
-def _chooser(masks: Mapping[str, list[bool]]) -> str:
-    """A list of the designs that shows one of them at a time; nothing to choose from where there is one."""
-    if len(masks) < 2:
-        return ""
-    options = "".join(
-        f'<option value="{index}">{html.escape(name)}</option>' for index, name in enumerate(masks)
-    )
-    return (
-        f'<p><label>Design <select id="design-shown">{options}</select></label></p>'
-        f"<script>const masks = {json.dumps(list(masks.values()))};"
-        'document.getElementById("design-shown").addEventListener("change", event => '
-        f'Plotly.restyle("{SCENE_ID}", {{visible: masks[event.target.value]}}));</script>'
-    )

@@ -60,7 +60,9 @@ def rows_table(evaluation: Evaluation) -> str:
     headings = ["design", "rays", f"{evaluation.metric.name} [{unit}]", "95 % interval", "failures"]
     detail = leading_detail(evaluation.rows)
     headings += [] if detail is None else [_words(detail)]
-    return table([*headings, "Mbit/s", "seconds"], _grouped(evaluation.rows, detail), text_columns=1)
+    caption = f"Means over {evaluation.scenes} held-out scenes; seconds are those of simulating and scoring all."
+    headings += ["Mbit/s", "seconds"]
+    return table(headings, _grouped(evaluation.rows, detail), text_columns=1, caption=caption)
 
 
 def paired_table(evaluation: Evaluation) -> str:
@@ -76,7 +78,8 @@ def paired_table(evaluation: Evaluation) -> str:
         )
         for index, pair in enumerate(evaluation.paired)
     ]
-    return table(headings, lines, text_columns=2)
+    caption = "Differences scene by scene at equal numbers of rays, with their 95 % bootstrap intervals over scenes."
+    return table(headings, lines, text_columns=2, caption=caption)
 
 
 def bandwidth_table(evaluation: Evaluation) -> str:
@@ -98,7 +101,9 @@ def bandwidth_table(evaluation: Evaluation) -> str:
                 bool(index and row.design == evaluation.equal_bandwidth[0].design),
             )
         )
-    return table([*headings, "difference (95 % interval)", "design is"], lines, text_columns=2)
+    caption = "Each design against baselines with as many rays (their rays) as fit in its bandwidth."
+    headings += ["difference (95 % interval)", "design is"]
+    return table(headings, lines, text_columns=2, caption=caption)
 
 
 def sensors_table(design: Design) -> str:
@@ -115,17 +120,21 @@ def sensors_table(design: Design) -> str:
     for sensor, weight in zip(design.sensors[:MOST_SENSORS], design.weights, strict=False):
         horizontal, vertical = (math.degrees(angle) for angle in sensor.field_of_view_rad)
         start, end = sensor.gate_m
+        # adding zero takes the sign from a rounded -0
+        looks = [round(math.degrees(angle), 1) + 0.0 for angle in (sensor.azimuth_rad, sensor.elevation_rad)]
         cells = [
             sensor.name,
             f"{weight:.3f}",
-            " ".join(f"{value:.3f}" for value in sensor.origin_m),
-            f"{math.degrees(sensor.azimuth_rad):.1f}, {math.degrees(sensor.elevation_rad):.1f}",
+            " ".join(f"{round(value, 3) + 0.0:.3f}" for value in sensor.origin_m),
+            ", ".join(f"{angle:.1f}" for angle in looks),
             f"{horizontal:.1f} x {vertical:.1f}",
             f"{start:.3f} to {end:.3f}",
         ]
         lines.append((cells, "", False))
     rest = len(design.sensors) - MOST_SENSORS
-    return table(headings, lines, text_columns=1) + (f"<p>and {rest} more.</p>" if rest > 0 else "")
+    caption = f"Sensors of {design.name}: shares of the rays, and intervals that hold {100 * design.level:g} % of each."
+    listed = table(headings, lines, text_columns=1, caption=caption)
+    return listed + (f"<p>and {rest} more.</p>" if rest > 0 else "")
 
 
 def _told(evaluation: Evaluation, pair: Paired, other: float) -> str:
@@ -161,6 +170,7 @@ def table(
     *,
     text_columns: int,
     words: Mapping[str, str] = VERDICTS,
+    caption: str = "",
 ) -> str:
     """An HTML table; a line is its cells, a verdict for the last cell (in `words`), and whether a group begins."""
     head = "".join(
@@ -168,7 +178,13 @@ def table(
         for column, heading in enumerate(headings)
     )
     body = "".join(_line(cells, word, words, first, text_columns) for cells, word, first in lines)
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    title = html.escape(caption)
+    named = f' role="region" aria-label="{title}"' if title else ""
+    told = f"<caption><span>{title}</span></caption>" if title else ""
+    return (
+        f'<div class="scroll" tabindex="0"{named}><table>{told}<thead><tr>{head}</tr></thead><tbody>{body}</tbody>'
+        "</table></div>"
+    )
 
 
 def _line(cells: list[str], word: str, words: Mapping[str, str], first: bool, text_columns: int) -> str:
@@ -176,6 +192,7 @@ def _line(cells: list[str], word: str, words: Mapping[str, str], first: bool, te
         f"<td{' class=name' if column < text_columns else ''}>{html.escape(cell)}</td>"
         for column, cell in enumerate(cells)
     ]
+    shown[0] = f'<th scope="row" class="name">{html.escape(cells[0])}</th>'
     if word:
         shown[-1] = f'<td class="{word}">{words[word]}</td>'
     return f"<tr{' class=first' if first else ''}>{''.join(shown)}</tr>"

@@ -1,0 +1,207 @@
+"""What the report's 3D view is drawn from, as one JSON document: numbers as base64 of little-endian arrays.
+
+Bodies at rest are merged, moving ones keep their own frame and a pose per frame; sensors are a few numbers each, and
+the page draws their fields of view and gates; a ray is where it starts, where it looks, how far it goes and what
+becomes of it. The page's script (`assets/scene.js`) puts together what is switched on.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from lidardesign.design.grid import field_on_sphere
+from lidardesign.design.sensor import Design, Sensor, interval_factor
+from lidardesign.evaluate.curves import Series
+from lidardesign.evaluate.drawing import (
+    SMALLEST_SPREAD_M,
+    drawn_share,
+    gate_shell,
+    origin_lines,
+    own_triangles,
+    round_steps,
+    scene_bounds,
+)
+from lidardesign.evaluate.shown import Shown, ShownDesign
+from lidardesign.numerics import EPSILON_FLOAT32
+from lidardesign.scene import Body
+from lidardesign.simulate.returns import Outcome
+
+MOST_SENSORS = 40  # drawn as frusta and switched one by one; a scan has hundreds, and its rays say it all
+MOST_BODIES = 2000  # of a scene, the largest first
+MARGIN = 1.0  # of the scene's extent: rays that go farther are cut there
+# More rays that hit nothing would hide everything else.
+MANY_RAYS, FAINT = 300, 0.22
+LARGEST_UINT16 = 65_535
+# What tells outcomes apart beside their colours (Okabe and Ito 2008): dashes of lines, marks at their ends.
+OUTCOMES = (
+    (Outcome.RETURN, "return", "#009E73", "solid", "circle"),
+    (Outcome.OCCLUDED, "occluded", "#D55E00", "dash", "x"),
+    (Outcome.AFTER_GATE, "behind the gate", "#0072B2", "dot", "diamond-open"),
+    (Outcome.MISS, "nothing hit", "#6b7280", "longdash", None),
+    (Outcome.NOT_DETECTED, "not detected", "#CC79A7", "dashdot", "cross"),
+)
+# Dashes of plotly by those of curves.
+DASHES = {"solid": "solid", "dashed": "dash", "dashdot": "dashdot", "dotted": "dot"}
+
+
+def view_document(shown: Shown, looks: Sequence[Series], density_m: np.ndarray | None = None) -> dict[str, Any]:
+    """The document of a view.
+
+    Arguments:
+        shown: The scene, and the designs in it.
+        looks: The colour and dash of each design, in the same order.
+        density_m: Points that the learned density observes, shape (K, 3) [m].
+    """
+    bodies = drawn_bodies(shown)
+    bounds = view_bounds(shown)
+    share, steps = drawn_share(shown.scene), round_steps(shown.scene)
+    moving = [body for body in bodies if body.poses.ndim == 3]
+    return {
+        "frames": len(shown.frames),
+        "places": len(shown.places),
+        "bounds": bounds.tolist(),
+        "camera": camera(shown.directions),
+        "outcomes": [
+            {"code": int(code), "colour": colour, "dash": dash, "symbol": symbol}
+            for code, _, colour, dash, symbol in OUTCOMES
+        ],
+        "rest": [_resting(bodies, target, bounds, share, steps) for target in (True, False)],
+        "moving": [_moving(body, shown, bounds, share, steps) for body in moving],
+        "designs": [_design(one, look) for one, look in zip(shown.designs, looks, strict=True)],
+        "density": None if density_m is None else encoded(density_m, "<f4"),
+        "many": MANY_RAYS,
+        "faint": FAINT,
+    }
+
+
+def encoded(values: np.ndarray, kind: str) -> str:
+    """An array as base64 of its little-endian bytes, row by row."""
+    return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode("ascii")
+
+
+def drawn_bodies(shown: Shown) -> list[Body]:
+    """The bodies that are drawn: the largest, where there are very many."""
+    bodies = list(shown.scene.bodies)
+    if len(bodies) <= MOST_BODIES:
+        return bodies
+    sizes = [_size(body) for body in bodies]
+    largest = np.argsort(sizes, kind="stable")[::-1][:MOST_BODIES]
+    return [bodies[index] for index in np.sort(largest)]
+
+
+def _size(body: Body) -> float:
+    """The extent of a body [m]; of a plane infinite."""
+    shape = body.shape
+    if hasattr(shape, "bounds_m"):
+        return float(np.ptp(shape.bounds_m, axis=0).max())
+    lengths = [value for entry in vars(shape).values() for value in np.atleast_1d(entry)]
+    return float(max(lengths, default=np.inf))
+
+
+def view_bounds(shown: Shown) -> np.ndarray:
+    """The box that is drawn, shape (2, 3) [m]: scene, sensors, and their rays as far as they stay near."""
+    rays = [one for design in shown.designs for one in design.rays]
+    each = [scene_bounds(shown.scene, frame, rays) for frame in {shown.frames[0], shown.frames[-1]}]
+    low, high = np.min([one[0] for one in each], axis=0), np.max([one[1] for one in each], axis=0)
+    reach = MARGIN * float((high - low).max())
+    ends = np.concatenate([np.zeros((0, 3)), *(design.ends_m.reshape(-1, 3) for design in shown.designs)])
+    ends = np.concatenate([ends, *(shell for design in shown.designs for shell in _shells(design))])
+    if len(ends):
+        low = np.minimum(low, np.maximum(ends.min(axis=0), low - reach))
+        high = np.maximum(high, np.minimum(ends.max(axis=0), high + reach))
+    return np.stack([low, high])
+
+
+def _shells(one: ShownDesign) -> list[np.ndarray]:
+    """Gates and origins that are drawn, at the first and the last position."""
+    if len(one.design.sensors) > MOST_SENSORS:
+        return []
+    found = []
+    for design in (one.placed[0], one.placed[-1]):
+        for sensor in design.sensors:
+            starts = origin_lines(sensor, design.level)
+            found += [gate_shell(sensor)[0], starts[~np.isnan(starts[:, 0])]]
+    return found
+
+
+def camera(directions: np.ndarray) -> dict[str, Any]:
+    """From behind and above the sensors; a world in the plane z = 0 is looked at from above, as on paper."""
+    if len(directions) and np.abs(directions[:, 2]).max() < EPSILON_FLOAT32:
+        up, kind = {"x": 0, "y": 1, "z": 0}, {"type": "orthographic"}
+        return {"eye": {"x": 0, "y": 0, "z": 1.9}, "up": up, "projection": kind, "center": {"x": 0, "y": 0, "z": 0}}
+    up = {"x": 0, "y": 0, "z": 1}
+    return {"eye": _side_view(directions), "up": up, "center": {"x": 0, "y": 0, "z": -0.1}}
+
+
+def _side_view(directions: np.ndarray) -> dict[str, float]:
+    """A camera beside the mean direction of the rays, a little behind the sensors and above them."""
+    mean = directions.mean(axis=0) if len(directions) else np.array([1.0, 0.0, 0.0])
+    forward = np.array([mean[0], mean[1], 0.0])
+    length = np.linalg.norm(forward)
+    forward = forward / length if length > EPSILON_FLOAT32 else np.array([1.0, 0.0, 0.0])
+    eye = 1.25 * np.array([-forward[1], forward[0], 0.0]) - 1.0 * forward + np.array([0.0, 0.0, 0.7])
+    return {name: float(value) for name, value in zip("xyz", eye, strict=True)}
+
+
+def _mesh(vertices: np.ndarray, faces: np.ndarray) -> dict[str, Any]:
+    wide = len(vertices) > LARGEST_UINT16
+    return {"vertices": encoded(vertices, "<f4"), "faces": encoded(faces, "<u4" if wide else "<u2"), "wide": wide}
+
+
+def _resting(bodies: Sequence[Body], target: bool, bounds: np.ndarray, share: float, steps: int) -> dict[str, Any]:
+    """All bodies at rest of one role as one mesh in the world."""
+    pieces = []
+    for body in bodies:
+        if body.is_target == target and body.poses.ndim == 2:
+            vertices, faces = own_triangles(body, body.poses, bounds, share, steps)
+            pieces.append((vertices @ body.poses[:3, :3].T + body.poses[:3, 3], faces))
+    offsets = np.cumsum([0, *(len(vertices) for vertices, _ in pieces)])
+    vertices = np.concatenate([np.zeros((0, 3)), *(vertices for vertices, _ in pieces)])
+    moved = (faces + start for (_, faces), start in zip(pieces, offsets[:-1], strict=True))
+    return _mesh(vertices, np.concatenate([np.zeros((0, 3), dtype=np.int64), *moved]))
+
+
+def _moving(body: Body, shown: Shown, bounds: np.ndarray, share: float, steps: int) -> dict[str, Any]:
+    """A body in its own frame, with the upper three rows of its pose at every frame that is shown."""
+    poses = np.stack([body.pose(frame) for frame in shown.frames])
+    vertices, faces = own_triangles(body, poses[0], bounds, share, steps)
+    return {"target": body.is_target, "poses": encoded(poses[:, :3], "<f4"), **_mesh(vertices, faces)}
+
+
+def _design(one: ShownDesign, look: Series) -> dict[str, Any]:
+    few = len(one.design.sensors) <= MOST_SENSORS
+    first = one.rays[0]
+    return {
+        "name": html.escape(one.design.name),
+        "colour": look.colour,
+        "dash": DASHES[look.dash],
+        "sensors": len(one.design.sensors) if few else 0,
+        "cones": encoded(np.stack([_cones(design) for design in one.placed]), "<f4") if few else "",
+        "rays": len(first),
+        "owner": encoded(first.sensor, "<u2"),
+        "origin": encoded(np.stack([rays.origin_m for rays in one.rays]), "<f4"),
+        "direction": encoded(np.stack([rays.direction for rays in one.rays]), "<f4"),
+        "length": encoded(one.length_m, "<f4"),
+        "outcome": encoded(one.outcome, "|u1"),
+    }
+
+
+def _cones(design: Design) -> np.ndarray:
+    """What a sensor's drawing follows from, shape (S, 25): see `_cone`."""
+    return np.stack([_cone(sensor, design.level) for sensor in design.sensors])
+
+
+def _cone(sensor: Sensor, level: float) -> np.ndarray:
+    """Origin, forward, horizontal and vertical (3 each), field of view, gate (2 each), three axes of its origins."""
+    variances, axes = np.linalg.eigh(sensor.origin_covariance_m2)
+    reach = interval_factor(level) * np.sqrt(np.clip(variances, 0.0, None))
+    # what hardly spreads looks like one place; the largest axis comes first
+    spread = np.where(reach < SMALLEST_SPREAD_M, 0.0, reach) * axes
+    return np.concatenate(
+        [sensor.origin_m, sensor.frame.ravel(), field_on_sphere(sensor), sensor.gate_m, spread.T[::-1].ravel()]
+    )
