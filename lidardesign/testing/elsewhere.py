@@ -8,15 +8,18 @@ import os
 import subprocess
 import sys
 from operator import attrgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from lidardesign.errors import LidardesignError
 from lidardesign.registry import plugin_guard
-from lidardesign.run.config import RunConfig
 from lidardesign.space import DesignSpace
 from lidardesign.task import scenes_of
 from lidardesign.testing.fingerprint import fingerprint
 from lidardesign.testing.law import BrokenLawError
 from lidardesign.testing.watch import Watch
+
+if TYPE_CHECKING:
+    from lidardesign.run.config import RunConfig
 
 CHILD = (
     "import json, sys; request = json.loads(sys.stdin.readline()); sys.path[:] = request['path']; "
@@ -59,19 +62,28 @@ def fingerprints_elsewhere(config: RunConfig, kind: type, seconds: float) -> dic
     except subprocess.TimeoutExpired:
         raise BrokenLawError(f"scenes were not made within {seconds:g} s in another process") from None
     try:
-        return json.loads(ended.stdout)
+        found = json.loads(ended.stdout)
     except ValueError:
-        words = ended.stderr.strip().splitlines()[-1:] or [f"exit code {ended.returncode}"]
-        raise BrokenLawError(f"scenes failed in another process: {words[0]}") from None
+        found = {"error": f"exit code {ended.returncode}"}
+    if "error" in found:
+        raise BrokenLawError(f"scenes failed in another process: {found['error']}")
+    return found
 
 
 def answer(request: dict[str, Any]) -> None:
-    """In that process: make the scenes and print their fingerprints as JSON on stdout."""
-    with plugin_guard(request["name"]), Watch(all_threads=True).during("scenes"):
-        task = attrgetter(request["name"])(importlib.import_module(request["module"]))()
-        config, space = task.Config(**request["task"]), DesignSpace.from_dict(request["space"])
-        found = {
-            split: [fingerprint(scene) for scene in scenes_of(task, config, split, request["seed"], space)]
-            for split in ("train", "test")
-        }
+    """In that process: make the scenes and print their fingerprints, or what went wrong, as JSON on stdout."""
+    try:
+        with plugin_guard(request["name"]), Watch(all_threads=True).during("scenes"):
+            found: dict[str, Any] = _fingerprints(request)
+    except LidardesignError as error:
+        found = {"error": error.message}
     print(json.dumps(found))
+
+
+def _fingerprints(request: dict[str, Any]) -> dict[str, list[str]]:
+    task = attrgetter(request["name"])(importlib.import_module(request["module"]))()
+    config, space = task.Config(**request["task"]), DesignSpace.from_dict(request["space"])
+    return {
+        split: [fingerprint(scene) for scene in scenes_of(task, config, split, request["seed"], space)]
+        for split in ("train", "test")
+    }

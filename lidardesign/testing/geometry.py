@@ -9,7 +9,6 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from lidardesign.density.fields import Field, build_field
-from lidardesign.density.target import PADDING_SIGMAS
 from lidardesign.scene import Body, Mesh, Scene
 from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction
@@ -18,6 +17,8 @@ from lidardesign.testing.probing import rays_that_meet
 from lidardesign.testing.subject import Subject
 
 RAYS = 300
+# How far grids reach beyond meshes: further than the points that are looked at lie from them.
+PADDING_SIGMAS = 4.0
 SEED = 20_252
 # Grids interpolate between points: a field of meshes may be off by so many of their steps.
 STEPS_OFF = 1.5

@@ -23,7 +23,7 @@ def check_config(subject: Subject) -> Held:
     with subject.calling("Config"):
         if _takes(kind, {**config.model_dump(), "no_such_key": 1}):
             raise BrokenLawError("takes a key that it does not know", hint="keep extra='forbid' of TaskConfig")
-        numbers = [name for name, value in config if isinstance(value, float)]
+        numbers = [name for name, value in config if isinstance(value, int | float)]
         taken = [name for name in numbers if _takes(kind, {**config.model_dump(), name: float("nan")})]
         again = kind(**config.model_dump(mode="json"))
     if taken:

@@ -209,7 +209,10 @@ def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
         _tell(result, Finding(*LOADS, "fail", said(error)))
         return None
     except LidardesignError as error:
-        _write(result, {"refused": error.as_dict()})
+        if str(error.where).startswith("defaults of task"):
+            _tell(result, Finding(*LOADS, "fail", f"{error.where}: {said(error)}"))
+        else:
+            _write(result, {"refused": error.as_dict()})
         return None
     except BaseException as error:
         _tell(result, Finding(*LOADS, "fail", f"{type(error).__name__}: {error}"))

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Sequence
+from importlib.util import find_spec
 
 from lidardesign.errors import LidardesignError
+from lidardesign.evaluate.scoring import gives_residuals
 from lidardesign.scene import Scene
 from lidardesign.task import Split
 from lidardesign.testing.elsewhere import fingerprints_elsewhere
@@ -49,12 +51,15 @@ def _compare(first: Sequence[Scene], again: Sequence[Scene], when: str) -> None:
 
 
 def check_seeds(subject: Subject) -> Held | NotApplicable:
-    """Another seed gives other training scenes, as refinement draws them."""
+    """Another seed gives other training scenes: refinement, which needs residuals, trains on further ones."""
     first = {geometry_fingerprint(scene) for scene in subject.scenes("train")}
     other = {geometry_fingerprint(scene) for scene in subject.scenes("train", subject.config.seed + 1)}
     shared = len(first & other)
     if shared == len(first):
-        return NotApplicable("another seed gives the same training scenes: designs cannot be refined on new ones")
+        same = "another seed gives the same training scenes"
+        if not gives_residuals(subject.task):
+            return NotApplicable(f"{same}; without residuals, no further ones are drawn")
+        raise BrokenLawError(f"{same}, but refinement draws further ones", hint="draw chance from the seed")
     return Held(f"{shared} of {len(first)} training scenes are the same with another seed", {"shared": shared})
 
 
@@ -76,10 +81,9 @@ def check_disjoint(subject: Subject) -> Held:
 def check_elsewhere(subject: Subject) -> Held | NotApplicable:
     """A worker process makes the same scenes: nothing hangs on the order of sets or on what ran before."""
     kind = type(subject.task)
-    if kind.__module__ == "__main__" or "<locals>" in kind.__qualname__:
+    if kind.__module__ == "__main__" or "<locals>" in kind.__qualname__ or find_spec(kind.__module__) is None:
         return NotApplicable("the task's class cannot be imported in another process")
-    started = subject.limits.seconds
-    found = fingerprints_elsewhere(subject.config, kind, started)
+    found = fingerprints_elsewhere(subject.config, kind, subject.limits.seconds)
     for split in SPLITS:
         mine = [fingerprint(scene) for scene in subject.scenes(split)]
         if found[split] != mine:
