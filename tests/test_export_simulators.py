@@ -561,6 +561,21 @@ def test_stl_solids_are_closed_and_stand_where_the_sensors_do_in_millimetres(wri
         assert np.abs(far[far[:, 2] < 0, 1]).min() > np.abs(far[far[:, 2] > 0, 1]).max()
 
 
+def test_names_that_look_like_the_format_do_not_become_part_of_it(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    some = design(("endsolid x", "facet normal 0 0 1", "element vertex 9\nend_header\n", "\U0001f600" * 5000))
+    rays = rays_of(some)
+    for name in MINE:
+        path = tmp_path / f"out{EXPORTERS[name].suffix}"
+        EXPORTERS[name].write(some, rays, path)
+        errors = EXPORTERS[name].rounding(some, rays, path)
+        assert errors["direction_rad"].error <= TOLERANCES[name]["direction_rad"]
+    assert len(trimesh.load(tmp_path / "out.stl", file_type="stl_ascii").geometry) == 4
+    header = (tmp_path / "out.ply.d" / "rays.ply").read_bytes().partition(b"end_header\n")[0]
+    assert max(map(len, header.splitlines())) < 1024
+    assert len(trimesh.load(tmp_path / "out.ply.d" / "rays.ply", process=False).vertices) == len(rays)
+
+
 def test_stl_says_of_sensors_that_are_regions_how_large_they_are(tmp_path):
     wide = Sensor("wide", 1.0, np.zeros(3), np.diag([1.0, 0, 0]), 0.0, 0.0, 0.0, 0.1, 0.1, 1.0, 0.1)
     some = Design("region", (wide,))

@@ -38,11 +38,15 @@ COLOURS = np.array(
 )
 # Parts of each side of a shell: a field of 90 degrees bulges by 0.2 % of its range less than the sphere does.
 PARTS = 12
+# Common readers take lines of up to 1023 characters; a letter may be escaped to twelve.
+LONGEST_NAME = 60
 
 
 def write(design: Design, rays: Rays, path: Path) -> list[str]:
     """Write the folder; returns notes of what the format cannot hold."""
-    comments = [f"comment sensor {index} {json.dumps(one.name)}" for index, one in enumerate(design.sensors)]
+    comments = [
+        f"comment sensor {index} {json.dumps(one.name[:LONGEST_NAME])}" for index, one in enumerate(design.sensors)
+    ]
     seen = [(index, one) for index, one in enumerate(design.sensors) if min(one.field_of_view_rad) > 0]
     files = {RAYS: _file(comments, vertex=_ray_points(rays)), BEAMS: _beams(rays, comments)}
     if seen:

@@ -63,8 +63,9 @@ def _notes(design: Design, mounted: list[Mount], path: Path) -> list[str]:
     ]
     for lost in gate_losses(mounted):
         notes += [lost, f"the {RANGES} files hold each ray's own gate, for rgl_node_rays_set_range of the library"]
-    names = [mount.sensor.name for mount in mounted]
-    return [*notes, *renamed_note(names, [mount.name for mount in mounted]), *design_losses(design, mounted)]
+    names = [design.name, *(mount.sensor.name for mount in mounted)]
+    written = [identifier(design.name), *(mount.name for mount in mounted)]
+    return [*notes, *renamed_note(names, written), *design_losses(design, mounted)]
 
 
 def _matrices(mount: Mount, rays: Rays) -> np.ndarray:

@@ -6,7 +6,6 @@ of 20 mm along the boresight; its far face is 16 mm wide at the bottom and 8 mm 
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +15,7 @@ import numpy as np
 from lidardesign.design.sensor import Design
 from lidardesign.errors import DataError
 from lidardesign.estimates import ROUNDING, Estimate
+from lidardesign.export.names import identifier
 from lidardesign.export.read_back import angles_between
 from lidardesign.numerics import unit_vectors
 from lidardesign.run.files import write_atomic
@@ -29,6 +29,7 @@ MM_PER_M = 1000.0
 CORNERS_MM = np.array([(0, 0, 0), (20, -8, -6), (20, -4, 6), (20, 4, 6), (20, 8, -6)], dtype=np.float64)
 # Seen from outside against the clock.
 FACETS = np.array([(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 1), (1, 4, 3), (1, 3, 2)])
+KEYWORDS = ("solid", "facet", "loop", "vertex")
 _VERTEX = re.compile(r"^\s*vertex (\S+) (\S+) (\S+)$", re.MULTILINE)
 
 
@@ -48,8 +49,7 @@ def write(design: Design, rays: Rays, path: Path) -> list[str]:
 
 
 def _solid(index: int, sensor: Sensor) -> str:
-    # a quoted name has no line breaks, and its letters beyond ASCII are escaped
-    name = f"sensor_{index} {json.dumps(sensor.name)}"
+    name = _solid_name(index, sensor.name)
     corners = MM_PER_M * np.asarray(sensor.origin_m) + CORNERS_MM @ sensor.frame
     facets = []
     for triangle in corners[FACETS]:
@@ -57,6 +57,12 @@ def _solid(index: int, sensor: Sensor) -> str:
         vertices = "".join(f"   vertex {_numbers(corner)}\n" for corner in triangle)
         facets.append(f" facet normal {_numbers(normal)}\n  outer loop\n{vertices}  endloop\n endfacet\n")
     return f"solid {name}\n{''.join(facets)}endsolid {name}\n"
+
+
+def _solid_name(index: int, name: str) -> str:
+    """A name that no reader takes for a word of the format."""
+    word = identifier(name)
+    return f"sensor_{index}" if any(key in word.lower() for key in KEYWORDS) else f"sensor_{index}_{word}"
 
 
 def _numbers(values: np.ndarray) -> str:
