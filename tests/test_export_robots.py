@@ -283,6 +283,24 @@ def test_a_format_holds_its_frame_rate_or_refuses_one(tmp_path, name):
         assert found["time_s"].error < 1.01e-9
 
 
+@pytest.mark.parametrize("rate_hz", [np.nan, np.inf, 0.0, -1.0, 1e-320, 1e300])
+def test_no_sensor_has_such_a_frame_rate(tmp_path, rate_hz):
+    with pytest.raises(ConfigError, match=r"0\.001 to 1e"):
+        EXPORTERS["sdf"].write(DESIGN, RAYS, tmp_path / "out", rate_hz)
+    assert not list(tmp_path.iterdir())
+
+
+def test_carla_fires_whole_numbers_of_points_per_second(tmp_path):
+    with pytest.raises(ConfigError, match="whole number of points per second"):
+        EXPORTERS["carla"].write(DESIGN, RAYS, tmp_path / "out", 0.3)
+    found = []
+    for rate_hz in (1.3, 10.0):
+        EXPORTERS["carla"].write(DESIGN, RAYS, tmp_path / "out", rate_hz)
+        found.append(EXPORTERS["carla"].rounding(DESIGN, RAYS, tmp_path / "out"))
+    assert found[0]["rays"] == found[1]["rays"]
+    assert found[0]["direction_rad"].error == pytest.approx(found[1]["direction_rad"].error)
+
+
 @pytest.mark.parametrize("name", ROBOTS)
 def test_no_rays_are_no_sensors(tmp_path, name):
     none = RAYS.subset(np.zeros(0, dtype=np.int64))

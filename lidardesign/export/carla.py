@@ -17,7 +17,7 @@ import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import Design
-from lidardesign.errors import DataError
+from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.even_grid import EvenGrid
 from lidardesign.export.grid_sensors import grid_of, grid_sensor_losses
@@ -35,8 +35,13 @@ NARROWEST_DEG = 0.001
 
 
 def write(design: Design, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
-    """Write the file, atomically; returns notes of what the format cannot hold."""
+    """Write the file, atomically; returns notes of what the format cannot hold.
+
+    Raises:
+        ConfigError: A frame rate at which CARLA's whole number of points per second is not the rays of a frame.
+    """
     mounted = mounts(design, rays)
+    _refuse_slow_rates(mounted, rate_hz)
     document = {
         "design": design.name,
         "fixed_delta_seconds": 1 / rate_hz,
@@ -59,6 +64,18 @@ def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"holds no lidars: {error!r}", where=str(path)) from error
     return held_rounding(rays, mounted, matched(found, mounted, path))
+
+
+def _refuse_slow_rates(mounted: Sequence[Mount], rate_hz: float) -> None:
+    for mount in mounted:
+        grid = grid_of(mount)
+        if round(round(len(grid) * rate_hz) / rate_hz / grid.rows) != grid.columns:
+            raise ConfigError(
+                f"{rate_hz:g} frames of {len(grid)} rays per second are no whole number of points per second, as CARLA "
+                f"counts them ({mount.name})",
+                where="--rate-hz",
+                allowed="a rate at which they are, as one of 1 or more",
+            )
 
 
 def _sensor(mount: Mount, rate_hz: float) -> dict[str, Any]:

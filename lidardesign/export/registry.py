@@ -12,6 +12,9 @@ from lidardesign.errors import ConfigError
 from lidardesign.estimates import Estimate
 from lidardesign.simulate.returns import Rays
 
+# A frame of a quarter of an hour, and one of a microsecond.
+SLOWEST_HZ, FASTEST_HZ = 0.001, 1e6
+
 
 @dataclass(frozen=True)
 class Exporter:
@@ -48,10 +51,12 @@ class Exporter:
             rate_hz: Frames per second [Hz]; that of the read-out model by default.
 
         Raises:
-            ConfigError: A frame rate for a format that holds none.
+            ConfigError: A frame rate for a format that holds none, or one that no sensor has.
             DataError: The file cannot be written, or the format cannot hold such a design at all.
         """
         write = import_module(self.module).write
+        if rate_hz is not None and not SLOWEST_HZ <= rate_hz <= FASTEST_HZ:
+            raise ConfigError(f"{rate_hz}", where="--rate-hz", allowed=f"{SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz")
         if self.rated:
             return write(design, rays, Path(path), rate_hz=Bandwidth().rate_hz if rate_hz is None else rate_hz)
         if rate_hz is not None:
