@@ -45,8 +45,8 @@ def check(
     with command(json=json, quiet=quiet, debug=debug) as console:
         with phase("libraries"):
             from lidardesign.testing.contract import refuse_broken
+            from lidardesign.testing.limits import Limits
             from lidardesign.testing.process import CheckRequest, check_apart
-            from lidardesign.testing.subject import Limits
 
         limits = Limits(seconds, memory_mb * MEBIBYTE)
         request = CheckRequest(name, config, tuple(overrides or ()), seed, limits)

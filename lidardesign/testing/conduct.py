@@ -50,7 +50,7 @@ def check_time(subject: Subject) -> Held:
 
 
 def _shown_seconds(seconds: float) -> str:
-    return f"{seconds:.2g} s" if seconds >= 1 else f"{1000 * seconds:.2g} ms"
+    return f"{seconds:.1f} s" if seconds >= 1 else f"{1000 * seconds:.0f} ms"
 
 
 def check_memory(subject: Subject) -> Held | NotApplicable:

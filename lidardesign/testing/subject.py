@@ -95,6 +95,8 @@ class Subject:
     @cached_property
     def conditions(self) -> list[dict[str, float]]:
         """The condition values that designs are evaluated at; one empty mapping where there are no conditions."""
+        if not self.config.space.conditioned:
+            return [{}]
         with self.calling("conditions"):
             return conditions_of(self.task, self.config.task, self.config.space)
 
