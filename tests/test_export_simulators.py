@@ -576,11 +576,12 @@ def test_names_that_look_like_the_format_do_not_become_part_of_it(tmp_path):
     assert len(trimesh.load(tmp_path / "out.ply.d" / "rays.ply", process=False).vertices) == len(rays)
 
 
-def test_stl_says_of_sensors_that_are_regions_how_large_they_are(tmp_path):
+@pytest.mark.parametrize(("name", "what"), [("stl", "solids"), ("ply", "frusta")])
+def test_shapes_of_sensors_that_are_regions_stand_in_their_middles_and_say_so(tmp_path, name, what):
     wide = Sensor("wide", 1.0, np.zeros(3), np.diag([1.0, 0, 0]), 0.0, 0.0, 0.0, 0.1, 0.1, 1.0, 0.1)
     some = Design("region", (wide,))
-    notes = EXPORTERS["stl"].write(some, rays_of(some), tmp_path / "out.stl")
-    assert "1 sensors are regions of up to 3.92 m: solids stand in their middles" in notes
+    notes = EXPORTERS[name].write(some, rays_of(some), tmp_path / "out")
+    assert f"1 sensors are regions of up to 3.92 m: {what} stand in their middles" in notes
 
 
 def test_a_boresight_and_its_pose_are_the_same_direction():

@@ -54,6 +54,9 @@ def write(design: Design, rays: Rays, path: Path) -> list[str]:
     notes = [*write_folder(path, files), "weights, spreads and origin covariances of the sensors are not held"]
     if len(seen) < len(design.sensors):
         notes.append(f"{len(design.sensors) - len(seen)} of {len(design.sensors)} sensors have no width, so no frustum")
+    moving = [length for length, _ in (sensor.travel_m for _, sensor in seen) if length > 0]
+    if moving:
+        notes.append(f"{len(moving)} sensors are regions of up to {max(moving):.3g} m: frusta stand in their middles")
     if design.constraints:
         notes.append("the constraints of the design are not held")
     return notes

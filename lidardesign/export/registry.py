@@ -179,7 +179,7 @@ EXPORTERS: dict[str, Exporter] = {
             "a scanner per sensor with a channel per ray, and surveys of one frame each",
             "lidardesign.export.helios",
             reader="HELIOS++",
-            checked="valid by a schema, and read back as HELIOS++ turns its beams",
+            checked="valid by schemas of its fields; a twin of HELIOS++ fires the rays",
             folder=True,
             rated=True,
         ),
@@ -189,7 +189,7 @@ EXPORTERS: dict[str, Exporter] = {
             "a lidar configuration per sensor: mounting position, unit vectors, microseconds",
             "lidardesign.export.osi",
             reader="sensor models and simulators of ASAM OSI",
-            checked="parsed by protobuf into the message, and read back",
+            checked="parsed by protobuf, with ASAM's own bindings where they are",
             rated=True,
         ),
         Exporter(
