@@ -9,9 +9,11 @@ from dataclasses import replace
 import pytest
 
 from lidardesign.evaluate.accuracy import Accuracy
-from lidardesign.evaluate.pareto import FILE_NAME, label_places, panels, pareto_png, write_pareto
+from lidardesign.evaluate.pareto import label_places, panels, pareto_picture
 from lidardesign.evaluate.pareto_figure import accuracy_tables, pareto_figure, pareto_height_px
-from lidardesign.evaluate.plots import write_plots
+from lidardesign.evaluate.pictured import Pictured
+from lidardesign.evaluate.plots import ACCURACY, pictures
+from lidardesign.evaluate.plots_canvas import looks, picture
 from lidardesign.evaluate.rungs import Ladder, Rung
 from tests.test_plots import make_evaluation
 
@@ -26,6 +28,11 @@ def make_ladder(rungs=None, knob="density.points", tolerance=0.02, unit="", note
         Rung("256", 0.0, 0.0, 0.2, reference=True),
     ]
     return Ladder(knob, "what is wrong", unit, "the finest", tolerance, "a reason", "one step", rungs, note)
+
+
+def drawn(ladders):
+    with looks():
+        return picture(pareto_picture(ladders), "svg")
 
 
 def test_every_rung_stands_inside_its_panel():
@@ -61,7 +68,7 @@ def test_figures_without_a_logarithm_are_drawn_too(rungs, tolerance):
     (panel,) = panels([ladder])
     ends = (*panel.seconds, *panel.errors, *(value for mark in panel.marks for value in (mark.x, mark.y, mark.low)))
     assert all(math.isfinite(value) and value > 0 for value in ends)
-    assert pareto_png([ladder]).startswith(b"\x89PNG")
+    assert drawn([ladder]).startswith(b"<?xml")
 
 
 def test_settings_that_would_meet_are_written_above_each_other():
@@ -77,21 +84,22 @@ def test_settings_that_would_meet_are_written_above_each_other():
     assert min(b - a for a, b in itertools.pairwise(ordered)) >= line * (1 - 1e-9)
 
 
-def test_ladders_of_one_rung_have_tables_and_no_panel(tmp_path):
+def test_ladders_of_one_rung_have_tables_and_no_panel():
     single = make_ladder([Rung("40", 0.3, 0.1, 2.0, default=True)])
     assert panels([single]) == []
-    assert write_pareto([single], tmp_path / "new") == []
+    assert pareto_picture([single]) is None
     assert "40 (run)" in accuracy_tables([single])
 
 
 def test_the_same_ladders_give_the_same_bytes():
-    assert pareto_png([make_ladder(), make_ladder()]) == pareto_png([make_ladder(), make_ladder()])
+    assert drawn([make_ladder(), make_ladder()]) == drawn([make_ladder(), make_ladder()])
 
 
-def test_plots_hold_the_picture_where_accuracy_was_measured(tmp_path):
+def test_plots_hold_the_picture_where_accuracy_was_measured():
     evaluation = replace(make_evaluation(), accuracy=Accuracy([make_ladder()], {"visibility": 1.0}))
-    assert [path.name for path in write_plots(evaluation, tmp_path)][-1] == FILE_NAME
-    assert len(write_plots(make_evaluation(), tmp_path / "plain")) == 2
+    assert pictures(make_evaluation(), Pictured())[ACCURACY]() is None
+    with looks():
+        assert len(pictures(evaluation, Pictured())[ACCURACY]().axes) == 1
 
 
 def test_figures_have_one_pair_of_axes_per_ladder_with_all_its_rungs():
@@ -119,7 +127,7 @@ def test_no_name_becomes_markup():
     ladder = make_ladder(rungs, knob=NASTY, unit=NASTY, note=NASTY)
     assert "<img" not in accuracy_tables([ladder])
     assert "<img" not in str(pareto_figure([ladder]))
-    assert pareto_png([ladder]).startswith(b"\x89PNG")
+    assert b"<img" not in drawn([ladder])
 
 
 def test_tables_name_what_to_choose_and_what_the_run_does():

@@ -44,6 +44,21 @@ def _line(key: str, seconds: float, total: float) -> tuple[str, str, str]:
     return f"{INDENT * len(outside)}{name}", f"{seconds:.2f}", f"{100 * seconds / total:.0f} %"
 
 
+def times_so_far(run: Path, name: str, console: Console) -> dict[str, dict[str, float]]:
+    """Seconds by phase of each command on a run, in the order in which they first ran; of this one until now."""
+    from lidardesign.run.manifest import read_manifest
+
+    kept = read_manifest(run).get("timings", {})
+    phases = {command: dict(entry["phases"]) for command, entry in kept.items() if _has_phases(entry)}
+    return {**phases, name: console.clock.timings()}
+
+
+def _has_phases(entry: object) -> bool:
+    """Whether an entry of a manifest holds seconds by phase; those of older versions do not."""
+    phases = entry.get("phases") if isinstance(entry, dict) else None
+    return isinstance(phases, dict) and all(isinstance(seconds, int | float) for seconds in phases.values())
+
+
 def keep_times(run: Path, name: str, console: Console, *, wait_s: float = SHORT_WAIT_S) -> None:
     """Enter the times of a command in the manifest of its run; where that cannot be, a note says so.
 

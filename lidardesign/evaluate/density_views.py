@@ -34,7 +34,7 @@ THINNEST = 1e-3
 HIGHEST = 2.5
 CENTIMETRES, METRES = ("cm", 100.0), ("m", 1.0)
 LONG_M = 5.0  # axes beyond this are told per metre
-# A full turn is cut at the one of so many bins about which, and about whose neighbours, least lies; unless that is much.
+# A full turn is cut at the one of so many bins about which least lies, counting its neighbours; unless that is much.
 TURN_BINS, CUT_BINS, EMPTY = 72, 4, 0.5
 NAMES = ("x", "y", "z", "azimuth", "elevation", "range")
 

@@ -1,4 +1,4 @@
-"""Error against seconds, one panel per ladder, on logarithmic axes: what the pictures have in common, and the PNG.
+"""Error against seconds, one panel per ladder, on logarithmic axes: what the pictures have in common, and the picture.
 
 A line joins the settings that no other one beats in both; those that are beaten are pale. The tolerance is a dashed
 line, the run's own setting has a ring, the one to choose has another colour. A reference, whose error is nothing,
@@ -7,24 +7,28 @@ stands on the lower edge as a triangle, as do settings whose errors are too smal
 
 from __future__ import annotations
 
-import io
 import math
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lidardesign.evaluate.plots import DOTS_PER_INCH, label_ticks, plain_label
+from lidardesign.evaluate.plots_canvas import (
+    COLUMN_INCHES,
+    LETTERS_POINTS,
+    SMALL_POINTS,
+    label_powers,
+    label_ticks,
+    new_figure,
+    plain_label,
+)
 from lidardesign.evaluate.rungs import Ladder, Rung
-from lidardesign.run.files import write_atomic
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-FILE_NAME = "accuracy.png"
-COLUMNS = 3
-PANEL_INCHES = (3.9, 3.1)
+COLUMNS = 2
+PANEL_INCHES = (COLUMN_INCHES, 2.7)
 # Axes span at least so many times their smallest value, and end so far beyond what they show.
 LEAST_SPAN = 4.0
 BEYOND = 1.5
@@ -155,34 +159,18 @@ def _mark(rung: Rung, least_seconds: float, errors: tuple[float, float], chosen:
     return Mark(rung, max(rung.seconds, least_seconds), y, min(ends[0], y), max(ends[1], y), on_edge, chosen, beaten)
 
 
-def write_pareto(ladders: Sequence[Ladder], directory: Path) -> list[Path]:
-    """Write the picture into a folder, which is made where it is missing; no file where there is nothing to draw."""
-    if not panels(ladders):
-        return []
-    path = Path(directory) / FILE_NAME
-    write_atomic(path, pareto_png(ladders))
-    return [path]
-
-
-def pareto_png(ladders: Sequence[Ladder]) -> bytes:
-    """All panels as PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
+def pareto_picture(ladders: Sequence[Ladder]) -> Figure | None:
+    """All panels, a page wide; None where there is nothing to draw."""
     shown = panels(ladders)
+    if not shown:
+        return None
     columns = min(COLUMNS, len(shown))
     rows = math.ceil(len(shown) / columns)
-    size = (columns * PANEL_INCHES[0], rows * PANEL_INCHES[1] + 0.5)
-    figure = Figure(figsize=size, dpi=DOTS_PER_INCH, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(columns * PANEL_INCHES[0], rows * PANEL_INCHES[1] + 0.5)
     for number, panel in enumerate(shown):
         _draw(figure.add_subplot(rows, columns, number + 1), panel)
-    figure.legend(*_legend(), loc="outside lower center", ncols=4 if columns > 1 else 2, frameon=False, fontsize=8)
-    buffer = io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing from")
-        figure.savefig(buffer, format="png", metadata={"Software": None})
-    return buffer.getvalue()
+    figure.legend(*_legend(), loc="outside lower center", ncols=4 if columns > 1 else 2, frameon=False)
+    return figure
 
 
 def _draw(axes: Axes, panel: Panel) -> None:
@@ -202,7 +190,7 @@ def _draw(axes: Axes, panel: Panel) -> None:
             textcoords="offset points",
             ha=side,
             va="center",
-            fontsize=7.5,
+            fontsize=SMALL_POINTS,
             color=CHOSEN if mark.chosen else "#333333",
             # lines behind the text would strike it through
             bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.6},
@@ -211,8 +199,6 @@ def _draw(axes: Axes, panel: Panel) -> None:
 
 
 def _dress(axes: Axes, panel: Panel) -> None:
-    from matplotlib.ticker import NullFormatter
-
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlim(*panel.seconds)
@@ -222,11 +208,11 @@ def _dress(axes: Axes, panel: Panel) -> None:
             label_ticks(axis, None)
         else:
             # on axes of one or two powers of ten there would be names at all ticks, which do not fit
-            axis.set_minor_formatter(NullFormatter())
-    axes.set_title(plain_label(panel.ladder.knob, 48), fontsize=9.5, loc="left", color="#222222")
-    axes.set_xlabel("seconds", fontsize=8)
-    axes.set_ylabel(plain_label(panel.error_title, 40), fontsize=8)
-    axes.tick_params(labelsize=7.5)
+            label_powers(axis)
+    axes.set_title(plain_label(panel.ladder.knob, 48), fontsize=LETTERS_POINTS, loc="left", color="#222222")
+    axes.set_xlabel("seconds")
+    axes.set_ylabel(plain_label(panel.error_title, 40))
+    axes.tick_params(labelsize=SMALL_POINTS)
     axes.set_axisbelow(True)
     axes.grid(True, which="major", color="#e2e2e2", linewidth=0.7, zorder=0.5)
     axes.spines[["top", "right"]].set_visible(False)

@@ -1,125 +1,60 @@
-"""Curves of score against rays and against bandwidth, as PNG files.
+"""Everything that the report shows, as pictures for papers: each as PNG and as SVG, in one folder.
 
-Drawn on matplotlib's own figure and canvas objects: no global state, no display, and nothing is imported
-before a plot is asked for.
+Nothing is imported before a picture is asked for, nothing needs a display, and the same figures give the same bytes.
 """
 
 from __future__ import annotations
 
-import io
-import warnings
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from lidardesign.evaluate.curves import Against, Series, axis_titles, logarithmic, position, series
+from lidardesign.evaluate.pictured import Pictured
+from lidardesign.evaluate.plots_bounds import constraints_picture, effects_picture
+from lidardesign.evaluate.plots_canvas import looks, write_pictures
+from lidardesign.evaluate.plots_density import field_picture, marginals_picture
+from lidardesign.evaluate.plots_scene import scene_picture
+from lidardesign.evaluate.plots_scores import curve_picture, differences_picture
+from lidardesign.evaluate.plots_times import times_picture
 from lidardesign.evaluate.results import Evaluation
-from lidardesign.run.files import write_atomic
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-SIZE_INCHES = (8.0, 4.6)
-DOTS_PER_INCH = 160
-BAND_OPACITY = 0.15
-LONGEST_LABEL = 28
-FILES: dict[Against, str] = {"rays": "score_against_rays.png", "bandwidth": "score_against_bandwidth.png"}
+SCENE, MARGINALS, FIELD = "scene", "density_marginals", "density_field"
+RAYS, BANDWIDTH, DIFFERENCES = "score_against_rays", "score_against_bandwidth", "paired_differences"
+CONSTRAINTS, EFFECTS, ACCURACY, TIMES = "constraints", "effects", "accuracy", "times"
 
 
-def write_plots(evaluation: Evaluation, directory: Path) -> list[Path]:
-    """Write both curves, and what accuracy costs where that was measured; returns the files.
+def write_plots(evaluation: Evaluation, directory: Path, pictured: Pictured | None = None) -> list[Path]:
+    """Write all pictures that there is something to draw for; returns the files, in the order of the report.
 
     The folder is made where it is missing.
     """
-    directory = Path(directory)
-    written = [_write(evaluation, against, directory / name) for against, name in FILES.items()]
-    if evaluation.accuracy is not None:
-        # it draws with this module's looks
-        from lidardesign.evaluate.pareto import write_pareto
-
-        written += write_pareto(evaluation.accuracy.ladders, directory)
+    written: list[Path] = []
+    with looks():
+        for stem, draw in pictures(evaluation, pictured or Pictured()).items():
+            figure = draw()
+            if figure is not None:
+                written += write_pictures(figure, Path(directory), stem)
     return written
 
 
-def curve_png(evaluation: Evaluation, against: Against) -> bytes:
-    """One curve as PNG: a line and an interval band per design and baseline, the legend beside it."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+def pictures(evaluation: Evaluation, pictured: Pictured) -> dict[str, Callable[[], Figure | None]]:
+    """What draws each picture, by the stem of its files; None comes back where there is nothing to draw."""
+    from lidardesign.evaluate.pareto import pareto_picture
 
-    figure = Figure(figsize=SIZE_INCHES, dpi=DOTS_PER_INCH, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    curves = series(evaluation)
-    for curve in curves:
-        _draw(axes, curve, against)
-    _dress(axes, evaluation, curves, against)
-    buffer = io.BytesIO()
-    with warnings.catch_warnings():
-        # a name in a script that the font lacks is drawn as boxes, which is no reason to fail
-        warnings.filterwarnings("ignore", message="Glyph .* missing from")
-        figure.savefig(buffer, format="png", metadata={"Software": None})
-    return buffer.getvalue()
-
-
-def _write(evaluation: Evaluation, against: Against, path: Path) -> Path:
-    write_atomic(path, curve_png(evaluation, against))
-    return path
-
-
-def _draw(axes: Axes, curve: Series, against: Against) -> None:
-    across = [position(row, against) for row in curve.rows]
-    axes.fill_between(
-        across,
-        [row.ci_low for row in curve.rows],
-        [row.ci_high for row in curve.rows],
-        color=curve.colour,
-        alpha=BAND_OPACITY,
-        linewidth=0,
-    )
-    axes.plot(
-        across,
-        [row.value for row in curve.rows],
-        color=curve.colour,
-        marker=curve.marker,
-        linestyle=curve.dash,
-        linewidth=1.4 if curve.baseline else 2.0,
-        markersize=5.5,
-        label=plain_label(curve.name),
-    )
-
-
-def _dress(axes: Axes, evaluation: Evaluation, curves: list[Series], against: Against) -> None:
-    across, up = axis_titles(evaluation, against)
-    rows = [row for curve in curves for row in curve.rows]
-    scenes = f"{evaluation.scenes} held-out scene{'s' if evaluation.scenes != 1 else ''}"
-    axes.set_xlabel(across)
-    axes.set_ylabel(plain_label(up, longest=80))
-    axes.set_title(f"{scenes}, bands are 95 % bootstrap intervals", fontsize=9, loc="left", color="#444444")
-    if logarithmic([position(row, against) for row in rows]):
-        axes.set_xscale("log")
-        label_ticks(axes.xaxis, sorted({row.rays for row in rows}) if against == "rays" else None)
-    if logarithmic([row.value for row in rows]):
-        axes.set_yscale("log")
-        label_ticks(axes.yaxis, None)
-    axes.grid(True, which="major", color="#dddddd", linewidth=0.7)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.figure.legend(loc="outside right upper", frameon=False)
-
-
-def label_ticks(axis: Any, at: list[int] | None) -> None:
-    """Plain numbers instead of powers of ten; at the given places where there are any."""
-    from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
-
-    if at is not None:
-        axis.set_major_locator(FixedLocator(at))
-        axis.set_minor_locator(NullLocator())
-    else:
-        axis.set_major_locator(LogLocator(base=10, subs=(1.0, 2.0, 5.0)))
-        axis.set_minor_formatter(NullFormatter())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-
-
-def plain_label(text: str, longest: int = LONGEST_LABEL) -> str:
-    """Text that matplotlib draws as it is: no formulas, no hidden legend entries, not too long."""
-    shortened = text if len(text) <= longest else f"{text[: longest - 1]}…"
-    shown = shortened.replace("$", r"\$")
-    return f" {shown}" if shown.startswith("_") else shown
+    shown, density = pictured.shown, pictured.density
+    ladders = evaluation.accuracy.ladders if evaluation.accuracy is not None else ()
+    return {
+        SCENE: lambda: scene_picture(shown) if shown is not None and shown.designs else None,
+        MARGINALS: lambda: marginals_picture(density) if density is not None and density.marginals else None,
+        FIELD: lambda: field_picture(density) if density is not None and density.planes else None,
+        RAYS: lambda: curve_picture(evaluation, "rays"),
+        BANDWIDTH: lambda: curve_picture(evaluation, "bandwidth"),
+        DIFFERENCES: lambda: differences_picture(evaluation) if evaluation.paired else None,
+        CONSTRAINTS: lambda: constraints_picture(pictured.tightness),
+        EFFECTS: lambda: effects_picture(evaluation.effects),
+        ACCURACY: lambda: pareto_picture(ladders),
+        TIMES: lambda: times_picture(pictured.times),
+    }

@@ -1,0 +1,134 @@
+"""Pictures for papers: one size of paper, one look, and files that come out the same every time.
+
+Figures are drawn at the size at which they are printed, a column or a page wide, so that letters are as large on paper
+as stated here. Each is written as PNG and as SVG. In the SVG, letters are text (any script that the reader's fonts
+have, to be searched and edited); what would take very many lines is an embedded image.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lidardesign.run.files import write_atomic
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLUMN_INCHES, PAGE_INCHES = 3.5, 7.1
+DOTS_PER_INCH = 300
+LETTERS_POINTS, SMALL_POINTS = 8.0, 7.0
+INK, SOFT, GRID = "#1f2933", "#52606d", "#dde1e6"
+BAND_OPACITY = 0.15
+LONGEST_LABEL = 28
+KINDS = ("png", "svg")
+# What is drawn does not hang on the user's own settings of matplotlib, nor on the day.
+LOOK: dict[str, Any] = {
+    "font.family": ["sans-serif"],
+    "font.sans-serif": ["DejaVu Sans", "Verdana", "Arial", "Helvetica"],
+    "font.size": LETTERS_POINTS,
+    "axes.labelsize": LETTERS_POINTS,
+    "axes.titlesize": LETTERS_POINTS,
+    "xtick.labelsize": SMALL_POINTS,
+    "ytick.labelsize": SMALL_POINTS,
+    "legend.fontsize": SMALL_POINTS,
+    "axes.linewidth": 0.7,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "xtick.minor.width": 0.5,
+    "ytick.minor.width": 0.5,
+    "lines.linewidth": 1.3,
+    "lines.markersize": 4.0,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": SOFT,
+    "xtick.color": SOFT,
+    "ytick.color": SOFT,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "text.parse_math": False,
+    "axes.unicode_minus": True,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "lidardesign",
+    "savefig.dpi": DOTS_PER_INCH,
+}
+
+
+@contextmanager
+def looks() -> Iterator[None]:
+    """Draw in the look of all pictures; the settings before are there again afterwards."""
+    from matplotlib import style
+
+    with style.context(["default", LOOK]), warnings.catch_warnings():
+        # a name in a script that the font lacks is drawn as boxes in the PNG, which is no reason to fail
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        warnings.filterwarnings("ignore", message="Matplotlib currently does not support .* natively")
+        yield
+
+
+def new_figure(width_inches: float, height_inches: float) -> Figure:
+    """An empty figure on a canvas of its own: no display, no global state. Call inside `looks`."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_inches, height_inches), dpi=DOTS_PER_INCH, layout="constrained", facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def picture(figure: Figure, kind: str) -> bytes:
+    """A figure as the bytes of a PNG or SVG file, always the same. Call inside `looks`."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=kind, metadata={"Software": None} if kind == "png" else {"Date": None})
+    return buffer.getvalue()
+
+
+def write_pictures(figure: Figure, directory: Path, stem: str) -> list[Path]:
+    """Write a figure in all kinds into a folder, which is made where it is missing. Call inside `looks`."""
+    paths = [Path(directory) / f"{stem}.{kind}" for kind in KINDS]
+    for path, kind in zip(paths, KINDS, strict=True):
+        write_atomic(path, picture(figure, kind))
+        # laid out once: both kinds are the same picture
+        figure.set_layout_engine("none")
+    return paths
+
+
+def plain_axes(axes: Axes, *, grid: str | None = "both") -> None:
+    """No box, and a pale grid behind what is drawn."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_axisbelow(True)
+    if grid is not None:
+        axes.grid(True, axis=grid, which="major", color=GRID, linewidth=0.6)
+
+
+def label_ticks(axis: Any, at: list[int] | None) -> None:
+    """Plain numbers instead of powers of ten; at the given places where there are any."""
+    from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
+
+    if at is not None:
+        axis.set_major_locator(FixedLocator(at))
+        axis.set_minor_locator(NullLocator())
+    else:
+        axis.set_major_locator(LogLocator(base=10, subs=(1.0, 2.0, 5.0)))
+        axis.set_minor_formatter(NullFormatter())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def label_powers(axis: Any) -> None:
+    """Plain numbers at powers of ten alone."""
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def plain_label(text: str, longest: int = LONGEST_LABEL) -> str:
+    """Text that can be drawn as it is: one line, no control characters, no hidden legend entries, not too long."""
+    shown = "".join(letter if letter.isprintable() else " " for letter in text)
+    shown = shown if len(shown) <= longest else f"{shown[: longest - 1]}…"
+    return f" {shown}" if shown.startswith("_") else shown
