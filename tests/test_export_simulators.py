@@ -31,7 +31,7 @@ TOLERANCES = {
     "sensors-csv": {"origin_m": 0, "direction_rad": EXACT, "range_m": EXACT},
     "helios": {"origin_m": EXACT, "direction_rad": EXACT, "gate_m": 0},
     "osi": {"origin_m": 0, "direction_rad": EXACT, "time_s": 0.5e-6 + EXACT},
-    "rgl": {"origin_m": FLOAT32, "direction_rad": FLOAT32, "gate_m": FLOAT32},
+    "rgl": {"origin_m": FLOAT32, "direction_rad": FLOAT32, "gate_m": FLOAT32, "time_s": 1e-8},
     "mitsuba": {"origin_m": 0, "direction_rad": EXACT},
     "ply": {"origin_m": 0, "direction_rad": 0, "gate_m": 0, "time_s": 0},
     "stl": {"origin_m": EXACT, "direction_rad": 1e-12},
@@ -354,11 +354,19 @@ def test_rgl_patterns_look_along_the_third_axis_of_proper_poses(written, case):
         assert start <= limits[:, 0].min() + FLOAT32
         assert end >= limits[:, 1].max() - FLOAT32
         at = np.array([x, y, z]) + poses[:, :, 3] @ frame.T
-        rows.append(np.concatenate([at, turns @ [0, 0, 1] @ frame.T, limits], axis=1))
+        times_s = np.frombuffer(pattern.with_suffix(".time1f").read_bytes(), dtype="<f4")[:, None] / 1e3
+        rows.append(np.concatenate([at, turns @ [0, 0, 1] @ frame.T, limits, times_s], axis=1))
         assert sensor.findtext("plugin/update_rate") == "10.0"
     order = np.argsort(rays.sensor, kind="stable")
-    expected = np.concatenate([rays.origin_m, rays.direction, rays.gate_m], axis=1)[order]
+    expected = np.concatenate([rays.origin_m, rays.direction, rays.gate_m, rays.time_s[:, None]], axis=1)[order]
     np.testing.assert_allclose(np.concatenate(rows), expected, atol=2e-6)
+
+
+def test_rgl_times_follow_the_frame_rate(tmp_path):
+    EXPORTERS["rgl"].write(DESIGN, CASES["mounted"], tmp_path / "out", rate_hz=40.0)
+    times_ms = np.concatenate([np.fromfile(file, "<f4") for file in (tmp_path / "out").glob("*.time1f")])
+    np.testing.assert_allclose(np.sort(times_ms), CASES["mounted"].time_s * 1e3 / 4, rtol=1e-6)
+    assert EXPORTERS["rgl"].rounding(DESIGN, CASES["mounted"], tmp_path / "out")["time_s"].error < 1e-8
 
 
 def test_rgl_says_how_much_wider_the_plugins_gates_are(written):

@@ -1,8 +1,9 @@
 """Ray patterns for Robotec GPU Lidar and its Gazebo plugin: a pattern file per sensor, and the model that uses them.
 
 A pattern is one row-major 3 x 4 float32 matrix per ray, its pose in the sensor's frame (x forward, y left, z up); the
-ray looks along the third axis of its pose. The plugin has one range for all rays of a sensor. The library's own call
-takes one per ray, which is what the `.range2f` files are: pairs of float32.
+ray looks along the third axis of its pose. The plugin has one range for all rays of a sensor and fires them at once;
+the library's own calls take a range and a time per ray, which is what the `.range2f` files (pairs of float32, metres)
+and the `.time1f` files (float32, milliseconds) are.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ import numpy as np
 
 from lidardesign.design.sensor import Design
 from lidardesign.errors import DataError
+from lidardesign.estimates import ROUNDING, Estimate
 from lidardesign.export.folders import write_folder
 from lidardesign.export.names import identifier, renamed_note
 from lidardesign.export.places import rays_of_parts, require_rays
-from lidardesign.export.poses import Mount, design_losses, gate_losses, mounts, quaternion, rotation
+from lidardesign.export.poses import Mount, design_losses, fire_times_s, gate_losses, mounts, quaternion, rotation
 from lidardesign.export.read_back import rays_rounding
 from lidardesign.export.xml import child, document, element, numbers, read_xml
 from lidardesign.numerics import unit_vectors
@@ -27,11 +29,12 @@ from lidardesign.space import angles
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-    from lidardesign.estimates import Estimate
     from lidardesign.export.places import Part
 
-MODEL, PATTERN, RANGES = "model.sdf", ".mat3x4f", ".range2f"
+MODEL, PATTERN, RANGES, TIMES = "model.sdf", ".mat3x4f", ".range2f", ".time1f"
+MS_PER_S = 1000.0
 SDF_VERSION = "1.9"
+POSE_NUMBERS = 6
 
 
 def write(design: Design, rays: Rays, path: Path, rate_hz: float) -> list[str]:
@@ -48,7 +51,9 @@ def write(design: Design, rays: Rays, path: Path, rate_hz: float) -> list[str]:
     child(model, "static", text=True)
     link = child(model, "link", name="lidar")
     files = {}
+    times_ms = MS_PER_S * fire_times_s(rays, rate_hz)
     for mount in mounted:
+        files[f"{mount.name}{TIMES}"] = times_ms[mount.ray].astype("<f4").tobytes()
         files[f"{mount.name}{PATTERN}"] = _matrices(mount, rays.subset(mount.ray)).astype("<f4").tobytes()
         files[f"{mount.name}{RANGES}"] = rays.gate_m[mount.ray].astype("<f4").tobytes()
         _add_sensor(link, mount, rays, path.resolve() / f"{mount.name}{PATTERN}", rate_hz)
@@ -59,7 +64,8 @@ def write(design: Design, rays: Rays, path: Path, rate_hz: float) -> list[str]:
 def _notes(design: Design, mounted: list[Mount], path: Path) -> list[str]:
     notes = [
         f"{MODEL} names the patterns by their absolute paths in {path.resolve()}: export again where they move",
-        "all rays of a frame fire at once: their times within the frame are not held",
+        f"the plugin fires all rays of a frame at once; the {TIMES} files hold when each fires, for "
+        "rgl_node_rays_set_time_offsets of the library",
     ]
     for lost in gate_losses(mounted):
         notes += [lost, f"the {RANGES} files hold each ray's own gate, for rgl_node_rays_set_range of the library"]
@@ -93,29 +99,44 @@ def _add_sensor(link: Element, mount: Mount, rays: Rays, pattern: Path, rate_hz:
     child(plugin, "pattern_preset_path", text=pattern)
 
 
-def read(path: Path, design: Design, rays: Rays) -> Rays:
-    """The rays of a folder that `write` made of a design and its rays, with their sensors and times.
+def read(path: Path, design: Design, rays: Rays) -> tuple[Rays, float]:
+    """The rays of a folder that `write` made of a design and its rays, with their sensors, and the frame rate [Hz].
 
     Raises:
         DataError: The folder cannot be read, or holds something else.
     """
     path = Path(path)
-    sensors = read_xml(path / MODEL, "sdf").findall("model/link/sensor")
-    found = {sensor.get("name"): sensor.findtext("pose", "") for sensor in sensors}
-    parts = [_part(mount, path, found.get(mount.name, "")) for mount in mounts(design, rays)]
-    return rays_of_parts(rays, parts, str(path))
+    found = {sensor.get("name"): sensor for sensor in read_xml(path / MODEL, "sdf").findall("model/link/sensor")}
+    times_s, rates_hz, parts = np.zeros(len(rays)), [], []
+    for mount in mounts(design, rays):
+        pose, rate_hz = _pose_and_rate(found.get(mount.name), mount, path)
+        parts.append(_part(mount, path, pose))
+        rates_hz.append(rate_hz)
+        times = _floats(path / f"{mount.name}{TIMES}", ()) / MS_PER_S
+        if len(times) != len(mount.ray):
+            raise DataError(f"holds {len(times)} times of {len(mount.ray)} rays", where=str(path / mount.name))
+        times_s[mount.ray] = times
+    held = rays_of_parts(rays, parts, str(path))
+    return Rays(held.origin_m, held.direction, held.gate_m, held.sensor, times_s), max(rates_hz)
 
 
-def _part(mount: Mount, path: Path, pose: str) -> Part:
+def _pose_and_rate(sensor: Element | None, mount: Mount, path: Path) -> tuple[list[float], float]:
+    try:
+        pose = [float(number) for number in ("" if sensor is None else sensor.findtext("pose", "")).split()]
+        rate_hz = float("" if sensor is None else sensor.findtext("plugin/update_rate", ""))
+    except ValueError as error:
+        raise DataError(f"holds no {mount.name}: {error}", where=str(path / MODEL), hint="export it again") from error
+    if len(pose) != POSE_NUMBERS:
+        raise DataError(f"holds no pose of {mount.name}", where=str(path / MODEL), hint="export it again")
+    return pose, rate_hz
+
+
+def _part(mount: Mount, path: Path, pose: list[float]) -> Part:
     """The rays of one sensor: its pose, and its pattern in the frame of that."""
     matrices = _floats(path / f"{mount.name}{PATTERN}", (3, 4))
     gate = _floats(path / f"{mount.name}{RANGES}", (2,))
-    try:
-        x, y, z, roll, pitch, yaw = (float(number) for number in pose.split())
-    except ValueError as error:
-        raise DataError(f"holds no pose of {mount.name}", where=str(path / MODEL), hint="export it again") from error
-    turn = rotation(np.array(quaternion(roll, pitch, yaw)))
-    return mount.ray, (x, y, z) + matrices[:, :, 3] @ turn.T, unit_vectors(matrices[:, :, 2] @ turn.T), gate
+    turn = rotation(np.array(quaternion(*pose[3:])))
+    return mount.ray, pose[:3] + matrices[:, :, 3] @ turn.T, unit_vectors(matrices[:, :, 2] @ turn.T), gate
 
 
 def _floats(path: Path, shape: tuple[int, ...]) -> np.ndarray:
@@ -128,4 +149,6 @@ def _floats(path: Path, shape: tuple[int, ...]) -> np.ndarray:
 
 def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose: patterns are float32."""
-    return rays_rounding(rays, read(path, design, rays), path, times=False)
+    found, rate_hz = read(path, design, rays)
+    late_s = float(np.abs(found.time_s - fire_times_s(rays, rate_hz)).max())
+    return {**rays_rounding(rays, found, path, times=False), "time_s": Estimate(None, late_s, "s", ROUNDING)}
