@@ -62,5 +62,5 @@ def budgets_within(designs: Iterable[Design], budgets: Sequence[int], console: C
     if not fixed or min(fixed.values()) >= usual[-1]:
         return usual
     name = min(fixed, key=lambda name: fixed[name])
-    console.note(f"note: {name} fires {fixed[name]} rays, so no row has more; --rays chooses other numbers")
+    console.note(f"note: {name} fires {fixed[name]} rays: at equal rays no more are compared; --rays has other numbers")
     return sorted({*(count for count in usual if count <= fixed[name]), fixed[name]})

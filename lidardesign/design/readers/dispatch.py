@@ -14,7 +14,8 @@ from lidardesign.design.readers.xml_text import read_xml
 from lidardesign.design.sensor_csv import COLUMNS, QUERY_COLUMN, looks_like_sensor_csv
 from lidardesign.errors import DataError
 
-ZIP_BEGINNING = b"PK\x03\x04"
+# An archive with members, and one without any.
+ZIP_BEGINNINGS = (b"PK\x03\x04", b"PK\x05\x06")
 XML_ROOTS = {"mujoco": read_mjcf, "sdf": read_sdf}
 XML_ALLOWED = "a MuJoCo model (<mujoco>) or an SDF file (<sdf>)"
 OTHER_ROOTS = {
@@ -33,7 +34,7 @@ def read_rig(path: Path, head: bytes) -> Rig | None:
     Raises:
         DataError: It is a rig's file that cannot be used.
     """
-    if head.startswith(ZIP_BEGINNING):
+    if head.startswith(ZIP_BEGINNINGS):
         return read_ray_npz(path)
     if _begins_as_xml(head):
         return _read_xml_rig(path)

@@ -28,7 +28,7 @@ from lidardesign.errors import DataError
 from lidardesign.run.kinds import is_name
 from lidardesign.space import FARTHEST_M, FULL_TURN, angles, direction
 
-# Rounds in which a boresight moves to the middle of its field: it rests after two or three.
+# Rounds in which a boresight moves to the middle of its field: away from the poles it rests after two or three.
 CENTRING_ROUNDS = 8
 # Rays of a whole turn cancel: so short a mean of unit vectors says nothing of where a sensor looks.
 SHORTEST_MEAN = 1e-3
@@ -204,11 +204,13 @@ def aim_of(directions: np.ndarray) -> Aim:
     mean = directions.mean(axis=0)
     if np.linalg.norm(mean) < SHORTEST_MEAN:
         mean = np.array([1.0, 0.0, 0.0])
+    tried = []
     for _ in range(CENTRING_ROUNDS):
-        frame = boresight_frame(*(float(angle) for angle in angles(mean)))
+        azimuth, elevation = (float(angle) for angle in angles(mean))
+        frame = boresight_frame(azimuth, elevation)
         seen = tangent_coordinates(frame, directions)
-        low, high = seen.min(axis=0), seen.max(axis=0)
-        mean = tangent_directions(frame, (low + high)[None] / 2)[0]
-    azimuth, elevation = (float(angle) for angle in angles(mean))
-    reach = np.abs(tangent_coordinates(boresight_frame(azimuth, elevation), directions)).max(axis=0)
-    return Aim(azimuth, elevation, 0.0, (2 * float(reach[0]), 2 * float(reach[1])))
+        reach = np.abs(seen).max(axis=0)
+        tried.append(Aim(azimuth, elevation, 0.0, (2 * float(reach[0]), 2 * float(reach[1]))))
+        mean = tangent_directions(frame, (seen.min(axis=0) + seen.max(axis=0))[None] / 2)[0]
+    # near a pole the frame turns with the boresight, and no round need be the best
+    return min(tried, key=lambda aim: aim.field_rad[0] * aim.field_rad[1])
