@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import site
 import subprocess
@@ -13,15 +14,20 @@ from pathlib import Path
 
 import pytest
 from command_line import caller, files_under
+from docs_output import difference
+from docs_pages import blocks_of, commands_of
+from docs_session import COLUMNS
 from plugins import GOOD, install_plugins
 
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.testing.contract import LAWS
 from lidardesign.testing.scaffold import LONGEST_NAME, new_task
 
 pytest_plugins = ["pytester"]
 ROOT = Path(__file__).parents[1]
+TEMPLATES = ROOT / "lidardesign" / "testing" / "template"
 EXAMPLE = ROOT / "examples" / "third_party_task"
-NAME = "drone_landing"
+NAME = "landmark"
 
 
 @pytest.fixture
@@ -50,7 +56,9 @@ def environment(tmp_path_factory):
 def done(*command: str, cwd: Path) -> str:
     """What a command prints, which must end well."""
     clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTEST_ADDOPTS")}
-    ended = subprocess.run(command, cwd=cwd, env=clean, capture_output=True, text=True, check=False)
+    ended = subprocess.run(
+        command, cwd=cwd, env={**clean, "COLUMNS": COLUMNS}, capture_output=True, text=True, check=False
+    )
     assert ended.returncode == 0, ended.stdout + ended.stderr
     return ended.stdout
 
@@ -66,14 +74,27 @@ def test_the_package_passes_its_own_tests_untouched_in_its_own_environment(envir
 
 
 @pytest.mark.slow
-def test_both_tasks_are_listed_where_they_are_installed(environment, tmp_path):
-    said = done(str(environment[0]), "-m", "lidardesign", "tasks", "list", cwd=tmp_path)
-    assert NAME in said
-    assert "landing" in said
-    assert "broken" not in said
+@pytest.mark.parametrize(
+    ("page", "task"), [("docs/writing-tasks.md", NAME), ("examples/third_party_task/README.md", "landing")]
+)
+def test_checking_an_installed_task_prints_what_its_page_says(environment, tmp_path, page, task):
+    blocks = [block for block in blocks_of(ROOT / page) if block.language == "console"]
+    commands = [command for block in blocks for command in commands_of(block)]
+    (expected,) = (command.output for command in commands if command.words == ["lidardesign", "tasks", "check", task])
+    said = done(str(environment[0]), "-m", "lidardesign", "tasks", "check", task, cwd=tmp_path)
+    assert difference(expected, said, "", small=False) is None
+    assert files_under(tmp_path) == {}
 
 
-@pytest.mark.parametrize("name", ["a", NAME, "abcdefghij_klmnopqrst_uvwxyz_9"])
+def test_the_guide_lists_every_law_and_shows_the_tests_that_are_written():
+    guide = (ROOT / "docs" / "writing-tasks.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", guide, re.MULTILINE)
+    assert [row for row in rows if row[0] in {law.name for law in LAWS}] == [(law.name, law.statement) for law in LAWS]
+    shown = {block.file: block.text for block in blocks_of(ROOT / "docs" / "writing-tasks.md")}
+    assert shown["tests/test_contract.py"] in (TEMPLATES / "test_contract.py.txt").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["a", "drone_landing", "abcdefghij_klmnopqrst_uvwxyz_9"])
 def test_a_new_package_is_clean_whatever_the_length_of_its_name(tmp_path, name):
     ruff = shutil.which("ruff", path=str(Path(sys.executable).parent)) or shutil.which("ruff")
     if ruff is None:

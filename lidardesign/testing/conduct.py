@@ -67,11 +67,11 @@ def check_memory(subject: Subject) -> Held | NotApplicable:
     return Held(f"the process held {peak / MEBIBYTE:.0f} MiB at most", {"peak_bytes": peak})
 
 
-_NEEDS = ("scores are numbers",)
+_AFTER = ("scores are numbers", "residuals are places")
 LAWS = (
-    Law("no global random state", "conduct", "no global random state is used", check_random, _NEEDS),
-    Law("nothing is written", "conduct", "only temporary files and caches are written", check_files, _NEEDS),
-    Law("nothing else is changed", "conduct", "working folder and environment stay", check_surroundings, _NEEDS),
-    Law("within time", "conduct", "every call ends in time", check_time, _NEEDS),
-    Law("within memory", "conduct", "the process stays within memory", check_memory, _NEEDS),
+    Law("no global random state", "conduct", "no global random state is used", check_random, after=_AFTER),
+    Law("nothing is written", "conduct", "only temporary files and caches are written", check_files, after=_AFTER),
+    Law("nothing else is changed", "conduct", "working folder and environment stay", check_surroundings, after=_AFTER),
+    Law("within time", "conduct", "every call ends in time", check_time, after=_AFTER),
+    Law("within memory", "conduct", "the process stays within memory", check_memory, after=_AFTER),
 )

@@ -49,6 +49,8 @@ class Contract:
 
     def _tried(self, law: Law) -> Finding:
         known = (law.name, law.group, law.statement)
+        for earlier in law.after:
+            self.finding(earlier)
         for needed in law.needs:
             if self.finding(needed).outcome != "pass" and not self._says_nothing(needed):
                 return Finding(*known, "skip", f"needs: {needed}")

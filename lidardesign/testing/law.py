@@ -43,6 +43,7 @@ class Law:
         statement: What a task keeps to, in one sentence.
         check: Tries it on a task; raises BrokenLawError where it does not hold.
         needs: Names of laws without which it cannot be tried.
+        after: Names of laws that are tried before it, whatever comes of them: it looks at what they did.
     """
 
     name: str
@@ -50,6 +51,7 @@ class Law:
     statement: str
     check: Callable[[Subject], Held | NotApplicable]
     needs: tuple[str, ...] = ()
+    after: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
