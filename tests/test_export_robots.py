@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -13,6 +14,7 @@ from lidardesign.design.rays import lay_out
 from lidardesign.design.sensor import Design
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.export import mjcf
+from lidardesign.export.names import identifier
 from lidardesign.export.poses import mounts
 from lidardesign.export.registry import EXPORTERS
 from lidardesign.scene import Body, Box, Mesh, Scene, Sphere, rigid
@@ -133,6 +135,20 @@ def test_two_sensors_of_one_name_are_two_bodies(tmp_path):
     assert {model.body(index).name for index in (1, 2)} == {"front left", "front left 2"}
 
 
+def test_no_name_is_a_word_of_the_format(reader, tmp_path):
+    import mujoco
+
+    for name in ("world", "include", "__model__", "a::b", "a\x00\nb", "x" * 5000):
+        design = Design(name, tuple(replace(one, name=name) for one in DESIGN.sensors[:1]))
+        rays = RAYS.subset(RAYS.sensor == 0)
+        path = tmp_path / "named"
+        EXPORTERS["mjcf"].write(design, rays, path)
+        model = mujoco.MjModel.from_xml_path(str(path))
+        assert model.nsensor == len(rays)
+        EXPORTERS["sdf"].write(design, rays, path)
+        check_gazebo(read_sdf(reader, path), design, rays, 1e-9)
+
+
 @pytest.mark.parametrize("name", ["mjcf", "sdf"])
 def test_what_is_written_for_a_simulator_is_a_design_again(tmp_path, name):
     design, rays = spinning()
@@ -218,6 +234,7 @@ def test_xacro_mounts_the_sensors_on_a_robot(reader, exported, tmp_path):
     expanded = tmp_path / "robot.urdf"
     expanded.write_text(xacro.process_file(str(robot)).toprettyxml())
     assert "left_down_link" in check_urdf(expanded)
+    assert {identifier(word) for word in ("include", "if", "property")} == {"s_include", "s_if", "s_property"}
     found = {one["name"]: one for one in read_sdf(reader, expanded)}
     check_gazebo([found[f"left_{name}"] for name in NAMES], DESIGN, RAYS, URDF_DIGITS)
 

@@ -17,6 +17,7 @@ import numpy as np
 from lidardesign.design.sensor import Design
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
+from lidardesign.export.names import xml_text
 from lidardesign.export.poses import Mount, design_losses, mounts, rotation
 from lidardesign.export.read_back import rays_rounding
 from lidardesign.export.xml import element, number, numbers, read_xml, write_xml
@@ -25,6 +26,7 @@ from lidardesign.simulate.returns import Rays
 
 # In the user data of each rangefinder: gate start and end [m], number of the sensor, firing time [s].
 USER_DATA = 4
+WORLD = "world"
 # Half of what a site of one ray is drawn as [m].
 SITE_SIZE_M = 0.002
 
@@ -71,12 +73,13 @@ def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
 
 
 def _names(names: Sequence[str]) -> list[str]:
-    """Names of bodies: those of the sensors, with a number where two are the same."""
-    found: list[str] = []
+    """Names of bodies: those of the sensors, with a number where two are the same, or one is that of the world."""
+    taken, found = {WORLD}, []
     for name in names:
-        chosen, count = name, 2
-        while chosen in found:
-            chosen, count = f"{name} {count}", count + 1
+        chosen, count = xml_text(name), 2
+        while chosen in taken:
+            chosen, count = f"{xml_text(name)} {count}", count + 1
+        taken.add(chosen)
         found.append(chosen)
     return found
 

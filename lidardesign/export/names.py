@@ -10,6 +10,11 @@ from collections.abc import Sequence
 LONGEST_NAME = 64
 # So many changed names are quoted in a note.
 QUOTED = 3
+# Names of SDF's and MuJoCo's own frame, and xacro's own macros.
+RESERVED = {
+    "world", "arg", "attribute", "call", "element", "else", "if", "include", "insert_block", "macro", "property",
+    "unless",
+}  # fmt: skip
 # What XML 1.0 cannot hold, not even escaped.
 _NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -17,11 +22,12 @@ _NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]"
 def identifier(name: str) -> str:
     """A name of letters, digits and underscores that begins with a letter; accents are dropped.
 
-    No underscore follows another or ends it: such names are reserved in SDF and in ROS.
+    No underscore follows another or ends it: such names are reserved in SDF and in ROS, as are some words.
     """
     plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
     word = re.sub(r"[^A-Za-z0-9]+", "_", plain).strip("_")[:LONGEST_NAME].rstrip("_")
-    return word if word[:1].isalpha() else f"s_{word}".rstrip("_")
+    plain_word = word[:1].isalpha() and word.lower() not in RESERVED
+    return word if plain_word else f"s_{word}".rstrip("_")
 
 
 def identifiers(names: Sequence[str]) -> list[str]:
