@@ -31,13 +31,13 @@ from lidardesign.evaluate.plots_canvas import (
     plain_label,
     write_pictures,
 )
-from lidardesign.evaluate.plots_scene import OUTCOME_LOOKS, framed_points
+from lidardesign.evaluate.plots_scene import OUTCOME_LOOKS, framed_points, opened
 from lidardesign.evaluate.plots_scores import MOST_ROWS, curve_picture, shown_pairs
 from lidardesign.evaluate.plots_times import phase_rows
 from lidardesign.evaluate.results import Evaluation, Paired, Row
 from lidardesign.evaluate.shown import shown_in
 from lidardesign.evaluate.tables import csv_text, write_csv
-from lidardesign.scene import Body, Plane, Scene, Sphere, rigid
+from lidardesign.scene import Body, Box, Plane, Scene, Sphere, rigid
 from lidardesign.simulate.plan import Tolerance
 from lidardesign.simulate.returns import Outcome, Rays
 from lidardesign.space import DesignSpace
@@ -257,6 +257,17 @@ def test_planes_are_seen_from_their_front_only():
     assert np.array_equal(shaded(Scene((BALL.bodies[0], ceiling), "ball"), 0, view, 60).depth_m, alone.depth_m)
     floor = shaded(Scene((BALL.bodies[0], BALL.bodies[2]), "ball"), 0, view, 60)
     assert np.isfinite(floor.depth_m).all()
+
+
+def test_a_room_is_cut_open_where_its_walls_hide_the_sensors():
+    room = Scene((Body(Box((6.0, 6.0, 6.0)), "room", "both"),), "room")
+    design = Design("inside", (make_sensor(),))
+    shown = shown_in(room, [design], [{}], lambda design, at: design, lambda design, at: make_rays())
+    view = view_of(shown.directions, framed_points(shown, 0, 0))
+    image, cut = opened(shown, 0, 0, view, 60)
+    assert cut
+    assert not image.hides(view, np.zeros((1, 3)), 0.05).any()
+    assert not opened(make_shown(), 0, 0, view, 60)[1]
 
 
 def test_a_flat_world_is_seen_from_above():

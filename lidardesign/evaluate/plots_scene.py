@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -41,6 +42,11 @@ SEEN, HIDDEN = 0.65, 0.12
 DENSE_RAYS = 100
 # Bodies that reach further than this many times beyond the rays are cut.
 REACH = 0.6
+# Things nearer than this share of the picture's width do not hide each other.
+SLACK_SHARE = 0.004
+# Where more than this share of the rays start behind something, what is before the sensors is cut away.
+MOST_HIDDEN = 0.5
+CUT_OPEN = "; cut open before the sensors"
 HEAD_INCHES, LEGEND_INCHES = 0.25, 0.3
 LARGEST_PANEL = 4.6
 # Rays from more places than these are drawn with small marks.
@@ -57,14 +63,27 @@ def scene_picture(shown: Shown) -> Figure:
     width = PAGE_INCHES / columns
     height = min(width / view.ratio, LARGEST_PANEL)
     figure = new_figure(PAGE_INCHES, rows * (height + HEAD_INCHES) + LEGEND_INCHES)
-    image = shaded(shown.scene, shown.frames[step], view, int(PIXELS_PER_INCH * min(width, height * view.ratio)))
+    pixels = int(PIXELS_PER_INCH * min(width, height * view.ratio))
+    image, cut = opened(shown, place, step, view, pixels)
     for number, design in enumerate(designs):
         axes = figure.add_subplot(rows, columns, number + 1)
         _draw_scene(axes, image, view)
         _draw_design(axes, design, place, step, image, view)
     _legend(figure, [int(kind) for one in designs for kind in np.unique(one.outcome[place, step])])
-    figure.suptitle(_told(shown, place, step), fontsize=SMALL_POINTS, color=SOFT)
+    figure.suptitle(_told(shown, place, step) + CUT_OPEN * cut, fontsize=SMALL_POINTS, color=SOFT)
     return figure
+
+
+def opened(shown: Shown, place: int, step: int, view: View, pixels: int) -> tuple[Shaded, bool]:
+    """The scene as it is seen, and whether what stands before the sensors is cut away, as walls that hide them."""
+    frame = shown.frames[step]
+    image = shaded(shown.scene, frame, view, pixels)
+    origins = np.concatenate([np.zeros((0, 3)), *(one.rays[place].origin_m for one in shown.designs)])
+    slack = SLACK_SHARE * (view.window[1] - view.window[0])
+    if not len(origins) or image.hides(view, origins, slack).mean() <= MOST_HIDDEN:
+        return image, False
+    nearer = replace(view, near_m=float(view.depth(origins).min()) - slack)
+    return shaded(shown.scene, frame, nearer, pixels), True
 
 
 def framed_points(shown: Shown, place: int, step: int) -> np.ndarray:
@@ -120,7 +139,7 @@ def _scale_bar(axes: Axes, view: View) -> None:
 def _draw_design(axes: Axes, one: ShownDesign, place: int, step: int, image: Shaded, view: View) -> None:
     rays, outcome, ends = one.rays[place], one.outcome[place, step], one.ends_m[place, step]
     keep = np.unique(np.linspace(0, len(rays) - 1, min(len(rays), MOST_RAYS)).astype(int))
-    slack = 0.004 * (view.window[1] - view.window[0])
+    slack = SLACK_SHARE * (view.window[1] - view.window[0])
     share = min(1.0, math.sqrt(DENSE_RAYS / max(len(keep), 1)))
     for kind, (colour, dash, width) in OUTCOME_LOOKS.items():
         some = keep[outcome[keep] == kind]
