@@ -10,6 +10,7 @@ import pytest
 from plugins import GOOD
 
 from lidardesign.errors import ConfigError, PluginError
+from lidardesign.registry import load_task
 from lidardesign.scene import Body, Mesh, Scene, Sphere
 from lidardesign.testing import BrokenLawError, Limits, check_task, contract_of
 from lidardesign.testing.contract import LAWS
@@ -180,6 +181,25 @@ def test_a_good_task_keeps_every_law_that_applies(kept):
     }
     assert not [finding for finding in kept.values() if finding.outcome == "fail"]
     assert kept["best on the truth"].figures["dense"] < kept["best on the truth"].figures["none"]
+
+
+SHIPPED = {
+    "arm": ("train=2", "test=2", "frames=6"),
+    "emitter": ("train=2", "test=2", "truth_points=500"),
+    "face": ("train=2", "test=2", "truth_points=500"),
+    "flatland": ("train=2", "test=2"),
+    "warehouse": ("train=2", "test=2", "size=small"),
+}
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_the_shipped_tasks_keep_the_contract(name):
+    contract = contract_of(load_task(name), overrides=SHIPPED[name])
+    for law in LAWS:
+        # in another process they are made again by the tests of workers
+        if law.name != "scenes repeat elsewhere":
+            finding = contract.finding(law.name)
+            assert finding.outcome != "fail", finding
 
 
 class Bent:

@@ -21,6 +21,7 @@ from plugins import GOOD, install_plugins
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.testing.contract import LAWS
+from lidardesign.testing.law import LOADS
 from lidardesign.testing.scaffold import LONGEST_NAME, new_task
 
 pytest_plugins = ["pytester"]
@@ -73,17 +74,27 @@ def test_the_package_passes_its_own_tests_untouched_in_its_own_environment(envir
     assert "failed" not in said
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("page", "task"), [("docs/writing-tasks.md", NAME), ("examples/third_party_task/README.md", "landing")]
-)
-def test_checking_an_installed_task_prints_what_its_page_says(environment, tmp_path, page, task):
-    blocks = [block for block in blocks_of(ROOT / page) if block.language == "console"]
+def shown_check(page: Path, task: str) -> list[str]:
+    """What a page says that the check of a task prints."""
+    blocks = [block for block in blocks_of(page) if block.language == "console"]
     commands = [command for block in blocks for command in commands_of(block)]
     (expected,) = (command.output for command in commands if command.words == ["lidardesign", "tasks", "check", task])
-    said = done(str(environment[0]), "-m", "lidardesign", "tasks", "check", task, cwd=tmp_path)
+    return expected
+
+
+@pytest.mark.slow
+def test_checking_the_installed_task_prints_what_the_guide_says(environment, tmp_path):
+    expected = shown_check(ROOT / "docs" / "writing-tasks.md", NAME)
+    said = done(str(environment[0]), "-m", "lidardesign", "tasks", "check", NAME, cwd=tmp_path)
     assert difference(expected, said, "", small=False) is None
     assert files_under(tmp_path) == {}
+
+
+def test_the_example_shows_every_law_as_kept():
+    shown = "\n".join(shown_check(EXAMPLE / "README.md", "landing"))
+    assert re.findall(r"^│ (\w.*?) +│ (\w+) │", shown, re.MULTILINE) == [
+        (name, "pass") for name in (LOADS[0], *(law.name for law in LAWS))
+    ]
 
 
 def test_the_guide_lists_every_law_and_shows_the_tests_that_are_written():
