@@ -17,7 +17,7 @@ import numpy as np
 from lidardesign.design.sensor import Design
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
-from lidardesign.export.names import xml_text
+from lidardesign.export.names import distinct, xml_text
 from lidardesign.export.poses import Mount, design_losses, mounts, rotation
 from lidardesign.export.read_back import rays_rounding
 from lidardesign.export.xml import element, number, numbers, read_xml, write_xml
@@ -34,7 +34,7 @@ SITE_SIZE_M = 0.002
 def write(design: Design, rays: Rays, path: Path) -> list[str]:
     """Write the model, atomically; returns notes of what the format cannot hold."""
     mounted = mounts(design, rays)
-    bodies = _names([one.sensor.name for one in mounted])
+    bodies = distinct([xml_text(one.sensor.name) for one in mounted], " ", taken=[WORLD])
     site = np.empty(len(rays), dtype=object)
     worldbody = element("worldbody")
     for mount, name in zip(mounted, bodies, strict=True):
@@ -70,18 +70,6 @@ def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
     if not len(rays):
         return rays_rounding(rays, rays, path)
     return rays_rounding(rays, read(path), path)
-
-
-def _names(names: Sequence[str]) -> list[str]:
-    """Names of bodies: those of the sensors, with a number where two are the same, or one is that of the world."""
-    taken, found = {WORLD}, []
-    for name in names:
-        chosen, count = xml_text(name), 2
-        while chosen in taken:
-            chosen, count = f"{xml_text(name)} {count}", count + 1
-        taken.add(chosen)
-        found.append(chosen)
-    return found
 
 
 def _body(mount: Mount, name: str, rays: Rays, sites: np.ndarray) -> Element:

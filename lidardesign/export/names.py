@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 # Of what a name becomes; topics and prim paths are built of several.
 LONGEST_NAME = 64
@@ -32,14 +32,26 @@ def identifier(name: str) -> str:
 
 def identifiers(names: Sequence[str]) -> list[str]:
     """An identifier of each name, no two alike, whatever their case."""
-    taken: set[str] = set()
+    return distinct([identifier(name) for name in names], "_")
+
+
+def distinct(names: Sequence[str], between: str, taken: Iterable[str] = ()) -> list[str]:
+    """Names, no two alike whatever their case, nor like one that is taken: the next number follows where they are.
+
+    Arguments:
+        names: The names.
+        between: What stands between a name and its number.
+        taken: Names that none may have.
+    """
+    used = {name.lower() for name in taken}
+    numbers: dict[str, int] = {}
     found = []
     for name in names:
-        word, number = identifier(name), 2
-        chosen = word
-        while chosen.lower() in taken:
-            chosen, number = f"{word}_{number}", number + 1
-        taken.add(chosen.lower())
+        chosen = name
+        while chosen.lower() in used:
+            numbers[name] = numbers.get(name, 1) + 1
+            chosen = f"{name}{between}{numbers[name]}"
+        used.add(chosen.lower())
         found.append(chosen)
     return found
 
