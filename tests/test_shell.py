@@ -1,132 +1,377 @@
-"""Proposals around surfaces, in and from their shell: weighted to p* they agree with brute force, rim included."""
+"""Habits of the shell: - for standard streams, no colour where none is wanted, help that works, clear mistakes, CI."""
 
 from __future__ import annotations
 
-import math
+import csv
+import importlib.util
+import io
+import json
+import os
+import pty
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
+import typer
+from command_line import caller, files_under, make_run
 
-from lidardesign.density.independent import independent_points, resampled_proposals
-from lidardesign.density.settings import DensitySettings
-from lidardesign.density.shell import shell_proposals
-from lidardesign.density.target import build_target
-from lidardesign.scene import Body, Mesh, Scene, Sphere, rigid
-from lidardesign.space import AZIMUTH, DesignSpace, direction
+from lidardesign.cli import deprecations
+from lidardesign.cli.deprecations import RENAMED, RenamedOption, deprecations_told, with_new_names
+from lidardesign.cli.main import app
+from lidardesign.cli.manual import MANUALS
+from lidardesign.deprecation import DeprecatedUse, announce
+from lidardesign.run.streams import STDIO, is_input, offered_input
+from lidardesign.run.yaml import load_yaml
 
-CENTRE, RADIUS, SIGMA = np.array([1.0, 0.0, 0.1]), 0.3, 0.02
-
-
-def ball():
-    return Body(Sphere(RADIUS), poses=rigid(translation_m=CENTRE))
-
-
-def mesh_ball():
-    mesh = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
-    return Body(Mesh(mesh.vertices, mesh.faces), poses=rigid(translation_m=CENTRE))
+ROOT = Path(__file__).parents[1]
+CI = ROOT / "examples" / "ci"
+COLOUR = re.compile(r"\x1b\[[0-9;]*(?:3[0-8]|4[0-8]|9[0-7]|10[0-7])[;m]")
 
 
-def open_space(measure="solid_angle"):
-    return DesignSpace((0, -0.05, 0, -0.6, -0.5, 0.3), (0, 0.05, 0, 0.6, 0.7, 1.6), measure=measure)
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
 
 
-def flat_space():
-    return DesignSpace((0, 0, 0, -0.6, 0.05, 0.3), (0, 0, 0, 0.6, 0.05, 1.6))
+@pytest.fixture
+def given(monkeypatch):
+    """A function that puts something on standard input."""
+
+    def give(content):
+        stream = io.TextIOWrapper(io.BytesIO(content if isinstance(content, bytes) else content.encode()))
+        monkeypatch.setattr(sys, "stdin", stream)
+
+    return give
 
 
-def on_the_rim(points):
-    """Whether a ray passes the ball without meeting it."""
-    offset = CENTRE - points[:, :3]
-    forward = direction(points[:, 3], points[:, 4])
-    along = np.einsum("nk,nk->n", offset, forward)
-    return np.linalg.norm(offset - along[:, None] * forward, axis=1) > RADIUS
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    """A run with a design."""
+    from lidardesign.cli.main import run
+
+    folder = make_run(tmp_path_factory.mktemp("runs") / "flat")
+    with pytest.raises(SystemExit):
+        run(["fit", str(folder), "--sensors", "2", "--rays", "9", "--quiet", "--json"])
+    return folder
 
 
-def weighted_means(points, log_weights, functions):
-    weights = np.exp(log_weights - log_weights.max())
-    weights /= weights.sum()
-    means = np.array([np.sum(weights * f(points)) for f in functions])
-    errors = [math.sqrt(np.sum(weights**2 * (f(points) - m) ** 2)) for f, m in zip(functions, means, strict=True)]
-    return means, np.array(errors)
+@pytest.fixture
+def flat(fitted, tmp_path):
+    """A copy of it that a test may write to."""
+    return shutil.copytree(fitted, tmp_path / "flat")
 
 
-FUNCTIONS = (on_the_rim, lambda p: p[:, 5], lambda p: p[:, 4], lambda p: np.abs(p[:, 3]))
+def test_constraints_come_from_standard_input(lidardesign, given, flat):
+    text = "gate: {width_m: {max: 0.3}}\nbudget: {rays: 40}\n"
+    (flat.parent / "few.yaml").write_text(text)
+    given(text)
+    piped = lidardesign("constrain", flat, "--constraints", "-", "--dry-run", "--json").json
+    filed = lidardesign("constrain", flat, "--constraints", "few.yaml", "--dry-run", "--json").json
+    assert piped["settings"] == filed["settings"]
+    assert piped["settings"]["constraints"]["budget"] == {"rays": 40}
 
 
-@pytest.mark.parametrize("body", [ball, mesh_ball], ids=["primitive", "mesh"])
-@pytest.mark.parametrize("measure", ["solid_angle", "angles"])
-@pytest.mark.parametrize("visibility", ["off", "raycast"])
-def test_weighted_proposals_have_the_moments_of_the_target(body, measure, visibility, tmp_path, monkeypatch):
-    monkeypatch.setenv("LIDARDESIGN_CACHE", str(tmp_path))
-    space, scenes = open_space(measure), [Scene((body(),))]
-    target = build_target(scenes, space, DensitySettings(sigma_m=SIGMA), visibility)
-    generator = np.random.default_rng(1)
-    points, log_density = independent_points(target, scenes, 20_000, generator)
-    assert space.contains(points).all()
-    found, error = weighted_means(points, target.log_density(points) - log_density, FUNCTIONS)
-    brute = space.sample(200_000, generator)
-    expected, brute_error = weighted_means(brute, target.log_density(brute), FUNCTIONS)
-    # the density of the shell is exact to first order in sigma / radius = 1 / 15, squared over two curvatures
-    curvature = 2 * SIGMA / RADIUS * np.array([expected[0], 0.05, 0.05, 0.05])
-    assert (np.abs(found - expected) < 4 * np.hypot(error, brute_error) + curvature).all()
-    assert found[0] > 0.01
+def test_a_configuration_comes_from_standard_input_with_its_paths_from_here(lidardesign, given, tmp_path):
+    (tmp_path / "scans").mkdir()
+    given("preset: draft\ntask: {folder: scans}\n")
+    result = lidardesign("learn", "meshes", "--config", "-", "--dry-run")
+    assert f"{tmp_path / 'scans'}: no mesh" in result.err or str(tmp_path / "scans") in result.err
+    given("preset: draft\ntask: {variation: 3}\n")
+    result = lidardesign("learn", "flatland", "--config", "-", "--dry-run")
+    assert result.code == 2
+    assert "-:2:19: task.variation" in result.err
+    given("preset: draft\n")
+    planned = lidardesign("learn", "flatland", "--config", "-", "--time-budget", 9, "--dry-run", "--json").json
+    assert planned["settings"]["preset"] == "draft"
+    assert planned["reads"] == [{"path": "-", "bytes": None}]
 
 
-def test_weights_of_shell_proposals_are_bounded():
-    space, scenes = open_space(), [Scene((mesh_ball(),))]
-    target = build_target(scenes, space, DensitySettings(sigma_m=SIGMA), "off")
-    points, log_density = shell_proposals(target.field, scenes, space, 5_000, SIGMA, np.random.default_rng(2))
-    log_weights = target.log_density(points) - log_density
-    area = 4 * math.pi * RADIUS**2
-    assert log_weights.max() <= math.log(area / points[:, 5].min() ** 2) + 1e-9
+@pytest.mark.parametrize("arguments", ["show -", "export - --format csv --out rays.csv", "evaluate flat -"])
+def test_a_design_comes_from_standard_input(lidardesign, given, flat, arguments):
+    given((flat / "designs" / "fit.yaml").read_bytes())
+    words = (*arguments.split(), *(("--dry-run",) if "evaluate" in arguments else ()))
+    result = lidardesign(*words)
+    assert result.code == 0, result.err
+    assert "stdin" in result.out or "rays.csv" in result.out
 
 
-def test_with_a_fixed_angle_points_are_resampled_by_proximity():
-    space, scenes = flat_space(), [Scene((ball(),))]
-    target = build_target(scenes, space, DensitySettings(sigma_m=SIGMA), "raycast")
-    generator = np.random.default_rng(3)
-    points, log_density = independent_points(target, scenes, 20_000, generator)
-    alike = resampled_proposals(target, 20_000, np.random.default_rng(3))
-    np.testing.assert_array_equal(points, alike[0])
-    found, error = weighted_means(points, target.log_density(points) - log_density, FUNCTIONS)
-    brute = space.sample(200_000, generator)
-    expected, brute_error = weighted_means(brute, target.log_density(brute), FUNCTIONS)
-    assert (np.abs(found - expected) < 4 * np.hypot(error, brute_error) + 1e-3).all()
-    assert found[0] > 0.01
+def test_mistakes_on_standard_input_are_named_by_place(lidardesign, given, flat):
+    for text, words in (("sensors: 3\n", "-:1:1:"), ("", "-"), ("schema_version: 1\nsensors: 3\n", "-:2:10:")):
+        given(text)
+        result = lidardesign("show", "-")
+        assert result.code == 2
+        assert result.err.startswith(f"config error: {words}")
+        assert "/tmp" not in result.err
+    given("budget: {rays: 40}\n")
+    result = lidardesign("constrain", "-", "--constraints", "-")
+    assert result.code == 2
+    assert "-: is a YAML file already, and cannot be a design too" in result.err
 
 
-@pytest.mark.parametrize("body", [ball, mesh_ball], ids=["primitive", "mesh"])
-def test_with_a_fixed_range_points_at_that_range_have_the_moments_of_the_target(body, tmp_path, monkeypatch):
-    monkeypatch.setenv("LIDARDESIGN_CACHE", str(tmp_path))
-    wide, scenes = open_space(), [Scene((body(),))]
-    range_m = (wide.low[5] + wide.high[5]) / 2
-    space = DesignSpace((*wide.low[:5], range_m), (*wide.high[:5], range_m))
-    target = build_target(scenes, space, DensitySettings(sigma_m=SIGMA), "raycast")
-    generator = np.random.default_rng(3)
-    points, log_density = independent_points(target, scenes, 20_000, generator)
-    assert (points[:, 5] == range_m).all()
-    found, error = weighted_means(points, target.log_density(points) - log_density, FUNCTIONS)
-    brute = space.sample(200_000, generator)
-    expected, brute_error = weighted_means(brute, target.log_density(brute), FUNCTIONS)
-    # 20,000 points are drawn, with repetition, from the candidates near the surface: as in plain integration
-    assert (np.abs(found - expected) < 4 * np.hypot(error, 2 * brute_error) + 1e-3).all()
+def test_a_dash_is_a_name_for_those_who_use_the_library(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "-").write_text("x: 1\n")
+    assert load_yaml(Path(STDIO)).value == {"x": 1}
+    assert not is_input(Path(STDIO))
+    with offered_input():
+        assert is_input(Path(STDIO))
+        assert load_yaml(tmp_path / STDIO).value == {"x": 1}
 
 
-def test_a_space_that_reaches_no_surface_gives_no_proposals():
-    away = DesignSpace((0, 0, 0, math.pi - 0.1, -0.1, 0.1), (0, 0, 0, math.pi + 0.1, 0.1, 0.5))
-    for body in (ball(), mesh_ball()):
-        target = build_target([Scene((body,))], away, DensitySettings(sigma_m=SIGMA), "off")
-        assert len(independent_points(target, [Scene((body,))], 500, np.random.default_rng(4))[0]) == 0
-    flat = DesignSpace((0, 0, 0, math.pi - 0.1, 0.0, 0.1), (0, 0, 0, math.pi + 0.1, 0.0, 0.5))
-    target = build_target([Scene((ball(),))], flat, DensitySettings(sigma_m=SIGMA), "off")
-    assert len(independent_points(target, [Scene((ball(),))], 500, np.random.default_rng(5))[0]) == 0
+def test_rays_and_rows_go_to_standard_output_and_words_to_stderr(lidardesign, flat):
+    design = flat / "designs" / "fit.yaml"
+    lidardesign("export", design, "--format", "csv", "--out", "rays.csv")
+    result = lidardesign("export", design, "--format", "csv", "--out", "-")
+    assert result.out == Path("rays.csv").read_text()
+    assert "read back: exact" in result.err
+    quiet = lidardesign("export", design, "--format", "csv", "--out", "-", "--quiet")
+    assert (quiet.out, quiet.err) == (result.out, "")
+    scored = lidardesign("evaluate", flat, "--rays", 9, "--csv", "-")
+    rows = list(csv.DictReader(io.StringIO(scored.out)))
+    assert {"fit", "uniform", "random", "bounding"} <= {row["design"] for row in rows}
+    assert "held-out scenes" in scored.err
 
 
-@pytest.mark.parametrize("body", [ball, mesh_ball], ids=["primitive", "mesh"])
-def test_the_same_seed_gives_the_same_proposals(body):
-    space, scenes = open_space(), [Scene((body(),))]
-    target = build_target(scenes, space, DensitySettings(sigma_m=SIGMA), "off")
-    first, second = (independent_points(target, scenes, 100, np.random.default_rng(6))[0] for _ in range(2))
-    assert first.tobytes() == second.tobytes()
-    assert np.ptp(first[:, AZIMUTH]) > 0
+def test_binary_rays_go_through_a_pipe(flat):
+    words = [sys.executable, "-m", "lidardesign", "export", flat / "designs/fit.yaml", "--format", "npz", "--out", "-"]
+    done = subprocess.run([*words, "--rays", "9"], capture_output=True, check=True)
+    with np.load(io.BytesIO(done.stdout)) as arrays:
+        assert len(arrays["azimuth_rad"]) == 9
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "export flat/designs/fit.yaml --format csv --out - --json",
+        "evaluate flat --csv - --report -",
+        "evaluate flat --csv - --json",
+        "export flat/designs/fit.yaml --format helios --out -",
+        "export - --format csv",
+    ],
+)
+def test_what_cannot_go_to_standard_output_is_refused_before_any_work(lidardesign, given, flat, arguments):
+    given((flat / "designs" / "fit.yaml").read_bytes())
+    before = files_under(flat)
+    result = lidardesign(*arguments.split())
+    assert result.code == 2
+    assert "standard" in result.err or "folder of files" in result.err
+    assert files_under(flat) == before
+
+
+def on_terminal(*arguments, **environment):
+    """What the program shows on a terminal."""
+    ours, theirs = pty.openpty()
+    with subprocess.Popen(
+        [sys.executable, "-m", "lidardesign", *arguments],
+        stdin=theirs, stdout=theirs, stderr=theirs, env={**os.environ, "TERM": "xterm-256color", **environment},
+    ) as process:  # fmt: skip
+        os.close(theirs)
+        shown = b""
+        try:
+            while part := os.read(ours, 65536):
+                shown += part
+        except OSError:  # Linux says so when nobody writes there any more
+            pass
+        process.wait()
+    os.close(ours)
+    return shown.decode()
+
+
+def test_colours_are_left_out_where_they_are_not_wanted():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("NO_COLOR", raising=False)
+        assert COLOUR.search(on_terminal("fit", "--help"))
+    assert not COLOUR.search(on_terminal("fit", "--help", NO_COLOR="1"))
+    assert "\x1b[" not in on_terminal("export", "--list", TERM="dumb", NO_COLOR="1")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "hint"),
+    [
+        (["tasks --help"], "lidardesign tasks --help"),
+        (["fit runs/face --sensors 4"], "lidardesign fit runs/face --sensors 4"),
+        (["lern", "face"], "lidardesign learn face"),
+        (["tasks", "shwo", "face"], "lidardesign tasks show face"),
+        (["help"], "lidardesign --help"),
+        (["help", "fit"], "lidardesign fit --help"),
+        (["help", "nothing"], "lidardesign --help"),
+        (["--json", "tasks", "list"], "lidardesign tasks list --json"),
+        (["--seed", "3", "-q", "fit", "runs/face"], "lidardesign fit runs/face --seed 3 -q"),
+        (["fit", "run", "--sensor", "3"], "lidardesign fit --help"),
+        (["xyzzy"], "lidardesign --help"),
+        (["--quiet"], "lidardesign --help"),
+    ],
+    ids=str,
+)
+def test_a_command_line_that_is_not_understood_names_one_that_is(lidardesign, arguments, hint):
+    result = lidardesign(*arguments)
+    assert result.code == 2
+    assert result.out == "" or "--json" in arguments
+    assert f"  try: {hint}\n" in result.err
+
+
+def commands():
+    root = typer.main.get_command(app)
+    for name, command in root.commands.items():
+        for part, inner in getattr(command, "commands", {"": command}).items():
+            yield f"{name} {part}".strip(), inner
+
+
+@pytest.mark.parametrize(("name", "command"), list(commands()), ids=lambda one: one if isinstance(one, str) else "")
+def test_every_command_has_a_manual_whose_examples_are_understood(lidardesign, name, command):
+    manual = MANUALS[name]
+    assert manual.examples
+    shown = lidardesign(*name.split(), "--help").out
+    for example in manual.examples:
+        assert f"   {example}\n" in shown
+    assert " Exit codes\n" in shown
+    for page in manual.see:
+        assert (ROOT / "docs" / page).is_file()
+
+
+def examples():
+    for name, manual in MANUALS.items():
+        for example in manual.examples:
+            for part in re.split(r"\s[|]\s", example):
+                words = shlex.split(re.sub(r"[<>] *\S+", "", part))
+                if "lidardesign" in words[:5] and "$(" not in part:
+                    yield pytest.param(words[words.index("lidardesign") + 1 :], id=f"{name}: {part}")
+
+
+@pytest.mark.parametrize("words", list(examples()))
+def test_an_example_is_parsed_by_the_program(words):
+    command = typer.main.get_command(app)
+    while hasattr(command, "commands"):
+        command, words = command.commands[words[0]], words[1:]
+    command.make_context(command.name, list(words))
+
+
+def test_the_command_reference_is_the_program_s(monkeypatch):
+    specification = importlib.util.spec_from_file_location("command_reference", ROOT / "tools/command_reference.py")
+    tool = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(tool)
+    monkeypatch.setattr(sys, "argv", ["command_reference.py", "--check"])
+    assert tool.main() == 0, "python tools/command_reference.py writes it anew"
+
+
+def test_every_exit_code_that_a_manual_names_is_explained_in_one_place():
+    page = (ROOT / "docs" / "shell.md").read_text(encoding="utf-8")
+    explained = {int(code) for code in re.findall(r"^\| (\d+) \|", page, re.MULTILINE)}
+    named = {code for manual in MANUALS.values() for code in manual.exits or ()}
+    assert named | {0, 2, 3, 70, 130, 141, 143} <= explained
+
+
+def test_a_deprecated_use_is_told_once_also_where_nothing_else_is(capsys):
+    with deprecations_told():
+        for _ in range(3):
+            announce("--old", instead="--new", removed_in="0.3.0")
+        announce("--other", instead="--new", removed_in="0.3.0")
+        with warnings.catch_warnings(record=True) as others:
+            warnings.simplefilter("always")
+            warnings.warn("something else", stacklevel=1)
+    assert capsys.readouterr().err.splitlines() == [
+        "deprecated: --old is deprecated and goes in 0.3.0; use --new",
+        "deprecated: --other is deprecated and goes in 0.3.0; use --new",
+    ]
+    assert len(others) == 1
+
+
+def test_other_warnings_are_not_taken_for_deprecations():
+    with pytest.warns(UserWarning, match="something else"), deprecations_told():
+        warnings.warn("something else", stacklevel=1)
+
+
+def test_python_callers_meet_a_warning_at_their_own_line():
+    def renamed():
+        announce("renamed()", instead="new()", removed_in="0.3.0")
+
+    with pytest.warns(DeprecatedUse) as caught:
+        renamed()
+    assert caught[0].filename == __file__
+    assert caught[0].message.as_dict() == {"what": "renamed()", "instead": "new()", "removed_in": "0.3.0"}
+
+
+def test_an_option_by_its_old_name_does_what_the_new_one_does(lidardesign, flat, monkeypatch):
+    old = RenamedOption("show", "--condition", "--at", "0.3.0")
+    monkeypatch.setattr(deprecations, "RENAMED", (old,))
+    design = flat / "designs" / "fit.yaml"
+    for given in (("--condition", "x_m=1"), ("--condition=x_m=1",)):
+        result = lidardesign("show", design, *given, "--quiet", "--json")
+        assert result.json["at"] == {"x_m": 1.0}
+        assert result.err == "deprecated: show --condition is deprecated and goes in 0.3.0; use --at\n"
+    assert lidardesign("show", design, "--at", "x_m=1", "--quiet").err == ""
+
+
+def test_only_options_of_the_command_are_renamed():
+    table = (RenamedOption("catalog show", "--old", "--new", "1.0.0"),)
+    with pytest.warns(DeprecatedUse):
+        assert with_new_names(["catalog", "show", "a", "--old=3", "--", "--old"], table) == [
+            "catalog", "show", "a", "--new=3", "--", "--old"
+        ]  # fmt: skip
+    for words in (["catalog", "list", "--old"], ["show", "--old"], [], ["catalog"]):
+        assert with_new_names(words, table) == words
+
+
+def test_what_is_renamed_has_a_name_that_there_is():
+    parsed = dict(commands())
+    for entry in RENAMED:
+        names = {name for parameter in parsed[entry.command].params for name in parameter.opts}
+        assert entry.new in names
+        assert entry.old not in names
+
+
+@pytest.fixture
+def gate(fitted, tmp_path):
+    """A checkout with the files of the CI example and a run that was learned before; its shell."""
+    for name in ("design_gate.sh", "lidar.yaml", "constraints.yaml"):
+        shutil.copy(CI / name, tmp_path)
+    shutil.copytree(fitted, tmp_path / "runs" / "gate")
+    (tmp_path / "bin").mkdir()
+    script = tmp_path / "bin" / "lidardesign"
+    script.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m lidardesign "$@"\n')
+    script.chmod(0o755)
+
+    def run(command, **environment):
+        path = f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}"
+        return subprocess.run(
+            ["bash", "-eo", "pipefail", "-c", command],
+            capture_output=True, text=True, check=False, cwd=tmp_path, env={**os.environ, "PATH": path, **environment},
+        )  # fmt: skip
+
+    return run
+
+
+def test_the_workflow_passes_with_a_good_design_and_keeps_what_can_be_looked_at(gate, tmp_path):
+    workflow = load_yaml(CI / "lidar-design.yml").value
+    (job,) = workflow["jobs"].values()
+    steps = [step for step in job["steps"] if "run" in step]
+    assert [step["name"] for step in steps if "pip install" in step["run"]] == ["Install"]
+    for step in steps:
+        if step["name"] != "Install":
+            done = gate(step["run"], RAYS="9", LIMIT="1e6")
+            assert done.returncode == 0, done.stderr + done.stdout
+    assert "good enough" in done.stdout
+    (kept,) = [step["with"]["path"] for step in job["steps"] if "upload-artifact" in step.get("uses", "")]
+    assert {path.name for path in (tmp_path / kept).iterdir()} == {"rows.csv", "result.json", "report.html"}
+    assert json.loads((tmp_path / kept / "result.json").read_text())["rows"]
+
+
+def test_the_shell_script_fails_with_a_bad_design_and_says_why(gate, tmp_path):
+    done = gate("sh design_gate.sh runs/gate 1e-6 runs/gate/designs/fit.yaml", RAYS="9")
+    assert done.returncode == 1
+    assert "worse than 1e-6 with 9 rays" in done.stdout
+    assert (tmp_path / "gate" / "rows.csv").is_file()
+    done = gate("sh design_gate.sh runs/gate 1e6 runs/gate/config.yaml")
+    assert done.returncode == 2
+    assert "not scored: exit code 2" in done.stdout
+
+
+def test_the_files_of_the_gate_are_what_the_program_takes(lidardesign, flat):
+    assert lidardesign("learn", "flatland", "--config", CI / "lidar.yaml", "--out", "new", "--dry-run").code == 0
+    assert lidardesign("constrain", flat, "--constraints", CI / "constraints.yaml", "--dry-run").code == 0
