@@ -14,7 +14,7 @@ from test_score import MissTask, design, make_request, scenes
 from lidardesign.errors import PluginError
 from lidardesign.evaluate.audit import Audit, AuditRow
 from lidardesign.evaluate.effects import effect_notes, summaries
-from lidardesign.evaluate.report import report_html
+from lidardesign.evaluate.physics_tables import audit_section, effects_section
 from lidardesign.evaluate.score import evaluate
 from lidardesign.scene import Ambient, Scene
 from lidardesign.simulate import plan as plan_module
@@ -156,13 +156,12 @@ def test_documents_hold_effects_and_audits_as_plain_json():
 def test_the_report_shows_effects_and_audit_and_escapes_names():
     request = make_request(test=sunny(1), planner=Planner(replace(SINGLE, name="<b>x</b>")), audit=True, rays=(9,))
     evaluation = evaluate(request)
-    rays = {"aimed": request.lay_out(design(), 9, None)}
-    page = report_html(evaluation, [design()], rays, request.test[0])
+    page = effects_section(evaluation) + audit_section(evaluation, evaluation.audit)
     assert "The audit passed." in page
     assert "100,000 lux (sun)" in page
     assert "<b>x</b>" not in page
     calm = evaluate(make_request())
-    assert "No scene calls for any effect" in report_html(calm, [design()], rays, request.test[0])
+    assert "No scene calls for any effect" in effects_section(calm)
 
 
 def test_failed_rows_are_those_beyond_the_tolerance_on_either_side():

@@ -10,9 +10,7 @@ from lidardesign.design.grid import field_on_sphere
 from lidardesign.design.sensor import Sensor, interval_factor, tangent_directions
 from lidardesign.numerics import TINY
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Outcome, Rays
-from lidardesign.simulate.simulate import gate_outcomes
+from lidardesign.simulate.returns import Rays
 
 MOST_FACES = 40_000  # of a scene's meshes, and of its round bodies; more would make the page large and slow to open
 STEPS = 24  # round a sphere or capsule
@@ -138,16 +136,6 @@ def gate_shell(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
     faces = _grid_faces(SHELL_STEPS + 1, SHELL_STEPS + 1)
     vertices = np.concatenate([sensor.origin_m + radius * patch for radius in sensor.gate_m])
     return vertices.astype(np.float32), np.concatenate([faces, faces + len(patch)]).astype(np.int32)
-
-
-def ray_segments(scene: Scene, rays: Rays, frame: int = 0) -> dict[Outcome, np.ndarray]:
-    """Line segments by outcome, from the origin to the first hit or the gate's end, (3 K, 3) float32 [m]."""
-    range_m = SceneCaster(scene, frame).first_hit(rays.origin_m, rays.direction).range_m
-    outcome = gate_outcomes(range_m, rays.gate_m)
-    length = np.minimum(range_m, rays.gate_m[:, 1])
-    ends = rays.origin_m + length[:, None] * rays.direction
-    lines = np.stack([rays.origin_m, ends, np.full_like(ends, np.nan)], axis=1)
-    return {kind: lines[outcome == kind].reshape(-1, 3).astype(np.float32) for kind in Outcome}
 
 
 def separated(lines: list[np.ndarray]) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from lidardesign.evaluate.curves import Series
 from lidardesign.evaluate.drawing import MOST_FACES, drawn_share
 from lidardesign.evaluate.report_parts import embedded, swatch, switch
-from lidardesign.evaluate.scene_view import DASHES, MOST_BODIES, MOST_SENSORS, OUTCOMES, view_document
+from lidardesign.evaluate.scene_view import DASHES, MOST_BODIES, MOST_SENSORS, OUTCOMES, is_flat, view_document
 from lidardesign.evaluate.shown import Shown, ShownDesign
 from lidardesign.simulate.returns import Outcome
 
@@ -28,6 +28,8 @@ CAMERA = (
     ("reset", "First view"),
 )
 
+OF_SOLID = ("up", "down", "above")
+
 
 def view_section(shown: Shown, looks: Sequence[Series], density_m: np.ndarray | None) -> str:
     """Everything of the view; `looks` are the designs' colours and dashes, `density_m` (K, 3) observed points."""
@@ -36,7 +38,7 @@ def view_section(shown: Shown, looks: Sequence[Series], density_m: np.ndarray | 
         f'<div class="stage"><div id="{SCENE_ID}" tabindex="0" role="application" aria-label="3D view of the scene. '
         'Arrow keys turn it, plus and minus go closer and farther, Home shows the first view."></div>'
         '<img id="view-printed" alt="The 3D view as it stood when the page was printed">'
-        f"{_camera_buttons()}</div>"
+        f"{_camera_buttons(is_flat(shown.directions))}</div>"
     )
     controls = "".join(
         (_sliders(shown), _outcomes(shown), _layers(shown, density_m is not None), _designs(shown, looks))
@@ -83,8 +85,10 @@ def frame_labels(shown: Shown) -> list[str]:
     return [f"frame {frame + 1} of {frames}, {frame / rate_hz:.2f} s" for frame in shown.frames]
 
 
-def _camera_buttons() -> str:
-    buttons = "".join(f'<button type="button" data-camera="{how}">{word}</button>' for how, word in CAMERA)
+def _camera_buttons(flat: bool) -> str:
+    """What moves the camera; a world in a plane is always seen from above."""
+    moves = [(how, word) for how, word in CAMERA if not (flat and how in OF_SOLID)]
+    buttons = "".join(f'<button type="button" data-camera="{how}">{word}</button>' for how, word in moves)
     save = '<button type="button" id="view-save">Save picture</button>'
     return f'<div class="buttons" role="group" aria-label="Camera">{buttons}{save}</div>'
 

@@ -129,11 +129,16 @@ def _shells(one: ShownDesign) -> list[np.ndarray]:
     return found
 
 
+def is_flat(directions: np.ndarray) -> bool:
+    """Whether all rays lie in planes of constant z: a world that is looked at as a map."""
+    return bool(len(directions)) and float(np.abs(directions[:, 2]).max()) < EPSILON_FLOAT32
+
+
 def camera(directions: np.ndarray) -> dict[str, Any]:
     """From behind and above the sensors; a world in the plane z = 0 is looked at from above, as on paper."""
-    if len(directions) and np.abs(directions[:, 2]).max() < EPSILON_FLOAT32:
-        up, kind = {"x": 0, "y": 1, "z": 0}, {"type": "orthographic"}
-        return {"eye": {"x": 0, "y": 0, "z": 1.9}, "up": up, "projection": kind, "center": {"x": 0, "y": 0, "z": 0}}
+    if is_flat(directions):
+        up, center = {"x": 0, "y": 1, "z": 0}, {"x": 0, "y": 0, "z": 0}
+        return {"eye": {"x": 0, "y": 0, "z": 1.9}, "up": up, "center": center}
     up = {"x": 0, "y": 0, "z": 1}
     return {"eye": _side_view(directions), "up": up, "center": {"x": 0, "y": 0, "z": -0.1}}
 

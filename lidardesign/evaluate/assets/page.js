@@ -5,7 +5,7 @@ const QUIET = { responsive: true, displaylogo: false, displayModeBar: false, plo
 const SCENE = "view-scene";
 const TURN = Math.PI / 12; // of the camera, per press
 const ZOOM = 1.2;
-const PAPER_PX = 680; // what fits on the width of a sheet
+const [PAPER_PX, HALF_PX] = [680, 330]; // what fits on the width of a sheet, once and beside another
 const [WIDE, FARTHEST] = [1.3, 1.5]; // the shape of the view that its first camera is for, and how far that may go back
 
 const find = (selector) => document.querySelector(selector);
@@ -48,7 +48,10 @@ function drawScene() {
   const drawn = sceneTraces(view, state);
   counts = drawn.counts;
   tell();
-  return Plotly.react(SCENE, drawn.traces, sceneLayout(view, parsed("page-font")), QUIET);
+  const layout = sceneLayout(view, parsed("page-font"));
+  // the camera stays where it was moved to
+  layout.scene.camera = document.getElementById(SCENE).layout?.scene?.camera ?? view.camera;
+  return Plotly.react(SCENE, drawn.traces, layout, QUIET);
 }
 
 // A narrow window shows less to the sides: the first view is from farther away.
@@ -68,11 +71,21 @@ function redraw() {
   });
 }
 
+// A world in a plane is looked at from above, as a map: it can be turned, and seen from nearer and farther.
+function moveMap(camera, how) {
+  const { eye, up } = camera;
+  const scale = { closer: 1 / ZOOM, farther: ZOOM }[how] ?? 1;
+  const turn = Math.atan2(up.y, up.x) + ({ left: -TURN, right: TURN }[how] ?? 0);
+  const moved = { eye: { ...eye, z: scale * eye.z }, up: { x: Math.cos(turn), y: Math.sin(turn), z: 0 } };
+  return Plotly.relayout(SCENE, { "scene.camera": { ...camera, ...moved } });
+}
+
 function moveCamera(how) {
   const camera = document.getElementById(SCENE).layout.scene.camera;
   if (how === "reset") return Plotly.relayout(SCENE, { "scene.camera": view.camera });
   const { center: c = { x: 0, y: 0, z: 0 }, eye } = camera;
   const [dx, dy, dz] = [eye.x - c.x, eye.y - c.y, eye.z - c.z];
+  if (camera.up.z === 0) return moveMap(camera, how);
   let radius = Math.hypot(dx, dy, dz);
   let turn = Math.atan2(dy, dx);
   let height = Math.asin(dz / radius);
@@ -127,7 +140,7 @@ function toPaper() {
   for (const fold of opened) fold.open = true;
   const scene = view && document.getElementById(SCENE)?._fullLayout?.scene?._scene;
   if (scene && scene.toImage) find("#view-printed").src = scene.toImage("png");
-  for (const figure of flatFigures()) Plotly.relayout(figure, { width: PAPER_PX, autosize: false });
+  for (const figure of flatFigures()) Plotly.relayout(figure, { width: figure.closest(".tiles") ? HALF_PX : PAPER_PX, autosize: false });
 }
 
 function toScreen() {

@@ -62,7 +62,7 @@ function coneOf(design, place, sensor) {
 
 function frustumLines(cone, path) {
   const side = Array.from({ length: SHELL_STEPS + 1 }, (_, i) => -1 + (2 * i) / SHELL_STEPS);
-  for (const u of [-1, 1]) for (const v of [-1, 1]) path.line([cone.origin, cone.at(cone.end, cone.direction(u, v))]);
+  for (const v of [-1, 1]) for (const u of [-1, 1]) path.line([cone.origin, cone.at(cone.end, cone.direction(u, v))]);
   const rim = [...side.map((s) => [s, -1]), ...side.map((s) => [1, s]), ...side.map((s) => [-s, 1]), ...side.map((s) => [-1, -s])];
   const outline = rim.map(([u, v]) => cone.direction(u, v));
   for (const radius of [cone.start, cone.end]) path.line(outline.map((d) => cone.at(radius, d)));
@@ -224,7 +224,6 @@ function sceneLayout(view, font) {
     paper_bgcolor: "#ffffff",
     margin: { l: 0, r: 0, t: 0, b: 0 },
     showlegend: false,
-    uirevision: "kept",
     scene: { aspectmode: "data", camera: view.camera, dragmode: flat ? "pan" : "orbit", ...axes },
   };
 }
