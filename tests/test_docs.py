@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from lidardesign.task import Task, conditions_of
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+CONSTRAINTS = (ROOT / "docs" / "constraints.md").read_text(encoding="utf-8")
 WRITING_TASKS = (ROOT / "docs" / "writing-tasks.md").read_text(encoding="utf-8")
 # The README's pictures are downloaded by everyone who clones it.
 LARGEST_PICTURE_BYTES = 250_000
@@ -33,39 +35,59 @@ def blocks(language: str, text: str = README) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
 
 
-def test_the_constraint_file_is_accepted():
-    text = next(block for block in blocks("yaml") if "buyable" in block)
-    constraints = Constraints.from_mapping(parse_yaml(text, where="README").value)
+def yaml_of(page: str, name: str) -> str:
+    """The file that a page shows under a name."""
+    return next(block for block in blocks("yaml", page) if block.startswith(f"# {name}"))
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/constraints.md"])
+def test_the_constraint_file_is_accepted(page):
+    text = yaml_of((ROOT / page).read_text(encoding="utf-8"), "buyable.yaml")
+    constraints = Constraints.from_mapping(parse_yaml(text, where=page).value)
     assert constraints.budget.rays == 576
 
 
-def test_the_mounts_of_the_ceiling_are_accepted():
-    text = next(block for block in blocks("yaml") if "ceiling.yaml" in block)
-    constraints = Constraints.from_mapping(parse_yaml(text, where="README").value)
+@pytest.mark.parametrize("page", ["arm.md", "constraints.md"])
+def test_the_mounts_of_the_ceiling_are_accepted(page):
+    text = yaml_of((ROOT / "docs" / page).read_text(encoding="utf-8"), "ceiling.yaml")
+    constraints = Constraints.from_mapping(parse_yaml(text, where=page).value)
     assert len(constraints.origin.mounts_m or ()) == 9
     assert constraints.sensors.count == 4
 
 
 def test_the_mounts_that_a_comment_shows_are_accepted():
-    (shown,) = re.findall(r"# (mounts_m: \[.*?\]\])", README)
-    origin = parse_yaml(shown, where="README").value
+    (shown,) = re.findall(r"# (mounts_m: \[.*?\]\])", CONSTRAINTS)
+    origin = parse_yaml(shown, where="constraints.md").value
     assert len(Constraints.from_mapping({"origin": origin}).origin.mounts_m or ()) == 2
 
 
+def leaves_of(model, path=()):
+    """The paths of all keys of a model, as `gate.width_m.max`."""
+    for name, field in model.model_fields.items():
+        kinds = (field.annotation, *get_args(field.annotation))
+        inner = next((kind for kind in kinds if hasattr(kind, "model_fields")), None)
+        if inner is None or name == "snap":
+            yield (*path, name)
+        else:
+            yield from leaves_of(inner, (*path, name))
+
+
 def test_every_constraint_key_that_is_shown_is_accepted_and_none_is_left_out():
-    text = next(block for block in blocks("yaml") if "each:" in block)
-    shown = parse_yaml(text, where="README").value
+    text = yaml_of(CONSTRAINTS, "every_key.yaml")
+    shown = parse_yaml(text, where="constraints.md").value
     Constraints.from_mapping(shown)
-    for section, model in Constraints.model_fields.items():
-        assert section in shown
-        keys = getattr(model.annotation, "model_fields", {})
-        assert all(key in text for key in keys)
+    table = CONSTRAINTS.partition("| key | what it bounds |")[2]
+    for path in leaves_of(Constraints):
+        assert path[0] in shown
+        # bounds of one quantity share a row and an example
+        named = [part for part in path if part not in ("min", "max")]
+        assert all(part in text for part in named), path
+        assert ".".join(named) in table or named[-1] in table, path
 
 
 def test_the_configuration_file_is_accepted(tmp_path):
-    text = next(block for block in blocks("yaml") if "scans.yaml" in block)
     path = tmp_path / "scans.yaml"
-    path.write_text(text)
+    path.write_text(yaml_of((ROOT / "docs" / "run-folder.md").read_text(encoding="utf-8"), "scans.yaml"))
     with pytest.raises(LidardesignError, match=r"scans: is not a folder") as caught:
         resolve(load_task("meshes"), config_file=path)
     assert caught.value.exit_code == 3
@@ -82,9 +104,15 @@ def test_every_exit_code_of_the_error_tree_is_listed():
 
 
 def test_every_command_is_shown():
+    shown = README + (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
     for command in app.registered_commands:
-        name = command.callback.__name__
-        assert name in README
+        assert f"lidardesign {command.name or command.callback.__name__}" in shown
+
+
+def test_every_page_is_in_the_index():
+    index = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
+    for page in (ROOT / "docs").glob("*.md"):
+        assert page.name == "README.md" or f"({page.name})" in index, page.name
 
 
 def test_the_example_task_keeps_the_contract_and_scores_a_ray():
