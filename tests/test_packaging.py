@@ -63,6 +63,7 @@ def test_the_wheel_holds_every_module_and_data_file_and_no_tests(wheel):
     expected |= {path.relative_to(ROOT / "tasks").as_posix() for path in (ROOT / "tasks").rglob("*.py")}
     expected |= {"lidardesign/py.typed", "lidardesign/design/design.schema.json"}
     expected |= {path.relative_to(ROOT).as_posix() for path in (ROOT / "lidardesign").rglob("*.yaml")}
+    expected |= {path.relative_to(ROOT).as_posix() for path in (ROOT / "lidardesign").rglob("template/*.txt")}
     data = ROOT / "tasks" / "lidardesign_tasks" / "data"
     expected |= {path.relative_to(ROOT / "tasks").as_posix() for path in data.iterdir() if path.is_file()}
     assert expected <= names

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from lidardesign.errors import LidardesignError, PluginError
+from lidardesign.registry import AUTHOR_HINT
 
 if TYPE_CHECKING:
     from lidardesign.testing.subject import Subject
 
+PACKAGE = Path(__file__).parents[1]
+# Libraries that tasks call, and that errors are raised in when they are called wrongly.
+LIBRARIES = ("numpy", "scipy", "trimesh", "pydantic", "mujoco")
 Outcome = Literal["pass", "fail", "skip"]
 # What comes before all laws: name, group and statement.
-LOADS = ("plugin loads", "interface", "the plugin is imported and has the members of the task interface")
+LOADS = (
+    "plugin loads",
+    "interface",
+    "it is imported, has all members of the interface, and its configuration resolves",
+)
 
 
 class BrokenLawError(PluginError):
@@ -94,6 +104,27 @@ def said(error: LidardesignError) -> str:
     parts = [error.message]
     if error.allowed:
         parts.append(f"allowed: {error.allowed}")
-    if error.hint:
+    # whoever checks a plugin is its author
+    if error.hint and AUTHOR_HINT not in error.hint:
         parts.append(f"try: {error.hint}")
     return "; ".join(parts)
+
+
+def place_of(error: BaseException) -> str:
+    """Where in other code than this package's an error comes from, as " (task.py:52)"; empty where that is unknown.
+
+    Of several places the last one counts that is in no installed library, unless there is none but in libraries.
+    """
+    while error.__cause__ is not None:
+        error = error.__cause__
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not _is_of_program(frame.filename)]
+    own = [frame for frame in frames if not _is_library(frame.filename)] or frames
+    return f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""
+
+
+def _is_of_program(file: str) -> bool:
+    return file.startswith("<") or Path(file).is_relative_to(PACKAGE)
+
+
+def _is_library(file: str) -> bool:
+    return any(name in Path(file).parts for name in (*LIBRARIES, "importlib", "contextlib.py"))

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 from lidardesign import registry
 from lidardesign.errors import ConfigError, DataError, LidardesignError
-from lidardesign.probe import BEGUN, GRACE_SECONDS, START_SECONDS, Apart, answer
+from lidardesign.probe import BEGUN, GRACE_SECONDS, START_SECONDS, UNHEARD, Apart, answer
 from lidardesign.run.config import resolve
-from lidardesign.testing.law import LOADS, Finding, Law, said
+from lidardesign.testing.law import LOADS, Finding, Law, place_of, said
 from lidardesign.testing.limits import Limits
 from lidardesign.testing.watch import Watch
 
@@ -174,7 +174,7 @@ def _settle(request: dict[str, Any]) -> None:
     """Limits on memory, a place for temporary files, and no compiled Python beside the plugin's sources."""
     temporary = _made(request, "temporary")
     tempfile.tempdir = os.environ["TMPDIR"] = temporary
-    sys.dont_write_bytecode = True
+    os.environ["PYTHONDONTWRITEBYTECODE"], sys.dont_write_bytecode = "1", True
     try:
         import resource
     except ImportError:  # not on Windows
@@ -206,7 +206,7 @@ def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
                 task, preset="draft", config_file=config_file, overrides=request["overrides"], seed=request["seed"]
             )
     except registry.PluginError as error:
-        _tell(result, Finding(*LOADS, "fail", said(error)))
+        _tell(result, Finding(*LOADS, "fail", f"{said(error)}{place_of(error)}"))
         return None
     except LidardesignError as error:
         if str(error.where).startswith("defaults of task"):
@@ -233,5 +233,8 @@ def _tell(result: BinaryIO, finding: Finding) -> None:
 
 
 def _write(result: BinaryIO, document: dict[str, Any]) -> None:
-    result.write(json.dumps(document).encode() + b"\n")
-    result.flush()
+    try:
+        result.write(json.dumps(document).encode() + b"\n")
+        result.flush()
+    except OSError:
+        os._exit(UNHEARD)

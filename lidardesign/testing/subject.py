@@ -18,7 +18,7 @@ from lidardesign.simulate.returns import Rays, Returns
 from lidardesign.simulate.simulate import build_casters, simulate
 from lidardesign.task import Score, Split, Task, conditions_of, scenes_of
 from lidardesign.testing.fingerprint import fingerprint
-from lidardesign.testing.law import BrokenLawError
+from lidardesign.testing.law import BrokenLawError, place_of
 from lidardesign.testing.limits import Limits
 from lidardesign.testing.probing import rays_at_targets
 from lidardesign.testing.watch import Watch
@@ -62,7 +62,8 @@ class Subject:
             with self.watch.during(what), plugin_guard(self.task.name):
                 yield
         except LidardesignError as error:
-            raise BrokenLawError(f"{what} failed: {error.message}", allowed=error.allowed) from error
+            told = error.message if error.message.startswith((what, "scoring")) else f"{what} failed: {error.message}"
+            raise BrokenLawError(f"{told}{place_of(error)}", allowed=error.allowed) from error
         finally:
             self.seconds[what] = max(self.seconds.get(what, 0.0), time.perf_counter() - started)
 
