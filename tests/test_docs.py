@@ -26,6 +26,7 @@ from lidardesign.task import Task, conditions_of
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 CONSTRAINTS = (ROOT / "docs" / "constraints.md").read_text(encoding="utf-8")
+SHELL = (ROOT / "docs" / "shell.md").read_text(encoding="utf-8")
 WRITING_TASKS = (ROOT / "docs" / "writing-tasks.md").read_text(encoding="utf-8")
 # The README's pictures are downloaded by everyone who clones it.
 LARGEST_PICTURE_BYTES = 250_000
@@ -99,7 +100,7 @@ def test_every_exit_code_of_the_error_tree_is_listed():
         for child in kind.__subclasses__():
             yield from codes(child)
 
-    listed = {int(number) for row in re.findall(r"^\| ([\d, ]+) \|", README, re.MULTILINE) for number in row.split(",")}
+    listed = {int(number) for row in re.findall(r"^\| ([\d, ]+) \|", SHELL, re.MULTILINE) for number in row.split(",")}
     assert {0, 70, 130, 141, 143} | set(codes(LidardesignError)) == listed
 
 
