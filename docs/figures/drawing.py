@@ -31,12 +31,26 @@ def command(*words: str | Path) -> dict[str, Any]:
     return json.loads(done.stdout)
 
 
-def save(figure: Figure, path: Path) -> None:
-    """As an opaque PNG with colours rounded to a 51st, which halves it: the picture lives in the repository."""
+def save(figure: Figure, path: Path, colours: int | None = None) -> None:
+    """As an opaque PNG with colours rounded to a 51st, or with so few, which halves it: it lives in the repository."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})
-    colours = np.asarray(Image.open(buffer).convert("RGB"))
-    rounded = COLOUR_STEP * np.round(colours / COLOUR_STEP)
+    if colours is None:
+        _save_rounded(Image.open(buffer), path)
+    else:
+        few = Image.open(buffer).convert("RGB").quantize(colours, kmeans=4, dither=Image.Dither.NONE)
+        few.save(path, optimize=True)
+
+
+def save_smaller(png: bytes, path: Path, width: int = 1600) -> None:
+    """A PNG that is meant for paper as a smaller one of so many pixels across."""
+    drawn = Image.open(io.BytesIO(png)).convert("RGB")
+    height = round(drawn.height * width / drawn.width)
+    _save_rounded(drawn.resize((width, height), Image.Resampling.LANCZOS), path)
+
+
+def _save_rounded(drawn: Image.Image, path: Path) -> None:
+    rounded = COLOUR_STEP * np.round(np.asarray(drawn.convert("RGB")) / COLOUR_STEP)
     Image.fromarray(rounded.astype(np.uint8)).save(path, optimize=True)
 
 

@@ -30,14 +30,14 @@ LEGEND_LETTERS = 64  # of all names, that fit beside each other
 DENSITY, EDGE = "#cfd6de", "#8593a3"
 # More designs than these are told apart no longer.
 MOST_DESIGNS = 6
-FIELD_INCHES, LEAST_INCHES, MOST_INCHES = 0.75, 1.8, 4.2
+LEAST_INCHES, MOST_INCHES = 1.3, 4.2
+LEFT_INCHES, RIGHT_INCHES, BELOW_INCHES, HEAD_INCHES = 0.6, 0.75, 0.45, 0.25
 TARGET, OTHER = "#d9d4cf", "#aab2bd"
 # From pale to dark, so that grey print keeps the order; the least of it is left clear.
 FIELD_COLOURS = ("#fde9b8", "#f6b04a", "#d95f30", "#93265f", "#2b0f54")
 FAINTEST = 0.02
 MOST_SHARE = 0.998  # of the cells that hold anything, up to the darkest colour
-LEAST_RATIO, MOST_RATIO = 0.3, 3.5
-BESIDE_INCHES, BAR_INCHES = 1.2, 0.1
+BAR_INCHES = 0.1
 
 
 def marginals_picture(view: DensityView) -> Figure:
@@ -81,29 +81,48 @@ def _draw_marginal(axes: Axes, marginal: Marginal) -> None:
 
 def field_picture(view: DensityView) -> Figure:
     """Where in space the density looks, over what the scene covers, a page wide; one panel per plane."""
-    ratios = [_panel_ratio(plane) for plane in view.planes]
-    # panels of one height, each with its labels and its colours beside it
-    usable = PAGE_INCHES - len(view.planes) * BESIDE_INCHES
-    inches = min(max(usable / sum(ratios), LEAST_INCHES), MOST_INCHES)
-    widths = [ratio * inches + BESIDE_INCHES for ratio in ratios]
-    figure = new_figure(PAGE_INCHES, inches + FIELD_INCHES)
-    panels = figure.subplots(1, len(view.planes), squeeze=False, gridspec_kw={"width_ratios": widths})[0]
-    for axes, plane in zip(panels, view.planes, strict=True):
-        _draw_plane(axes, plane, inches)
-    figure.suptitle(
-        f"what the density observes, over {plain_label(view.scene)} (outlined: its bodies)",
-        fontsize=SMALL_POINTS,
-        color=SOFT,
-    )
+    places, height = panel_places([_ratio(plane) for plane in view.planes])
+    figure = new_figure(PAGE_INCHES, height)
+    # panels keep their shape: where they are is known, and nothing is left to lay out
+    figure.set_layout_engine("none")
+    for plane, (left, bottom, width, tall) in zip(view.planes, places, strict=True):
+        size = (left / PAGE_INCHES, bottom / height, width / PAGE_INCHES, tall / height)
+        _draw_plane(figure.add_axes(size), plane, width)
+    told = f"what the density observes, over {plain_label(view.scene)} (outlined: its bodies)"
+    figure.text(0.5, 1 - 0.5 * HEAD_INCHES / height, told, fontsize=SMALL_POINTS, color=SOFT, ha="center", va="center")
     return figure
 
 
-def _panel_ratio(plane: PlaneDensity) -> float:
-    """Width over height of a panel; none is so narrow that its labels do not fit."""
-    return min(max(float(np.ptp(plane.edges[0]) / np.ptp(plane.edges[1])), LEAST_RATIO), MOST_RATIO)
+def panel_places(ratios: list[float]) -> tuple[list[tuple[float, float, float, float]], float]:
+    """Where panels of given width over height lie on a page: left, bottom, width and height, and the page's [inches].
+
+    Beside each other where they are high enough then, else below each other.
+    """
+    beside = (PAGE_INCHES - len(ratios) * (LEFT_INCHES + RIGHT_INCHES)) / sum(ratios)
+    if beside >= LEAST_INCHES or len(ratios) == 1:
+        tall = min(beside, MOST_INCHES)
+        widths = [ratio * tall for ratio in ratios]
+        spare = PAGE_INCHES - sum(widths) - len(ratios) * (LEFT_INCHES + RIGHT_INCHES)
+        steps = np.cumsum([0.0, *(width + LEFT_INCHES + RIGHT_INCHES for width in widths[:-1])])
+        lefts = [float(step) + spare / 2 + LEFT_INCHES for step in steps]
+        places = [(left, BELOW_INCHES, width, tall) for left, width in zip(lefts, widths, strict=True)]
+        return places, tall + BELOW_INCHES + HEAD_INCHES
+    usable = PAGE_INCHES - LEFT_INCHES - RIGHT_INCHES
+    sizes = [(min(usable, ratio * MOST_INCHES), min(usable / ratio, MOST_INCHES)) for ratio in ratios]
+    height = HEAD_INCHES + sum(tall + BELOW_INCHES for _, tall in sizes)
+    top, places = height - HEAD_INCHES, []
+    for width, tall in sizes:
+        places.append((LEFT_INCHES + (usable - width) / 2, top - tall, width, tall))
+        top -= tall + BELOW_INCHES
+    return places, height
 
 
-def _draw_plane(axes: Axes, plane: PlaneDensity, inches: float) -> None:
+def _ratio(plane: PlaneDensity) -> float:
+    """Width over height."""
+    return float(np.ptp(plane.edges[0]) / np.ptp(plane.edges[1]))
+
+
+def _draw_plane(axes: Axes, plane: PlaneDensity, width_inches: float) -> None:
     across, up = plane.edges
     extent = (across[0], across[-1], up[0], up[-1])
     axes.imshow(_bodies(plane), extent=extent, origin="lower", interpolation="nearest")
@@ -119,7 +138,7 @@ def _draw_plane(axes: Axes, plane: PlaneDensity, inches: float) -> None:
         if mask.any() and not mask.all():
             axes.contour(mask, (0.5,), extent=extent, colors=[colour], linewidths=0.5, alpha=0.7)
     beyond = "max" if plane.heights.max() > most else "neither"
-    bar = axes.figure.colorbar(drawn, extend=beyond, cax=_bar_axes(axes, float(np.ptp(across) / np.ptp(up)) * inches))
+    bar = axes.figure.colorbar(drawn, extend=beyond, cax=_bar_axes(axes, width_inches))
     bar.set_label(plane.unit.replace("2", "²"))
     bar.outline.set_visible(False)
     axes.spines[["top", "right"]].set_visible(False)
@@ -131,9 +150,9 @@ def shown_most(heights: np.ndarray) -> float:
 
 
 def _bar_axes(axes: Axes, width_inches: float) -> Axes:
-    """Axes for the colours beside a panel of about so many inches, as high as it is."""
-    width = max(width_inches, BAR_INCHES)
-    return axes.inset_axes((1.0 + 0.8 * BAR_INCHES / width, 0.0, BAR_INCHES / width, 1.0))
+    """Axes for the colours beside a panel of so many inches, as high as it is."""
+    width = BAR_INCHES / width_inches
+    return axes.inset_axes((1.0 + 0.8 * width, 0.0, width, 1.0))
 
 
 def _bodies(plane: PlaneDensity) -> np.ndarray:

@@ -1,38 +1,54 @@
-"""Draws docs/overview.png: the learned density over a head, sensors fitted to it, and what they are worth.
+"""Draws the pictures of docs/idea.md: docs/overview.png, the whole way from a scene to a score, and docs/idea-*.png.
 
-    python docs/figures/overview.py                 # learns a draft run on the embedded head model first
-    python docs/figures/overview.py --run RUN       # from a face run that is there
+    python docs/figures/idea.py                 # learns a draft run on the embedded head model first
+    python docs/figures/idea.py --run RUN       # from a face run that is there
 
-Everything shown is computed: the head is a held-out one, the density is the run's weighted samples, the sensors come
-from `lidardesign fit`, and the curves from `lidardesign evaluate`.
+Everything shown is computed: heads are held-out ones but for the outlines, which are those that are learned from;
+the density is the weighted samples of the run, sensors and rays come from `lidardesign fit`, scores from `evaluate`.
 """
 
 from __future__ import annotations
 
 import argparse
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from drawing import INK, PAPER, QUIET, command, save
+from drawing import INK, PAPER, QUIET, command, save, save_smaller
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.ticker import FixedLocator, FuncFormatter, MultipleLocator, NullLocator
 from scipy.ndimage import gaussian_filter
 
 from lidardesign.design.files import load_design
 from lidardesign.design.grid import field_on_sphere
+from lidardesign.design.rays import lay_out
 from lidardesign.design.samples import Samples, load_samples
 from lidardesign.design.sensor import Design, Sensor, tangent_directions
+from lidardesign.evaluate.density_views import density_view
+from lidardesign.evaluate.plots_camera import View, shaded, view_of
+from lidardesign.evaluate.plots_canvas import looks, picture
+from lidardesign.evaluate.plots_density import field_picture, marginals_picture
+from lidardesign.evaluate.plots_scene import OUTCOME_LOOKS
 from lidardesign.run.config import RunConfig, load_run_config
+from lidardesign.scene import Scene
 from lidardesign.simulate.raycast import SceneCaster
+from lidardesign.simulate.returns import Outcome, Rays, Returns
+from lidardesign.simulate.simulate import simulate
 from lidardesign.space import AZIMUTH, ELEVATION, angles, direction
 
-SIZE_INCHES, DOTS_PER_INCH = (16.0, 7.0), 100
+SIZE_INCHES, DOTS_PER_INCH = (14.0, 11.2), 100
+RAYS = 576
+COLOURS = 256  # of the overview: it has more areas than fit with all colours
+HALF_HIGH_M = 0.26  # of what the side view shows
+OUTLINES = 12  # heads that are learned from, drawn as outlines
 PIXELS = 1000  # of the head's picture, along each side
 BINS = 210  # of the density, along each side
 SERIES = {
@@ -42,19 +58,20 @@ SERIES = {
     "uniform": ("#555555", "x", (0, (4, 2, 1, 2))),
     "random": ("#999999", "+", (0, (1, 1.5))),
 }
+SENSOR = "#3b3f8f"
 HEAT = LinearSegmentedColormap.from_list("heat", ["#1b2a6b", "#7b2a8b", "#d5483c", "#f6a02c", "#fdf3b4"])
 GATES = LinearSegmentedColormap.from_list("gates", ["#f0a202", "#d5483c", "#8a2f8f", "#2c4bb0"])
 
 
 def computed(run: Path, learn: bool) -> tuple[Design, dict[str, Any]]:
-    """The drawn design, and the evaluation of two layouts of 10 sensors against the baselines."""
+    """Ten sensors with rays laid out by the density, and their evaluation beside an even layout and the baselines."""
     if learn:
         command("learn", "face", "--preset", "draft", "--out", run)
-    names = {"overview-grid": "grid", "overview-density": "density"}
+    names = {"overview-density": "density", "overview-grid": "grid"}
     for name, layout in names.items():
         command("fit", run, "--sensors", "10", "--layout", layout, "--name", name)
-    designs = [run / "designs" / f"{name}.yaml" for name in names]
-    return load_design(designs[0]), command("evaluate", *designs)
+    paths = [run / "designs" / f"{name}.yaml" for name in names]
+    return load_design(paths[0]), command("evaluate", *paths)
 
 
 class HeadView:
@@ -181,23 +198,109 @@ def draw_scores(axes: Axes, evaluation: dict[str, Any]) -> None:
     axes.legend(handles=lines[2:], loc="upper right", **look)
 
 
-def caption(figure: Figure, left: float, word: str, explanation: str) -> None:
-    """A heading over one of the three parts."""
-    figure.text(left, 0.945, word, fontsize=22, fontweight="bold", color=INK, va="center")
-    figure.text(left, 0.885, explanation, fontsize=13.5, color="#52606d", va="center")
+class SideView:
+    """Heads seen from the side, with where rays may start and look."""
+
+    def __init__(self, config: RunConfig, heads: list[Scene], head: Scene) -> None:
+        space = config.space
+        self.origin = np.array(space.low[:3]) / 2 + np.array(space.high[:3]) / 2
+        middle = (space.low[AZIMUTH] + space.high[AZIMUTH]) / 2
+        self.rims = direction(np.full(2, middle), np.array([space.low[ELEVATION], space.high[ELEVATION]]))
+        ahead = direction(middle, 0.0)
+        corners = self.origin + np.array([0.68 * ahead, -0.04 * ahead, (0, 0, HALF_HIGH_M), (0, 0, -HALF_HIGH_M)])
+        # straight from the side: the camera's own height and slant would hide the wedge
+        view = view_of(ahead[None], corners)
+        right = -ahead / np.linalg.norm(ahead)
+        up = np.array([0.0, 0.0, 1.0])
+        across, high = corners @ right, corners @ up
+        window = (across.min(), across.max(), high.min(), high.max())
+        self.view = View(right, up, np.cross(up, right), tuple(map(float, window)), view.near_m - 2.0)
+        self.head = shaded(head, 0, self.view, 900)
+        self.others = [shaded(one, 0, self.view, 450) for one in heads]
+
+    def draw(self, axes: Axes) -> None:
+        """The shaded head."""
+        axes.imshow(self.head.colour, extent=self.view.window, origin="lower", interpolation="antialiased")
+        axes.set(xlim=self.view.window[:2], ylim=self.view.window[2:])
+        axes.set_aspect("equal")
+        axes.set_axis_off()
+
+    def draw_space(self, axes: Axes) -> None:
+        """Outlines of the heads that are learned from, and the wedge of directions and ranges that rays may have."""
+        for other in self.others:
+            seen = np.isfinite(other.depth_m).astype(float)
+            axes.contour(seen, (0.5,), extent=self.view.window, colors=[QUIET], linewidths=0.8, alpha=0.6)
+        start = self.view.project(self.origin)
+        ends = self.view.project(self.origin + HALF_HIGH_M / abs(self.rims[0, 2]) * self.rims)
+        for end in ends:
+            axes.plot(*np.stack([start, end]).T, color=SENSOR, linewidth=1.6, linestyle=(0, (4, 3)))
+        axes.plot(*start, marker="D", color=SENSOR, markersize=10)
+
+    def draw_rays(self, axes: Axes, rays: Rays, returns: Returns) -> None:
+        """Rays by what became of them, up to their first hit or their gate's end, and the points that are measured."""
+        length = np.where(returns.returned, np.nan_to_num(returns.range_m), rays.gate_m[:, 1])
+        starts, ends = self.view.project(rays.origin_m), rays.origin_m + length[:, None] * rays.direction
+        lines = np.stack([starts, self.view.project(ends)], axis=1)
+        for kind, (colour, dash, _) in OUTCOME_LOOKS.items():
+            some = returns.outcome == kind
+            axes.add_collection(LineCollection(lines[some], colors=colour, linestyles=dash, linewidths=0.6, alpha=0.2))
+        measured = self.view.project(returns.points_m)
+        axes.plot(*measured.T, "o", color=OUTCOME_LOOKS[Outcome.RETURN][0], markersize=3.4)
+        axes.plot(*starts[0], marker="D", color=SENSOR, markersize=10)
+        shown = [kind for kind in reversed(OUTCOME_LOOKS) if (returns.outcome == kind).any()]
+        handles = [
+            Line2D([], [], color=OUTCOME_LOOKS[kind][0], linestyle=OUTCOME_LOOKS[kind][1], linewidth=2)
+            for kind in shown
+        ]
+        counts = [int((returns.outcome == kind).sum()) for kind in shown]
+        names = [f"{kind.name.lower().replace('_', ' ')} ({count})" for kind, count in zip(shown, counts, strict=True)]
+        axes.legend(handles, names, loc="lower right", frameon=False, fontsize=12, labelcolor=INK)
 
 
-def overview(config: RunConfig, head: Any, samples: Samples, design: Design, evaluation: dict[str, Any]) -> Figure:
-    """The whole picture."""
+def draw_rays(axes: Axes, view: HeadView, rays: Rays, design: Design) -> None:
+    """Where each ray looks, coloured by its sensor as the fields of view are."""
+    view.draw(axes, 1.0)
+    order = sorted(range(len(design.sensors)), key=lambda index: design.sensors[index].range_m)
+    colours = GATES(np.linspace(0, 1, len(order)))
+    for place, index in enumerate(order):
+        looking = view.degrees(rays.direction[rays.sensor == index])
+        axes.plot(*looking.T, "o", color=colours[place], markersize=4.2, markeredgecolor="white", markeredgewidth=0.4)
+
+
+def caption(figure: Figure, left: float, top: float, number: int, word: str, explanation: str) -> None:
+    """A heading over one of the parts."""
+    figure.text(left, top, f"{number}  {word}", fontsize=22, fontweight="bold", color=INK, va="center")
+    figure.text(left, top - 0.031, explanation, fontsize=13.5, color="#52606d", va="center")
+
+
+def overview(
+    side: SideView, view: HeadView, samples: Samples, design: Design, rays: Rays, found: Returns, scores: dict[str, Any]
+) -> Figure:
+    """The whole way, in six parts."""
     figure = Figure(figsize=SIZE_INCHES, dpi=DOTS_PER_INCH, facecolor=PAPER)
     FigureCanvasAgg(figure)
-    view = HeadView(config, head)
-    draw_density(figure.add_axes((0.015, 0.02, 0.30, 0.83)), view, samples)
-    draw_sensors(figure.add_axes((0.318, 0.02, 0.30, 0.83)), figure.add_axes((0.636, 0.10, 0.046, 0.66)), view, design)
-    draw_scores(figure.add_axes((0.746, 0.115, 0.242, 0.70)), evaluation)
-    caption(figure, 0.022, "learn", "where rays are worth firing, from simulated heads")
-    caption(figure, 0.345, "fit", "10 sensors: fields of view, and a time gate for each")
-    caption(figure, 0.712, "evaluate", f"on {evaluation['scenes']} held-out heads; lower is better")
+    columns, rows = (0.02, 0.35, 0.69), (0.525, 0.02)
+    first = figure.add_axes((columns[0], rows[0], 0.30, 0.40))
+    side.draw(first)
+    side.draw_space(first)
+    draw_density(figure.add_axes((columns[1], rows[0], 0.29, 0.41)), view, samples)
+    heads = figure.add_axes((columns[2] - 0.02, rows[0], 0.26, 0.41))
+    draw_sensors(heads, figure.add_axes((0.952, rows[0] + 0.05, 0.042, 0.31)), view, design)
+    draw_rays(figure.add_axes((columns[0] - 0.01, rows[1], 0.29, 0.41)), view, rays, design)
+    fifth = figure.add_axes((columns[1], rows[1], 0.29, 0.40))
+    side.draw(fifth)
+    side.draw_rays(fifth, rays, found)
+    draw_scores(figure.add_axes((0.735, rows[1] + 0.045, 0.255, 0.345)), scores)
+    words = [
+        ("scene", "simulated heads, and rays from the mark"),
+        ("density", "learn: where rays are worth firing"),
+        ("sensors", "fit: 10 fields of view, a time gate for each"),
+        ("rays", f"{len(rays)} of them, laid out by the density"),
+        ("returns", "what a held-out head sends back"),
+        ("score", f"evaluate: {scores['scenes']} held-out heads; lower is better"),
+    ]
+    for number, (word, explanation) in enumerate(words):
+        caption(figure, columns[number % 3] + 0.002, (0.978, 0.474)[number // 3], number + 1, word, explanation)
     return figure
 
 
@@ -205,15 +308,26 @@ def main() -> None:
     """Compute what is not there, and draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--run", type=Path, help="a run of the face task (default: learn a draft)")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "overview.png")
+    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1], help="the folder of the pictures")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         run = options.run or Path(folder) / "run"
-        design, evaluation = computed(run, learn=options.run is None)
+        design, scores = computed(run, learn=options.run is None)
         task, config = load_run_config(run)
         head = task.scenes(config.task.model_copy(update={"test": 1}), "test", config.seed)[0]
-        save(overview(config, head, load_samples(run), design, evaluation), options.out)
-    print(f"{options.out}: {options.out.stat().st_size / 1000:.0f} kB")
+        learned = task.scenes(config.task, "train", config.seed)[:OUTLINES]
+        samples = load_samples(run)
+    rays = lay_out(design, RAYS, samples)
+    side, front = SideView(config, list(learned), head), HeadView(config, head)
+    figure = overview(side, front, samples, design, rays, simulate(head, rays)[0], scores)
+    save(figure, options.out / "overview.png", colours=COLOURS)
+    view = density_view(samples, head, [replace(design, name="10 sensors")])
+    with looks():
+        save_smaller(picture(marginals_picture(view), "png"), options.out / "idea-marginals.png")
+        save_smaller(picture(field_picture(view), "png"), options.out / "idea-field.png")
+    for name in ("overview", "idea-marginals", "idea-field"):
+        path = options.out / f"{name}.png"
+        print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
 
 
 if __name__ == "__main__":
