@@ -10,9 +10,9 @@ import typer
 from lidardesign.cli import options
 from lidardesign.cli.console import command
 from lidardesign.cli.dry_run import DryRun
-from lidardesign.cli.fit import GATES, LAYOUTS, check_level, check_sensors, fit_and_write, load_libraries, usual_layout
+from lidardesign.cli.fit import check_choices, check_level, check_sensors, fit_and_write, load_libraries, usual_layout
 from lidardesign.cli.likes import likeness
-from lidardesign.cli.runs import check_choice, check_name, need_run, open_target, parse_at, sensor_count
+from lidardesign.cli.runs import check_name, need_run, open_target, parse_at, sensor_count
 from lidardesign.cli.weighting import Weighting
 
 if TYPE_CHECKING:
@@ -34,10 +34,7 @@ def constrain(
     overrides: Annotated[
         list[str] | None,
         typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="One constraint, as gate.width_m.max=0.1; repeatable.",
-            show_default=False,
+            "--set", metavar="KEY=VALUE", help="One constraint: gate.width_m.max=0.1; repeatable.", show_default=False
         ),
     ] = None,
     sensors: options.Sensors = None,
@@ -60,12 +57,12 @@ def constrain(
     with command(json=json, quiet=quiet, debug=debug) as console:
         check_name(name)
         load_libraries()
-        _check_choices(gates, layout)
+        check_choices(gates, layout)
         count, condition = sensor_count(sensors, None), parse_at(at)
-        checked = load_constraints(constraints, overrides or [])
+        asked = load_constraints(constraints, overrides or [])
         opened, design = open_target(target, console)
         run = need_run(opened, target)
-        checked, layout = likeness(like, checked, layout, rays, run, console)
+        checked, layout = likeness(like, asked, layout, rays, run, console)
         layout = layout or _usual(checked, design, run)
         check_sensors(count, layout)
         fit_and_write(
@@ -85,13 +82,6 @@ def constrain(
             refine=refine,
             dry_run=dry_run,
         )
-
-
-def _check_choices(gates: str | None, layout: str | None) -> None:
-    if gates is not None:
-        check_choice(gates, "--gates", GATES)
-    if layout is not None:
-        check_choice(layout, "--layout", LAYOUTS)
 
 
 def _usual(constraints: Constraints, design: Design | None, run: Run) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -54,10 +55,7 @@ def fit(
     with command(json=json, quiet=quiet, debug=debug) as console:
         check_name(name)
         load_libraries()
-        if layout is not None:
-            check_choice(layout, "--layout", LAYOUTS)
-        if gates is not None:
-            check_choice(gates, "--gates", GATES)
+        check_choices(gates, layout)
         count, condition = sensor_count(sensors, None), parse_at(at)
         opened = open_run(run)
         constraints, layout = likeness(like, None, layout, rays, opened, console)
@@ -84,6 +82,18 @@ def fit(
             refine=refine,
             dry_run=dry_run,
         )
+
+
+def check_choices(gates: str | None, layout: str | None) -> None:
+    """Refuse gates and layouts that there are none of.
+
+    Raises:
+        ConfigError: See above.
+    """
+    if layout is not None:
+        check_choice(layout, "--layout", LAYOUTS)
+    if gates is not None:
+        check_choice(gates, "--gates", GATES)
 
 
 @phase("libraries")
@@ -165,7 +175,6 @@ def fit_and_write(
 
         given = {"constraints": constraints, "at": at or {}, "weighting": weighting, "refine": refine}
         return tell_plan(fit_plan(run, command_name, name, seed=seed, choices=choices, **given), console)
-    from dataclasses import replace
 
     from lidardesign.cli.designs import show_fit, write_design
     from lidardesign.cli.refine import FitOrder, fitted, refined, show_refinement

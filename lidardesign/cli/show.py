@@ -59,7 +59,8 @@ def show(
         def print_all(rich: RichConsole) -> None:
             show_design(loaded, rich)
             show_constraints(checks, rich)
-            rich.print(_shown_readout(readout), soft_wrap=True, markup=False)
+            for line in _shown_readout(readout):
+                rich.print(line, soft_wrap=True, markup=False)
 
         console.result(_document(loaded, design, checks, readout), print_all, show_costs=False)
 
@@ -100,14 +101,13 @@ def _checks(design: Design, path: Path, run: Run | None, console: Console) -> li
     return check_design(design_document(design), design.constraints, None if run is None else run.config.space)
 
 
-def _shown_readout(readout: Readout) -> str:
-    """Rays and bandwidth in one line."""
+def _shown_readout(readout: Readout) -> list[str]:
+    """Bandwidth, and the read-out that it is of."""
     from lidardesign.cli.designs import number
 
     model = readout.model
-    said = f"{number(model.bin_ps)} ps bins of {number(model.bits_per_bin)} bits, {number(model.rate_hz)} frames/s"
+    of = f"({number(model.bin_ps)} ps bins of {number(model.bits_per_bin)} bits, {number(model.rate_hz)} frames/s)"
     low, high = number(readout.low_mbps), number(readout.high_mbps)
     span = low if low == high else f"{low} .. {high}"
-    if readout.rays is None:
-        return f"bandwidth: {span} Mbit/s per ray in a frame ({said})"
-    return f"bandwidth: {span} Mbit/s for {readout.rays} rays per frame ({said})"
+    rays = "each ray in a frame" if readout.rays is None else f"{readout.rays} rays per frame"
+    return [f"bandwidth: {span} Mbit/s for {rays}", of]
