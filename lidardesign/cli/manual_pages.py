@@ -140,6 +140,25 @@ PAGES: dict[str, Manual] = {
         {"lidardesign tasks list": "names, and why a broken one is broken"}, see=("writing-tasks.md",)
     ),
     "tasks show": Manual({"lidardesign tasks show face": "its metric, its keys with units and defaults, its space"}),
+    "tasks check": Manual(
+        {
+            "lidardesign tasks check landmark": "a table of all laws, with what was measured",
+            "lidardesign tasks check meshes --set folder=scans --json": "with settings, for scripts",
+        },
+        about="Every law of the contract is tried: determinism, splits that share nothing, fields of the right sign "
+        "and slope that agree with rays, scores that are numbers and worse for less, no global random state, nothing "
+        "written. The task runs in a process of its own with limits.",
+        exits={6: "a law does not hold, or the plugin does not load"},
+        see=("writing-tasks.md",),
+    ),
+    "tasks new": Manual(
+        {
+            "lidardesign tasks new landmark": "the package lidardesign-landmark, in this folder",
+            "lidardesign tasks new landmark --out work/landmark": "in a folder of another name",
+        },
+        files=("--out DIR: a new or empty folder; nothing is overwritten",),
+        see=("writing-tasks.md",),
+    ),
     "config init": Manual(
         {
             "lidardesign config init meshes --set folder=scans --out scans.yaml": "a file to edit, for learn --config",

@@ -225,8 +225,5 @@ def _shown_default(value: Any) -> str:
     return "[" + ", ".join(map(str, value)) + "]" if isinstance(value, list | tuple) else str(value)
 
 
-for subcommand, examples in {
-    check: ("lidardesign tasks check face", "lidardesign tasks check meshes --set folder=scans --json"),
-    new: ("lidardesign tasks new landmark", "lidardesign tasks new landmark --out work/landmark"),
-}.items():
-    tasks_app.command(epilog="\n\n".join(("Examples:", *examples)))(subcommand)
+for subcommand in (check, new):
+    tasks_app.command()(subcommand)

@@ -38,10 +38,7 @@ def check(
     quiet: options.Quiet = False,
     debug: options.Debug = False,
 ) -> None:
-    """Check that a task keeps the contract: every law, with figures; exit 6 where one does not hold.
-
-    The task runs in a process of its own with limits, so one that hangs, crashes or writes about harms nothing.
-    """
+    """Check that a task keeps the contract: every law, with figures; exit 6 where one does not hold."""
     with command(json=json, quiet=quiet, debug=debug) as console:
         with phase("libraries"):
             from lidardesign.testing.contract import refuse_broken

@@ -26,10 +26,7 @@ def new(
     quiet: options.Quiet = False,
     debug: options.Debug = False,
 ) -> None:
-    """Write an installable package of a new task: task, configuration, tests, README and CI file.
-
-    It keeps the contract and passes its own tests as it is written; change it from there.
-    """
+    """Write an installable package of a new task, which keeps the contract and passes its own tests as it is."""
     with command(json=json, quiet=quiet, debug=debug) as console:
         with phase("libraries"):
             from lidardesign.testing.scaffold import new_task
