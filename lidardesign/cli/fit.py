@@ -80,7 +80,7 @@ def fit(
             at=condition,
             weighting=Weighting(tuple(weights or ())),
             refine=refine,
-            dry_run=dry_run,
+            plan_of=(like,) if dry_run else None,
         )
 
 
@@ -152,7 +152,7 @@ def fit_and_write(
     at: Mapping[str, float] | None = None,
     weighting: Weighting,
     refine: int | None = None,
-    dry_run: bool = False,
+    plan_of: Sequence[Path | None] | None = None,
     **choices: Any,
 ) -> None:
     """Fit a design to a run's samples, refine it if asked to, write it, and give the result.
@@ -167,14 +167,14 @@ def fit_and_write(
         at: Condition values that the design is for; without any, one for all of them.
         weighting: What the density is multiplied by.
         refine: Rounds of refinement, or None.
-        dry_run: Only say what would be done.
+        plan_of: Where only the plan is wanted, the files that were read for it.
         choices: sensors, layout, rays, gates and level, as `lidardesign.design.fit.fit` takes them.
     """
-    if dry_run:
+    if plan_of is not None:
         from lidardesign.cli.dry_designs import fit_plan
 
         given = {"constraints": constraints, "at": at or {}, "weighting": weighting, "refine": refine}
-        return tell_plan(fit_plan(run, command_name, name, seed=seed, choices=choices, **given), console)
+        return tell_plan(fit_plan(run, command_name, name, plan_of, seed=seed, choices=choices, **given), console)
 
     from lidardesign.cli.designs import show_fit, write_design
     from lidardesign.cli.refine import FitOrder, fitted, refined, show_refinement
@@ -182,9 +182,8 @@ def fit_and_write(
 
     path = run.design_path(name)
     order = FitOrder(run, name, seed, constraints, at or {}, choices)
-    further: dict[str, Any] = {}
     if refine is None:
-        result, weighting = fitted(order, weighting, console)
+        (result, weighting), further = fitted(order, weighting, console), {}
     else:
         (result, weighting), further = refined(order, weighting, refine, console)
     for note in result.notes:
