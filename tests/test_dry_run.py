@@ -23,6 +23,14 @@ def flat(tmp_path):
     return make_run(tmp_path / "run")
 
 
+@pytest.fixture
+def given_files(lidardesign, flat, tmp_path):
+    """A design of two sensors, constraints and a configuration."""
+    lidardesign("fit", flat, "--sensors", 2)
+    (tmp_path / "few.yaml").write_text("budget: {rays: 40}\n")
+    (tmp_path / "flat.yaml").write_text("task: {variation: 0.5}\n")
+
+
 def dry(lidardesign, tmp_path, *arguments):
     """The plan of a command, which must leave everything as it is."""
     before = files_under(tmp_path)
@@ -167,3 +175,13 @@ def test_another_run_whose_files_are_damaged_is_no_example(lidardesign, tmp_path
     (broken / "manifest.json").write_text(json.dumps([]))
     (broken / "config.yaml").write_text("{")
     assert dry(lidardesign, tmp_path, "learn", "flatland")["before"] is None
+
+
+def test_files_that_were_given_are_among_those_that_are_read(lidardesign, given_files, tmp_path):
+    plan = dry(lidardesign, tmp_path, "constrain", "run/designs/fit.yaml", "--constraints", "few.yaml")
+    assert [entry["path"] for entry in plan["reads"]][:2] == ["run/designs/fit.yaml", "few.yaml"]
+    plan = dry(lidardesign, tmp_path, "learn", "flatland", "--config", "flat.yaml")
+    assert [entry["path"] for entry in plan["reads"]] == ["flat.yaml"]
+    plan = dry(lidardesign, tmp_path, "fit", "run", "--like", "run/designs/fit.yaml")
+    assert plan["reads"][0]["path"] == "run/designs/fit.yaml"
+    assert plan["settings"]["sensors"] == 2

@@ -80,7 +80,7 @@ def constrain(
             at={**(design.at if design else {}), **condition},
             weighting=_weighting(weights, design, console),
             refine=refine,
-            dry_run=dry_run,
+            plan_of=(target if design else None, constraints, like) if dry_run else None,
         )
 
 

@@ -20,6 +20,7 @@ def fit_plan(
     run: Run,
     command: str,
     name: str,
+    read: Sequence[Path | None],
     *,
     seed: int,
     constraints: Constraints | None,
@@ -28,7 +29,7 @@ def fit_plan(
     refine: int | None,
     choices: Mapping[str, Any],
 ) -> Plan:
-    """The plan of a fit; what it is made of is as `fit_and_write` takes it.
+    """The plan of a fit; what it is made of is as `fit_and_write` takes it, `read` are files that were given.
 
     Raises:
         DataError: The run has no samples yet, or they are not those that were recorded.
@@ -54,7 +55,7 @@ def fit_plan(
     return Plan(
         command,
         _fit_steps(settings, run.task.name),
-        [run.folder / name for name in (CONFIGURATION, MANIFEST, SAMPLES)],
+        [*filter(None, read), *(run.folder / name for name in (CONFIGURATION, MANIFEST, SAMPLES))],
         [run.design_path(name), run.folder / MANIFEST],
         settings,
         last_time(run.folder, command),
