@@ -41,9 +41,9 @@ def caller(capsys, tmp_path, monkeypatch):
     return call
 
 
-def make_run(folder: Path, count: int = 4000) -> Path:
-    """A run as `learn` leaves it, with samples around two spots of flatland instead of a learned density."""
-    task = load_task("flatland")
+def make_run(folder: Path, count: int = 4000, task: str = "flatland") -> Path:
+    """A run as `learn` leaves it, with samples around two spots of its space instead of a learned density."""
+    task = load_task(task)
     config = resolve(task, preset="draft", seed=3)
     generator = np.random.default_rng(0)
     points = config.space.sample(count, generator)

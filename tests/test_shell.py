@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import typer
 from command_line import caller, files_under, make_run
 
@@ -250,6 +251,60 @@ def test_an_example_is_parsed_by_the_program(words):
     while hasattr(command, "commands"):
         command, words = command.commands[words[0]], words[1:]
     command.make_context(command.name, list(words))
+
+
+PLANNED = ("learn", "fit", "constrain", "evaluate", "export")
+# These need no plan, or a run that was learned and not only made.
+UNPLANNED = ("--list", "--resume", "--accuracy")
+RIG = """<sdf version="1.9"><model name="robot"><link name="body">
+<sensor name="front" type="gpu_lidar"><pose>0.4 0 0 0 0 3.1</pose><lidar><scan>
+<horizontal><samples>8</samples><min_angle>-0.2</min_angle><max_angle>0.2</max_angle></horizontal>
+<vertical><samples>8</samples><min_angle>-0.2</min_angle><max_angle>0.2</max_angle></vertical>
+</scan><range><min>0.1</min><max>1.0</max></range></lidar></sensor></link></model></sdf>
+"""
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with the files that examples name: runs with a design each, constraints, a configuration, meshes."""
+    folder = tmp_path_factory.mktemp("place")
+    (folder / "scans").mkdir()
+    cube = trimesh.creation.box((100, 100, 100))
+    for name in ("one", "two"):
+        cube.export(folder / "scans" / f"{name}.stl")
+    for name in ("face", "warehouse", "arm"):
+        make_run(folder / "runs" / name, count=1000, task=name)
+        (folder / "runs" / name / "designs").mkdir()
+        for design in ("free", "track"):
+            text = (ROOT / "examples" / "hand_written_design.yaml").read_text(encoding="utf-8")
+            text += "\nprovenance: {run: ..}\n"
+            (folder / "runs" / name / "designs" / f"{design}.yaml").write_text(text)
+    (folder / "buyable.yaml").write_text("gate: {width_m: {max: 0.1}}\n")
+    (folder / "robot.sdf").write_text(RIG)
+    return folder
+
+
+def planned_examples():
+    return [one for one in examples() if one.values[0][0] in PLANNED and not set(one.values[0]) & set(UNPLANNED)]
+
+
+@pytest.mark.parametrize("words", planned_examples())
+def test_an_example_can_be_done_where_its_files_are(lidardesign, place, monkeypatch, words):
+    monkeypatch.chdir(place)
+    before = sorted(place.rglob("*"))
+    text = "budget: {rays: 196}\n" if "--constraints" in words else "preset: draft\n"
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(text.encode())))
+    if words[0] == "learn":  # the runs that other examples work on are there already
+        words = [*words, "--out", "runs/new"]
+    result = lidardesign(*words, "--dry-run")
+    assert result.code == 0, result.err
+    assert sorted(place.rglob("*")) == before
+
+
+def test_every_command_has_the_options_that_all_have():
+    for name, command in commands():
+        names = {name for parameter in command.params for name in parameter.opts}
+        assert {"--json", "--seed", "--quiet", "-q", "--debug"} <= names, name
 
 
 def test_the_command_reference_is_the_program_s(monkeypatch):
