@@ -6,6 +6,7 @@ import math
 import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -31,13 +32,13 @@ from lidardesign.evaluate.plots_canvas import (
     plain_label,
     write_pictures,
 )
-from lidardesign.evaluate.plots_scene import OUTCOME_LOOKS, framed_points, opened
+from lidardesign.evaluate.plots_scene import OUTCOME_LOOKS, framed_points, opened, scene_picture
 from lidardesign.evaluate.plots_scores import MOST_ROWS, curve_picture, shown_pairs
 from lidardesign.evaluate.plots_times import phase_rows
 from lidardesign.evaluate.results import Evaluation, Paired, Row
 from lidardesign.evaluate.shown import shown_in
 from lidardesign.evaluate.tables import csv_text, write_csv
-from lidardesign.scene import Body, Box, Plane, Scene, Sphere, rigid
+from lidardesign.scene import Body, Box, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.plan import Tolerance
 from lidardesign.simulate.returns import Outcome, Rays
 from lidardesign.space import DesignSpace
@@ -268,6 +269,19 @@ def test_a_room_is_cut_open_where_its_walls_hide_the_sensors():
     assert cut
     assert not image.hides(view, np.zeros((1, 3)), 0.05).any()
     assert not opened(make_shown(), 0, 0, view, 60)[1]
+
+
+def test_a_detector_of_its_own_has_a_mark():
+    scene = replace(BALL, receiver=Receiver((0.0, 0.5, 0.0), 0.0, 0.0, 0.5, 0.5, (0.1, 9.0)))
+    shown = replace(make_shown(), scene=scene)
+    left, right, bottom, top = (view := view_of(shown.directions, framed_points(shown, 0, 0))).window
+    across, up = view.project(np.array([0.0, 0.5, 0.0]))
+    assert left < across < right
+    assert bottom < up < top
+    with looks():
+        names = [text.get_text() for text in scene_picture(shown).legends[0].get_texts()]
+        assert "detector" in names
+        assert "detector" not in [text.get_text() for text in scene_picture(make_shown()).legends[0].get_texts()]
 
 
 def test_a_flat_world_is_seen_from_above():

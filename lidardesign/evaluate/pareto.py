@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from lidardesign.evaluate.plots_canvas import (
-    COLUMN_INCHES,
     LETTERS_POINTS,
+    PAGE_INCHES,
     SMALL_POINTS,
     label_powers,
     label_ticks,
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLUMNS = 2
-PANEL_INCHES = (COLUMN_INCHES, 2.7)
+COLUMNS = 3
+PANEL_INCHES = (PAGE_INCHES / COLUMNS, 2.2)
 # Axes span at least so many times their smallest value, and end so far beyond what they show.
 LEAST_SPAN = 4.0
 BEYOND = 1.5
@@ -40,7 +40,7 @@ LINE, CHOSEN, TOLERANCE = "#0072B2", "#D55E00", "#555555"
 PALE = 0.45
 LONGEST_SETTING = 22
 # Points per inch, and a line of the settings' text [points].
-POINTS, LINE_POINTS = 72.0, 9.0
+POINTS, LINE_POINTS = 72.0, 8.0
 # Text on marks whose places along the axis differ by more than this share of it does not meet.
 TEXT_SHARE = 0.45
 LEFT_FROM = 0.66
@@ -224,9 +224,9 @@ def _draw_mark(axes: Axes, mark: Mark) -> None:
         axes.plot([mark.x, mark.x], [mark.low, mark.high], color=colour, linewidth=1.0, alpha=alpha, zorder=3)
     look = {"linestyle": "none", "clip_on": False, "zorder": 4}
     shape = "v" if mark.on_edge else "o"
-    axes.plot(mark.x, mark.y, marker=shape, markersize=6.5, color=colour, alpha=alpha, markeredgewidth=0, **look)
+    axes.plot(mark.x, mark.y, marker=shape, markersize=4.5, color=colour, alpha=alpha, markeredgewidth=0, **look)
     if mark.rung.default:
-        axes.plot(mark.x, mark.y, marker="o", markersize=12, color="none", markeredgecolor="#222222", **look)
+        axes.plot(mark.x, mark.y, marker="o", markersize=8.5, color="none", markeredgecolor="#222222", **look)
 
 
 def label_places(panel: Panel, height: float, line: float) -> list[tuple[float, float, str]]:
@@ -264,9 +264,9 @@ def _legend() -> tuple[list[object], list[str]]:
 
     dot = {"linestyle": "none", "marker": "o"}
     handles = [
-        Line2D([], [], color=CHOSEN, markersize=6.5, **dot),
-        Line2D([], [], color="none", markeredgecolor="#222222", markersize=11, **dot),
-        Line2D([], [], color=LINE, linestyle="none", marker="v", markersize=6.5),
+        Line2D([], [], color=CHOSEN, markersize=4.5, **dot),
+        Line2D([], [], color="none", markeredgecolor="#222222", markersize=8.5, **dot),
+        Line2D([], [], color=LINE, linestyle="none", marker="v", markersize=4.5),
         Line2D([], [], color=TOLERANCE, linestyle="dashed", linewidth=1.0),
     ]
     return handles, ["the one to choose", "the run's own", "reference, or next to no error", "tolerance"]

@@ -42,6 +42,7 @@ SEEN, HIDDEN = 0.65, 0.12
 DENSE_RAYS = 100
 # Bodies that reach further than this many times beyond the rays are cut.
 REACH = 0.6
+RECEIVER_LOOK = {"marker": "s", "color": INK, "markersize": 4.0, "linestyle": "none", "zorder": 5}
 # Things nearer than this share of the picture's width do not hide each other.
 SLACK_SHARE = 0.004
 # Where more than this share of the rays start behind something, what is before the sensors is cut away.
@@ -63,13 +64,17 @@ def scene_picture(shown: Shown) -> Figure:
     width = PAGE_INCHES / columns
     height = min(width / view.ratio, LARGEST_PANEL)
     figure = new_figure(PAGE_INCHES, rows * (height + HEAD_INCHES) + LEGEND_INCHES)
+    receiver = shown.scene.receiver
     pixels = int(PIXELS_PER_INCH * min(width, height * view.ratio))
     image, cut = opened(shown, place, step, view, pixels)
     for number, design in enumerate(designs):
         axes = figure.add_subplot(rows, columns, number + 1)
         _draw_scene(axes, image, view)
         _draw_design(axes, design, place, step, image, view)
-    _legend(figure, [int(kind) for one in designs for kind in np.unique(one.outcome[place, step])])
+        if receiver is not None:
+            axes.plot(*view.project(np.array(receiver.origin_m)), **RECEIVER_LOOK)
+    kinds = [int(kind) for one in designs for kind in np.unique(one.outcome[place, step])]
+    _legend(figure, kinds, receiver=receiver is not None)
     figure.suptitle(_told(shown, place, step) + CUT_OPEN * cut, fontsize=SMALL_POINTS, color=SOFT)
     return figure
 
@@ -88,7 +93,8 @@ def opened(shown: Shown, place: int, step: int, view: View, pixels: int) -> tupl
 
 def framed_points(shown: Shown, place: int, step: int) -> np.ndarray:
     """What the picture must hold: where rays start and end, and bodies that are not far beyond, shape (K, 3) [m]."""
-    ends = [np.zeros((0, 3))]
+    receiver = shown.scene.receiver
+    ends = [np.zeros((0, 3)) if receiver is None else np.array([receiver.origin_m])]
     for one in shown.designs:
         rays = one.rays[place]
         # what hits nothing ends somewhere
@@ -203,7 +209,7 @@ def _drawn_sensors(sensors: Sequence[Sensor]) -> Sequence[Sensor]:
     return sensors if len(sensors) <= MOST_SENSORS else ()
 
 
-def _legend(figure: Figure, kinds: Sequence[int]) -> None:
+def _legend(figure: Figure, kinds: Sequence[int], *, receiver: bool) -> None:
     from matplotlib.lines import Line2D
 
     shown = [kind for kind in Outcome if int(kind) in kinds]
@@ -214,6 +220,9 @@ def _legend(figure: Figure, kinds: Sequence[int]) -> None:
         for kind, (colour, dash, _) in looks.items()
     ]
     names = ["sensor, field of view and gate", *(kind.name.lower().replace("_", " ") for kind in shown)]
+    if receiver:
+        handles.append(Line2D([], [], **RECEIVER_LOOK))
+        names.append("detector")
     look = {"ncols": 6, "frameon": False, "handlelength": 2.4, "columnspacing": 1.2}
     figure.legend(handles, names, loc="outside lower center", **look)
 
