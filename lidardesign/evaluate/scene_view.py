@@ -39,11 +39,11 @@ MANY_RAYS, FAINT = 300, 0.22
 LARGEST_UINT16 = 65_535
 # What tells outcomes apart beside their colours (Okabe and Ito 2008): dashes of lines, marks at their ends.
 OUTCOMES = (
-    (Outcome.RETURN, "return", "#009E73", "solid", "circle"),
+    (Outcome.RETURN, "return", "#009E73", "solid", "plus"),
     (Outcome.OCCLUDED, "occluded", "#D55E00", "dash", "x"),
-    (Outcome.AFTER_GATE, "behind the gate", "#0072B2", "dot", "diamond-open"),
+    (Outcome.AFTER_GATE, "behind the gate", "#0072B2", "dot", "diamond"),
     (Outcome.MISS, "nothing hit", "#6b7280", "longdash", None),
-    (Outcome.NOT_DETECTED, "not detected", "#CC79A7", "dashdot", "cross"),
+    (Outcome.NOT_DETECTED, "not detected", "#CC79A7", "dashdot", "square"),
 )
 # Dashes of plotly by those of curves.
 DASHES = {"solid": "solid", "dashed": "dash", "dashdot": "dashdot", "dotted": "dot"}

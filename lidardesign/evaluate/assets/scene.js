@@ -4,6 +4,14 @@
 const SHELL_STEPS = 8; // along each side of a gate's shell, as in drawing.py
 const TURN_STEPS = 24; // round an ellipse of origins
 const CONE = 25; // numbers per sensor: origin 3, frame 9, field of view 2, gate 2, axes of origins 9
+// Marks at the ends of rays, as lines about a point: plotly's own take far longer until they are first drawn.
+const MARK_SHARE = 0.006; // of the scene's extent
+const MARKS = {
+  plus: [[[-1, 0, 0], [1, 0, 0]], [[0, -1, 0], [0, 1, 0]], [[0, 0, -1], [0, 0, 1]]],
+  x: [[[-1, -1, -1], [1, 1, 1]], [[1, -1, -1], [-1, 1, 1]]],
+  diamond: [[[1.2, 0, 0], [0, 0, 1.2], [-1.2, 0, 0], [0, 0, -1.2], [1.2, 0, 0]], [[0, 1.2, 0], [0, 0, 1.2], [0, -1.2, 0], [0, 0, -1.2], [0, 1.2, 0]]],
+  square: [[[1, 0, 1], [-1, 0, 1], [-1, 0, -1], [1, 0, -1], [1, 0, 1]], [[0, 1, 1], [0, -1, 1], [0, -1, -1], [0, 1, -1], [0, 1, 1]]],
+};
 const LIGHT_DISTANCE = 1e4; // far away, so that light is parallel
 
 function bytesOf(text) {
@@ -133,8 +141,10 @@ function bodyTraces(view, state) {
   const lighting = { ambient: 0.55, diffuse: 0.7, specular: 0.05, roughness: 0.9 };
   const eye = view.camera.eye;
   const lightposition = { x: LIGHT_DISTANCE * eye.x, y: LIGHT_DISTANCE * eye.y, z: LIGHT_DISTANCE * eye.z };
-  return [["scene", true, "#c9b8a8"], ["occluders", false, "#6b7280"]].map(([name, target, color]) =>
-    meshTrace(bodyColumns(view, target, state.frame), { color, lighting, lightposition, visible: state.layers[name] !== false }));
+  return [["scene", true, "#c9b8a8"], ["occluders", false, "#6b7280"]].map(([name, target, color]) => {
+    const columns = bodyColumns(view, target, state.frame);
+    return meshTrace(columns, { color, lighting, lightposition, visible: state.layers[name] !== false && columns.x.length > 0 });
+  });
 }
 
 // Segments of the rays of all designs and sensors that are switched on, by outcome; and how many there are of each.
@@ -159,16 +169,27 @@ function rayPaths(view, state) {
   return paths;
 }
 
+function markLines(ends, symbol, size) {
+  const path = new Path();
+  for (let n = 0; n < ends.x.length; n++) {
+    for (const line of MARKS[symbol]) path.line(line.map((d) => [ends.x[n] + size * d[0], ends.y[n] + size * d[1], ends.z[n] + size * d[2]]));
+  }
+  return path;
+}
+
 function rayTraces(view, state, paths) {
   const traces = [];
+  const extent = Math.max(...[0, 1, 2].map((k) => view.bounds[1][k] - view.bounds[0][k]));
   for (const { code, colour, dash, symbol } of view.outcomes) {
     const { lines, ends, count } = paths.get(code);
     const visible = state.outcomes[code] !== false && count > 0;
     const faint = symbol === null && count > view.many;
     const common = { type: "scatter3d", hoverinfo: "skip", visible };
     traces.push({ ...common, mode: "lines", x: lines.x, y: lines.y, z: lines.z, opacity: faint ? view.faint : 0.6, line: { color: colour, width: 1.6, dash } });
-    const size = symbol === "circle" ? 2.6 : 4;
-    if (symbol) traces.push({ ...common, mode: "markers", x: ends.x, y: ends.y, z: ends.z, marker: { color: colour, size, symbol } });
+    if (symbol) {
+      const marks = markLines(ends, symbol, MARK_SHARE * extent);
+      traces.push({ ...common, mode: "lines", x: marks.x, y: marks.y, z: marks.z, line: { color: colour, width: 2 } });
+    }
   }
   return traces;
 }
