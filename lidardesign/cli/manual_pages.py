@@ -110,7 +110,7 @@ PAGES: dict[str, Manual] = {
             "DESIGN: a design, the research code's sensor CSV, or a rig of others: rays as CSV or NPZ, a MuJoCo model "
             "with rangefinders, an SDF file with lidars",
         ),
-        see=("design-file.md", "formats.md"),
+        see=("design-file.md", "rigs.md", "formats.md"),
     ),
     "compare": Manual(
         {
@@ -121,7 +121,7 @@ PAGES: dict[str, Manual] = {
         about="Shows what differs, sensor by sensor, and what that is worth: both are scored in the same held-out "
         "scenes, and the differences scene by scene have the intervals that tell two designs apart.",
         exits=FROM_A_RUN,
-        see=("design-file.md", "evaluate.md"),
+        see=("rigs.md", "evaluate.md"),
     ),
     "catalog list": Manual(
         {"lidardesign catalog list --reflectance 10 --klux 100": "ranges stated for dark targets in the sun"},
