@@ -71,7 +71,7 @@ BROKEN = {
     ],
     "splits are disjoint": [("split, i)", "i)", "is the held-out scene 'test 0'")],
     "scenes are picklable": [('{"at": centre}', '{"at": centre, "f": lambda: 0}', "cannot be pickled")],
-    "targets are in reach": [(CENTRE, CENTRE.replace("0.0]", "90.0]"), "none of 300 rays")],
+    "targets are in reach": [(CENTRE, CENTRE.replace("0.0]", "90.0]"), "none of 3000 rays")],
     "scores are numbers": [
         (VALUE, "        return 3.0\n", "score returned float"),
         (VALUE, "        return Score(float('inf'))\n", "score returned inf"),

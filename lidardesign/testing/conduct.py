@@ -45,12 +45,8 @@ def check_time(subject: Subject) -> Held:
             allowed=f"{limit:g} s",
             hint="check fewer or smaller scenes (--set), or allow more (--seconds)",
         )
-    said = ", ".join(f"{what} {_shown_seconds(seconds)}" for what, seconds in subject.seconds.items())
+    said = ", ".join(f"{what} {seconds:.3f} s" for what, seconds in subject.seconds.items())
     return Held(f"at most: {said}", {f"{what}_s": round(seconds, 4) for what, seconds in subject.seconds.items()})
-
-
-def _shown_seconds(seconds: float) -> str:
-    return f"{seconds:.1f} s" if seconds >= 1 else f"{1000 * seconds:.0f} ms"
 
 
 def check_memory(subject: Subject) -> Held | NotApplicable:

@@ -16,7 +16,10 @@ from lidardesign.testing.law import BrokenLawError, Held, Law
 from lidardesign.testing.probing import rays_that_meet
 from lidardesign.testing.subject import Subject
 
-RAYS = 300
+# So many rays are tried in each round, until so many have met a target.
+RAYS, ENOUGH, ROUNDS = 300, 150, 10
+# Of a scene that moves, the frame is looked at in which targets are seen best, out of so many.
+FRAMES, TRIAL_RAYS = 8, 60
 # How far grids reach beyond meshes: further than the points that are looked at lie from them.
 PADDING_SIGMAS = 4.0
 SEED = 20_252
@@ -39,6 +42,7 @@ class Seen(NamedTuple):
         origin_m, direction, normal: Shape (N, 3); normals face the origins.
         range_m: Of the first hits [m], shape (N,).
         solid: Whether what was hit has an inside, shape (N,).
+        tried: How many rays towards targets these are of.
     """
 
     number: int
@@ -47,6 +51,7 @@ class Seen(NamedTuple):
     normal: np.ndarray
     range_m: np.ndarray
     solid: np.ndarray
+    tried: int
 
     def at(self, range_m: np.ndarray) -> np.ndarray:
         """Points along the rays, shape (N, 3) [m]."""
@@ -54,7 +59,7 @@ class Seen(NamedTuple):
 
 
 class Ground:
-    """The targets' fields of the scenes that are looked at, in their first frames, and rays that meet them.
+    """The targets' fields of the scenes that are looked at, in one frame each, and rays that meet them.
 
     Arguments:
         subject: Whose scenes.
@@ -62,7 +67,7 @@ class Ground:
 
     def __init__(self, subject: Subject) -> None:
         settings = subject.config.density
-        self.scenes = [_first_frame(scene) for scene in subject.looked_at]
+        self.scenes = [_at_rest(subject, scene) for scene in subject.looked_at]
         self.sigma_m = settings.sigma_m
         padding_m = PADDING_SIGMAS * settings.sigma_m
         self.field: Field = build_field(
@@ -96,8 +101,30 @@ def ground_of(subject: Subject) -> Ground:
     return _GROUNDS[subject]
 
 
-def _first_frame(scene: Scene) -> Scene:
-    return replace(scene, bodies=tuple(replace(body, poses=body.pose()) for body in scene.bodies))
+def _at_rest(subject: Subject, scene: Scene) -> Scene:
+    """A scene as it is in the frame in which most rays meet targets."""
+    frames = np.unique(np.linspace(0, scene.frames - 1, min(scene.frames, FRAMES)).astype(int))
+    stills = [
+        replace(scene, bodies=tuple(replace(body, poses=body.pose(frame)) for body in scene.bodies)) for frame in frames
+    ]
+    if len(stills) == 1:
+        return stills[0]
+    seen = [
+        len(_tried(subject, still, SceneCaster(still), TRIAL_RAYS, np.random.default_rng(SEED))) for still in stills
+    ]
+    return stills[int(np.argmax(seen))]
+
+
+def _tried(
+    subject: Subject, scene: Scene, caster: SceneCaster, count: int, generator: np.random.Generator
+) -> np.ndarray:
+    """Design points, body and normal in columns, shape (K, 10), of rays at all condition values that meet targets."""
+    per = -(-count // len(subject.conditions))
+    found = [
+        rays_that_meet(scene, subject.config.space.at(condition), caster, 0, per, generator)
+        for condition in subject.conditions
+    ]
+    return np.concatenate([np.column_stack([points, hits.body, hits.normal]) for points, hits in found])
 
 
 def _step_m(scenes: list[Scene], resolution: int, padding_m: float) -> float:
@@ -112,15 +139,13 @@ def _step_m(scenes: list[Scene], resolution: int, padding_m: float) -> float:
 def _seen(subject: Subject, number: int, scene: Scene) -> Seen:
     """Rays from the design space towards points of a scene's targets, those that meet a target first."""
     generator, caster = np.random.default_rng([SEED, number]), SceneCaster(scene)
-    per = -(-RAYS // len(subject.conditions))
-    spaces = [subject.config.space.at(condition) for condition in subject.conditions]
-    found = [rays_that_meet(scene, space, caster, 0, per, generator) for space in spaces]
-    design = np.concatenate([points for points, _ in found])
-    body = np.concatenate([hits.body for _, hits in found])
-    normal = np.concatenate([hits.normal for _, hits in found])
-    solid = np.array([_is_solid(one) for one in scene.bodies], dtype=bool)[body]
+    rounds: list[np.ndarray] = []
+    while len(rounds) < ROUNDS and sum(map(len, rounds)) < ENOUGH:
+        rounds.append(_tried(subject, scene, caster, RAYS, generator))
+    design = np.concatenate(rounds)
+    solid = np.array([_is_solid(one) for one in scene.bodies], dtype=bool)[design[:, 6].astype(int)]
     looking = direction(design[:, AZIMUTH], design[:, ELEVATION])
-    return Seen(number, design[:, :3], looking, normal, design[:, RANGE], solid)
+    return Seen(number, design[:, :3], looking, design[:, 7:], design[:, RANGE], solid, RAYS * len(rounds))
 
 
 def _is_solid(body: Body) -> bool:
@@ -133,10 +158,10 @@ def check_reach(subject: Subject) -> Held:
     if not min(counts):
         name = subject.looked_at[counts.index(0)].name
         raise BrokenLawError(
-            f"none of {RAYS} rays from the design space to the targets of scene {name!r} meets one",
+            f"none of {RAYS * ROUNDS} rays from the design space to the targets of scene {name!r} meets one",
             hint="widen the angles or the range, move the origin, or check the units: all lengths are metres",
         )
-    share = float(np.mean(counts)) / RAYS
+    share = sum(counts) / sum(seen.tried for seen in ground_of(subject).seen)
     return Held(f"{share:.0%} of the rays towards targets meet one inside the design space", {"share": share})
 
 

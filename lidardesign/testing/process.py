@@ -26,6 +26,8 @@ from lidardesign.testing.limits import Limits
 from lidardesign.testing.watch import Watch
 
 if TYPE_CHECKING:
+    from lidardesign.run.config import RunConfig
+    from lidardesign.task import Task
     from lidardesign.testing.contract import Contract
 
 CHILD = (
@@ -34,6 +36,7 @@ CHILD = (
 )
 # Libraries are loaded in the first law that needs them, and a law calls the task's code many times.
 LAW_CALLS = 3
+FINDING_KEYS = {"law", "group", "statement", "outcome", "detail", "seconds", "figures"}
 REFUSALS = {"config": ConfigError, "data": DataError}
 
 
@@ -93,8 +96,7 @@ def _heard(child: Apart, seconds: float) -> Iterator[Finding]:
     """Findings as they come; where the process is lost, the law that it tried does not hold."""
     started, line = child.next_line(time.monotonic() + START_SECONDS)
     if line != BEGUN:
-        reason = "the process that checks could not be started"
-        yield from _all_lost(0, reason)
+        yield from _all_lost(0, "the process that checks could not be started")
         return
     for number in range(len(_laws()) + 1):
         allowed = seconds * (1 if number == 0 else LAW_CALLS)
@@ -106,15 +108,21 @@ def _heard(child: Apart, seconds: float) -> Iterator[Finding]:
             written = "writes into what is not its own while this is tried" if line else None
             yield from _all_lost(number, written or died_of or f"did not end within {allowed:g} s")
             return
-        if "refused" in found:
-            raise REFUSALS.get(found["refused"]["kind"], ConfigError)(
-                found["refused"]["message"], **{key: found["refused"].get(key) for key in ("where", "allowed", "hint")}
-            )
-        finding = Finding(**found)
+        finding = _finding(found)
         yield finding
         if number == 0 and finding.outcome == "fail":
             yield from _not_reached(1)
             return
+
+
+def _finding(found: dict[str, Any]) -> Finding:
+    """What a line says; where the configuration was refused, the error that it was refused with."""
+    if "refused" not in found:
+        return Finding(**found)
+    told = found["refused"]
+    raise REFUSALS.get(told["kind"], ConfigError)(
+        told["message"], **{key: told.get(key) for key in ("where", "allowed", "hint")}
+    )
 
 
 def _read(line: bytes) -> dict[str, Any] | None:
@@ -124,9 +132,6 @@ def _read(line: bytes) -> dict[str, Any] | None:
     except ValueError:
         return None
     return found if isinstance(found, dict) and ("refused" in found or set(found) == FINDING_KEYS) else None
-
-
-FINDING_KEYS = {"law", "group", "statement", "outcome", "detail", "seconds", "figures"}
 
 
 def _all_lost(number: int, reason: str) -> Iterator[Finding]:
@@ -193,18 +198,9 @@ def _made(request: dict[str, Any], name: str) -> str:
 def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
     """Import the plugin and resolve its configuration; None where that is the end of it, which is told."""
     watch = Watch(all_threads=True)
-    limits = Limits(request["seconds"], request["memory_bytes"])
     started = time.perf_counter()
-    offer = EntryPoint(request["name"], request["value"], registry.GROUP)
     try:
-        with watch.during("import"):
-            task = registry.import_task(offer, limits.seconds)
-        seconds = time.perf_counter() - started
-        config_file = Path(request["config_file"]) if request["config_file"] else None
-        with watch.during("space"):
-            config = resolve(
-                task, preset="draft", config_file=config_file, overrides=request["overrides"], seed=request["seed"]
-            )
+        task, config = _loaded(request, watch)
     except registry.PluginError as error:
         _tell(result, Finding(*LOADS, "fail", f"{said(error)}{place_of(error)}"))
         return None
@@ -221,11 +217,20 @@ def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
     from lidardesign.testing.contract import Contract
     from lidardesign.testing.subject import Subject
 
-    subject = Subject(task, config, limits, watch)
-    subject.seconds["import"] = seconds
     version = f"version {task.api_version} of the task interface"
-    _tell(result, Finding(*LOADS, "pass", f"{version}, {type(task).__module__}", seconds))
-    return Contract(subject)
+    _tell(result, Finding(*LOADS, "pass", f"{version}, {type(task).__module__}", time.perf_counter() - started))
+    return Contract(Subject(task, config, Limits(request["seconds"], request["memory_bytes"]), watch))
+
+
+def _loaded(request: dict[str, Any], watch: Watch) -> tuple[Task, RunConfig]:
+    offer = EntryPoint(request["name"], request["value"], registry.GROUP)
+    with watch.during("import"):
+        task = registry.import_task(offer, request["seconds"])
+    config_file = Path(request["config_file"]) if request["config_file"] else None
+    with watch.during("space"):
+        return task, resolve(
+            task, preset="draft", config_file=config_file, overrides=request["overrides"], seed=request["seed"]
+        )
 
 
 def _tell(result: BinaryIO, finding: Finding) -> None:
