@@ -20,6 +20,7 @@ from lidardesign.evaluate.density_views import density_view
 from lidardesign.evaluate.effects import EffectSummary
 from lidardesign.evaluate.pictured import Pictured, tightness_of
 from lidardesign.evaluate.plots import pictures, write_plots
+from lidardesign.evaluate.plots_bounds import constraints_picture
 from lidardesign.evaluate.plots_camera import shaded, view_of
 from lidardesign.evaluate.plots_canvas import (
     COLUMN_INCHES,
@@ -314,7 +315,9 @@ def test_phases_add_up_to_the_time_of_the_command():
 
 
 def test_a_design_without_constraints_has_no_bounds_to_draw():
-    assert tightness_of(Design("free", (make_sensor(),)), SPACE) == []
+    free = tightness_of(Design("free", (make_sensor(),)), SPACE)
+    assert {one.name.split(".")[0] for one in free} == {"space"}
+    assert constraints_picture({"free": free}) is None
     bound = Design("bound", (make_sensor(),), constraints={"gate": {"width_m": {"max": 1.0}}})
     (row,) = [one for one in tightness_of(bound, SPACE) if one.name == "gate.width_m.max"]
     assert row.room == pytest.approx(1.0 - 2 * 1.959964 * 0.2, abs=1e-5)

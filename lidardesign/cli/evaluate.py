@@ -290,16 +290,31 @@ def _write_files(
         with written_file(csv) as file:
             write_csv(evaluation, file)
         written.append(csv)
+    return written + _write_drawn(evaluation, request, run, times, report, plots) if report or plots else written
+
+
+def _write_drawn(
+    evaluation: Evaluation,
+    request: EvaluationRequest,
+    run: Run,
+    times: dict[str, dict[str, float]],
+    report: Path | None,
+    plots: Path | None,
+) -> list[Path]:
+    """Pictures and report, of one drawing's material."""
+    from lidardesign.evaluate.pictured import pictured_of
+
+    written: list[Path] = []
+    pictured = pictured_of(evaluation, request, times)
     if plots is not None:
-        from lidardesign.evaluate.pictured import pictured_of
         from lidardesign.evaluate.plots import write_plots
 
-        written += write_plots(evaluation, plots, pictured_of(evaluation, request, times))
+        written += write_plots(evaluation, plots, pictured)
     if report is not None:
         from lidardesign.cli.pages import write_page
 
         with written_file(report) as file:
-            write_page(evaluation, request, run, times, file)
+            write_page(evaluation, request, run, pictured, file)
         written.append(report)
     return written
 

@@ -1,4 +1,4 @@
-"""What the report of `evaluate` is made of beside the scores: the 3D view, the density, constraints and times."""
+"""What the report of `evaluate` is made of beside the scores: pictures, where the time went, how to reproduce it."""
 
 from __future__ import annotations
 
@@ -15,13 +15,11 @@ if TYPE_CHECKING:
 
     from lidardesign.cli.runs import Run
     from lidardesign.design.sensor import Design
-    from lidardesign.design.tightness import Tightness
-    from lidardesign.evaluate.density_views import DensityView
+    from lidardesign.evaluate.pictured import Pictured
     from lidardesign.evaluate.report import Report
     from lidardesign.evaluate.report_tables import CommandTimes, Reproduction
     from lidardesign.evaluate.request import EvaluationRequest
     from lidardesign.evaluate.results import Evaluation
-    from lidardesign.evaluate.shown import Shown
 
 # Drawn in the 3D view of what the density observes: enough to see its shape, few enough to see through.
 DENSITY_POINTS = 3000
@@ -30,93 +28,48 @@ STREAM = "report"
 THIS = "evaluate"
 
 
-def write_page(
-    evaluation: Evaluation,
-    request: EvaluationRequest,
-    run: Run,
-    times: Mapping[str, Mapping[str, float]],
-    path: Path,
-) -> None:
+def write_page(evaluation: Evaluation, request: EvaluationRequest, run: Run, pictured: Pictured, path: Path) -> None:
     """Write the report of an evaluation.
 
     Arguments:
         evaluation: What was found.
         request: What was asked for.
         run: The run whose density the designs are of.
-        times: Seconds by phase of each command on the run, of this one until now.
+        pictured: What is drawn beside the scores.
         path: The HTML file.
     """
     from lidardesign.evaluate.report import write_report
 
-    write_report(report_of(evaluation, request, run, times), path)
+    write_report(report_of(evaluation, request, run, pictured), path)
 
 
 @phase("report")
-def report_of(
-    evaluation: Evaluation, request: EvaluationRequest, run: Run, times: Mapping[str, Mapping[str, float]]
-) -> Report:
+def report_of(evaluation: Evaluation, request: EvaluationRequest, run: Run, pictured: Pictured) -> Report:
     """Everything that a report is made of; see `write_page`."""
     from lidardesign.evaluate.report import Report
 
-    density, points = _density(request, run)
     scenes = "1 held-out scene" if evaluation.scenes == 1 else f"{evaluation.scenes} held-out scenes"
     return Report(
         evaluation,
-        _shown(evaluation, request),
+        pictured.shown,
         title=f"{run.task.name}: {evaluation.metric.name} on {scenes}",
-        density=density,
-        density_m=points,
-        constraints={design.name: _tightness(design, run) for design in request.designs},
-        times=_times(run, times),
+        density=pictured.density,
+        density_m=_density_points(request, run),
+        constraints=pictured.tightness,
+        times=_times(run, pictured.times),
         reproduce=_reproduction(request, run),
     )
 
 
-def _shown(evaluation: Evaluation, request: EvaluationRequest) -> Shown:
-    """The first held-out scene with all designs, under the effects that were simulated where any were."""
-    from lidardesign.design.track import placed
-    from lidardesign.evaluate.entries import ordered_conditions
-    from lidardesign.evaluate.shown import shown_in
-    from lidardesign.simulate.returns import Rays
-
-    def laid_out(design: Design, at: Any) -> Rays:
-        count = design.rays or max(request.rays)
-        return request.lay_out(design, count, request.samples.get(design.name), at=at)
-
-    return shown_in(
-        request.test[0],
-        request.designs,
-        ordered_conditions(request),
-        placed,
-        laid_out,
-        planner=request.planner if any(effect.on for effect in evaluation.effects) else None,
-        seed=request.seed,
-    )
-
-
-def _density(request: EvaluationRequest, run: Run) -> tuple[DensityView | None, np.ndarray | None]:
-    """The learned density to look at, and points that it observes; nothing where a run has no samples."""
-    from lidardesign.design.samples import FILE_NAME, load_samples
-    from lidardesign.evaluate.density_views import density_view
+def _density_points(request: EvaluationRequest, run: Run) -> np.ndarray | None:
+    """Points that the learned density observes; None where no run left samples."""
     from lidardesign.space import observed_point
     from lidardesign.task import random_generator
 
-    if not (run.folder / FILE_NAME).exists():
-        return None, None
-    samples = load_samples(run.folder)
-    drawn = samples.resample(DENSITY_POINTS, random_generator(run.config.seed, STREAM))
-    return density_view(samples, request.test[0], request.designs), observed_point(drawn)
-
-
-def _tightness(design: Design, run: Run) -> list[Tightness]:
-    """How tight each constraint of a design is, those of its space last."""
-    from lidardesign.design.check import check_design
-    from lidardesign.design.files import design_document
-    from lidardesign.design.tightness import SPACE_MARK, tightness
-
-    checks = check_design(design_document(design), design.constraints, run.config.space)
-    found = tightness(checks, [sensor.name for sensor in design.sensors])
-    return sorted(found, key=lambda one: one.name.startswith(SPACE_MARK))
+    density = request.density() if request.density is not None else None
+    if density is None:
+        return None
+    return observed_point(density.samples.resample(DENSITY_POINTS, random_generator(run.config.seed, STREAM)))
 
 
 def _times(run: Run, times: Mapping[str, Mapping[str, float]]) -> list[CommandTimes]:

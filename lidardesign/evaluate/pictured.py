@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from lidardesign.design.check import check_design
 from lidardesign.design.files import design_document
 from lidardesign.design.sensor import Design
-from lidardesign.design.tightness import Tightness, tightness
+from lidardesign.design.tightness import SPACE_MARK, Tightness, tightness
 from lidardesign.design.track import placed
 from lidardesign.evaluate.density_views import DensityView, density_view
 from lidardesign.evaluate.entries import ordered_conditions
@@ -73,8 +73,7 @@ def density_of(request: EvaluationRequest) -> DensityView | None:
 
 
 def tightness_of(design: Design, space: DesignSpace) -> list[Tightness]:
-    """How tight each constraint of a design is, by the independent checker; none where it has no constraints."""
-    if not design.constraints:
-        return []
+    """How tight each constraint of a design is, by the independent checker; the bounds of its space last."""
     checks = check_design(design_document(design), design.constraints, space)
-    return tightness(checks, [sensor.name for sensor in design.sensors])
+    found = tightness(checks, [sensor.name for sensor in design.sensors])
+    return sorted(found, key=lambda one: one.name.startswith(SPACE_MARK))

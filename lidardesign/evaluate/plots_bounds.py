@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.design.tightness import Tightness
+from lidardesign.design.tightness import SPACE_MARK, Tightness
 from lidardesign.evaluate.curves import COLOURS, MARKERS
 from lidardesign.evaluate.effects import MILLIMETRES, EffectSummary
 from lidardesign.evaluate.plots_canvas import (
@@ -42,7 +42,8 @@ def constraints_picture(tightness: Mapping[str, Sequence[Tightness]]) -> Figure 
     Arguments:
         tightness: How tight each bound is, by the design's name.
     """
-    designs = {name: rows for name, rows in tightness.items() if rows}
+    # what holds for every design of the space is no constraint of anybody's
+    designs = {name: rows for name, rows in tightness.items() if any(not _of_space(row) for row in rows)}
     if not designs:
         return None
     shown = dict(list(designs.items())[:MOST_DESIGNS])
@@ -66,6 +67,10 @@ def constraints_picture(tightness: Mapping[str, Sequence[Tightness]]) -> Figure 
     axes.set_title(told, fontsize=SMALL_POINTS, loc="left", color=SOFT)
     figure.legend(*_room_legend(list(shown)), loc="outside lower center", ncols=4, frameon=False)
     return figure
+
+
+def _of_space(row: Tightness) -> bool:
+    return row.name.startswith(SPACE_MARK)
 
 
 def bound_label(row: Tightness) -> str:
