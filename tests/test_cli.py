@@ -407,7 +407,7 @@ def test_a_scan_exported_at_another_count_has_its_own_sensors(lidardesign, flat,
 
 def test_help_gives_an_example_of_every_command(lidardesign):
     for name in ("learn", "fit", "constrain", "evaluate", "export", "show"):
-        assert f"lidardesign {name} " in lidardesign(name, "--help").out.split("Examples:")[1]
+        assert f"lidardesign {name} " in lidardesign(name, "--help").out.split(" Examples\n")[1]
 
 
 def test_a_design_that_was_copied_away_from_its_run_says_what_it_lacks(lidardesign, flat, tmp_path):
