@@ -28,7 +28,7 @@ def constrain(
     constraints: Annotated[
         Path | None,
         typer.Option(
-            "--constraints", metavar="FILE", help="YAML file of constraints (keys: README).", show_default=False
+            "--constraints", metavar="FILE", help="YAML file of constraints (keys: docs/constraints.md).", show_default=False
         ),
     ] = None,
     overrides: Annotated[

@@ -12,7 +12,6 @@ import typer
 from typer.core import TyperCommand
 
 WIDEST = 100
-EXAMPLES_HEAD = "Examples:"
 DOCS = "docs/"
 
 
@@ -54,7 +53,7 @@ MANUALS: dict[str, Manual] = {}
 
 
 def add_manuals(groups: Mapping[str, typer.Typer], pages: Mapping[str, Manual]) -> None:
-    """Give every command of the program its manual; examples of an epilog are one for those that have no other.
+    """Give every command of the program its manual.
 
     Arguments:
         groups: The program, by "", and its groups of commands by name.
@@ -64,13 +63,8 @@ def add_manuals(groups: Mapping[str, typer.Typer], pages: Mapping[str, Manual]) 
         for information in application.registered_commands:
             own = information.name or str(getattr(information.callback, "__name__", "")).strip("_").replace("_", "-")
             path = f"{group} {own}".strip()
-            MANUALS[path] = pages.get(path) or Manual(_examples_of(information.epilog))
-            information.epilog, information.cls = None, ManualCommand
-
-
-def _examples_of(epilog: str | None) -> dict[str, str]:
-    head, _, lines = (epilog or "").partition("\n")
-    return {line.strip(): "" for line in lines.split("\n") if line.strip()} if head == EXAMPLES_HEAD else {}
+            if path in pages:
+                MANUALS[path], information.cls = pages[path], ManualCommand
 
 
 def manual_text(manual: Manual, width: int) -> str:
