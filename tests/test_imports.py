@@ -13,6 +13,7 @@ from command_line import caller, make_run
 from lidardesign.design.files import load_design, save_design
 from lidardesign.design.rays import lay_out
 from lidardesign.design.readers.rig import aim_of
+from lidardesign.design.readers.xml_text import _Builder
 from lidardesign.design.sensor import Design, RayTable, Sensor, boresight_frame, tangent_coordinates
 from lidardesign.errors import DataError, LidardesignError
 from lidardesign.export.registry import EXPORTERS
@@ -332,6 +333,35 @@ def test_xml_that_cannot_be_used_is_refused_by_what_is_wrong(tmp_path, case):
     assert refused.value.where.startswith(str(path))
 
 
+def test_text_of_many_lines_is_read_in_a_time_that_grows_with_it(tmp_path):
+    """Of a text whose lines are joined one by one, the last line would copy all those before it."""
+    builder, pieces = _Builder(tmp_path / "m.xml"), []
+    take = builder._parser.CharacterDataHandler
+    builder._parser.CharacterDataHandler = lambda text: (pieces.append(text), take(text))
+    lines = "a line<!-- and a remark -->\n" * 20_000
+    assert builder.build(f"<sdf>{lines}</sdf>".encode()).text == "a line\n" * 20_000
+    assert len(pieces) < 10
+
+
+def test_includes_do_not_nest_deeper_than_one_file_may(tmp_path):
+    bodies = 150
+    for number in range(9):
+        inside = f'<include file="part{number + 1}.xml"/>' if number < 8 else '<site name="a"/>'
+        text = f"<mujocoinclude>{'<body>' * bodies}{inside}{'</body>' * bodies}</mujocoinclude>"
+        (tmp_path / f"part{number}.xml").write_text(text)
+    path = tmp_path / "m.xml"
+    for part, refused in ((8, False), (7, True), (0, True)):
+        path.write_text(
+            f'<mujoco><worldbody><include file="part{part}.xml"/></worldbody>'
+            '<sensor><rangefinder site="a" cutoff="1"/></sensor></mujoco>'
+        )
+        if refused:
+            with pytest.raises(DataError, match="nested too deep, with what it includes"):
+                load_design(path)
+        else:
+            assert load_design(path).rays == 1
+
+
 # ------------------------------------------------------------------- SDF
 
 
@@ -434,6 +464,33 @@ def test_a_model_stands_by_its_placement_frame(tmp_path):
     np.testing.assert_allclose(design.sensors[0].origin_m, [5, 0, 1], atol=EXACT)
 
 
+def test_a_topmost_model_stands_by_its_placement_frame_too(tmp_path):
+    inner = '<frame name="foot"><pose>0 0 -1 0 0 0</pose></frame>'
+    model = f'<pose>5 0 0 0 0 0</pose>{inner}<link name="l">{lidar()}</link>'
+    text = f'<model name="m" placement_frame="foot">{model}</model>'
+    np.testing.assert_allclose(load_sdf(tmp_path, text).sensors[0].origin_m, [5, 0, 1], atol=EXACT)
+
+
+@pytest.mark.parametrize(("version", "where"), [("1.5", 6), ("1.6", 6), ("1.7", 2), ("1.9", 2)])
+def test_poses_before_version_1_7_count_from_what_they_call_their_frame(tmp_path, version, where):
+    """As libsdformat reads them; from 1.7 on the attribute is `relative_to`, and another one says nothing."""
+    near, far = '<link name="k"><pose>5 0 0 0 0 0</pose></link>', '<link name="l"><pose>1 0 0 0 0 0</pose>{}</link>'
+    eye = lidar(pose='<pose frame="k">1 0 0 0 0 0</pose>')
+    path = tmp_path / "old.sdf"
+    path.write_text(f'<sdf version="{version}"><model name="m">{near}{far.format(eye)}</model></sdf>')
+    np.testing.assert_allclose(load_design(path).sensors[0].origin_m, [where, 0, 0], atol=EXACT)
+
+
+def test_poses_of_nested_models_are_worked_out_once(tmp_path):
+    """Each model stands by a frame two models further in: worked out anew each time, these would be 10^9 poses."""
+    deepest = 45
+    text = f'<model name="m{deepest}"><pose>1 0 0 0 0 0</pose><link name="l">{lidar()}</link></model>'
+    for number in range(deepest - 1, -1, -1):
+        by = f' placement_frame="m{number + 1}::m{number + 2}"' if number + 2 <= deepest else ""
+        text = f'<model name="m{number}"{by}>{text}<link name="l"/></model>'
+    assert load_sdf(tmp_path, text).rays == 15
+
+
 def test_what_an_sdf_file_says_beyond_a_design_is_told(tmp_path):
     extra = lidar(columns=(1, -0.5, 0.5), rows=None, reach="<max>inf</max>").replace(
         "<range>", "<noise><type>gaussian</type></noise><range>"
@@ -452,6 +509,7 @@ def test_what_an_sdf_file_says_beyond_a_design_is_told(tmp_path):
     np.testing.assert_allclose(lay_out(design).direction[0], direction(-0.5, 0.0), atol=EXACT)
 
 
+CHAIN = "".join(f'<frame name="f{one}" attached_to="f{one + 1}"/>' for one in range(400)) + '<frame name="f400"/>'
 BAD_SDF = {
     "a circle": (
         '<model name="m"><link name="a"><pose relative_to="b">0 0 0 0 0 0</pose>{lidar}</link>'
@@ -467,6 +525,20 @@ BAD_SDF = {
         "no length",
     ),
     "a link without a name": ('<model name="m"><link>{lidar}</link></model>', "no name"),
+    "a model without a name": (
+        '<world name="w"><model><pose>5 0 0 0 0 0</pose><link name="a">{lidar}</link></model></world>', "no name",
+    ),
+    "two links of one name": (
+        '<model name="m"><link name="a">{lidar}</link><link name="a"><pose>1 0 0 0 0 0</pose>{lidar}</link></model>',
+        "a second link is called 'a'",
+    ),
+    "the world inside a model": (
+        '<model name="m"><link name="a"><pose relative_to="world">0 0 0 0 0 0</pose>{lidar}</link></model>', "'world'",
+    ),
+    "a chain of frames": (
+        f'<model name="m">{CHAIN}<link name="a"><pose relative_to="f0">0 0 0 0 0 0</pose>{{lidar}}</link></model>',
+        "counts from too many others",
+    ),
 }  # fmt: skip
 
 

@@ -8,9 +8,10 @@ where the model puts them, which is where they are when a simulation begins.
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
 from pathlib import Path
 
-from lidardesign.design.readers.xml_text import Element, read_xml
+from lidardesign.design.readers.xml_text import DEEPEST, Element, read_xml
 from lidardesign.errors import DataError
 
 ALLOWED = "an MJCF model"
@@ -39,42 +40,50 @@ def stripped_model(path: Path) -> ElementTree.Element:
         DataError: A file is no XML, lies outside the model's folder, or the model is one that cannot be read so.
     """
     root = read_xml(path, ALLOWED)
-    seen = [path.resolve()]
     model = ElementTree.Element("mujoco", {"model": "rig"})
-    copies = [0]
-    _copy_children(root, model, path, seen, 1, copies)
+    _Copier([path.resolve()]).copy_children(root, model, path, depth=1)
     return model
 
 
-def _copy_children(
-    source: ElementTree.Element,
-    target: ElementTree.Element,
-    path: Path,
-    seen: list[Path],
-    times: int,
-    copies: list[int],
-) -> None:
-    """Append what is kept of an element's children; `times` is how often it is replicated."""
-    for child in source:
-        if child.tag == "include":
-            included, file = _included(child, path, seen)
-            _copy_children(included, target, file, seen, times, copies)
-            continue
-        where = f"{path}:{child.line if isinstance(child, Element) else 1}"
-        if child.tag == "attach":
-            raise DataError("attaches another model", where=where, allowed="one model, or <include>")
-        if child.tag == "rangefinder" and CAMERA in child.attrib:
-            raise DataError("has a rangefinder of a camera", where=where, allowed="rangefinders of sites: one ray each")
-        if child.tag not in KEPT:
-            continue
-        kept = ElementTree.SubElement(
-            target, child.tag, {name: child.attrib[name] for name in KEPT[child.tag] if name in child.attrib}
-        )
-        inner = times * _count(child, where) if child.tag == "replicate" else times
-        copies[0] += inner
-        if copies[0] > MOST_COPIES:
-            raise DataError("replicates too much", where=where, allowed=f"at most {MOST_COPIES} bodies and sites")
-        _copy_children(child, kept, path, seen, inner, copies)
+@dataclass
+class _Copier:
+    """Copies what is kept of a model and of what it includes.
+
+    Arguments:
+        seen: The files that were read, the model's own first.
+        copies: How many elements there are once `replicate` has made its own.
+    """
+
+    seen: list[Path]
+    copies: int = 0
+
+    def copy_children(
+        self, source: ElementTree.Element, target: ElementTree.Element, path: Path, *, depth: int, times: int = 1
+    ) -> None:
+        """Append what is kept of an element's children; `times` is how often it is replicated."""
+        for child in source:
+            where = f"{path}:{child.line if isinstance(child, Element) else 1}"
+            if depth >= DEEPEST:
+                raise DataError("is nested too deep, with what it includes", where=where, allowed=f"{DEEPEST} levels")
+            if child.tag == "include":
+                included, file = _included(child, path, self.seen)
+                self.copy_children(included, target, file, depth=depth + 1, times=times)
+                continue
+            if child.tag == "attach":
+                raise DataError("attaches another model", where=where, allowed="one model, or <include>")
+            if child.tag == "rangefinder" and CAMERA in child.attrib:
+                allowed = "rangefinders of sites: one ray each"
+                raise DataError("has a rangefinder of a camera", where=where, allowed=allowed)
+            if child.tag not in KEPT:
+                continue
+            kept = ElementTree.SubElement(
+                target, child.tag, {name: child.attrib[name] for name in KEPT[child.tag] if name in child.attrib}
+            )
+            inner = times * _count(child, where) if child.tag == "replicate" else times
+            self.copies += inner
+            if self.copies > MOST_COPIES:
+                raise DataError("replicates too much", where=where, allowed=f"at most {MOST_COPIES} bodies and sites")
+            self.copy_children(child, kept, path, depth=depth + 1, times=inner)
 
 
 def _count(element: ElementTree.Element, where: str) -> int:

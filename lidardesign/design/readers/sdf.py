@@ -58,6 +58,7 @@ def read_sdf(path: Path) -> Rig:
         DataError: The file is no SDF, has no lidar, or an element of one cannot be used; with file and line.
     """
     root = read_xml(path, ALLOWED)
+    _name_frames_as_later(root)
     notes: dict[str, None] = {}
     sensors: list[RigSensor] = []
     longer: list[str] = []
@@ -80,22 +81,32 @@ def read_sdf(path: Path) -> Rig:
     return Rig(KIND, named, list(notes), "give <range> a <max>")
 
 
+def _name_frames_as_later(root: ElementTree.Element) -> None:
+    """Poses of versions before 1.7 count from what `frame` names, which is called `relative_to` since."""
+    version = [int(part) for part in root.get("version", "").split(".") if part.isdecimal()]
+    if not version or version >= [1, 7]:
+        return
+    for pose in root.iter("pose"):
+        if "frame" in pose.attrib:
+            pose.attrib.setdefault("relative_to", pose.attrib["frame"])
+
+
 def _lidars(root: ElementTree.Element, path: Path) -> Iterator[tuple[Scope, ElementTree.Element, ElementTree.Element]]:
     """Scope, link and sensor of every lidar, in the order of the file."""
     open_scopes = []
     for child in root:
         if child.tag == "world":
             world = Scope(child, path)
-            open_scopes += [Scope(model, path, world) for model in child.findall("model")]
+            open_scopes += [world.within(model) for model in world.children("model")]
         elif child.tag == "model":
             open_scopes.append(Scope(child, path))
     while open_scopes:
         scope = open_scopes.pop(0)
-        for link in scope.element.findall("link"):
+        for link in scope.children("link"):
             for sensor in link.findall("sensor"):
                 if sensor.get("type") in TYPES:
                     yield scope, link, sensor
-        open_scopes[:0] = [Scope(model, path, scope) for model in scope.element.findall("model")]
+        open_scopes[:0] = [scope.within(model) for model in scope.children("model")]
 
 
 def _sensor(scope: Scope, link: ElementTree.Element, element: ElementTree.Element, notes: dict[str, None]) -> RigSensor:
@@ -111,8 +122,6 @@ def _sensor(scope: Scope, link: ElementTree.Element, element: ElementTree.Elemen
     if across.samples * up.samples > MOST_RAYS:
         found = f"{across.samples} x {up.samples} rays"
         raise DataError(found, where=scope.where(scan), allowed=f"at most {MOST_RAYS}")
-    if not link.get("name"):
-        raise DataError("a link has no name", where=scope.where(link))
     pose = scope.in_world() @ scope.placed(element, link.get("name", ""))
     azimuth, elevation = (values.reshape(-1) for values in np.meshgrid(across.angles_rad, up.angles_rad))
     world = angles(direction(azimuth, elevation) @ pose[:3, :3].T)

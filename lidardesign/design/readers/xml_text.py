@@ -16,6 +16,8 @@ LARGEST_BYTES = 16_000_000
 DEEPEST = 200
 MOST_ELEMENTS = 500_000
 LONGEST_QUOTE = 80
+# The parser hands text over in pieces of so much, not line by line: each is joined to what is there already.
+PIECE_BYTES = 1 << 20
 
 
 class Element(ElementTree.Element):
@@ -56,6 +58,7 @@ class _Builder:
         # the root stays below the elements that are open
         self._open: list[Element] = []
         self._parser = expat.ParserCreate()
+        self._parser.buffer_text, self._parser.buffer_size = True, PIECE_BYTES
         self._parser.StartDoctypeDeclHandler = self._doctype
         self._parser.StartElementHandler = self._start
         self._parser.EndElementHandler = self._end
