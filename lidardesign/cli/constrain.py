@@ -27,9 +27,7 @@ def constrain(
     target: Annotated[Path, typer.Argument(metavar="RUN|DESIGN", help="A run folder, or a design that came from one.")],
     constraints: Annotated[
         Path | None,
-        typer.Option(
-            "--constraints", metavar="FILE", help="YAML file of constraints (keys: docs/constraints.md).", show_default=False
-        ),
+        typer.Option("--constraints", metavar="FILE", help="YAML file; keys: docs/constraints.md.", show_default=False),
     ] = None,
     overrides: Annotated[
         list[str] | None,
