@@ -11,9 +11,9 @@ NOTE = "note: "
 # Every command that computes ends with this table; pages that are not about it leave it out.
 TIMES = "where the time went"
 # What a comparison of numbers may turn out to be.
-VERDICTS = re.compile(r"\b(?:better|worse|not told apart|yes, tight|yes)\b")
+VERDICTS = re.compile(r"\b(?:better|worse|not told apart|yes, tight|yes|no)\b")
 # Said only where the numbers ask for it.
-OCCASIONAL = re.compile(r", # rays in all(?=:)|, rays #$")
+OCCASIONAL = re.compile(r", # rays in all(?=:)|, rays #$|<(?=#)")
 
 
 def masked(text: str) -> str:

@@ -7,6 +7,7 @@ A comment above a block, which readers of the page do not see, may say how the t
     <!-- run: not, REASON -->     not run: its commands are parsed only
     <!-- run: if NAME, ... -->    run where a program or a Python package of this name is installed
     <!-- exits: 0, 1 -->          its commands may end with these codes, where that hangs on numbers
+    <!-- columns: N -->          a terminal of another width
     <!-- file: NAME -->           the block is a file of this name
     <!-- before: COMMAND -->      a command that this page takes as done, run without being shown
 

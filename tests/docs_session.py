@@ -19,7 +19,7 @@ from docs_pages import Block, Command
 from lidardesign.cli.main import run as run_program
 
 # The wide tables of the documentation were printed on a terminal of this width.
-COLUMNS = "100"
+COLUMNS = 100
 QUICK = (
     "learning.samples=10000", "learning.coverage_proposals=512", "learning.balance_proposals=2048",
     "learning.batch=128", "train=2", "test=2",
@@ -94,6 +94,7 @@ class Session:
 
     def console(self, block: Block, commands: list[Command]) -> None:
         """Run the commands of a console; a failure is right where the next command asks for the exit code."""
+        os.environ["COLUMNS"] = block.remarks.get("columns", str(COLUMNS))
         for command, following in zip(commands, [*commands[1:], None], strict=True):
             self.code_is_asked_for = following is not None and following.words == ["echo", "$?"]
             self.command(command, block)

@@ -67,7 +67,7 @@ def test_an_output_agrees_where_all_but_numbers_is_the_same(shown, agrees):
 @pytest.mark.parametrize("page", PAGES, ids=named)
 def test_a_page_can_be_followed_in_an_empty_folder(page, tmp_path, monkeypatch, library):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", COLUMNS)
+    monkeypatch.setenv("COLUMNS", str(COLUMNS))
     session = Session(tmp_path, library)
     for block in blocks_of(page):
         kind, reason = block.run
