@@ -188,6 +188,7 @@ def test_phases_add_up_and_small_ones_count_as_other():
 def test_figures_of_any_kind_are_told():
     assert number([0.5, -0.0]) == "0.5, 0"
     assert number({"x": 1, "y": None}) == "x 1, y -"
+    assert number([[0.0, 1.0, 2.0]] * 3) == "3 places"
 
 
 def luminance(colour):

@@ -159,7 +159,7 @@ def _density(view: DensityView, looks: Mapping[str, Series]) -> str:
         for index, one in enumerate(view.marginals)
     )
     planes = "".join(
-        figure(plane_figure(one), f"plane-{index}", PLANE_PX, f"What is observed, {one.labels[0]} and {one.labels[1]}")
+        figure(plane_figure(one), f"plane-{index}", PLANE_PX, f"What is observed, {' and '.join(one.labels)}", "plane")
         for index, one in enumerate(view.planes)
     )
     more = len(names) - len(drawn)

@@ -75,7 +75,8 @@ def _constraint_row(one: Tightness) -> str:
     if one.sensors > 1 and (one.broken or one.tight):
         verdict += f" ({one.broken or one.tight} of {one.sensors})"
     room = "-" if one.room is None else _room(one.room, one.bound)
-    cells = f"<td>{html.escape(number(one.bound))}</td><td>{owner}{html.escape(number(one.value))}</td><td>{room}</td>"
+    bound, value = html.escape(number(one.bound)), html.escape(number(one.value))
+    cells = f'<td class="wraps">{bound}</td><td class="wraps">{owner}{value}</td><td>{room}</td>'
     used = f'<td class="bars">{_used(one)}</td>'
     name = f'<th scope="row" class="name">{html.escape(one.name)}</th>'
     return f'<tr>{name}{cells}{used}<td class="{how}">{verdict}</td></tr>'
@@ -99,9 +100,11 @@ def _used(one: Tightness) -> str:
 
 
 def number(value: Any) -> str:
-    """A figure, a text, or a list or mapping of them, for people."""
+    """A figure, a text, or a list or mapping of them, for people; of a list of places how many there are."""
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {number(item)}" for name, item in value.items())
+    if isinstance(value, list | tuple) and value and isinstance(value[0], list | tuple):
+        return f"{len(value)} places"
     if isinstance(value, list | tuple):
         return ", ".join(number(item) for item in value)
     if value is None:
