@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ROW_INCHES, MARGIN_INCHES = 0.19, 0.95
+DESIGN_INCHES = 0.085  # of a row, for each design in it
 MOST_ROWS = 48
 MOST_DESIGNS = 6
 PERCENT = 100.0
@@ -48,13 +49,14 @@ def constraints_picture(tightness: Mapping[str, Sequence[Tightness]]) -> Figure 
         return None
     shown = dict(list(designs.items())[:MOST_DESIGNS])
     labels = list(dict.fromkeys(bound_label(row) for rows in shown.values() for row in rows))
-    told = "the closest sensor's room, as a share of the bound; at 0 the design leans on the bound"
+    told = "of the closest sensor; at 0 the design leans on the bound"
     if len(labels) > MOST_ROWS:
         told += f"; the first {MOST_ROWS} of {len(labels)} bounds"
         labels = labels[:MOST_ROWS]
     if len(designs) > len(shown):
         told += f"; the first {len(shown)} of {len(designs)} designs"
-    figure = new_figure(PAGE_INCHES, MARGIN_INCHES + max(len(labels), 2) * ROW_INCHES)
+    row_inches = max(ROW_INCHES, len(shown) * DESIGN_INCHES)
+    figure = new_figure(PAGE_INCHES, MARGIN_INCHES + max(len(labels), 2) * row_inches)
     axes = figure.add_subplot()
     for number, (name, rows) in enumerate(shown.items()):
         _draw_room(axes, rows, labels, number, len(shown), name)

@@ -11,12 +11,14 @@ import numpy as np
 
 from lidardesign.evaluate.plots_canvas import INK
 from lidardesign.numerics import EPSILON_FLOAT32, HALF_DIGITS
-from lidardesign.scene import Plane, Scene
+from lidardesign.scene import Body, Plane, Scene
 from lidardesign.simulate.raycast import SceneCaster
 
 SIDE, BEHIND, ABOVE = 1.25, 1.0, 0.75  # where the camera is, beside, behind and above the sensors
 AMBIENT, FRONT, LAMP = 0.42, 0.33, 0.40
 TARGET, OTHER = (0.86, 0.81, 0.76), (0.66, 0.69, 0.74)
+# Floors and walls fill the picture: what stands before them counts.
+GROUND = (1.02, 1.02, 1.02)
 EDGE_DEPTH = 0.012  # of the picture's width: a step in depth that is drawn as an edge
 BLOCK = 200_000  # rays cast at once
 
@@ -129,17 +131,24 @@ def shaded(scene: Scene, frame: int, view: View, width: int) -> Shaded:
     colour, depth = np.zeros((len(starts), 4)), np.full(len(starts), np.inf)
     if seen.bodies:
         caster = SceneCaster(seen, frame)
-        kinds = np.array([TARGET if body.is_target else OTHER for body in seen.bodies])
+        kinds = np.array([_colour(body) for body in seen.bodies])
         for block in np.array_split(np.arange(len(starts)), max(1, len(starts) // BLOCK)):
             hits = caster.first_hit(starts[block], np.broadcast_to(view.forward, (len(block), 3)))
             met = np.isfinite(hits.range_m)
             depth[block] = view.near_m + hits.range_m
-            colour[block[met], :3] = kinds[hits.body[met]] * _light(hits.normal[met], view)[:, None]
+            lit = kinds[hits.body[met]] * _light(hits.normal[met], view)[:, None]
+            colour[block[met], :3] = np.minimum(lit, 1.0)
             colour[block[met], 3] = 1.0
     depth = depth.reshape(height, width)
     colour = colour.reshape(height, width, 4)
     _draw_edges(colour, depth, EDGE_DEPTH * (right - left))
     return Shaded(colour, depth)
+
+
+def _colour(body: Body) -> tuple[float, float, float]:
+    if isinstance(body.shape, Plane):
+        return GROUND
+    return TARGET if body.is_target else OTHER
 
 
 def _light(normal: np.ndarray, view: View) -> np.ndarray:

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLUMNS = 3
-PANEL_INCHES, LEGEND_INCHES = 1.75, 0.3
+DENSITY_NAME = "learned density"
+PANEL_INCHES, LEGEND_INCHES, LINE_INCHES = 1.75, 0.15, 0.15
 LEGEND_LETTERS = 64  # of all names, that fit beside each other
 DENSITY, EDGE = "#cfd6de", "#8593a3"
 # More designs than these are told apart no longer.
@@ -45,12 +46,14 @@ def marginals_picture(view: DensityView) -> Figure:
     shown = view.marginals
     columns = min(COLUMNS, len(shown))
     rows = math.ceil(len(shown) / columns)
-    figure = new_figure(PAGE_INCHES, rows * PANEL_INCHES + LEGEND_INCHES)
+    names = [DENSITY_NAME, *(plain_label(name) for name in list(shown[0].designs)[:MOST_DESIGNS])]
+    beside = len(names) if sum(map(len, names)) < LEGEND_LETTERS else COLUMNS
+    lines = math.ceil(len(names) / beside)
+    figure = new_figure(PAGE_INCHES, rows * PANEL_INCHES + LEGEND_INCHES + lines * LINE_INCHES)
     for number, marginal in enumerate(shown):
         _draw_marginal(figure.add_subplot(rows, columns, number + 1), marginal)
-    handles, names = figure.axes[0].get_legend_handles_labels()
-    columns = len(names) if sum(map(len, names)) < LEGEND_LETTERS else COLUMNS
-    figure.legend(handles, names, loc="outside lower center", ncols=columns, frameon=False, handlelength=2.4)
+    handles, _ = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=beside, frameon=False, handlelength=2.4)
     left_out = len(shown[0].designs) - MOST_DESIGNS
     if left_out > 0:
         figure.suptitle(
@@ -60,7 +63,7 @@ def marginals_picture(view: DensityView) -> Figure:
 
 
 def _draw_marginal(axes: Axes, marginal: Marginal) -> None:
-    axes.stairs(marginal.heights, marginal.edges, fill=True, color=DENSITY, label="learned density")
+    axes.stairs(marginal.heights, marginal.edges, fill=True, color=DENSITY, label=DENSITY_NAME)
     axes.stairs(marginal.heights, marginal.edges, color=EDGE, linewidth=0.6, baseline=None)
     for number, (name, heights) in enumerate(list(marginal.designs.items())[:MOST_DESIGNS]):
         axes.stairs(
