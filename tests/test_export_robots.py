@@ -223,6 +223,14 @@ def test_urdfdom_finds_a_link_per_sensor(exported):
     assert check_urdf(exported["urdf"][0]) == {"lidar_base", *(f"{name}_link" for name in NAMES)}
 
 
+@pytest.mark.parametrize("name", ["lidar_base", "World", "world link"])
+def test_no_sensor_takes_the_name_of_what_holds_it(tmp_path, name):
+    one = replace(DESIGN.sensors[0], name=name)
+    path = tmp_path / "named.urdf"
+    EXPORTERS["urdf"].write(Design(name, (one,)), RAYS.subset(RAYS.sensor == 0), path)
+    assert len(check_urdf(path)) == 2
+
+
 def test_xacro_mounts_the_sensors_on_a_robot(reader, exported, tmp_path):
     xacro = pytest.importorskip("xacro", reason="needs xacro: the extra `consumers`")
     robot = tmp_path / "robot.xacro"

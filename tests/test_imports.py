@@ -491,6 +491,13 @@ def test_poses_of_nested_models_are_worked_out_once(tmp_path):
     assert load_sdf(tmp_path, text).rays == 15
 
 
+def test_more_lidars_than_a_design_has_are_refused_at_the_first_too_many(tmp_path, monkeypatch):
+    monkeypatch.setattr("lidardesign.design.readers.sdf.MOST_SENSORS", 3)
+    with pytest.raises(DataError, match="more rays or sensors than a design") as refused:
+        load_sdf(tmp_path, '<model name="m"><link name="l">' + "\n".join([lidar(rows=None)] * 5) + "</link></model>")
+    assert refused.value.where == f"{tmp_path / 'robot.sdf'}:6"
+
+
 def test_what_an_sdf_file_says_beyond_a_design_is_told(tmp_path):
     extra = lidar(columns=(1, -0.5, 0.5), rows=None, reach="<max>inf</max>").replace(
         "<range>", "<noise><type>gaussian</type></noise><range>"

@@ -22,7 +22,7 @@ from lidardesign.export.sdf import held, losses, matched, sensor_element
 from lidardesign.export.xml import element, numbers, read_xml, write_xml
 from lidardesign.simulate.returns import Rays
 
-# No sensor's link is called so: those end in _link.
+# No sensor's link is called so: those end in _link. Nor its joint, for none has the name of the world.
 WORLD, BASE = "world", "lidar_base"
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 BASE_MASS_KG, BASE_INERTIA_KG_M2 = 0.1, 0.0001
@@ -58,7 +58,7 @@ def _base() -> list[Element]:
     mass = element("mass", {"value": numbers([BASE_MASS_KG])})
     inertial = element("inertial", children=[mass, element("inertia", moments)])
     ends = [element("parent", {"link": WORLD}), element("child", {"link": BASE})]
-    joint = element("joint", {"name": f"{BASE}_joint", "type": "fixed"}, ends)
+    joint = element("joint", {"name": f"{WORLD}_joint", "type": "fixed"}, ends)
     return [element("link", {"name": WORLD}), element("link", {"name": BASE}, [inertial]), joint]
 
 

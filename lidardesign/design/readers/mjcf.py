@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -79,7 +80,8 @@ def read_mjcf(path: Path) -> Rig:
         )
     groups = _groups(rays)
     notes = [NO_START] if any(ray.start_m is None for ray in rays) else []
-    sensors = [_sensor([rays[index] for index in group], np.array(group), groups, rays) for group in groups]
+    of_bodies = Counter(rays[group[0]].body for group in groups)
+    sensors = [_sensor([rays[index] for index in group], np.array(group), of_bodies) for group in groups]
     return Rig(KIND, sensors, notes, "give the rangefinders a cutoff")
 
 
@@ -146,13 +148,13 @@ def _near(
     return None
 
 
-def _sensor(own: Sequence[_Ray], order: np.ndarray, groups: Sequence[Sequence[int]], rays: Sequence[_Ray]) -> RigSensor:
-    of_body = sum(rays[group[0]].body == own[0].body for group in groups)
+def _sensor(own: Sequence[_Ray], order: np.ndarray, of_bodies: Mapping[int, int]) -> RigSensor:
+    """One sensor; `of_bodies` says how many each body has."""
     azimuth, elevation = angles(np.array([ray.direction for ray in own]))
     start = np.array([ray.start_m or 0.0 for ray in own])
     end = np.array([ray.cutoff_m for ray in own])
     return RigSensor(
-        name=_name(own, alone=of_body == 1),
+        name=_name(own, alone=of_bodies[own[0].body] == 1),
         origin_m=np.array([ray.origin_m for ray in own]),
         azimuth_rad=azimuth,
         elevation_rad=elevation,

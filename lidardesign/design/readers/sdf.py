@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidardesign.design.readers.rig import Aim, Rig, RigSensor
+from lidardesign.design.readers.rig import MOST_SENSORS, Aim, Rig, RigSensor
 from lidardesign.design.readers.sdf_poses import Scope
 from lidardesign.design.readers.xml_text import numbers_of, read_xml
 from lidardesign.design.sensor import MOST_RAYS, boresight_frame
@@ -62,12 +62,15 @@ def read_sdf(path: Path) -> Rig:
     notes: dict[str, None] = {}
     sensors: list[RigSensor] = []
     longer: list[str] = []
+    rays = 0
     for scope, link, element in _lidars(root, path):
         sensor = _sensor(scope, link, element, notes)
         sensors.append(sensor)
         longer.append("::".join((scope.element.get("name", ""), link.get("name", ""), sensor.name)))
-        if sum(len(one.azimuth_rad) for one in sensors) > MOST_RAYS:
-            raise DataError("has more rays than a design", where=scope.where(element), allowed=f"at most {MOST_RAYS}")
+        rays += len(sensor.azimuth_rad)
+        if rays > MOST_RAYS or len(sensors) > MOST_SENSORS:
+            allowed = f"at most {MOST_RAYS} rays of {MOST_SENSORS} sensors"
+            raise DataError("has more rays or sensors than a design", where=scope.where(element), allowed=allowed)
     if any(True for _ in root.iter("include")):
         notes["models that the file includes are not read; copy their lidars into it"] = None
     if not sensors:
