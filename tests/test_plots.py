@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -148,8 +149,6 @@ def test_pictures_are_a_column_or_a_page_wide_with_letters_to_read(written):
 
 
 def test_no_name_becomes_markup_and_no_picture_reaches_out(written):
-    from xml.etree import ElementTree
-
     for path in written[1::2]:
         text = path.read_text(encoding="utf-8")
         assert "<script" not in text
@@ -161,8 +160,6 @@ def test_no_name_becomes_markup_and_no_picture_reaches_out(written):
 
 
 def test_names_stand_in_the_pictures_as_they_are(written):
-    from xml.etree import ElementTree
-
     tree = ElementTree.fromstring(next(path for path in written if path.name == "density_marginals.svg").read_text())
     words = ["".join(node.itertext()) for node in tree.iter() if node.tag.endswith("}text")]
     assert plain_label(NASTY) in words
@@ -197,15 +194,16 @@ def drawn(evaluation, against="rays"):
         return picture(curve_picture(evaluation, against), "svg")
 
 
-@pytest.mark.parametrize("name", ["$x$ and $", "_hidden", "设计", "a" * 300, "<b>", "\\frac", "two\nlines\0"])
-def test_any_name_can_be_drawn(name):
-    assert drawn(make_evaluation((name, "other")), against="bandwidth").startswith(b"<?xml")
+def test_any_name_can_be_drawn():
+    names = ("$x$ and $", "_hidden", "设计", "a" * 300, "<b>", "\\frac", "two\nlines\0")
+    tree = ElementTree.fromstring(drawn(make_evaluation(names), against="bandwidth"))
+    words = ["".join(node.itertext()).strip() for node in tree.iter() if node.tag.endswith("}text")]
+    assert {"$x$ and $", "_hidden", "设计", f"{'a' * 27}…", "<b>", "\\frac", "two lines"} <= set(words)
 
 
 @pytest.mark.parametrize("value", [0.0, -3.0, 1e-9, 1e9])
 def test_any_finite_score_can_be_drawn(value):
-    assert drawn(make_evaluation(value=value))
-    assert drawn(make_evaluation(rays=(8,), value=value))
+    assert drawn(make_evaluation(("one",), value=value, rays=(8,) if value == 0.0 else (8, 64)))
 
 
 def test_what_there_is_nothing_to_draw_for_is_no_picture():
@@ -272,9 +270,9 @@ def test_a_room_is_cut_open_where_its_walls_hide_the_sensors():
     assert not opened(make_shown(), 0, 0, view, 60)[1]
 
 
-def test_a_detector_of_its_own_has_a_mark():
+def test_a_detector_of_its_own_has_a_mark(written):
     scene = replace(BALL, receiver=Receiver((0.0, 0.5, 0.0), 0.0, 0.0, 0.5, 0.5, (0.1, 9.0)))
-    shown = replace(make_shown(), scene=scene)
+    shown = replace(make_shown(("first", "second")), scene=scene)
     left, right, bottom, top = (view := view_of(shown.directions, framed_points(shown, 0, 0))).window
     across, up = view.project(np.array([0.0, 0.5, 0.0]))
     assert left < across < right
@@ -282,7 +280,7 @@ def test_a_detector_of_its_own_has_a_mark():
     with looks():
         names = [text.get_text() for text in scene_picture(shown).legends[0].get_texts()]
         assert "detector" in names
-        assert "detector" not in [text.get_text() for text in scene_picture(make_shown()).legends[0].get_texts()]
+    assert ">detector<" not in written[1].read_text(encoding="utf-8")
 
 
 def test_a_flat_world_is_seen_from_above():

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 MOST_DESIGNS = 6
 COLUMNS = 2
-PIXELS_PER_INCH = 220
+PIXELS_PER_INCH = 160
 MOST_RAYS = 600
 # From so many sensors on their frusta are a thicket; rays say it all.
 MOST_SENSORS = 20
