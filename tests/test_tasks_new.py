@@ -58,7 +58,7 @@ def done(*command: str, cwd: Path) -> str:
     """What a command prints, which must end well."""
     clean = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTEST_ADDOPTS")}
     ended = subprocess.run(
-        command, cwd=cwd, env={**clean, "COLUMNS": COLUMNS}, capture_output=True, text=True, check=False
+        command, cwd=cwd, env={**clean, "COLUMNS": str(COLUMNS)}, capture_output=True, text=True, check=False
     )
     assert ended.returncode == 0, ended.stdout + ended.stderr
     return ended.stdout
