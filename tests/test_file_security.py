@@ -67,9 +67,15 @@ def unsafe(tree):
             yield f"{node.lineno}: a shell"
 
 
+# The law that scenes can be pickled reads what it wrote itself a line before, which is in no file.
+READS_NO_FILE = {"lidardesign/testing/scenes.py": "imports pickle"}
+
+
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_a_module_runs_no_code_of_files(path):
-    assert list(unsafe(ast.parse(path.read_text(encoding="utf-8")))) == []
+    known = READS_NO_FILE.get(path.relative_to(ROOT).as_posix())
+    found = [words.partition(": ")[2] for words in unsafe(ast.parse(path.read_text(encoding="utf-8")))]
+    assert found == ([known] if known else [])
 
 
 @pytest.mark.parametrize(
