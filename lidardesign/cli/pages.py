@@ -47,12 +47,12 @@ def write_page(evaluation: Evaluation, request: EvaluationRequest, run: Run, pic
 def report_of(evaluation: Evaluation, request: EvaluationRequest, run: Run, pictured: Pictured) -> Report:
     """Everything that a report is made of; see `write_page`."""
     from lidardesign.evaluate.report import Report
+    from lidardesign.evaluate.verdicts import held_out
 
-    scenes = "1 held-out scene" if evaluation.scenes == 1 else f"{evaluation.scenes} held-out scenes"
     return Report(
         evaluation,
         pictured.shown,
-        title=f"{run.task.name}: {evaluation.metric.name} on {scenes}",
+        title=f"{run.task.name}: {evaluation.metric.name} on {held_out(evaluation.scenes)}",
         density=pictured.density,
         density_m=_density_points(request, run),
         constraints=pictured.tightness,

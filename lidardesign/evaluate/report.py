@@ -35,6 +35,7 @@ from lidardesign.evaluate.rungs import Ladder
 from lidardesign.evaluate.shown import Shown
 from lidardesign.evaluate.verdicts import (
     bandwidth_table,
+    held_out,
     paired_table,
     rows_table,
     sensors_table,
@@ -120,7 +121,7 @@ def _curves(evaluation: Evaluation) -> str:
         switch(curve.name, picture=swatch(curve.colour, curve.dash, curve.marker), curve=str(index))
         for index, curve in enumerate(series(evaluation))
     )
-    scenes = f"over {evaluation.scenes} held-out scenes"
+    scenes = f"over {held_out(evaluation.scenes)}"
     return (
         f'<fieldset><legend>Curves shown</legend><div class="curves-shown">{legend}</div></fieldset>'
         + figure(curve_figure(evaluation, "rays"), RAYS_ID, CURVE_PX, f"Score against rays per frame: means {scenes}, "

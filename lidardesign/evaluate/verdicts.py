@@ -27,6 +27,11 @@ def plain(value: float, digits: int, tiny: float = TINY) -> str:
     return f"{rounded:,.0f}" if rounded >= 10 ** (digits - 1) else f"{rounded:g}"
 
 
+def held_out(scenes: int) -> str:
+    """How many held-out scenes, in words."""
+    return "1 held-out scene" if scenes == 1 else f"{scenes} held-out scenes"
+
+
 def verdict(evaluation: Evaluation, pair: Paired) -> str:
     """`better` or `worse` where the paired interval of a excludes zero, `open` where it does not."""
     sign = 1.0 if evaluation.metric.better == "lower" else -1.0
@@ -38,8 +43,8 @@ def summary_sentences(evaluation: Evaluation) -> list[str]:
     """One sentence per design at the largest number of rays, against each baseline."""
     metric = evaluation.metric
     sentences = [
-        f"{metric.name} in {metric.unit}, {metric.better} is better, mean over {evaluation.scenes} held-out "
-        f"scenes. A scene in which too few rays return counts as {metric.worst:g} {metric.unit}."
+        f"{metric.name} in {metric.unit}, {metric.better} is better, mean over {held_out(evaluation.scenes)}. A scene "
+        f"in which too few rays return counts as {metric.worst:g} {metric.unit}."
     ]
     values = {(row.design, row.rays): row.value for row in evaluation.rows}
     baselines = {row.design for row in evaluation.rows if row.baseline}
@@ -60,7 +65,7 @@ def rows_table(evaluation: Evaluation) -> str:
     headings = ["design", "rays", f"{evaluation.metric.name} [{unit}]", "95 % interval", "failures"]
     detail = leading_detail(evaluation.rows)
     headings += [] if detail is None else [_words(detail)]
-    caption = f"Means over {evaluation.scenes} held-out scenes; seconds are those of simulating and scoring all."
+    caption = f"Means over {held_out(evaluation.scenes)}; seconds are those of simulating and scoring all."
     headings += ["Mbit/s", "seconds"]
     return table(headings, _grouped(evaluation.rows, detail), text_columns=1, caption=caption)
 
