@@ -13,7 +13,7 @@ TIMES = "where the time went"
 # What a comparison of numbers may turn out to be.
 VERDICTS = re.compile(r"\b(?:better|worse|not told apart|yes, tight|yes|no)\b")
 # Said only where the numbers ask for it.
-OCCASIONAL = re.compile(r", # rays in all(?=:)|, rays #$|<(?=#)")
+OCCASIONAL = re.compile(r", # rays in all(?=:)|, rays #$|<(?=#)| \(# %\)(?= verdict)")
 
 
 def masked(text: str) -> str:
