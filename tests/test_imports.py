@@ -10,15 +10,24 @@ import numpy as np
 import pytest
 from command_line import caller, make_run
 
+from lidardesign.design.constraints import Constraints
 from lidardesign.design.files import load_design, save_design
+from lidardesign.design.likeness import constraints_like
 from lidardesign.design.rays import lay_out
 from lidardesign.design.readers.rig import aim_of
 from lidardesign.design.readers.xml_text import _Builder
-from lidardesign.design.sensor import Design, RayTable, Sensor, boresight_frame, tangent_coordinates
+from lidardesign.design.sensor import (
+    Design,
+    RayTable,
+    Sensor,
+    boresight_frame,
+    interval_factor,
+    tangent_coordinates,
+)
 from lidardesign.errors import DataError, LidardesignError
 from lidardesign.export.registry import EXPORTERS
 from lidardesign.rotations import rotation_of_quaternion, rotation_of_rpy
-from lidardesign.space import angles, direction
+from lidardesign.space import DesignSpace, angles, direction
 
 NASTY = ('front "left"', "a,b\u00e9</script>", "{x} [bold]")
 EXACT = 1e-12
@@ -696,6 +705,32 @@ def test_fits_like_a_rig_are_no_more_than_it(call, run, tmp_path):
         assert np.all(np.array(one.field_of_view_rad) <= np.array(theirs.field_of_view_rad) + 1e-6)
         assert one.gate_m[1] - one.gate_m[0] <= 0.8 + 1e-9
     assert "like fans: 2 sensors, 16 rays" in result.err
+
+
+def test_sensors_like_a_planar_scanner_stay_planar():
+    """A field of view of no height is one: only a single ray has none that could be a bound."""
+    wide = 2 * interval_factor(0.95)
+    fields = {
+        "fan": (1.0, 0.0),
+        "wall": (0.0, 0.5),
+        "turn": (2 * math.pi, 0.0),
+        "ball": (2 * math.pi, 7.0),
+        "ray": (0, 0),
+    }
+    sensors = tuple(
+        Sensor(name, 0.2, np.zeros(3), np.zeros((3, 3)), 0.0, 0.0, 0.0, across / wide, up / wide, 1.0, 0.2)
+        for name, (across, up) in fields.items()
+    )
+    space = DesignSpace((0,) * 3 + (0, -1.5, 0), (0,) * 3 + (6, 1.5, 9))
+    found = constraints_like(Design("rig", sensors), space, Constraints(), rays=None).as_document()["each"]
+    narrow = pytest.approx(1e-3)
+    assert [one.get("field_of_view", {}) for one in found] == [
+        {"horizontal_deg": {"max": pytest.approx(math.degrees(1))}, "vertical_deg": {"max": narrow}},
+        {"horizontal_deg": {"max": narrow}, "vertical_deg": {"max": pytest.approx(math.degrees(0.5))}},
+        {"vertical_deg": {"max": narrow}},
+        {},
+        {},
+    ]
 
 
 def test_what_a_user_asks_for_goes_before_what_the_rig_has(call, run, tmp_path):

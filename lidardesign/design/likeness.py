@@ -18,7 +18,8 @@ from lidardesign.errors import ConfigError
 from lidardesign.numerics import SLACK
 from lidardesign.space import DIMENSIONS, DesignSpace
 
-# Rays of one direction, or of directions that differ by rounding, have no field of view that could be a bound.
+# Rays of one direction, or of directions that differ by rounding, have no field of view that could be a bound; those of
+# a fan have one in their plane, and this one across it.
 SMALLEST_FIELD_DEG = 1e-3
 PLACES = ("fixed_m", "low_m", "high_m", "mounts_m")
 SHARED = tuple(SensorConstraints.model_fields)
@@ -68,12 +69,10 @@ def _under(like: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, Any]:
 
 def _of_sensor(sensor: Sensor, space: DesignSpace) -> dict[str, Any]:
     bounds: dict[str, Any] = {"origin": _place(sensor, space)}
-    fields = {}
-    for axis, angle in zip(("horizontal", "vertical"), sensor.field_of_view_rad, strict=True):
-        if SMALLEST_FIELD_DEG < math.degrees(angle) < 360:
-            fields[f"{axis}_deg"] = {"max": math.degrees(angle)}
-    if fields:
-        bounds["field_of_view"] = fields
+    widths = dict(zip(("horizontal_deg", "vertical_deg"), map(math.degrees, sensor.field_of_view_rad), strict=True))
+    if max(widths.values()) > SMALLEST_FIELD_DEG:
+        narrow = {axis: {"max": max(width, SMALLEST_FIELD_DEG)} for axis, width in widths.items() if width < 360}
+        bounds.update({"field_of_view": narrow} if narrow else {})
     start, end = sensor.gate_m
     if end - start > SLACK:
         bounds["gate"] = {"width_m": {"max": end - start}}
