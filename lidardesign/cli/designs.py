@@ -172,8 +172,9 @@ def _left(check: ConstraintCheck) -> str:
     if room is None or room < 0:
         return "-"
     # what is left below the rounding of the checks themselves is nothing
-    shown = "0" if share is not None and share < SMALLEST_ERROR else number(room, 3)
-    return shown if share is None else f"{shown} ({number(100 * share, 2)} %)"
+    if room == 0 or (share is not None and share < SMALLEST_ERROR):
+        return "0"
+    return number(room, 3) if share is None else f"{number(room, 3)} ({number(100 * share, 2)} %)"
 
 
 def show_fit(document: dict[str, Any], design: Design, checks: Sequence[Any], rich: RichConsole) -> None:

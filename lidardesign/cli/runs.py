@@ -157,7 +157,7 @@ def need_run(run: Run | None, path: Path) -> Run:
         raise DataError(
             "the run of this design is not there",
             where=str(path),
-            hint="give the run folder, or put the design back into its designs folder",
+            hint="give the run folder (RUN --like FILE for a rig), or put the design back into its designs folder",
         )
     return run
 

@@ -98,10 +98,12 @@ def rig_of_columns(columns: RayColumns, kind: str) -> Rig:
     if END in columns.numbers:
         columns.refuse(end < start, END, "before the gate's start", "at least the gate's start")
     notes += _notes_of_times(columns)
+    gate = np.stack([start, end], axis=1)
+    order = np.argsort(columns.sensor, kind="stable")
+    rays_of = np.split(order, np.cumsum(np.bincount(columns.sensor, minlength=len(columns.names)))[:-1])
     sensors = [
-        RigSensor(name, origin[rays], azimuth[rays], elevation[rays], np.stack([start, end], axis=1)[rays], order=rays)
-        for index, name in enumerate(columns.names)
-        if len(rays := np.flatnonzero(columns.sensor == index))
+        RigSensor(name, origin[rays], azimuth[rays], elevation[rays], gate[rays], order=rays)
+        for name, rays in zip(columns.names, rays_of, strict=True)
     ]
     return Rig(kind, sensors, notes, f"add a column {END}")
 

@@ -174,10 +174,11 @@ def _table(sensors: Sequence[RigSensor]) -> RayTable:
 
 
 def _sensor(one: RigSensor, name: str, total: int) -> Sensor:
-    aim = one.aim or aim_of(direction(one.azimuth_rad, one.elevation_rad))
+    single = Aim(float(one.azimuth_rad[0]), float(one.elevation_rad[0]), 0.0, (0.0, 0.0))
+    count = len(one.azimuth_rad)
+    aim = one.aim or (single if count == 1 else aim_of(direction(one.azimuth_rad, one.elevation_rad)))
     wide = 2 * interval_factor(DEFAULT_LEVEL)
     start, end = float(one.gate_m[:, 0].min()), float(one.gate_m[:, 1].max())
-    count = len(one.azimuth_rad)
     away = one.origin_m - one.origin_m[0]
     still = not away.any()
     return Sensor(
