@@ -317,7 +317,7 @@ BAD_XML = {
     "an unknown site": (model_of('<rangefinder site="b" cutoff="1"/>'), "MuJoCo cannot read it"),
     "a camera": (model_of('<rangefinder camera="c"/>', '<camera name="c"/>'), "of a camera"),
     "too many copies": (
-        model_of("", '<replicate count="99999"><replicate count="99"><site/></replicate></replicate>'),
+        model_of("", '<replicate count="999"><replicate count="99"><site/></replicate></replicate>'),
         "replicates too much",
     ),
     "no number of copies": (model_of("", '<replicate count="many"><site/></replicate>'), "count is 'many'"),
