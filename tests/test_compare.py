@@ -126,6 +126,16 @@ def test_designs_of_other_numbers_of_rays_are_also_compared_as_they_are(call, ru
     assert itself["paired"][0]["difference"] == 0
 
 
+def test_what_rounding_leaves_of_no_difference_is_shown_as_none(call, run, tmp_path):
+    """A direction goes through its unit vector, and comes back to the last digit but one."""
+    rows = "".join(f"{angle / 7},{angle / 9},2\n" for angle in range(3))
+    (tmp_path / "rays.csv").write_text("azimuth_rad,elevation_rad,gate_end_m\n" + rows)
+    assert call("export", "rays.csv", "--format", "mjcf", "--out", "rays.xml").code == 0
+    result = call("compare", "rays.csv", "rays.xml")
+    assert result.code == 0, result.err
+    assert "e-" not in result.out
+
+
 def test_without_a_run_there_are_no_scores_and_with_one_there_are(call, run, tmp_path):
     for name in ("one", "two"):
         save_design(replace(load_design(run / "designs" / "few.yaml"), provenance={}), tmp_path / f"{name}.yaml")

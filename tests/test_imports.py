@@ -692,6 +692,14 @@ def test_a_rig_is_shown_and_exported(call, tmp_path):
     assert "gate_end_m" in refused.err
 
 
+@pytest.mark.parametrize("name", ["sensors-csv", "stl"])
+def test_formats_of_sensors_take_no_number_of_rays(call, tmp_path, name):
+    result = call("export", flat_rig(tmp_path), "--format", name, "--rays", 20, "--out", "sensors")
+    assert result.code == 2
+    assert f"{name} holds sensors, not rays" in result.err
+    assert not (tmp_path / "sensors").exists()
+
+
 def test_fits_like_a_rig_are_no_more_than_it(call, run, tmp_path):
     path = flat_rig(tmp_path)
     like = load_design(path)

@@ -35,6 +35,7 @@ RayCounts = Annotated[
         show_default="both as they are, else the task's",
     ),
 ]
+SHOWN_DECIMALS = 6
 SCORE_COLUMNS = ("design", "rays", "value", "95 % interval", "failures", "Mbit/s")
 SENSOR_COLUMNS = (
     "first", "second", "place [m]", "looks [deg]", "field of view [deg]", "gate start [m]", "gate end [m]", "weight",
@@ -207,7 +208,8 @@ def _sensor_line(pair: dict[str, Any]) -> list[str]:
     if found is None:
         return [*names, *("-" for _ in SENSOR_COLUMNS[2:])]
     fields = f"{_signed(found['horizontal_deg'])} x {_signed(found['vertical_deg'])}"
-    apart = [number(found[name], 3) for name in ("place_m", "boresight_deg")]
+    # what rounding leaves of no difference is none
+    apart = [number(round(found[name], SHOWN_DECIMALS), 3) for name in ("place_m", "boresight_deg")]
     return [*names, *apart, fields, *(_signed(found[name], 3) for name in ("gate_start_m", "gate_end_m", "weight"))]
 
 

@@ -48,7 +48,9 @@ class _Asked:
 
 
 def export(
-    design: Annotated[Path | None, typer.Argument(metavar="DESIGN", help="A design file.", show_default=False)] = None,
+    design: Annotated[
+        Path | None, typer.Argument(metavar="DESIGN", help="A design file, or the file of a rig.", show_default=False)
+    ] = None,
     format_: Annotated[
         str | None,
         typer.Option("--format", metavar="NAME", help="Format; --list shows them.", show_default=False),
@@ -131,6 +133,9 @@ def _export(
         raise ConfigError("no design was given", where="DESIGN", hint="lidardesign export --list shows the formats")
     exporter = _exporter(name)
     design = read_design(path, console)
+    if asked.rays is not None and exporter.name in WITHOUT_RAYS and design.layout != "scan":
+        # of a scan another number of rays is another number of sensors
+        raise ConfigError(f"{exporter.name} holds sensors, not rays", where="--rays", hint="leave it out")
     target = _target(path, out, exporter)
     folder = folder_of(design, path)
     if dry_run:

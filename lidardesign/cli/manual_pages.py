@@ -86,9 +86,12 @@ PAGES: dict[str, Manual] = {
             "lidardesign export runs/face/designs/free.yaml --format csv --rays 576 --out - | head -3": "to stdout",
         },
         about="Says what the format cannot hold, and reads the file back to say what its numbers lose.",
-        files=("DESIGN: a design file, - for standard input", "--out PATH: what is written, - for standard output"),
+        files=(
+            "DESIGN: a design file or one of a rig (lidardesign show --help), - for standard input",
+            "--out PATH: what is written, - for standard output",
+        ),
         exits={6: "the task's plugin failed"},
-        see=("design-file.md",),
+        see=("formats.md", "design-file.md"),
     ),
     "capture": Manual(
         {
