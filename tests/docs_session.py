@@ -30,7 +30,6 @@ SMALL = {
     "face": (*QUICK, "learning.steps=60", "density.sigma_m=0.02", "truth_points=500"),
     "arm": (*QUICK, "learning.steps=120", "learning.samples=20000", "density.sigma_m=0.1", "frames=8"),
     "warehouse": (*QUICK, "learning.steps=80", "density.sigma_m=0.1"),
-    "emitter": (*QUICK, "learning.samples=50000", "learning.steps=80", "density.sigma_m=0.02", "truth_points=500"),
     "meshes": (*QUICK[:-2], "learning.steps=60", "density.sigma_m=0.01", "poses=1", "truth_points=500"),
 }
 SHELL = re.compile(r"[|<>&;`]|\$\(")

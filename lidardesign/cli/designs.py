@@ -146,13 +146,15 @@ def show_constraints(checks: Sequence[ConstraintCheck], rich: RichConsole) -> No
     The bounds of the design space hold for every sensor; they are shown where they are broken.
     """
     from rich.markup import escape
-    from rich.table import Table
+    from rich.table import Column, Table
 
     if not checks:
         return
     from lidardesign.design.tightness import is_tight
 
-    table = Table("constraint", "bound", "value", "left", "holds", title="constraints", title_justify="left")
+    # names are needed whole, to loosen what they name
+    name = Column("constraint", overflow="fold")
+    table = Table(name, "bound", "value", "left", "holds", title="constraints", title_justify="left")
     for check in checks:
         if SPACE_MARK in check.name and check.satisfied:
             continue
