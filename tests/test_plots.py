@@ -16,7 +16,7 @@ from PIL import Image
 from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import Design, Sensor
 from lidardesign.design.tightness import Tightness
-from lidardesign.evaluate.curves import COLOURS, axis_titles, logarithmic, series
+from lidardesign.evaluate.curves import COLOURS, axis_titles, log_ticks, logarithmic, series
 from lidardesign.evaluate.density_views import density_view
 from lidardesign.evaluate.effects import EffectSummary
 from lidardesign.evaluate.pictured import Pictured, tightness_of
@@ -364,3 +364,13 @@ def test_nothing_draws_before_it_is_asked_to():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("span", [4.1, 20.0, 29.0, 31.0, 1e5])
+@pytest.mark.parametrize("low", [0.037, 1.0, 5.7])
+def test_a_logarithmic_axis_has_at_least_three_labels_at_round_places_inside_it(low, span):
+    ticks = log_ticks([low * span, low])
+    assert ticks == sorted(set(ticks))
+    assert 3 <= len(ticks) <= 18
+    assert low / 1.21 <= ticks[0] < ticks[-1] <= low * span * 1.21
+    assert all(f"{tick:.1e}"[:3] in ("1.0", "1.5", "2.0", "3.0", "4.0", "5.0", "6.0", "8.0") for tick in ticks)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -16,6 +17,9 @@ GREYS = ("#555555", "#808080", "#222222", "#999999", "#6b6b6b")
 MARKERS = ("o", "s", "^", "D", "v", "P")
 BASELINE_MARKERS = ("x", "+", "*", "1", "d")
 DASHES = ("solid", "dashed", "dashdot", "dotted")
+# Labels of a logarithmic axis: at these times every power of ten, the few where the values span more than the factor.
+FEW_MANTISSAS, MANY_MANTISSAS, WIDE_FACTOR = (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0), 30.0
+TICK_MARGIN = 1.2
 MANY_DECADES = 4.0  # a range of values wider than this factor is easier to read on a logarithmic axis
 
 
@@ -67,6 +71,15 @@ def logarithmic(values: Sequence[float]) -> bool:
     """Whether values span so much that a logarithmic axis shows them better."""
     positive = [value for value in values if value > 0]
     return len(positive) == len(values) > 1 and max(positive) > MANY_DECADES * min(positive)
+
+
+def log_ticks(values: Sequence[float]) -> list[float]:
+    """Round places to label on a logarithmic axis that holds some values: more to a decade where it has few of them."""
+    low, high = min(values), max(values)
+    mantissas = FEW_MANTISSAS if high > WIDE_FACTOR * low else MANY_MANTISSAS
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    ticks = [mantissa * 10.0**decade for decade in decades for mantissa in mantissas]
+    return [tick for tick in ticks if low / TICK_MARGIN <= tick <= high * TICK_MARGIN]
 
 
 def axis_titles(evaluation: Evaluation, against: Against) -> tuple[str, str]:

@@ -10,7 +10,7 @@ import html
 from collections.abc import Sequence
 from typing import Any
 
-from lidardesign.evaluate.curves import Against, Series, axis_titles, logarithmic, position, series
+from lidardesign.evaluate.curves import Against, Series, axis_titles, log_ticks, logarithmic, position, series
 from lidardesign.evaluate.results import Evaluation
 
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 14, "color": "#1f2933"}
@@ -59,7 +59,7 @@ def curve_figure(evaluation: Evaluation, against: Against) -> dict[str, Any]:
 
 
 def _scale(values: Sequence[float]) -> dict[str, Any]:
-    return {"type": "log", "dtick": "D2"} if logarithmic(values) else {"type": "linear"}
+    return {"type": "log", "tickvals": log_ticks(values)} if logarithmic(values) else {"type": "linear"}
 
 
 def _curve_traces(curve: Series, against: Against) -> list[dict[str, Any]]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -106,7 +106,7 @@ def plain_axes(axes: Axes, *, grid: str | None = "both") -> None:
         axes.grid(True, axis=grid, which="major", color=GRID, linewidth=0.6)
 
 
-def label_ticks(axis: Any, at: list[int] | None) -> None:
+def label_ticks(axis: Any, at: Sequence[float] | None) -> None:
     """Plain numbers instead of powers of ten; at the given places where there are any."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from lidardesign.evaluate.curves import Against, Series, axis_titles, logarithmic, position, series
+from lidardesign.evaluate.curves import Against, Series, axis_titles, log_ticks, logarithmic, position, series
 from lidardesign.evaluate.plots_canvas import (
     BAND_OPACITY,
     COLUMN_INCHES,
@@ -85,13 +85,15 @@ def _dress_curves(axes: Axes, evaluation: Evaluation, curves: list[Series], agai
     axes.set_ylabel(plain_label(up, longest=40))
     told = f"{evaluation.metric.better} is better; {scenes}, 95 % intervals"
     axes.set_title(told, fontsize=SMALL_POINTS, loc="left", color=SOFT)
-    if logarithmic([position(row, against) for row in rows]):
+    places = [position(row, against) for row in rows]
+    if logarithmic(places):
         axes.set_xscale("log")
         counts = sorted({row.rays for row in rows})
-        label_ticks(axes.xaxis, counts if against == "rays" and len(counts) <= MOST_RAY_TICKS else None)
+        at_counts = against == "rays" and len(counts) <= MOST_RAY_TICKS
+        label_ticks(axes.xaxis, counts if at_counts else log_ticks(places))
     if logarithmic([row.value for row in rows]):
         axes.set_yscale("log")
-        label_ticks(axes.yaxis, None)
+        label_ticks(axes.yaxis, log_ticks([row.value for row in rows]))
     plain_axes(axes)
 
 
