@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 from xml.etree import ElementTree
 
 import numpy as np
@@ -690,6 +691,13 @@ def test_a_rig_is_shown_and_exported(call, tmp_path):
     refused = call("show", flat_rig(tmp_path, end=False))
     assert refused.code == 3
     assert "gate_end_m" in refused.err
+
+
+def test_what_is_no_file_is_refused_before_it_is_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (type(tmp_path)("/dev/zero"), tmp_path / "pipe"):
+        with pytest.raises(DataError, match="no regular file"):
+            load_design(path)
 
 
 @pytest.mark.parametrize("name", ["sensors-csv", "stl"])

@@ -165,11 +165,14 @@ def load_design(path: Path, reach_m: float | None = None) -> Design:
         ConfigError: The file is not YAML, or not a design (exit 2).
     """
     path = Path(path)
+    hint = "give a design file, as RUN/designs/NAME.yaml"
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        # a pipe gives its content once, and would be waited for the second time
+        raise DataError("is no regular file", where=str(path), hint=f"{hint}, or - for standard input")
     try:
         with path.open("rb") as file:
             head = file.read(4096)
     except OSError as error:
-        hint = "give a design file, as RUN/designs/NAME.yaml"
         raise DataError(f"cannot be read: {error.strerror or error}", where=str(path), hint=hint) from None
     rig = read_rig(path, head)
     if rig is not None:
