@@ -6,9 +6,8 @@ few returns has the metric's worst value, and a scene fails where all of its fra
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,30 +17,18 @@ from lidardesign.scene import Scene
 from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
 from lidardesign.task import Metric, Residuals, Score, random_generator
-from lidardesign_tasks.surface import surface_residuals, surface_score
+from lidardesign_tasks.surface import LazyTruth, surface_residuals, surface_score
 
 SURFACES = "surfaces"
 
 
-@dataclass(frozen=True, eq=False)
-class MovingTruth(Mapping[str, "tuple[SurfaceCloud | None, ...]"]):
-    """The truth of a scene under the key `surfaces`, one per frame, found when it is first asked for.
+class MovingTruth(LazyTruth):
+    """What some admissible ray sees of the targets: a SurfaceCloud or None per frame, under `surfaces`."""
 
-    Arguments:
-        scene: The scene without a truth.
-        space: What the sensors may do.
-        points: Points of each cloud.
-        seed: Of their random places.
-    """
+    key = SURFACES
 
-    scene: Scene
-    space: DesignSpace
-    points: int
-    seed: int
-
-    @cached_property
-    def surfaces(self) -> tuple[SurfaceCloud | None, ...]:
-        """What some admissible ray sees of the targets in each frame; raises DataError where that is nothing in all."""
+    def find(self) -> tuple[SurfaceCloud | None, ...]:
+        """The visible part of the targets in each frame."""
         found = [self._surface(frame) for frame in range(self.scene.frames)]
         if all(surface is None for surface in found):
             raise DataError(
@@ -58,17 +45,6 @@ class MovingTruth(Mapping[str, "tuple[SurfaceCloud | None, ...]"]):
         except DataError:
             # nothing of it is in view
             return None
-
-    def __getitem__(self, key: str) -> tuple[SurfaceCloud | None, ...]:
-        if key != SURFACES:
-            raise KeyError(key)
-        return self.surfaces
-
-    def __iter__(self) -> Iterator[str]:
-        return iter((SURFACES,))
-
-    def __len__(self) -> int:
-        return 1
 
 
 def with_moving_truth(scene: Scene, space: DesignSpace, points: int, generator: np.random.Generator) -> Scene:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -23,36 +25,51 @@ STEEPEST_DEG = 85.0  # flatter triangles bridge depth steps: with dense rays the
 
 
 @dataclass(frozen=True, eq=False)
-class VisibleTruth(Mapping[str, SurfaceCloud]):
-    """The truth of a scene under the key `surface`, found when it is first asked for: learning never asks.
+class LazyTruth(Mapping[str, Any]):
+    """The truth of a scene under one key, found when it is first asked for: learning never asks.
 
     Arguments:
         scene: The scene without a truth.
         space: What the sensors may do.
-        points: Points of the cloud.
+        points: Points of a cloud.
         seed: Of their random places.
     """
 
+    key: ClassVar[str]
     scene: Scene
     space: DesignSpace
     points: int
     seed: int
 
-    @cached_property
-    def surface(self) -> SurfaceCloud:
-        """The part of the targets that some admissible ray sees; raises DataError where there is none."""
-        return visible_surface(self.scene, self.space, self.points, random_generator(self.seed, "truth"))
+    @abstractmethod
+    def find(self) -> Any:
+        """What stands under the key; raises DataError where no admissible ray sees any target."""
 
-    def __getitem__(self, key: str) -> SurfaceCloud:
-        if key != "surface":
+    @cached_property
+    def found(self) -> Any:
+        """What `find` found the first time."""
+        return self.find()
+
+    def __getitem__(self, key: str) -> Any:
+        if key != self.key:
             raise KeyError(key)
-        return self.surface
+        return self.found
 
     def __iter__(self) -> Iterator[str]:
-        return iter(("surface",))
+        return iter((self.key,))
 
     def __len__(self) -> int:
         return 1
+
+
+class VisibleTruth(LazyTruth):
+    """The part of the targets that some admissible ray sees: a SurfaceCloud under `surface`."""
+
+    key = "surface"
+
+    def find(self) -> SurfaceCloud:
+        """The visible part of the targets."""
+        return visible_surface(self.scene, self.space, self.points, random_generator(self.seed, "truth"))
 
 
 def with_visible_truth(
