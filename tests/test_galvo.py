@@ -155,6 +155,14 @@ def test_scattered_stops_are_toured_nearly_as_shortly_as_is_known_to_be_possible
     assert travel(stops) < 0.1 * travel(points)
 
 
+def test_stops_in_a_column_or_a_row_are_toured_along_it():
+    for axis in (0, 1):
+        points = np.zeros((9, 2))
+        points[:, axis] = np.random.default_rng(1).permutation(9)
+        tour = points[short_tour(points), axis]
+        assert abs(np.diff(tour)).sum() == 8
+
+
 def test_tours_are_the_same_every_time():
     points = np.random.default_rng(6).uniform(-15, 15, (300, 2))
     np.testing.assert_array_equal(short_tour(points), short_tour(points.copy()))

@@ -65,7 +65,9 @@ def _neighbours(points: np.ndarray) -> np.ndarray:
 def _rows(points: np.ndarray) -> np.ndarray:
     """Rows to and fro, as many as make their stops as far apart as the rows are."""
     low, extent = points.min(axis=0), np.maximum(np.ptp(points, axis=0), TINY)
-    rows = max(1, round(float(np.sqrt(len(points) * min(extent[1] / extent[0], len(points))))))
+    # a column of stops has no extent to divide by
+    steepness = len(points) if extent[1] >= len(points) * extent[0] else float(extent[1] / extent[0])
+    rows = max(1, round(float(np.sqrt(len(points) * steepness))))
     row = np.minimum((points[:, 1] - low[1]) / extent[1] * rows, rows - 1).astype(np.int64)
     along = np.where(row % 2 == 0, points[:, 0], -points[:, 0])
     return np.lexsort((along, row))
