@@ -155,6 +155,17 @@ def test_sensors_are_numbers_or_names(tmp_path):
     assert [(sensor.name, sensor.rays) for sensor in named.sensors] == [("left", 2), ("2", 1)]
 
 
+def test_names_keep_the_line_ends_of_other_scripts(tmp_path):
+    path = tmp_path / "n.csv"
+    path.write_text("sensor,azimuth_deg,elevation_deg,gate_end_m\r\nleft\u2028eye,0,0,1\r\n\r\n,0,0,1\r\n", newline="")
+    with pytest.raises(DataError) as refused:
+        load_design(path)
+    assert refused.value.where == f"{path}:4:1"
+    path.write_text(path.read_text().rsplit("\n\n", 1)[0])
+    (sensor,) = load_design(path).sensors
+    assert sensor.name == "left\u2028eye"
+
+
 def test_uneven_firing_times_are_told(tmp_path):
     looks = {"azimuth_deg": [0, 10, 20], "elevation_deg": [0, 0, 0], "gate_end_m": [1, 1, 1], "gate_start_m": [0, 0, 0]}
     even = load_design(write_rays(tmp_path / "t.csv", {**looks, "time_s": [0, 0.1, 0.2]}))

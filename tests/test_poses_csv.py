@@ -85,6 +85,11 @@ def test_a_body_rests_before_its_first_and_after_its_last_row(tmp_path):
     np.testing.assert_allclose(path.at(np.array([0, 1, 1.5, 2, 3, 9]))[:, 0, 3], [0, 0, 0.5, 1, 2, 2], atol=EXACT)
 
 
+def test_names_keep_the_line_ends_of_other_scripts(tmp_path):
+    path = write(tmp_path / "p.csv", f"{HEADER}\n0,a\u2028b,0,0,0\n")
+    assert list(read_poses(path)) == ["a\u2028b"]
+
+
 BAD = {
     "no column": ("time_s,body,x_m,y_m\n0,a,0,0\n", "p.csv:1", "missing columns: z_m"),
     "another column": (f"{HEADER},colour\n0,a,0,0,0,1\n", "p.csv:1", "colour"),

@@ -9,6 +9,7 @@ rotations turn at an even speed the shorter way; before its first and after its 
 from __future__ import annotations
 
 import csv
+import io
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -159,7 +160,8 @@ def _rows(path: Path) -> list[tuple[int, list[str]]]:
         raise DataError(f"cannot be read: {error.strerror or error}", where=str(path)) from None
     except UnicodeDecodeError:
         raise DataError("is not UTF-8 text", where=str(path)) from None
-    reader = csv.reader(text.splitlines(), strict=True)
+    # `splitlines` would also part names at the line ends of other scripts
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     try:
         rows = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
     except csv.Error as error:

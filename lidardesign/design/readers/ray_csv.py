@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -61,7 +62,8 @@ def _rows(path: Path) -> tuple[list[list[str]], list[int]]:
     except UnicodeDecodeError:
         raise DataError("is not UTF-8 text", where=str(path)) from None
     rows, lines = [], []
-    reader = csv.reader(text.splitlines(), strict=True)
+    # `splitlines` would also part names at the line ends of other scripts
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     try:
         for row in reader:
             if any(cell.strip() for cell in row):
