@@ -106,13 +106,14 @@ def plugin_guard(name: str) -> Iterator[None]:
         raise PluginError(f"tried to end the program (exit {error.code})", where=f"task {name}") from error
     except BaseException as error:
         raise PluginError(
-            f"{type(error).__name__}: {_text_of(error)}",
+            f"{type(error).__name__}: {text_of(error)}",
             where=f"task {name}",
             hint=f"--debug shows where; {AUTHOR_HINT}",
         ) from error
 
 
-def _text_of(error: BaseException) -> str:
+def text_of(error: BaseException) -> str:
+    """What an error says, on one line, whatever its class makes of that."""
     try:
         return " ".join(str(error).split()) or "no message"
     except Exception:
@@ -226,7 +227,7 @@ def answer_probe(request: dict[str, Any]) -> None:
     except PluginError as error:
         answer(result, {"error": error.message})
     except BaseException as error:
-        answer(result, {"error": f"{type(error).__name__}: {_text_of(error)}"})
+        answer(result, {"error": f"{type(error).__name__}: {text_of(error)}"})
 
 
 @contextlib.contextmanager

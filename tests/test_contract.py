@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from plugins import GOOD
 
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.registry import load_task
-from lidardesign.scene import Body, Mesh, Scene, Sphere
+from lidardesign.scene import Body, Medium, Mesh, Scene, Sphere
 from lidardesign.testing import BrokenLawError, Limits, check_task, contract_of
 from lidardesign.testing.contract import LAWS
 from lidardesign.testing.fingerprint import fingerprint, geometry_fingerprint
@@ -42,10 +43,12 @@ BROKEN = {
         (METRIC, METRIC.replace("0.5", "0.0"), "metric.tolerance is 0.0"),
         (METRIC, METRIC.replace("100.0", "float('inf')"), "metric.worst is inf"),
         (METRIC, METRIC.replace("lower", "smaller"), "metric.better is 'smaller'"),
+        (METRIC, METRIC.replace("100.0", "10**400"), "OverflowError"),
     ],
     "defaults are accepted": [
         (DEFAULTS, "Defaults(layout='spiral')", "defaults.layout is 'spiral'"),
         (DEFAULTS, "Defaults(rays=())", "defaults.rays is ()"),
+        (DEFAULTS, "Defaults(rays=36)", "defaults.rays is 36"),
         (DEFAULTS, "Defaults(level=95)", "defaults.level is 95"),
         (DEFAULTS, "Defaults(learning={'rough': {}})", "the preset 'rough'"),
         (DEFAULTS, "Defaults(learning={'fine': {'step': 3}})", "preset fine: unknown key 'learning.step'"),
@@ -111,7 +114,9 @@ BROKEN = {
         (VALUE, "        import os\n        try: os.mkdir('left')\n        except OSError: pass\n" + VALUE, "left"),
     ],
     "nothing else is changed": [
-        (VALUE, "        import os; os.environ['MINE'] = '1'\n" + VALUE, "the environment in score"),
+        (VALUE, "        import os; os.environ['MINE'] = '1'\n" + VALUE, "the environment (MINE) in score"),
+        (VALUE, "        import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n" + VALUE, "who hears SIGINT"),
+        (VALUE, "        import locale; locale.setlocale(locale.LC_ALL, 'C.UTF-8')\n" + VALUE, "the locale in score"),
         (VALUE, "        np.seterr(all='ignore')\n" + VALUE, "numpy's error settings in score"),
     ],
 }  # fmt: skip
@@ -280,6 +285,8 @@ def test_a_fingerprint_is_of_the_content_alone():
     assert fingerprint(scene(x=1)) != fingerprint(scene(x=1.0))
     assert geometry_fingerprint(scene("a")) == geometry_fingerprint(scene("b"))
     assert geometry_fingerprint(scene()) != geometry_fingerprint(scene(radius=0.3))
+    assert geometry_fingerprint(scene()) != geometry_fingerprint(replace(scene(), medium=Medium(0.1, 0.01)))
+    assert geometry_fingerprint(scene()) == geometry_fingerprint(replace(scene(x=1), notes=("one",)))
     mesh = Mesh(np.eye(3), np.array([[0, 1, 2]]), "unsigned")
     before = fingerprint(mesh)
     assert mesh.content_hash

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -12,7 +13,10 @@ from plugins import GOOD, install_plugins
 
 from lidardesign import registry
 from lidardesign.errors import ConfigError
+from lidardesign.probe import START_SECONDS
+from lidardesign.testing import process
 from lidardesign.testing.contract import LAWS
+from lidardesign.testing.law import Finding
 from lidardesign.testing.limits import Limits
 from lidardesign.testing.process import CheckRequest, check_apart
 
@@ -60,6 +64,16 @@ CONTAINED = {
     ),
     "hog": (GOOD.replace(SCENES, SCENES + "        np.ones(2**28)\n"), "scenes are made", "needs more than 512 MiB"),
 }
+# What is unusual and keeps the contract: it says much, never ends by itself, holds a library that sets variables of its
+# own, and has scenes that differ in their fog alone.
+UNUSUAL = (
+    "import atexit, os, threading\natexit.register(print, 'bye')\nos.environ.setdefault('KMP_INIT_AT_FORK', 'FALSE')\n"
+    "threading.Thread(target=threading.Event().wait).start()\n"
+    + GOOD.replace(SCENES, SCENES + "        os.system('echo one more')\n")
+    .replace("generator.uniform(2.0, 3.0), generator.uniform(-0.5, 0.5), 0.0", "2.5, 0.0, 0.0")
+    .replace('{"at": centre})', '{"at": centre}, medium=Medium(generator.uniform(0.01, 0.1), 0.001))')
+    .replace("import Body,", "import Body, Medium,")
+)
 SECONDS = {"hang": 2.0}
 MEMORY = {"hog": 2**29}
 
@@ -71,7 +85,7 @@ def place(tmp_path_factory):
     sources = {name: source.replace("OUTSIDE", str(root / "mark")) for name, (source, *_) in BROKEN.items()}
     sources |= {name: source for name, (source, *_) in CONTAINED.items()}
     twin = sources.pop("duplicate")
-    install_plugins(root / "installed", {"good": GOOD, **sources})
+    install_plugins(root / "installed", {"good": GOOD, "unusual": UNUSUAL, **sources})
     for package in ("first", "second"):
         install_plugins(root / "installed", {"duplicate": twin}, package=package)
     with pytest.MonkeyPatch.context() as patched:
@@ -89,7 +103,7 @@ def findings(place):
 
     before = files_under(place)
     with ThreadPoolExecutor(4) as pool:
-        found = dict(pool.map(checked, [*BROKEN, *CONTAINED]))
+        found = dict(pool.map(checked, [*BROKEN, *CONTAINED, "unusual"]))
     assert files_under(place) == before
     return found
 
@@ -109,6 +123,33 @@ def test_every_law_has_its_finding_and_those_that_stand_on_a_broken_one_are_not_
     broken = [finding.law for finding in found if finding.outcome == "fail"]
     assert len(broken) == 1, broken
     assert all(finding.detail for finding in found)
+
+
+def test_an_unusual_plugin_keeps_every_law_that_applies(findings):
+    assert [finding for finding in findings["unusual"] if finding.outcome == "fail"] == []
+    kept = {finding.law for finding in findings["unusual"] if finding.outcome == "pass"}
+    assert kept >= {"scenes repeat elsewhere", "splits are disjoint", "nothing else is changed"}
+
+
+class Playing:
+    """A process that says given lines, and how long each is waited for."""
+
+    def __init__(self, *lines):
+        self.lines, self.waits = [json.dumps(line).encode() for line in lines], []
+
+    def next_line(self, deadline):
+        self.waits.append(deadline - time.monotonic())
+        return 0.0, self.lines.pop(0) if self.lines else None
+
+
+def test_every_call_of_a_law_has_its_own_time():
+    finding = Finding("law", "group", "statement", "pass", "").as_dict()
+    child = Playing({"called": "score"}, {"called": ""}, {"called": "score"}, finding)
+    assert process._next_finding(child, 2.0, loading=False) == finding
+    waiting, calling = START_SECONDS + 8.0, 8.0
+    assert child.waits == pytest.approx([waiting, calling, waiting, calling], abs=0.5)
+    assert process._next_finding(Playing({"called": "score"}), 2.0, loading=False) == "score did not end within 6 s"
+    assert process._next_finding(Playing({"other": 1}), 2.0, loading=True).startswith("writes into what is not its own")
 
 
 def test_none_of_them_is_imported_here_or_spoils_the_others(findings, place, tmp_path, monkeypatch, capsys):

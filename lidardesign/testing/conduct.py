@@ -29,10 +29,10 @@ def check_files(subject: Subject) -> Held:
 
 
 def check_surroundings(subject: Subject) -> Held:
-    """The working folder, the environment and numpy's error settings stay."""
+    """The working folder, the environment, the locale, signals and numpy's error settings stay."""
     if subject.watch.changed:
         raise BrokenLawError(f"changes {', '.join(subject.watch.changed)}", hint="put back what you change")
-    return Held("working folder, environment and numpy's error settings are as they were")
+    return Held("working folder, environment, locale, signals and numpy's error settings are as they were")
 
 
 def check_time(subject: Subject) -> Held:
@@ -67,7 +67,7 @@ _AFTER = ("scores are numbers", "residuals are places")
 LAWS = (
     Law("no global random state", "conduct", "no global random state is used", check_random, after=_AFTER),
     Law("nothing is written", "conduct", "only temporary files and caches are written", check_files, after=_AFTER),
-    Law("nothing else is changed", "conduct", "working folder and environment stay", check_surroundings, after=_AFTER),
+    Law("nothing else is changed", "conduct", "working folder, environment, locale and signals stay", check_surroundings, after=_AFTER),
     Law("within time", "conduct", "every call ends in time", check_time, after=_AFTER),
     Law("within memory", "conduct", "the process stays within memory", check_memory, after=_AFTER),
 )

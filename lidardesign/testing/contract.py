@@ -7,10 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from lidardesign import registry
 from lidardesign.errors import ConfigError, LidardesignError
+from lidardesign.registry import text_of
 from lidardesign.run.config import RunConfig, resolve
 from lidardesign.task import Task
 from lidardesign.testing import conduct, geometry, interface, scenes, scoring
-from lidardesign.testing.law import BrokenLawError, Finding, Law, NotApplicable, said
+from lidardesign.testing.law import BrokenLawError, Finding, Law, NotApplicable, place_of, said
 from lidardesign.testing.limits import Limits
 from lidardesign.testing.subject import Subject
 from lidardesign.testing.watch import Watch
@@ -62,6 +63,9 @@ class Contract:
         except MemoryError:
             limit = self.subject.limits.memory_bytes
             return Finding(*known, "fail", f"needs more than {limit / 2**20:.0f} MiB", time.perf_counter() - started)
+        except Exception as error:  # what a task gives instead of what it should surprises in any way
+            words = f"{type(error).__name__}: {text_of(error)}{place_of(error)}"
+            return Finding(*known, "fail", words, time.perf_counter() - started)
         seconds = time.perf_counter() - started
         if isinstance(found, NotApplicable):
             return Finding(*known, "skip", found.reason, seconds)

@@ -10,7 +10,9 @@ import sys
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
+from lidardesign import probe
 from lidardesign.errors import LidardesignError
+from lidardesign.probe import START_SECONDS
 from lidardesign.registry import plugin_guard
 from lidardesign.space import DesignSpace
 from lidardesign.task import scenes_of
@@ -27,6 +29,7 @@ CHILD = (
 )
 # Any number but 0, which would be no chance at all, and not the one of the process that asks.
 HASH_SEEDS = ("20251", "20252")
+SPLITS = 2
 
 
 def fingerprints_elsewhere(config: RunConfig, kind: type, seconds: float) -> dict[str, list[str]]:
@@ -35,7 +38,7 @@ def fingerprints_elsewhere(config: RunConfig, kind: type, seconds: float) -> dic
     Arguments:
         config: Whose scenes.
         kind: The task's class; it must be importable.
-        seconds: How long the process may take.
+        seconds: How long the scenes of one split may take there.
 
     Raises:
         BrokenLawError: It failed there, or took longer.
@@ -56,11 +59,11 @@ def fingerprints_elsewhere(config: RunConfig, kind: type, seconds: float) -> dic
             capture_output=True,
             text=True,
             check=False,
-            timeout=seconds,
+            timeout=START_SECONDS + SPLITS * seconds,
             env={**os.environ, "PYTHONHASHSEED": hash_seed},
         )
     except subprocess.TimeoutExpired:
-        raise BrokenLawError(f"scenes were not made within {seconds:g} s in another process") from None
+        raise BrokenLawError(f"scenes were not made within {SPLITS * seconds:g} s in another process") from None
     try:
         found = json.loads(ended.stdout)
     except ValueError:
@@ -71,13 +74,18 @@ def fingerprints_elsewhere(config: RunConfig, kind: type, seconds: float) -> dic
 
 
 def answer(request: dict[str, Any]) -> None:
-    """In that process: make the scenes and print their fingerprints, or what went wrong, as JSON on stdout."""
+    """In that process: make the scenes, say their fingerprints or what went wrong as JSON on stdout, and end.
+
+    What the task prints, also by processes of its own, goes to stderr.
+    """
+    result = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     try:
         with plugin_guard(request["name"]), Watch(all_threads=True).during("scenes"):
             found: dict[str, Any] = _fingerprints(request)
     except LidardesignError as error:
         found = {"error": error.message}
-    print(json.dumps(found))
+    probe.answer(result, found)
 
 
 def _fingerprints(request: dict[str, Any]) -> dict[str, list[str]]:

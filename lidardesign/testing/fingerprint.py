@@ -15,6 +15,8 @@ from pydantic import BaseModel
 from lidardesign.scene import Body, Scene
 
 DEEPEST = 40
+# What of scenes and bodies no ray meets, or what is told apart otherwise.
+UNSEEN = ("name", "notes", "truth", "bodies", "poses", "importance")
 
 
 def fingerprint(value: Any) -> str:
@@ -28,12 +30,14 @@ def fingerprint(value: Any) -> str:
 
 
 def geometry_fingerprint(scene: Scene) -> str:
-    """The same of what rays meet in a scene, whatever it and its bodies are called."""
-    return fingerprint([_geometry(body) for body in scene.bodies])
+    """The same of what rays meet in a scene and what light does there, whatever it and its bodies are called."""
+    others = [getattr(scene, field.name) for field in fields(scene) if field.name not in UNSEEN]
+    return fingerprint([*(_seen(body) for body in scene.bodies), *others])
 
 
-def _geometry(body: Body) -> tuple[Any, ...]:
-    return body.role, np.round(body.poses, 12), body.shape
+def _seen(body: Body) -> tuple[Any, ...]:
+    others = [getattr(body, field.name) for field in fields(body) if field.name not in UNSEEN]
+    return np.round(body.poses, 12), *others
 
 
 def _add(digest: Any, value: Any, depth: int) -> None:

@@ -76,7 +76,7 @@ def check_defaults(subject: Subject) -> Held:
     allowed = "sensors and rays of 1 or more, a known layout, a level between 0 and 1"
     wrong = {
         "sensors": not _is_count(defaults.sensors),
-        "rays": not defaults.rays or not all(map(_is_count, defaults.rays)),
+        "rays": not _are_counts(defaults.rays),
         "layout": defaults.layout not in LAYOUTS,
         "level": not _is_finite(defaults.level) or not 0 < defaults.level < 1,
     }
@@ -105,6 +105,10 @@ def _as_yaml(value: object) -> str:
 
 def _is_count(value: object) -> bool:
     return isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= 1
+
+
+def _are_counts(values: object) -> bool:
+    return isinstance(values, list | tuple) and len(values) > 0 and all(map(_is_count, values))
 
 
 def check_space(subject: Subject) -> Held:

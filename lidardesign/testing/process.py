@@ -1,7 +1,8 @@
 """The contract tried in a process of its own, with limits: a plugin that hangs, crashes or hogs harms nobody.
 
-The process says by lines of JSON which law it begins and what it found; whoever asks waits for each line no longer than
-a law may take. It works in an empty folder, has temporary files of its own, and is told how much memory it may take.
+The process says by lines of JSON when it calls the task's code and what it found; whoever asks waits for each line no
+longer than a call may take. It works in an empty folder, has temporary files of its own, and is told how much memory
+it may take.
 """
 
 from __future__ import annotations
@@ -34,8 +35,10 @@ CHILD = (
     "import json, sys; request = json.loads(sys.stdin.readline()); sys.path[:] = request['path']; "
     "from lidardesign.testing.process import answer_check; answer_check(request)"
 )
-# Libraries are loaded in the first law that needs them, and a law calls the task's code many times.
-LAW_CALLS = 3
+# A call that takes longer than it may ends within this many times as long, so that it can be told how long it took.
+OVERTIME = 3
+# The key of a line that says what is called now; empty once the call has ended.
+CALLED = "called"
 FINDING_KEYS = {"law", "group", "statement", "outcome", "detail", "seconds", "figures"}
 REFUSALS = {"config": ConfigError, "data": DataError}
 
@@ -94,25 +97,46 @@ def _as_document(request: CheckRequest, offer: EntryPoint, folder: str) -> dict[
 
 def _heard(child: Apart, seconds: float) -> Iterator[Finding]:
     """Findings as they come; where the process is lost, the law that it tried does not hold."""
-    started, line = child.next_line(time.monotonic() + START_SECONDS)
+    _, line = child.next_line(time.monotonic() + START_SECONDS)
     if line != BEGUN:
         yield from _all_lost(0, "the process that checks could not be started")
         return
     for number in range(len(_laws()) + 1):
-        allowed = seconds * (1 if number == 0 else LAW_CALLS)
-        deadline = max(started, time.monotonic()) + allowed + GRACE_SECONDS
-        _, line = child.next_line(deadline)
-        found = _read(line) if line else None
-        if found is None:
-            died_of = None if line is None else child.died_of(deadline, "while this is tried")
-            written = "writes into what is not its own while this is tried" if line else None
-            yield from _all_lost(number, written or died_of or f"did not end within {allowed:g} s")
+        found = _next_finding(child, seconds, loading=number == 0)
+        if isinstance(found, str):
+            yield from _all_lost(number, found)
             return
         finding = _finding(found)
         yield finding
         if number == 0 and finding.outcome == "fail":
             yield from _not_reached(1)
             return
+
+
+def _next_finding(child: Apart, seconds: float, *, loading: bool) -> dict[str, Any] | str:
+    """The next line that is a finding, or how the process was lost; every call of the task's code has time of its own.
+
+    Arguments:
+        child: The process.
+        seconds: How long a call may take.
+        loading: Whether it loads the plugin, which is one call.
+    """
+    # between calls libraries are loaded, fields built and other processes waited for
+    allowed = seconds if loading else START_SECONDS + OVERTIME * seconds
+    called = ""
+    while True:
+        deadline = time.monotonic() + allowed + GRACE_SECONDS
+        _, line = child.next_line(deadline)
+        found = _read(line) if line else None
+        if found is None:
+            if line:
+                return "writes into what is not its own while this is tried"
+            died_of = None if line is None else child.died_of(deadline, "while this is tried")
+            return died_of or f"{called} did not end within {allowed:g} s".lstrip()
+        if CALLED not in found:
+            return found
+        called = str(found[CALLED])
+        allowed = OVERTIME * seconds if called else START_SECONDS + OVERTIME * seconds
 
 
 def _finding(found: dict[str, Any]) -> Finding:
@@ -131,7 +155,8 @@ def _read(line: bytes) -> dict[str, Any] | None:
         found = json.loads(line)
     except ValueError:
         return None
-    return found if isinstance(found, dict) and ("refused" in found or set(found) == FINDING_KEYS) else None
+    known = isinstance(found, dict) and ("refused" in found or set(found) in ({CALLED}, FINDING_KEYS))
+    return found if known else None
 
 
 def _all_lost(number: int, reason: str) -> Iterator[Finding]:
@@ -219,7 +244,8 @@ def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
 
     version = f"version {task.api_version} of the task interface"
     _tell(result, Finding(*LOADS, "pass", f"{version}, {type(task).__module__}", time.perf_counter() - started))
-    return Contract(Subject(task, config, Limits(request["seconds"], request["memory_bytes"]), watch))
+    limits = Limits(request["seconds"], request["memory_bytes"])
+    return Contract(Subject(task, config, limits, watch, lambda what: _write(result, {CALLED: what})))
 
 
 def _loaded(request: dict[str, Any], watch: Watch) -> tuple[Task, RunConfig]:

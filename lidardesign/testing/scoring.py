@@ -164,7 +164,7 @@ LAWS = (
         "score",
         "a finite number, or failed, for dense, sparse and random rays",
         check_number,
-        needs=("targets are in reach",),
+        needs=("metric is defined", "targets are in reach"),
     ),
     Law(
         "nothing heard is scored",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -36,12 +36,14 @@ class Subject:
         config: Its resolved configuration.
         limits: What its code may take.
         watch: Notes what its code does to the process.
+        tell_call: Told what is called before every call of its code, and "" after it.
     """
 
     task: Task
     config: RunConfig
     limits: Limits = field(default_factory=Limits)
     watch: Watch = field(default_factory=Watch)
+    tell_call: Callable[[str], None] = lambda what: None
 
     def __post_init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -57,6 +59,7 @@ class Subject:
         Raises:
             BrokenLawError: Whatever it raised.
         """
+        self.tell_call(what)
         started = time.perf_counter()
         try:
             with self.watch.during(what), plugin_guard(self.task.name):
@@ -66,6 +69,7 @@ class Subject:
             raise BrokenLawError(f"{told}{place_of(error)}", allowed=error.allowed) from error
         finally:
             self.seconds[what] = max(self.seconds.get(what, 0.0), time.perf_counter() - started)
+            self.tell_call("")
 
     def new_scenes(self, split: Split, seed: int) -> list[Scene]:
         """The scenes of a split, made anew."""

@@ -8,8 +8,10 @@ code and other processes write unseen.
 from __future__ import annotations
 
 import contextlib
+import locale
 import os
 import random
+import signal
 import sys
 import tempfile
 import threading
@@ -39,6 +41,10 @@ DEVICES = ("/dev/", "/proc/")
 # Python and numba keep what they compile beside the source.
 COMPILED = "__pycache__"
 MOST_NOTES = 20
+# Libraries set variables of these names for themselves when they are imported, as scikit-learn does.
+LIBRARIES_OWN = ("KMP_", "JAX_", "TF_", "TF2_", "TPU_", "XLA_", "PYGAME_", "OPENCV_", "QT_")
+# Ctrl-C and what ends a process belong to the program.
+PROGRAMS_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Watch:
@@ -168,10 +174,12 @@ def _same_state(first: Any, second: Any) -> bool:
 
 
 class _Surroundings:
-    """The working folder, the environment and numpy's answer to bad numbers."""
+    """The working folder, the environment, the locale, who hears signals, and numpy's answer to bad numbers."""
 
     def __init__(self) -> None:
         self._folder, self._environment, self._errors = os.getcwd(), dict(os.environ), np.geterr()
+        self._locale = locale.setlocale(locale.LC_ALL)
+        self._heard = {number: signal.getsignal(number) for number in PROGRAMS_SIGNALS}
 
     def restored(self) -> list[str]:
         """Put all back; the names of what had changed."""
@@ -180,10 +188,26 @@ class _Surroundings:
             changed.append("the working folder")
             os.chdir(self._folder)
         if dict(os.environ) != self._environment:
-            changed.append("the environment")
-            os.environ.clear()
-            os.environ.update(self._environment)
+            changed += self._restored_environment()
+        if locale.setlocale(locale.LC_ALL) != self._locale:
+            changed.append("the locale")
+            locale.setlocale(locale.LC_ALL, self._locale)
         if np.geterr() != self._errors:
             changed.append("numpy's error settings")
             np.seterr(**self._errors)
-        return changed
+        return changed + self._restored_signals()
+
+    def _restored_environment(self) -> list[str]:
+        now, before = dict(os.environ), self._environment
+        names = [name for name in sorted({*now, *before}) if now.get(name) != before.get(name)]
+        named = [name for name in names if name in before or not name.startswith(LIBRARIES_OWN)]
+        os.environ.clear()
+        os.environ.update(before)
+        return [f"the environment ({', '.join(named)})"] if named else []
+
+    def _restored_signals(self) -> list[str]:
+        changed = [number for number, heard in self._heard.items() if signal.getsignal(number) != heard]
+        for number in changed:
+            with contextlib.suppress(ValueError, TypeError):  # not in this thread, or not from Python
+                signal.signal(number, self._heard[number])
+        return [f"who hears {number.name}" for number in changed]
