@@ -168,15 +168,15 @@ def _beginning(current: str, items: Sequence[tuple[str, str]]) -> Answer:
     return Answer(WORDS, [item for item in items if item[0].startswith(current)])
 
 
-def words_of_line(line: str, point: int) -> list[str]:
-    """The words of a line up to the cursor, the last one as far as it is typed; quotes may be open there."""
+def words_of_line(line: str, point: int) -> tuple[list[str], bool]:
+    """The words of a line up to the cursor, the last one as far as it is typed, and whether it is in open quotes."""
     for closing in ("", '"', "'"):
         try:
             words = shlex.split(line[:point] + CURSOR + closing)
         except ValueError:
             continue
-        return [*words[:-1], words[-1].removesuffix(CURSOR)]
-    return [""]
+        return [*words[:-1], words[-1].removesuffix(CURSOR)], bool(closing)
+    return [""], False
 
 
 def respond(shell: str, arguments: Sequence[str], environment: Mapping[str, str], root: Any) -> list[str]:
@@ -193,15 +193,16 @@ def respond(shell: str, arguments: Sequence[str], environment: Mapping[str, str]
         return [found.kind, *(f"{value}\t{words}" for value, words in _printable(found.items))]
     line = environment.get("COMP_LINE", "")
     point = environment.get("COMP_POINT", "")
-    words = words_of_line(line, int(point) if point.isdecimal() else len(line))[1:] or [""]
-    found = answer_of(words, root)
+    words, quoted = words_of_line(line, int(point) if point.isdecimal() else len(line))
+    found = answer_of(words[1:] or [""], root)
     values = [value for value, _ in _printable(found.items)]
     kind = (
         "open" if found.kind == WORDS and values and all(value.endswith(OPEN_ENDS) for value in values) else found.kind
     )
-    cut = 1 + max(words[-1].rfind(mark) for mark in BASH_BREAKS)
+    # within quotes bash takes no words apart, and reads what it is given as it is
+    cut = 0 if quoted else 1 + max(words[-1].rfind(mark) for mark in BASH_BREAKS)
     values = [value[cut:] for value in values]
-    return [kind, *(values if kind == PATHS else map(_bash_quoted, values))]
+    return [kind, *(values if kind == PATHS or quoted else map(_bash_quoted, values))]
 
 
 def _printable(items: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:

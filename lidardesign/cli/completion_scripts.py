@@ -10,7 +10,7 @@ BASH = r"""# Completion of lidardesign for bash 4.4 or newer:
 _lidardesign() {
     local IFS=$'\n' current=${COMP_WORDS[COMP_CWORD]} lines=() kind
     mapfile -t lines < <(_LIDARDESIGN_COMPLETE=bash COMP_LINE="$COMP_LINE" COMP_POINT="$COMP_POINT" \
-        "${COMP_WORDS[0]}" 2>/dev/null)
+        "${COMP_WORDS[0]/#\~\//$HOME/}" 2>/dev/null)
     kind=${lines[0]}
     # what follows = or : is a word of its own to bash
     [[ $current == [=:] ]] && current=
