@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import trimesh
 import typer
-from command_line import caller, files_under, make_run
+from command_line import caller, files_under, make_run, program
 
 from lidardesign.cli import deprecations
 from lidardesign.cli.deprecations import RENAMED, RenamedOption, deprecations_told, with_new_names
@@ -434,3 +434,23 @@ def test_the_shell_script_fails_with_a_bad_design_and_says_why(gate, tmp_path):
 def test_the_files_of_the_gate_are_what_the_program_takes(lidardesign, flat):
     assert lidardesign("learn", "flatland", "--config", CI / "lidar.yaml", "--out", "new", "--dry-run").code == 0
     assert lidardesign("constrain", flat, "--constraints", CI / "constraints.yaml", "--dry-run").code == 0
+
+
+def test_json_stands_alone_whatever_a_plugin_starts_prints_and_leaves_behind():
+    noisy = """
+import atexit, os
+from lidardesign import registry
+kept = registry.load_task
+def load_task(name):
+    os.system("echo from a process")
+    print("from Python")
+    atexit.register(print, "at the end")
+    return kept(name)
+registry.load_task = load_task
+"""
+    for name, code in (("flatland", 0), ("no_such_task", 2)):
+        process = program("tasks", "show", name, "--json", before=noisy)
+        out, err = process.communicate()
+        assert process.returncode == code
+        assert json.loads(out)["schema_version"] == 1
+        assert all(words in err.decode() for words in ("from a process", "from Python", "at the end"))

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
+from lidardesign.cli.aside import printing_aside
 from lidardesign.cli.environment import TerminatedError
 from lidardesign.cli.times import show_times
 from lidardesign.errors import LidardesignError
@@ -140,11 +141,11 @@ def print_json(document: dict[str, Any], output: TextIO | None = None) -> None:
 def command(*, json: bool, quiet: bool, debug: bool) -> Iterator[Console]:
     """Run a command's body: its errors become one message and an exit code.
 
-    With `--json`, whatever plugins and libraries print meanwhile goes to stderr.
+    With `--json`, whatever plugins and libraries print meanwhile goes to stderr, also by processes of their own.
     """
     console = Console(json=json, quiet=quiet, debug=debug, output=sys.stdout)
     try:
-        aside = contextlib.redirect_stdout(sys.stderr) if json else contextlib.nullcontext()
+        aside = printing_aside(console) if json else contextlib.nullcontext()
         with aside, running(console.clock), offered_input():
             yield console
         console.output.flush()

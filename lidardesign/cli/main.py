@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from lidardesign import __version__
+from lidardesign.cli.aside import print_aside_from_now_on
 from lidardesign.cli.capture import capture
 from lidardesign.cli.catalog import catalog_app
 from lidardesign.cli.compare import compare
@@ -81,6 +82,8 @@ def run(arguments: list[str] | None = None) -> None:
         with deprecations_told():
             code = _invoke(with_new_names(arguments))
         sys.stdout.flush()
+        if "--json" in arguments:
+            print_aside_from_now_on()
     except BrokenPipeError:
         forget_stdout()
         code = EXIT_BROKEN_PIPE
