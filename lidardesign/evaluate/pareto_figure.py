@@ -206,9 +206,8 @@ def _table(ladder: Ladder) -> str:
     chosen = ladder.chosen
     lines = [(_cells(rung), "better" if rung is chosen else "open", False) for rung in ladder.rungs]
     words = {"better": "to choose", "open": ""}
-    return (
-        f"<h3>{html.escape(ladder.knob)}: {html.escape(ladder.verdict)}</h3><p>{html.escape(about)}</p>"
-        + table(headings, lines, text_columns=1, words=words, caption=f"Settings of {ladder.knob}.")
+    return f"<h3>{html.escape(ladder.knob)}: {html.escape(ladder.verdict)}</h3><p>{html.escape(about)}</p>" + table(
+        headings, lines, text_columns=1, words=words, caption=f"Settings of {ladder.knob}."
     )
 
 

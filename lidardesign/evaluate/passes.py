@@ -72,9 +72,7 @@ class Scorer(Protocol):
         ...
 
 
-def score_here(
-    request: EvaluationRequest, scene_pass: ScenePass, progress: Progress | None
-) -> list[SceneScores]:
+def score_here(request: EvaluationRequest, scene_pass: ScenePass, progress: Progress | None) -> list[SceneScores]:
     """Score scene by scene in this process, so that only one scene's casters are held at a time.
 
     Arguments:
