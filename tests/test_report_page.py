@@ -47,7 +47,7 @@ def opened(browser, report, tmp_path_factory):
     """The page, drawn, with what it said and asked for from the very beginning."""
     path = tmp_path_factory.mktemp("page") / "report.html"
     path.write_text(report_html(report), encoding="utf-8")
-    page = browser.new_page(viewport={"width": 800, "height": 600})
+    page = browser.new_page(viewport={"width": 480, "height": 360})
     page.set_default_timeout(WAIT_MS)
     heard = {"errors": [], "requests": [], "dialogs": []}
     page.on("console", lambda message: message.type == "error" and heard["errors"].append(message.text))
@@ -275,7 +275,7 @@ def test_the_view_prints_as_a_picture_and_nothing_is_cut(page):
               all('details').every(fold => fold.open), document.documentElement.scrollWidth];
     }""")
     page.emulate_media(media="screen")
-    page.set_viewport_size({"width": 800, "height": 600})
+    page.set_viewport_size({"width": 480, "height": 360})
     page.evaluate("() => window.dispatchEvent(new Event('afterprint'))")
     visible, colours, live, opened, width = printed
     assert (visible, live, opened) == (True, False, True)
