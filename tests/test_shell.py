@@ -454,3 +454,13 @@ registry.load_task = load_task
         assert process.returncode == code
         assert json.loads(out)["schema_version"] == 1
         assert all(words in err.decode() for words in ("from a process", "from Python", "at the end"))
+
+
+def test_quiet_commands_print_their_results_without_notes(lidardesign):
+    small = ("learning.steps=8", "learning.samples=2000", "learning.coverage_proposals=500", "learning.batch=64")
+    words = ["learn", "flatland", "--preset", "draft", *(word for one in small for word in ("--set", one))]
+    told, quiet = lidardesign(*words, "--out", "told"), lidardesign(*words, "--out", "quiet", "--quiet")
+    assert (told.code, quiet.code) == (0, 0)
+    assert "note: " in told.out
+    assert "note: " not in quiet.out + quiet.err
+    assert "run: quiet" in quiet.out

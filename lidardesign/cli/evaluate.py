@@ -168,7 +168,8 @@ def evaluate(
             written = _write_files(evaluation, request, learned, times_so_far(run.folder, "evaluate", console), *files)
         document = {**evaluation.as_dict(), "set": overrides or [], "files": [str(path) for path in written]}
         keep_times(run.folder, "evaluate", console)
-        console.result(document, lambda rich: _show(evaluation, document, written, rich))
+        shown = {**document, "notes": []} if console.quiet else document
+        console.result(document, lambda rich: _show(evaluation, shown, written, rich))
         _check_threshold(evaluation, fail_above)
         _check_audit(evaluation)
 

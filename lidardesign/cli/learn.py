@@ -89,7 +89,7 @@ def learn(
         result = _learn_in_folder(job, device, console, ranks)
         keep_times(run, "learn", console, wait_s=WAIT_S)
         result = replace(result, notes=(*result.notes, *_advice(result)))
-        console.result(_document(result), lambda rich: _show(result, rich))
+        console.result(_document(result), lambda rich: _show(result, rich, notes=not console.quiet))
         check_met(result, goal)
 
 
@@ -183,7 +183,7 @@ def _document(result: LearnResult) -> dict[str, Any]:
     }
 
 
-def _show(result: LearnResult, rich: RichConsole) -> None:
+def _show(result: LearnResult, rich: RichConsole, *, notes: bool) -> None:
     from rich.markup import escape
     from rich.table import Table
 
@@ -201,6 +201,6 @@ def _show(result: LearnResult, rich: RichConsole) -> None:
     row("misplaced", "misplaced", "", "share of the density's mass in the wrong place")
     table.add_row("time", f"{result.seconds:.1f} s", "", f"{result.steps} steps")
     rich.print(table)
-    for note in result.notes:
+    for note in result.notes if notes else ():
         rich.print(f"note: {escape(note)}")
     rich.print(f"run: {escape(str(result.run))}", soft_wrap=True)
