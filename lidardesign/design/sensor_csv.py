@@ -101,9 +101,9 @@ def _header(path: Path, lines: list[tuple[int, str]]) -> tuple[tuple[str, ...], 
     missing = [name for name in COLUMNS if name not in names]
     unknown = [name for name in names if name not in (*COLUMNS, QUERY_COLUMN)]
     if missing or unknown or len(set(names)) != len(names):
-        found = f"missing columns: {', '.join(missing) or 'none'}; unknown or repeated: "
         repeated = sorted({name for name in names if names.count(name) > 1})
-        found += ", ".join([*unknown, *repeated]) or "none"
+        told = {"missing columns": missing, "unknown or repeated": [*unknown, *repeated]}
+        found = "; ".join(f"{what}: {', '.join(columns)}" for what, columns in told.items() if columns)
         raise DataError(found, where=f"{path}:{lines[0][0]}", allowed=", ".join(COLUMNS))
     return names, lines[1:]
 

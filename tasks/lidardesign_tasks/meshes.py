@@ -70,7 +70,9 @@ class MeshesConfig(Importance):
         5000, ge=100, le=200_000, description="points of the visible surface to judge by"
     )
     motion: Path | None = Field(
-        None, description="CSV of poses over time: time_s, body, x_m, y_m, z_m, and qw..qz or roll, pitch, yaw"
+        None,
+        description="CSV of poses over time: columns time_s, body, x_m, y_m, z_m, and qw, qx, qy, qz or "
+        "roll_deg, pitch_deg, yaw_deg or roll_rad, pitch_rad, yaw_rad",
     )
     frame_rate_hz: float = Field(10.0, gt=0, le=10_000, description="frames per second of a motion [Hz]")
     speed_m_s: float = Field(0.0, ge=0, le=100, description="how fast objects move within a frame, in any direction")

@@ -15,6 +15,8 @@ from lidardesign_tasks.poses_csv import BodyPath, read_poses, span_s
 
 EVERY = "*"
 MOST_FRAMES = 500
+# Of the names that a body may have, in a message.
+MOST_SHOWN = 12
 # A motion of whole frames ends in the last of them, whatever the product rounds to.
 ROUNDING_FRAMES = 1e-3
 
@@ -86,7 +88,7 @@ def _check_bodies(paths: Mapping[str, BodyPath], path: Path, objects: list[str],
             continue
         if len(called) != 1:
             found = f"no mesh is called {name!r}" if not called else f"{name!r} is {' and '.join(called)}"
-            allowed = ", ".join([EVERY, *every][:12])
+            allowed = ", ".join([EVERY, *every][:MOST_SHOWN]) + (", ..." if len(every) >= MOST_SHOWN else "")
             raise DataError(found, where=f"{path}:{one.line}", allowed=allowed, hint="name one mesh file, or * for all")
     for mesh in every:
         both = [name for name in paths if name in (mesh, Path(mesh).stem)]

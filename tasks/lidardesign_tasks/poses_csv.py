@@ -186,7 +186,8 @@ def _checked_header(names: tuple[str, ...], where: str) -> tuple[str, ...]:
     given = [group for group in ROTATIONS if any(name in names for name in group)]
     missing += [name for group in given for name in group if name not in names]
     if wrong or missing or len(given) > 1:
-        found = f"missing columns: {', '.join(missing) or 'none'}; unknown or repeated: {', '.join(wrong) or 'none'}"
+        told = {"missing columns": missing, "unknown or repeated": wrong}
+        found = "; ".join(f"{what}: {', '.join(columns)}" for what, columns in told.items() if columns)
         if len(given) > 1:
             found = "rotations are given in two ways"
         either = " or ".join(", ".join(group) for group in ROTATIONS)
