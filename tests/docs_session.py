@@ -6,6 +6,7 @@ import contextlib
 import io
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -21,18 +22,21 @@ from lidardesign.cli.main import run as run_program
 # The wide tables of the documentation were printed on a terminal of this width.
 COLUMNS = 100
 QUICK = (
-    "learning.samples=10000", "learning.coverage_proposals=512", "learning.balance_proposals=2048",
+    "learning.samples=5000", "learning.coverage_proposals=512", "learning.balance_proposals=2048",
     "learning.batch=128", "train=2", "test=2",
 )  # fmt: skip
 # What `learn` takes further in a small run: a blurred density of few scenes is learned in seconds instead of minutes.
 SMALL = {
     "flatland": (*QUICK, "learning.steps=40", "density.sigma_m=0.03"),
-    "face": (*QUICK, "learning.steps=60", "density.sigma_m=0.02", "truth_points=500"),
-    "arm": (*QUICK, "learning.steps=120", "learning.samples=20000", "density.sigma_m=0.1", "frames=8"),
+    "face": (*QUICK, "learning.steps=40", "density.sigma_m=0.02", "truth_points=500"),
+    "arm": (*QUICK, "learning.steps=80", "learning.samples=10000", "density.sigma_m=0.1", "frames=8"),
     "warehouse": (*QUICK, "learning.steps=80", "density.sigma_m=0.1"),
     "meshes": (*QUICK[:-2], "learning.steps=60", "density.sigma_m=0.01", "poses=1", "truth_points=500"),
 }
 SHELL = re.compile(r"[|<>&;`]|\$\(")
+# Commands that hand on what they print, into a file in the end, and nothing else that takes a shell.
+STAGE = r"(?:[^|<>&;`$()*?~'\"\\]|'[^'|>]*')+"
+PIPED = re.compile(rf"{STAGE}(?:\|{STAGE})*(?:>\s*[\w./-]+\s*)?")
 
 
 @dataclass
@@ -99,9 +103,11 @@ class Session:
             self.command(command, block)
 
     def _ran(self, command: Command, small: bool) -> Ran:
-        words = command.words
-        if words[0] != "lidardesign" or SHELL.search(command.text.partition(" #")[0]):
-            return self._shell(command)
+        words, text = command.words, command.text.partition(" #")[0]
+        if SHELL.search(text):
+            return self._piped(text) if PIPED.fullmatch(text) else self._shell(text)
+        if words[0] != "lidardesign":
+            return self._shell(text)
         if small and words[1] == "learn":
             return self._learned(words[1:])
         return in_process(words[1:])
@@ -127,10 +133,22 @@ class Session:
         shutil.copytree(kept, out)
         return Ran(0, ran.out.replace("{out}", str(out)), ran.err)
 
-    def _shell(self, command: Command) -> Ran:
+    def _piped(self, text: str) -> Ran:
+        """What commands do one after the other; the program in this process, as its start alone takes a second."""
+        line, _, file = text.partition(">")
+        given, said = None, ""
+        for stage in line.split("|"):
+            words = shlex.split(stage)
+            ran = in_process(words[1:], given) if words[0] == "lidardesign" else self._shell(stage, given)
+            given, said = ran.out, said + ran.err
+        if file:
+            (self.folder / file.strip()).write_text(given, encoding="utf-8")
+        return Ran(ran.code, "" if file else given, said)
+
+    def _shell(self, text: str, given: str | None = None) -> Ran:
         paths = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
         done = subprocess.run(
-            ["bash", "-c", command.text], capture_output=True, text=True, check=False, cwd=self.folder,
+            ["bash", "-c", text], input=given, capture_output=True, text=True, check=False, cwd=self.folder,
             env={**os.environ, "PATH": paths},
         )  # fmt: skip
         return Ran(done.returncode, done.stdout, done.stderr)
@@ -140,15 +158,20 @@ class Session:
         exec(code, self.names)
 
 
-def in_process(arguments: list[str]) -> Ran:
-    """What the program does with some arguments, in this process."""
+def in_process(arguments: list[str], given: str | None = None) -> Ran:
+    """What the program does with some arguments, and maybe something on standard input, in this process."""
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True) for _ in range(2))
     code: object = 0
+    before = sys.stdin
+    if given is not None:
+        sys.stdin = io.TextIOWrapper(io.BytesIO(given.encode()), encoding="utf-8")
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
             run_program([str(argument) for argument in arguments])
         except SystemExit as ended:
             code = ended.code
+        finally:
+            sys.stdin = before
     texts = (stream.buffer.getvalue().decode() for stream in (out, err))  # type: ignore[attr-defined]
     return Ran(code if isinstance(code, int) else 0, *texts)
 
