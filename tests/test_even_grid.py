@@ -11,8 +11,9 @@ from lidardesign.design.sensor import Design, tangent_directions
 from lidardesign.export.even_grid import EvenGrid, nearest_grid
 from lidardesign.export.grid_sensors import grid_losses
 from lidardesign.export.names import identifier, identifiers, renamed_note, xml_text
-from lidardesign.export.poses import mounts, quaternion, rotation
+from lidardesign.export.poses import mounts, quaternion
 from lidardesign.export.xml import element, read_xml, write_xml
+from lidardesign.rotations import rotations_of_quaternions
 from lidardesign.simulate.returns import Rays
 from lidardesign.space import angles, direction
 
@@ -87,10 +88,10 @@ def test_a_mounts_rotation_is_its_sensors_frame(seed):
     one = sensor("s", generator.normal(size=3), generator.uniform(0, 6.3), elevation, generator.uniform(-3, 3))
     rays = Rays(one.origin_m[None], one.frame[:1], np.ones((1, 2)), np.zeros(1), np.zeros(1))
     (mount,) = mounts(Design("d", (one,)), rays)
-    np.testing.assert_allclose(rotation(np.array(mount.quaternion)), one.frame.T, atol=1e-15)
+    np.testing.assert_allclose(rotations_of_quaternions(np.array(mount.quaternion)), one.frame.T, atol=1e-15)
     roll, pitch, yaw = mount.roll_pitch_yaw_rad
     about = [quaternion(*angles_rad) for angles_rad in ((roll, 0, 0), (0, pitch, 0), (0, 0, yaw))]
-    steps = [rotation(np.array(one)) for one in about]
+    steps = [rotations_of_quaternions(np.array(one)) for one in about]
     np.testing.assert_allclose(steps[2] @ steps[1] @ steps[0], one.frame.T, atol=1e-15)
     np.testing.assert_allclose([mount.azimuth_rad, mount.elevation_rad], 0.0, atol=1e-15)
 

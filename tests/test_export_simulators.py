@@ -12,8 +12,9 @@ import pytest
 
 from lidardesign.design.sensor import Design, Sensor
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.export.poses import mounts, rotation
+from lidardesign.export.poses import mounts
 from lidardesign.export.registry import EXPORTERS
+from lidardesign.rotations import rotations_of_quaternions
 from lidardesign.simulate.returns import Rays
 from lidardesign.space import direction
 
@@ -594,7 +595,7 @@ def test_shapes_of_sensors_that_are_regions_stand_in_their_middles_and_say_so(tm
 
 def test_a_boresight_and_its_pose_are_the_same_direction():
     for mount in mounts(DESIGN, CASES["mounted"]):
-        turn = rotation(np.array(mount.quaternion))
+        turn = rotations_of_quaternions(np.array(mount.quaternion))
         np.testing.assert_allclose(turn.T, mount.sensor.frame, atol=1e-12)
         np.testing.assert_allclose(
             turn[:, 0], direction(mount.sensor.azimuth_rad, mount.sensor.elevation_rad), atol=1e-12

@@ -18,7 +18,8 @@ from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.folders import write_folder
 from lidardesign.export.isaac import FoundSensor, emitters_of, found_emitters, losses, profile_rounding, whole_rate_hz
-from lidardesign.export.poses import Mount, mounts, rotation
+from lidardesign.export.poses import Mount, mounts
+from lidardesign.rotations import rotations_of_quaternions
 from lidardesign.simulate.returns import Rays
 
 MOUNTS = "mounts.json"
@@ -136,7 +137,7 @@ def _found(placed: dict[str, Any], folder: Path) -> FoundSensor:
     ranges = [[one["min"], one["max"]] for one in profile["ranges"]]
     return FoundSensor(
         np.array(placed["translation_m"]),
-        rotation(np.array(placed["orientation_wxyz"])),
+        rotations_of_quaternions(np.array(placed["orientation_wxyz"])),
         profile["scanRateBaseHz"],
         found_emitters(profile["emitterStates"][0], ranges),
     )

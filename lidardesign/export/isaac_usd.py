@@ -27,7 +27,8 @@ from lidardesign.export.isaac import (
     profile_rounding,
     whole_rate_hz,
 )
-from lidardesign.export.poses import Mount, mounts, rotation
+from lidardesign.export.poses import Mount, mounts
+from lidardesign.rotations import rotations_of_quaternions
 from lidardesign.run.files import write_atomic
 from lidardesign.simulate.returns import Rays
 
@@ -178,7 +179,7 @@ def _found(values: Mapping[str, str]) -> FoundSensor:
     state = {name: array(f"{STATE}{name}") for name in ("azimuthDeg", "elevationDeg", "fireTimeNs", "rangeId")}
     return FoundSensor(
         np.array(array("xformOp:translate")),
-        rotation(np.array(array("xformOp:orient"))),
+        rotations_of_quaternions(np.array(array("xformOp:orient"))),
         float(values[f"{CORE}scanRateBaseHz"]),
         found_emitters(state, ranges),
     )

@@ -18,10 +18,11 @@ from lidardesign.design.sensor import Design
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.names import distinct, xml_text
-from lidardesign.export.poses import Mount, design_losses, mounts, rotation
+from lidardesign.export.poses import Mount, design_losses, mounts
 from lidardesign.export.read_back import rays_rounding
 from lidardesign.export.xml import element, number, numbers, read_xml, write_xml
 from lidardesign.numerics import SLACK, unit_vectors
+from lidardesign.rotations import rotations_of_quaternions
 from lidardesign.simulate.returns import Rays
 
 # In the user data of each rangefinder: gate start and end [m], number of the sensor, firing time [s].
@@ -109,10 +110,10 @@ def _rangefinder(site: str, rays: Rays, ray: int) -> Element:
 
 def _sites(body: Element) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Where each site of a body is and where its +z looks, in the world."""
-    place, turn = _floats(body, "pos"), rotation(_floats(body, "quat"))
+    place, turn = _floats(body, "pos"), rotations_of_quaternions(_floats(body, "quat"))
     sites = list(body.iterfind("site"))
     local = np.array([_floats(one, "pos") for one in sites]).reshape(-1, 3)
-    looking = rotation(np.array([_floats(one, "quat") for one in sites]).reshape(-1, 4))[:, :, 2]
+    looking = rotations_of_quaternions(np.array([_floats(one, "quat") for one in sites]).reshape(-1, 4))[:, :, 2]
     world = zip(place + local @ turn.T, looking @ turn.T, strict=True)
     return {one.attrib["name"]: pose for one, pose in zip(sites, world, strict=True)}
 

@@ -18,9 +18,10 @@ from lidardesign.design.sensor import Design
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import ROUNDING, Estimate
 from lidardesign.export.places import Place, places, rays_of_parts, require_rays
-from lidardesign.export.poses import design_losses, fire_times_s, mounts, quaternion, rotation
+from lidardesign.export.poses import design_losses, fire_times_s, mounts
 from lidardesign.export.read_back import rays_rounding
 from lidardesign.numerics import FULL_TURN, unit_vectors
+from lidardesign.rotations import rotation_of_rpy
 from lidardesign.run.files import write_atomic
 from lidardesign.simulate.returns import Rays
 from lidardesign.space import angles
@@ -115,7 +116,7 @@ def read(path: Path, design: Design, rays: Rays) -> tuple[Rays, float]:
 
 def _part(place: Place, lidar: dict[str, Any], rays: Rays) -> Part:
     mounting = lidar["mountingPosition"]
-    turn = rotation(np.array(quaternion(*(mounting["orientation"][name] for name in ("roll", "pitch", "yaw")))))
+    turn = rotation_of_rpy(*(mounting["orientation"][name] for name in ("roll", "pitch", "yaw")))
     looking = np.array([[one[axis] for axis in "xyz"] for one in lidar["directions"]]).reshape(-1, 3)
     origin = np.tile([mounting["position"][axis] for axis in "xyz"], (len(looking), 1))
     return place.ray, origin, unit_vectors(looking @ turn.T), rays.gate_m[place.ray]

@@ -110,17 +110,6 @@ def quaternion(roll_rad: float, pitch_rad: float, yaw_rad: float) -> tuple[float
     )
 
 
-def rotation(quaternions: np.ndarray) -> np.ndarray:
-    """Rotation matrices of quaternions (w, x, y, z) of any length: (..., 4) to (..., 3, 3); columns are the axes."""
-    w, x, y, z = np.moveaxis(quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
 def fire_times_s(rays: Rays, rate_hz: float) -> np.ndarray:
     """When rays fire in a frame of another rate than they were laid out for [s]."""
     return rays.time_s * (DEFAULT_RATE_HZ / rate_hz)

@@ -19,10 +19,11 @@ from lidardesign.estimates import ROUNDING, Estimate
 from lidardesign.export.folders import write_folder
 from lidardesign.export.names import identifier, renamed_note
 from lidardesign.export.places import rays_of_parts, require_rays
-from lidardesign.export.poses import Mount, design_losses, fire_times_s, gate_losses, mounts, quaternion, rotation
+from lidardesign.export.poses import Mount, design_losses, fire_times_s, gate_losses, mounts, quaternion
 from lidardesign.export.read_back import rays_rounding
 from lidardesign.export.xml import child, document, element, numbers, read_xml
 from lidardesign.numerics import unit_vectors
+from lidardesign.rotations import rotations_of_quaternions
 from lidardesign.simulate.returns import Rays
 from lidardesign.space import angles
 
@@ -135,7 +136,7 @@ def _part(mount: Mount, path: Path, pose: list[float]) -> Part:
     """The rays of one sensor: its pose, and its pattern in the frame of that."""
     matrices = _floats(path / f"{mount.name}{PATTERN}", (3, 4))
     gate = _floats(path / f"{mount.name}{RANGES}", (2,))
-    turn = rotation(np.array(quaternion(*pose[3:])))
+    turn = rotations_of_quaternions(np.array(quaternion(*pose[3:])))
     return mount.ray, pose[:3] + matrices[:, :, 3] @ turn.T, unit_vectors(matrices[:, :, 2] @ turn.T), gate
 
 

@@ -19,8 +19,9 @@ from lidardesign.estimates import Estimate
 from lidardesign.export.even_grid import EvenGrid
 from lidardesign.export.grid_sensors import grid_of, grid_sensor_losses
 from lidardesign.export.names import identifier, renamed_note
-from lidardesign.export.poses import Held, Mount, held_rounding, mounts, quaternion, rotation
+from lidardesign.export.poses import Held, Mount, held_rounding, mounts, quaternion
 from lidardesign.export.xml import element, number, numbers, read_xml, write_xml
+from lidardesign.rotations import rotations_of_quaternions
 from lidardesign.simulate.returns import Rays
 
 VERSION = "1.9"
@@ -117,7 +118,7 @@ def held(sensor: Element, path: Path, pose: np.ndarray | None = None) -> Held:
             tuple(float(str(sensor.findtext(f"lidar/scan/{axis}/{name}_angle"))) for name in ("min", "max"))
             for axis in ("horizontal", "vertical")
         )
-        turn = rotation(np.array(quaternion(*pose[3:])))
+        turn = rotations_of_quaternions(np.array(quaternion(*pose[3:])))
     except (ValueError, TypeError) as error:
         raise DataError(f"holds no such lidar: {error}", where=str(path)) from error
     grid = EvenGrid(columns, rows, (azimuth[0], azimuth[1]), (elevation[0], elevation[1]))
