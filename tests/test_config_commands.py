@@ -185,6 +185,7 @@ CONFIGURATIONS = [
     {"task_name": "face"},
     {"preset": "draft"},
     {"preset": "quick"},
+    {"preset": None},
     {"seed": -1},
     {"seed": 1},
     {"more": 1},

@@ -136,6 +136,8 @@ def check_can_be_written(path: Path | str) -> None:
     target = Path(path)
     if target.is_dir() and not is_folder:
         raise DataError("is a folder", where=str(path), hint="give the name of a file")
+    if target.is_file() and is_folder:
+        raise DataError("is a file", where=str(target), hint="give a new folder, or one that is there")
     there = next(parent for parent in (target, *target.absolute().parents) if parent.exists())
     if there != target and not there.is_dir():
         raise DataError(f"cannot be made: {there} is a file", where=str(path), hint="give another place")

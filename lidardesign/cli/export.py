@@ -136,6 +136,7 @@ def _export(
     if asked.rays is not None and exporter.name in WITHOUT_RAYS and design.layout != "scan":
         # of a scan another number of rays is another number of sensors
         raise ConfigError(f"{exporter.name} holds sensors, not rays", where="--rays", hint="leave it out")
+    exporter.check_rate(asked.rate_hz)
     target = _target(path, out, exporter)
     folder = folder_of(design, path)
     if dry_run:

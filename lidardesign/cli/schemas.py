@@ -51,7 +51,7 @@ def config_schema(task: Task | None) -> dict[str, Any]:
             "schema_version": {"const": SCHEMA_VERSION},
             "task_name": {"type": "string"} if task is None else {"const": task.name},
             "seed": {"type": "integer", "minimum": 0, "maximum": MAX_SEED},
-            "preset": {"enum": list(PRESETS)},
+            "preset": {"enum": [*PRESETS, None]},
             "task": _or_empty(own),
             "space": _or_empty(_space_schema()),
             "density": _or_empty(_partial(DensitySettings, "density", definitions)),

@@ -55,16 +55,24 @@ class Exporter:
             DataError: The file cannot be written, or the format cannot hold such a design at all.
         """
         write = import_module(self.module).write
-        if rate_hz is not None and not SLOWEST_HZ <= rate_hz <= FASTEST_HZ:
-            raise ConfigError(f"{rate_hz}", where="--rate-hz", allowed=f"{SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz")
+        self.check_rate(rate_hz)
         if self.rated:
             return write(design, rays, Path(path), rate_hz=Bandwidth().rate_hz if rate_hz is None else rate_hz)
-        if rate_hz is not None:
+        return write(design, rays, Path(path))
+
+    def check_rate(self, rate_hz: float | None) -> None:
+        """Refuse a frame rate [Hz] that no sensor has, or that the format cannot hold.
+
+        Raises:
+            ConfigError: It is such a one.
+        """
+        if rate_hz is not None and not SLOWEST_HZ <= rate_hz <= FASTEST_HZ:
+            raise ConfigError(f"{rate_hz}", where="--rate-hz", allowed=f"{SLOWEST_HZ:g} to {FASTEST_HZ:g} Hz")
+        if rate_hz is not None and not self.rated:
             rated = ", ".join(name for name, exporter in EXPORTERS.items() if exporter.rated)
             raise ConfigError(
                 f"{self.name} holds no frame rate", where="--rate-hz", allowed=f"with {rated}" if rated else "none"
             )
-        return write(design, rays, Path(path))
 
     def rounding(self, design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
         """What the numbers in a file that was just written lose, by reading it back: the largest error of each kind.
