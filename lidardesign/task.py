@@ -127,6 +127,9 @@ class Task(Protocol):
 
     A task may also give `residuals(scene, returns) -> Residuals`, where the error of what `score` judges is; designs
     of a task without them cannot be refined.
+
+    A task may also give `notes(config, space) -> Sequence[str]`, what a user should know of a configuration before
+    anything is learned of it: lengths that look like another unit, splits that share their objects.
     """
 
     name: ClassVar[str]
@@ -171,6 +174,20 @@ def scenes_of(task: Task, config: Any, split: Split, seed: int, space: DesignSpa
             found = f"scenes gave one {type(scene).__name__}"
             raise PluginError(found, where=f"task {task.name}", allowed="lidardesign.scene.Scene")
     return scenes
+
+
+def notes_of(task: Task, config: Any, space: DesignSpace) -> list[str]:
+    """What a task says of its configuration in a design space, one line each; nothing where it has no `notes`.
+
+    Raises:
+        PluginError: The task gave something else.
+    """
+    if not hasattr(task, "notes"):
+        return []
+    found = task.notes(config, space)
+    if isinstance(found, str) or not all(isinstance(line, str) for line in found):
+        raise PluginError(f"notes gave {found!r}", where=f"task {task.name}", allowed="a list of lines of text")
+    return list(found)
 
 
 def judged_by_keys(task: Task, config: Any) -> dict[str, Any]:

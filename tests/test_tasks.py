@@ -22,7 +22,7 @@ from lidardesign.scene import Scene
 from lidardesign.simulate.returns import Outcome, Rays, Returns
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import aim, direction
-from lidardesign.task import Task, conditions_of, scenes_of
+from lidardesign.task import Task, conditions_of, notes_of, scenes_of
 
 REAL_MODEL = Path(__file__).parents[2] / "shared" / "data" / "ict_face.h5"
 SMALL = {"train": 2, "test": 2, "truth_points": 800}
@@ -400,6 +400,6 @@ def test_a_mesh_in_millimetres_without_a_scale_is_noted_by_its_file(tmp_path):
     trimesh.creation.box((120, 90, 70)).export(tmp_path / "box.obj")
     for scale, noted in ((1.0, True), (0.001, False)):
         task = MeshesTask()
-        scene = task.scenes(task.Config(folder=tmp_path, scale=scale), "train", 0)[0]
-        notes = " ".join(scene.bodies[0].shape.notes)
+        config = task.Config(folder=tmp_path, scale=scale)
+        notes = " ".join(notes_of(task, config, task.space(config)))
         assert ("box.obj: is 120 m long" in notes) == noted

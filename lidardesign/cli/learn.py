@@ -81,6 +81,7 @@ def learn(
         plugin = load_task(task)
         run = out if out is not None else Path("runs") / task
         job = resumed(plugin, run, goal, choices, console) if resume else started(plugin, run, goal, choices)
+        told = _tell_task_notes(job, console)
         if dry_run:
             from lidardesign.cli.dry_learn import learn_plan
 
@@ -89,8 +90,21 @@ def learn(
         result = _learn_in_folder(job, device, console, ranks)
         keep_times(run, "learn", console, wait_s=WAIT_S)
         result = replace(result, notes=(*result.notes, *_advice(result)))
-        console.result(_document(result), lambda rich: _show(result, rich, notes=not console.quiet))
+        untold = [] if console.quiet else [note for note in result.notes if note not in told]
+        console.result(_document(result), lambda rich: _show(result, untold, rich))
         check_met(result, goal)
+
+
+def _tell_task_notes(job: Job, console: Console) -> list[str]:
+    """Say what the task has to say of its configuration before anything takes time; returns what was said."""
+    from lidardesign.registry import plugin_guard
+    from lidardesign.task import notes_of
+
+    with phase("scenes"), plugin_guard(job.task.name):
+        found = notes_of(job.task, job.settings.task, job.settings.space)
+    for line in found:
+        console.note(f"note: {line}")
+    return found
 
 
 def _learn_in_folder(job: Job, device: str, console: Console, ranks: Ranks) -> LearnResult:
@@ -183,7 +197,7 @@ def _document(result: LearnResult) -> dict[str, Any]:
     }
 
 
-def _show(result: LearnResult, rich: RichConsole, *, notes: bool) -> None:
+def _show(result: LearnResult, notes: list[str], rich: RichConsole) -> None:
     from rich.markup import escape
     from rich.table import Table
 
@@ -201,6 +215,6 @@ def _show(result: LearnResult, rich: RichConsole, *, notes: bool) -> None:
     row("misplaced", "misplaced", "", "share of the density's mass in the wrong place")
     table.add_row("time", f"{result.seconds:.1f} s", "", f"{result.steps} steps")
     rich.print(table)
-    for note in result.notes if notes else ():
+    for note in notes:
         rich.print(f"note: {escape(note)}")
     rich.print(f"run: {escape(str(result.run))}", soft_wrap=True)

@@ -53,6 +53,7 @@ def show(
         run = None if space_of is None else open_run(space_of)
         loaded = read_design(design, console, reach_of([run]) if run else None)
         checks = _checks(loaded, design, run, console)
+        _tell_outside(loaded, design, run, console)
         loaded = placed(loaded, condition) if condition else loaded
         readout = readout_of(loaded)
 
@@ -63,6 +64,21 @@ def show(
                 rich.print(line, soft_wrap=True, markup=False)
 
         console.result(_document(loaded, design, checks, readout), print_all, show_costs=False)
+
+
+def _tell_outside(design: Design, path: Path, run: Run | None, console: Console) -> None:
+    """Say where a design stands far outside the design space of the run that it is shown in, or came from."""
+    from lidardesign.cli.runs import run_of
+    from lidardesign.design.outside import outside_notes
+    from lidardesign.errors import LidardesignError
+
+    try:
+        run = run or run_of(design, path)
+    except LidardesignError:
+        # a run that cannot be opened is told where the design is checked, and not needed to show it
+        return
+    for line in outside_notes(design, run.config.space) if run else ():
+        console.note(f"note: {line}")
 
 
 def _document(loaded: Design, path: Path, checks: list[ConstraintCheck], readout: Readout) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from lidardesign.run.config import RunConfig
 from lidardesign.scene import Scene
 from lidardesign.simulate.receiver_view import in_view
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction
-from lidardesign.task import Task, random_generator, scenes_of
+from lidardesign.task import Task, notes_of, random_generator, scenes_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +52,11 @@ def prepare_ground(task: Task, config: RunConfig, ranks: Ranks = ALONE) -> Groun
             hint="free at least one, or write the point as a design file",
         )
     ranks.announce({"job": "ground", "config": config.as_document()})
+    with plugin_guard(config.task_name):
+        told = notes_of(task, config.task, config.space)
     scenes = training_scenes(task, config)
     target, notes = prepare_target(scenes, config, ranks=ranks)
-    return Ground(scenes, target, tuple(notes), _pool(target, scenes, config))
+    return Ground(scenes, target, (*told, *notes), _pool(target, scenes, config))
 
 
 @phase("scenes")

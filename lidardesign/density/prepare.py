@@ -52,7 +52,7 @@ def prepare_target(
     if visibility == "quadrature":
         target, refined = _refine_quadrature(target, scenes, config)
         notes.extend(refined)
-    notes.extend(resolution_notes(target, settings.sigma_m))
+    notes.extend(resolution_notes(target, settings))
     notes.extend(flatness_notes(target, settings.sigma_m, random_generator(config.seed, "flatness")))
     notes.extend(importance_notes(scenes))
     notes.extend(dict.fromkeys(line for scene in scenes for line in scene.notes))

@@ -12,6 +12,7 @@ import numpy as np
 from lidardesign.density.bodies import Bodies
 from lidardesign.density.fields import BodyField, Field, TableField, UnionField
 from lidardesign.density.parallel_target import GatheredField
+from lidardesign.density.settings import DensitySettings
 from lidardesign.density.target import Target
 from lidardesign.errors import ConfigError
 from lidardesign.space import RANGE, DesignSpace, observed_point
@@ -23,14 +24,17 @@ ROUNDINGS = 4
 # A density that varies by less than this over the whole space prefers hardly anything.
 FLAT_NATS = 0.5
 FLATNESS_PROBES = 256
+# Scenes that large with a sigma that fine are more likely in another unit.
+DOUBTFUL_ACROSS_M = 20.0
 
 
-def resolution_notes(target: Target, sigma_m: float) -> list[str]:
+def resolution_notes(target: Target, settings: DensitySettings) -> list[str]:
     """What sigma blurs.
 
     Raises:
         ConfigError: Sigma is finer than distances are known.
     """
+    sigma_m = settings.sigma_m
     _refuse_below_rounding(target.space, sigma_m)
     steps = _grid_steps_m(target.field)
     if not len(steps) or sigma_m >= BLURRED_SHARE * steps.max():
@@ -40,12 +44,23 @@ def resolution_notes(target: Target, sigma_m: float) -> list[str]:
             f"sigma {sigma_m:g} m is far below the grid step {steps.min():.3g} m of the fields",
             where="density.sigma_m",
             allowed=f"at least {UNRESOLVED_SHARE * steps.min():.3g} m on this grid",
-            hint="raise density.field_resolution, or sigma",
+            hint=_finer_hint(float(steps.min()) * settings.field_resolution),
         )
     return [
         f"sigma {sigma_m:g} m is below half the field's grid step {steps.max():.3g} m: "
         "surfaces are blurred more than sigma says; raise density.field_resolution"
     ]
+
+
+def _finer_hint(across_m: float) -> str:
+    """What to do about fields across so many metres that sigma is lost in them."""
+    finer = "raise density.field_resolution, or sigma"
+    if across_m < DOUBTFUL_ACROSS_M:
+        return finer
+    return (
+        f"are the lengths in metres? the scenes are about {across_m:.2g} m across; files in millimetres need the "
+        f"factor 0.001 (task meshes: --set scale=0.001); else {finer}"
+    )
 
 
 def flatness_notes(target: Target, sigma_m: float, generator: np.random.Generator) -> list[str]:

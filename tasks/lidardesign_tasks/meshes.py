@@ -33,6 +33,7 @@ from lidardesign_tasks.moving_surface import SURFACES, moving_residuals, moving_
 from lidardesign_tasks.pose import jittered_pose
 from lidardesign_tasks.surface import surface_residuals, surface_score, with_visible_truth
 from lidardesign_tasks.surroundings import any_direction, moving
+from lidardesign_tasks.units import doubtful_meshes, doubtful_motion
 
 Vector = tuple[float, float, float]
 Axis = Literal["x", "y", "z"]
@@ -40,8 +41,10 @@ Axis = Literal["x", "y", "z"]
 WORLD_AXES = {"x": [1, 2, 0], "y": [2, 0, 1], "z": [0, 1, 2]}
 RELATIVE_JITTER = 0.02  # of the largest extent, where no shift is given
 SENSOR_DISTANCE = 2.0  # extents
-DOUBTFUL_EXTENT_M = 20.0  # an object that large is more likely in another unit
 SPLIT_SEED = 0  # of which meshes are held out, whatever the seed of a run
+SAME_MESH = (
+    "training and held-out scenes show the same one in other poses, so scores say nothing of other objects"
+)
 ROOM = 1.1  # around the bounding sphere, for the pose jitter
 
 
@@ -157,6 +160,20 @@ class MeshesTask:
             scenes.append(config.around(replace(judged, bodies=(moving(placed, velocity), *occluders))))
         return scenes
 
+    def notes(self, config: MeshesConfig, space: DesignSpace) -> list[str]:
+        """Lengths that look like another unit, and a mesh that is trained on and held out."""
+        meshes = load_folder(config)
+        extents_m = {name: extent_m([mesh]) for name, mesh in [*meshes, *load_occluders(config)]}
+        motion = motion_of(config, meshes)
+        bounds_m = {} if motion is None else {
+            name: moved_bounds_m(mesh, motion.of_object(name)) for name, mesh in meshes
+        }  # fmt: skip
+        return [
+            *doubtful_meshes(extents_m, config.scale),
+            *doubtful_motion(bounds_m, extent_m([mesh for _, mesh in meshes]), space),
+            *(f"{name} is the only mesh: {SAME_MESH}" for name, _ in meshes if len(meshes) == 1),
+        ]
+
     def score(self, scene: Scene, returns: Sequence[Returns]) -> Score:
         """Chamfer distance [mm] between the reconstruction and the part of the surface that could be seen."""
         score = moving_score if SURFACES in scene.truth else surface_score
@@ -223,16 +240,7 @@ def _load_file(
     vertices = mesh.vertices[:, WORLD_AXES[up]]
     if centre:
         vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    notes = [*mesh.notes, *_doubts_about_unit(vertices, scale)]
-    return replace(mesh, vertices=vertices, notes=tuple(f"{path.name}: {note}" for note in notes))
-
-
-def _doubts_about_unit(vertices: np.ndarray, scale: float) -> list[str]:
-    """A note on a mesh that is larger than a building while no unit was given."""
-    extent = float(np.ptp(vertices, axis=0).max())
-    if scale != 1.0 or extent < DOUBTFUL_EXTENT_M:
-        return []
-    return [f"is {extent:.4g} m long; if the file is in millimetres, set scale=0.001"]
+    return replace(mesh, vertices=vertices, notes=tuple(f"{path.name}: {note}" for note in mesh.notes))
 
 
 def split_meshes(meshes: Sequence[tuple[str, Mesh]], config: MeshesConfig, split: Split) -> list[tuple[str, Mesh]]:
