@@ -116,6 +116,7 @@ def _scores(
 
     own = [_own_count(entry.design) for entry in entries]
     counts = rays or _counts([entry.design for entry in entries], own, run, console)
+    _check_fired([entry.design for entry in entries], counts, console)
     request = replace(request_of(run, list(entries), counts, [], seed), equal_bandwidth=False)
     found = evaluate(request)
     rows, paired = [row.as_dict() for row in found.rows], [pair.as_dict() for pair in found.paired]
@@ -130,6 +131,16 @@ def _scores(
         "rows": rows,
         "paired": paired,
     }
+
+
+def _check_fired(designs: Sequence[Design], counts: Sequence[int], console: Console) -> None:
+    """Say where a design has no row; a design that has none at all is refused."""
+    from lidardesign.evaluate.ray_numbers import fired_numbers, left_out
+
+    for design in designs:
+        fired_numbers([design], counts)
+    for line in left_out(designs, counts):
+        console.note(f"note: {line}")
 
 
 def _keys(rows: Sequence[dict[str, Any]]) -> set[tuple[str, int]]:

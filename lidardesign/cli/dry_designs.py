@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from lidardesign.cli.runs import Run
     from lidardesign.cli.weighting import Weighting
     from lidardesign.design.constraints import Constraints
+    from lidardesign.design.sensor import Design
 
 CONFIGURATION, MANIFEST, SAMPLES = "config.yaml", "manifest.json", "samples.npz"
 
@@ -81,7 +82,7 @@ def _fit_steps(settings: Mapping[str, Any], task: str) -> list[str]:
 
 def evaluate_plan(
     run: Run,
-    designs: Sequence[tuple[str, Path]],
+    designs: Sequence[tuple[Design, Path]],
     *,
     rays: Sequence[int],
     baselines: Sequence[str],
@@ -92,20 +93,28 @@ def evaluate_plan(
 
     Arguments:
         run: The run whose task judges.
-        designs: Names and files.
-        rays: Numbers of rays.
+        designs: The designs and their files.
+        rays: Numbers of rays that are asked for.
         baselines: All of them, by name.
         outputs: Files to write, by option.
         settings: Further options, for `--json` and, where they are set, for people.
+
+    Raises:
+        ConfigError: No design can fire any of the numbers of rays.
     """
-    counts = ", ".join(map(str, rays))
-    rows = (len(designs) + len(baselines)) * len(rays)
-    matched = len(designs) * len(baselines) * len(rays)
+    from lidardesign.evaluate.ray_numbers import can_fire, fired_numbers, left_out
+
+    judged = [design for design, _ in designs]
+    kept = fired_numbers(judged, rays)
+    counts = ", ".join(map(str, kept))
+    scored = sum(can_fire(design, count) for design in judged for count in kept)
+    rows, matched = scored + len(baselines) * len(kept), scored * len(baselines)
     said = ", ".join(f"{name} {value}" for name, value in settings.items() if value not in (None, (), [], False))
     steps = [
-        f"score {_listed([name for name, _ in designs])} in the held-out scenes of task {run.task.name}, with {counts} "
-        f"rays per frame",
+        f"score {_listed([design.name for design in judged])} in the held-out scenes of task {run.task.name}, "
+        f"with {counts} rays per frame",
         f"beside {', '.join(baselines)}: {rows} rows at equal rays, up to {matched} at equal bandwidth",
+        *left_out(judged, rays),
         *([f"with {said}"] if said else []),
     ]
     folders = [run.folder / name for name in (CONFIGURATION, MANIFEST)]
@@ -116,7 +125,7 @@ def evaluate_plan(
         steps,
         [path for _, path in designs] + folders + samples,
         [*written, run.folder / MANIFEST],
-        {"designs": [name for name, _ in designs], "rays": list(rays), "baselines": list(baselines), **settings},
+        {"designs": [design.name for design in judged], "rays": kept, "baselines": list(baselines), **settings},
         last_time(run.folder, "evaluate"),
     )
 

@@ -49,8 +49,8 @@ RayCounts = Annotated[
         metavar="N",
         min=1,
         max=1_000_000,
-        help="Rays per frame and position; repeatable.",
-        show_default="the task's",
+        help="Rays per frame and position; repeatable. A fixed pattern is left out beyond its own number.",
+        show_default="the task's and those of smaller fixed patterns",
     ),
 ]
 Baseline = Annotated[
@@ -138,14 +138,14 @@ def evaluate(
         claim_stdout(console, dry_run=dry_run, csv=csv, report=report)
         with phase("libraries"):
             import lidardesign.evaluate.score  # noqa: F401
-            from lidardesign.cli.rigs import budgets_within
+            from lidardesign.evaluate.ray_numbers import usual_numbers
             from lidardesign.run.config import judged_by
 
         wanted = _checked(workers, baseline or [], cma_seconds, fail_above)
         planner, audit = planner_of(effects, detector, range_tolerance_mm, return_tolerance)
         entries, runs = collect(targets, console)
         run = learned = common_run(named_apart(entries), runs)
-        rays = rays or budgets_within([entry.design for entry in entries], run.task.defaults.rays, console)
+        rays = rays or usual_numbers([entry.design for entry in entries], run.task.defaults.rays)
         if accuracy:
             _check_measurable(learned)
         if overrides:
@@ -205,7 +205,7 @@ def _checked(
 def _plan(
     run: Run,
     entries: list[JudgedDesign],
-    rays: list[int] | None,
+    rays: list[int],
     baselines: list[str],
     outputs: dict[str, Path | None],
     settings: dict[str, Any],
@@ -215,8 +215,8 @@ def _plan(
 
     return evaluate_plan(
         run,
-        [(entry.design.name, entry.path) for entry in entries],
-        rays=sorted(set(rays or run.task.defaults.rays)),
+        [(entry.design, entry.path) for entry in entries],
+        rays=sorted(set(rays)),
         baselines=tuple(dict.fromkeys([*ALWAYS, *baselines])),
         outputs=outputs,
         settings=settings,

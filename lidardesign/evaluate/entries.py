@@ -18,6 +18,7 @@ from lidardesign.evaluate.candidates import Candidate, Positions, mean_mbps
 from lidardesign.evaluate.cma_candidate import CmaCandidate, Record
 from lidardesign.evaluate.cma_objective import TrainingObjective
 from lidardesign.evaluate.observed import TrainingViews
+from lidardesign.evaluate.ray_numbers import can_fire, fired_numbers
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.scoring import score_lists
 from lidardesign.registry import plugin_guard
@@ -76,14 +77,19 @@ class Entry:
 
 @phase("rays")
 def entries_of(request: EvaluationRequest) -> list[Entry]:
-    """All rows to be: designs, baselines, then baselines at each design's bandwidth."""
+    """All rows to be: designs at the numbers of rays that they can fire, baselines, then those at each one's bandwidth.
+
+    Raises:
+        ConfigError: No design can fire any of the numbers of rays, or a track ends before where it is evaluated.
+    """
     _check_tracks(request)
     baselines = _baselines(request)
-    counts = list(dict.fromkeys(request.rays))
+    counts = fired_numbers(request.designs, request.rays)
     designs = [
         Entry(design.name, _laid_out(request, design, count), baseline=False)
         for design in request.designs
         for count in counts
+        if can_fire(design, count)
     ]
     wanted = [
         _Wanted(name, baselines.options(name, count), None) for name in request.baselines for count in counts

@@ -12,6 +12,7 @@ from lidardesign.design.tightness import SPACE_MARK, Tightness, tightness
 from lidardesign.design.track import placed
 from lidardesign.evaluate.density_views import DensityView, density_view
 from lidardesign.evaluate.entries import ordered_conditions
+from lidardesign.evaluate.ray_numbers import fired_numbers, pattern_size
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.results import Evaluation
 from lidardesign.evaluate.shown import Conditions, Shown, shown_in
@@ -51,8 +52,10 @@ def pictured_of(
 def shown_of(request: EvaluationRequest, *, physics: bool) -> Shown:
     """The designs in the first held-out scene, with the physics that it calls for or by geometry alone."""
 
+    most = max(fired_numbers(request.designs, request.rays))
+
     def laid_out(design: Design, at: Conditions) -> Rays:
-        count = design.rays or max(request.rays)
+        count = design.rays or pattern_size(design) or most
         return request.lay_out(design, count, request.samples.get(design.name), at=at)
 
     return shown_in(

@@ -33,7 +33,8 @@ class EvaluationRequest:
         space: The design space that baselines fill.
         seed: Root of the drawn baselines and the bootstrap.
         designs: The designs, by distinct names that are no baseline's.
-        rays: Numbers of rays per frame; with conditions, per condition value.
+        rays: Numbers of rays per frame; with conditions, per condition value. A design of a fixed pattern has no row
+            at more rays than it has.
         baselines: Names of baselines.
         bandwidth: The read-out model.
         samples: Samples of the learned density by design name, for layouts that need them.

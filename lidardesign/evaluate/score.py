@@ -21,6 +21,7 @@ from lidardesign.evaluate.cma_candidate import Record
 from lidardesign.evaluate.effects import effect_notes, summaries
 from lidardesign.evaluate.entries import Entry, entries_of
 from lidardesign.evaluate.passes import Progress, ScenePass
+from lidardesign.evaluate.ray_numbers import left_out
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.results import Evaluation, Paired, Row, worse_than_threshold
 from lidardesign.evaluate.scoring import score_scene
@@ -218,7 +219,7 @@ def _bandwidth_pairs(rows: Sequence[Row], matched: Sequence[Row], seed: int) -> 
 
 
 def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequence[Row]) -> list[str]:
-    notes = []
+    notes = left_out(request.designs, request.rays)
     positions = max(len(entry.positions) for entry in entries)
     if positions > 1:
         notes.append(f"rays and bandwidth count per position; every scene is seen from {positions} positions")
