@@ -112,12 +112,16 @@ def _scores(
     from lidardesign.cli.judged import request_of
 
     with phase("libraries"):
+        from lidardesign.design.outside import outside_notes
         from lidardesign.evaluate.score import evaluate
 
     own = [_own_count(entry.design) for entry in entries]
     counts = rays or _counts([entry.design for entry in entries], own, run, console)
     _check_fired([entry.design for entry in entries], counts, console)
     request = replace(request_of(run, list(entries), counts, [], seed), equal_bandwidth=False)
+    for entry in entries:
+        for line in outside_notes(entry.design, run.config.space):
+            console.note(f"note: {line}")
     found = evaluate(request)
     rows, paired = [row.as_dict() for row in found.rows], [pair.as_dict() for pair in found.paired]
     if not rays and None not in own and own[0] != own[1]:

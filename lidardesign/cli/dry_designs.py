@@ -102,6 +102,7 @@ def evaluate_plan(
     Raises:
         ConfigError: No design can fire any of the numbers of rays.
     """
+    from lidardesign.design.outside import outside_notes
     from lidardesign.evaluate.ray_numbers import can_fire, fired_numbers, left_out
 
     judged = [design for design, _ in designs]
@@ -115,6 +116,7 @@ def evaluate_plan(
         f"with {counts} rays per frame",
         f"beside {', '.join(baselines)}: {rows} rows at equal rays, up to {matched} at equal bandwidth",
         *left_out(judged, rays),
+        *(line for design in judged for line in outside_notes(design, run.config.space)),
         *([f"with {said}"] if said else []),
     ]
     folders = [run.folder / name for name in (CONFIGURATION, MANIFEST)]

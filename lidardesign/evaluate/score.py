@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from lidardesign.design.outside import outside_notes
 from lidardesign.evaluate.audit import Audit, audit_rows
 from lidardesign.evaluate.catalog import part_notes
 from lidardesign.evaluate.cma_candidate import Record
@@ -26,9 +27,11 @@ from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.results import Evaluation, Paired, Row, worse_than_threshold
 from lidardesign.evaluate.scoring import score_scene
 from lidardesign.evaluate.statistics import bootstrap_interval, paired_difference
+from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.simulate.plan import Plan, Planner
 from lidardesign.simulate.triangles import SecondCasts
+from lidardesign.task import notes_of
 
 __all__ = [
     "Evaluation",
@@ -225,6 +228,10 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
         notes.append(f"rays and bandwidth count per position; every scene is seen from {positions} positions")
     if len(request.test) == 1:
         notes.append("one held-out scene: intervals have no width and say nothing about other scenes")
+    with plugin_guard(request.task.name):
+        notes += notes_of(request.task, request.config, request.space)
+    for design in request.designs:
+        notes += outside_notes(design, request.space)
     empty = [row for row in matched if row.rays == 0]
     if empty:
         names = ", ".join(sorted({row.design for row in empty}))
