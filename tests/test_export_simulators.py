@@ -427,7 +427,7 @@ def rendered(tmp_path_factory):
         missing = "No module named" in done.stderr or "LLVM" in done.stderr
         assert missing, done.stderr
         pytest.skip("mitsuba, mitransient or LLVM is not installed")
-    return rays, [np.array(one) for one in json.loads(done.stdout.rsplit("RESULT", 1)[1])]
+    return rays, [np.array(one) for one in json.loads(done.stdout.rsplit("RESULT", 1)[1].splitlines()[0])]
 
 
 def test_mitsuba_sees_light_in_the_bin_of_each_rays_range(rendered):

@@ -62,7 +62,7 @@ CONTAINED = {
         "scenes are made",
         "crashes while this is tried (Segmentation fault)",
     ),
-    "hog": (GOOD.replace(SCENES, SCENES + "        np.ones(2**28)\n"), "scenes are made", "needs more than 512 MiB"),
+    "hog": (GOOD.replace(SCENES, SCENES + "        np.ones(2**28)\n"), "scenes are made", "needs more than 768 MiB"),
 }
 # What is unusual and keeps the contract: it says much, never ends by itself, holds a library that sets variables of its
 # own, and has scenes that differ in their fog alone.
@@ -75,7 +75,7 @@ UNUSUAL = (
     .replace("import Body,", "import Body, Medium,")
 )
 SECONDS = {"hang": 2.0}
-MEMORY = {"hog": 2**29}
+MEMORY = {"hog": 3 * 2**28}
 
 
 @pytest.fixture(scope="module")
