@@ -12,8 +12,9 @@ from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
 from lidardesign.cli.designs import number
 from lidardesign.cli.grids import print_table
+from lidardesign.cli.outputs import claim_outputs
 from lidardesign.cli.runs import check_choice, folder_of, parse_at, read_design
-from lidardesign.cli.streams import claim_stdout, written_file
+from lidardesign.cli.streams import written_file
 from lidardesign.cli.times import keep_times
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.clock import phase
@@ -96,7 +97,7 @@ def capture(
 ) -> None:
     """Score designs by a captured scan: with their gates, without, and beside even rays."""
     with command(json=json, quiet=quiet, debug=debug) as console:
-        claim_stdout(console, csv=csv)
+        claim_outputs(console, csv=csv)
         _check_numbers(false_alarm, within_deg, outlier_mm)
         check_choice(estimator, "--estimator", ESTIMATORS)
         with phase("libraries"):

@@ -10,6 +10,7 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
+from lidardesign.cli.outputs import tell_new_folders
 from lidardesign.cli.runs import check_choice
 from lidardesign.cli.streams import is_output, put_on_stdout
 from lidardesign.errors import ConfigError
@@ -129,6 +130,7 @@ def _give(text: str, document: dict[str, Any], out: Path | None, console: Consol
 
     to_file = out is not None and not is_output(out)
     if to_file:
+        tell_new_folders([Path(str(out))], console)
         with phase("writing"):
             write_atomic(Path(str(out)), text)
     if console.json:

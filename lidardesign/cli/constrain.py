@@ -57,7 +57,8 @@ def constrain(
         load_libraries()
         check_choices(gates, layout)
         count, condition = sensor_count(sensors, None), parse_at(at)
-        asked = load_constraints(constraints, overrides or [])
+        asked = load_constraints(constraints, overrides or [], console)
+        check_parts(asked)
         opened, design = open_target(target, console)
         run = need_run(opened, target)
         checked, layout = likeness(like, asked, layout, rays, run, console)
@@ -109,18 +110,34 @@ def _level(given: float | None, design: Design | None, usual: float) -> float:
     return design.level if design else usual
 
 
-def load_constraints(file: Path | None, overrides: list[str]) -> Constraints:
-    """Constraints of a file with `--set` laid over it.
+def check_parts(constraints: Constraints) -> None:
+    """Refuse names of parts that there are none of before anything is fitted.
+
+    Raises:
+        ConfigError: So it is.
+    """
+    from lidardesign.design.snap_options import parts_of
+
+    for index in range(len(constraints.each) + 1):
+        snap = constraints.of_sensor(index).snap
+        if snap is not None and snap.parts is not None:
+            parts_of(snap)
+
+
+def load_constraints(file: Path | None, overrides: list[str], console: Console | None = None) -> Constraints:
+    """Constraints of a file with `--set` laid over it; the console is told where the file holds none.
 
     Raises:
         ConfigError: At file:line:column, or at the `--set` option.
     """
     from lidardesign.design.constraints import CATALOG, Constraints
     from lidardesign.run.overrides import apply_override, parse_override
-    from lidardesign.run.yaml import Document, load_yaml
+    from lidardesign.run.yaml import Document, leaves, load_yaml
 
     document = load_yaml(file) if file else Document({}, "constraints")
     values: dict[str, Any] = document.mapping
+    if file and console is not None and all(value in (None, {}, []) for _, value in leaves(values)):
+        console.note(f"note: {document.where} holds no constraints")
     origins: dict[KeyPath, str] = {}
     for text in overrides:
         override = parse_override(text)

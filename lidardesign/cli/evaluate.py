@@ -14,10 +14,11 @@ from lidardesign.cli.console import Console, command
 from lidardesign.cli.designs import number
 from lidardesign.cli.dry_run import DryRun, tell_plan
 from lidardesign.cli.judged import ALWAYS, JudgedDesign, collect, common_run, named_apart, request_of
+from lidardesign.cli.outputs import claim_outputs
 from lidardesign.cli.physics import Detector, Effects, RangeTolerance, ReturnTolerance, planner_of
 from lidardesign.cli.scores import show_evaluation
 from lidardesign.cli.searches import CmaSeconds, check_cma_seconds, searching, told
-from lidardesign.cli.streams import claim_stdout, is_output, written_file
+from lidardesign.cli.streams import is_output, written_file
 from lidardesign.cli.times import keep_times, times_so_far
 from lidardesign.errors import ConfigError, ThresholdError
 from lidardesign.run.clock import phase
@@ -135,7 +136,7 @@ def evaluate(
 ) -> None:
     """Score designs on held-out scenes against the baselines uniform, random and bounding."""
     with command(json=json, quiet=quiet, debug=debug) as console:
-        claim_stdout(console, dry_run=dry_run, csv=csv, report=report)
+        claim_outputs(console, dry_run=dry_run, csv=csv, report=report, plots=plots)
         with phase("libraries"):
             import lidardesign.evaluate.score  # noqa: F401
             from lidardesign.evaluate.ray_numbers import usual_numbers

@@ -13,6 +13,7 @@ import typer
 from lidardesign.cli import options
 from lidardesign.cli.console import Console, command
 from lidardesign.cli.dry_run import DryRun, tell_plan
+from lidardesign.cli.outputs import tell_new_folders
 from lidardesign.cli.runs import folder_of, parse_at, read_design
 from lidardesign.cli.streams import claim_stdout, is_output, written_file
 from lidardesign.cli.times import keep_times
@@ -139,6 +140,7 @@ def _export(
     exporter.check_rate(asked.rate_hz)
     target = _target(path, out, exporter)
     folder = folder_of(design, path)
+    tell_new_folders([target], console)
     if dry_run:
         return tell_plan(_plan(design, path, target, exporter, asked), console)
     design, laid_out = design_and_rays(design, path, exporter.name, asked.rays, asked.at, asked.seed, console)
