@@ -23,8 +23,13 @@ if TYPE_CHECKING:
     from lidardesign.run.yaml import KeyPath
 
 
+Target = Annotated[
+    Path, typer.Argument(metavar="RUN|DESIGN", readable=False, help="A run folder, or a design that came from one.")
+]
+
+
 def constrain(
-    target: Annotated[Path, typer.Argument(metavar="RUN|DESIGN", help="A run folder, or a design that came from one.")],
+    target: Target,
     constraints: Annotated[
         Path | None,
         typer.Option("--constraints", metavar="FILE", help="YAML file; keys: docs/constraints.md.", show_default=False),
@@ -61,7 +66,7 @@ def constrain(
         check_parts(asked)
         opened, design = open_target(target, console)
         run = need_run(opened, target)
-        checked, layout = likeness(like, asked, layout, rays, run, console)
+        checked, layout, names = likeness(like, asked, layout, rays, run, console)
         layout = layout or _usual(checked, design, run)
         check_sensors(count, layout)
         fit_and_write(
@@ -71,6 +76,7 @@ def constrain(
             name=name,
             seed=run.config.seed if seed is None else seed,
             constraints=checked,
+            names=names,
             sensors=_sensors(count, checked, design, run.task.defaults.sensors),
             layout=layout,
             rays=_rays(rays, checked, design, layout == "grid" and gates != "ray", run.task.defaults.rays),

@@ -58,7 +58,7 @@ def fit(
         check_choices(gates, layout)
         count, condition = sensor_count(sensors, None), parse_at(at)
         opened = open_run(run)
-        constraints, layout = likeness(like, None, layout, rays, opened, console)
+        constraints, layout, names = likeness(like, None, layout, rays, opened, console)
         layout = layout or usual_layout(opened)
         check_sensors(count, layout)
         rays = rays or (constraints.budget.rays if constraints else None)
@@ -72,6 +72,7 @@ def fit(
             name=name,
             seed=opened.config.seed if seed is None else seed,
             constraints=constraints,
+            names=names,
             sensors=usual if count is None else count,
             layout=layout,
             rays=budget,
@@ -148,7 +149,8 @@ def fit_and_write(
     command_name: str,
     name: str,
     seed: int,
-    constraints: Any = None,
+    constraints: Constraints | None = None,
+    names: Sequence[str] = (),
     at: Mapping[str, float] | None = None,
     weighting: Weighting,
     refine: int | None = None,
@@ -164,6 +166,7 @@ def fit_and_write(
         name: The design's name and its file's.
         seed: Root of the random streams.
         constraints: Checked constraints, or None.
+        names: What sensors are called, where there are as many; none numbers them.
         at: Condition values that the design is for; without any, one for all of them.
         weighting: What the density is multiplied by.
         refine: Rounds of refinement, or None.
@@ -173,11 +176,12 @@ def fit_and_write(
     if plan_of is not None:
         from lidardesign.cli.dry_designs import fit_plan
 
+        run.config.space.at(at or {})
         given = {"constraints": constraints, "at": at or {}, "weighting": weighting, "refine": refine}
         return tell_plan(fit_plan(run, command_name, name, plan_of, seed=seed, choices=choices, **given), console)
 
-    from lidardesign.cli.designs import show_fit, write_design
-    from lidardesign.cli.refine import FitOrder, fitted, refined, show_refinement
+    from lidardesign.cli.designs import write_design
+    from lidardesign.cli.refine import FitOrder, fitted, refined
     from lidardesign.cli.weighting import KEY
 
     path = run.design_path(name)
@@ -189,18 +193,31 @@ def fit_and_write(
     for note in result.notes:
         console.note(f"note: {note}")
     made_by = provenance(run, path, command_name, seed, **({KEY: weighting.as_document()} if weighting else {}))
-    design = replace(result.design, provenance={**result.design.provenance, **made_by})
+    result, design = _finished(result, names, made_by)
     with phase("writing"):
         checks = check_written(design, constraints, run.config.space)
         write_design(design, run.folder, path)
     document = {**_document(result, path, checks), **further}
     keep_times(run.folder, command_name, console, wait_s=WAIT_S)
+    console.result(document, lambda rich: _show(document, design, checks, rich))
 
-    def show(rich: RichConsole) -> None:
-        show_refinement(document, rich)
-        show_fit(document, design, checks, rich)
 
-    console.result(document, show)
+def _show(document: dict[str, Any], design: Design, checks: Sequence[ConstraintCheck], rich: RichConsole) -> None:
+    """Print what was fitted, after the rounds of its refinement."""
+    from lidardesign.cli.designs import show_fit
+    from lidardesign.cli.refine import show_refinement
+
+    show_refinement(document, rich)
+    show_fit(document, design, checks, rich)
+
+
+def _finished(result: FitResult, names: Sequence[str], made_by: Mapping[str, Any]) -> tuple[FitResult, Design]:
+    """The result with sensors of these names, if they are as many, and its design with where it came from."""
+    design = result.design
+    if len(names) == len(design.sensors):
+        named = (replace(sensor, name=name) for sensor, name in zip(design.sensors, names, strict=True))
+        design = replace(design, sensors=tuple(named))
+    return replace(result, design=design), replace(design, provenance={**design.provenance, **made_by})
 
 
 def _document(result: FitResult, path: Path, checks: Sequence[ConstraintCheck]) -> dict[str, Any]:

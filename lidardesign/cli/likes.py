@@ -11,34 +11,58 @@ if TYPE_CHECKING:
     from lidardesign.cli.console import Console
     from lidardesign.cli.runs import Run
     from lidardesign.design.constraints import Constraints
+    from lidardesign.space import DesignSpace
 
 Asked = TypeVar("Asked", "Constraints", None)
 # In the others rays are sensors of their own, or leave their sensors' places.
 LAYOUTS = ("grid", "density")
+# Keys by which tasks are told where sensors may be.
+PLACE_KEYS = ("origin_m", "origin_box_m")
 
 
 def likeness(
     like: Path | None, asked: Asked, layout: str | None, rays: int | None, run: Run, console: Console
-) -> tuple[Constraints | Asked, str | None]:
-    """The constraints with those of a rig below them, and the layout; both as they are where there is no rig.
+) -> tuple[Constraints | Asked, str | None, tuple[str, ...]]:
+    """The constraints with those of a rig below them, the layout, and its sensors' names; as they are without a rig.
 
     Raises:
         ConfigError: A layout whose rays are no sensor's, or more sensors than a fit takes.
         DataError: The rig cannot be read.
+        InfeasibleError: It stands where the run's sensors may not.
     """
     if like is None:
-        return asked, layout
+        return _settled(asked, run.config.space, console), layout, ()
     from lidardesign.cli.rigs import reach_of
     from lidardesign.cli.runs import read_design
     from lidardesign.design.constraints import Constraints
-    from lidardesign.design.likeness import constraints_like, taken_over
+    from lidardesign.design.likeness import constraints_like, moved_notes, taken_over
 
     layout = layout or LAYOUTS[0]
     if layout not in LAYOUTS:
         raise ConfigError(f"{layout} beside --like", where="--layout", allowed=", ".join(LAYOUTS))
     rig = read_design(like, console, reach_of([run]))
     own = Constraints() if asked is None else asked
-    found = constraints_like(rig, run.config.space, own, rays=rays)
-    for line in taken_over(rig, found, own):
+    space = run.config.space
+    found = constraints_like(rig, space, own, rays=rays, hint=_hint(run))
+    for line in (*taken_over(rig, found, own), *moved_notes(rig, space, found)):
         console.note(f"note: {line}")
-    return found, layout
+    return _settled(found, space, console), layout, tuple(sensor.name for sensor in rig.sensors)
+
+
+def _hint(run: Run) -> str:
+    """How a run is learned whose sensors stand where a rig's do, by the keys that its task has."""
+    keys = [key for key in PLACE_KEYS if key in type(run.config.task).model_fields]
+    others = "the keys x_m, y_m and z_m of its space"
+    return f"learn with {' / '.join(keys) or others} for the rig's places: lidardesign tasks show {run.task.name}"
+
+
+def _settled(constraints: Asked, space: DesignSpace, console: Console) -> Asked:
+    """The constraints with pinned origins where the space fixes them; says which were moved there."""
+    from lidardesign.design.places import settled
+
+    if constraints is None:
+        return constraints
+    found, notes = settled(constraints, space)
+    for note in notes:
+        console.note(f"note: {note}")
+    return found

@@ -7,7 +7,7 @@ spreads, compared with the reported ones, and bounds are applied to both. `const
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Any
@@ -24,6 +24,8 @@ AGREEMENT = COARSE_SLACK
 # The bandwidth model counts a width this share above whole bins as whole bins.
 BIN_ROUNDING = SLACK
 LIGHT_M_PER_S = 299792458.0
+# Places are told to the millimetre: an origin pinned so near to the only one that the space has is that one [m].
+SAME_PLACE_M = 1e-3
 PICOSECOND_S = 1e-12
 
 
@@ -70,7 +72,7 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
         own = _over(rules, each[index]) if index < len(each) else rules
         name = str(sensor.get("name", index))
         checks += _consistency(name, sensor, z)
-        checks += _origin(name, sensor, own) + _boresight(name, sensor, own, bounds)
+        checks += _origin(name, sensor, own, bounds) + _boresight(name, sensor, own, bounds)
         checks += [ConstraintCheck(*row) for row in excluded_rows(name, sensor, own, z)]
         checks += _intervals(name, sensor, own, z)
         checks += [ConstraintCheck(*row) for row in snap_rows(name, index, document, own.get("snap"))]
@@ -144,7 +146,10 @@ def _consistency(name: str, sensor: Mapping[str, Any], z: float) -> list[Constra
     return [check for check in checks if not check.satisfied]
 
 
-def _origin(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any]) -> list[ConstraintCheck]:
+def _origin(
+    name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], space: Mapping[str, Any] | None
+) -> list[ConstraintCheck]:
+    """Origins in their boxes; one that is pinned next to where the space fixes it is kept by standing there."""
     mean, covariance = sensor["origin_m"]["mean"], sensor["origin_m"]["covariance"]
     checks = []
     tests = {
@@ -155,7 +160,8 @@ def _origin(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any]) -> l
     for key, test in tests.items():
         bound = _get(rules, "origin", key)
         if bound is not None:
-            kept = all(test(value, limit) for value, limit in zip(mean, bound, strict=True))
+            meant = _meant(bound, space) if key == "fixed_m" else bound
+            kept = all(test(value, limit) for value, limit in zip(mean, meant, strict=True))
             checks.append(ConstraintCheck(f"{name}.origin.{key}", list(bound), list(mean), bool(kept)))
     largest = _get(rules, "origin", "spread_m", "max")
     principal = np.sqrt(np.maximum(np.linalg.eigvalsh(np.array(covariance, dtype=np.float64)), 0.0))
@@ -166,6 +172,16 @@ def _origin(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any]) -> l
     if _get(rules, "origin", "fixed_m") is not None:
         checks.append(ConstraintCheck(f"{name}.origin.fixed_m.spread", 0.0, spread, spread == 0.0))
     return checks
+
+
+def _meant(pinned: Sequence[float], space: Mapping[str, Any] | None) -> list[float]:
+    """A pinned origin, with the space's coordinate where that is fixed no further away than places are told."""
+    place = [float(value) for value in pinned]
+    for axis, key in enumerate(("x_m", "y_m", "z_m")):
+        low, high = (float(end) for end in (space or {}).get(key, (-math.inf, math.inf)))
+        if low == high and abs(place[axis] - low) <= SAME_PLACE_M:
+            place[axis] = low
+    return place
 
 
 def _mounts(

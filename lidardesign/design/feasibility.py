@@ -15,6 +15,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints import Constraints, SensorConstraints
 from lidardesign.design.mounts import most_mounted, mounts_of
 from lidardesign.design.origins import free_boxes
+from lidardesign.design.places import settled_place
 from lidardesign.errors import InfeasibleError
 from lidardesign.numerics import SLACK
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace
@@ -84,6 +85,7 @@ def _check_count(constraints: Constraints, sensors: int | None) -> None:
 def _check_origin(constraints: Constraints, one: SensorConstraints, index: int, space: DesignSpace) -> None:
     low_name, high_name = (constraints.name_of(index, f"origin.{key}_m") for key in ("low", "high"))
     fixed_name = constraints.name_of(index, "origin.fixed_m")
+    place = None if one.origin.fixed_m is None else settled_place(one.origin.fixed_m, space)
     for axis in range(3):
         bounds = f"space.{DIMENSIONS[axis]}"
         lows = [_Bound(space.low[axis], bounds)]
@@ -92,8 +94,8 @@ def _check_origin(constraints: Constraints, one: SensorConstraints, index: int, 
             lows.append(_Bound(one.origin.low_m[axis], low_name))
         if one.origin.high_m is not None:
             highs.append(_Bound(one.origin.high_m[axis], high_name))
-        if one.origin.fixed_m is not None:
-            fixed = _Bound(one.origin.fixed_m[axis], fixed_name)
+        if place is not None:
+            fixed = _Bound(place[axis], fixed_name)
             lows.append(fixed)
             highs.append(fixed)
         for low in lows:

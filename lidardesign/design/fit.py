@@ -20,6 +20,7 @@ from lidardesign.design.features import Axes, Features
 from lidardesign.design.fit_result import FitResult
 from lidardesign.design.mount_choice import at_mounts
 from lidardesign.design.mounts import is_mounted, most_mounted, placement_notes
+from lidardesign.design.places import settled
 from lidardesign.design.quantise import SAMPLES_PER_RAY
 from lidardesign.design.rays import Gates, make_ray_table, own_gates, split_budget
 from lidardesign.design.resolve import bounds_of, groups
@@ -105,7 +106,7 @@ def fit(
         ConfigError: Options that do not fit together.
     """
     started = time.perf_counter()
-    constraints = Constraints() if constraints is None else constraints
+    constraints, moved = settled(Constraints() if constraints is None else constraints, samples.space)
     _check_options(constraints, samples, sensors, layout, rays)
     if samples.space.conditioned:
         return _along_condition(samples, constraints, rays, level, seed, name)
@@ -122,7 +123,7 @@ def fit(
         satisfied=all(check.satisfied for check in checks),
         constraints=checks,
         seconds=time.perf_counter() - started,
-        notes=(*placement_notes(constraints), *ensemble.notes, *(snap.notes if snap else ())),
+        notes=(*moved, *placement_notes(constraints), *ensemble.notes, *(snap.notes if snap else ())),
         error_estimates=fit_estimates(score, supports, samples, design.sensors),
         snap=snap.report if snap else None,
     )

@@ -7,14 +7,15 @@ anything of where sensors are, the rig says nothing of it. Where sensors look is
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from lidardesign.design.constraints import MOST_FITTED, Constraints, SensorConstraints, merged
+from lidardesign.design.places import misses, place_text, settled_place
 from lidardesign.design.sensor import Design, Sensor, interval_factor
-from lidardesign.errors import ConfigError
+from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.numerics import SLACK
 from lidardesign.space import DIMENSIONS, DesignSpace
 
@@ -22,10 +23,13 @@ from lidardesign.space import DIMENSIONS, DesignSpace
 # a fan have one in their plane, and this one across it.
 SMALLEST_FIELD_DEG = 1e-3
 PLACES = ("fixed_m", "low_m", "high_m", "mounts_m")
+MOST_NAMED = 4
 SHARED = tuple(SensorConstraints.model_fields)
 
 
-def constraints_like(rig: Design, space: DesignSpace, asked: Constraints, *, rays: int | None) -> Constraints:
+def constraints_like(
+    rig: Design, space: DesignSpace, asked: Constraints, *, rays: int | None, hint: str | None = None
+) -> Constraints:
     """The constraints of a rig below those that were asked for.
 
     Arguments:
@@ -33,9 +37,11 @@ def constraints_like(rig: Design, space: DesignSpace, asked: Constraints, *, ray
         space: The design space; a coordinate that is a condition stays open, as sensors move along it.
         asked: What the user wants.
         rays: The number of rays that the user wants, where that is said elsewhere; else the rig's own is a bound.
+        hint: What to do where the rig's sensors stand outside the space.
 
     Raises:
         ConfigError: More sensors than a fit takes.
+        InfeasibleError: A sensor of the rig stands where those of the space may not, and the user asks for no place.
     """
     if len(rig.sensors) > MOST_FITTED:
         raise ConfigError(
@@ -56,15 +62,38 @@ def constraints_like(rig: Design, space: DesignSpace, asked: Constraints, *, ray
     like = [_of_sensor(sensor, space) for sensor in rig.sensors]
     # entries beyond the rig's sensors stay: there are then too many, which is found where all contradictions are
     like += [{} for _ in each[len(like) :]]
-    result["each"] = [_under(one, merged(shared, entry)) for one, entry in zip(like, each, strict=True)]
+    own_places = [merged(shared, entry) for entry in each]
+    _check_places(rig, space, [_placed(one) for one in own_places], hint)
+    result["each"] = [_under(one, entry) for one, entry in zip(like, own_places, strict=True)]
     return Constraints.from_mapping(result, where=f"--like {rig.name}")
 
 
 def _under(like: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, Any]:
     """A rig's bounds on a sensor below those that were asked for it."""
-    placed = any(key in asked.get("origin", {}) for key in PLACES)
-    base = {key: value for key, value in like.items() if not (placed and key == "origin")}
+    base = {key: value for key, value in like.items() if not (_placed(asked) and key == "origin")}
     return merged(base, asked)
+
+
+def _placed(asked: Mapping[str, Any]) -> bool:
+    """Whether a user says where a sensor may be."""
+    return any(key in asked.get("origin", {}) for key in PLACES)
+
+
+def _check_places(rig: Design, space: DesignSpace, placed: Sequence[bool], hint: str | None) -> None:
+    """Refuse a rig whose sensors stand where the design space has no place, of those that the user puts nowhere."""
+    boxes = {sensor.name: _box(sensor) for sensor, own in zip(rig.sensors, placed, strict=False) if not own}
+    beyond = {name: axes for name, box in boxes.items() if (axes := misses(*box, space))}
+    if not beyond:
+        return
+    name = next(iter(beyond))
+    more = f" (and {len(beyond) - 1} more of its sensors elsewhere, too)" if len(beyond) > 1 else ""
+    raise InfeasibleError(
+        f"the run's sensors stand at {place_text(space.low[:3], space.high[:3])}; the rig's {name} at "
+        f"{place_text(*boxes[name])}{more}",
+        conflicts=[*(f"space.{DIMENSIONS[axis]}" for axis in beyond[name]), f"--like {rig.name}"],
+        where=f"--like {rig.name}",
+        hint=hint or "learn with a design space that holds the rig's places",
+    )
 
 
 def _of_sensor(sensor: Sensor, space: DesignSpace) -> dict[str, Any]:
@@ -81,14 +110,36 @@ def _of_sensor(sensor: Sensor, space: DesignSpace) -> dict[str, Any]:
 
 def _place(sensor: Sensor, space: DesignSpace) -> dict[str, Any]:
     """Where a sensor is: a point, or the box of its origins, open along conditions."""
-    half = interval_factor(sensor.level) * np.sqrt(np.maximum(np.diag(sensor.origin_covariance_m2), 0.0))
-    low, high = sensor.origin_m - half, sensor.origin_m + half
+    low, high = _box(sensor)
+    place = settled_place(sensor.origin_m, space)
     moving = [axis for axis in range(3) if DIMENSIONS[axis] in space.condition]
-    if not moving and not half.any():
-        return {"fixed_m": [float(value) for value in sensor.origin_m]}
+    if not moving and (low == high).all():
+        return {"fixed_m": place}
+    low, high = np.minimum(low, place), np.maximum(high, place)
     for axis in moving:
         low[axis], high[axis] = space.low[axis], space.high[axis]
     return {"low_m": [float(value) for value in low], "high_m": [float(value) for value in high]}
+
+
+def _box(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of the box of a sensor's origins, (3,) each [m]."""
+    half = interval_factor(sensor.level) * np.sqrt(np.maximum(np.diag(sensor.origin_covariance_m2), 0.0))
+    return sensor.origin_m - half, sensor.origin_m + half
+
+
+def moved_notes(rig: Design, space: DesignSpace, constraints: Constraints) -> list[str]:
+    """Which sensors of a rig are taken to stand where the space fixes their place, as they stand next to it."""
+    moved = []
+    for sensor, one in zip(rig.sensors, constraints.each, strict=False):
+        place = settled_place(sensor.origin_m, space)
+        off = float(np.abs(np.subtract(place, sensor.origin_m)).max())
+        # what is said of other places, or of conditions, is no move
+        if off > SLACK and one.origin.fixed_m == place:
+            moved.append((sensor.name, 1e3 * off))
+    if not moved:
+        return []
+    names = ", ".join(name for name, _ in moved[:MOST_NAMED]) + ", ..." * (len(moved) > MOST_NAMED)
+    return [f"{names}: {max(off for _, off in moved):.2g} mm from where the run's sensors stand: taken to stand there"]
 
 
 def taken_over(rig: Design, constraints: Constraints, asked: Constraints) -> list[str]:
