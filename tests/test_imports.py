@@ -324,7 +324,7 @@ def test_a_model_may_include_files_of_its_own_folder_alone(tmp_path):
 DOCTYPE = '<!DOCTYPE m [<!ENTITY a "aaaaaaaaaa"><!ENTITY b SYSTEM "file:///etc/passwd">]>'
 BAD_XML = {
     "a document type": (DOCTYPE + model_of('<rangefinder site="a" cutoff="1"/>'), "document type"),
-    "cut short": (model_of("")[:-9], "is no XML"),
+    "cut short": (model_of("")[:-9], "ends early"),
     "no rangefinder": (model_of(""), "has no rangefinder"),
     "an unknown site": (model_of('<rangefinder site="b" cutoff="1"/>'), "MuJoCo cannot read it"),
     "a camera": (model_of('<rangefinder camera="c"/>', '<camera name="c"/>'), "of a camera"),
@@ -689,7 +689,7 @@ def test_a_rig_scores_as_the_design_that_fires_its_rays(call, run, tmp_path):
         assert by["fans", count] == by["same", count]
     assert "how far 16 of 16 rays are heard is not said; 1.2 m" in result.err
     assert any(note.startswith("fans fires 16 rays") for note in result.json["notes"])
-    assert max(row["rays"] for row in result.json["rows"]) > 16
+    assert any(note.startswith("no design fires") for note in result.json["notes"])
 
 
 def test_a_rig_is_shown_and_exported(call, tmp_path):

@@ -78,9 +78,10 @@ CsvFile = Annotated[
 
 
 def capture(
-    file: Annotated[Path, typer.Argument(metavar="CAPTURE", help="Captured histograms, .npz or .mat.")],
+    file: Annotated[Path, typer.Argument(metavar="CAPTURE", readable=False, help="Captured histograms, .npz or .mat.")],
     designs: Annotated[
-        list[Path], typer.Argument(metavar="DESIGN", help="Design files, or what `export --format galvo` wrote.")
+        list[Path],
+        typer.Argument(metavar="DESIGN", readable=False, help="Design files, or what `export --format galvo` wrote."),
     ],
     rays: options.RayCount = None,
     at: options.At = None,
@@ -118,8 +119,8 @@ def capture(
         if csv is not None:
             from lidardesign.evaluate.capture_table import write_csv
 
-            with phase("writing"), written_file(csv) as file:
-                write_csv(found, file)
+            with phase("writing"), written_file(csv) as table:
+                write_csv(found, table)
         for folder in _folders(designs):
             keep_times(folder, "capture", console)
         document = {"capture": str(file), **found.as_dict(), "files": [] if csv is None else [str(csv)]}

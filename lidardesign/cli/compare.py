@@ -43,8 +43,10 @@ SENSOR_COLUMNS = (
 
 
 def compare(
-    first: Annotated[Path, typer.Argument(metavar="DESIGN", help="A design file, or the file of a rig.")],
-    second: Annotated[Path, typer.Argument(metavar="OTHER", help="The design to compare it with.")],
+    first: Annotated[
+        Path, typer.Argument(metavar="DESIGN", readable=False, help="A design file, or the file of a rig.")
+    ],
+    second: Annotated[Path, typer.Argument(metavar="OTHER", readable=False, help="The design to compare it with.")],
     space_of: SpaceOf = None,
     rays: RayCounts = None,
     seed: options.Seed = None,

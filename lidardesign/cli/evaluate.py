@@ -41,7 +41,8 @@ BASELINE_HELP = (
 
 
 Targets = Annotated[
-    list[Path], typer.Argument(metavar="RUN|DESIGN", help="Run folders (all their designs) and design files.")
+    list[Path],
+    typer.Argument(metavar="RUN|DESIGN", readable=False, help="Run folders (all their designs) and design files."),
 ]
 RayCounts = Annotated[
     list[int] | None,
@@ -158,8 +159,7 @@ def evaluate(
             further = {"--effects": effects, "--detector": detector, "--set": overrides, "--accuracy": accuracy}
             return tell_plan(_plan(run, entries, rays, baseline or [], outputs, further), console)
         request = request_of(run, entries, rays, [*ALWAYS, *(baseline or [])], seed)
-        request = replace(request, planner=planner, audit=audit)
-        files = (report, plots, csv)
+        request, files = replace(request, planner=planner, audit=audit), (report, plots, csv)
         evaluation = _evaluate_with(wanted, replace(request, cma=searching(cma_seconds)), console)
         # accuracy takes minutes: what was scored by then is written already
         early = (None if accuracy and is_output(path) else path for path in files)

@@ -50,7 +50,10 @@ class _Asked:
 
 def export(
     design: Annotated[
-        Path | None, typer.Argument(metavar="DESIGN", help="A design file, or the file of a rig.", show_default=False)
+        Path | None,
+        typer.Argument(
+            metavar="DESIGN", readable=False, help="A design file, or the file of a rig.", show_default=False
+        ),
     ] = None,
     format_: Annotated[
         str | None,

@@ -54,12 +54,18 @@ def collect(targets: list[Path], console: Console) -> tuple[list[JudgedDesign], 
 
 
 def named_apart(entries: list[JudgedDesign]) -> list[JudgedDesign]:
-    """Designs of different runs that share a name take their run's name in front."""
-    names = [entry.design.name for entry in entries]
+    """Designs that share a name take in front their run's name, or behind their file's ending, as tells them apart."""
+    alike: dict[str, list[JudgedDesign]] = {}
     for entry in entries:
-        if names.count(entry.design.name) > 1:
-            folder = entry.run.folder if entry.run else entry.path.parent
-            entry.design = replace(entry.design, name=f"{folder.resolve().name}/{entry.design.name}")
+        alike.setdefault(entry.design.name, []).append(entry)
+    for name, group in alike.items():
+        folders = [(entry.run.folder if entry.run else entry.path.parent).resolve().name for entry in group]
+        for entry, folder in zip(group, folders, strict=True):
+            # files of one folder, as rig.csv and rig.sdf, differ in their endings alone
+            ending = entry.path.suffix if folders.count(folder) > 1 else ""
+            front = f"{folder}/" if len(set(folders)) > 1 else ""
+            if len(group) > 1:
+                entry.design = replace(entry.design, name=f"{front}{name}{ending}")
     names = [entry.design.name for entry in entries]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice:

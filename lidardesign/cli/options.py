@@ -107,6 +107,7 @@ Like = Annotated[
     typer.Option(
         "--like",
         metavar="RIG",
+        readable=False,
         help="Be as a rig that there is (a design, rays as CSV or NPZ, a MuJoCo model, an SDF file): as many sensors "
         "at its places, fields of view and gates no wider, as many rays. Constraints of your own go before.",
         show_default=False,

@@ -32,7 +32,9 @@ SpaceOf = Annotated[
 
 
 def show(
-    design: Annotated[Path, typer.Argument(metavar="DESIGN", help="A design file, or the file of a rig.")],
+    design: Annotated[
+        Path, typer.Argument(metavar="DESIGN", readable=False, help="A design file, or the file of a rig.")
+    ],
     at: options.At = None,
     space_of: SpaceOf = None,
     seed: options.Seed = None,

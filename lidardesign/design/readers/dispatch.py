@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
+from lidardesign.design.readers.faults import check_bytes, check_separator, check_text, refuse_headless
 from lidardesign.design.readers.mjcf import read_mjcf
 from lidardesign.design.readers.ray_csv import read_ray_csv
 from lidardesign.design.readers.ray_npz import read_ray_npz
@@ -36,10 +37,18 @@ def read_rig(path: Path, head: bytes) -> Rig | None:
     """
     if head.startswith(ZIP_BEGINNINGS):
         return read_ray_npz(path)
+    check_bytes(path, head)
     if _begins_as_xml(head):
         return _read_xml_rig(path)
-    if looks_like_sensor_csv(head) and not _is_sensor_table(head):
+    if not looks_like_sensor_csv(head):
+        check_text(path, head)
+        return None
+    check_separator(path, head)
+    cells = _first_cells(head)
+    if not any(cell in (*COLUMNS, QUERY_COLUMN) or _is_number(cell) for cell in cells):
         return read_ray_csv(path)
+    if len(cells) not in (len(COLUMNS), len(COLUMNS) + 1) and not {*cells} & {*COLUMNS}:
+        raise refuse_headless(path)
     return None
 
 
@@ -48,12 +57,11 @@ def _begins_as_xml(head: bytes) -> bool:
     return head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith((b"<", b"\xff\xfe<\x00", b"\xfe\xff\x00<"))
 
 
-def _is_sensor_table(head: bytes) -> bool:
-    """Whether a CSV begins as the research code's: with numbers, or with names of its columns."""
+def _first_cells(head: bytes) -> list[str]:
+    """The cells of a CSV's first line; the research code's begins with numbers, or with names of its columns."""
     text = head.decode("utf-8-sig", errors="replace")
     first = next(line for line in text.splitlines() if line.strip())
-    cells = [cell.strip() for cell in next(csv.reader([first]))]
-    return any(cell in (*COLUMNS, QUERY_COLUMN) or _is_number(cell) for cell in cells)
+    return [cell.strip() for cell in next(csv.reader([first]))]
 
 
 def _is_number(cell: str) -> bool:

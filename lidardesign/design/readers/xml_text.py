@@ -18,6 +18,16 @@ MOST_ELEMENTS = 500_000
 LONGEST_QUOTE = 80
 # The parser hands text over in pieces of so much, not line by line: each is joined to what is there already.
 PIECE_BYTES = 1 << 20
+# What the parser says at the end of a file that goes on.
+CUT_SHORT = frozenset(
+    expat.errors.codes[text]
+    for text in (
+        expat.errors.XML_ERROR_NO_ELEMENTS,
+        expat.errors.XML_ERROR_UNCLOSED_TOKEN,
+        expat.errors.XML_ERROR_PARTIAL_CHAR,
+        expat.errors.XML_ERROR_UNCLOSED_CDATA_SECTION,
+    )
+)
 
 
 class Element(ElementTree.Element):
@@ -41,10 +51,13 @@ def read_xml(path: Path, allowed: str) -> Element:
         raise DataError(f"cannot be read: {error.strerror or error}", where=str(path), allowed=allowed) from None
     if len(content) > LARGEST_BYTES:
         raise DataError("the file is too large", where=str(path), allowed=f"at most {LARGEST_BYTES} bytes")
+    builder = _Builder(path)
     try:
-        return _Builder(path).build(content)
+        return builder.build(content)
     except expat.ExpatError as error:
         position = f"{path}:{error.lineno}:{error.offset + 1}"
+        if error.code in CUT_SHORT:
+            raise DataError(builder.unfinished, where=position, allowed=allowed, hint="it may be cut short") from None
         raise DataError(f"is no XML: {expat.ErrorString(error.code)}", where=position, allowed=allowed) from None
     except (LookupError, ValueError) as error:
         raise DataError(f"is no XML: {error}", where=str(path), allowed=allowed) from None
@@ -67,6 +80,14 @@ class _Builder:
     def build(self, content: bytes) -> Element:
         self._parser.Parse(content, True)
         return self._open[0]
+
+    @property
+    def unfinished(self) -> str:
+        """What is missing of a file that ends too early."""
+        if not self._open:
+            return "is no XML, or ends early: it has no element"
+        last = self._open[-1]
+        return f"ends early: <{last.tag[:LONGEST_QUOTE]}> of line {last.line} is not closed"
 
     def _doctype(self, *_: object) -> None:
         where = f"{self._path}:{self._parser.CurrentLineNumber}"
