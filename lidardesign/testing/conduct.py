@@ -67,7 +67,13 @@ _AFTER = ("scores are numbers", "residuals are places")
 LAWS = (
     Law("no global random state", "conduct", "no global random state is used", check_random, after=_AFTER),
     Law("nothing is written", "conduct", "only temporary files and caches are written", check_files, after=_AFTER),
-    Law("nothing else is changed", "conduct", "working folder, environment, locale and signals stay", check_surroundings, after=_AFTER),
+    Law(
+        "nothing else is changed",
+        "conduct",
+        "working folder, environment, locale and signals stay",
+        check_surroundings,
+        after=_AFTER,
+    ),
     Law("within time", "conduct", "every call ends in time", check_time, after=_AFTER),
     Law("within memory", "conduct", "the process stays within memory", check_memory, after=_AFTER),
 )
