@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from lidardesign.errors import ConfigError
 from lidardesign.run import clock as clocks
-from lidardesign.run.clock import Clock, keep_timings, phase, running
+from lidardesign.run.clock import Clock, keep_timings, peak_memory_bytes, phase, running
 from lidardesign.run.lock import run_lock
 from lidardesign.run.manifest import read_manifest, start_manifest
 
@@ -129,3 +133,12 @@ def test_times_are_not_written_into_a_run_that_another_command_writes(tmp_path):
     start_manifest(tmp_path, command=[], seed=1)
     with run_lock(tmp_path), pytest.raises(ConfigError, match="writing this run"):
         keep_timings(tmp_path, "fit", Clock(), wait_s=0.0)
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux tells it there")
+def test_a_process_does_not_count_the_memory_of_the_one_that_started_it():
+    held = np.ones(60_000_000)  # 480 MB
+    code = "from lidardesign.run.clock import peak_memory_bytes; print(peak_memory_bytes())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, close_fds=False)
+    assert 1e6 < int(done.stdout) < held.nbytes
+    assert peak_memory_bytes() > held.nbytes
