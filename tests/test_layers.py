@@ -26,6 +26,7 @@ LAYERS = {
     "lidardesign.run.streams": 1,
     "lidardesign.run.files": 1,
     "lidardesign.run.processes": 1,
+    "lidardesign.run.csv_rows": 1,
     "lidardesign.run.npz": 1,
     "lidardesign.run.yaml": 1,
     "lidardesign.run.kinds": 2,

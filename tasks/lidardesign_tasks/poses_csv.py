@@ -8,8 +8,6 @@ rotations turn at an even speed the shorter way; before its first and after its 
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -20,6 +18,7 @@ import numpy as np
 
 from lidardesign.errors import DataError
 from lidardesign.rotations import rotation_of_quaternion, rotation_of_rpy
+from lidardesign.run.csv_rows import csv_rows
 from lidardesign.scene import rigid
 from lidardesign.space import FARTHEST_M
 from lidardesign_tasks.pose import rotation_matrix
@@ -151,21 +150,7 @@ class _Row:
 
 def _rows(path: Path) -> list[tuple[int, list[str]]]:
     """The line and the cells of every row that is not blank, the header first."""
-    try:
-        size = path.stat().st_size
-        if size > LARGEST_BYTES:
-            raise DataError(f"has {size} bytes", where=str(path), allowed=f"at most {LARGEST_BYTES}")
-        text = path.read_bytes().decode("utf-8-sig")
-    except OSError as error:
-        raise DataError(f"cannot be read: {error.strerror or error}", where=str(path)) from None
-    except UnicodeDecodeError:
-        raise DataError("is not UTF-8 text", where=str(path)) from None
-    # `splitlines` would also part names at the line ends of other scripts
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    try:
-        rows = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
-    except csv.Error as error:
-        raise DataError(f"is no CSV: {error}", where=f"{path}:{reader.line_num}") from None
+    rows = csv_rows(path, LARGEST_BYTES)
     if not rows or len(rows) > MOST_ROWS + 1:
         raise DataError(f"{max(len(rows) - 1, 0)} rows", where=str(path), allowed=f"a header and 1 to {MOST_ROWS} rows")
     width = len(rows[0][1])

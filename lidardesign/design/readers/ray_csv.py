@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,6 +12,7 @@ from lidardesign.design.readers.ray_columns import SENSOR, RayColumns, check_nam
 from lidardesign.design.readers.rig import Rig
 from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import DataError
+from lidardesign.run.csv_rows import csv_rows
 
 KIND = "rays CSV"
 # A million rays of twelve columns with all their digits.
@@ -52,28 +51,11 @@ def read_ray_csv(path: Path) -> Rig:
 
 def _rows(path: Path) -> tuple[list[list[str]], list[int]]:
     """The cells of every line that is not blank, the header first, and the lines' numbers."""
-    try:
-        size = path.stat().st_size
-        if size > LARGEST_BYTES:
-            raise DataError(f"has {size} bytes", where=str(path), allowed=f"at most {LARGEST_BYTES}")
-        text = path.read_bytes().decode("utf-8-sig")
-    except OSError as error:
-        raise DataError(f"cannot be read: {error.strerror or error}", where=str(path)) from None
-    except UnicodeDecodeError:
-        raise DataError("is not UTF-8 text", where=str(path)) from None
-    rows, lines = [], []
-    # `splitlines` would also part names at the line ends of other scripts
-    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-    try:
-        for row in reader:
-            if any(cell.strip() for cell in row):
-                rows.append(row)
-                lines.append(reader.line_num)
-    except csv.Error as error:
-        raise DataError(f"is no CSV: {error}", where=f"{path}:{reader.line_num}") from None
+    rows = csv_rows(path, LARGEST_BYTES)
     if not rows:
         raise DataError("is empty", where=str(path), allowed="a header and one ray per line")
-    return rows, lines
+    lines, cells = zip(*rows, strict=True)
+    return list(cells), list(lines)
 
 
 def _numbers(cells: Sequence[str], name: str, locate: Locate) -> np.ndarray:
