@@ -1,5 +1,6 @@
 # make demo   sets everything up in .venv and runs the whole chain on the built-in face task, about three minutes
 # make test   sets up, lints and runs the tests, a few minutes; also installs the light-transport simulator, 200 MB
+# make test-arithmetic  runs the commands of the docs with the arithmetic of a plain processor, two minutes
 # make fuzz   reads 100,000 damaged files, an hour on two cores; the result goes to docs/soak
 # make coverage  measures the lines and branches that the tests take, an hour
 # make mutation  changes the core's code in a thousand small ways and counts what its tests notice; to docs/soak
@@ -14,7 +15,7 @@ export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_WAIT_POLICY ?= PASSIVE
 
-.PHONY: demo test coverage mutation lint fuzz soak soak-runs soak-seeds soak-kills clean
+.PHONY: demo test test-arithmetic coverage mutation lint fuzz soak soak-runs soak-seeds soak-kills clean
 
 $(BIN)/.ready: pyproject.toml constraints.txt
 	@echo "Setting up $(VENV): once, a minute or more"
@@ -42,6 +43,12 @@ $(BIN)/.consumers: $(BIN)/.ready
 test: $(BIN)/.ready $(BIN)/.transport $(BIN)/.consumers
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
+
+# Every kind of processor rounds in its own way, and a small run ends elsewhere on each: this is another one
+test-arithmetic: $(BIN)/.ready
+	ATEN_CPU_CAPABILITY=default MKL_CBWR=COMPATIBLE \
+		NUMBA_CPU_NAME=generic NUMBA_CACHE_DIR=$(CURDIR)/build/numba-generic \
+		$(BIN)/python -m pytest tests/test_docs_run.py
 
 # The suite with every line and branch that it takes; what numba compiles, apart, in a run without the compiler
 KERNELS := NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage

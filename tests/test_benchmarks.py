@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from small_runs import shifting_environment
 
 from lidardesign.scene import Mesh
 
@@ -313,7 +314,9 @@ def run_script(name, tmp_path, *words):
     """What a script writes as JSON."""
     file = tmp_path / "found.json"
     command = [sys.executable, ROOT / "benchmarks" / f"{name}.py", "--rounds", "1", "--json", file, *words]
-    done = subprocess.run([*map(str, command)], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [*map(str, command)], capture_output=True, text=True, check=False, env=shifting_environment()
+    )
     assert done.returncode == 0, done.stderr
     assert "| ---" in done.stdout
     return json.loads(file.read_text(encoding="utf-8"))

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from small_runs import shifting_environment
 
 from lidardesign.export.galvo import is_galvo_file
 
@@ -29,6 +30,7 @@ def run_example(name: str, folder: Path, *further: str) -> str:
     done = subprocess.run(
         [sys.executable, EXAMPLES / f"{name}.py", "--out", folder, *words, *further],
         capture_output=True, text=True, check=False, cwd=folder.parent,
+        env=shifting_environment(),
     )  # fmt: skip
     assert done.returncode == 0, done.stderr + done.stdout
     assert "Done in" in done.stdout
