@@ -33,6 +33,8 @@ ROOT = Path(__file__).resolve().parents[1]
 ENVIRONMENT = {
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"),
     **{"COLUMNS": "120", "LINES": "50", "TERM": "dumb", "NO_COLOR": "1", "TZ": "UTC", "CUDA_VISIBLE_DEVICES": ""},
+    # the length of this path is in the size of an exported file
+    **{"TMPDIR": "/tmp"},
     **{"MPLBACKEND": "Agg", "PYTHONHASHSEED": "0"},
 }
 STARTED = "LIDARDESIGN_GOLDEN"
