@@ -32,7 +32,7 @@ def add_head(figures: Figures, scene: Any, run: Any, designs: Sequence[Path], op
     import capture as laboratory
 
     from lidardesign.design.files import load_design
-    from lidardesign.design.rays import lay_out
+    from lidardesign.design.layouts.rays import lay_out
     from lidardesign.export.galvo import read, write
 
     detector = laboratory.load_detector(options.detector)
@@ -55,10 +55,9 @@ def add_rows(
     figures: Figures, scan: Path, designs: Sequence[Any], estimator: str, folder: Path, gate: str | None = None
 ) -> None:
     """Outliers [%] and Chamfer [mm] of designs in a capture."""
-    from lidardesign.evaluate.capture import load_capture
-    from lidardesign.evaluate.capture_ranges import Estimation
-    from lidardesign.evaluate.capture_scan import default_within_rad
-    from lidardesign.evaluate.capture_score import CaptureSettings, evaluate_capture
+    from lidardesign.evaluate.captures.capture import load_capture
+    from lidardesign.evaluate.captures.scan import Estimation, default_within_rad
+    from lidardesign.evaluate.captures.score import CaptureSettings, evaluate_capture
 
     capture = load_capture(scan)
     settings = CaptureSettings(
@@ -101,9 +100,8 @@ def tour_rows(designs: Sequence[Path], rounds: int) -> list[list[object]]:
     import statistics
 
     from lidardesign.design.files import load_design
-    from lidardesign.design.rays import lay_out
-    from lidardesign.export.galvo import plan
-    from lidardesign.export.steering import travel
+    from lidardesign.design.layouts.rays import lay_out
+    from lidardesign.export.galvo import plan, travel
 
     rows = []
     for path in designs:
@@ -138,7 +136,7 @@ def measure(run_folder: Path, options: Any, folder: Path) -> None:
     """Fit, capture and print."""
     import capture as laboratory
 
-    from lidardesign.cli.runs import open_run
+    from lidardesign.workflow.runs import open_run
 
     run = open_run(run_folder)
     words = ("--rays", str(laboratory.RAYS), "--sensors")

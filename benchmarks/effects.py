@@ -19,7 +19,7 @@ def even_rays(count: int, gate_m: tuple[float, float]) -> Any:
     """An even grid of rays at a face from 0.40 m."""
     import numpy as np
 
-    from lidardesign.simulate.returns import Rays
+    from lidardesign.geometry.rays import Rays
     from lidardesign.space import direction
 
     side = int(np.ceil(np.sqrt(count)))
@@ -124,7 +124,7 @@ def main() -> None:
     options_of.add_argument("--many", type=int, default=100_000, help="rays of the largest list (default %(default)s)")
     options_of.add_argument("--detector", default="single-photon", help="detector (default %(default)s)")
     options = options_of.parse_args()
-    from lidardesign.simulate.detector_files import load_detector
+    from lidardesign.simulate.detector.files import load_detector
 
     detector = load_detector(options.detector)
     # a beam with a width, so that its effect has work to do

@@ -18,13 +18,13 @@ from common import median_ratio, parser, report
 from sklearn.mixture import GaussianMixture
 from threadpoolctl import threadpool_limits
 
-from lidardesign.design.bounds import Bounds, Floors
-from lidardesign.design.em import fit_mixture, seed
-from lidardesign.design.features import Axes, Features
-from lidardesign.design.mixture import expect, log_density
-from lidardesign.design.mstep import maximise
-from lidardesign.design.samples import load_samples
+from lidardesign.design.constraints.bounds import Bounds, Floors
+from lidardesign.design.mixture.em import fit_mixture, seed
+from lidardesign.design.mixture.features import Axes, Features
+from lidardesign.design.mixture.mixture import expect, log_density
+from lidardesign.design.mixture.mstep import maximise
 from lidardesign.design.sensor import interval_factor
+from lidardesign.samples import load_samples
 from lidardesign.space import DesignSpace
 
 SENSORS = 10

@@ -23,10 +23,10 @@ import common  # noqa: F401 (before numpy: it limits the thread pools)
 import numpy as np
 from common import face_scenes, installed, interleaved, median_ratio, model_option, parser, report
 
-from lidardesign.density.fields import TableField, build_field
-from lidardesign.density.grids import BAND_CELLS, Grid, distance_grid
-from lidardesign.density.settings import DensitySettings
-from lidardesign.density.target import PADDING_SIGMAS
+from lidardesign.config import DensitySettings
+from lidardesign.density.fields.distance import TableField, build_field
+from lidardesign.density.fields.grids import BAND_CELLS, Grid, distance_grid
+from lidardesign.density.target.target import PADDING_SIGMAS
 from lidardesign.scene import Mesh
 
 INSIDE = 0.5  # winding numbers above this are inside

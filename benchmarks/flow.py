@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from zuko.lazy import LazyInverse
 from zuko.transforms import MonotonicRQSTransform
 
-from lidardesign.density.flow import DesignFlow
+from lidardesign.density.flow.flow import DesignFlow
 
 FEATURES = 6
 # Origin, direction and range: the chain that learning uses where nothing is on a circle.

@@ -25,12 +25,12 @@ import common  # before numpy: it limits the thread pools
 import numpy as np
 from common import Timing, interleaved, median_ratio, parser, report, robot_settings, verdict, without_traceback
 
-from lidardesign.density.fields import build_field, scene_columns
-from lidardesign.density.frames import FramesTarget
-from lidardesign.density.independent import independent_points
-from lidardesign.density.settings import DensitySettings
-from lidardesign.density.target import PADDING_SIGMAS, Target, build_target
-from lidardesign.density.visibility import NoVisibility, RayBatch, Raycast, RayGradient
+from lidardesign.config import DensitySettings
+from lidardesign.density.fields.distance import build_field, scene_columns
+from lidardesign.density.target.frames import FramesTarget
+from lidardesign.density.target.target import PADDING_SIGMAS, Target, build_target
+from lidardesign.density.training.independent import independent_points
+from lidardesign.density.visibility.quadrature import NoVisibility, RayBatch, Raycast, RayGradient
 from lidardesign.scene import Body, Scene
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction, observed_point
 

@@ -93,7 +93,7 @@ def simulation(options: Any) -> tuple[Table, list[str]]:
     from effects import even_rays
     from lidardesign_tasks.face import FaceTask
 
-    from lidardesign.simulate.detector_files import load_detector
+    from lidardesign.simulate.detector.files import load_detector
     from lidardesign.simulate.physics import Physics
     from lidardesign.simulate.plan import Planner
     from lidardesign.simulate.simulate import build_casters, simulate
@@ -118,11 +118,11 @@ def simulation(options: Any) -> tuple[Table, list[str]]:
 
 def mixtures(options: Any) -> tuple[Table, list[str]]:
     """EM on samples of a mixture of as many components, by the number of sensors."""
-    from lidardesign.design.bounds import Bounds, Floors
-    from lidardesign.design.em import fit_mixture, seed
-    from lidardesign.design.features import Axes, Features
-    from lidardesign.design.mixture import expect
-    from lidardesign.design.mstep import maximise
+    from lidardesign.design.constraints.bounds import Bounds, Floors
+    from lidardesign.design.mixture.em import fit_mixture, seed
+    from lidardesign.design.mixture.features import Axes, Features
+    from lidardesign.design.mixture.mixture import expect
+    from lidardesign.design.mixture.mstep import maximise
     from lidardesign.design.sensor import interval_factor
     from lidardesign.space import DesignSpace
 
@@ -158,9 +158,9 @@ def dimensions(options: Any) -> tuple[Table, list[str]]:
     """The flow's step, the density of foreign points, and the target, by the number of free dimensions."""
     import torch
 
-    from lidardesign.density.objective import Coordinates
-    from lidardesign.density.settings import DensitySettings, LearningSettings
-    from lidardesign.density.target import build_target
+    from lidardesign.config import DensitySettings, LearningSettings
+    from lidardesign.density.flow.objective import Coordinates
+    from lidardesign.density.target.target import build_target
     from lidardesign.space import DesignSpace
 
     scenes, settings, rows = face_scenes(options.model, options.heads), LearningSettings(), []
@@ -205,7 +205,7 @@ def flow_of(coordinates: Any, settings: Any) -> Any:
     """The flow that learning would make."""
     import torch
 
-    from lidardesign.density.flow import DesignFlow
+    from lidardesign.density.flow.flow import DesignFlow
 
     sizes = {"layers": settings.layers, "hidden": settings.hidden, "bins": settings.bins}
     generator = torch.Generator().manual_seed(0)

@@ -67,12 +67,12 @@ def rays_needed(rays: Sequence[int], distance_m: Sequence[float], reached_m: flo
 
 def curves(run_folder: Path, layout: str, sensors: int, rays: Sequence[int], seed: int) -> tuple[Curve, Curve]:
     """Of a design fitted with a seed, and of its twin."""
-    from lidardesign.cli.layouts import TWIN_NAME, RunTarget, layouts_of, twin_without_visibility
-    from lidardesign.cli.runs import open_run
-    from lidardesign.design.constraints import Constraints
+    from lidardesign.design.constraints.document import Constraints
     from lidardesign.design.fit import fit
-    from lidardesign.design.samples import load_samples
     from lidardesign.evaluate.score import EvaluationRequest, evaluate
+    from lidardesign.samples import load_samples
+    from lidardesign.workflow.layouts import TWIN_NAME, RunTarget, layouts_of, twin_without_visibility
+    from lidardesign.workflow.runs import open_run
 
     run = open_run(run_folder)
     config, samples = run.config, load_samples(run.folder)

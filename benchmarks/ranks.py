@@ -54,12 +54,12 @@ def work(job: dict[str, Any]) -> None:
     """Be one rank: prepare, train a little, time steps of both phases, and print what was found as the first rank."""
     import torch
 
-    from lidardesign.density.ground import prepare_ground
+    from lidardesign.config import load_run_config, resolve
     from lidardesign.density.learn import FLOW, make_trainer
-    from lidardesign.density.parallel_ranks import join_ranks
+    from lidardesign.density.rank_processes import join_ranks
+    from lidardesign.density.training.checkpoint import load_arrays
+    from lidardesign.density.training.training_data import prepare_ground
     from lidardesign.registry import load_task
-    from lidardesign.run.checkpoint import load_arrays
-    from lidardesign.run.config import load_run_config, resolve
 
     ranks = join_ranks()
     if job["run"]:

@@ -33,9 +33,9 @@ class Tally:
 
 def request_of(run: Any, designs: list[Any], options: Any) -> Any:
     """What to evaluate, with the detector and what the scenes call for."""
-    from lidardesign.design.samples import load_samples
     from lidardesign.evaluate.score import EvaluationRequest
-    from lidardesign.simulate.detector_files import load_detector
+    from lidardesign.samples import load_samples
+    from lidardesign.simulate.detector.files import load_detector
     from lidardesign.simulate.plan import Planner
 
     samples = load_samples(run.folder)
@@ -91,8 +91,8 @@ def add_figures(tally: Tally, scene: Any, rays: Any, detector: Any, caster: Any)
     """Expected background counts in a gate, pulses blinded before the echo, and false peaks, by their closed forms."""
     import numpy as np
 
-    from lidardesign.simulate.bounds.counts import Counts
-    from lidardesign.simulate.bounds.sight import Sight
+    from lidardesign.simulate.effects.expected_counts import Counts
+    from lidardesign.simulate.effects.first_hits import Sight
 
     sight = Sight.of(scene, 0, detector, [rays], caster)
     counts = Counts(sight)
@@ -154,9 +154,9 @@ def main() -> None:
 
 def measure(run_folder: Path, options: Any) -> None:
     """Fit, simulate and print."""
-    from lidardesign.cli.runs import open_run
     from lidardesign.design.files import load_design
     from lidardesign.evaluate.entries import entries_of
+    from lidardesign.workflow.runs import open_run
 
     run = open_run(run_folder)
     paths = [fitted(run_folder, f"sunlight-{n}", "--sensors", str(n))[0] for n in options.sensors]

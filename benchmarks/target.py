@@ -22,10 +22,10 @@ import numpy as np
 import torch
 from common import face_scenes, interleaved, median_ratio, model_option, parser, report
 
-from lidardesign.density.fields import TableField
-from lidardesign.density.proposals import propose
-from lidardesign.density.settings import DensitySettings
-from lidardesign.density.target import Target, build_target
+from lidardesign.config import DensitySettings
+from lidardesign.density.fields.distance import TableField
+from lidardesign.density.target.target import Target, build_target
+from lidardesign.density.training.proposals import propose
 from lidardesign.space import DesignSpace, observed_point
 
 EXPONENT_LIMIT = 60.0

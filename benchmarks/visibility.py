@@ -16,8 +16,8 @@ import common  # noqa: F401 (before numpy: it limits the thread pools)
 import numpy as np
 from common import face_scenes, interleaved, model_option, parser, report
 
-from lidardesign.density.settings import DensitySettings
-from lidardesign.evaluate.ladders.visibility import POINTS, REFERENCE_POINTS, Case
+from lidardesign.config import DensitySettings
+from lidardesign.evaluate.accuracy.visibility import POINTS, REFERENCE_POINTS, Case
 from lidardesign.scene import Body, Box, Scene, rigid
 from lidardesign.space import DesignSpace
 

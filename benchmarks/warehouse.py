@@ -66,12 +66,12 @@ def verdicts(found: dict[str, Any]) -> list[str]:
 
 def miss_rates(run_folder: Path, designs: list[Path], x_m: float, rays: int) -> dict[str, float]:
     """Mean miss rate [%] on the held-out shelves seen from one position, by design and baseline."""
-    from lidardesign.cli.layouts import layouts_of
-    from lidardesign.cli.runs import open_run
     from lidardesign.design.files import load_design
-    from lidardesign.design.samples import load_samples
     from lidardesign.evaluate.score import EvaluationRequest, evaluate
+    from lidardesign.samples import load_samples
     from lidardesign.task import scenes_of
+    from lidardesign.workflow.layouts import layouts_of
+    from lidardesign.workflow.runs import open_run
 
     run = open_run(run_folder)
     config = run.config
@@ -105,11 +105,11 @@ def divergence_nats(run_folder: Path, x_m: float, log_likelihood: float) -> floa
     """
     import numpy as np
 
-    from lidardesign.cli.layouts import RunTarget
-    from lidardesign.cli.runs import open_run
-    from lidardesign.design.conditions import MOVED_SAMPLES, at_condition
-    from lidardesign.design.samples import load_samples
+    from lidardesign.design.mixture.conditions import MOVED_SAMPLES, at_condition
+    from lidardesign.samples import load_samples
     from lidardesign.task import random_generator
+    from lidardesign.workflow.layouts import RunTarget
+    from lidardesign.workflow.runs import open_run
 
     run = open_run(run_folder)
     generator = random_generator(run.config.seed, "condition")  # the fit's own samples

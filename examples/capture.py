@@ -24,19 +24,19 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from lidardesign.cli.runs import open_run
 from lidardesign.design.galvo import SPEED_OF_LIGHT_M_PER_PS, degree_frame, scan_directions
-from lidardesign.evaluate.capture import Capture, load_capture
+from lidardesign.evaluate.captures.capture import Capture, load_capture
 from lidardesign.export.galvo import read
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Rays
 from lidardesign.run.files import write_atomic
 from lidardesign.scene import Mesh, Scene
-from lidardesign.simulate.detector import FWHM_PER_SIGMA, Detector
-from lidardesign.simulate.detector_files import load_detector
-from lidardesign.simulate.photon_histograms import photon_histograms
+from lidardesign.simulate.detector.counting import photon_histograms
+from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, Detector
+from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.physics import Physics
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Rays
 from lidardesign.space import RANGE, DesignSpace
+from lidardesign.workflow.runs import open_run
 
 SUNLIGHT = ("illuminance_lux=100000", "light=sun")
 SENSORS = (4, 10)

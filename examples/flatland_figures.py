@@ -26,11 +26,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Wedge
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-from lidardesign.density.target import Target, build_target
-from lidardesign.design.samples import Samples, load_samples
-from lidardesign.run.config import RunConfig, load_run_config
+from lidardesign.config import RunConfig, load_run_config
+from lidardesign.density.target.target import Target, build_target
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.samples import Samples, load_samples
 from lidardesign.scene import Capsule, Scene
-from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.space import AZIMUTH, RANGE, DesignSpace, X, aim
 
 INK, QUIET, SURFACE, OCCLUDER = "#1f2933", "#9aa5b1", "#3e4c59", "#b0b8c1"

@@ -1,4 +1,9 @@
-"""Mesh files, read through trimesh and checked: refused or mended with a note, never silently wrong."""
+"""Mesh files, read through trimesh and checked: refused or mended with a note, never silently wrong.
+
+Faces of a mesh that run around it the same way: what is told from edges alone, and by how much they disagree.
+
+Weights that someone painted on a mesh: a number per vertex, or the brightness of vertex colours.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +13,202 @@ import logging
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from lidardesign.errors import DataError, LidardesignError
 from lidardesign.numerics import ROUNDING
-from lidardesign.orientation import edge_defects, turned_to_agree, unique_rows
-from lidardesign.scene import Mesh, Sign
+from lidardesign.scene import LARGEST_WEIGHT, Mesh, Sign
 from lidardesign.space import FARTHEST_M
-from lidardesign.vertex_weights import Painted, painted_weights
+
+if TYPE_CHECKING:
+    import trimesh
+
+
+def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where each distinct row (N, K) stands first, in their order, and which of these each row is, (U,) and (N,).
+
+    As `numpy.unique` along an axis, which takes minutes for the faces of a large scan.
+    """
+    order = np.lexsort(rows.T[::-1])
+    is_new = np.ones(len(rows), dtype=bool)
+    is_new[1:] = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
+    group = np.empty(len(rows), dtype=np.int64)
+    group[order] = np.cumsum(is_new) - 1
+    return order[is_new], group
+
+
+def _edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which edge each side of faces (F, 3) is and whether it runs upwards, (3 F,), and the faces per edge (E,)."""
+    start, end = faces.reshape(-1).astype(np.int64), np.roll(faces, -1, axis=1).reshape(-1).astype(np.int64)
+    # one number per edge: pairs of int32 fit into an int64
+    number = np.minimum(start, end) * (int(faces.max(initial=0)) + 1) + np.maximum(start, end)
+    _, edge, count = np.unique(number, return_inverse=True, return_counts=True)
+    return edge.reshape(-1), start < end, count
+
+
+def edge_defects(faces: np.ndarray) -> tuple[int, int]:
+    """How many edges are open, and how many join faces that run along them the same way.
+
+    An edge is open when an odd number of faces meets there. Where closed parts touch, four faces share an
+    edge, two in each direction: that is no defect.
+    """
+    edge, upwards, count = _edges(faces)
+    balance = np.bincount(edge, weights=np.where(upwards, 1.0, -1.0))
+    is_open = count % 2 == 1
+    return int(is_open.sum()), int((~is_open & (balance != 0)).sum())
+
+
+def turned_to_agree(faces: np.ndarray, areas: np.ndarray) -> tuple[np.ndarray, int]:
+    """Faces (F, 3) of which those that disagree with their neighbours are turned, and how many those are.
+
+    Two faces that alone share an edge agree when they run along it in opposite directions. Within a part that such
+    edges hold together, the orientation of the larger area stays; a part that has none, as a Moebius strip, stays as
+    it is.
+
+    Arguments:
+        faces: Vertex indices, shape (F, 3).
+        areas: Of the faces, in any unit, shape (F,).
+    """
+    first, second, agree = _neighbours(faces)
+    side = _sides(len(faces), first, second, agree)
+    if side is None:
+        return faces, 0
+    part, flipped = side
+    # the sheet of less area is turned
+    share = np.bincount(part, weights=np.where(flipped, areas, -areas))
+    turn = flipped ^ (share[part] > 0)
+    return np.where(turn[:, None], faces[:, ::-1], faces), int(turn.sum())
+
+
+def _neighbours(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs of faces that alone share an edge, and whether they run along it in opposite directions, (P,) each."""
+    edge, upwards, count = _edges(faces)
+    order = np.argsort(edge, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(count)[:-1]])[count == 2]
+    one, other = order[starts], order[starts + 1]
+    return one // 3, other // 3, upwards[one] != upwards[other]
+
+
+def _sides(
+    count: int, first: np.ndarray, second: np.ndarray, agree: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The part of each face and whether it lies on the other side than the part's first face; None if none turns.
+
+    Every face stands twice in a graph, once as it is and once turned (the orientation double cover): a part whose
+    two copies hang together cannot be oriented, and keeps its faces.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    if agree.all():
+        return None
+    across = np.where(agree, 0, count)
+    rows = np.concatenate([first, first + count])
+    columns = np.concatenate([second + across, (second + count) - across])
+    graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(2 * count, 2 * count))
+    sheet = connected_components(graph, directed=False)[1]
+    part = np.minimum(sheet[:count], sheet[count:])
+    one_sided = sheet[:count] == sheet[count:]
+    return part, (sheet[:count] != part) & ~one_sided
+
+
+COLOURS = "colours"
+# luma of red, green and blue as they are stored (ITU-R BT.709)
+LUMA = np.array([0.2126, 0.7152, 0.0722])
+POSITIONS = ("x", "y", "z", "nx", "ny", "nz")
+
+
+@dataclass(frozen=True)
+class Painted:
+    """Where a file has its weights.
+
+    Arguments:
+        attribute: The name of a property of the vertices whose values are the weights, or `colours`.
+        contrast: How many times as much white counts as black; a brightness b between them counts contrast^b.
+    """
+
+    attribute: str
+    contrast: float = 10.0
+
+
+def painted_weights(part: trimesh.Trimesh, painted: Painted, where: str) -> np.ndarray:
+    """The weight of each vertex of a mesh as it was loaded, unprocessed, shape (V,).
+
+    Raises:
+        DataError: It has no such property or no colours, or a weight is not a positive number.
+    """
+    if painted.attribute == COLOURS:
+        return painted.contrast ** brightness(part, where)
+    named = vertex_properties(part)
+    if painted.attribute not in named:
+        raise DataError(
+            f"has no vertex property {painted.attribute!r}",
+            where=where,
+            allowed=", ".join([*sorted(named), COLOURS]),
+            hint="PLY and glTF files keep properties of vertices; name one of these",
+        )
+    values = named[painted.attribute]
+    if len(values) != len(part.vertices):
+        raise DataError(
+            f"has {len(values)} values of {painted.attribute!r} for {len(part.vertices)} vertices",
+            where=where,
+            hint="export the mesh without texture coordinates",
+        )
+    if values.ndim != 1 or values.dtype.kind not in "iuf":
+        raise DataError(f"vertex property {painted.attribute!r} is not one number per vertex", where=where)
+    return _checked(values.astype(np.float64), painted.attribute, where)
+
+
+def brightness(part: trimesh.Trimesh, where: str) -> np.ndarray:
+    """How bright the colour of each vertex is, 0 for black to 1 for white, shape (V,).
+
+    Raises:
+        DataError: The mesh has no vertex colours.
+    """
+    kind = part.visual.kind
+    if kind != "vertex":
+        found = {"face": "colours of faces", "texture": "a texture"}.get(kind or "", "no colours")
+        raise DataError(
+            f"has {found}, but none of vertices",
+            where=where,
+            allowed="vertex colours, as PLY, OBJ and glTF files have them",
+            hint="paint vertices, or transfer the colours to them, and export these",
+        )
+    return part.visual.vertex_colors[:, :3] @ LUMA / 255.0
+
+
+def vertex_properties(part: trimesh.Trimesh) -> dict[str, np.ndarray]:
+    """The properties of a mesh's vertices by name, besides positions, normals and colours."""
+    found = {name: _alone(values) for name, values in part.vertex_attributes.items()}
+    data = part.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
+    names = getattr(getattr(data, "dtype", None), "names", None) or (data if isinstance(data, dict) else ())
+    for name in names:
+        if name not in POSITIONS:
+            found[name] = _alone(data[name])
+    return found
+
+
+def _alone(values: np.ndarray) -> np.ndarray:
+    """The values of a property; a column of one number each as a list of numbers."""
+    values = np.asarray(values)
+    return values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
+
+
+def _checked(weights: np.ndarray, name: str, where: str) -> np.ndarray:
+    wrong = ~((weights >= 1 / LARGEST_WEIGHT) & (weights <= LARGEST_WEIGHT))
+    if wrong.any():
+        raise DataError(
+            f"{name} of {int(wrong.sum())} vertices is not a usable weight, as {weights[wrong][0]:g}",
+            where=where,
+            allowed=f"{1 / LARGEST_WEIGHT:g} to {LARGEST_WEIGHT:g}",
+            hint="a part that hardly matters has a small weight, not 0",
+        )
+    return weights
+
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
 LARGEST_FILE_BYTES = 2 * 1024**3

@@ -15,8 +15,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from lidardesign.errors import ConfigError, PluginError
+from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Scene
-from lidardesign.simulate.returns import Returns
 from lidardesign.space import DIMENSIONS, DesignSpace
 
 API_VERSION = 1

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from lidardesign.cli.main import run as run_program
-from lidardesign.design.samples import Samples, save_samples
+from lidardesign.config import resolve, save_run_config
 from lidardesign.registry import load_task
-from lidardesign.run.config import resolve, save_run_config
 from lidardesign.run.manifest import start_manifest
+from lidardesign.samples import Samples, save_samples
 
 
 class Result:

@@ -9,14 +9,13 @@ import numpy as np
 import torch
 import trimesh
 
-from lidardesign.density.ground import prepare_ground
+from lidardesign.config import DensitySettings, LearningSettings, RunConfig
 from lidardesign.density.learn import make_trainer
-from lidardesign.density.parallel import Ranks
-from lidardesign.density.parallel_ranks import join_ranks
-from lidardesign.density.parallel_target import build_shared_target
-from lidardesign.density.settings import DensitySettings, LearningSettings
+from lidardesign.density.rank_processes import join_ranks
+from lidardesign.density.ranks import Ranks
+from lidardesign.density.target.ranks import build_shared_target
+from lidardesign.density.training.training_data import prepare_ground
 from lidardesign.errors import ConfigError, NumericalError
-from lidardesign.run.config import RunConfig
 from lidardesign.scene import Body, Box, Mesh, Receiver, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, TaskConfig

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from lidardesign.design.samples import Samples
+from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
 
 # trilinear interpolation of a smooth distance is off by about h^2 / 4 (measured: 6.3e-4 at h = 1/64 of a unit sphere)

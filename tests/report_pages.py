@@ -6,19 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidardesign.design.check import ConstraintCheck
-from lidardesign.design.samples import Samples
+from lidardesign.design.constraints.check import ConstraintCheck
+from lidardesign.design.constraints.slack import tightness
+from lidardesign.design.layouts.track import placed
 from lidardesign.design.sensor import Design, Sensor
-from lidardesign.design.tightness import tightness
-from lidardesign.design.track import placed
-from lidardesign.evaluate.density_views import density_view
-from lidardesign.evaluate.report import Report
-from lidardesign.evaluate.report_tables import CommandTimes, Reproduction
+from lidardesign.evaluate.figures.density_views import density_view
+from lidardesign.evaluate.figures.scene_figure import shown_in
+from lidardesign.evaluate.report.report import Report
+from lidardesign.evaluate.report.tables import CommandTimes, Reproduction
 from lidardesign.evaluate.results import Evaluation, Paired, Row
-from lidardesign.evaluate.shown import shown_in
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Outcome, Rays
+from lidardesign.samples import Samples
 from lidardesign.scene import Body, Box, Capsule, Plane, Scene, Sphere, rigid
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Outcome, Rays
 from lidardesign.simulate.simulate import gate_outcomes
 from lidardesign.space import DesignSpace
 from lidardesign.task import Metric

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lidardesign.design.sensor import Design, Sensor
-from lidardesign.simulate.returns import Rays
+from lidardesign.geometry.rays import Rays
 from lidardesign.space import angles, direction
 
 NASTY = 'b</script> "&amp;" \\ ö\'{x}${y}'

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from lidardesign.scene import Body, Scene, Sphere
-from lidardesign.simulate.counting import Light, histogram
-from lidardesign.simulate.detection import detect
-from lidardesign.simulate.detector import Detector, Photons
-from lidardesign.simulate.echoes import Background, Echoes
+from lidardesign.simulate.detector.counting import Light, histogram
+from lidardesign.simulate.detector.detection import detect
+from lidardesign.simulate.detector.detector import Detector, Photons
+from lidardesign.simulate.detector.light import Background, Echoes
 from lidardesign.simulate.physics import Physics
 
 WAVELENGTH_M = 905e-9

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from lidardesign.density.adam import BETAS, Adam
+from lidardesign.density.training.training import BETAS, Adam
 from lidardesign.numerics import HALF_DIGITS
 
 

@@ -28,9 +28,9 @@ from lidardesign_tasks.arm_motion import (
 from lidardesign_tasks.arm_robot import load_robot
 
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Outcome, Rays, Returns
 from lidardesign.scene import Mesh
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Outcome, Rays, Returns
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import ELEVATION, aim
 from lidardesign.task import Task

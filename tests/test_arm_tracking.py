@@ -7,9 +7,9 @@ import pytest
 from lidardesign_tasks.arm_tracking import filled_path, tracked_places
 
 from lidardesign.evaluate.metrics import discrete_frechet_m
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Outcome, Rays, Returns
 from lidardesign.scene import Body, Scene, Sphere, rigid
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Outcome, Rays, Returns
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import aim, direction
 from tests.references import recursive_frechet

@@ -11,17 +11,17 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import exp1
 
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Rays
+from lidardesign.geometry.receiver import path_windows
 from lidardesign.scene import Body, Box, Medium, Receiver, Scene, rigid
-from lidardesign.simulate.bistatic import path_windows
-from lidardesign.simulate.bounds.light import haze_per_pulse
-from lidardesign.simulate.bounds.sight import Sight
-from lidardesign.simulate.detector import IDEAL, Detector, Photons
-from lidardesign.simulate.echoes import Background, Beams
+from lidardesign.simulate.detector.detector import IDEAL, Detector, Photons
+from lidardesign.simulate.detector.light import Background, Beams
 from lidardesign.simulate.effects.atmosphere import through_air
+from lidardesign.simulate.effects.expected_counts import haze_per_pulse
+from lidardesign.simulate.effects.first_hits import Sight
 from lidardesign.simulate.effects.footprint import split
 from lidardesign.simulate.physics import direct_echoes
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Rays
 
 PHOTONS = Photons(905e-9, 1e-6, 1e4, "scanned", 1e6, 1e-6, 1e-4, 0.2, 1e-9, 1e3, 0.0)
 COUNTING = Detector("counting", photons=PHOTONS)

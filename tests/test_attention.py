@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidardesign.evaluate.attention import (
+from lidardesign.evaluate.refinement.attention import (
     ANCHORS,
     FACTOR_DECIMALS,
     LARGEST_FACTOR,
@@ -17,8 +17,8 @@ from lidardesign.evaluate.attention import (
     Attention,
     anchors_for,
 )
+from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Body, Scene, Sphere, rigid
-from lidardesign.simulate.returns import Rays
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import direction
 from lidardesign.task import Residuals

@@ -12,13 +12,12 @@ from test_plan import SINGLE
 from test_score import MissTask, design, make_request, scenes
 
 from lidardesign.errors import PluginError
-from lidardesign.evaluate.audit import Audit, AuditRow
-from lidardesign.evaluate.effects import effect_notes, summaries
-from lidardesign.evaluate.physics_tables import audit_section, effects_section
+from lidardesign.evaluate.report.tables import audit_section, effects_section
+from lidardesign.evaluate.results import Audit, AuditRow, effect_notes, summaries
 from lidardesign.evaluate.score import evaluate
 from lidardesign.scene import Ambient, Scene
 from lidardesign.simulate import plan as plan_module
-from lidardesign.simulate.detector import IDEAL, Detector
+from lidardesign.simulate.detector.detector import IDEAL, Detector
 from lidardesign.simulate.physics import EFFECTS
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
 

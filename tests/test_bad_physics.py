@@ -12,11 +12,11 @@ from lidardesign_tasks.emitter import winding_number
 from lidardesign_tasks.flatland import FlatlandTask
 from test_bad_input import GARBAGE, GOOD, check_one_clear_message
 
-from lidardesign.cli.console import EXIT_INTERRUPTED, Console, describe_error
+from lidardesign.cli.output import EXIT_INTERRUPTED, Console, describe_error
 from lidardesign.errors import PluginError
 from lidardesign.registry import plugin_guard
 from lidardesign.scene import Ambient, Body, Medium, Mesh, Receiver, Scene, Sphere
-from lidardesign.simulate import light_transport_process
+from lidardesign.simulate.light_transport import process as light_transport_process
 
 LONG = "x" * 300
 BILLION_LAUGHS = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.rays import Rays
 from lidardesign.scene import SPEED_OF_LIGHT_M_S
-from lidardesign.simulate.returns import Rays
 
 
 def rays_with_gates(gates):

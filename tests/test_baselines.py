@@ -6,19 +6,18 @@ import numpy as np
 import pytest
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.grid import low_discrepancy
+from lidardesign.design.layouts.grid import low_discrepancy
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate import baselines
-from lidardesign.evaluate.baselines import (
+from lidardesign.evaluate.baselines import simple as baselines
+from lidardesign.evaluate.baselines.candidates import Layout, even_placement, opened_gate
+from lidardesign.evaluate.baselines.observed import unrolled
+from lidardesign.evaluate.baselines.simple import (
     Baselines,
     Family,
     baseline_of,
     build_baseline,
     is_baseline,
 )
-from lidardesign.evaluate.candidates import Layout
-from lidardesign.evaluate.observed import unrolled
-from lidardesign.evaluate.placement import even_placement, opened_gate
 from lidardesign.scene import Body, Box, Scene, Sphere, rigid
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import DesignSpace, angles

@@ -10,12 +10,12 @@ from test_bound_laws import SIMULATED, errors
 from test_bounds import counts, facing_wall
 from test_plan import SINGLE, grid
 
+from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Ambient, Body, Box, Medium, Scene, rigid
-from lidardesign.simulate.bounds.blindness import Blindness, missed_behind, unevenness
-from lidardesign.simulate.photon_histograms import photon_histograms
+from lidardesign.simulate.detector.counting import photon_histograms
+from lidardesign.simulate.effects.expected_counts import Blindness, missed_behind, unevenness
 from lidardesign.simulate.physics import Physics
 from lidardesign.simulate.plan import Planner
-from lidardesign.simulate.raycast import SceneCaster
 
 THIN = replace(SINGLE, divergence_rad=0.0, footprint_rays=1)
 RAYS = grid(side=20, half_rad=0.3, gate_m=(0.1, 1.3))

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from test_plan import CONSUMER, SINGLE, TIMED, decisions, grid
 
+from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Ambient, Body, Box, Capsule, Medium, Scene, Sphere, rigid
-from lidardesign.simulate.bounds.sight import Sight
+from lidardesign.simulate.effects.first_hits import Sight
 from lidardesign.simulate.physics import EFFECTS, Physics
 from lidardesign.simulate.plan import Planner, Tolerance
-from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.simulate import simulate
 
 STANDARD_ERRORS = 4.0

@@ -12,19 +12,16 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import norm, poisson
 from test_plan import CONSUMER, SINGLE, TIMED, decisions, grid, room
 
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Ambient, Body, Box, Capsule, Medium, Mesh, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.bounds.counts import Counts, estimate_error_m, needed_counts, share_in_bins
-from lidardesign.simulate.bounds.motion import entered_rays, point_velocities
-from lidardesign.simulate.bounds.multipath import _detours
-from lidardesign.simulate.bounds.neighbours import edge_probability
-from lidardesign.simulate.bounds.sight import Sight
-from lidardesign.simulate.bounds.spots import _moved_m
-from lidardesign.simulate.detector import metres
-from lidardesign.simulate.effects.motion import moving_tracer
+from lidardesign.simulate.detector.detector import metres
+from lidardesign.simulate.effects.expected_counts import Counts, estimate_error_m, needed_counts, share_in_bins
+from lidardesign.simulate.effects.first_hits import Sight, edge_probability
+from lidardesign.simulate.effects.motion import entered_rays, moving_tracer, point_velocities
+from lidardesign.simulate.effects.multipath import _detours, _moved_m
 from lidardesign.simulate.physics import Physics, followed_light
 from lidardesign.simulate.plan import Planner
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Rays
 
 
 def bound(name, scene, detector, rays=None):

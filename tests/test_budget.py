@@ -7,12 +7,12 @@ import pytest
 import torch
 from test_learn import BallTask, config_of, result_bytes
 
-from lidardesign.density import budget
-from lidardesign.density.budget import LEAST_STEPS, Timekeeper, TimePlan
-from lidardesign.density.ground import prepare_ground
+from lidardesign.config import LearningSettings
 from lidardesign.density.learn import learn, make_trainer
-from lidardesign.density.settings import LearningSettings
-from lidardesign.density.snapshots import FOLDER
+from lidardesign.density.training import schedule as budget
+from lidardesign.density.training.checkpoint import FOLDER
+from lidardesign.density.training.schedule import LEAST_STEPS, Timekeeper, TimePlan
+from lidardesign.density.training.training_data import prepare_ground
 from lidardesign.errors import ConfigError
 from lidardesign.run.manifest import read_manifest, start_manifest
 from lidardesign.run.yaml import load_yaml

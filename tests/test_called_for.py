@@ -12,15 +12,15 @@ from lidardesign_tasks.flatland import FlatlandTask
 from scipy.spatial.transform import Rotation
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.rays import fire_times
-from lidardesign.evaluate.audit import Audit, AuditRow
-from lidardesign.evaluate.placement import even_placement, rays_at
+from lidardesign.design.layouts.rays import fire_times
+from lidardesign.evaluate.baselines.candidates import even_placement, rays_at
+from lidardesign.evaluate.results import Audit, AuditRow
+from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Body, Box, rigid
-from lidardesign.simulate.detector import Detector
-from lidardesign.simulate.detector_files import load_detector
+from lidardesign.simulate.detector.detector import Detector
+from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.physics import EFFECTS, Physics
 from lidardesign.simulate.plan import Planner
-from lidardesign.simulate.returns import Rays
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import direction
 

@@ -11,14 +11,14 @@ from command_line import caller
 
 from lidardesign.design.files import save_design
 from lidardesign.design.galvo import degree_frame, scan_directions
-from lidardesign.design.rays import lay_out
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import Design, Sensor
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.evaluate import capture_ranges
-from lidardesign.evaluate.capture import Capture, load_capture
-from lidardesign.evaluate.capture_ranges import Estimation
-from lidardesign.evaluate.capture_scan import (
+from lidardesign.evaluate.captures import scan as capture_ranges
+from lidardesign.evaluate.captures.capture import Capture, load_capture
+from lidardesign.evaluate.captures.scan import (
     Captured,
+    Estimation,
     default_within_rad,
     gate_bins,
     scan,
@@ -26,9 +26,9 @@ from lidardesign.evaluate.capture_scan import (
     uniform_rays,
     whole_window,
 )
-from lidardesign.evaluate.capture_score import CaptureSettings, evaluate_capture
+from lidardesign.evaluate.captures.score import CaptureSettings, evaluate_capture
 from lidardesign.export.galvo import read, write
-from lidardesign.simulate.returns import Rays
+from lidardesign.geometry.rays import Rays
 
 BIN_M = BIN_PS * C_M_PER_PS / 2
 ESTIMATIONS = [Estimation("peak"), Estimation("matched")]

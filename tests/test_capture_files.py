@@ -13,10 +13,9 @@ from captures import BINS, make_capture
 from scipy.io import savemat
 
 from lidardesign.errors import DataError
-from lidardesign.evaluate.capture import load_capture
-from lidardesign.evaluate.capture_arrays import read_arrays
-from lidardesign.evaluate.capture_matlab import read_matlab
-from lidardesign.run import npz
+from lidardesign.evaluate.captures.arrays import read_arrays, read_matlab
+from lidardesign.evaluate.captures.capture import load_capture
+from lidardesign.run import arrays as npz
 
 
 def save_npz(path, arrays):

@@ -16,8 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidardesign.design.catalog.library import FOLDER, find_part, load_library
-from lidardesign.design.catalog.part import Part, conditions_of, disagreements
-from lidardesign.design.catalog.pattern import to_angles, to_directions
+from lidardesign.design.catalog.part import Part, conditions_of, disagreements, thinned, to_angles, to_directions
 from lidardesign.design.catalog.placing import (
     Pose,
     boresight_of,
@@ -31,10 +30,9 @@ from lidardesign.design.catalog.placing import (
     side_by_side,
 )
 from lidardesign.design.catalog.statements import FIELDS, PartFile, Statement
-from lidardesign.design.catalog.thinning import thinned
 from lidardesign.design.files import SCHEMA_FILE, design_document, design_from_document, load_design, save_design
-from lidardesign.design.grid import grid_rows
-from lidardesign.design.rays import lay_out
+from lidardesign.design.layouts.grid import grid_rows
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import RayTable, boresight_frame, fitted_layout
 from lidardesign.errors import ConfigError
 from lidardesign.run.validation import check_model

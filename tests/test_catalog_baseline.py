@@ -13,15 +13,14 @@ from scipy.spatial import cKDTree
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.catalog.library import find_part
 from lidardesign.design.catalog.placing import Pose, part_rays
-from lidardesign.design.part_views import in_view, worth_firing
-from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import boresight_frame
-from lidardesign.design.shapes import Shape, gate_inside, shapes_of
+from lidardesign.design.snap.shapes import Shape, gate_inside, in_view, shapes_of, worth_firing
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.baselines import Baselines, baseline_of
-from lidardesign.evaluate.catalog import Density, part_notes, split_argument
-from lidardesign.evaluate.part_poses import CLUTTER, PosedPart, ScenePoints, places
+from lidardesign.evaluate.baselines.catalog import Density, part_notes, split_argument
+from lidardesign.evaluate.baselines.part_poses import CLUTTER, PosedPart, ScenePoints, places
+from lidardesign.evaluate.baselines.simple import Baselines, baseline_of
 from lidardesign.numerics import effective_count
+from lidardesign.samples import Samples
 from lidardesign.scene import Body, Box, Scene, Sphere, rigid
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import DesignSpace, aim, direction, observed_point
@@ -46,7 +45,7 @@ PAIRS = (
 @pytest.fixture(autouse=True)
 def few_points(monkeypatch):
     """Poses are judged by fewer scene points than usual, which is quick."""
-    monkeypatch.setattr("lidardesign.evaluate.catalog.POINTS", 500)
+    monkeypatch.setattr("lidardesign.evaluate.baselines.catalog.POINTS", 500)
 
 
 def ball(centre, radius=0.4):
@@ -342,7 +341,7 @@ def test_a_shape_is_where_its_component_looks_upright_and_turned():
     upright, turned = shapes_of(part, space)
     assert upright.field_of_view_rad == part.field_of_view_rad
     assert turned.field_of_view_rad == part.field_of_view_rad[::-1]
-    from lidardesign.design.features import Axes
+    from lidardesign.design.mixture.features import Axes
 
     axes = Axes.of(space)
     for shape in (upright, turned):

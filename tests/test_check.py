@@ -8,11 +8,11 @@ import math
 import numpy as np
 import pytest
 
-from lidardesign.design.check import check_design
-from lidardesign.design.constraints import Constraints
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document
 from lidardesign.design.fit import fit
-from lidardesign.design.samples import Samples
+from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
 
 SPACE = DesignSpace((-1.0, -1.0, 0.0, 0.0, -1.5, 0.1), (1.0, 1.0, 2.0, 2 * math.pi, 1.5, 4.0))

@@ -13,11 +13,11 @@ import pytest
 from command_line import caller, files_under, make_run
 
 from lidardesign import __version__
-from lidardesign.cli import console as console_module
-from lidardesign.cli.console import Console, command, plain_json
-from lidardesign.design.samples import Samples, load_samples, save_samples
+from lidardesign.cli import output as console_module
+from lidardesign.cli.output import Console, command, plain_json
 from lidardesign.errors import InfeasibleError
 from lidardesign.run.yaml import load_yaml
+from lidardesign.samples import Samples, load_samples, save_samples
 
 COMMANDS = ["learn", "fit", "constrain", "evaluate", "export", "show", "tasks", "tasks list", "tasks show"]
 
@@ -268,7 +268,7 @@ def test_a_damaged_run_is_noticed_before_anything_is_written(lidardesign, flat):
 
 
 def test_a_design_that_breaks_a_constraint_is_never_written(lidardesign, flat, monkeypatch):
-    from lidardesign.cli import fit as fit_module
+    from lidardesign.cli.commands import fit as fit_module
 
     def refuse(design, constraints, space):
         raise InfeasibleError("broken", conflicts=["gate.width_m.max"])
@@ -281,7 +281,7 @@ def test_a_design_that_breaks_a_constraint_is_never_written(lidardesign, flat, m
 
 
 def test_a_run_that_is_being_written_is_left_alone(lidardesign, flat, monkeypatch):
-    monkeypatch.setattr("lidardesign.cli.designs.WAIT_S", 0.1)
+    monkeypatch.setattr("lidardesign.cli.tables.designs.WAIT_S", 0.1)
     (flat / ".lock").write_text(json.dumps({"pid": 1, "host": "elsewhere"}))
     result = lidardesign("fit", flat)
     assert result.code == 2
@@ -429,9 +429,9 @@ def test_a_design_that_was_copied_away_from_its_run_says_what_it_lacks(lidardesi
 
 @pytest.mark.parametrize("decided", ["raycast", "off", None])
 def test_a_pinned_origin_is_weighted_with_the_visibility_that_the_run_decided_on(flat, monkeypatch, decided):
-    from lidardesign.cli.layouts import RunTarget
-    from lidardesign.cli.runs import open_run
     from lidardesign.run.manifest import note
+    from lidardesign.workflow.layouts import RunTarget
+    from lidardesign.workflow.runs import open_run
 
     asked = []
 
@@ -444,7 +444,7 @@ def test_a_pinned_origin_is_weighted_with_the_visibility_that_the_run_decided_on
         asked.append((len(scenes), visibility))
         return Flat(), []
 
-    monkeypatch.setattr("lidardesign.density.prepare.prepare_target", prepare)
+    monkeypatch.setattr("lidardesign.density.target.prepare.prepare_target", prepare)
     if decided is not None:
         note(flat, visibility=decided)
     target = RunTarget(open_run(flat))
@@ -455,7 +455,7 @@ def test_a_pinned_origin_is_weighted_with_the_visibility_that_the_run_decided_on
 def test_a_density_that_was_learned_badly_comes_with_advice():
     from types import SimpleNamespace
 
-    from lidardesign.cli.learn import _advice
+    from lidardesign.cli.commands.learn import _advice
 
     assert _advice(SimpleNamespace(ess=0.6, coverage=0.98)) == []
     assert len(_advice(SimpleNamespace(ess=0.01, coverage=0.1))) == 2

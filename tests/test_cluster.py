@@ -15,9 +15,10 @@ import pytest
 from test_workers import make_request, results
 
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate import messages, worker_cluster
 from lidardesign.evaluate.score import evaluate
-from lidardesign.evaluate.workers import WorkerScorer, workers_of
+from lidardesign.evaluate.workers import cluster as worker_cluster
+from lidardesign.evaluate.workers import worker as messages
+from lidardesign.evaluate.workers.pool import WorkerScorer, workers_of
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")

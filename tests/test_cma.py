@@ -11,24 +11,23 @@ import numpy as np
 import pytest
 from command_line import caller
 
-from lidardesign.cli.console import Console
+from lidardesign.cli.output import Console
 from lidardesign.cli.searches import check_cma_seconds, told
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.check import check_design
-from lidardesign.design.constraints import Constraints
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document
 from lidardesign.design.sensor import Design, Sensor, Track, tangent_coordinates
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.candidates import mean_mbps, whole_range
-from lidardesign.evaluate.cma_candidate import CmaCandidate, CmaSettings
-from lidardesign.evaluate.cma_figures import Setting
-from lidardesign.evaluate.cma_models import Amount, SensorModel, widest_bins
-from lidardesign.evaluate.cma_objective import OutOfTimeError, TrainingObjective
-from lidardesign.evaluate.cma_origins import exp_matrix, log_matrix
-from lidardesign.evaluate.cma_search import Budget, Search
-from lidardesign.evaluate.cma_starts import starts, tiles
-from lidardesign.evaluate.cma_track import TrackFigures, TrackModel, Way
-from lidardesign.evaluate.observed import TrainingViews, dense_points
+from lidardesign.evaluate.baselines.candidates import mean_mbps, whole_range
+from lidardesign.evaluate.baselines.observed import TrainingViews, dense_points
+from lidardesign.evaluate.cma.candidate import CmaCandidate, CmaSettings
+from lidardesign.evaluate.cma.models import Amount, SensorModel, widest_bins
+from lidardesign.evaluate.cma.objective import OutOfTimeError, TrainingObjective
+from lidardesign.evaluate.cma.search import Budget, Search
+from lidardesign.evaluate.cma.sensor_parameters import Setting, exp_matrix, log_matrix
+from lidardesign.evaluate.cma.starts import starts, tiles
+from lidardesign.evaluate.cma.track import TrackFigures, TrackModel, Way
 from lidardesign.evaluate.score import EvaluationRequest, evaluate
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.simulate.plan import Planner

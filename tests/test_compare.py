@@ -10,10 +10,9 @@ import pytest
 from command_line import caller, make_run
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.comparison import angle_between, paired_sensors
+from lidardesign.design.compare import angle_between, paired_sensors, readout_of
 from lidardesign.design.files import load_design, save_design
-from lidardesign.design.rays import lay_out
-from lidardesign.design.readout import readout_of
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import Design, Sensor
 from lidardesign.space import direction
 

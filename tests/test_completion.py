@@ -18,13 +18,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidardesign.cli import completion_values
+from lidardesign.cli.commands.completion import VARIABLE
 from lidardesign.cli.completing import FILES, FOLDERS, NOTHING, PATHS, answer_of, respond, words_of_line
 from lidardesign.cli.completion_names import BASELINES
-from lidardesign.cli.completion_scripts import VARIABLE
 from lidardesign.cli.main import app
 from lidardesign.design.catalog.library import load_library
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.baselines import baseline_of
+from lidardesign.evaluate.baselines.simple import baseline_of
 from lidardesign.export.registry import EXPORTERS
 from lidardesign.simulate.physics import EFFECTS
 

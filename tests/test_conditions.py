@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidardesign.design.conditions import at_condition, conditioned, fixed_conditions
-from lidardesign.design.samples import Samples
+from lidardesign.design.mixture.conditions import at_condition, conditioned, fixed_conditions
 from lidardesign.errors import ConfigError, DataError, NumericalError
+from lidardesign.samples import Samples
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace
 
 AISLE = DesignSpace((0.0, 0.0, 0.0, -2.0, 0.0, 0.1), (4.0, 0.0, 0.0, 2.0, 0.0, 4.0), condition=("x_m",))

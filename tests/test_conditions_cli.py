@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from command_line import caller, files_under, make_run
 
+from lidardesign.config import resolve, save_run_config
 from lidardesign.design.files import load_design
-from lidardesign.design.rays import lay_out
-from lidardesign.design.samples import Samples, save_samples
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.registry import load_task
-from lidardesign.run.config import resolve, save_run_config
 from lidardesign.run.manifest import start_manifest
+from lidardesign.samples import Samples, save_samples
 
 
 def log_target(points):
@@ -38,7 +38,7 @@ def make_conditioned_run(folder, count=6000, condition="[x_m]"):
 @pytest.fixture
 def lidardesign(capsys, tmp_path, monkeypatch):
     """Run the program in this process; the target density is the planted one."""
-    monkeypatch.setattr("lidardesign.cli.layouts.RunTarget.__call__", lambda self, points: log_target(points))
+    monkeypatch.setattr("lidardesign.workflow.layouts.RunTarget.__call__", lambda self, points: log_target(points))
     return caller(capsys, tmp_path, monkeypatch)
 
 
@@ -233,8 +233,8 @@ def test_a_design_by_hand_without_a_number_of_rays_is_exported_at_the_one_that_i
 
 
 def test_a_design_is_exported_with_the_rays_that_it_is_evaluated_with(lidardesign, run, tmp_path):
-    from lidardesign.cli.layouts import Layouts
-    from lidardesign.design.samples import load_samples
+    from lidardesign.samples import load_samples
+    from lidardesign.workflow.layouts import Layouts
 
     for layout, gates in (("grid", "ray"), ("density", "ray"), ("distributed", "sensor"), ("distributed", "ray")):
         name = f"{layout}-{gates}"
@@ -252,8 +252,8 @@ def test_a_design_is_exported_with_the_rays_that_it_is_evaluated_with(lidardesig
 
 
 def test_a_scan_for_one_value_is_fitted_anew_once_for_all_places(lidardesign, run, monkeypatch):
-    from lidardesign.design import rays as rays_module
-    from lidardesign.design.samples import load_samples
+    from lidardesign.design.layouts import rays as rays_module
+    from lidardesign.samples import load_samples
 
     assert lidardesign("fit", run, "--at", "x_m=0.37", "--layout", "scan", "--rays", 4, "--name", "here").code == 0
     design, samples, fits = load_design(run / "designs" / "here.yaml"), load_samples(run), []
@@ -267,7 +267,7 @@ def test_a_scan_for_one_value_is_fitted_anew_once_for_all_places(lidardesign, ru
 
 
 def test_a_distributed_design_by_hand_is_evaluated_with_the_gates_of_its_layout(tmp_path):
-    from lidardesign.cli.layouts import Layouts
+    from lidardesign.workflow.layouts import Layouts
 
     (tmp_path / "hand.yaml").write_text(OPEN.format(layout="distributed"))
     design = load_design(tmp_path / "hand.yaml")
@@ -278,7 +278,7 @@ def test_a_distributed_design_by_hand_is_evaluated_with_the_gates_of_its_layout(
 
 
 def test_the_seed_of_an_export_draws_its_layout(lidardesign, run, tmp_path):
-    from lidardesign.design.samples import load_samples
+    from lidardesign.samples import load_samples
 
     made = ("--at", "x_m=0.37", "--layout", "density", "--rays", 8, "--sensors", 1)
     assert lidardesign("fit", run, *made).code == 0

@@ -8,12 +8,18 @@ from pathlib import Path
 import pytest
 from pydantic import Field, model_validator
 
-from lidardesign.density.settings import DensitySettings, LearningSettings
+from lidardesign import config as config_module
+from lidardesign.config import (
+    DensitySettings,
+    LearningSettings,
+    judged_by,
+    load_run_config,
+    parse_override,
+    resolve,
+    save_run_config,
+)
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.run import config as config_module
-from lidardesign.run.config import judged_by, load_run_config, resolve, save_run_config
 from lidardesign.run.manifest import start_manifest
-from lidardesign.run.overrides import parse_override
 from lidardesign.space import DIMENSIONS, DesignSpace
 from lidardesign.task import Defaults, Metric, TaskConfig
 

@@ -13,13 +13,11 @@ from command_line import caller, make_run
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidardesign.cli.config_text import Chosen, config_text, default_document, uncommented
-from lidardesign.cli.schemas import schema_of
-from lidardesign.density.settings import PRESETS, DensitySettings, LearningSettings
-from lidardesign.design.constraints import Constraints
+from lidardesign.cli.commands.config import Chosen, config_text, default_document, schema_of, uncommented
+from lidardesign.config import PRESETS, DensitySettings, LearningSettings, resolve
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.errors import ConfigError
 from lidardesign.registry import list_tasks, load_task
-from lidardesign.run.config import resolve
 from lidardesign.run.yaml import dump_yaml, parse_yaml
 from lidardesign.task import Metric, TaskConfig
 
@@ -280,7 +278,7 @@ def test_what_evaluate_prints_is_valid_and_complete(evaluation):
 
 
 def test_the_rungs_of_accuracy_are_those_of_the_schema():
-    from lidardesign.evaluate.rungs import Ladder, Rung
+    from lidardesign.evaluate.accuracy.settings import Ladder, Rung
 
     rungs = [Rung("4", 0.1, 0.01, 2.0, values={"gap_mm": 1.0}), Rung("8", 0.0, 0.0, 4.0, 5, True, True)]
     ladder = Ladder("knob", "gap", "mm", "the finest", 0.5, "it is small", "work", rungs)

@@ -12,13 +12,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from lidardesign.design.check import check_design
-from lidardesign.design.constraints import Constraints, DistanceRange, Gate, check_feasible
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints, DistanceRange, Gate, check_feasible
 from lidardesign.design.files import design_document, design_from_document
 from lidardesign.design.fit import fit
-from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
 
 FACE = DesignSpace((0.0, 0.0, 0.0, -0.5, -0.5, 0.05), (0.0, 0.0, 0.0, 0.5, 0.5, 1.05))

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from command_line import caller, files_under, make_run
 
-from lidardesign.cli.times import show_times
+from lidardesign.cli.tables.times import show_times
 from lidardesign.run.lock import run_lock
 from lidardesign.run.manifest import read_manifest
 

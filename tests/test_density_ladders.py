@@ -13,16 +13,16 @@ import trimesh
 from references import shape_distance
 from scipy.stats import norm
 
-from lidardesign.density.compared_fields import ExactField, InterpolatedField, fresh_table
-from lidardesign.density.fields import TableField, build_field
-from lidardesign.density.flow import DesignFlow
-from lidardesign.density.grids import Grid
+from lidardesign.config import DensitySettings, LearningSettings, resolve, save_run_config
+from lidardesign.density.fields.distance import TableField, build_field
+from lidardesign.density.fields.grids import Grid
+from lidardesign.density.flow.flow import DesignFlow
+from lidardesign.density.flow.objective import Coordinates
 from lidardesign.density.learn import learn
-from lidardesign.density.losses import Pool
-from lidardesign.density.misplaced import misplaced_share
-from lidardesign.density.objective import Coordinates
-from lidardesign.density.opaque import LOG_OPAQUE, opaque_target
-from lidardesign.density.precision import (
+from lidardesign.density.target.target import build_target
+from lidardesign.density.training.losses import Pool
+from lidardesign.density.training.quality import misplaced_share
+from lidardesign.density.training.snapshot_quality import (
     Drawn,
     Steps,
     beside_noise,
@@ -30,15 +30,14 @@ from lidardesign.density.precision import (
     gradient,
     in_arithmetic,
 )
-from lidardesign.density.settings import DensitySettings, LearningSettings
-from lidardesign.density.target import build_target
 from lidardesign.errors import NumericalError
-from lidardesign.evaluate.accuracy import AccuracyRequest
-from lidardesign.evaluate.ladders import fields, precision, scenes, visibility
-from lidardesign.evaluate.ladders.probes import draw_probes, few_columns, with_frames
+from lidardesign.evaluate.accuracy import fields, precision, scenes, visibility
+from lidardesign.evaluate.accuracy.fields import ExactField, InterpolatedField, fresh_table
+from lidardesign.evaluate.accuracy.probes import draw_probes, few_columns, with_frames
+from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
+from lidardesign.evaluate.accuracy.visibility import LOG_OPAQUE, opaque_target
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.registry import load_task
-from lidardesign.run.config import resolve, save_run_config
 from lidardesign.run.manifest import start_manifest
 from lidardesign.scene import Body, Box, Mesh, Receiver, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace

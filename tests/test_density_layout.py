@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from lidardesign.design.rays import lay_out
-from lidardesign.design.samples import Samples
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import Design, Sensor
+from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace, angles
 
 SPACE = DesignSpace((0, 0, 0, 0, -math.pi / 2, 0), (0, 0, 0, 2 * math.pi, math.pi / 2, 10))

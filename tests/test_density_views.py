@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import Coupling, Design, Sensor, Track
-from lidardesign.evaluate.density_views import PERCENT, density_view, marginals, smoothed, turn_start
-from lidardesign.evaluate.mixture_points import mixture_points
-from lidardesign.evaluate.silhouettes import silhouette
+from lidardesign.evaluate.figures.density_views import (
+    PERCENT,
+    density_view,
+    marginals,
+    mixture_points,
+    silhouette,
+    smoothed,
+    turn_start,
+)
+from lidardesign.samples import Samples
 from lidardesign.scene import Body, Box, Plane, Scene, Sphere, rigid
 from lidardesign.space import AZIMUTH, RANGE, DesignSpace, observed_point
 

@@ -19,10 +19,10 @@ from synthetic_light import (
 )
 
 from lidardesign.errors import ConfigError
-from lidardesign.simulate import detection
-from lidardesign.simulate.counting import PHOTONS_ONE_BY_ONE
-from lidardesign.simulate.detector import FWHM_PER_SIGMA, Detector, Photons, metres
-from lidardesign.simulate.echoes import Background, Echoes
+from lidardesign.simulate.detector import detection
+from lidardesign.simulate.detector.counting import PHOTONS_ONE_BY_ONE
+from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, Detector, Photons, metres
+from lidardesign.simulate.detector.light import Background, Echoes
 
 RAYS = 4000
 SIGMA_S = 50e-12

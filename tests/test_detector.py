@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from lidardesign.errors import ConfigError
-from lidardesign.simulate.detector import FWHM_PER_SIGMA, IDEAL, metres
-from lidardesign.simulate.detector_files import CHOICES, FOLDER, QUANTITIES, detector_names, load_detector
+from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, IDEAL, metres
+from lidardesign.simulate.detector.files import CHOICES, FOLDER, QUANTITIES, detector_names, load_detector
 
 ROOT = Path(__file__).parents[1]
 LIGHT = """\

@@ -9,12 +9,12 @@ import pytest
 import torch
 import trimesh
 
-from lidardesign.density.device_target import DeviceTarget, on_device, stays_on
-from lidardesign.density.flow import DesignFlow
-from lidardesign.density.losses import Pool, balancing_loss, pathwise_loss
-from lidardesign.density.objective import Coordinates, log_target, log_target_values
-from lidardesign.density.settings import DensitySettings
-from lidardesign.density.target import build_target
+from lidardesign.config import DensitySettings
+from lidardesign.density.flow.flow import DesignFlow
+from lidardesign.density.flow.objective import Coordinates, log_target, log_target_values
+from lidardesign.density.target.device import DeviceTarget, on_device, stays_on
+from lidardesign.density.target.target import build_target
+from lidardesign.density.training.losses import Pool, balancing_loss, pathwise_loss
 from lidardesign.errors import NumericalError
 from lidardesign.scene import Body, Mesh, Scene, rigid
 from lidardesign.space import DesignSpace

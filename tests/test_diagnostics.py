@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import references
 
-from lidardesign.density.diagnostics import coverage, quality
+from lidardesign.density.training.quality import coverage, quality
 from lidardesign.errors import NumericalError
 from lidardesign.estimates import Estimate
 

@@ -10,16 +10,15 @@ import numpy as np
 import pytest
 from scipy.special import chdtri
 
-from lidardesign.design import lines
-from lidardesign.design.coupling import coupling_of
-from lidardesign.design.distributed import normal_ball
 from lidardesign.design.files import design_document, design_from_document
 from lidardesign.design.fit import fit
-from lidardesign.design.grid import low_discrepancy
-from lidardesign.design.rays import lay_out
-from lidardesign.design.regions import in_region
-from lidardesign.design.samples import Samples
+from lidardesign.design.layouts import distributed as lines
+from lidardesign.design.layouts.distributed import in_region, normal_ball
+from lidardesign.design.layouts.grid import low_discrepancy
+from lidardesign.design.layouts.rays import lay_out
+from lidardesign.design.mixture.coupling import coupling_of
 from lidardesign.design.sensor import Sensor, tangent_directions
+from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace, aim, angles, direction, observed_point
 
 CEILING = DesignSpace((-0.6, -0.6, 1.0, 0.0, -math.pi / 2, 0.2), (0.6, 0.6, 1.0, 2 * math.pi, -math.pi / 3, 1.2))

@@ -12,14 +12,14 @@ import typer
 
 from lidardesign import registry
 from lidardesign.cli.main import app
-from lidardesign.design.constraints import Constraints
+from lidardesign.config import resolve
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.errors import LidardesignError
-from lidardesign.evaluate.scoring import checked_residuals
+from lidardesign.evaluate.scene_scores import checked_residuals
+from lidardesign.geometry.rays import Rays
 from lidardesign.registry import load_task
-from lidardesign.run.config import resolve
 from lidardesign.run.yaml import parse_yaml
 from lidardesign.scene import Scene
-from lidardesign.simulate.returns import Rays
 from lidardesign.simulate.simulate import simulate
 from lidardesign.task import Task, conditions_of
 

@@ -12,27 +12,26 @@ import pytest
 from lidardesign_tasks.emitter import EmitterTask
 from lidardesign_tasks.face import FaceTask
 
-from lidardesign.density.proposals import propose
-from lidardesign.density.settings import DensitySettings
-from lidardesign.density.target import build_target
-from lidardesign.design.constraints import Constraints
+from lidardesign.config import DensitySettings
+from lidardesign.density.target.target import build_target
+from lidardesign.density.training.proposals import propose
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.fit import fit
-from lidardesign.design.rays import lay_out
-from lidardesign.design.samples import Samples
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.evaluate.metrics import is_heard, is_visible, trial_origins
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Outcome, Rays
+from lidardesign.geometry.receiver import in_view, path_of_range, path_windows, range_of_path
 from lidardesign.run.yaml import parse_yaml
+from lidardesign.samples import Samples
 from lidardesign.scene import Ambient, Body, Box, Medium, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.bistatic import path_of_range, path_windows, range_of_path
-from lidardesign.simulate.bounds.counts import Counts
-from lidardesign.simulate.bounds.multipath import _hidden, stake
-from lidardesign.simulate.bounds.sight import Sight
-from lidardesign.simulate.detector import IDEAL
-from lidardesign.simulate.detector_files import load_detector
-from lidardesign.simulate.echoes import Beams
+from lidardesign.simulate.detector.detector import IDEAL
+from lidardesign.simulate.detector.files import load_detector
+from lidardesign.simulate.detector.light import Beams
+from lidardesign.simulate.effects.expected_counts import Counts
+from lidardesign.simulate.effects.first_hits import Sight
+from lidardesign.simulate.effects.multipath import _hidden, stake
 from lidardesign.simulate.physics import EFFECTS, Physics, direct_echoes
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.receiver_view import in_view
-from lidardesign.simulate.returns import Outcome, Rays
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import RANGE, aim, direction
 

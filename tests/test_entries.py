@@ -8,12 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.rays import lay_out
-from lidardesign.design.samples import Samples
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import Coupling, Design, RayTable, Sensor
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.evaluate.entries import entries_of, middle_condition
 from lidardesign.evaluate.score import EvaluationRequest, evaluate
+from lidardesign.samples import Samples
 from lidardesign.scene import Body, Box, Capsule, Scene, Sphere, rigid
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import DesignSpace, angles

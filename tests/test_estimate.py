@@ -10,8 +10,13 @@ from references import first_photon_distribution
 from scipy.special import pdtrc
 from scipy.stats import norm
 
-from lidardesign.simulate.corrected_kernels import alive_shares, find_corrected
-from lidardesign.simulate.estimate_kernels import at_least, find_returns, pulse_shape
+from lidardesign.simulate.detector.estimate_kernels import (
+    alive_shares,
+    at_least,
+    find_corrected,
+    find_returns,
+    pulse_shape,
+)
 
 WHOLE = np.ones((1, 2))
 SIGMA, HALF = 2.5, 2

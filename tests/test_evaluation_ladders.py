@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidardesign.design.samples import Samples
-from lidardesign.evaluate.accuracy import AccuracyRequest
-from lidardesign.evaluate.ladders import held_out, mixture, physics
+from lidardesign.evaluate.accuracy import held_out, mixture, physics
+from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
 from lidardesign.evaluate.results import Evaluation, Row
 from lidardesign.evaluate.score import evaluate
-from lidardesign.simulate.detector_files import load_detector
+from lidardesign.samples import Samples
+from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner
 from lidardesign.space import DesignSpace
 from lidardesign.task import Metric

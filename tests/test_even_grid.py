@@ -6,15 +6,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rigs import even, farthest_nearest, sensor
 
-from lidardesign.design.grid import grid_tangent
+from lidardesign.design.layouts.grid import grid_tangent
 from lidardesign.design.sensor import Design, tangent_directions
-from lidardesign.export.even_grid import EvenGrid, nearest_grid
-from lidardesign.export.grid_sensors import grid_losses
-from lidardesign.export.names import identifier, identifiers, renamed_note, xml_text
-from lidardesign.export.poses import mounts, quaternion
-from lidardesign.export.xml import element, read_xml, write_xml
-from lidardesign.rotations import rotations_of_quaternions
-from lidardesign.simulate.returns import Rays
+from lidardesign.export.common.even_grid import EvenGrid, grid_losses, nearest_grid
+from lidardesign.export.common.names import identifier, identifiers, renamed_note, xml_text
+from lidardesign.export.common.poses import mounts, quaternion
+from lidardesign.export.common.xml import element, read_xml, write_xml
+from lidardesign.geometry.rays import Rays
+from lidardesign.geometry.rotation import rotations_of_quaternions
 from lidardesign.space import angles, direction
 
 angle = st.floats(-1.2, 1.2)

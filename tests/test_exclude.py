@@ -14,13 +14,13 @@ from command_line import caller, make_run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidardesign.design.check import check_design
-from lidardesign.design.constraints import Constraints
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document, load_design, save_design
 from lidardesign.design.fit import fit
-from lidardesign.design.rays import lay_out
-from lidardesign.design.samples import Samples
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace, aim, observed_point
 
 ROOM = DesignSpace((-1, -1, 0, 0.0, -math.pi / 2, 0.05), (1, 1, 2, 2 * math.pi, math.pi / 2, 6.0))

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from lidardesign.design.files import load_design
-from lidardesign.design.rays import lay_out
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import Design, Sensor
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.export.columns import ray_columns
+from lidardesign.export.common.columns import ray_columns
 from lidardesign.export.registry import EXPORTERS, find_exporter
 
 

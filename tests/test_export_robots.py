@@ -10,15 +10,15 @@ import pytest
 from rigs import NASTY, even, farthest_nearest, read_sdf, rig, sdf_reader, spinning
 
 from lidardesign.design.files import load_design
-from lidardesign.design.rays import lay_out
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import Design
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.export import mjcf
-from lidardesign.export.names import identifier
-from lidardesign.export.poses import mounts
+from lidardesign.export.common.names import identifier
+from lidardesign.export.common.poses import mounts
 from lidardesign.export.registry import EXPORTERS
+from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Body, Box, Mesh, Scene, Sphere, rigid
-from lidardesign.simulate.raycast import SceneCaster
 
 ROBOTS = ("mjcf", "sdf", "urdf", "xacro", "carla", "isaac-json", "isaac-usd")
 GRIDS = ("sdf", "urdf", "xacro", "carla")

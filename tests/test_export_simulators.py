@@ -12,10 +12,10 @@ import pytest
 
 from lidardesign.design.sensor import Design, Sensor
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.export.poses import mounts
+from lidardesign.export.common.poses import mounts
 from lidardesign.export.registry import EXPORTERS
-from lidardesign.rotations import rotations_of_quaternions
-from lidardesign.simulate.returns import Rays
+from lidardesign.geometry.rays import Rays
+from lidardesign.geometry.rotation import rotations_of_quaternions
 from lidardesign.space import direction
 
 SCHEMAS = Path(__file__).parent / "schemas"

@@ -10,9 +10,9 @@ import pytest
 from command_line import caller, make_run
 
 from lidardesign.design.files import load_design, save_design
-from lidardesign.design.readers.xml_text import read_xml
 from lidardesign.design.sensor import Design, Sensor
 from lidardesign.errors import DataError
+from lidardesign.run.xml import read_xml
 
 HEADER = "origin_x_m,origin_y_m,origin_z_m,azimuth_deg,elevation_deg,gate_start_m,gate_end_m"
 ROWS = ["0.5,0,0,60,0,0.1,0.9", "0.5,0,0,90,0,0.1,0.9", "0.5,0,0,120,0,0.1,0.9"]
@@ -138,7 +138,7 @@ def test_files_that_only_their_endings_tell_apart_are_called_by_them(call, tmp_p
 
 
 def test_a_sensor_table_of_the_research_code_may_still_lack_its_header(tmp_path):
-    from lidardesign.design.sensor_csv import write_sensor_csv
+    from lidardesign.design.rigs.sensor_csv import write_sensor_csv
 
     sensor = Sensor("s", 1.0, np.zeros(3), np.zeros((3, 3)), 1.0, 0.0, 0.0, 0.1, 0.1, 0.5, 0.1)
     write_sensor_csv(Design("d", (sensor,)), tmp_path / "table.csv")

@@ -10,8 +10,8 @@ import references
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from lidardesign.density import grids
-from lidardesign.density.fields import BodyField, TableField, UnionField, build_field
+from lidardesign.density.fields import grids
+from lidardesign.density.fields.distance import BodyField, TableField, UnionField, build_field
 from lidardesign.errors import ConfigError
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
 

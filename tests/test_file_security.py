@@ -12,7 +12,7 @@ from lidardesign_tasks.arm_robot import load_robot
 from lidardesign.design.files import load_design
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.meshio import load_mesh
-from lidardesign.simulate.detector_files import load_detector
+from lidardesign.simulate.detector.files import load_detector
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted([*(ROOT / "lidardesign").rglob("*.py"), *(ROOT / "tasks").rglob("*.py")])

@@ -18,7 +18,7 @@ from lidardesign.design.files import (
     load_design,
     save_design,
 )
-from lidardesign.design.rays import lay_out
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import Coupling, Design, RayTable, Sensor, interval_factor
 from lidardesign.errors import ConfigError, DataError, NumericalError
 from lidardesign.run.yaml import dump_yaml, parse_yaml

@@ -8,13 +8,13 @@ import math
 import numpy as np
 import pytest
 
-from lidardesign.design.constraints import Constraints
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.rules import Group
 from lidardesign.design.files import design_document
 from lidardesign.design.fit import fit
-from lidardesign.design.resolve import Group
-from lidardesign.design.samples import Samples
-from lidardesign.design.support import pinned, restricted
+from lidardesign.design.mixture.support import pinned, restricted
 from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace, aim, observed_point
 
 FACE = DesignSpace((0.0, 0.0, 0.0, -0.6, -0.6, 0.05), (0.0, 0.0, 0.0, 0.6, 0.6, 1.05))

@@ -10,8 +10,8 @@ import pytest
 import references
 import torch
 
-from lidardesign.density.flow import DesignFlow
-from lidardesign.density.objective import Coordinates
+from lidardesign.density.flow.flow import DesignFlow
+from lidardesign.density.flow.objective import Coordinates
 from lidardesign.space import DesignSpace
 
 # name -> (blocks, context, periodic): adding a flow to every law below is adding a line

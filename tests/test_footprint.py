@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Body, Box, Plane, Scene, rigid
-from lidardesign.simulate.detector import Detector
-from lidardesign.simulate.echoes import Beams
+from lidardesign.simulate.detector.detector import Detector
+from lidardesign.simulate.detector.light import Beams
 from lidardesign.simulate.effects.footprint import even_disc, split
 from lidardesign.simulate.physics import direct_echoes
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Rays
 from lidardesign.space import direction
 
 HALF_RAD = 0.02

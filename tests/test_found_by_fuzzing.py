@@ -15,22 +15,22 @@ from command_line import caller, make_run
 from lidardesign_tasks.arm_robot import load_robot
 from lidardesign_tasks.basel import load_model
 
-from lidardesign.cli.console import Console, describe_error
-from lidardesign.density.grids import _digest, _load
-from lidardesign.density.ladder import seconds_at
-from lidardesign.density.training import _step_of
-from lidardesign.design.constraints import MOST_FITTED, Constraints
+from lidardesign.cli.output import Console, describe_error
+from lidardesign.density.fields.grids import _digest, _load
+from lidardesign.density.training.snapshot_quality import seconds_at
+from lidardesign.density.training.training import _step_of
+from lidardesign.design.constraints.document import MOST_FITTED, Constraints
 from lidardesign.design.files import load_design
 from lidardesign.design.fit import fit
-from lidardesign.design.rays import split_budget
-from lidardesign.design.samples import Samples, load_samples
+from lidardesign.design.layouts.rays import split_budget
 from lidardesign.design.sensor import MOST_RAYS, interval_factor
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.evaluate.capture import load_capture
+from lidardesign.evaluate.captures.capture import load_capture
 from lidardesign.export import csv as csv_format
 from lidardesign.export import npz as npz_format
 from lidardesign.meshio import check_mesh, load_mesh
 from lidardesign.run.manifest import record
+from lidardesign.samples import Samples, load_samples
 from lidardesign.space import FARTHEST_M, DesignSpace
 
 SPACE = DesignSpace((0.0, 0, 0, 2, 0, 0), (1.0, 0, 0, 4, 0, 1))

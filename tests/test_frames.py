@@ -10,17 +10,17 @@ import references
 import trimesh
 from scipy import integrate, stats
 
-from lidardesign.density.bodies import collect_bodies, occluding_bodies
-from lidardesign.density.fields import BodyField
-from lidardesign.density.frames import FramesTarget
-from lidardesign.density.independent import draw_near_surfaces, independent_points
-from lidardesign.density.occlusion import BodyRaycast, Pairs
-from lidardesign.density.settings import DensitySettings
-from lidardesign.density.target import build_target
-from lidardesign.density.visibility import RayBatch
+from lidardesign.config import DensitySettings
+from lidardesign.density.fields.bodies import collect_bodies, occluding_bodies
+from lidardesign.density.fields.distance import BodyField
+from lidardesign.density.target.frames import FramesTarget
+from lidardesign.density.target.target import build_target
+from lidardesign.density.training.independent import draw_near_surfaces, independent_points
+from lidardesign.density.visibility.occlusion import BodyRaycast, Pairs
+from lidardesign.density.visibility.quadrature import RayBatch
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
-from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.space import AZIMUTH, ELEVATION, DesignSpace, direction, observed_point
 
 CEILING = DesignSpace((-0.6, -0.6, 1.0, 0.0, -math.pi / 2, 0.1), (0.6, 0.6, 1.0, 2 * math.pi, -math.pi / 4, 1.5))
@@ -147,7 +147,7 @@ def test_bodies_are_found_by_their_boxes_as_by_looking_at_all():
     bodies = collect_bodies(scenes, lambda body: not isinstance(body.shape, Plane), resolution=24, padding_m=0.1)
     points = np.random.default_rng(5).uniform(-0.6, 0.8, (400, 3))
     everything = BodyField(bodies).distances(points)
-    from lidardesign.density.frames import near_pairs
+    from lidardesign.density.target.frames import near_pairs
 
     pairs = near_pairs(bodies, points, np.zeros(bodies.columns), 0.05, 1e9)
     np.testing.assert_array_equal(pairs.columns, np.tile(np.arange(bodies.columns), len(points)))

@@ -18,12 +18,11 @@ from lidardesign.design.galvo import (
     scan_angles_deg,
     scan_directions,
 )
-from lidardesign.design.rays import lay_out
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import Design, Sensor
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.export.galvo import COLUMNS, is_galvo_file, read, write
-from lidardesign.export.steering import short_tour, travel
-from lidardesign.simulate.returns import Rays
+from lidardesign.export.galvo import COLUMNS, is_galvo_file, read, short_tour, travel, write
+from lidardesign.geometry.rays import Rays
 
 C_M_PER_PS = 299_792_458e-12
 HERE = (0.4, 0.0, 0.0)

@@ -7,7 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
-from lidardesign.cli.grids import print_table
+from lidardesign.cli.tables.grids import print_table
 from lidardesign.evaluate.verdicts import plain
 
 HEADINGS = ("design", "rays", "difference (95 % interval)", "seconds")

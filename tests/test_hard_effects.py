@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Outcome, Rays
 from lidardesign.scene import Ambient, Body, Medium, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector import IDEAL
-from lidardesign.simulate.detector_files import load_detector
-from lidardesign.simulate.echoes import Beams
+from lidardesign.simulate.detector.detector import IDEAL
+from lidardesign.simulate.detector.files import load_detector
+from lidardesign.simulate.detector.light import Beams
 from lidardesign.simulate.physics import EFFECTS, Physics, direct_echoes
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Outcome, Rays
 from lidardesign.simulate.simulate import simulate
 
 EVERYTHING = frozenset(EFFECTS) - {"multipath"}

@@ -8,7 +8,8 @@ import pytest
 from command_line import caller
 
 import lidardesign.density.learn as density_learn
-from lidardesign.density import measure, training
+from lidardesign.density.training import quality as measure
+from lidardesign.density.training import training
 
 SETTINGS = (
     "size=small", "train=2", "test=1", "frames=6", "learning.steps=40", "learning.batch=64", "learning.samples=1000",

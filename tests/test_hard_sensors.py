@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidardesign.design.files import design_from_document
-from lidardesign.design.rays import lay_out
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.errors import ConfigError
 
 COUPLING = {

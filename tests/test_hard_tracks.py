@@ -8,8 +8,8 @@ from command_line import caller
 from test_conditions_cli import make_conditioned_run
 
 from lidardesign.design.files import design_from_document
-from lidardesign.design.gates import central_intervals
-from lidardesign.design.track import placed
+from lidardesign.design.layouts.gates import central_intervals
+from lidardesign.design.layouts.track import placed
 from lidardesign.errors import ConfigError
 from lidardesign.run.yaml import dump_yaml, load_yaml
 

@@ -13,14 +13,14 @@ from references import STANDARD_ERRORS
 from synthetic_light import PHOTON_EFFECTS
 
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.rays import Outcome, Rays
 from lidardesign.scene import SPEED_OF_LIGHT_M_S, Ambient, Body, Box, Plane, Scene, Sphere, rigid
-from lidardesign.simulate.daylight import FIRST_NM, LED_AT_1_LUX, STEP_NM, SUN_AT_100_KLUX, spectral_irradiance
-from lidardesign.simulate.detector import PLANCK_J_S, metres
-from lidardesign.simulate.detector_files import load_detector
-from lidardesign.simulate.photon_histograms import photon_histograms
+from lidardesign.simulate.detector.counting import photon_histograms
+from lidardesign.simulate.detector.detector import PLANCK_J_S, metres
+from lidardesign.simulate.detector.files import load_detector
+from lidardesign.simulate.detector.light import FIRST_NM, LED_AT_1_LUX, STEP_NM, SUN_AT_100_KLUX, spectral_irradiance
 from lidardesign.simulate.physics import Physics, followed_light
 from lidardesign.simulate.plan import Planner
-from lidardesign.simulate.returns import Outcome, Rays
 from lidardesign.simulate.simulate import build_casters, simulate
 
 DETECTOR = load_detector("single-photon")
@@ -231,9 +231,9 @@ SCRIPT = """
 import sys
 import numpy as np
 from lidardesign.scene import Body, Scene, Sphere
-from lidardesign.simulate.detector_files import load_detector
+from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.physics import Physics
-from lidardesign.simulate.returns import Rays
+from lidardesign.geometry.rays import Rays
 from lidardesign.simulate.simulate import simulate
 rays = Rays(np.array([[0.0, 0.0, 3.0]]), np.array([[0.0, 0.0, -1.0]]), np.array([[0.0, 5.0]]), [0], [0.0])
 simulate(Scene((Body(Sphere(1.0)),)), rays, physics=Physics(load_detector("single-photon"), frozenset({effects})))

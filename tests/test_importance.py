@@ -10,20 +10,25 @@ import torch
 import trimesh
 from lidardesign_tasks.face import FaceConfig, FaceTask
 
-from lidardesign.density.device_target import DeviceTarget, on_device
-from lidardesign.density.grids import grid_around
-from lidardesign.density.importance import BodyWeights, TableWeights, UnionWeights, is_weighted
-from lidardesign.density.independent import independent_points
+from lidardesign.config import DensitySettings, LearningSettings, RunConfig
+from lidardesign.density.fields.grids import grid_around
+from lidardesign.density.fields.importance import (
+    BodyWeights,
+    TableWeights,
+    UnionWeights,
+    barycentric,
+    is_weighted,
+    log_weight_grid,
+)
+from lidardesign.density.flow.objective import Coordinates, log_target
 from lidardesign.density.learn import learn
-from lidardesign.density.objective import Coordinates, log_target
-from lidardesign.density.prepare import prepare_target
-from lidardesign.density.settings import DensitySettings, LearningSettings
-from lidardesign.density.target import build_target
-from lidardesign.density.weight_grids import barycentric, log_weight_grid
-from lidardesign.design.samples import load_samples
+from lidardesign.density.target.device import DeviceTarget, on_device
+from lidardesign.density.target.prepare import prepare_target
+from lidardesign.density.target.target import build_target
+from lidardesign.density.training.independent import independent_points
 from lidardesign.errors import DataError
 from lidardesign.numerics import logsumexp
-from lidardesign.run.config import RunConfig
+from lidardesign.samples import load_samples
 from lidardesign.scene import LARGEST_WEIGHT, Body, Box, Capsule, Mesh, Receiver, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, observed_point
 from lidardesign.task import Defaults, Metric, TaskConfig, judged_by_keys

@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 from command_line import caller, make_run
 
-from lidardesign.design.constraints import Constraints
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.rig_constraints import constraints_like
 from lidardesign.design.files import load_design, save_design
-from lidardesign.design.likeness import constraints_like
-from lidardesign.design.rays import lay_out
-from lidardesign.design.readers.rig import aim_of
-from lidardesign.design.readers.xml_text import _Builder
+from lidardesign.design.layouts.rays import lay_out
+from lidardesign.design.rigs.rig import aim_of
 from lidardesign.design.sensor import (
     Design,
     RayTable,
@@ -27,7 +26,8 @@ from lidardesign.design.sensor import (
 )
 from lidardesign.errors import DataError, LidardesignError
 from lidardesign.export.registry import EXPORTERS
-from lidardesign.rotations import rotation_of_quaternion, rotation_of_rpy
+from lidardesign.geometry.rotation import rotation_of_quaternion, rotation_of_rpy
+from lidardesign.run.xml import _Builder
 from lidardesign.space import DesignSpace, angles, direction
 
 NASTY = ('front "left"', "a,b\u00e9</script>", "{x} [bold]")
@@ -513,7 +513,7 @@ def test_poses_of_nested_models_are_worked_out_once(tmp_path):
 
 
 def test_more_lidars_than_a_design_has_are_refused_at_the_first_too_many(tmp_path, monkeypatch):
-    monkeypatch.setattr("lidardesign.design.readers.sdf.MOST_SENSORS", 3)
+    monkeypatch.setattr("lidardesign.design.rigs.sdf.MOST_SENSORS", 3)
     with pytest.raises(DataError, match="more rays or sensors than a design") as refused:
         load_sdf(tmp_path, '<model name="m"><link name="l">' + "\n".join([lidar(rows=None)] * 5) + "</link></model>")
     assert refused.value.where == f"{tmp_path / 'robot.sdf'}:6"
@@ -594,9 +594,9 @@ def test_a_scan_that_cannot_be_is_refused(tmp_path, options):
 
 
 def test_what_is_written_for_gazebo_fires_as_it_is_read(tmp_path):
-    from lidardesign.export.poses import mounts
+    from lidardesign.export.common.poses import mounts
+    from lidardesign.export.common.xml import read_xml
     from lidardesign.export.sdf import held
-    from lidardesign.export.xml import read_xml
 
     design = rig(3, counts=(9, 6), names=("a", "b"))
     rays = lay_out(design)

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 import torch
 
-from lidardesign.density import ground, training
+from lidardesign.config import DensitySettings, LearningSettings, RunConfig
 from lidardesign.density import learn as learning
-from lidardesign.density.ground import prepare_ground
 from lidardesign.density.learn import learn
-from lidardesign.density.measure import log_density_of
-from lidardesign.density.prepare import prepare_target
-from lidardesign.density.settings import DensitySettings, LearningSettings
-from lidardesign.design.samples import load_samples
+from lidardesign.density.target.prepare import prepare_target
+from lidardesign.density.training import training
+from lidardesign.density.training import training_data as ground
+from lidardesign.density.training.checkpoint import save_arrays
+from lidardesign.density.training.quality import log_density_of
+from lidardesign.density.training.training_data import prepare_ground
 from lidardesign.errors import ConfigError, DataError, PluginError
-from lidardesign.run.checkpoint import save_arrays
-from lidardesign.run.config import RunConfig
+from lidardesign.samples import load_samples
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, TaskConfig

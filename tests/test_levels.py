@@ -12,11 +12,11 @@ from test_distributed import RING
 from test_rays import drawn_from, three_sensors
 from test_track import SAMPLES as AISLE_SAMPLES
 
-from lidardesign.design.constraints import Constraints
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import load_design
 from lidardesign.design.fit import fit
-from lidardesign.design.membership import seen_from
-from lidardesign.design.rays import lay_out
+from lidardesign.design.layouts.rays import lay_out
+from lidardesign.design.layouts.shared_fields import seen_from
 from lidardesign.design.sensor import Design, interval_factor
 from lidardesign.errors import InfeasibleError
 from lidardesign.space import observed_point

@@ -16,15 +16,15 @@ import numpy as np
 import pytest
 
 from lidardesign.errors import ConfigError, NumericalError
+from lidardesign.geometry.raycast import shared_caster
+from lidardesign.geometry.rays import Rays
 from lidardesign.registry import load_task
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate import light_transport_process as process
-from lidardesign.simulate.echoes import Beams, Echoes
+from lidardesign.simulate.detector.light import Beams, Echoes
 from lidardesign.simulate.effects.shadowing import heard
-from lidardesign.simulate.light_transport import Lights, PathBins, available, pixel_rays, render_transient
+from lidardesign.simulate.light_transport import process
+from lidardesign.simulate.light_transport.transport import Lights, PathBins, available, pixel_rays, render_transient
 from lidardesign.simulate.physics import direct_echoes
-from lidardesign.simulate.raycast import shared_caster
-from lidardesign.simulate.returns import Rays
 
 needs_simulator = pytest.mark.skipif(
     not available(), reason=f"the light-transport simulator cannot run here: {process.missing()}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lidardesign.density.locality import nearby_order
+from lidardesign.density.target.target import nearby_order
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 1000])

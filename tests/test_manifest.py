@@ -13,7 +13,8 @@ import threading
 import pytest
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.run import files, lock, processes
+from lidardesign.run import files, lock
+from lidardesign.run import files as processes
 from lidardesign.run import manifest as manifest_module
 from lidardesign.run.files import remove_stray_temporaries, sha256_file, write_atomic
 from lidardesign.run.lock import run_lock

@@ -18,9 +18,9 @@ from lidardesign.evaluate.metrics import (
     triangle_distance_m,
     visible_surface_points,
 )
+from lidardesign.geometry.surface import sample_body
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, angles
-from lidardesign.surface import sample_body
 
 STANDARD_ERRORS = 4  # the tolerance of every sampled mean below
 

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from lidardesign.design.bounds import Bounds, Floors
-from lidardesign.design.em import climb, fit_mixture, from_labels, seed
-from lidardesign.design.features import Axes, Features
-from lidardesign.design.mixture import (
+from lidardesign.design.constraints.bounds import Bounds, Floors
+from lidardesign.design.mixture.em import climb, fit_mixture, from_labels, seed
+from lidardesign.design.mixture.features import Axes, Features
+from lidardesign.design.mixture.mixture import (
     Mixture,
     angle_ratio,
     expect,
@@ -23,7 +23,7 @@ from lidardesign.design.mixture import (
     mean_directions,
     responsibilities,
 )
-from lidardesign.design.mstep import fit_field, fit_gate, maximise
+from lidardesign.design.mixture.mstep import fit_field, fit_gate, maximise
 from lidardesign.design.sensor import boresight_frame, interval_factor, tangent_coordinates, tangent_directions
 from lidardesign.numerics import logsumexp, wrap_angle
 from lidardesign.space import DesignSpace, angles, direction
@@ -109,7 +109,7 @@ def test_blocks_do_not_change_the_density(monkeypatch):
     mixture = random_mixture(generator, 3)
     features = features_of(drawn(mixture, 1000, generator))
     whole = log_density(mixture, features)
-    monkeypatch.setattr("lidardesign.design.mixture.BLOCK", 37)
+    monkeypatch.setattr("lidardesign.design.mixture.mixture.BLOCK", 37)
     np.testing.assert_allclose(log_density(mixture, features), whole, rtol=1e-13)
 
 
@@ -495,7 +495,7 @@ def test_density_and_shares_are_those_of_the_free_dimensions_alone(name):
 @pytest.mark.parametrize("block", [1, 7, 70, 1000])
 @pytest.mark.parametrize("name", SPACES)
 def test_statistics_are_sums_over_the_shares_in_blocks_of_any_length(name, block, monkeypatch):
-    monkeypatch.setattr("lidardesign.design.mixture.BLOCK", block)
+    monkeypatch.setattr("lidardesign.design.mixture.mixture.BLOCK", block)
     mixture, features = case_of(name)
     terms = naive_terms(mixture, features)
     shares = np.exp(terms - logsumexp(terms, axis=1)[:, None]) * features.weights[:, None]

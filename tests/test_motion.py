@@ -10,9 +10,9 @@ import trimesh
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.simulate.effects.motion import Screw, moving_tracer, path_of
-from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.space import direction
 
 RATE_HZ = 10.0

@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidardesign.design.check import check_design
-from lidardesign.design.constraints import Constraints
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.mounts import matched, most_mounted
 from lidardesign.design.files import design_document
 from lidardesign.design.fit import fit
-from lidardesign.design.mounts import matched, most_mounted
-from lidardesign.design.samples import Samples
 from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace, aim, observed_point
 
 ROOM = DesignSpace((-2, -2, 0, 0.0, -math.pi / 2, 0.05), (2, 2, 2, 2 * math.pi, math.pi / 2, 6.0))

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from test_light_transport import needs_simulator, rays_from, spiral
 
+from lidardesign.geometry.raycast import shared_caster
+from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector import Detector
-from lidardesign.simulate.detector_files import load_detector
-from lidardesign.simulate.echoes import Beams
-from lidardesign.simulate.light_transport import Lights, PathBins, render_transient
-from lidardesign.simulate.multipath_bound import Detours, lamp_bound, pixel_bound, series
+from lidardesign.simulate.detector.detector import Detector
+from lidardesign.simulate.detector.files import load_detector
+from lidardesign.simulate.detector.light import Beams
+from lidardesign.simulate.light_transport.multipath_bound import Detours, lamp_bound, pixel_bound, series
+from lidardesign.simulate.light_transport.transport import Lights, PathBins, render_transient
 from lidardesign.simulate.physics import Physics, direct_echoes
-from lidardesign.simulate.raycast import shared_caster
-from lidardesign.simulate.returns import Rays
 from lidardesign.simulate.simulate import simulate
 
 REFLECTANCE = 0.6

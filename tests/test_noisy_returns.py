@@ -16,12 +16,12 @@ from lidardesign_tasks.surface import surface_score, with_visible_truth
 from lidardesign_tasks.warehouse import WarehouseTask
 from test_tasks import write_ball
 
-from lidardesign.evaluate.placement import rays_at
-from lidardesign.evaluate.scoring import checked_score, score_lists
+from lidardesign.evaluate.baselines.candidates import rays_at
+from lidardesign.evaluate.scene_scores import checked_score, score_lists
+from lidardesign.geometry.rays import Outcome, Rays
 from lidardesign.scene import Body, Box, Mesh, Scene, rigid
-from lidardesign.simulate.detector import Detector
+from lidardesign.simulate.detector.detector import Detector
 from lidardesign.simulate.physics import Physics
-from lidardesign.simulate.returns import Outcome, Rays
 from lidardesign.simulate.simulate import build_casters, simulate
 from lidardesign.space import DIMENSIONS, RANGE, DesignSpace, direction
 from lidardesign.task import Metric, Score, conditions_of, scenes_of

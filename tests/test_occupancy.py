@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidardesign.evaluate.candidates import Spot
-from lidardesign.evaluate.occupancy import AimedPoints, OccupancyGrid, occupancy, occupancy_grid
-from lidardesign.evaluate.placement import RAY_AXES
+from lidardesign.evaluate.baselines.candidates import RAY_AXES, Spot
+from lidardesign.evaluate.baselines.occupancy import AimedPoints, OccupancyGrid, occupancy, occupancy_grid
 from lidardesign.scene import Body, Box, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, direction, observed_point
 

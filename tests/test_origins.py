@@ -10,15 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidardesign.design.bounds import Bounds, Floors
-from lidardesign.design.box_step import Box, improved, objective, projected
-from lidardesign.design.constraints import Constraints
-from lidardesign.design.em import climb, seed
-from lidardesign.design.features import Axes, Features
-from lidardesign.design.mstep import fit_gate
-from lidardesign.design.origin_step import Limits, best_origins
-from lidardesign.design.origins import box_around, free_boxes, inside_excluded, nearest_admitted, origin_box
-from lidardesign.design.resolve import bounds_of
+from lidardesign.design.constraints.bounds import Bounds, Floors
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.rules import bounds_of
+from lidardesign.design.mixture.em import climb, seed
+from lidardesign.design.mixture.features import Axes, Features
+from lidardesign.design.mixture.mstep import fit_gate
+from lidardesign.design.mixture.origin_step import Box, Limits, best_origins, improved, objective, projected
+from lidardesign.design.mixture.origins import box_around, free_boxes, inside_excluded, nearest_admitted, origin_box
 from lidardesign.space import DesignSpace
 
 SPACE = DesignSpace((0, 0, 0, 0.0, -1.5, 0.1), (6, 6, 6, 2 * math.pi, 1.5, 4.0))

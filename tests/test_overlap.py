@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import references
 
-from lidardesign.density.overlap import Sides, overlap
+from lidardesign.density.training.quality import Sides, overlap
 from lidardesign.errors import NumericalError
 
 LOG_Z = -2.3

@@ -24,8 +24,7 @@ from lidardesign_tasks.surroundings import Surroundings
 from pydantic import ValidationError
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.meshio import check_mesh, load_mesh
-from lidardesign.vertex_weights import Painted
+from lidardesign.meshio import Painted, check_mesh, load_mesh
 
 SENSOR = np.array([3.0, 0.5, 0.2])
 COLOURED = ("ply", "glb", "gltf", "obj")

@@ -16,10 +16,10 @@ from ranks import finished, start_ranks
 
 from lidardesign.cli.ranks import refuse_ranks
 from lidardesign.density.learn import own_device
-from lidardesign.density.parallel import ALONE, Ranks
-from lidardesign.density.parallel_ranks import _reached, join_ranks
-from lidardesign.density.parallel_target import _shared
-from lidardesign.density.target import build_target
+from lidardesign.density.rank_processes import _reached, join_ranks
+from lidardesign.density.ranks import ALONE, Ranks
+from lidardesign.density.target.ranks import _shared
+from lidardesign.density.target.target import build_target
 from lidardesign.errors import ConfigError, LostRankError
 from lidardesign.scene import Body, Box, Scene, Sphere, rigid
 
@@ -60,7 +60,7 @@ def test_an_environment_that_no_launcher_makes_is_refused(environment):
 
 
 WAITING = """
-from lidardesign.density.parallel_ranks import join_ranks
+from lidardesign.density.rank_processes import join_ranks
 print("waits", flush=True)
 join_ranks()
 """

@@ -8,13 +8,13 @@ from dataclasses import replace
 
 import pytest
 
-from lidardesign.evaluate.accuracy import Accuracy
-from lidardesign.evaluate.pareto import label_places, panels, pareto_picture
-from lidardesign.evaluate.pareto_figure import accuracy_tables, pareto_figure, pareto_height_px
-from lidardesign.evaluate.pictured import Pictured
-from lidardesign.evaluate.plots import ACCURACY, pictures
-from lidardesign.evaluate.plots_canvas import looks, picture
-from lidardesign.evaluate.rungs import Ladder, Rung
+from lidardesign.evaluate.accuracy.settings import Ladder, Rung
+from lidardesign.evaluate.accuracy.sweeps import Accuracy
+from lidardesign.evaluate.figures.canvas import looks, picture
+from lidardesign.evaluate.figures.figure_data import Pictured
+from lidardesign.evaluate.figures.pareto import label_places, panels, pareto_picture
+from lidardesign.evaluate.figures.plots import ACCURACY, pictures
+from lidardesign.evaluate.report.figures import accuracy_tables, pareto_figure, pareto_height_px
 from tests.test_plots import make_evaluation
 
 NASTY = "</script><img src=x onerror=alert(1)>$x^2"
@@ -139,6 +139,6 @@ def test_tables_name_what_to_choose_and_what_the_run_does():
 
 
 def test_nothing_is_drawn_before_it_is_asked_for():
-    code = "import sys, lidardesign.evaluate.pareto_figure; print({'matplotlib', 'plotly'} & set(sys.modules))"
+    code = "import sys, lidardesign.evaluate.report.figures; print({'matplotlib', 'plotly'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import references
 
-from lidardesign.design.bounds import Bounds
-from lidardesign.design.check import check_design
-from lidardesign.design.constraints import Constraints
-from lidardesign.design.em import climb, from_labels
-from lidardesign.design.features import Axes, Features
+from lidardesign.design.constraints.bounds import Bounds
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document
 from lidardesign.design.fit import fit
-from lidardesign.design.rays import lay_out
-from lidardesign.design.samples import Samples
+from lidardesign.design.layouts.rays import lay_out
+from lidardesign.design.mixture.em import climb, from_labels
+from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.sensor import boresight_frame, interval_factor, tangent_directions
 from lidardesign.numerics import clipped_eigenvalues
+from lidardesign.samples import Samples
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import DesignSpace, aim, angles, direction

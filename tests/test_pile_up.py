@@ -9,7 +9,8 @@ from scipy.stats import chi2, norm
 from synthetic_light import PULSES, background, counted, counting_detector, no_echoes, single_echoes, windows
 
 from lidardesign.errors import ConfigError
-from lidardesign.simulate.detector import metres
+from lidardesign.simulate.detector.counting import coates
+from lidardesign.simulate.detector.detector import metres
 from lidardesign.simulate.effects.pile_up import (
     DRAWS_PER_BIN,
     _across_pulses,
@@ -17,7 +18,6 @@ from lidardesign.simulate.effects.pile_up import (
     _one_of,
     _within_pulses,
 )
-from lidardesign.simulate.photon_histograms import coates
 from lidardesign.simulate.streams import uniform
 
 BIN_S = 1e-9

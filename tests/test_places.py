@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from command_line import caller, make_run
 
-from lidardesign.design.check import check_design
-from lidardesign.design.constraints import Constraints, check_feasible
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints, check_feasible
+from lidardesign.design.constraints.mounts import SAME_PLACE_M, settled
+from lidardesign.design.constraints.rig_constraints import constraints_like
 from lidardesign.design.files import design_document, load_design
-from lidardesign.design.likeness import constraints_like
-from lidardesign.design.places import SAME_PLACE_M, settled
 from lidardesign.design.sensor import Design, Sensor
 from lidardesign.errors import InfeasibleError
 from lidardesign.space import DesignSpace

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Ambient, Body, Box, Medium, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate import plan as plan_module
-from lidardesign.simulate.detector import IDEAL, Detector
-from lidardesign.simulate.detector_files import load_detector
+from lidardesign.simulate.detector.detector import IDEAL, Detector
+from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.physics import EFFECTS
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
-from lidardesign.simulate.returns import Rays
 from lidardesign.simulate.simulate import build_casters
 from lidardesign.space import direction
 from lidardesign.task import Metric

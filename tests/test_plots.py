@@ -13,17 +13,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lidardesign.design.samples import Samples
+from lidardesign.design.constraints.slack import Tightness
 from lidardesign.design.sensor import Design, Sensor
-from lidardesign.design.tightness import Tightness
-from lidardesign.evaluate.curves import COLOURS, axis_titles, log_ticks, logarithmic, series
-from lidardesign.evaluate.density_views import density_view
-from lidardesign.evaluate.effects import EffectSummary
-from lidardesign.evaluate.pictured import Pictured, tightness_of
-from lidardesign.evaluate.plots import pictures, write_plots
-from lidardesign.evaluate.plots_bounds import constraints_picture
-from lidardesign.evaluate.plots_camera import shaded, view_of
-from lidardesign.evaluate.plots_canvas import (
+from lidardesign.evaluate.figures.bounds import constraints_picture
+from lidardesign.evaluate.figures.canvas import (
     COLUMN_INCHES,
     DOTS_PER_INCH,
     LOOK,
@@ -34,15 +27,18 @@ from lidardesign.evaluate.plots_canvas import (
     plain_label,
     write_pictures,
 )
-from lidardesign.evaluate.plots_scene import OUTCOME_LOOKS, framed_points, opened, scene_picture
-from lidardesign.evaluate.plots_scores import MOST_ROWS, curve_picture, shown_pairs
-from lidardesign.evaluate.plots_times import phase_rows
-from lidardesign.evaluate.results import Evaluation, Paired, Row
-from lidardesign.evaluate.shown import shown_in
-from lidardesign.evaluate.tables import csv_text, write_csv
+from lidardesign.evaluate.figures.curves import COLOURS, axis_titles, log_ticks, logarithmic, series
+from lidardesign.evaluate.figures.density_views import density_view
+from lidardesign.evaluate.figures.figure_data import Pictured, tightness_of
+from lidardesign.evaluate.figures.plots import pictures, write_plots
+from lidardesign.evaluate.figures.scene import OUTCOME_LOOKS, framed_points, opened, scene_picture, shaded, view_of
+from lidardesign.evaluate.figures.scene_figure import shown_in
+from lidardesign.evaluate.figures.scores import MOST_ROWS, curve_picture, phase_rows, shown_pairs
+from lidardesign.evaluate.results import EffectSummary, Evaluation, Paired, Row, csv_text, write_csv
+from lidardesign.geometry.rays import Outcome, Rays
+from lidardesign.samples import Samples
 from lidardesign.scene import Body, Box, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.plan import Tolerance
-from lidardesign.simulate.returns import Outcome, Rays
 from lidardesign.space import DesignSpace
 from lidardesign.task import Metric
 
@@ -359,7 +355,8 @@ def test_the_table_holds_every_row_with_units_in_its_header(tmp_path):
 
 def test_nothing_draws_before_it_is_asked_to():
     code = (
-        "import sys, lidardesign.evaluate.plots, lidardesign.evaluate.report, lidardesign.evaluate.score;"
+        "import sys, lidardesign.evaluate.figures.plots, lidardesign.evaluate.report.report\n"
+        "import lidardesign.evaluate.score\n"
         "print([m for m in ('matplotlib', 'plotly', 'torch', 'scipy.stats') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

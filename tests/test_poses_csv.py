@@ -18,9 +18,9 @@ from lidardesign_tasks.poses_csv import COLUMNS, interpolated, read_poses, rotat
 from pydantic import ValidationError
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.rotations import rotation_of_quaternion, rotation_of_rpy
+from lidardesign.geometry.rays import Rays
+from lidardesign.geometry.rotation import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.scene import rigid
-from lidardesign.simulate.returns import Rays
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import aim, direction
 

@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.bounds import Bounds
-from lidardesign.design.gates import central_intervals
-from lidardesign.design.priced_gates import Heard, _Prices, gates_within
+from lidardesign.design.constraints.bounds import Bounds
+from lidardesign.design.layouts.gates import Heard, _Prices, central_intervals, gates_within
 from lidardesign.design.sensor import interval_factor
 
 Z = interval_factor(0.95)

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidardesign.design.nearest import Nearest
-from lidardesign.design.quantise import lloyd
+from lidardesign.design.layouts.quantise import Nearest, lloyd
 from lidardesign.errors import ConfigError
 
 

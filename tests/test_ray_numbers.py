@@ -12,7 +12,7 @@ from command_line import caller, make_run
 from lidardesign.design.files import save_design
 from lidardesign.design.sensor import Design, RayTable, Sensor
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.ray_numbers import fired_numbers, left_out, usual_numbers
+from lidardesign.evaluate.request import fired_numbers, left_out, usual_numbers
 
 FAR_M = 0.9
 

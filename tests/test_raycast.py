@@ -13,10 +13,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from lidardesign.errors import ConfigError
+from lidardesign.geometry import triangles
+from lidardesign.geometry.raycast import SceneCaster, shared_caster, trace_each
+from lidardesign.geometry.triangles import mesh_caster
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
-from lidardesign.simulate import triangles
-from lidardesign.simulate.raycast import SceneCaster, shared_caster, trace_each
-from lidardesign.simulate.triangles import mesh_caster
 
 PRIMITIVES = {"sphere": Sphere(0.7), "box": Box((0.3, 0.5, 0.9)), "capsule": Capsule(0.3, 0.8), "plane": Plane()}
 SOLIDS = {name: shape for name, shape in PRIMITIVES.items() if name != "plane"}

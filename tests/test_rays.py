@@ -8,10 +8,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidardesign.design.grid import grid_rows, grid_tangent
-from lidardesign.design.membership import log_density, members, seen_from
-from lidardesign.design.rays import gates_of, lay_out, make_ray_table, own_count, own_gates, refitted, split_budget
-from lidardesign.design.samples import Samples
+from lidardesign.design.layouts.grid import grid_rows, grid_tangent
+from lidardesign.design.layouts.rays import (
+    gates_of,
+    lay_out,
+    make_ray_table,
+    own_count,
+    own_gates,
+    refitted,
+    split_budget,
+)
+from lidardesign.design.layouts.shared_fields import log_density, members, seen_from
 from lidardesign.design.sensor import (
     MOST_RAYS,
     Design,
@@ -23,6 +30,7 @@ from lidardesign.design.sensor import (
 )
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import running
+from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace, angles, direction
 
 SPACE = DesignSpace((-5, -5, -5, 0, -math.pi / 2, 0), (5, 5, 5, 2 * math.pi, math.pi / 2, 10))

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from lidardesign.design.galvo import SPEED_OF_LIGHT_M_PER_PS
-from lidardesign.design.rays import lay_out
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import Design, Sensor
 from lidardesign.errors import DataError
 from lidardesign.export import csv, npz
-from lidardesign.export.read_back import angles_between, rays_rounding
+from lidardesign.export.common.read_back import angles_between, rays_rounding
 from lidardesign.export.registry import EXPORTERS
 
 ROUNDING = 1e-15

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from lidardesign.density.receiver import HeardVisibility
-from lidardesign.density.refinement import refine_quadrature
-from lidardesign.density.settings import DensitySettings
-from lidardesign.density.target import build_target
-from lidardesign.density.visibility import NoVisibility
+from lidardesign.config import DensitySettings
+from lidardesign.density.target.refinement import refine_quadrature
+from lidardesign.density.target.target import build_target
+from lidardesign.density.visibility.quadrature import NoVisibility
+from lidardesign.density.visibility.receiver import HeardVisibility
 from lidardesign.errors import ConfigError
 from lidardesign.scene import Body, Box, Receiver, Scene, Sphere, rigid
 from lidardesign.space import RANGE, DesignSpace, aim, observed_point

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lidardesign.geometry.receiver import angles_in_view, in_view, receiver_axes
 from lidardesign.scene import Receiver
-from lidardesign.simulate.receiver_view import angles_in_view, in_view, receiver_axes
 from lidardesign.space import direction
 
 STRAIGHT = Receiver((0.0, 0.0, 0.0), 0.0, 0.0, math.radians(60), math.radians(50), (0.1, 2.0))

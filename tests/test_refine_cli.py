@@ -11,26 +11,26 @@ import yaml
 from command_line import caller, make_run
 from lidardesign_tasks.flatland import FlatlandTask
 
-from lidardesign.cli.layouts import RunTarget
-from lidardesign.cli.refine import FitOrder, _scenes
-from lidardesign.cli.runs import open_run
-from lidardesign.cli.weighting import Weighting
-from lidardesign.design.check import check_design
-from lidardesign.design.constraints import Constraints
+from lidardesign.config import resolve, save_run_config
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document, load_design
 from lidardesign.design.fit import fit
-from lidardesign.design.rays import lay_out
-from lidardesign.design.reweighting import Reweighting
-from lidardesign.design.samples import Samples, load_samples, save_samples
-from lidardesign.evaluate.scoring import checked_score
+from lidardesign.design.layouts.rays import lay_out
+from lidardesign.evaluate.refinement.reweighting import Reweighting
+from lidardesign.evaluate.scene_scores import checked_score
 from lidardesign.export.npz import read
+from lidardesign.geometry.rays import Rays
 from lidardesign.registry import load_task
-from lidardesign.run.config import resolve, save_run_config
 from lidardesign.run.manifest import start_manifest
-from lidardesign.simulate.returns import Rays
+from lidardesign.samples import Samples, load_samples, save_samples
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import RANGE, direction
 from lidardesign.task import Residuals, scenes_of
+from lidardesign.workflow.layouts import RunTarget
+from lidardesign.workflow.refine import FitOrder, _scenes
+from lidardesign.workflow.runs import open_run
+from lidardesign.workflow.weighting import Weighting
 
 SEED = 3
 

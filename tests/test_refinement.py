@@ -15,10 +15,10 @@ from lidardesign_tasks.flatland import FlatlandTask
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import Design, Sensor
 from lidardesign.errors import ConfigError, InfeasibleError, NumericalError, PluginError
-from lidardesign.evaluate.attention import Attention
-from lidardesign.evaluate.refinement import LEVELS, PATIENCE, SPREADS, Refiner, Shape, Trial
-from lidardesign.evaluate.scoring import checked_score
-from lidardesign.simulate.returns import Rays
+from lidardesign.evaluate.refinement.attention import Attention
+from lidardesign.evaluate.refinement.refinement import LEVELS, PATIENCE, SPREADS, Refiner, Shape, Trial
+from lidardesign.evaluate.scene_scores import checked_score
+from lidardesign.geometry.rays import Rays
 from lidardesign.simulate.simulate import simulate
 from lidardesign.task import Metric, Residuals, Score
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.check import check_design
-from lidardesign.design.constraints import Constraints
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document
-from lidardesign.design.rays import lay_out
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import Design, RayTable, Sensor, interval_factor
-from lidardesign.evaluate.regating import Gating, has_ray_gates
+from lidardesign.evaluate.refinement.regating import Gating, has_ray_gates
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.simulate.simulate import build_casters, simulate
 from lidardesign.space import DesignSpace

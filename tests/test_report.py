@@ -22,9 +22,8 @@ from report_pages import (
 )
 
 from lidardesign.design.sensor import Design
-from lidardesign.evaluate.curves import series
-from lidardesign.evaluate.density_figures import marginal_figure, plane_figure
-from lidardesign.evaluate.drawing import (
+from lidardesign.evaluate.figures.curves import series
+from lidardesign.evaluate.figures.drawing import (
     FEWEST_STEPS,
     MOST_FACES,
     STEPS,
@@ -36,18 +35,24 @@ from lidardesign.evaluate.drawing import (
     round_steps,
     thinned,
 )
-from lidardesign.evaluate.figures import curve_figure
-from lidardesign.evaluate.page import asset
-from lidardesign.evaluate.report import report_html, write_report
-from lidardesign.evaluate.report_parts import script_safe
-from lidardesign.evaluate.report_tables import CommandTimes, constraints_table, number, times_tables
-from lidardesign.evaluate.report_view import OUTCOMES, told
+from lidardesign.evaluate.figures.scene_figure import MOST_RAY_STEPS, MOST_STEPS, Shown
+from lidardesign.evaluate.report.figures import curve_figure, marginal_figure, plane_figure
+from lidardesign.evaluate.report.markup import asset, script_safe
+from lidardesign.evaluate.report.report import report_html, write_report
+from lidardesign.evaluate.report.tables import CommandTimes, constraints_table, number, times_tables
+from lidardesign.evaluate.report.view import (
+    MOST_BODIES,
+    MOST_SENSORS,
+    OUTCOMES,
+    drawn_bodies,
+    told,
+    view_bounds,
+    view_document,
+)
 from lidardesign.evaluate.results import Evaluation, leading_detail
-from lidardesign.evaluate.scene_view import MOST_BODIES, MOST_SENSORS, drawn_bodies, view_bounds, view_document
-from lidardesign.evaluate.shown import MOST_RAY_STEPS, MOST_STEPS, Shown
 from lidardesign.evaluate.verdicts import figure, rows_table, summary_sentences, table, verdict
+from lidardesign.geometry.rays import Outcome
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
-from lidardesign.simulate.returns import Outcome
 from lidardesign.task import Metric
 
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from report_pages import FRAMES, NASTY, PLACES, make_report
 
-from lidardesign.evaluate.drawing import body_triangles, frustum_lines, origin_lines, scene_bounds
-from lidardesign.evaluate.report import report_html
-from lidardesign.simulate.returns import Outcome
+from lidardesign.evaluate.figures.drawing import body_triangles, frustum_lines, origin_lines, scene_bounds
+from lidardesign.evaluate.report.report import report_html
+from lidardesign.geometry.rays import Outcome
 
 FLAGS = [
     *("--no-sandbox", "--no-first-run", "--disable-quic", "--disable-sync", "--disable-background-networking"),

@@ -7,8 +7,8 @@ import pytest
 from lidardesign_tasks.flatland import FlatlandTask
 
 from lidardesign.errors import PluginError
-from lidardesign.evaluate.scoring import checked_residuals, gives_residuals
-from lidardesign.simulate.returns import Rays
+from lidardesign.evaluate.scene_scores import checked_residuals, gives_residuals
+from lidardesign.geometry.rays import Rays
 from lidardesign.simulate.simulate import simulate
 from lidardesign.task import Residuals
 

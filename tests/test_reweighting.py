@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidardesign.cli.weighting import KEY, WIDEST_SPREAD_M, Weighting
 from lidardesign.design.fit import fit
-from lidardesign.design.reweighting import LARGEST_LOG_FACTOR, NEIGHBOURS, Reweighting
-from lidardesign.design.samples import Samples
 from lidardesign.design.sensor import Design, Sensor
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.evaluate.refinement.reweighting import LARGEST_LOG_FACTOR, NEIGHBOURS, Reweighting
 from lidardesign.run.yaml import dump_yaml, parse_yaml
+from lidardesign.samples import Samples
 from lidardesign.space import RANGE, DesignSpace, observed_point
+from lidardesign.workflow.weighting import KEY, WIDEST_SPREAD_M, Weighting
 
 SPACE = DesignSpace((0, 0, 0, -0.6, -0.4, 0.2), (0, 0, 0, 0.6, 0.4, 2.0))
 

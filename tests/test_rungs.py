@@ -2,7 +2,7 @@
 
 import mmap
 
-from lidardesign.evaluate.rungs import Ladder, Rung, timed
+from lidardesign.evaluate.accuracy.settings import Ladder, Rung, timed
 
 
 def ladder(*rungs, tolerance=0.1):

@@ -15,26 +15,26 @@ from test_mixture import POINT, features_of, random_mixture
 from test_mixture import drawn as drawn_from_mixture
 from test_rays import sensor
 
-from lidardesign.density.losses import Pool, draw_conditions
-from lidardesign.density.measure import draw_samples, log_density_of
-from lidardesign.density.objective import Coordinates
-from lidardesign.density.precision import FlatTarget
-from lidardesign.density.visibility import Optics
-from lidardesign.design.constraints import Constraints
+from lidardesign.density.flow.objective import Coordinates
+from lidardesign.density.training.losses import Pool, draw_conditions
+from lidardesign.density.training.quality import draw_samples, log_density_of
+from lidardesign.density.training.snapshot_quality import FlatTarget
+from lidardesign.density.visibility.quadrature import Optics
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.rules import groups
 from lidardesign.design.fit import fit
-from lidardesign.design.grid import low_discrepancy
-from lidardesign.design.mixture import log_density
-from lidardesign.design.rays import lay_out
-from lidardesign.design.resolve import groups
-from lidardesign.design.samples import Samples
+from lidardesign.design.layouts.grid import low_discrepancy
+from lidardesign.design.layouts.rays import lay_out
+from lidardesign.design.mixture.mixture import log_density
+from lidardesign.design.mixture.support import pinned, restricted
 from lidardesign.design.sensor import Design, tangent_coordinates, tangent_directions
-from lidardesign.design.support import pinned, restricted
-from lidardesign.evaluate.baselines import build_baseline
-from lidardesign.evaluate.occupancy import OccupancyGrid
+from lidardesign.evaluate.baselines.occupancy import OccupancyGrid
+from lidardesign.evaluate.baselines.simple import build_baseline
+from lidardesign.geometry.surface import sample_body
 from lidardesign.numerics import systematic_draw
+from lidardesign.samples import Samples
 from lidardesign.scene import Body, Box, Capsule, Mesh, Scene, Sphere
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, angles, direction
-from lidardesign.surface import sample_body
 
 DRAWS = 20_000
 

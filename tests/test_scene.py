@@ -11,9 +11,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from lidardesign.errors import DataError
+from lidardesign.geometry.surface import sample_body, sample_triangles, surface_area_m2
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, inverse_rigid, rigid
 from lidardesign.space import DesignSpace
-from lidardesign.surface import sample_body, sample_triangles, surface_area_m2
 
 SPACE = DesignSpace((0, 0, 0, 0, -1, 0), (0, 0, 0, 1, 1, 3))
 TRIANGLE = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])

@@ -10,16 +10,16 @@ import pytest
 import references
 from command_line import caller
 
-from lidardesign.design.constraints import Constraints
+from lidardesign.config import resolve, save_run_config
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import load_design, save_design
 from lidardesign.design.fit import fit
-from lidardesign.design.rays import lay_out
-from lidardesign.design.samples import Samples, save_samples
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.evaluate.score import EvaluationRequest, evaluate
 from lidardesign.export.registry import EXPORTERS
 from lidardesign.registry import load_task
-from lidardesign.run.config import resolve, save_run_config
 from lidardesign.run.manifest import start_manifest
+from lidardesign.samples import Samples, save_samples
 from lidardesign.scene import Body, Capsule, Mesh, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, aim
 from lidardesign.task import Defaults, Metric, Score, TaskConfig
@@ -149,7 +149,7 @@ def test_rows_of_a_fitted_design_stay_when_the_world_turns_by_a_quarter(layout):
 @pytest.fixture
 def lidardesign(capsys, tmp_path, monkeypatch):
     """Run the program in this process; the target density is the planted one."""
-    monkeypatch.setattr("lidardesign.cli.layouts.RunTarget.__call__", lambda self, points: log_shelf(points))
+    monkeypatch.setattr("lidardesign.workflow.layouts.RunTarget.__call__", lambda self, points: log_shelf(points))
     return caller(capsys, tmp_path, monkeypatch)
 
 

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidardesign.design.files import load_design
+from lidardesign.design.rigs.sensor_csv import COLUMNS, looks_like_sensor_csv, read_sensor_csv, write_sensor_csv
 from lidardesign.design.sensor import Design, Sensor, tangent_coordinates
-from lidardesign.design.sensor_csv import COLUMNS, looks_like_sensor_csv, read_sensor_csv, write_sensor_csv
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.space import direction
 

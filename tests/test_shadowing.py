@@ -10,12 +10,12 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.echoes import Beams
+from lidardesign.simulate.detector.light import Beams
 from lidardesign.simulate.effects.shadowing import heard
 from lidardesign.simulate.physics import direct_echoes
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Rays
 from lidardesign.space import direction
 
 BESIDE = Receiver((0.0, 1.0, 0.0), 0.0, 0.0, 3.0, 3.0, (0.0, 1e6))

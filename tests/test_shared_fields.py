@@ -11,14 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.check import check_design
-from lidardesign.design.constraints import Constraints
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document
 from lidardesign.design.fit import fit
-from lidardesign.design.rays import lay_out, split_budget
-from lidardesign.design.samples import Samples
+from lidardesign.design.layouts.rays import lay_out, split_budget
+from lidardesign.design.layouts.shared_fields import bandwidth_limit, shared_rays
 from lidardesign.design.sensor import Design, Sensor, interval_factor, tangent_coordinates
-from lidardesign.design.shared_fields import bandwidth_limit, shared_rays
+from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
 
 SPACE = DesignSpace((0, 0, 0, -1.2, -0.9, 0.2), (0, 0, 0, 1.2, 0.9, 3.0))

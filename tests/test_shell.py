@@ -27,7 +27,7 @@ from lidardesign.cli.deprecations import RENAMED, RenamedOption, deprecations_to
 from lidardesign.cli.main import app
 from lidardesign.cli.manual import MANUALS
 from lidardesign.deprecation import DeprecatedUse, announce
-from lidardesign.run.streams import STDIO, is_input, offered_input
+from lidardesign.run.files import STDIO, is_input, offered_input
 from lidardesign.run.yaml import load_yaml
 
 ROOT = Path(__file__).parents[1]

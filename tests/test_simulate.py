@@ -9,9 +9,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Outcome, Rays
 from lidardesign.scene import Body, Box, Capsule, Mesh, Scene, Sphere, rigid
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Outcome, Rays
 from lidardesign.simulate.simulate import build_casters, simulate, simulate_many
 from lidardesign.space import direction
 

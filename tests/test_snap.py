@@ -13,21 +13,20 @@ from command_line import caller, make_run
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidardesign.design.budget import ReadOut
 from lidardesign.design.catalog.library import find_part, load_library
-from lidardesign.design.check import check_design
-from lidardesign.design.constraints import Constraints
+from lidardesign.design.constraints.budget import ReadOut
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document, design_from_document, load_design
 from lidardesign.design.fit import fit
-from lidardesign.design.mixture import Mixture
-from lidardesign.design.rays import lay_out
-from lidardesign.design.samples import Samples
+from lidardesign.design.layouts.rays import lay_out
+from lidardesign.design.mixture.mixture import Mixture
 from lidardesign.design.sensor import tangent_coordinates
-from lidardesign.design.shapes import shapes_of
-from lidardesign.design.snap import Choice, nearest_parts, with_parts
-from lidardesign.design.snap_options import Options, options_of, parts_of, wants_parts
-from lidardesign.design.snap_rays import affordable, capped_split, counts_of, useful_split
+from lidardesign.design.snap.parts import Choice, Options, nearest_parts, options_of, parts_of, wants_parts, with_parts
+from lidardesign.design.snap.rays import affordable, capped_split, counts_of, useful_split
+from lidardesign.design.snap.shapes import shapes_of
 from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace, aim
 
 SPACE = DesignSpace((0, 0, 0, -0.8, -0.8, 0.1), (0, 0, 0, 0.8, 0.8, 3.0))
@@ -257,9 +256,9 @@ def test_a_part_is_turned_where_the_sensor_lies_on_its_side(tmp_path):
 
 def test_losses_are_what_the_mixture_loses_by_each_part_alone():
     """The naive way: the whole mixture's density with one component exchanged."""
-    from lidardesign.design.ensemble import Ensemble
-    from lidardesign.design.mixture import log_density
-    from lidardesign.design.shapes import shaped_mixture
+    from lidardesign.design.mixture.ensemble import Ensemble
+    from lidardesign.design.mixture.mixture import log_density
+    from lidardesign.design.snap.shapes import shaped_mixture
 
     ensemble = fitted_ensemble()
     assert isinstance(ensemble, Ensemble)

@@ -8,18 +8,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_learn import BallTask, Interrupter, config_of
 
+from lidardesign.config import LearningSettings
 from lidardesign.density.learn import learn
-from lidardesign.density.settings import LearningSettings
-from lidardesign.density.snapshots import (
+from lidardesign.density.training.checkpoint import (
     FOLDER,
     clear_snapshots,
     kept_snapshots,
+    load_arrays,
     rung_steps,
     snapshot_name,
     snapshot_steps,
     twin_step,
 )
-from lidardesign.run.checkpoint import load_arrays
 from lidardesign.run.manifest import verify
 
 

@@ -21,12 +21,12 @@ from soak.scaled_flatland import NAME, ScaledFlatlandTask, offer
 from soak.seeds import Learned, seeds_page
 from soak.whole_runs import BLIND, ROUGH, WHOLE, Record, whole_run
 
-from lidardesign.design.check import check_design
-from lidardesign.design.constraints import Constraints
-from lidardesign.design.feasibility import check_feasible
+from lidardesign.config import resolve
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.feasibility import check_feasible
 from lidardesign.errors import InfeasibleError
 from lidardesign.registry import load_task
-from lidardesign.run.config import resolve
 from lidardesign.run.yaml import dump_yaml
 from lidardesign.space import DesignSpace
 

@@ -9,15 +9,15 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector import Detector
-from lidardesign.simulate.echoes import Beams
+from lidardesign.simulate.detector.detector import Detector
+from lidardesign.simulate.detector.light import Beams
 from lidardesign.simulate.effects import specular
 from lidardesign.simulate.effects.footprint import split
 from lidardesign.simulate.effects.specular import MAXIMUM_TURNS, detours
 from lidardesign.simulate.physics import direct_echoes
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Rays
 from lidardesign.space import direction
 
 EVERYWHERE = {"azimuth_rad": 0.0, "elevation_rad": 0.0, "horizontal_rad": 3.1, "vertical_rad": 3.1}

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lidardesign.density.splines import EDGE, BoundedSpline, spline
+from lidardesign.density.flow.splines import EDGE, BoundedSpline, spline
 
 BINS = 7
 PERIODIC = torch.tensor([False, True, False])

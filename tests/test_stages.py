@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from test_learn import BallTask, Interrupter, config_of, result_bytes
 
-from lidardesign.density.ground import prepare_ground
+from lidardesign.config import save_run_config
 from lidardesign.density.learn import learn
-from lidardesign.density.stages import (
+from lidardesign.density.training.schedule import (
     Stage,
     ToleranceGoal,
     goal_of,
@@ -15,8 +15,8 @@ from lidardesign.density.stages import (
     stage_steps,
     with_steps,
 )
+from lidardesign.density.training.training_data import prepare_ground
 from lidardesign.errors import DataError
-from lidardesign.run.config import save_run_config
 from lidardesign.run.manifest import note, read_manifest, start_manifest, verify
 from lidardesign.run.yaml import load_yaml
 

@@ -18,12 +18,12 @@ from lidardesign_tasks.surroundings import fog
 from lidardesign_tasks.warehouse import WarehouseTask
 from pydantic import ValidationError
 
+from lidardesign.geometry.raycast import shared_caster
+from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Ambient
-from lidardesign.simulate.detector_files import load_detector
+from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.physics import Physics
 from lidardesign.simulate.plan import Planner
-from lidardesign.simulate.raycast import shared_caster
-from lidardesign.simulate.returns import Rays
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import direction
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import references
 
-from lidardesign.density.settings import DensitySettings
-from lidardesign.density.target import build_target
+from lidardesign.config import DensitySettings
+from lidardesign.density.target.target import build_target
 from lidardesign.errors import NumericalError
 from lidardesign.scene import Body, Box, Capsule, Plane, Scene, Sphere, rigid
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, observed_point

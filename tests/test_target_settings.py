@@ -9,8 +9,7 @@ import pytest
 from test_fields import icosphere
 from test_learn import config_of
 
-from lidardesign.evaluate.ladders.fields import RESOLUTIONS
-from lidardesign.evaluate.target_settings import FIELD_SHARE, fields_within
+from lidardesign.evaluate.accuracy.fields import FIELD_SHARE, RESOLUTIONS, fields_within
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
 

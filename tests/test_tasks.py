@@ -18,8 +18,8 @@ from lidardesign_tasks.pose import jittered_pose
 from lidardesign_tasks.warehouse import WarehouseTask
 
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.geometry.rays import Outcome, Rays, Returns
 from lidardesign.scene import Scene
-from lidardesign.simulate.returns import Outcome, Rays, Returns
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import aim, direction
 from lidardesign.task import Task, conditions_of, notes_of, scenes_of

@@ -13,11 +13,10 @@ from plugins import GOOD, install_plugins
 
 from lidardesign import registry
 from lidardesign.errors import ConfigError
-from lidardesign.probe import START_SECONDS
+from lidardesign.registry import START_SECONDS
 from lidardesign.testing import process
 from lidardesign.testing.contract import LAWS
-from lidardesign.testing.law import Finding
-from lidardesign.testing.limits import Limits
+from lidardesign.testing.law import Finding, Limits
 from lidardesign.testing.process import CheckRequest, check_apart
 
 SCORE = "    def score(self, scene, returns):\n"

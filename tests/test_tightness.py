@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from lidardesign.design.check import ConstraintCheck
-from lidardesign.design.tightness import room_of, tightness
+from lidardesign.design.constraints.check import ConstraintCheck
+from lidardesign.design.constraints.slack import room_of, tightness
 
 
 def check(name, bound, value, satisfied=True):

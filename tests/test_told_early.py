@@ -8,15 +8,15 @@ import trimesh
 from command_line import caller, make_run
 from lidardesign_tasks.units import doubtful_meshes, doubtful_motion
 
-from lidardesign.cli.console import Console
-from lidardesign.cli.runs import read_design
-from lidardesign.density.resolution import resolution_notes
-from lidardesign.design.outside import outside_notes
+from lidardesign.cli.output import Console
+from lidardesign.config import load_run_config
+from lidardesign.density.target.resolution import resolution_notes
+from lidardesign.design.compare import outside_notes
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.registry import load_task
-from lidardesign.run.config import load_run_config
 from lidardesign.space import DesignSpace
 from lidardesign.task import notes_of
+from lidardesign.workflow.runs import read_design
 
 SPACE = DesignSpace(low=(1.0, 0, 0, 2.8, -0.4, 0.5), high=(1.0, 0, 0, 3.5, 0.4, 1.5))
 QUICK = [word for key in ("poses=1", "truth_points=100", "density.field_resolution=8", "density.visibility=off")
@@ -62,7 +62,8 @@ def test_the_error_about_sigma_names_the_likely_cause_after_a_note_before_learni
 def test_the_error_about_sigma_leaves_units_alone_where_scenes_are_small(monkeypatch):
     found = {}
     for step in (0.9, 3.6):
-        monkeypatch.setattr("lidardesign.density.resolution._grid_steps_m", lambda field, step=step: np.array([step]))
+        steps = "lidardesign.density.target.resolution._grid_steps_m"
+        monkeypatch.setattr(steps, lambda field, step=step: np.array([step]))
         settings = type("Settings", (), {"sigma_m": 0.002, "field_resolution": 16})
         with pytest.raises(ConfigError) as refused:
             resolution_notes(type("Target", (), {"space": SPACE, "field": None}), settings)

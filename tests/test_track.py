@@ -14,20 +14,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidardesign.design.along import Along, aimed_rays
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.check import check_design
-from lidardesign.design.constraints import Constraints
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import SCHEMA_FILE, design_document, design_from_document, load_design, save_design
 from lidardesign.design.fit import fit
-from lidardesign.design.quantise import lloyd
-from lidardesign.design.rays import lay_out
-from lidardesign.design.samples import Samples
+from lidardesign.design.layouts.along import Along, aimed_rays
+from lidardesign.design.layouts.quantise import lloyd
+from lidardesign.design.layouts.rays import lay_out
+from lidardesign.design.layouts.track import interpolated, placed, travels
+from lidardesign.design.layouts.track_fit import fit_track
 from lidardesign.design.sensor import Design, Sensor, Track
-from lidardesign.design.track import interpolated, placed, travels
-from lidardesign.design.track_fit import fit_track
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.run.yaml import dump_yaml, parse_yaml
+from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace, angles
 
 AISLE = DesignSpace(
@@ -229,7 +229,7 @@ def test_places_where_a_ray_sees_nothing_are_bridged():
 
 
 def test_every_update_of_the_cells_lowers_their_cost(monkeypatch):
-    from lidardesign.design import along as module
+    from lidardesign.design.layouts import along as module
 
     costs = []
     cost = module._cost

@@ -10,25 +10,26 @@ import numpy as np
 import pytest
 from command_line import caller
 
-from lidardesign.density import budget
+from lidardesign.config import load_run_config, resolve, save_run_config
 from lidardesign.density import learn as learning
-from lidardesign.density.ladder import load_flow, remeasured, seconds_at
 from lidardesign.density.learn import learn
-from lidardesign.density.measure import draw_probes
-from lidardesign.density.stages import Stage, ToleranceGoal
-from lidardesign.density.training import Trainer
+from lidardesign.density.training import schedule as budget
+from lidardesign.density.training.checkpoint import save_arrays
+from lidardesign.density.training.quality import draw_probes
+from lidardesign.density.training.schedule import Stage, ToleranceGoal
+from lidardesign.density.training.snapshot_quality import load_flow, remeasured, seconds_at
+from lidardesign.density.training.training import Trainer
 from lidardesign.design.fit import fit
-from lidardesign.design.samples import load_samples
 from lidardesign.errors import DataError, NumericalError
-from lidardesign.evaluate import accuracy, score
-from lidardesign.evaluate.accuracy import Accuracy, AccuracyRequest
-from lidardesign.evaluate.ladders import training
-from lidardesign.evaluate.ladders.probes import run_target
+from lidardesign.evaluate import score
+from lidardesign.evaluate.accuracy import sweeps as accuracy
+from lidardesign.evaluate.accuracy import training
+from lidardesign.evaluate.accuracy.probes import run_target
+from lidardesign.evaluate.accuracy.sweeps import Accuracy, AccuracyRequest
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.registry import load_task
-from lidardesign.run.checkpoint import save_arrays
-from lidardesign.run.config import load_run_config, resolve, save_run_config
 from lidardesign.run.manifest import note, read_manifest, record, start_manifest
+from lidardesign.samples import load_samples
 from lidardesign.task import random_generator, scenes_of
 
 SMALL = (

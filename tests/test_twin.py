@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.check import check_design
-from lidardesign.design.constraints import Constraints
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document
 from lidardesign.design.fit import fit
-from lidardesign.design.rays import lay_out
-from lidardesign.design.samples import Samples
-from lidardesign.evaluate.ablation import TwinCandidate, fitted_twin
-from lidardesign.evaluate.candidates import mean_mbps
+from lidardesign.design.layouts.rays import lay_out
+from lidardesign.evaluate.baselines.candidates import mean_mbps
+from lidardesign.evaluate.baselines.no_visibility import TwinCandidate, fitted_twin
+from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
 
 SPACE = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))

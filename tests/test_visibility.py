@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from lidardesign.density.fields import build_field
-from lidardesign.density.prepare import prepare_target
-from lidardesign.density.settings import DensitySettings
-from lidardesign.density.target import build_target
-from lidardesign.density.visibility import Optics, Quadrature, RayBatch, Raycast
+from lidardesign.config import DensitySettings
+from lidardesign.density.fields.distance import build_field
+from lidardesign.density.target.prepare import prepare_target
+from lidardesign.density.target.target import build_target
+from lidardesign.density.visibility.quadrature import Optics, Quadrature, RayBatch, Raycast
 from lidardesign.scene import Body, Box, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.space import RANGE, DesignSpace
 

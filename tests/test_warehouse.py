@@ -12,9 +12,9 @@ from lidardesign_tasks.warehouse_shelf import LEVELS, SHELF_DEPTH_M, build_shelf
 from lidardesign_tasks.warehouse_truth import ON_FACE_M, BoxTruth, cut_scene, visible_boxes
 
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Outcome, Rays, Returns
 from lidardesign.scene import Body, Box, Scene, rigid
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Outcome, Rays, Returns
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import ELEVATION, RANGE, DesignSpace, direction
 from lidardesign.task import Task, conditions_of, scenes_of

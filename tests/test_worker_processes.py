@@ -14,10 +14,10 @@ from command_line import caller, make_run, program
 from test_workers import make_request, results, without_times
 
 from lidardesign.errors import ConfigError, NumericalError, PluginError
-from lidardesign.evaluate import worker_processes
 from lidardesign.evaluate.score import evaluate
-from lidardesign.evaluate.worker_processes import MOST_TRIES, Processes
-from lidardesign.evaluate.workers import WorkerScorer
+from lidardesign.evaluate.workers import processes as worker_processes
+from lidardesign.evaluate.workers.pool import WorkerScorer
+from lidardesign.evaluate.workers.processes import MOST_TRIES, Processes
 from lidardesign.registry import load_task
 
 
@@ -60,7 +60,7 @@ def test_a_scene_that_kills_its_workers_is_named(pool, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     source = "import os, sys\ndef main():\n    sys.stdin.buffer.read(1)\n    os.kill(os.getpid(), 9)\n"
     (tmp_path / "deadly.py").write_text(source)
-    monkeypatch.setattr("lidardesign.evaluate.worker_processes.WORKER", "deadly")
+    monkeypatch.setattr("lidardesign.evaluate.workers.processes.WORKER", "deadly")
     with pytest.raises(NumericalError, match=f"held-out scene 0 was ended by SIGKILL, {MOST_TRIES} times"):
         list(pool(1).answers([b"one", b"two"]))
 

@@ -13,14 +13,15 @@ from test_score import MissTask
 from lidardesign import errors
 from lidardesign.design.sensor import Design, Sensor
 from lidardesign.errors import ConfigError, PluginError
-from lidardesign.evaluate import messages, worker
-from lidardesign.evaluate.passes import ScenePass, SceneScores
+from lidardesign.evaluate.scene_scores import ScenePass, SceneScores
 from lidardesign.evaluate.score import EvaluationRequest, evaluate
-from lidardesign.evaluate.workers import WorkerScorer, check_workers, workers_of
+from lidardesign.evaluate.workers import worker
+from lidardesign.evaluate.workers import worker as messages
+from lidardesign.evaluate.workers.pool import WorkerScorer, check_workers, workers_of
+from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Body, Mesh, Scene, Sphere, rigid
-from lidardesign.simulate.detector_files import detector_names, load_detector
+from lidardesign.simulate.detector.files import detector_names, load_detector
 from lidardesign.simulate.plan import Planner, Tolerance
-from lidardesign.simulate.returns import Rays
 from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import Score
 

@@ -29,9 +29,9 @@ RECORDS = ROOT / "build" / "mutation"
 # The files that test each module. A change outside of functions meets the first one alone, whole.
 TESTS = {
     "lidardesign/numerics.py": ("numerics",),
-    "lidardesign/design/mixture.py": ("mixture",),
-    "lidardesign/design/constraints.py": ("constraints", "check"),
-    "lidardesign/design/rays.py": ("rays",),
+    "lidardesign/design/mixture/mixture.py": ("mixture",),
+    "lidardesign/design/constraints/document.py": ("constraints", "check"),
+    "lidardesign/design/layouts/rays.py": ("rays",),
 }
 # Packages and modules that a mutant is to meet anew; the tests are too.
 OURS = {"lidardesign", "lidardesign_tasks"}

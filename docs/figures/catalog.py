@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from lidardesign.design.catalog.library import load_library
 from lidardesign.design.catalog.part import Part
 from lidardesign.design.files import load_design
-from lidardesign.design.rays import own_count
+from lidardesign.design.layouts.rays import own_count
 from lidardesign.design.sensor import Design
 from lidardesign.errors import ConfigError
 from lidardesign.space import angles

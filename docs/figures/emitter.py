@@ -23,15 +23,15 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
-from lidardesign.cli.runs import open_run
 from lidardesign.design.files import load_design
-from lidardesign.design.rays import lay_out
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import Design
+from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Scene
-from lidardesign.simulate.detector import IDEAL
+from lidardesign.simulate.detector.detector import IDEAL
 from lidardesign.simulate.physics import Physics
-from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.simulate.simulate import simulate
+from lidardesign.workflow.runs import open_run
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 from emitter import EMITTERS

@@ -27,20 +27,19 @@ from matplotlib.patches import Polygon
 from matplotlib.ticker import FixedLocator, FuncFormatter, MultipleLocator, NullLocator
 from scipy.ndimage import gaussian_filter
 
+from lidardesign.config import RunConfig, load_run_config
 from lidardesign.design.files import load_design
-from lidardesign.design.grid import field_on_sphere
-from lidardesign.design.rays import lay_out
-from lidardesign.design.samples import Samples, load_samples
+from lidardesign.design.layouts.grid import field_on_sphere
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import Design, Sensor, tangent_directions
-from lidardesign.evaluate.density_views import density_view
-from lidardesign.evaluate.plots_camera import View, shaded, view_of
-from lidardesign.evaluate.plots_canvas import looks, picture
-from lidardesign.evaluate.plots_density import field_picture, marginals_picture
-from lidardesign.evaluate.plots_scene import OUTCOME_LOOKS
-from lidardesign.run.config import RunConfig, load_run_config
+from lidardesign.evaluate.figures.canvas import looks, picture
+from lidardesign.evaluate.figures.density import field_picture, marginals_picture
+from lidardesign.evaluate.figures.density_views import density_view
+from lidardesign.evaluate.figures.scene import OUTCOME_LOOKS, View, shaded, view_of
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Outcome, Rays, Returns
+from lidardesign.samples import Samples, load_samples
 from lidardesign.scene import Scene
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Outcome, Rays, Returns
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import AZIMUTH, ELEVATION, angles, direction
 

@@ -24,15 +24,15 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from scipy.ndimage import gaussian_filter
 
-from lidardesign.cli.runs import open_run
 from lidardesign.design.files import load_design
-from lidardesign.design.rays import lay_out
-from lidardesign.design.samples import Samples, load_samples
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import Design
+from lidardesign.geometry.rays import Outcome
+from lidardesign.samples import Samples, load_samples
 from lidardesign.scene import Scene
-from lidardesign.simulate.returns import Outcome
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import AZIMUTH, ELEVATION, X
+from lidardesign.workflow.runs import open_run
 
 RAYS = 12
 POSITION_M = 0.37

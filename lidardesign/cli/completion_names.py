@@ -56,7 +56,7 @@ def parts(line: Line, current: str) -> Items:
 
 def detectors(line: Line, current: str) -> Items:
     """Names of the shipped detectors."""
-    found = sorted((PACKAGE / "simulate" / "detectors").glob("*.yaml"))
+    found = sorted((PACKAGE / "simulate" / "detector" / "presets").glob("*.yaml"))
     return [(name, "a detector") for name in dict.fromkeys(("ideal", *(path.stem for path in found)))]
 
 
@@ -98,7 +98,7 @@ def configuration_keys(line: Line, current: str) -> Items:
 
     Of a run only those of the task itself: the density was learned.
     """
-    from lidardesign.density.settings import DensitySettings, LearningSettings
+    from lidardesign.config import DensitySettings, LearningSettings
     from lidardesign.registry import load_task
     from lidardesign.space import DIMENSIONS
 
@@ -115,7 +115,7 @@ def configuration_keys(line: Line, current: str) -> Items:
 
 def constraint_keys(line: Line, current: str) -> Items:
     """Keys of constraints, as `gate.width_m.max=`."""
-    from lidardesign.design.constraints import CATALOG, Constraints
+    from lidardesign.design.constraints.document import CATALOG, Constraints
 
     items = [item for item in keyed(Constraints, "", current) if not item[0].startswith("each")]
     return [(f"snap={CATALOG}", "every sensor becomes a real part"), *items]
@@ -129,7 +129,7 @@ def keyed(model: type[BaseModel], prefix: str, current: str) -> Iterator[tuple[s
         prefix: What stands before its keys.
         current: What is typed.
     """
-    from lidardesign.run.kinds import nested_model
+    from lidardesign.run.validation import nested_model
 
     for name, info in model.model_fields.items():
         nested = nested_model(info.annotation)

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from lidardesign.cli.console import tell
+from lidardesign.cli.output import tell
 from lidardesign.deprecation import DeprecatedUse, announce
 
 

@@ -38,7 +38,7 @@ def set_cache_default() -> None:
 
     numba refuses to import otherwise. Nobody else can write there: numba's cache is code.
     """
-    places = (Path(__file__).parents[1] / "density" / "__pycache__", _user_caches() / "numba")
+    places = (Path(__file__).parents[1] / "density" / "fields" / "__pycache__", _user_caches() / "numba")
     if "NUMBA_CACHE_DIR" in os.environ or any(_can_be_written(place) for place in places):
         return
     folder = tempfile.mkdtemp(prefix="lidardesign-numba-")

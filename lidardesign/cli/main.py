@@ -8,26 +8,25 @@ from typing import Annotated, Any
 import typer
 
 from lidardesign import __version__
-from lidardesign.cli.aside import print_aside_from_now_on
-from lidardesign.cli.capture import capture
-from lidardesign.cli.catalog import catalog_app
-from lidardesign.cli.compare import compare
-from lidardesign.cli.completion import answer, completion, is_asked
-from lidardesign.cli.config import config_app
-from lidardesign.cli.console import EXIT_BROKEN_PIPE, Console, forget_stdout, print_json, report_error, tell
-from lidardesign.cli.constrain import constrain
+from lidardesign.cli.commands.capture import capture
+from lidardesign.cli.commands.catalog import catalog_app
+from lidardesign.cli.commands.compare import compare
+from lidardesign.cli.commands.completion import answer, completion, is_asked
+from lidardesign.cli.commands.config import config_app
+from lidardesign.cli.commands.constrain import constrain
+from lidardesign.cli.commands.evaluate import evaluate
+from lidardesign.cli.commands.export import export
+from lidardesign.cli.commands.fit import fit
+from lidardesign.cli.commands.learn import learn
+from lidardesign.cli.commands.show import show
+from lidardesign.cli.commands.tasks import tasks_app
 from lidardesign.cli.deprecations import deprecations_told, with_new_names
 from lidardesign.cli.environment import make_streams_tolerant, set_cache_default, set_thread_defaults, terminate_cleanly
-from lidardesign.cli.evaluate import evaluate
-from lidardesign.cli.export import export
-from lidardesign.cli.fit import fit
-from lidardesign.cli.learn import learn
-from lidardesign.cli.manual import add_manuals
-from lidardesign.cli.manual_pages import PAGES
+from lidardesign.cli.manual import PAGES, add_manuals
 from lidardesign.cli.mistakes import hint_of
+from lidardesign.cli.output import EXIT_BROKEN_PIPE, Console, forget_stdout, print_json, report_error, tell
 from lidardesign.cli.ranks import refuse_ranks
-from lidardesign.cli.show import show
-from lidardesign.cli.tasks import tasks_app
+from lidardesign.cli.stdout_guard import print_aside_from_now_on
 
 EXIT_USAGE = 2
 SETTINGS = {"help_option_names": ["-h", "--help"]}

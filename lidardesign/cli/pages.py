@@ -13,13 +13,13 @@ from lidardesign.run.clock import phase
 if TYPE_CHECKING:
     import numpy as np
 
-    from lidardesign.cli.runs import Run
     from lidardesign.design.sensor import Design
-    from lidardesign.evaluate.pictured import Pictured
-    from lidardesign.evaluate.report import Report
-    from lidardesign.evaluate.report_tables import CommandTimes, Reproduction
+    from lidardesign.evaluate.figures.figure_data import Pictured
+    from lidardesign.evaluate.report.report import Report
+    from lidardesign.evaluate.report.tables import CommandTimes, Reproduction
     from lidardesign.evaluate.request import EvaluationRequest
     from lidardesign.evaluate.results import Evaluation
+    from lidardesign.workflow.runs import Run
 
 # Drawn in the 3D view of what the density observes: enough to see its shape, few enough to see through.
 DENSITY_POINTS = 3000
@@ -38,7 +38,7 @@ def write_page(evaluation: Evaluation, request: EvaluationRequest, run: Run, pic
         pictured: What is drawn beside the scores.
         path: The HTML file.
     """
-    from lidardesign.evaluate.report import write_report
+    from lidardesign.evaluate.report.report import write_report
 
     write_report(report_of(evaluation, request, run, pictured), path)
 
@@ -46,7 +46,7 @@ def write_page(evaluation: Evaluation, request: EvaluationRequest, run: Run, pic
 @phase("report")
 def report_of(evaluation: Evaluation, request: EvaluationRequest, run: Run, pictured: Pictured) -> Report:
     """Everything that a report is made of; see `write_page`."""
-    from lidardesign.evaluate.report import Report
+    from lidardesign.evaluate.report.report import Report
     from lidardesign.evaluate.verdicts import held_out
 
     return Report(
@@ -74,7 +74,7 @@ def _density_points(request: EvaluationRequest, run: Run) -> np.ndarray | None:
 
 def _times(run: Run, times: Mapping[str, Mapping[str, float]]) -> list[CommandTimes]:
     """The times of commands on a run, with what its manifest says of when they ran and what memory they took."""
-    from lidardesign.evaluate.report_tables import CommandTimes
+    from lidardesign.evaluate.report.tables import CommandTimes
     from lidardesign.run.manifest import read_manifest
 
     kept = read_manifest(run.folder).get("timings") or {}
@@ -97,8 +97,8 @@ def _bytes(entry: dict[str, Any]) -> int | None:
 
 def _reproduction(request: EvaluationRequest, run: Run) -> Reproduction:
     """Commands, seeds and versions of the run, its designs and this evaluation."""
-    from lidardesign.evaluate.report_tables import Reproduction
-    from lidardesign.run.config import FILE_NAME
+    from lidardesign.config import FILE_NAME
+    from lidardesign.evaluate.report.tables import Reproduction
     from lidardesign.run.manifest import read_manifest, versions
 
     manifest = read_manifest(run.folder)

@@ -59,7 +59,7 @@ def planner_of(
     Raises:
         ConfigError: An unknown effect or detector, or a tolerance that is not above 0.
     """
-    from lidardesign.simulate.detector_files import load_detector
+    from lidardesign.simulate.detector.files import load_detector
     from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
 
     _check_tolerance("--range-tolerance-mm", range_tolerance_mm)

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from lidardesign.cli.console import EXIT_INTERRUPTED, Console
+from lidardesign.cli.output import EXIT_INTERRUPTED, Console
 from lidardesign.errors import ConfigError, LidardesignError, LostRankError, ThresholdError
 from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
-    from lidardesign.density.parallel import Ranks
+    from lidardesign.density.ranks import Ranks
 
 # torchrun sets the first of these; it, mpirun wrappers and clusters set the others, which torch.distributed needs.
 LAUNCHER = "TORCHELASTIC_RUN_ID"
@@ -48,13 +48,12 @@ def joined_ranks(console: Console) -> Iterator[Ranks]:
     """
     if not all(name in os.environ for name in NEEDED):
         with phase("libraries"):
-            from lidardesign.density.parallel import ALONE
+            from lidardesign.density.ranks import ALONE
 
         yield ALONE
         return
     with phase("libraries"):
-        from lidardesign.density.parallel_learn import finish
-        from lidardesign.density.parallel_ranks import join_ranks
+        from lidardesign.density.rank_processes import finish, join_ranks
     with phase("ranks"):
         ranks = join_ranks()
     if not ranks.first:
@@ -75,7 +74,7 @@ def joined_ranks(console: Console) -> Iterator[Ranks]:
 
 def _follow(ranks: Ranks, console: Console) -> None:
     """Learn along; an error is told on stderr unless the first rank tells of it, or of its own."""
-    from lidardesign.density.parallel_learn import follow
+    from lidardesign.density.rank_processes import follow
 
     console.json, console.quiet = False, True
     try:

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
     from rich.progress import TaskID
 
-    from lidardesign.cli.console import Console
-    from lidardesign.evaluate.cma_candidate import CmaSettings
-    from lidardesign.evaluate.cma_search import Progress
+    from lidardesign.cli.output import Console
+    from lidardesign.evaluate.cma.candidate import CmaSettings
+    from lidardesign.evaluate.cma.search import Progress
     from lidardesign.task import Metric
 
 CMA = "cma"
@@ -51,8 +51,8 @@ def check_cma_seconds(seconds: float | None, baselines: Sequence[str]) -> None:
 
 def searching(seconds: float | None) -> CmaSettings:
     """The settings of searches that tell nobody how they stand."""
-    from lidardesign.evaluate.cma_candidate import DEFAULT_SECONDS, CmaSettings
-    from lidardesign.evaluate.cma_search import Budget
+    from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
+    from lidardesign.evaluate.cma.search import Budget
 
     return CmaSettings(Budget(DEFAULT_SECONDS if seconds is None else seconds))
 

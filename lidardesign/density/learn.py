@@ -10,22 +10,20 @@ from typing import Any
 
 import torch
 
-from lidardesign.density.device_target import on_device, stays_on
-from lidardesign.density.flow import DesignFlow
-from lidardesign.density.ground import Ground, prepare_ground
-from lidardesign.density.measure import Measured, draw_probes, measure
-from lidardesign.density.objective import Coordinates
-from lidardesign.density.parallel import ALONE, Ranks
-from lidardesign.density.settings import LearningSettings
-from lidardesign.density.snapshots import clear_snapshots
-from lidardesign.density.training import PROGRESS, LearnProgress, Trainer
-from lidardesign.design.samples import Samples, save_samples
+from lidardesign.config import LearningSettings, RunConfig
+from lidardesign.density.flow.flow import DesignFlow
+from lidardesign.density.flow.objective import Coordinates
+from lidardesign.density.ranks import ALONE, Ranks
+from lidardesign.density.target.device import on_device, stays_on
+from lidardesign.density.training.checkpoint import clear_snapshots, save_arrays
+from lidardesign.density.training.quality import Measured, draw_probes, measure
+from lidardesign.density.training.training import PROGRESS, LearnProgress, Trainer
+from lidardesign.density.training.training_data import Ground, prepare_ground
 from lidardesign.errors import ConfigError
 from lidardesign.estimates import Estimate
-from lidardesign.run.checkpoint import save_arrays
 from lidardesign.run.clock import phase, running
-from lidardesign.run.config import RunConfig
 from lidardesign.run.manifest import note, record, versions
+from lidardesign.samples import Samples, save_samples
 from lidardesign.scene import Scene
 from lidardesign.space import AZIMUTH
 from lidardesign.task import Task, random_generator

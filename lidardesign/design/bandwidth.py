@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import SLACK
 from lidardesign.scene import SPEED_OF_LIGHT_M_S
-from lidardesign.simulate.returns import Rays
 
 SECONDS_PER_PICOSECOND = 1e-12
 BITS_PER_MEGABIT = 1e6

@@ -9,33 +9,30 @@ from typing import Any, Literal
 
 import numpy as np
 
-from lidardesign.design.budget import ReadOut, within_budget
-from lidardesign.design.check import ConstraintCheck, check_design
-from lidardesign.design.conditions import fixed_conditions
-from lidardesign.design.constraints import MOST_FITTED, Constraints
-from lidardesign.design.coupling import couplings
-from lidardesign.design.ensemble import Ensemble, Part, fit_parts, heaviest_first, sensors_of
-from lidardesign.design.feasibility import check_feasible, most_rays
-from lidardesign.design.features import Axes, Features
-from lidardesign.design.fit_result import FitResult
-from lidardesign.design.mount_choice import at_mounts
-from lidardesign.design.mounts import is_mounted, most_mounted, placement_notes
-from lidardesign.design.places import settled
-from lidardesign.design.quantise import SAMPLES_PER_RAY
-from lidardesign.design.rays import Gates, make_ray_table, own_gates, split_budget
-from lidardesign.design.resolve import bounds_of, groups
-from lidardesign.design.samples import Samples
-from lidardesign.design.scan import fit_scan, rays_of
+from lidardesign.design.constraints.budget import ReadOut, within_budget
+from lidardesign.design.constraints.check import ConstraintCheck, check_design
+from lidardesign.design.constraints.document import MOST_FITTED, Constraints
+from lidardesign.design.constraints.feasibility import check_feasible, most_rays
+from lidardesign.design.constraints.mounts import is_mounted, most_mounted, placement_notes, settled
+from lidardesign.design.constraints.rules import bounds_of, groups
+from lidardesign.design.fit_result import FitResult, fit_estimates, likelihood_error
+from lidardesign.design.layouts.quantise import SAMPLES_PER_RAY
+from lidardesign.design.layouts.rays import Gates, make_ray_table, own_gates, split_budget
+from lidardesign.design.layouts.scan import fit_scan, rays_of
+from lidardesign.design.layouts.track_fit import fit_track
+from lidardesign.design.mixture.conditions import fixed_conditions
+from lidardesign.design.mixture.coupling import couplings
+from lidardesign.design.mixture.ensemble import Ensemble, Part, at_mounts, fit_parts, heaviest_first, sensors_of
+from lidardesign.design.mixture.features import Axes, Features
+from lidardesign.design.mixture.support import Retarget, Support, check_support, pinned, restricted
 from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, Design, Layout, Sensor, interval_factor
-from lidardesign.design.snap_fit import Snapped, at_one_place, snapped
-from lidardesign.design.snap_options import wants_parts
-from lidardesign.design.support import Retarget, Support, check_support, pinned, restricted
-from lidardesign.design.track_fit import fit_track
-from lidardesign.design.uncertainty import fit_estimates, likelihood_error
+from lidardesign.design.snap.fit import Snapped, at_one_place, snapped
+from lidardesign.design.snap.parts import wants_parts
 from lidardesign.errors import ConfigError
 from lidardesign.estimates import Estimate
 from lidardesign.numerics import systematic_draw
 from lidardesign.run.clock import phase
+from lidardesign.samples import Samples
 from lidardesign.space import DIMENSIONS
 from lidardesign.task import random_generator
 

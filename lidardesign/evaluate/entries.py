@@ -10,17 +10,16 @@ from typing import Any
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.track import travels
+from lidardesign.design.layouts.track import travels
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.ablation import TwinCandidate
-from lidardesign.evaluate.baselines import CMA, Baselines, Judge, Option
-from lidardesign.evaluate.candidates import Candidate, Positions, mean_mbps
-from lidardesign.evaluate.cma_candidate import CmaCandidate, Record
-from lidardesign.evaluate.cma_objective import TrainingObjective
-from lidardesign.evaluate.observed import TrainingViews
-from lidardesign.evaluate.ray_numbers import can_fire, fired_numbers
-from lidardesign.evaluate.request import EvaluationRequest
-from lidardesign.evaluate.scoring import score_lists
+from lidardesign.evaluate.baselines.candidates import Candidate, Positions, mean_mbps
+from lidardesign.evaluate.baselines.no_visibility import TwinCandidate
+from lidardesign.evaluate.baselines.observed import TrainingViews
+from lidardesign.evaluate.baselines.simple import CMA, Baselines, Judge, Option
+from lidardesign.evaluate.cma.candidate import CmaCandidate, Record
+from lidardesign.evaluate.cma.objective import TrainingObjective
+from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers
+from lidardesign.evaluate.scene_scores import score_lists
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidardesign.errors import DataError
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.receiver import in_view
+from lidardesign.geometry.surface import sample_body, sample_triangles
 from lidardesign.numerics import SLACK
 from lidardesign.scene import Receiver, Scene
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.receiver_view import in_view
 from lidardesign.space import RANGE, DesignSpace, aim
-from lidardesign.surface import sample_body, sample_triangles
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree

@@ -2,24 +2,37 @@
 
 A mean over scenes says little where scenes differ more than designs do. Differences are therefore taken scene
 by scene, and their intervals are the ones that tell two designs apart.
+
+The audit of a plan: every row under all effects and under the planned ones, scene by scene.
+
+Both have the same random numbers: every effect draws from a stream of its own, so what differs is what was skipped.
+
+What was simulated over all held-out scenes, and why: the plans of all scenes as one line per effect.
+
+The rows of an evaluation as a CSV table with units in its headers.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lidardesign.estimates import HALF_INTERVAL, Estimate, as_documents
+from lidardesign.evaluate.statistics import paired_difference
+from lidardesign.run.files import write_atomic
+from lidardesign.simulate.physics import EFFECTS
+from lidardesign.simulate.plan import Choice, Decision, Plan, Tolerance
 from lidardesign.task import Metric
 
 if TYPE_CHECKING:
-    from lidardesign.evaluate.accuracy import Accuracy
-    from lidardesign.evaluate.audit import Audit
-    from lidardesign.evaluate.cma_candidate import Record
-    from lidardesign.evaluate.effects import EffectSummary
+    from lidardesign.evaluate.accuracy.sweeps import Accuracy
+    from lidardesign.evaluate.cma.candidate import Record
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,3 +215,247 @@ def worse_than_threshold(evaluation: Evaluation, limit: float) -> list[Row]:
     """
     sign = 1.0 if evaluation.metric.better == "lower" else -1.0
     return [row for row in evaluation.rows if not row.baseline and sign * row.value > sign * limit]
+
+
+@dataclass(frozen=True)
+class AuditRow:
+    """What the skipped effects are worth to one row.
+
+    Arguments:
+        design: Its name.
+        rays: Rays per frame.
+        planned, everything: Mean score under the planned effects, and under all.
+        difference: Mean over scenes of planned minus all, in the metric's unit.
+        ci_low, ci_high: Ends of its 95 % bootstrap interval.
+        seconds, seconds_everything: Time to simulate and score all scenes [s].
+        matched_to, matched_rays: As in the row at equal bandwidth.
+    """
+
+    design: str
+    rays: int
+    planned: float
+    everything: float
+    difference: float
+    ci_low: float
+    ci_high: float
+    seconds: float
+    seconds_everything: float
+    matched_to: str | None = None
+    matched_rays: int | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """All fields; the design that it was matched to only at equal bandwidth."""
+        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        if self.matched_to is None:
+            del values["matched_to"], values["matched_rays"]
+        return values
+
+
+@dataclass(frozen=True, eq=False)
+class Audit:
+    """Whether what was skipped changes the metric.
+
+    Arguments:
+        tolerance: The metric's own: differences below it do not matter.
+        unit: The metric's.
+        rows: Every row of the evaluation, those at equal bandwidth last.
+        skipped: Effects that only the other side simulated, in any scene.
+        unavailable: Effects that neither side could simulate.
+    """
+
+    tolerance: float
+    unit: str
+    rows: Sequence[AuditRow]
+    skipped: Sequence[str]
+    unavailable: Sequence[str]
+
+    @property
+    def failed(self) -> list[AuditRow]:
+        """Rows whose mean moves by more than the tolerance."""
+        return [row for row in self.rows if abs(row.difference) > self.tolerance]
+
+    @property
+    def worst(self) -> float:
+        """The largest difference of means, in the metric's unit."""
+        return max((abs(row.difference) for row in self.rows), default=0.0)
+
+    @property
+    def seconds(self) -> tuple[float, float]:
+        """Time of all rows under the plan and under all effects [s]."""
+        return sum(row.seconds for row in self.rows), sum(row.seconds_everything for row in self.rows)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For `--json`."""
+        planned, everything = self.seconds
+        return {
+            "passed": not self.failed,
+            "tolerance": self.tolerance,
+            "unit": self.unit,
+            "worst": self.worst,
+            "skipped": list(self.skipped),
+            "unavailable": list(self.unavailable),
+            "seconds": planned,
+            "seconds_everything": everything,
+            "rows": [row.as_dict() for row in self.rows],
+        }
+
+
+def audit_rows(planned: Sequence[Row], everything: Sequence[Row], seed: int) -> list[AuditRow]:
+    """The same rows under both, paired."""
+    return [_audit_row(one, other, seed) for one, other in zip(planned, everything, strict=True)]
+
+
+def _audit_row(planned: Row, everything: Row, seed: int) -> AuditRow:
+    mean, low, high = paired_difference(planned.per_scene, everything.per_scene, seed)
+    return AuditRow(
+        planned.design,
+        planned.rays,
+        planned.value,
+        everything.value,
+        mean,
+        low,
+        high,
+        planned.seconds,
+        everything.seconds,
+        planned.matched_to,
+        planned.matched_rays,
+    )
+
+
+MILLIMETRES = 1000.0
+
+
+@dataclass(frozen=True)
+class EffectSummary:
+    """An effect over all scenes.
+
+    Arguments:
+        name: Of the effect.
+        scenes_on: The share of scenes in which it was simulated.
+        range_m: Its largest bound on ranges, in any scene [m].
+        lost: Its largest bound on the share of returns.
+        tolerance: Of all skipped effects together.
+        reason: Why, in the scene where it could change most.
+        seconds: What simulating it in all scenes takes, predicted [s].
+        missing: What its simulation needs and is not there.
+    """
+
+    name: str
+    scenes_on: float
+    range_m: float
+    lost: float
+    tolerance: Tolerance
+    reason: str
+    seconds: float
+    missing: str | None = None
+
+    @property
+    def on(self) -> bool:
+        """Whether it was simulated anywhere."""
+        return self.scenes_on > 0
+
+    @property
+    def exceeds(self) -> bool:
+        """Whether it could change more than is tolerated."""
+        return self.range_m > self.tolerance.range_m or self.lost > self.tolerance.lost
+
+    def as_dict(self) -> dict[str, Any]:
+        """The contract's keys for ranges; the same for returns, and what it costs."""
+        return {
+            "name": self.name,
+            "on": self.on,
+            "bound": self.range_m,
+            "tolerance": self.tolerance.range_m,
+            "unit": "m",
+            "reason": self.reason,
+            "lost": self.lost,
+            "lost_tolerance": self.tolerance.lost,
+            "scenes_on": self.scenes_on,
+            "seconds": self.seconds,
+            "missing": self.missing,
+        }
+
+
+def summaries(plans: Sequence[Plan]) -> list[EffectSummary]:
+    """One line per effect, in the order in which light meets them."""
+    return [_summary([_decision(plan, name) for plan in plans], plans[0].tolerance) for name in EFFECTS]
+
+
+def _decision(plan: Plan, name: str) -> Decision:
+    return next(decision for decision in plan.decisions if decision.name == name)
+
+
+def _summary(decisions: Sequence[Decision], tolerance: Tolerance) -> EffectSummary:
+    worst = max(decisions, key=lambda decision: decision.bound.relative(tolerance))
+    return EffectSummary(
+        worst.name,
+        sum(decision.on for decision in decisions) / len(decisions),
+        max(decision.bound.range_m for decision in decisions),
+        max(decision.bound.lost for decision in decisions),
+        tolerance,
+        worst.bound.reason,
+        sum(decision.seconds for decision in decisions),
+        worst.missing,
+    )
+
+
+def effect_notes(effects: Sequence[EffectSummary], choice: Choice) -> list[str]:
+    """What was not simulated although it matters."""
+    notes = [
+        f"{effect.name} is not simulated ({effect.missing}): it may move ranges by up to "
+        f"{MILLIMETRES * effect.range_m:.3g} mm and change {effect.lost:.2g} of the returns"
+        for effect in effects
+        if effect.missing is not None and effect.exceeds
+    ]
+    left_out = [effect.name for effect in effects if effect.exceeds and not effect.on and effect.missing is None]
+    if left_out and choice != "auto":
+        notes.append(f"not simulated, as asked, though beyond the tolerance: {', '.join(left_out)}")
+    return notes
+
+
+def csv_text(evaluation: Evaluation) -> str:
+    """One line per row: equal rays first, then equal bandwidth, which names the design it was matched to."""
+    unit = evaluation.metric.unit
+    header = (
+        "design",
+        "rays",
+        f"{evaluation.metric.name} [{unit}]",
+        f"ci_low [{unit}]",
+        f"ci_high [{unit}]",
+        "failures",
+        "scenes",
+        "bandwidth [Mbit/s]",
+        "seconds [s]",
+        "matched_to",
+        "matched_rays",
+    )
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(header)
+    for row in (*evaluation.rows, *evaluation.equal_bandwidth):
+        writer.writerow(
+            (
+                _no_formula(row.design),
+                row.rays,
+                row.value,
+                row.ci_low,
+                row.ci_high,
+                row.failures,
+                evaluation.scenes,
+                row.bandwidth_mbps,
+                row.seconds,
+                _no_formula(row.matched_to or ""),
+                "" if row.matched_rays is None else row.matched_rays,
+            )
+        )
+    return buffer.getvalue()
+
+
+def write_csv(evaluation: Evaluation, path: Path) -> None:
+    """Write the rows as UTF-8 CSV, whole or not at all."""
+    write_atomic(Path(path), csv_text(evaluation))
+
+
+def _no_formula(text: str) -> str:
+    """A name that spreadsheets would read as a formula is quoted with an apostrophe."""
+    return f"'{text}" if text.startswith(("=", "+", "-", "@")) else text

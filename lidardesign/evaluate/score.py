@@ -15,22 +15,27 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.design.outside import outside_notes
-from lidardesign.evaluate.audit import Audit, audit_rows
-from lidardesign.evaluate.catalog import part_notes
-from lidardesign.evaluate.cma_candidate import Record
-from lidardesign.evaluate.effects import effect_notes, summaries
+from lidardesign.design.compare import outside_notes
+from lidardesign.evaluate.baselines.catalog import part_notes
+from lidardesign.evaluate.cma.candidate import Record
 from lidardesign.evaluate.entries import Entry, entries_of
-from lidardesign.evaluate.passes import Progress, ScenePass
-from lidardesign.evaluate.ray_numbers import left_out
-from lidardesign.evaluate.request import EvaluationRequest
-from lidardesign.evaluate.results import Evaluation, Paired, Row, worse_than_threshold
-from lidardesign.evaluate.scoring import score_scene
+from lidardesign.evaluate.request import EvaluationRequest, left_out
+from lidardesign.evaluate.results import (
+    Audit,
+    Evaluation,
+    Paired,
+    Row,
+    audit_rows,
+    effect_notes,
+    summaries,
+    worse_than_threshold,
+)
+from lidardesign.evaluate.scene_scores import Progress, ScenePass, score_scene
 from lidardesign.evaluate.statistics import bootstrap_interval, paired_difference
+from lidardesign.geometry.triangles import SecondCasts
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.simulate.plan import Plan, Planner
-from lidardesign.simulate.triangles import SecondCasts
 from lidardesign.task import notes_of
 
 __all__ = [

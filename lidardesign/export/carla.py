@@ -19,13 +19,12 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import Design
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
-from lidardesign.export.even_grid import EvenGrid
-from lidardesign.export.grid_sensors import grid_of, grid_sensor_losses
-from lidardesign.export.poses import Held, Mount, held_rounding, mounts
+from lidardesign.export.common.even_grid import EvenGrid, grid_of, grid_sensor_losses
+from lidardesign.export.common.poses import Held, Mount, held_rounding, mounts
 from lidardesign.export.sdf import matched
+from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import HALF_DIGITS
 from lidardesign.run.files import write_atomic
-from lidardesign.simulate.returns import Rays
 from lidardesign.space import direction
 
 BLUEPRINT = "sensor.lidar.ray_cast"

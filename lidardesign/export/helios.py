@@ -16,20 +16,19 @@ import numpy as np
 
 from lidardesign.design.sensor import Design
 from lidardesign.errors import DataError
-from lidardesign.export.folders import write_folder
-from lidardesign.export.places import rays_of_parts, require_rays
-from lidardesign.export.poses import Mount, design_losses, mounts
-from lidardesign.export.read_back import rays_rounding
-from lidardesign.export.xml import child, document, element, read_xml
+from lidardesign.export.common.names import write_folder
+from lidardesign.export.common.poses import Mount, design_losses, mounts, rays_of_parts, require_rays
+from lidardesign.export.common.read_back import rays_rounding
+from lidardesign.export.common.xml import child, document, element, read_xml
+from lidardesign.geometry.rays import Rays
 from lidardesign.scene import SPEED_OF_LIGHT_M_S
-from lidardesign.simulate.returns import Rays
 from lidardesign.space import angles, direction
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
     from lidardesign.estimates import Estimate
-    from lidardesign.export.places import Part
+    from lidardesign.export.common.poses import Part
 
 SCANNERS, PLATFORMS, SURVEY, SCENE = "scanners.xml", "platforms.xml", ".survey.xml", "scene.xml#scene"
 # HELIOS++ drops echoes whose rise begins before the gate does: a short pulse, in fine bins, loses little.

@@ -17,10 +17,10 @@ import numpy as np
 from lidardesign.design.sensor import Design
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
-from lidardesign.export.names import renamed_note
-from lidardesign.export.poses import Mount, design_losses, fire_times_s, origin_losses
-from lidardesign.export.read_back import rays_rounding
-from lidardesign.simulate.returns import Rays
+from lidardesign.export.common.names import renamed_note
+from lidardesign.export.common.poses import Mount, design_losses, fire_times_s, origin_losses
+from lidardesign.export.common.read_back import rays_rounding
+from lidardesign.geometry.rays import Rays
 from lidardesign.space import direction
 
 NANOSECONDS_PER_SECOND = 1_000_000_000

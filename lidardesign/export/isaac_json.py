@@ -16,11 +16,11 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import Design
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
-from lidardesign.export.folders import write_folder
+from lidardesign.export.common.names import write_folder
+from lidardesign.export.common.poses import Mount, mounts
 from lidardesign.export.isaac import FoundSensor, emitters_of, found_emitters, losses, profile_rounding, whole_rate_hz
-from lidardesign.export.poses import Mount, mounts
-from lidardesign.rotations import rotations_of_quaternions
-from lidardesign.simulate.returns import Rays
+from lidardesign.geometry.rays import Rays
+from lidardesign.geometry.rotation import rotations_of_quaternions
 
 MOUNTS = "mounts.json"
 # No sensor's file is called so.

@@ -18,6 +18,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import Design
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
+from lidardesign.export.common.poses import Mount, mounts
 from lidardesign.export.isaac import (
     Emitters,
     FoundSensor,
@@ -27,10 +28,9 @@ from lidardesign.export.isaac import (
     profile_rounding,
     whole_rate_hz,
 )
-from lidardesign.export.poses import Mount, mounts
-from lidardesign.rotations import rotations_of_quaternions
+from lidardesign.geometry.rays import Rays
+from lidardesign.geometry.rotation import rotations_of_quaternions
 from lidardesign.run.files import write_atomic
-from lidardesign.simulate.returns import Rays
 
 CORE = "omni:sensor:Core:"
 STATE = f"{CORE}emitterState:s001:"

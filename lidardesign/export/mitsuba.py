@@ -15,19 +15,18 @@ import numpy as np
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import Design
 from lidardesign.errors import DataError
-from lidardesign.export.folders import write_folder
-from lidardesign.export.places import Place, places, rays_of_parts, require_rays
-from lidardesign.export.poses import design_losses, mounts
-from lidardesign.export.read_back import rays_rounding
-from lidardesign.export.xml import child, document, element, read_xml
+from lidardesign.export.common.names import write_folder
+from lidardesign.export.common.poses import Place, design_losses, mounts, places, rays_of_parts, require_rays
+from lidardesign.export.common.read_back import rays_rounding
+from lidardesign.export.common.xml import child, document, element, read_xml
+from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import unit_vectors
-from lidardesign.simulate.returns import Rays
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
     from lidardesign.estimates import Estimate
-    from lidardesign.export.places import Part
+    from lidardesign.export.common.poses import Part
 
 SUFFIX = ".xml"
 VERSION = "3.0.0"

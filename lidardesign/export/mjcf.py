@@ -17,13 +17,13 @@ import numpy as np
 from lidardesign.design.sensor import Design
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
-from lidardesign.export.names import distinct, xml_text
-from lidardesign.export.poses import Mount, design_losses, mounts
-from lidardesign.export.read_back import rays_rounding
-from lidardesign.export.xml import element, number, numbers, read_xml, write_xml
+from lidardesign.export.common.names import distinct, xml_text
+from lidardesign.export.common.poses import Mount, design_losses, mounts
+from lidardesign.export.common.read_back import rays_rounding
+from lidardesign.export.common.xml import element, number, numbers, read_xml, write_xml
+from lidardesign.geometry.rays import Rays
+from lidardesign.geometry.rotation import rotations_of_quaternions
 from lidardesign.numerics import SLACK, unit_vectors
-from lidardesign.rotations import rotations_of_quaternions
-from lidardesign.simulate.returns import Rays
 
 # In the user data of each rangefinder: gate start and end [m], number of the sensor, firing time [s].
 USER_DATA = 4

@@ -9,11 +9,11 @@ import numpy as np
 
 from lidardesign.design.sensor import Design
 from lidardesign.estimates import Estimate
-from lidardesign.export.columns import losses, ray_columns, rays_of
-from lidardesign.export.read_back import rays_rounding
+from lidardesign.export.common.columns import losses, ray_columns, rays_of
+from lidardesign.export.common.read_back import rays_rounding
+from lidardesign.geometry.rays import Rays
+from lidardesign.run.arrays import NUMERIC_KINDS, read_npz
 from lidardesign.run.files import write_atomic
-from lidardesign.run.npz import NUMERIC_KINDS, read_npz
-from lidardesign.simulate.returns import Rays
 
 
 def write(design: Design, rays: Rays, path: Path) -> list[str]:

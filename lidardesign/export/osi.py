@@ -17,17 +17,24 @@ import numpy as np
 from lidardesign.design.sensor import Design
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import ROUNDING, Estimate
-from lidardesign.export.places import Place, places, rays_of_parts, require_rays
-from lidardesign.export.poses import design_losses, fire_times_s, mounts
-from lidardesign.export.read_back import rays_rounding
+from lidardesign.export.common.poses import (
+    Place,
+    design_losses,
+    fire_times_s,
+    mounts,
+    places,
+    rays_of_parts,
+    require_rays,
+)
+from lidardesign.export.common.read_back import rays_rounding
+from lidardesign.geometry.rays import Rays
+from lidardesign.geometry.rotation import rotation_of_rpy
 from lidardesign.numerics import FULL_TURN, unit_vectors
-from lidardesign.rotations import rotation_of_rpy
 from lidardesign.run.files import write_atomic
-from lidardesign.simulate.returns import Rays
 from lidardesign.space import angles
 
 if TYPE_CHECKING:
-    from lidardesign.export.places import Part
+    from lidardesign.export.common.poses import Part
 
 MICROSECONDS_PER_S = 1e6
 NANOSECONDS_PER_S = 10**9

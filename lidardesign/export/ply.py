@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidardesign.design.grid import field_on_sphere
+from lidardesign.design.layouts.grid import field_on_sphere
 from lidardesign.design.sensor import Design, tangent_directions
 from lidardesign.errors import DataError
-from lidardesign.export.folders import write_folder
-from lidardesign.export.read_back import rays_rounding
-from lidardesign.simulate.returns import Rays
+from lidardesign.export.common.names import write_folder
+from lidardesign.export.common.read_back import rays_rounding
+from lidardesign.geometry.rays import Rays
 
 if TYPE_CHECKING:
     from lidardesign.design.sensor import Sensor

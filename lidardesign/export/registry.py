@@ -10,7 +10,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import Design
 from lidardesign.errors import ConfigError
 from lidardesign.estimates import Estimate
-from lidardesign.simulate.returns import Rays
+from lidardesign.geometry.rays import Rays
 
 # A frame of a quarter of an hour, and one of a microsecond.
 SLOWEST_HZ, FASTEST_HZ = 0.001, 1e6

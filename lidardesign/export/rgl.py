@@ -16,21 +16,28 @@ import numpy as np
 from lidardesign.design.sensor import Design
 from lidardesign.errors import DataError
 from lidardesign.estimates import ROUNDING, Estimate
-from lidardesign.export.folders import write_folder
-from lidardesign.export.names import identifier, renamed_note
-from lidardesign.export.places import rays_of_parts, require_rays
-from lidardesign.export.poses import Mount, design_losses, fire_times_s, gate_losses, mounts, quaternion
-from lidardesign.export.read_back import rays_rounding
-from lidardesign.export.xml import child, document, element, numbers, read_xml
+from lidardesign.export.common.names import identifier, renamed_note, write_folder
+from lidardesign.export.common.poses import (
+    Mount,
+    design_losses,
+    fire_times_s,
+    gate_losses,
+    mounts,
+    quaternion,
+    rays_of_parts,
+    require_rays,
+)
+from lidardesign.export.common.read_back import rays_rounding
+from lidardesign.export.common.xml import child, document, element, numbers, read_xml
+from lidardesign.geometry.rays import Rays
+from lidardesign.geometry.rotation import rotations_of_quaternions
 from lidardesign.numerics import unit_vectors
-from lidardesign.rotations import rotations_of_quaternions
-from lidardesign.simulate.returns import Rays
 from lidardesign.space import angles
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-    from lidardesign.export.places import Part
+    from lidardesign.export.common.poses import Part
 
 MODEL, PATTERN, RANGES, TIMES = "model.sdf", ".mat3x4f", ".range2f", ".time1f"
 MS_PER_S = 1000.0

@@ -16,13 +16,12 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import Design
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
-from lidardesign.export.even_grid import EvenGrid
-from lidardesign.export.grid_sensors import grid_of, grid_sensor_losses
-from lidardesign.export.names import identifier, renamed_note
-from lidardesign.export.poses import Held, Mount, held_rounding, mounts, quaternion
-from lidardesign.export.xml import element, number, numbers, read_xml, write_xml
-from lidardesign.rotations import rotations_of_quaternions
-from lidardesign.simulate.returns import Rays
+from lidardesign.export.common.even_grid import EvenGrid, grid_of, grid_sensor_losses
+from lidardesign.export.common.names import identifier, renamed_note
+from lidardesign.export.common.poses import Held, Mount, held_rounding, mounts, quaternion
+from lidardesign.export.common.xml import element, number, numbers, read_xml, write_xml
+from lidardesign.geometry.rays import Rays
+from lidardesign.geometry.rotation import rotations_of_quaternions
 
 VERSION = "1.9"
 LINK = "lidar"

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from lidardesign.design.rigs.sensor_csv import read_sensor_csv, write_sensor_csv
 from lidardesign.design.sensor import Design
-from lidardesign.design.sensor_csv import read_sensor_csv, write_sensor_csv
 from lidardesign.estimates import Estimate
-from lidardesign.export.read_back import sensors_rounding
-from lidardesign.simulate.returns import Rays
+from lidardesign.export.common.read_back import sensors_rounding
+from lidardesign.geometry.rays import Rays
 
 
 def write(design: Design, rays: Rays, path: Path) -> list[str]:

@@ -15,14 +15,14 @@ import numpy as np
 from lidardesign.design.sensor import Design
 from lidardesign.errors import DataError
 from lidardesign.estimates import ROUNDING, Estimate
-from lidardesign.export.names import identifier
-from lidardesign.export.read_back import angles_between
+from lidardesign.export.common.names import identifier
+from lidardesign.export.common.read_back import angles_between
 from lidardesign.numerics import unit_vectors
 from lidardesign.run.files import write_atomic
 
 if TYPE_CHECKING:
     from lidardesign.design.sensor import Sensor
-    from lidardesign.simulate.returns import Rays
+    from lidardesign.geometry.rays import Rays
 
 MM_PER_M = 1000.0
 # Forward, to the left and up from the tip [mm]: the tip, then the far face from its bottom right against the clock.

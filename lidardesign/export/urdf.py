@@ -16,11 +16,11 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import Design
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
-from lidardesign.export.names import identifier
-from lidardesign.export.poses import Held, Mount, held_rounding, mounts
+from lidardesign.export.common.names import identifier
+from lidardesign.export.common.poses import Held, Mount, held_rounding, mounts
+from lidardesign.export.common.xml import element, numbers, read_xml, write_xml
 from lidardesign.export.sdf import held, losses, matched, sensor_element
-from lidardesign.export.xml import element, numbers, read_xml, write_xml
-from lidardesign.simulate.returns import Rays
+from lidardesign.geometry.rays import Rays
 
 # No sensor's link is called so: those end in _link. Nor its joint, for none has the name of the world.
 WORLD, BASE = "world", "lidar_base"

@@ -12,12 +12,12 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import Design
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
-from lidardesign.export.names import identifier
-from lidardesign.export.poses import held_rounding, mounts
+from lidardesign.export.common.names import identifier
+from lidardesign.export.common.poses import held_rounding, mounts
+from lidardesign.export.common.xml import element, read_xml, write_xml
 from lidardesign.export.sdf import matched
 from lidardesign.export.urdf import held_sensors, mounted_parts, notes
-from lidardesign.export.xml import element, read_xml, write_xml
-from lidardesign.simulate.returns import Rays
+from lidardesign.geometry.rays import Rays
 
 NAMESPACE = "http://www.ros.org/wiki/xacro"
 MACRO = "xacro:macro"

@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.run.files import remove_stray_temporaries, temporary_beside
-from lidardesign.run.processes import is_gone, started
+from lidardesign.run.files import is_gone, remove_stray_temporaries, started, temporary_beside
 
 try:
     import fcntl

@@ -1,19 +1,80 @@
-"""From pydantic's errors to messages that name file, line and column, what was found and what is allowed."""
+"""From pydantic's errors to messages that name file, line and column, what was found and what is allowed.
+
+What values of files are: booleans and quoted text are no numbers, and names do not steer terminals.
+
+Reading plain documents with errors that say where: a value, its key path, and its position in the file.
+"""
 
 from __future__ import annotations
 
 import difflib
+import math
 import os
 import typing
-from collections.abc import Iterable, Mapping
+import unicodedata
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from types import UnionType
 from typing import Any, TypeVar
 
+import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from lidardesign.errors import ConfigError
-from lidardesign.run.kinds import nested_model, parts, wrong_kinds
 from lidardesign.run.yaml import KeyPath
+
+LIKE_TEXT = (str, bytes, Path)
+
+
+def is_name(value: Any) -> bool:
+    """Whether a value is text that may be shown: not blank, and without characters that steer a terminal."""
+    if not isinstance(value, str) or not value.strip():
+        return False
+    return not any(unicodedata.category(letter) == "Cc" for letter in value)
+
+
+def parts(annotation: Any) -> list[Any]:
+    """An annotation and everything that it is a union, list or annotated form of."""
+    origin = typing.get_origin(annotation)
+    if origin is None:
+        return [annotation]
+    if origin in (typing.Union, UnionType, list, tuple, typing.Annotated):
+        return [part for argument in typing.get_args(annotation) for part in parts(argument)]
+    return [annotation] if origin is typing.Literal else []
+
+
+def nested_model(annotation: Any) -> type[BaseModel] | None:
+    """The model that an annotation admits, if it admits one."""
+    models = [part for part in parts(annotation) if isinstance(part, type) and issubclass(part, BaseModel)]
+    return models[0] if models else None
+
+
+def wrong_kinds(model: type[BaseModel], values: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:
+    """Where values are booleans or text although a model asks for numbers, with what stands there."""
+    if not isinstance(values, dict):
+        return
+    for name, value in values.items():
+        info = model.model_fields.get(name) if isinstance(name, str) else None
+        if info is None:
+            continue
+        nested = nested_model(info.annotation)
+        if nested is not None and isinstance(value, dict):
+            yield from wrong_kinds(nested, value, (*path, name))
+        else:
+            yield from _wrong_values(parts(info.annotation), value, (*path, name))
+
+
+def _wrong_values(admitted: list[Any], value: Any, path: KeyPath) -> Iterator[tuple[KeyPath, Any]]:
+    if isinstance(value, list | tuple):
+        for index, item in enumerate(value):
+            yield from _wrong_values(admitted, item, (*path, index))
+    if not {int, float} & {part for part in admitted if isinstance(part, type)}:
+        return
+    words = any(typing.get_origin(part) is typing.Literal or part in LIKE_TEXT for part in admitted)
+    if (isinstance(value, bool) and bool not in admitted) or (isinstance(value, str) and not words):
+        yield path, value
+
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -159,3 +220,113 @@ def _short(value: Any, limit: int = 60) -> str:
 
 def _lower(text: str) -> str:
     return text[:1].lower() + text[1:]
+
+
+LocateKey = Callable[[KeyPath], str]
+LONGEST_QUOTE = 40
+
+
+@dataclass(frozen=True)
+class Node:
+    """One value of a document.
+
+    Arguments:
+        value: Plain values: mappings, lists, text, numbers, booleans, None.
+        path: Keys and indices from the document's root.
+        locate: The position of a path, as `file:line:column`.
+    """
+
+    value: Any
+    path: KeyPath
+    locate: LocateKey
+
+    @property
+    def name(self) -> str:
+        """The key path for people, as `sensors[0].gate_m.end`."""
+        text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in self.path)
+        return text.lstrip(".") or "the document"
+
+    def error(self, message: str, *, allowed: str | None = None, hint: str | None = None) -> ConfigError:
+        """An error about this value."""
+        return ConfigError(f"{self.name} {message}", where=self.locate(self.path), allowed=allowed, hint=hint)
+
+    def wrong(self, allowed: str) -> ConfigError:
+        """The error that this value is not of the allowed kind."""
+        quoted = repr(self.value)
+        shown = quoted if len(quoted) <= LONGEST_QUOTE else quoted[: LONGEST_QUOTE - 3] + "..."
+        return self.error(f"is {shown}", allowed=allowed)
+
+    def child(self, key: str | int) -> Node:
+        """The value under a key or index."""
+        return Node(self.value[key], (*self.path, key), self.locate)
+
+    def mapping(self, required: Iterable[str], optional: Iterable[str] = ()) -> dict[str, Node]:
+        """The values of a mapping by key; an optional key that is null counts as absent."""
+        required, optional = tuple(required), tuple(optional)
+        known = (*required, *optional)
+        if not isinstance(self.value, dict):
+            raise self.wrong(f"a mapping with the keys {', '.join(known)}")
+        for key in self.value:
+            if key not in known:
+                near = difflib.get_close_matches(str(key), known, 1)
+                hint = f"{near[0]}" if near else None
+                raise self.child(key).error("is an unknown key", allowed=", ".join(known), hint=hint)
+        for key in required:
+            if key not in self.value:
+                raise self.error(f"has no key `{key}`", allowed=", ".join(known))
+        return {key: self.child(key) for key in known if self.value.get(key) is not None or key in required}
+
+    def items(self) -> list[Node]:
+        """The values of a list."""
+        if not isinstance(self.value, list):
+            raise self.wrong("a list")
+        return [self.child(index) for index in range(len(self.value))]
+
+    def number(self, low: float = -math.inf, high: float = math.inf) -> float:
+        """A finite number from low to high, both included."""
+        value = self.value
+        plain = isinstance(value, int | float) and not isinstance(value, bool)
+        if not (plain and math.isfinite(value) and low <= value <= high):
+            raise self.wrong(f"a number{_between(low, high)}")
+        return float(value)
+
+    def integer(self, low: int, high: int | None = None) -> int:
+        """A whole number of at least `low`."""
+        value = self.value
+        top = math.inf if high is None else high
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= top:
+            between = f" of at least {low}" if high is None else f" from {low} to {high}"
+            raise self.wrong(f"a whole number{between}")
+        return value
+
+    def text(self) -> str:
+        """Text that is not empty, without characters that steer a terminal."""
+        if not is_name(self.value):
+            raise self.wrong("text without control characters")
+        return self.value
+
+    def choice(self, options: Iterable[str]) -> str:
+        """One of several words."""
+        options = tuple(options)
+        if self.value not in options:
+            raise self.wrong(" or ".join(options))
+        return self.value
+
+    def numbers(self, count: int | None = None, low: float = -math.inf, high: float = math.inf) -> np.ndarray:
+        """A list of finite numbers, shape (count,)."""
+        values = [item.number(low, high) for item in self.items()]
+        if count is not None and len(values) != count:
+            raise self.error(f"has {len(values)} numbers", allowed=f"{count}")
+        return np.array(values, dtype=np.float64)
+
+    def plain(self) -> dict[str, Any]:
+        """A mapping of anything."""
+        if not isinstance(self.value, dict):
+            raise self.wrong("a mapping")
+        return self.value
+
+
+def _between(low: float, high: float) -> str:
+    if math.isinf(high):
+        return "" if math.isinf(low) else f" of at least {low:g}"
+    return f" from {low:.6g} to {high:.6g}" if math.isfinite(low) else f" of at most {high:.6g}"

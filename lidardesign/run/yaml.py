@@ -19,7 +19,7 @@ from typing import Any
 import yaml
 
 from lidardesign.errors import ConfigError, NumericalError
-from lidardesign.run.streams import is_input, read_input
+from lidardesign.run.files import is_input, read_input
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 32

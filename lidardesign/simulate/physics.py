@@ -16,14 +16,13 @@ from typing import NamedTuple
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Hits, Outcome, Rays, Returns
+from lidardesign.geometry.receiver import path_windows, range_of_path
 from lidardesign.run.validation import suggest
 from lidardesign.scene import Scene
-from lidardesign.simulate.bistatic import path_windows, range_of_path
-from lidardesign.simulate.detector import IDEAL, Detector
-from lidardesign.simulate.echoes import Background, Beams, Echoes
-from lidardesign.simulate.hits import Hits
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Outcome, Rays, Returns
+from lidardesign.simulate.detector.detector import IDEAL, Detector
+from lidardesign.simulate.detector.light import Background, Beams, Echoes
 
 EFFECTS = {
     "footprint": "beams have a width: mixed pixels, several returns",
@@ -96,7 +95,7 @@ def measure(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: 
         physics: The detector and at least one effect.
     """
     light = followed_light(scene, frame, rays, caster, physics)
-    from lidardesign.simulate.detection import detect
+    from lidardesign.simulate.detector.detection import detect
 
     found = detect(scene, frame, light.windows_m, light.echoes, light.background, physics)
     return _returns(scene, frame, rays, light.beams, light.hits, found.path_m, found.body)

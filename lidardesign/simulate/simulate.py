@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Outcome, Rays, Returns
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Outcome, Rays, Returns
 
 if TYPE_CHECKING:
     from lidardesign.simulate.physics import Physics

@@ -13,7 +13,7 @@ _HOMES = {
     "BrokenLawError": "law",
     "Finding": "law",
     "Law": "law",
-    "Limits": "limits",
+    "Limits": "law",
     "LAWS": "contract",
     "Contract": "contract",
     "check_task": "contract",

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from lidardesign.run.clock import peak_memory_bytes
-from lidardesign.testing.law import BrokenLawError, Held, Law, NotApplicable
-from lidardesign.testing.limits import GIBIBYTE
+from lidardesign.testing.law import GIBIBYTE, BrokenLawError, Held, Law, NotApplicable
 from lidardesign.testing.subject import Subject
 
 MEBIBYTE = 2**20

@@ -6,13 +6,12 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 
 from lidardesign import registry
+from lidardesign.config import RunConfig, resolve
 from lidardesign.errors import ConfigError, LidardesignError
 from lidardesign.registry import text_of
-from lidardesign.run.config import RunConfig, resolve
 from lidardesign.task import Task
 from lidardesign.testing import conduct, geometry, interface, scenes, scoring
-from lidardesign.testing.law import BrokenLawError, Finding, Law, NotApplicable, place_of, said
-from lidardesign.testing.limits import Limits
+from lidardesign.testing.law import BrokenLawError, Finding, Law, Limits, NotApplicable, place_of, said
 from lidardesign.testing.subject import Subject
 from lidardesign.testing.watch import Watch
 

@@ -10,10 +10,9 @@ import sys
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
-from lidardesign import probe
+from lidardesign import registry as probe
 from lidardesign.errors import LidardesignError
-from lidardesign.probe import START_SECONDS
-from lidardesign.registry import plugin_guard
+from lidardesign.registry import START_SECONDS, plugin_guard
 from lidardesign.space import DesignSpace
 from lidardesign.task import scenes_of
 from lidardesign.testing.fingerprint import fingerprint
@@ -21,7 +20,7 @@ from lidardesign.testing.law import BrokenLawError
 from lidardesign.testing.watch import Watch
 
 if TYPE_CHECKING:
-    from lidardesign.run.config import RunConfig
+    from lidardesign.config import RunConfig
 
 CHILD = (
     "import json, sys; request = json.loads(sys.stdin.readline()); sys.path[:] = request['path']; "

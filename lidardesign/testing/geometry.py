@@ -8,9 +8,9 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from lidardesign.density.fields import Field, build_field
+from lidardesign.density.fields.distance import Field, build_field
+from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Body, Mesh, Scene
-from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction
 from lidardesign.testing.law import BrokenLawError, Held, Law
 from lidardesign.testing.probing import rays_that_meet

@@ -7,9 +7,8 @@ import math
 import numpy as np
 from pydantic import ValidationError
 
-from lidardesign.density.settings import PRESETS
+from lidardesign.config import PRESETS, resolve
 from lidardesign.errors import ConfigError
-from lidardesign.run.config import resolve
 from lidardesign.space import DesignSpace
 from lidardesign.testing.law import BrokenLawError, Held, Law, NotApplicable
 from lidardesign.testing.subject import Subject

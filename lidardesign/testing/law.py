@@ -1,4 +1,7 @@
-"""Laws of the task contract, and what became of one: it holds, it does not, or it does not apply."""
+"""Laws of the task contract, and what became of one: it holds, it does not, or it does not apply.
+
+What the code of a task may take while it is checked.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from lidardesign.registry import AUTHOR_HINT
 
 if TYPE_CHECKING:
     from lidardesign.testing.subject import Subject
+
 
 PACKAGE = Path(__file__).parents[1]
 # Libraries that tasks call, and that errors are raised in when they are called wrongly.
@@ -128,3 +132,19 @@ def _is_of_program(file: str) -> bool:
 
 def _is_library(file: str) -> bool:
     return any(name in Path(file).parts for name in (*LIBRARIES, "importlib", "contextlib.py"))
+
+
+GIBIBYTE = 2**30
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a task's code may take.
+
+    Arguments:
+        seconds: One call of it [s].
+        memory_bytes: The process that runs it.
+    """
+
+    seconds: float = 60.0
+    memory_bytes: int = 4 * GIBIBYTE

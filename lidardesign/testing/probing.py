@@ -7,12 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Hits, Outcome, Rays, Returns
+from lidardesign.geometry.surface import sample_body
 from lidardesign.scene import Scene
-from lidardesign.simulate.hits import Hits
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Outcome, Rays, Returns
 from lidardesign.space import AZIMUTH, ELEVATION, FARTHEST_M, RANGE, DesignSpace, aim, direction
-from lidardesign.surface import sample_body
 
 DRAW_ROUNDS = 12
 # Of a scene that moves, so many frames are aimed at.

@@ -19,15 +19,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from lidardesign import registry
+from lidardesign.config import resolve
 from lidardesign.errors import ConfigError, DataError, LidardesignError
-from lidardesign.probe import BEGUN, GRACE_SECONDS, START_SECONDS, UNHEARD, Apart, answer
-from lidardesign.run.config import resolve
-from lidardesign.testing.law import LOADS, Finding, Law, place_of, said
-from lidardesign.testing.limits import Limits
+from lidardesign.registry import BEGUN, GRACE_SECONDS, START_SECONDS, UNHEARD, Apart, answer
+from lidardesign.testing.law import LOADS, Finding, Law, Limits, place_of, said
 from lidardesign.testing.watch import Watch
 
 if TYPE_CHECKING:
-    from lidardesign.run.config import RunConfig
+    from lidardesign.config import RunConfig
     from lidardesign.task import Task
     from lidardesign.testing.contract import Contract
 

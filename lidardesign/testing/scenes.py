@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 
 from lidardesign.errors import LidardesignError
-from lidardesign.evaluate.scoring import gives_residuals
+from lidardesign.evaluate.scene_scores import gives_residuals
 from lidardesign.scene import Scene
 from lidardesign.task import Split
 from lidardesign.testing.elsewhere import fingerprints_elsewhere

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidardesign.evaluate.scoring import checked_residuals, gives_residuals
+from lidardesign.evaluate.scene_scores import checked_residuals, gives_residuals
+from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Scene
-from lidardesign.simulate.returns import Returns
 from lidardesign.testing.fingerprint import fingerprint
 from lidardesign.testing.law import BrokenLawError, Held, Law, NotApplicable
 from lidardesign.testing.probing import full_rays, shuffled, with_noise, without_returns

@@ -8,18 +8,17 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
+from lidardesign.config import RunConfig
 from lidardesign.errors import LidardesignError
-from lidardesign.evaluate.scoring import checked_score
+from lidardesign.evaluate.scene_scores import checked_score
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Rays, Returns
 from lidardesign.registry import plugin_guard
-from lidardesign.run.config import RunConfig
 from lidardesign.scene import Scene
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Rays, Returns
 from lidardesign.simulate.simulate import build_casters, simulate
 from lidardesign.task import Score, Split, Task, conditions_of, scenes_of
 from lidardesign.testing.fingerprint import fingerprint
-from lidardesign.testing.law import BrokenLawError, place_of
-from lidardesign.testing.limits import Limits
+from lidardesign.testing.law import BrokenLawError, Limits, place_of
 from lidardesign.testing.probing import rays_at_targets
 from lidardesign.testing.watch import Watch
 

@@ -17,9 +17,9 @@ from pydantic import Field, model_validator
 
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.metrics import discrete_frechet_m
+from lidardesign.geometry.rays import Returns
 from lidardesign.numerics import safe_divide
 from lidardesign.scene import Body, Scene, Sphere, rigid
-from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Residuals, Score, Split, random_generator
 from lidardesign_tasks.arm_motion import Arm, Motion

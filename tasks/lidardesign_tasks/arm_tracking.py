@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lidardesign.simulate.returns import Returns
+from lidardesign.geometry.rays import Returns
 
 # A ball hit evenly over its disc is hit, on average, this share of its radius in front of its centre's plane
 MEAN_DEPTH = 2 / 3

@@ -19,9 +19,9 @@ import numpy as np
 from pydantic import Field
 
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.rays import Returns
 from lidardesign.meshio import check_mesh, usable_faces
 from lidardesign.scene import Body, Mesh, Receiver, Scene, Sign
-from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Residuals, Score, Split, random_generator
 from lidardesign_tasks.basel import MorphableModel, Unit, load_model

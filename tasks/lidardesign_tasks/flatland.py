@@ -16,9 +16,9 @@ import numpy as np
 from pydantic import Field
 
 from lidardesign.evaluate.metrics import chamfer_m, nearest_m
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Body, Capsule, Scene, Sphere, rigid
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace, aim
 from lidardesign.task import Defaults, Metric, Residuals, Score, Split, random_generator
 from lidardesign_tasks.surroundings import Surroundings

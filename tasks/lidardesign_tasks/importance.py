@@ -16,8 +16,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.surface import sample_triangles
 from lidardesign.space import FARTHEST_M, DesignSpace
-from lidardesign.surface import sample_triangles
 from lidardesign.task import random_generator
 from lidardesign_tasks.surroundings import Surroundings
 

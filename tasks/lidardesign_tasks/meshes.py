@@ -20,13 +20,12 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from lidardesign.errors import ConfigError
-from lidardesign.meshio import list_mesh_files, load_mesh
+from lidardesign.geometry.rays import Returns
+from lidardesign.meshio import COLOURS, Painted, list_mesh_files, load_mesh
 from lidardesign.numerics import circular_difference
 from lidardesign.scene import Body, Mesh, Scene, Sign
-from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace, aim
 from lidardesign.task import Defaults, Metric, Residuals, Score, Split, random_generator
-from lidardesign.vertex_weights import COLOURS, Painted
 from lidardesign_tasks.importance import WEIGHING_KEYS, Importance, middle_of_origins
 from lidardesign_tasks.motion import Motion, load_motion, moved_bounds_m
 from lidardesign_tasks.moving_surface import SURFACES, moving_residuals, moving_score, with_moving_truth

@@ -13,8 +13,8 @@ import numpy as np
 
 from lidardesign.errors import DataError
 from lidardesign.evaluate.metrics import SurfaceCloud, visible_surface
+from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Scene
-from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
 from lidardesign.task import Metric, Residuals, Score, random_generator
 from lidardesign_tasks.surface import LazyTruth, surface_residuals, surface_score

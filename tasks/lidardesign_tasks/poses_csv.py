@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from lidardesign.errors import DataError
-from lidardesign.rotations import rotation_of_quaternion, rotation_of_rpy
-from lidardesign.run.csv_rows import csv_rows
+from lidardesign.geometry.rotation import rotation_of_quaternion, rotation_of_rpy
+from lidardesign.run.arrays import csv_rows
 from lidardesign.scene import rigid
 from lidardesign.space import FARTHEST_M
 from lidardesign_tasks.pose import rotation_matrix

@@ -11,8 +11,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lidardesign.evaluate.metrics import SurfaceCloud, delaunay_surface, ray_spacing, surface_cloud, visible_surface
+from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Scene
-from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
 from lidardesign.task import Metric, Residuals, Score, random_generator
 

@@ -16,8 +16,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Scene
-from lidardesign.simulate.returns import Returns
 from lidardesign.space import DIMENSIONS, DesignSpace, X
 from lidardesign.task import Defaults, Metric, Residuals, Score, Split, conditions_of, random_generator
 from lidardesign_tasks.surroundings import Surroundings, moving

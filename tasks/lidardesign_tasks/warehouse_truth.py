@@ -15,8 +15,8 @@ from functools import cached_property
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Body, Scene
-from lidardesign.simulate.returns import Returns
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 from lidardesign.task import Metric, Residuals, Score
 

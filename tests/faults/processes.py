@@ -18,11 +18,11 @@ from pathlib import Path
 
 # What learn, fit and evaluate import late; nothing of it may be run here, because threads do not survive a fork.
 LATE = (
-    "lidardesign.cli.main", "lidardesign.cli.layouts", "lidardesign.density.body_kernels",
-    "lidardesign.density.hit_kernels", "lidardesign.density.kernels", "lidardesign.density.learn",
-    "lidardesign.density.spline_kernels", "lidardesign.design.conditions", "lidardesign.design.fit",
-    "lidardesign.evaluate.metrics", "lidardesign.evaluate.report", "lidardesign.evaluate.score",
-    "lidardesign.evaluate.tables", "lidardesign.evaluate.workers", "lidardesign_tasks.flatland", "plotly.io",
+    "lidardesign.cli.main", "lidardesign.workflow.layouts", "lidardesign.density.fields.body_kernels",
+    "lidardesign.density.visibility.hit_kernels", "lidardesign.density.fields.kernels", "lidardesign.density.learn",
+    "lidardesign.density.flow.spline_kernels", "lidardesign.design.mixture.conditions", "lidardesign.design.fit",
+    "lidardesign.evaluate.metrics", "lidardesign.evaluate.report.report", "lidardesign.evaluate.score",
+    "lidardesign.evaluate.results", "lidardesign.evaluate.workers.pool", "lidardesign_tasks.flatland", "plotly.io",
     "rich.table", "torch._dynamo",
 )  # fmt: skip
 # Every step by which files come, change their names and go: what is on the disk changes only here.

@@ -17,9 +17,9 @@ from fuzz_runs import SMALL, checkpoints, rerecord, small_config
 from fuzz_targets import TEXTS
 from mutators import Mutator, mutate_bytes, mutate_yaml
 
+from lidardesign.config import save_run_config
 from lidardesign.design.files import save_design
 from lidardesign.errors import LidardesignError
-from lidardesign.run.config import save_run_config
 
 KNOWN_CODES = (0, 1, 2, 3, 4, 5, 6)
 NUMERICAL = 5

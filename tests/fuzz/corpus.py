@@ -16,18 +16,18 @@ from captures import BIN_PS, BINS, make_capture
 from command_line import make_run
 from scipy.io import savemat
 
+from lidardesign.config import resolve
 from lidardesign.design.files import design_document
-from lidardesign.design.rays import lay_out
+from lidardesign.design.layouts.rays import lay_out
+from lidardesign.design.rigs.sensor_csv import QUERY_COLUMN, write_sensor_csv
 from lidardesign.design.sensor import Coupling, Design, RayTable, Sensor, Track
-from lidardesign.design.sensor_csv import QUERY_COLUMN, write_sensor_csv
 from lidardesign.export import csv as csv_format
 from lidardesign.export import galvo
 from lidardesign.export import npz as npz_format
 from lidardesign.registry import load_task
-from lidardesign.run.config import resolve
 from lidardesign.run.manifest import note, read_manifest
 from lidardesign.run.yaml import dump_yaml
-from lidardesign.simulate.detector_files import FOLDER as DETECTORS
+from lidardesign.simulate.detector.files import FOLDER as DETECTORS
 
 ROOT = Path(__file__).parents[2]
 TASKS = ("flatland", "meshes", "face", "arm", "warehouse", "emitter")

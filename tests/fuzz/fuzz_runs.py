@@ -10,8 +10,8 @@ from types import SimpleNamespace
 from command_line import make_run
 from fuzz_kinds import Read, of_file
 
+from lidardesign.config import RunConfig, resolve
 from lidardesign.registry import load_task
-from lidardesign.run.config import RunConfig, resolve
 
 # Two steps of a small flow, measured roughly.
 SMALL = (
@@ -35,9 +35,9 @@ def rerecord(run: Path, name: str, content: bytes) -> None:
 
 def open_manifests(folder: Path) -> Read:
     """As every command does that is given a run."""
-    from lidardesign.cli.runs import open_run
-    from lidardesign.density.snapshots import kept_snapshots
+    from lidardesign.density.training.checkpoint import kept_snapshots
     from lidardesign.run.manifest import verify
+    from lidardesign.workflow.runs import open_run
 
     run = make_run(folder / "run", count=50)
 
@@ -52,7 +52,7 @@ def open_manifests(folder: Path) -> Read:
 
 def open_samples(folder: Path) -> Read:
     """As `fit` does, behind the hash."""
-    from lidardesign.design.samples import load_samples
+    from lidardesign.samples import load_samples
 
     run = make_run(folder / "run", count=50)
 
@@ -66,7 +66,7 @@ def open_samples(folder: Path) -> Read:
 
 def open_progress(folder: Path) -> Read:
     """As `evaluate --accuracy` does, behind the hash."""
-    from lidardesign.density.ladder import seconds_at
+    from lidardesign.density.training.snapshot_quality import seconds_at
 
     run = make_run(folder / "run", count=50)
 
@@ -94,7 +94,7 @@ def open_locks(folder: Path) -> Read:
 
 def open_fields(folder: Path) -> Read:
     """As `learn` does with its cache: what cannot be used is built again."""
-    from lidardesign.density.grids import _digest, _load
+    from lidardesign.density.fields.grids import _digest, _load
 
     read = of_file(".npy", lambda path: _load(path, 64))(folder)
     return lambda content: (read(content), read(content + _digest(content)))
@@ -104,10 +104,10 @@ def _trainer(run: Path) -> object:
     """A trainer at its first step, with a small flow and nothing to train on."""
     import torch
 
+    from lidardesign.density.flow.objective import Coordinates
     from lidardesign.density.learn import make_flow
-    from lidardesign.density.objective import Coordinates
-    from lidardesign.density.parallel import ALONE
-    from lidardesign.density.training import Trainer
+    from lidardesign.density.ranks import ALONE
+    from lidardesign.density.training.training import Trainer
 
     config = small_config()
     generator = torch.Generator().manual_seed(0)

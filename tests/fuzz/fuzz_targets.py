@@ -34,8 +34,8 @@ MOST_LAID_OUT = 5000
 
 def read_configuration(path: Path) -> object:
     """As `learn --config` does, for the task that the file names."""
+    from lidardesign.config import SECTIONS, config_of, resolve
     from lidardesign.registry import load_task
-    from lidardesign.run.config import SECTIONS, config_of, resolve
     from lidardesign.run.yaml import load_yaml
 
     document = load_yaml(path)
@@ -48,10 +48,10 @@ def read_configuration(path: Path) -> object:
 
 def open_overrides(_: Path) -> Read:
     """As `--set` does, for a configuration and for constraints."""
-    from lidardesign.cli.constrain import load_constraints
+    from lidardesign.cli.commands.constrain import load_constraints
+    from lidardesign.config import resolve
     from lidardesign.errors import LidardesignError
     from lidardesign.registry import load_task
-    from lidardesign.run.config import resolve
 
     def configured(text: str) -> object:
         return resolve(load_task("flatland"), overrides=[text])
@@ -73,16 +73,16 @@ def open_overrides(_: Path) -> Read:
 
 @lru_cache(maxsize=1)
 def _spaces() -> list[object]:
+    from lidardesign.config import resolve
     from lidardesign.registry import load_task
-    from lidardesign.run.config import resolve
 
     return [resolve(load_task(name), preset="draft").space for name in ("flatland", "arm")]
 
 
 def read_constraints(path: Path) -> object:
     """As `constrain --constraints` does, up to the check that any design can satisfy them."""
-    from lidardesign.cli.constrain import load_constraints
-    from lidardesign.design.constraints import check_feasible
+    from lidardesign.cli.commands.constrain import load_constraints
+    from lidardesign.design.constraints.document import check_feasible
     from lidardesign.errors import InfeasibleError
     from lidardesign.run.yaml import dump_yaml, parse_yaml
 
@@ -102,7 +102,7 @@ def read_constraints(path: Path) -> object:
 def read_design(path: Path) -> object:
     """As `show` and `export` do: what was read can be written and read again, and its rays are rays."""
     from lidardesign.design.files import design_document, design_from_document, load_design
-    from lidardesign.design.rays import lay_out
+    from lidardesign.design.layouts.rays import lay_out
     from lidardesign.run.yaml import dump_yaml, parse_yaml
 
     design = load_design(path)
@@ -116,7 +116,7 @@ def read_design(path: Path) -> object:
 
 def read_detector(path: Path) -> object:
     """As `evaluate --detector` does."""
-    from lidardesign.simulate.detector_files import load_detector
+    from lidardesign.simulate.detector.files import load_detector
 
     return load_detector(path)
 
@@ -139,7 +139,7 @@ def read_face(path: Path) -> object:
 
 def read_capture(path: Path) -> object:
     """As `capture` does; true ranges may be NaN where nothing is."""
-    from lidardesign.evaluate.capture import load_capture
+    from lidardesign.evaluate.captures.capture import load_capture
 
     capture = load_capture(path)
     return replace(capture, true_range_m=None), capture.spacing_rad, capture.background_per_bin

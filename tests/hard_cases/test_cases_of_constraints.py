@@ -19,22 +19,22 @@ from test_constraints import CONTRADICTIONS, FACE, ROOM, SAMPLES
 from test_fit import FREE, MOVING, log_target
 from test_rays import drawn_from, three_sensors
 
-import lidardesign.design.check as checker
-from lidardesign.design.bounds import Bounds
-from lidardesign.design.check import check_design
-from lidardesign.design.constraints import Constraints, check_feasible
-from lidardesign.design.em import fit_mixture
-from lidardesign.design.ensemble import admitted
-from lidardesign.design.features import Axes, Features
+import lidardesign.design.constraints.check as checker
+from lidardesign.design.constraints.bounds import Bounds
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints, check_feasible
 from lidardesign.design.files import design_document, design_from_document
 from lidardesign.design.fit import fit
-from lidardesign.design.mixture import log_density
-from lidardesign.design.rays import MOST_RAYS, lay_out, split_budget
-from lidardesign.design.samples import Samples
+from lidardesign.design.layouts.rays import MOST_RAYS, lay_out, split_budget
+from lidardesign.design.mixture.em import fit_mixture
+from lidardesign.design.mixture.ensemble import admitted
+from lidardesign.design.mixture.features import Axes, Features
+from lidardesign.design.mixture.mixture import log_density
+from lidardesign.design.mixture.support import LEAST_MASS
 from lidardesign.design.sensor import Design, interval_factor
-from lidardesign.design.support import LEAST_MASS
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.evaluate.metrics import DRAW_ROUNDS
+from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
 
 Z = interval_factor(0.95)
@@ -457,7 +457,7 @@ class TestBoundsHoldOnTheWrittenFile:
                 assert not np.any(sensor["origin_m"]["covariance"])
 
     def test_the_checker_shares_no_code_with_the_fit(self):
-        rules = {"lidardesign.design.check_excluded", "lidardesign.design.check_snap", "lidardesign.numerics"}
+        rules = {"lidardesign.design.constraints.check", "lidardesign.design.snap.check", "lidardesign.numerics"}
         # parts have to be looked up, and angles mean what they mean: data and conventions, nothing of the fit
         parts = {f"lidardesign.design.catalog.{name}" for name in ("library", "part")}
         conventions = {"lidardesign.errors", "lidardesign.space", "lidardesign.design.sensor"}

@@ -19,25 +19,32 @@ from test_learn import SMALL, BallTask
 from test_physical import from_the_ceiling
 from test_visibility import along_axis, both_ways, config_of, plate, transmittance_on, wall
 
-from lidardesign.density.fields import build_field
-from lidardesign.density.flow import DesignFlow
-from lidardesign.density.frames import FramesTarget
+from lidardesign.config import (
+    FASTEST_PER_M,
+    LONGEST_M,
+    SHORTEST_M,
+    DensitySettings,
+    LearningSettings,
+    RunConfig,
+    resolve,
+)
+from lidardesign.density.fields.distance import build_field
+from lidardesign.density.flow.flow import DesignFlow
+from lidardesign.density.flow.objective import Coordinates
 from lidardesign.density.learn import learn
-from lidardesign.density.losses import Pool, balancing_loss, pathwise_loss
-from lidardesign.density.objective import Coordinates
-from lidardesign.density.prepare import prepare_target
-from lidardesign.density.resolution import ROUNDINGS, UNRESOLVED_SHARE
-from lidardesign.density.settings import FASTEST_PER_M, LONGEST_M, SHORTEST_M, DensitySettings, LearningSettings
-from lidardesign.density.target import build_target
-from lidardesign.density.visibility import MINIMUM_COSINE, Optics, Quadrature, RayBatch, Raycast
+from lidardesign.density.target.frames import FramesTarget
+from lidardesign.density.target.prepare import prepare_target
+from lidardesign.density.target.resolution import ROUNDINGS, UNRESOLVED_SHARE
+from lidardesign.density.target.target import build_target
+from lidardesign.density.training.losses import Pool, balancing_loss, pathwise_loss
+from lidardesign.density.visibility.quadrature import MINIMUM_COSINE, Optics, Quadrature, RayBatch, Raycast
 from lidardesign.design.fit import fit
-from lidardesign.design.rays import lay_out
-from lidardesign.design.samples import Samples, load_samples
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.registry import load_task
-from lidardesign.run.config import RunConfig, resolve
+from lidardesign.samples import Samples, load_samples
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
-from lidardesign.simulate.raycast import SceneCaster
 from lidardesign.space import ELEVATION, RANGE, DesignSpace, aim, direction, observed_point
 from lidardesign.task import TaskConfig
 

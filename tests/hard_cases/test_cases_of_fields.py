@@ -20,17 +20,16 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from test_meshio import BOX_FACES, BOX_VERTICES, write_box
 
-from lidardesign.density import grids
-from lidardesign.density.bodies import collect_bodies
-from lidardesign.density.compared_fields import ExactField, InterpolatedField
-from lidardesign.density.fields import BodyField, TableField, build_field
-from lidardesign.density.frames import near_pairs
-from lidardesign.density.settings import DensitySettings
-from lidardesign.density.target import Target, build_target
-from lidardesign.density.visibility import NoVisibility, Optics
+from lidardesign.config import DensitySettings
+from lidardesign.density.fields import grids
+from lidardesign.density.fields.bodies import collect_bodies
+from lidardesign.density.fields.distance import BodyField, TableField, build_field
+from lidardesign.density.target.frames import near_pairs
+from lidardesign.density.target.target import Target, build_target
+from lidardesign.density.visibility.quadrature import NoVisibility, Optics
 from lidardesign.errors import DataError
-from lidardesign.meshio import SUFFIXES, check_mesh, load_mesh, signed_volume_m3
-from lidardesign.orientation import unique_rows
+from lidardesign.evaluate.accuracy.fields import ExactField, InterpolatedField
+from lidardesign.meshio import SUFFIXES, check_mesh, load_mesh, signed_volume_m3, unique_rows
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
 

@@ -14,16 +14,16 @@ from cases import hard_case
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidardesign.cli.constrain import load_constraints
-from lidardesign.density.training import CHECKPOINT
+from lidardesign.cli.commands.constrain import load_constraints
+from lidardesign.config import resolve
+from lidardesign.density.training.checkpoint import FORMAT, load_arrays, save_arrays
+from lidardesign.density.training.training import CHECKPOINT
 from lidardesign.design.files import load_design
 from lidardesign.errors import ConfigError, DataError, LidardesignError
 from lidardesign.registry import load_task
-from lidardesign.run.checkpoint import FORMAT, load_arrays, save_arrays
-from lidardesign.run.config import resolve
 from lidardesign.run.manifest import record, start_manifest
 from lidardesign.run.yaml import MAX_BYTES, MAX_DEPTH, parse_yaml
-from lidardesign.simulate.detector_files import load_detector
+from lidardesign.simulate.detector.files import load_detector
 
 BOMB_LEVELS = 7
 # name: text, position of the mistake, words of the reason
@@ -322,10 +322,10 @@ def fresh_trainer(run, hidden):
 
     import torch
 
+    from lidardesign.density.flow.objective import Coordinates
     from lidardesign.density.learn import make_flow
-    from lidardesign.density.objective import Coordinates
-    from lidardesign.density.parallel import ALONE
-    from lidardesign.density.training import Trainer
+    from lidardesign.density.ranks import ALONE
+    from lidardesign.density.training.training import Trainer
 
     small = [f"learning.hidden={hidden}", "learning.layers=1", "learning.bins=4"]
     config = resolve(load_task("flatland"), preset="draft", overrides=small)

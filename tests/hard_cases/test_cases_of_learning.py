@@ -25,16 +25,17 @@ from zuko.distributions import BoxUniform
 from zuko.transforms import MonotonicRQSTransform
 
 from lidardesign.cli.main import run as run_program
-from lidardesign.density import measure, training
-from lidardesign.density.ground import prepare_ground
+from lidardesign.config import DensitySettings
+from lidardesign.density.flow.splines import BoundedSpline
 from lidardesign.density.learn import learn, make_trainer
-from lidardesign.density.round_trip import TOLERANCE_NATS, round_trip_nats
-from lidardesign.density.settings import DensitySettings
-from lidardesign.density.splines import BoundedSpline
-from lidardesign.density.target import Target
-from lidardesign.design.samples import load_samples
+from lidardesign.density.target.target import Target
+from lidardesign.density.training import quality as measure
+from lidardesign.density.training import training
+from lidardesign.density.training.checkpoint import load_arrays
+from lidardesign.density.training.losses import TOLERANCE_NATS, round_trip_nats
+from lidardesign.density.training.training_data import prepare_ground
 from lidardesign.errors import DivergenceError
-from lidardesign.run.checkpoint import load_arrays
+from lidardesign.samples import load_samples
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
 

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from test_mixture import POINT, WHOLE, Z, drawn, features_of, naive_log_density, random_mixture
 from test_track import shelves
 
-from lidardesign.design.bounds import Bounds, Floors
-from lidardesign.design.em import climb, fit_mixture, seed
-from lidardesign.design.features import Axes, Features
+from lidardesign.design.constraints.bounds import Bounds, Floors
 from lidardesign.design.files import design_document
 from lidardesign.design.fit import fit
-from lidardesign.design.mixture import Mixture, expect, log_density, responsibilities
-from lidardesign.design.samples import Samples
+from lidardesign.design.mixture.em import climb, fit_mixture, seed
+from lidardesign.design.mixture.features import Axes, Features
+from lidardesign.design.mixture.mixture import Mixture, expect, log_density, responsibilities
+from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
 
 # rounding of a log-likelihood of some hundred nats that is summed over some thousand samples

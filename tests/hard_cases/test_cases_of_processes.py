@@ -22,11 +22,12 @@ from cases import hard_case
 from command_line import caller, files_under, make_run, program
 from lidardesign_tasks.flatland import FlatlandTask
 
-from lidardesign import probe, registry
-from lidardesign.density.stages import with_steps
+from lidardesign import registry
+from lidardesign import registry as probe
+from lidardesign.config import load_run_config, save_run_config
+from lidardesign.density.training.schedule import with_steps
 from lidardesign.errors import PluginError
 from lidardesign.run import lock
-from lidardesign.run.config import load_run_config, save_run_config
 from lidardesign.run.files import remove_stray_temporaries
 from lidardesign.run.lock import run_lock
 from lidardesign.run.manifest import note, start_manifest
@@ -182,7 +183,7 @@ class TestKillsFullDisksAndTwoWriters:
         assert remove_stray_temporaries(run) == []
 
     def test_a_second_writer_is_told_who_writes_and_changes_nothing(self, tmp_path, lidardesign, monkeypatch):
-        monkeypatch.setattr("lidardesign.cli.designs.WAIT_S", 0.05)
+        monkeypatch.setattr("lidardesign.cli.tables.designs.WAIT_S", 0.05)
         run = make_run(tmp_path / "run", count=1000)
         before = files_under(run)
         with run_lock(run):

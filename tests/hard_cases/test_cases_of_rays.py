@@ -13,15 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from lidardesign.design.files import design_from_document
 from lidardesign.errors import ConfigError, LidardesignError
-from lidardesign.evaluate.messages import pack, scores_as_document, scores_from_document, unpack
-from lidardesign.evaluate.passes import score_in_scene
+from lidardesign.evaluate.scene_scores import score_in_scene
 from lidardesign.evaluate.score import slipped_notes
+from lidardesign.evaluate.workers.worker import pack, scores_as_document, scores_from_document, unpack
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Rays
+from lidardesign.geometry.triangles import BESIDE_SHARE, SecondCasts, Triangles
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.simulate.plan import Planner
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Rays
 from lidardesign.simulate.simulate import simulate
-from lidardesign.simulate.triangles import BESIDE_SHARE, SecondCasts, Triangles
 from lidardesign.task import Metric, Score
 
 

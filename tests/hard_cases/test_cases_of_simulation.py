@@ -25,7 +25,7 @@ from lidardesign_tasks.warehouse import WarehouseTask
 from test_called_for import EVERYTHING, face_rays, heads
 from test_score import design, make_request, rows_by_key
 
-from lidardesign.density.ground import refuse_blind_receiver
+from lidardesign.density.training.training_data import refuse_blind_receiver
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.evaluate.metrics import (
     SurfaceCloud,
@@ -35,16 +35,16 @@ from lidardesign.evaluate.metrics import (
     sample_surface,
     visible_surface,
 )
+from lidardesign.evaluate.scene_scores import checked_score
 from lidardesign.evaluate.score import evaluate
-from lidardesign.evaluate.scoring import checked_score
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Outcome, Rays
+from lidardesign.geometry.receiver import path_of_range, path_windows, range_of_path
 from lidardesign.scene import Body, Box, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.bistatic import path_of_range, path_windows, range_of_path
-from lidardesign.simulate.detector import IDEAL, Detector
-from lidardesign.simulate.detector_files import load_detector
+from lidardesign.simulate.detector.detector import IDEAL, Detector
+from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.physics import EFFECTS, Physics
 from lidardesign.simulate.plan import Planner, parse_effects
-from lidardesign.simulate.raycast import SceneCaster
-from lidardesign.simulate.returns import Outcome, Rays
 from lidardesign.simulate.simulate import gate_outcomes, simulate
 from lidardesign.space import DesignSpace, direction
 from lidardesign.task import conditions_of
@@ -264,7 +264,7 @@ import sys
 import numpy as np
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.simulate.plan import Planner
-from lidardesign.simulate.returns import Rays
+from lidardesign.geometry.rays import Rays
 from lidardesign.simulate.simulate import simulate
 ahead = np.array([[1.0, 0.0, 0.0]])
 rays = Rays(0 * ahead, ahead, np.array([[0.0, 5.0]]), np.zeros(1), np.zeros(1))
@@ -285,9 +285,9 @@ print(*(name for name in sys.modules if name.startswith("lidardesign.simulate.ef
 import sys
 import numpy as np
 from lidardesign.scene import Body, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector import Detector
+from lidardesign.simulate.detector.detector import Detector
 from lidardesign.simulate.physics import Physics
-from lidardesign.simulate.returns import Rays
+from lidardesign.geometry.rays import Rays
 from lidardesign.simulate.simulate import simulate
 ahead = np.array([[1.0, 0.0, 0.0]])
 rays = Rays(0 * ahead, ahead, np.array([[0.0, 5.0]]), np.zeros(1), np.zeros(1))

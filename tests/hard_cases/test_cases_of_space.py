@@ -14,21 +14,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from lidardesign.density.flow import DesignFlow
-from lidardesign.density.ground import prepare_ground
-from lidardesign.density.objective import Coordinates
-from lidardesign.density.settings import DensitySettings, LearningSettings
-from lidardesign.density.target import MINIMUM_POLE_COSINE, build_target
+from lidardesign.config import DensitySettings, LearningSettings, RunConfig, resolve
+from lidardesign.density.flow.flow import DesignFlow
+from lidardesign.density.flow.objective import Coordinates
+from lidardesign.density.target.target import MINIMUM_POLE_COSINE, build_target
+from lidardesign.density.training.training_data import prepare_ground
 from lidardesign.design.files import load_design, save_design
 from lidardesign.design.fit import fit
-from lidardesign.design.samples import Samples
+from lidardesign.design.rigs.sensor_csv import COLUMNS
 from lidardesign.design.sensor import boresight_frame, tangent_directions
-from lidardesign.design.sensor_csv import COLUMNS
 from lidardesign.errors import ConfigError, DataError, NumericalError
 from lidardesign.numerics import circular_mean
 from lidardesign.registry import load_task
-from lidardesign.run.config import RunConfig, resolve
 from lidardesign.run.yaml import dump_yaml
+from lidardesign.samples import Samples
 from lidardesign.scene import Body, Plane, Scene, Sphere, rigid
 from lidardesign.space import (
     AZIMUTH,

@@ -27,24 +27,24 @@ from test_hard_learning import interrupt_after_a_checkpoint
 from test_registry import BROKEN, GOOD
 
 from lidardesign.cli.main import run as run_program
-from lidardesign.density.diagnostics import coverage, quality
-from lidardesign.density.settings import DensitySettings, LearningSettings
-from lidardesign.density.target import build_target
-from lidardesign.design.check import check_design
-from lidardesign.design.constraints import Constraints
+from lidardesign.config import DensitySettings, LearningSettings
+from lidardesign.density.target.target import build_target
+from lidardesign.density.training.checkpoint import load_arrays, save_arrays
+from lidardesign.density.training.quality import coverage, quality
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.fit import fit
-from lidardesign.design.quantise import lloyd
-from lidardesign.design.rays import split_budget
-from lidardesign.design.samples import Samples
+from lidardesign.design.layouts.quantise import lloyd
+from lidardesign.design.layouts.rays import split_budget
 from lidardesign.errors import DataError, LidardesignError
-from lidardesign.evaluate.scoring import checked_score
+from lidardesign.evaluate.scene_scores import checked_score
 from lidardesign.evaluate.statistics import bootstrap_interval
+from lidardesign.geometry.rays import Rays
 from lidardesign.run import yaml as yaml_module
-from lidardesign.run.checkpoint import load_arrays, save_arrays
 from lidardesign.run.manifest import record, start_manifest
 from lidardesign.run.yaml import load_yaml
+from lidardesign.samples import Samples
 from lidardesign.scene import Ambient, Body, Box, Capsule, Medium, Mesh, Scene, Sphere, rigid
-from lidardesign.simulate.returns import Rays
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import DesignSpace
 from lidardesign.task import Score
@@ -278,7 +278,7 @@ WRITER = """
 import sys
 from pathlib import Path
 import numpy as np
-from lidardesign.run.checkpoint import save_arrays
+from lidardesign.density.training.checkpoint import save_arrays
 print("ready", flush=True)
 for step in range(1, 100_000):
     save_arrays(Path(sys.argv[1]), "checkpoint.safetensors", {"weights": np.full(20_000, float(step))}, {"step": step})

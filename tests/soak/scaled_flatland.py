@@ -12,8 +12,8 @@ from lidardesign_tasks.flatland import FlatlandConfig, FlatlandTask, reconstruct
 from pydantic import Field
 
 from lidardesign.evaluate.metrics import chamfer_m
+from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Body, Capsule, Scene, Sphere
-from lidardesign.simulate.returns import Returns
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Score, Split
 

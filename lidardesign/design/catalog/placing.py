@@ -12,9 +12,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lidardesign.design.catalog.part import Part
-from lidardesign.design.catalog.thinning import thinned
-from lidardesign.design.grid import grid_rows, grid_tangent
+from lidardesign.design.catalog.part import Part, thinned
+from lidardesign.design.layouts.grid import grid_rows, grid_tangent
 from lidardesign.design.sensor import (
     DEFAULT_LEVEL,
     MOST_RAYS,
@@ -25,7 +24,7 @@ from lidardesign.design.sensor import (
     interval_factor,
 )
 from lidardesign.errors import ConfigError
-from lidardesign.simulate.returns import Rays
+from lidardesign.geometry.rays import Rays
 from lidardesign.space import angles, observed_point
 
 Wanted = Callable[[np.ndarray], np.ndarray]

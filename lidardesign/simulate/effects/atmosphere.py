@@ -1,4 +1,4 @@
-r"""The air weakens light and sends some of it back.
+"""The air weakens light and sends some of it back.
 
 Light fades as exp(-alpha * length) over its whole way, twice the half path (Beer, Lambert). Haze at a range r of a ray
 sends back, per metre, beta times the solid angle of the aperture there times exp(-alpha (r + b)), with b the way from
@@ -8,23 +8,32 @@ There a pixel looks along the ray, sharp at the range f of what the ray meets, o
 to the solid angle A (1 / r - 1 / f)^2, as an aperture A seen from r is wider than from f; a pixel of a smaller solid
 angle catches its share of that (the overlap of an ideal lens). So haze right before the sensor counts no more than a
 pixel's solid angle, and not 1 / r^2. A fixed receiver elsewhere hears all haze in its view.
+
+Fog and haze: light that fades, and light that comes back from the air itself.
+
+Over a range R the air leaves exp(-2 alpha R) of an echo's photons: the range strays more and returns are lost, as
+from fewer photons. Haze sends h counts into a bin, most at the gate's start; it is taken for the echo with at most
+(B - 1) exp(-(sqrt(s) - sqrt(h))^2) (see `Counts.mistaken`), and raises the level that an echo has to stand out from. A
+ray without a return may take it for one where any of it is counted: 1 - exp(-all of its counts), as one count is enough
+in the dark. Where a detector is blind after a count, haze before an echo leaves less of it (see `Blindness`).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lidardesign.geometry.rays import Hits, Rays
+from lidardesign.geometry.receiver import in_view, path_of_range, range_of_path
 from lidardesign.numerics import safe_divide
 from lidardesign.scene import Medium, Receiver, Scene
-from lidardesign.simulate.bistatic import path_of_range, range_of_path
-from lidardesign.simulate.detector import Detector, Photons
-from lidardesign.simulate.echoes import Background, Beams, Echoes
-from lidardesign.simulate.hits import Hits
-from lidardesign.simulate.receiver_view import in_view
-from lidardesign.simulate.returns import Rays
+from lidardesign.simulate.detector.detector import Detector, Photons
+from lidardesign.simulate.detector.light import Background, Beams, Echoes
+from lidardesign.simulate.effects.expected_counts import Blindness, Counts, Echo, changed_share
+from lidardesign.simulate.effects.first_hits import Sight, Stake
 
 # Cells of haze along a ray, each longer than the one before by the same factor: counts are even within a cell, and
 # over a gate from 1 cm to 10 m its profile falls by a third from each to the next.
@@ -155,3 +164,29 @@ def _solid_angle_sr(distance_m: np.ndarray, aperture_m2: float) -> np.ndarray:
     slant = np.sqrt(distance_m**2 + squared)
     # 2 pi (1 - d / slant) without its cancellation from afar
     return 2 * math.pi * squared / (slant * (slant + distance_m))
+
+
+def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
+    """Why the air does not matter, if so."""
+    if scene.medium is None or scene.medium.extinction_per_m == scene.medium.backscatter_per_m_sr == 0:
+        return "the air is clear"
+    return None if detector.photons is not None else "the detector hears an echo however weak"
+
+
+def stake(sight: Sight, counts: Counts) -> Stake:
+    """Of air that weakens and scatters."""
+    sigma_m = sight.sigma_m()
+    blind, without = Blindness.of(counts), Blindness.of(counts, haze=False)
+    clear, left = counts.signal, blind.left
+    haze, fullest = (counts.pulses * part for part in counts.haze_per_pulse)
+    # haze raises the level of background that a return has to stand out from
+    fewer = counts.more_missed(Echo(clear, sigma_m), Echo(left, sigma_m, haze / counts.bins))
+    any_count = -np.expm1(-haze)
+    own = counts.per_bin * blind.under
+    wrong = np.minimum(counts.mistaken(left, counts.per_bin + fullest, own, sigma_m), any_count)
+    changed = np.maximum(changed_share(clear, counts.in_air), changed_share(without.left, left))
+    squared = counts.error_m(left, sigma_m) ** 2 * np.minimum(2 * np.sqrt(changed) + any_count, 1.0)
+    lost = np.where(sight.returned, fewer + wrong, any_count)
+    medium = sight.scene.medium
+    reason = f"air that dims light by {100 * -np.expm1(-2 * medium.extinction_per_m):.3g} % per metre of range"
+    return Stake(squared, np.minimum(lost, 1.0), reason)

@@ -24,26 +24,45 @@ that; their noise falls with the root of `PATHS`, which all rays share.
 
 Echoes are the simulator's bins of half path, a quarter of the detector's resolution where no more than `MOST_CELLS` of
 them reach to the gates' ends. They name the body of the ray's first hit, whose echo they disturb.
+
+Light that comes back by way of other surfaces: later, and weaker by each bounce.
+
+From points that rays meet, other surfaces are looked for, and what they send there is bounded (`multipath_bound`): of
+a flood or for one receiver that hears all, what they get of the light; where one spot at a time is lit and seen,
+what falls on it again. What is late by less than a detector tells apart moves the echo by its delay times its share;
+what is late by more makes its own peak, taken for the echo at most where all of it outweighs that. Where a receiver
+that stands elsewhere does not hear the echo at all, whatever comes by detours may be taken for it.
+
+Light that the spots of other rays send to a ray's own, where a flood lights all of them at once.
+
+All rays have the same power. Ray j lights a spot Q at the distance R_j, which sends rho_Q of it on; a spot P of the
+area A, seen by pixel i, gets rho_Q cos cos A / (pi d^2) of what its own ray gives it, late by (R_j + d - R_i) / 2 of
+half path. Further bounces bring at most 1 / (1 - rho) times as much in all, rho the largest reflectance (energy is
+kept; a geometric series). Whether anything stands between the spots is not asked, and beams are taken to end on them:
+where only part of a wide beam does, its own light is weaker than is said here.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from lidardesign.numerics import EPSILON_FLOAT32
-from lidardesign.scene import Scene
-from lidardesign.simulate.bistatic import path_windows
-from lidardesign.simulate.detector import Detector
-from lidardesign.simulate.echoes import Beams, Echoes
-from lidardesign.simulate.histogram import resolution_m
-from lidardesign.simulate.hits import Hits
-from lidardesign.simulate.light_transport import Lights, PathBins, Transients, render_transient
+from lidardesign.geometry.raycast import shared_caster
+from lidardesign.geometry.rays import Hits, Rays
+from lidardesign.geometry.receiver import in_view, path_windows
+from lidardesign.numerics import EPSILON_FLOAT32, safe_divide
+from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere
+from lidardesign.simulate.detector.detector import Detector
+from lidardesign.simulate.detector.histogram import resolution_m
+from lidardesign.simulate.detector.light import Beams, Echoes
+from lidardesign.simulate.effects.expected_counts import Counts
+from lidardesign.simulate.effects.first_hits import Sight, Stake
+from lidardesign.simulate.light_transport.multipath_bound import Detours, lamp_bound, pixel_bound
+from lidardesign.simulate.light_transport.transport import Lights, PathBins, Transients, render_transient
 from lidardesign.simulate.physics import Physics, direct_echoes
-from lidardesign.simulate.raycast import shared_caster
-from lidardesign.simulate.returns import Rays
 
 MOST_SURFACES = 6
 # Light paths of a frame, all rays together: about a second.
@@ -219,3 +238,133 @@ def _bins(detector: Detector, reach_m: float) -> PathBins:
     width_m = 10 ** (math.ceil(math.log10(finest_m) * WIDTHS_PER_DECADE) / WIDTHS_PER_DECADE)
     count = math.ceil(2 * reach_m / width_m) + 1
     return PathBins(width_m, 1 << (count - 1).bit_length())
+
+
+MOST_POINTS, AT_ONCE = 64, 8
+# Bounces between white walls all around never end; a share this close to 1 stands for theirs.
+WHITEST = 0.999
+
+
+def moved_by_spots_m(sight: Sight) -> np.ndarray:
+    """How far light from the spots of the same list moves ranges, for some rays of each list, shape (K,) [m]."""
+    found = [np.zeros(1)]
+    for row in np.unique(sight.row[sight.returned]):
+        rays = np.flatnonzero((sight.row == row) & (sight.hits.body >= 0))
+        own = np.flatnonzero((sight.row == row) & sight.returned)
+        own = own[np.unique(np.linspace(0, len(own) - 1, MOST_POINTS).astype(int))]
+        # a few at a time, so that memory stays small beside long lists
+        found += [_moved_m(sight, some, rays) for some in np.array_split(own, max(len(own) // AT_ONCE, 1))]
+    return np.concatenate(found)
+
+
+def _moved_m(sight: Sight, own: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Of spots `own` by those of `rays`, all of one list, shape (len(own),) [m]."""
+    place = sight.rays.origin_m + sight.range_m[:, None] * sight.rays.direction
+    reflectance = np.array([body.reflectance for body in sight.scene.bodies])[sight.hits.body[rays]]
+    photons, half_rad = sight.detector.photons, sight.detector.divergence_rad / 2
+    pixel_sr = max(photons.field_of_view_sr, math.pi * half_rad**2)
+    area_m2 = (pixel_sr * sight.range_m**2 / sight.cosine)[own, None]
+    between = place[rays] - place[own, None]
+    apart_m = np.linalg.norm(between, axis=2)
+    leaving = np.maximum(np.einsum("ikx,ix->ik", between, sight.hits.normal[own]), 0.0)
+    facing = np.maximum(-np.einsum("ikx,kx->ik", between, sight.hits.normal[rays]), 0.0)
+    share = reflectance * np.minimum(safe_divide(leaving * facing * area_m2, math.pi * apart_m**4), 1.0)
+    late_m = np.abs(sight.range_m[rays] + apart_m - sight.range_m[own, None]) / 2
+    near = late_m < sight.resolution_m
+    whitest = min(max(body.reflectance for body in sight.scene.bodies), WHITEST)
+    return np.minimum((share * late_m * near).sum(axis=1) / (1 - whitest), sight.resolution_m)
+
+
+# What lies in the way by less than this share of it is the surface itself: rays are traced to float32.
+CLEARANCE_SHARE = 1e-4
+# Shares of late light below this are not told apart [%].
+TINY_PERCENT = 0.01
+
+
+def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
+    """Why no light can go from one surface to another, if so."""
+    if len(scene.bodies) == 1 and _convex_from(scene.bodies[0], lists):
+        return "one convex body lights nothing else"
+    if not detector.bin_s and not detector.pulse_sigma_s:
+        return "later light is told apart from the first echo"
+    if max(body.reflectance for body in scene.bodies) == 0:
+        return "nothing reflects"
+    return None
+
+
+def stake(sight: Sight, counts: Counts) -> Stake:
+    """Of light that is late, the same for all rays: as its rms over points."""
+    rows = np.flatnonzero(sight.returned)
+    if not len(rows):
+        return sight.nothing("no ray returns")
+    found = _detours(sight, rows)
+    moved_m = np.minimum(found.shift_m, sight.width_m[rows][found.chosen])
+    squared_m2 = np.mean(moved_m**2)
+    by_spots_m2 = np.mean(moved_by_spots_m(sight) ** 2) if _is_flood(sight) else 0.0
+    alone = _hidden(sight, rows[found.chosen]) & (found.seen > 0)
+    outweighed = np.mean((found.apart > 1) | alone)
+    late = 100 * found.share.mean()
+    reason = (
+        f"other surfaces fill {100 * found.seen.mean():.2g} % of what a surface sees; "
+        + (f"late light is at most {late:.2g} %" if late >= TINY_PERCENT else f"late light is below {TINY_PERCENT} %")
+        + (f", and all there is of {100 * alone.mean():.3g} % of returns" if alone.any() else "")
+    )
+    if by_spots_m2 > squared_m2:
+        reason = f"the spots of a flood light each other, {reason}"
+    return Stake(np.full(len(sight), max(squared_m2, by_spots_m2)), np.where(sight.returned, outweighed, 0.0), reason)
+
+
+def _hidden(sight: Sight, rows: np.ndarray) -> np.ndarray:
+    """Whether the light of some rays that hit something does not come straight to a receiver elsewhere, (K,) bool."""
+    receiver = sight.scene.receiver
+    if receiver is None:
+        return np.zeros(len(rows), dtype=bool)
+    home, origin_m = np.asarray(receiver.origin_m), sight.rays.origin_m[rows]
+    points = origin_m + sight.range_m[rows, None] * sight.rays.direction[rows]
+    way, hidden = points - home, ~in_view(receiver, points)
+    length_m = np.linalg.norm(way, axis=1)
+    asked = ~hidden & (origin_m != home).any(axis=1) & (length_m > 0)
+    met_m = sight.caster.first_hit(np.broadcast_to(home, way[asked].shape), way[asked]).range_m
+    hidden[asked] = met_m < length_m[asked] * (1 - CLEARANCE_SHARE)
+    return hidden
+
+
+def _is_flood(sight: Sight) -> bool:
+    """Whether all rays are lit at once, and each is heard where it starts."""
+    photons = sight.detector.photons
+    return sight.scene.receiver is None and photons is not None and photons.emission == "flood"
+
+
+def _detours(sight: Sight, rows: np.ndarray) -> Detours:
+    rays, hits = sight.rays.subset(rows), sight.hits
+    hits = Hits(hits.range_m[rows], hits.body[rows], hits.normal[rows])
+    photons, receiver = sight.detector.photons, sight.scene.receiver
+    flood = photons is not None and photons.emission == "flood"
+    if not flood and receiver is None:
+        beam_sr = math.pi * (sight.detector.divergence_rad / 2) ** 2
+        pixel_sr = beam_sr if photons is None else max(photons.field_of_view_sr, beam_sr)
+        return pixel_bound(sight.scene, rays, hits, sight.caster, pixel_sr, sight.resolution_m)
+    # a flood's pixels look at spots that its emitters light; a receiver alone hears what is sent anywhere in its view
+    lamp_m = None if flood or receiver is None else np.asarray(receiver.origin_m)
+    return lamp_bound(sight.scene, rays, hits, sight.caster, lamp_m, sight.resolution_m)
+
+
+def _convex_from(body: Body, lists: Sequence[Rays]) -> bool:
+    """Whether a body is convex as all rays see it: from outside."""
+    if isinstance(body.shape, Mesh):
+        return False
+    poses = body.poses if body.poses.ndim == 3 else body.poses[None]
+    return not any(_inside(body, rays.origin_m, pose).any() for rays in lists for pose in poses)
+
+
+def _inside(body: Body, points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Which points (N, 3) lie in a primitive, shape (N,); both sides of a plane are flat."""
+    shape, local = body.shape, (points - pose[:3, 3]) @ pose[:3, :3]
+    if isinstance(shape, Box):
+        return (np.abs(local) < np.asarray(shape.half_extents_m)).all(axis=1)
+    if isinstance(shape, Capsule):
+        local[:, 2] -= np.clip(local[:, 2], -shape.half_length_m, shape.half_length_m)
+    if isinstance(shape, Plane):
+        return np.zeros(len(points), dtype=bool)
+    assert isinstance(shape, Sphere | Capsule)
+    return np.linalg.norm(local, axis=1) < shape.radius_m

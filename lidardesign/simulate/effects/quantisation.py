@@ -1,10 +1,23 @@
-"""Times are rounded to bins, which start with the gate or with the pulse; uniform error: bin / sqrt(12) rms."""
+"""Times are rounded to bins, which start with the gate or with the pulse; uniform error: bin / sqrt(12) rms.
+
+Rounding to bins: an error spread evenly over a bin.
+
+Its rms is bin / sqrt(12), as ranges lie anywhere in a bin: an estimate where all of them lie at one place of their bin,
+which may be half a bin off.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 
-from lidardesign.simulate.detector import Detector
+from lidardesign.geometry.rays import Rays
+from lidardesign.scene import Scene
+from lidardesign.simulate.detector.detector import Detector
+from lidardesign.simulate.effects.expected_counts import Counts
+from lidardesign.simulate.effects.first_hits import Sight, Stake
 
 
 def bins_start(windows_m: np.ndarray, detector: Detector) -> np.ndarray:
@@ -20,3 +33,15 @@ def rounded(path_m: np.ndarray, windows_m: np.ndarray, detector: Detector) -> np
     first = bins_start(windows_m, detector)
     low = first + np.floor((path_m - first) / detector.bin_m) * detector.bin_m
     return (np.maximum(low, windows_m[:, 0]) + np.minimum(low + detector.bin_m, windows_m[:, 1])) / 2
+
+
+def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
+    """Why nothing is rounded, if so."""
+    return None if detector.bin_m else "the detector has no bins"
+
+
+def stake(sight: Sight, counts: Counts) -> Stake:
+    """bin^2 / 12 for every ray."""
+    bin_m = sight.detector.bin_m
+    reason = f"bins are {1000 * bin_m:.3g} mm wide"
+    return Stake(np.full(len(sight), (bin_m / math.sqrt(12)) ** 2), np.zeros(len(sight)), reason)

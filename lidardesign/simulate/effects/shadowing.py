@@ -1,17 +1,105 @@
-"""A receiver that stands elsewhere may not see what the emitter lights."""
+"""A receiver that stands elsewhere may not see what the emitter lights.
+
+What a fixed receiver sees of lit points: those in its view with nothing in between, or nothing but glass.
+
+A receiver that stands elsewhere: what the emitter lights may be hidden from it.
+
+What it sees of each point is not known without casting a ray there, so every return may be lost. Where a ray starts at
+the receiver the two see the same, and only what lies outside of the receiver's own view is lost, exactly.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from lidardesign.scene import Scene
-from lidardesign.simulate.echoes import Beams, Echoes
-from lidardesign.simulate.effects.sight import sight_shares
-from lidardesign.simulate.hits import Hits
+from lidardesign.geometry.rays import Hits, Rays
+from lidardesign.geometry.receiver import in_view
+from lidardesign.numerics import COARSE_SLACK
+from lidardesign.scene import Mesh, Scene
+from lidardesign.simulate.detector.detector import Detector
+from lidardesign.simulate.detector.light import Beams, Echoes
+from lidardesign.simulate.effects.expected_counts import Counts
+from lidardesign.simulate.effects.first_hits import Sight, Stake
 from lidardesign.simulate.physics import Tracer
-from lidardesign.simulate.receiver_view import in_view
+
+# Closed forms round at 1e-15 of a distance or so; this clears a surface and is far below the thickness of any pane.
+CLEARANCE_SHARE = 1e-5
+# Hits on meshes are exact to float32, up to 1e-6 of their radius from as far away as Embree is asked: twice that.
+MESH_CLEARANCE_SHARE = 2 * COARSE_SLACK
+# A line of sight through more surfaces than this counts as blocked.
+MAXIMUM_SURFACES = 8
+
+
+_mesh_radii_m: WeakKeyDictionary[Scene, float] = WeakKeyDictionary()
+
+
+def clearance_m(scene: Scene, distance_m: np.ndarray) -> np.ndarray:
+    """How far off a surface a ray starts or ends, so that rounding does not let it meet that surface again.
+
+    Arguments:
+        scene: Its meshes are as coarse as they are large.
+        distance_m: How far the ray has gone so far, shape (N,) [m].
+    """
+    if scene not in _mesh_radii_m:
+        _mesh_radii_m[scene] = _mesh_radius_m(scene)
+    return CLEARANCE_SHARE * distance_m + MESH_CLEARANCE_SHARE * _mesh_radii_m[scene]
+
+
+def _mesh_radius_m(scene: Scene) -> float:
+    """Half the diagonal around what is traced as one: each moving mesh, or all that rest [m]."""
+    radii_m, resting = [0.0], []
+    for body in scene.bodies:
+        if isinstance(body.shape, Mesh):
+            low, high = body.shape.bounds_m
+            radii_m.append(float(np.linalg.norm(high - low)) / 2)
+            if body.poses.ndim == 2:
+                middle = body.poses[:3, :3] @ (low + high) / 2 + body.poses[:3, 3]
+                resting += [middle - radii_m[-1], middle + radii_m[-1]]
+    if resting:
+        radii_m.append(float(np.linalg.norm(np.ptp(resting, axis=0))) / 2)
+    return max(radii_m)
+
+
+def sight_shares(
+    scene: Scene, points: np.ndarray, normal: np.ndarray, time_s: np.ndarray, tracer: Tracer
+) -> np.ndarray:
+    """The share of the light of surface points (N, 3) that comes straight to the receiver, shape (N,).
+
+    0 outside its field of view or range, and behind anything; a transparent surface in between lets its transmission
+    through. Sight ends a clearance above the surface, so that surfaces that touch the lit one do not hide it.
+
+    Arguments:
+        scene: Its receiver and its bodies' transmissions.
+        points: Lit points [m].
+        normal: Unit normals towards the light, shape (N, 3).
+        time_s: When they are lit within the frame [s], shape (N,).
+        tracer: First hits of any rays at any time within the frame.
+    """
+    receiver = scene.receiver
+    passing = np.array([body.transmission for body in scene.bodies])
+    start = np.asarray(receiver.origin_m)
+    ends = points + clearance_m(scene, np.linalg.norm(points - start, axis=1))[:, None] * normal
+    length_m = np.linalg.norm(ends - start, axis=1)
+    lit_side = np.einsum("nk,nk->n", normal, start - points) > 0
+    share = (in_view(receiver, points) & (lit_side | (length_m == 0))).astype(np.float64)
+    rows, travelled_m = np.flatnonzero(share * length_m > 0), np.zeros(len(points))
+    for _ in range(MAXIMUM_SURFACES):
+        direction = (ends[rows] - start) / length_m[rows, None]
+        found = tracer(start + travelled_m[rows, None] * direction, direction, time_s[rows])
+        met_m = travelled_m[rows] + found.range_m
+        blocked = (found.body >= 0) & (met_m < length_m[rows])
+        rows, met_m, body = rows[blocked], met_m[blocked], found.body[blocked]
+        share[rows] *= passing[body]
+        travelled_m[rows] = met_m + clearance_m(scene, met_m)
+        rows = rows[(share[rows] > 0) & (travelled_m[rows] < length_m[rows])]
+        if not len(rows):
+            return share
+    share[rows] = 0.0
+    return share
 
 
 def heard(scene: Scene, beams: Beams, hits: Hits, echoes: Echoes, tracer: Tracer) -> Echoes:
@@ -34,3 +122,19 @@ def heard(scene: Scene, beams: Beams, hits: Hits, echoes: Echoes, tracer: Tracer
     rows = seen[apart]
     share[apart] = sight_shares(scene, points[apart], hits.normal[rows], beams.time_s[rows], tracer)
     return replace(echoes, gain=echoes.gain * share).kept(share > 0)
+
+
+def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
+    """Why all that is lit is seen, if so."""
+    return None if scene.receiver is not None else "every ray is heard where it starts"
+
+
+def stake(sight: Sight, counts: Counts) -> Stake:
+    """Of points that the receiver does not see."""
+    receiver, rays = sight.scene.receiver, sight.rays
+    together = (rays.origin_m == np.asarray(receiver.origin_m)).all(axis=1)
+    points = rays.origin_m + sight.range_m[:, None] * rays.direction
+    lost = np.where(together, ~in_view(receiver, points), True) & sight.returned
+    away, hidden = (f"{100 * share.mean():.3g} %" for share in (~together, lost))
+    reason = f"{away} of rays start away from the receiver, {hidden} may not be seen by it"
+    return Stake(np.zeros(len(sight)), lost.astype(float), reason)

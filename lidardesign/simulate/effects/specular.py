@@ -8,22 +8,31 @@ that went out. A fixed receiver elsewhere hears a lit surface straight, through 
 where it stands are heard as without one. Mirrors are flat over the width of a beam: curved ones neither gather nor
 spread it. Panes do not bend light. A mirror that a beam meets squarely enough to shine back into the receiver is not
 taken for an echo.
+
+Mirrors and glass: what they lead elsewhere may meet anything, so every ray that they meet may be wrong.
+
+Lost is the share of rays whose first hit is on a body that mirrors or lets through, and what else comes back of them
+may move their echoes by as much as the detector does not tell apart; the others are as they were. It bounds strictly:
+where that light goes is not known without following it, and how much it weighs is not asked.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lidardesign.geometry.rays import Hits, Rays
+from lidardesign.geometry.receiver import in_view
 from lidardesign.scene import Scene
-from lidardesign.simulate.echoes import Beams, Echoes
-from lidardesign.simulate.effects.sight import clearance_m, sight_shares
-from lidardesign.simulate.hits import Hits
+from lidardesign.simulate.detector.detector import Detector
+from lidardesign.simulate.detector.light import Beams, Echoes
+from lidardesign.simulate.effects.expected_counts import Counts
+from lidardesign.simulate.effects.first_hits import Sight, Stake
+from lidardesign.simulate.effects.shadowing import clearance_m, sight_shares
 from lidardesign.simulate.physics import Tracer, direct_echoes
-from lidardesign.simulate.receiver_view import in_view
 
 # Beams that have met more surfaces than this are given up: four panes, in and out.
 MAXIMUM_TURNS = 8
@@ -168,3 +177,21 @@ def _columns(beams: Beams) -> tuple[np.ndarray, ...]:
 
 def _no_echoes() -> Echoes:
     return Echoes(np.empty(0, dtype=np.int64), np.empty(0), np.empty(0), np.empty(0, dtype=np.int64))
+
+
+def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
+    """Why light is led nowhere else, if so."""
+    return None if any(_leads(body) for body in scene.bodies) else "nothing mirrors or lets light through"
+
+
+def stake(sight: Sight, counts: Counts) -> Stake:
+    """Of light that goes on."""
+    leading = np.array([_leads(body) for body in sight.scene.bodies])
+    met = np.where(sight.hits.body >= 0, leading[sight.hits.body], False)
+    names = ", ".join(dict.fromkeys(body.name for body in sight.scene.bodies if _leads(body)))
+    moved_m = np.minimum(sight.resolution_m, sight.width_m) * met
+    return Stake(moved_m**2, met.astype(float), f"{100 * met.mean():.3g} % of rays meet mirrors or glass: {names}")
+
+
+def _leads(body: object) -> bool:
+    return body.specular > 0 or body.transmission > 0

@@ -1,0 +1,1 @@
+"""The subcommands: each parses its options, calls the library, and prints what came back."""

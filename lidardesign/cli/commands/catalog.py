@@ -1,0 +1,271 @@
+"""`lidardesign catalog`: real parts, what is known of them and from where, and designs of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lidardesign.cli import options
+from lidardesign.cli.output import Console, command
+from lidardesign.errors import ConfigError
+from lidardesign.run.clock import phase
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from lidardesign.design.catalog.part import Part
+    from lidardesign.design.catalog.placing import Pose
+    from lidardesign.design.sensor import Design
+
+# How several parts at one place are turned against each other.
+ARRANGEMENTS = ("interleaved", "beside")
+Own = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--catalog",
+        metavar="PATH",
+        help="A part file of your own, or a folder of them; repeatable.",
+        show_default=False,
+    ),
+]
+Reflectance = Annotated[
+    float | None,
+    typer.Option(
+        "--reflectance",
+        metavar="PERCENT",
+        help="Ranges that sources vouch for on targets of this reflectance.",
+        show_default=False,
+    ),
+]
+Klux = Annotated[
+    float | None,
+    typer.Option(
+        "--klux", metavar="KLUX", help="Ranges that sources vouch for in this ambient light.", show_default=False
+    ),
+]
+
+Out = Annotated[
+    Path | None, typer.Option("--out", metavar="FILE.yaml", help="Write a design of the part.", show_default=False)
+]
+AtOrigin = Annotated[
+    str | None, typer.Option("--at-origin", metavar="X,Y,Z", help="Where it stands, in metres.", show_default="0,0,0")
+]
+Azimuth = Annotated[
+    float | None, typer.Option("--azimuth-deg", metavar="DEG", help="Azimuth of its forward axis.", show_default="0")
+]
+Elevation = Annotated[
+    float | None,
+    typer.Option("--elevation-deg", metavar="DEG", help="Elevation of its forward axis.", show_default="0"),
+]
+Roll = Annotated[
+    float | None, typer.Option("--roll-deg", metavar="DEG", help="Roll about its forward axis.", show_default="0")
+]
+Rays = Annotated[
+    int | None,
+    typer.Option("--rays", metavar="N", min=1, max=1_000_000, help="Rays per frame.", show_default="all that it has"),
+]
+Parts = Annotated[
+    int | None,
+    typer.Option("--parts", metavar="N", min=1, max=1000, help="Parts.", show_default="as many as the rays need"),
+]
+Arrange = Annotated[
+    str | None,
+    typer.Option(
+        "--arrange",
+        metavar="interleaved|beside",
+        help="Several parts see the same with rays between each other's, or fields side by side.",
+        show_default="interleaved",
+    ),
+]
+
+catalog_app = typer.Typer(help="List real parts, or show one and write a design of it.", invoke_without_command=True)
+
+
+@catalog_app.callback()
+def catalog(
+    context: typer.Context,
+    own: Own = None,
+    reflectance: Reflectance = None,
+    klux: Klux = None,
+    seed: options.Seed = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """List real parts, or show one and write a design of it."""
+    if context.invoked_subcommand is None:
+        list_(own=own, reflectance=reflectance, klux=klux, seed=seed, json=json, quiet=quiet, debug=debug)
+    elif own or reflectance is not None or klux is not None:
+        with command(json=json, quiet=quiet, debug=debug):
+            raise ConfigError(
+                "options of a subcommand stand behind it", where="catalog", hint="lidardesign catalog list --help"
+            )
+
+
+@catalog_app.command("list")
+def list_(
+    own: Own = None,
+    reflectance: Reflectance = None,
+    klux: Klux = None,
+    seed: options.Seed = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """List all parts in all their modes: pattern, field of view, range and what reading them costs."""
+    with command(json=json, quiet=quiet, debug=debug) as console:
+        with phase("libraries"):
+            from lidardesign.cli.tables.parts import part_entry, show_list
+            from lidardesign.design.catalog.library import load_library
+
+        check_conditions(reflectance, klux)
+        parts = [_under(part, reflectance, klux) for part in load_library(own or ()).every_mode()]
+        vouched = [part for part in parts if part is not None]
+        left_out = len(parts) - len(vouched)
+        document = {"parts": [part_entry(part) for part in vouched], "left_out": left_out}
+        console.result(document, lambda rich: show_list(vouched, rich), show_costs=False)
+        if left_out:
+            console.note(f"note: {left_out} of {len(parts)} parts and modes have no range stated for such conditions")
+
+
+@catalog_app.command("show")
+def show(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A part's name, NAME:MODE, or a part file.")],
+    own: Own = None,
+    reflectance: Reflectance = None,
+    klux: Klux = None,
+    out: Out = None,
+    at_origin: AtOrigin = None,
+    azimuth: Azimuth = None,
+    elevation: Elevation = None,
+    roll: Roll = None,
+    rays: Rays = None,
+    parts: Parts = None,
+    arrange: Arrange = None,
+    seed: options.Seed = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Show a part: every figure, its conditions and its source; with --out also write a design of it."""
+    with command(json=json, quiet=quiet, debug=debug) as console:
+        with phase("libraries"):
+            from lidardesign.cli.tables.parts import part_document, show_part
+            from lidardesign.design.catalog.library import find_part
+
+        check_conditions(reflectance, klux)
+        part = find_part(name, own or ())
+        if reflectance is not None or klux is not None:
+            part = part.under(reflectance_percent=reflectance, illuminance_klux=klux)
+        document = part_document(part)
+        given = {
+            "--at-origin": at_origin, "--azimuth-deg": azimuth, "--elevation-deg": elevation, "--roll-deg": roll,
+            "--rays": rays, "--parts": parts, "--arrange": arrange,
+        }  # fmt: skip
+        if out is not None:
+            design = _design(part, given, out.stem, console)
+            document |= {"design": str(out), "design_rays": design.rays, "sensors": len(design.sensors)}
+            _write(design, out)
+        else:
+            _refuse_without_out(given)
+
+        console.result(document, lambda rich: show_part(part, document, rich), show_costs=False)
+
+
+def check_conditions(reflectance: float | None, klux: float | None) -> None:
+    """Refuse conditions that no target and no light can have.
+
+    Raises:
+        ConfigError: A reflectance outside 0 to 100 %, or negative light.
+    """
+    if reflectance is not None and not 0 < reflectance <= 100:
+        raise ConfigError(f"found {reflectance:g}", where="--reflectance", allowed="a percentage above 0, at most 100")
+    if klux is not None and not 0 <= klux <= 1000:
+        raise ConfigError(f"found {klux:g}", where="--klux", allowed="0 (darkness) to 1000; sunlight is about 100")
+
+
+def _under(part: Part, reflectance: float | None, klux: float | None) -> Part | None:
+    """The part with its range under conditions; None where no source vouches for one."""
+    if reflectance is None and klux is None:
+        return part
+    try:
+        return part.under(reflectance_percent=reflectance, illuminance_klux=klux)
+    except ConfigError:
+        return None
+
+
+def _refuse_without_out(given: dict[str, Any]) -> None:
+    """Refuse options that say how to place a part where no design is written."""
+    for option, value in given.items():
+        if value is not None:
+            raise ConfigError("says how a design is made", where=option, hint="--out FILE.yaml writes one")
+
+
+def _design(part: Part, given: dict[str, Any], name: str, console: Console) -> Design:
+    """The design that the options ask for."""
+    from lidardesign.design.catalog.placing import interleaved, part_design, parts_for, side_by_side
+    from lidardesign.design.sensor import MOST_RAYS
+    from lidardesign.workflow.runs import check_choice
+
+    count, number = given["--rays"], given["--parts"]
+    arrange = check_choice(given["--arrange"] or ARRANGEMENTS[0], "--arrange", ARRANGEMENTS)
+    needed = number or (1 if count is None else parts_for(part, count))
+    if needed == 1 and given["--arrange"] is not None:
+        raise ConfigError("is for several parts", where="--arrange", hint="--parts N")
+    pose = _pose(given)
+    poses = interleaved(part, pose, needed) if arrange == "interleaved" else side_by_side(part, pose, needed)
+    if count is None and part.rays * needed > MOST_RAYS:
+        raise ConfigError(f"{part.rays * needed} rays", where="--parts", hint="--rays N takes an even subset")
+    if needed > 1 and number is None:
+        console.note(f"note: {count} rays take {needed} x {part.name}, {arrange}")
+    return part_design(part, poses, count, name=name)
+
+
+def _pose(given: dict[str, Any]) -> Pose:
+    """Where the options put the first part.
+
+    Raises:
+        ConfigError: Angles that are not finite or beyond the zenith.
+    """
+    import math
+
+    from lidardesign.design.catalog.placing import Pose
+
+    degrees = {option: given[option] or 0.0 for option in ("--azimuth-deg", "--elevation-deg", "--roll-deg")}
+    for option, value in degrees.items():
+        most = 90 if option == "--elevation-deg" else 360
+        if not abs(value) <= most:
+            raise ConfigError(f"found {value:g}", where=option, allowed=f"-{most} to {most} degrees")
+    return Pose(_origin(given["--at-origin"]), *(math.radians(value) for value in degrees.values()))
+
+
+def _origin(text: str | None) -> np.ndarray:
+    import numpy as np
+
+    from lidardesign.space import FARTHEST_M
+
+    try:
+        origin = np.array([float(item) for item in (text or "0,0,0").split(",")])
+    except ValueError:
+        origin = np.zeros(0)
+    if origin.shape != (3,) or not np.isfinite(origin).all() or np.abs(origin).max() > FARTHEST_M:
+        allowed = f"three numbers, as 0.5,0,1.8 [m], each at most {FARTHEST_M:g}"
+        raise ConfigError(f"found {text!r}", where="--at-origin", allowed=allowed)
+    return origin
+
+
+def _write(design: Design, out: Path) -> None:
+    """Write the design, and say what to do where it has more rays than a file takes."""
+    from lidardesign.design.files import MOST_TABLE_RAYS, save_design
+
+    if (design.rays or 0) > MOST_TABLE_RAYS:
+        raise ConfigError(
+            f"{design.rays} rays are too many for a design file",
+            where=str(out),
+            allowed=f"at most {MOST_TABLE_RAYS:,}",
+            hint="--rays N takes an evenly spread subset",
+        )
+    with phase("writing"):
+        save_design(design, out)

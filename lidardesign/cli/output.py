@@ -1,0 +1,248 @@
+"""What commands print and how they end: one JSON document or text for people, messages, exit codes."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import math
+import os
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+import typer
+
+from lidardesign.cli.environment import TerminatedError
+from lidardesign.cli.stdout_guard import printing_aside
+from lidardesign.cli.tables.times import show_times
+from lidardesign.errors import LidardesignError
+from lidardesign.run.clock import Clock, peak_memory_bytes, running
+from lidardesign.run.files import offered_input
+
+if TYPE_CHECKING:
+    from rich.console import Console as RichConsole
+    from rich.progress import Progress
+
+SCHEMA_VERSION = 1
+EXIT_SYSTEM = 3
+EXIT_INTERNAL = 70
+EXIT_INTERRUPTED = 130
+EXIT_BROKEN_PIPE = 141
+EXIT_TERMINATED = 143
+PLAIN_WIDTH = 120
+NUMBA_CACHE = "numba/core/caching.py"
+NO_MEMORY = "can't allocate memory"
+DISK_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
+
+
+def plain_json(value: Any) -> Any:
+    """Values as JSON has them: numpy becomes lists and numbers, paths text, NaN and infinity null."""
+    if isinstance(value, dict):
+        return {str(key): plain_json(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain_json(item) for item in value]
+    if hasattr(value, "tolist"):
+        return plain_json(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    return value
+
+
+@dataclass
+class Console:
+    """Where a command's output goes.
+
+    Arguments:
+        json: Print one JSON document on stdout and nothing else there.
+        quiet: No progress and no notes.
+        debug: Show tracebacks.
+        output: Where the result goes: the program's stdout.
+        when_interrupted: What to tell the user after Ctrl-C or SIGTERM.
+        answered: Whether the one JSON document was printed; an error after it adds none.
+        clock: Where the command's time goes.
+    """
+
+    json: bool = False
+    quiet: bool = False
+    debug: bool = False
+    output: TextIO = field(default_factory=lambda: sys.stdout)
+    when_interrupted: Callable[[], str | None] = field(default=lambda: None)
+    answered: bool = False
+    clock: Clock = field(default_factory=Clock)
+
+    def rich(self, *, stderr: bool = False) -> RichConsole:
+        """A rich console; it honours NO_COLOR and prints plain text where there is no terminal."""
+        from rich.console import Console as RichConsole
+
+        file = sys.stderr if stderr else self.output
+        width = None if file.isatty() or "COLUMNS" in os.environ else PLAIN_WIDTH
+        return RichConsole(file=file, highlight=False, width=width)
+
+    def note(self, text: str) -> None:
+        """Tell something by the way, on stderr."""
+        if not self.quiet:
+            tell(text)
+
+    def result(
+        self, document: dict[str, Any], show: Callable[[RichConsole], None], *, show_costs: bool = True
+    ) -> None:
+        """Give the result, as JSON or shown for people, and where the time went until now.
+
+        Arguments:
+            document: The JSON form; `timings` and `peak_memory_bytes` are added.
+            show: Prints the result for people.
+            show_costs: Whether people are shown the times: not by commands that only look something up.
+        """
+        timings = self.clock.timings()
+        if self.json:
+            self.answered = True
+            print_json({**document, "timings": timings, "peak_memory_bytes": peak_memory_bytes()}, self.output)
+            return
+        rich = self.rich()
+        show(rich)
+        if show_costs and not self.quiet:
+            show_times(timings, peak_memory_bytes(), rich)
+
+    @contextlib.contextmanager
+    def progress(self, *columns: str) -> Iterator[Progress | None]:
+        """A progress bar with further fields as columns, on a terminal; None where there is none."""
+        if self.quiet or not sys.stderr.isatty():
+            yield None
+            return
+        from rich.progress import BarColumn, Progress, TextColumn
+
+        shown = [TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %")]
+        fields = [TextColumn("{task.fields[" + name + "]}") for name in columns]
+        with Progress(*shown, *fields, console=self.rich(stderr=True), transient=True) as bar:
+            yield bar
+
+
+def tell(text: str) -> None:
+    """Print on stderr; where nobody listens there any more, that is no reason to stop working."""
+    try:
+        print(text, file=sys.stderr, flush=True)
+    except (OSError, ValueError):
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - lives as long as the process
+
+
+def print_json(document: dict[str, Any], output: TextIO | None = None) -> None:
+    """Print the one JSON document of a command, on stdout."""
+    text = json.dumps({"schema_version": SCHEMA_VERSION, **plain_json(document)}, allow_nan=False, indent=2)
+    print(text, file=output or sys.stdout, flush=True)
+
+
+@contextlib.contextmanager
+def command(*, json: bool, quiet: bool, debug: bool) -> Iterator[Console]:
+    """Run a command's body: its errors become one message and an exit code.
+
+    With `--json`, whatever plugins and libraries print meanwhile goes to stderr, also by processes of their own.
+    """
+    console = Console(json=json, quiet=quiet, debug=debug, output=sys.stdout)
+    try:
+        aside = printing_aside(console) if json else contextlib.nullcontext()
+        with aside, running(console.clock), offered_input():
+            yield console
+        console.output.flush()
+    except typer.Exit:
+        raise
+    except BrokenPipeError:
+        forget_stdout()
+        raise typer.Exit(EXIT_BROKEN_PIPE) from None
+    except (Exception, KeyboardInterrupt) as error:
+        code = report_error(error, console)
+        _drop_unwritable(console.output)
+        raise typer.Exit(code) from None
+
+
+def _drop_unwritable(output: TextIO) -> None:
+    """Forget what a full disk did not take: it was reported, and the last flush would fail once more."""
+    try:
+        output.flush()
+    except OSError:
+        forget_stdout()
+
+
+def forget_stdout() -> None:
+    """Point stdout nowhere once it was closed, so that the interpreter's last flush is quiet."""
+    sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - lives as long as the process
+
+
+def report_error(error: BaseException, console: Console) -> int:
+    """Print what went wrong, once, and return the exit code."""
+    document, code, text = describe_error(error, console)
+    if console.json and not console.answered:
+        print_json({"error": document, "exit_code": code}, console.output)
+    tell(text)
+    if console.debug:
+        traceback.print_exception(error)
+    return code
+
+
+def describe_error(error: BaseException, console: Console) -> tuple[dict[str, Any], int, str]:
+    """The JSON form of an error, its exit code, and its text for people."""
+    error = _interruption(error) or error
+    if isinstance(error, LidardesignError):
+        return error.as_dict(), error.exit_code, f"{error.kind} error: {error}"
+    if isinstance(error, KeyboardInterrupt):
+        terminated = isinstance(error, TerminatedError)
+        kind, code = ("terminated", EXIT_TERMINATED) if terminated else ("interrupted", EXIT_INTERRUPTED)
+        further = console.when_interrupted()
+        text = f"{kind}: {further}" if further else kind
+        return {"kind": kind, "message": text}, code, text
+    # torch says so by a name or by words of its own
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError" or NO_MEMORY in str(error):
+        text = "the computer has no memory left; a smaller batch, field_resolution or preset needs less"
+        return {"kind": "memory", "message": text}, EXIT_INTERNAL, f"memory error: {text}"
+    if isinstance(error, OSError):
+        return _describe_system_error(error)
+    folder = _damaged_cache(error)
+    if folder is not None:
+        text, hint = f"{folder}: the cache of compiled code is damaged", "remove its files *.nbi and *.nbc"
+        document = {"kind": "system", "message": text, "hint": hint}
+        return document, EXIT_SYSTEM, f"system error: {text}\n  try: {hint}"
+    text = f"{type(error).__name__}: {' '.join(str(error).split())}"
+    hint = "this is a fault of lidardesign; --debug shows where, please report it"
+    return (
+        {"kind": "internal", "message": text, "hint": hint},
+        EXIT_INTERNAL,
+        f"internal error: {text}\n  {hint}",
+    )
+
+
+def _interruption(error: BaseException) -> KeyboardInterrupt | None:
+    """The interruption that an error came of: compiled kernels that return into one make it a SystemError."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, KeyboardInterrupt):
+            return cause
+        cause = cause.__cause__
+    return None
+
+
+def _damaged_cache(error: BaseException) -> str | None:
+    """The folder of numba's cache where an error came of reading it: files that are cut or changed are no pickles."""
+    trace = error.__traceback__
+    while trace is not None:
+        frame = trace.tb_frame
+        if frame.f_code.co_filename.replace(os.sep, "/").endswith(NUMBA_CACHE):
+            folder = getattr(frame.f_locals.get("self"), "_cache_path", None)
+            if folder is not None:
+                return str(folder)
+        trace = trace.tb_next
+    return None
+
+
+def _describe_system_error(error: OSError) -> tuple[dict[str, Any], int, str]:
+    name = f"{error.filename}: " if error.filename else ""
+    document = {"kind": "system", "message": f"{name}{error.strerror or error}"}
+    text = f"system error: {document['message']}"
+    if error.errno in DISK_FULL and not error.filename:
+        document["hint"] = "make room where the output, the temporary files or numba's cache (NUMBA_CACHE_DIR) go"
+        text += f"\n  try: {document['hint']}"
+    return document, EXIT_SYSTEM, text

@@ -1,0 +1,258 @@
+"""Writing and showing the designs that `fit` and `constrain` make.
+
+The table that `constrain --set snap=catalog` prints: what every sensor became, and what it lost.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy as np
+    from rich.console import Console as RichConsole
+
+    from lidardesign.design.constraints.check import ConstraintCheck
+    from lidardesign.design.sensor import Design, Sensor, Track
+
+
+MAX_SHOWN = 20
+ERROR_DIGITS = 2
+# Relative errors below what `number` shows of a figure are left out.
+SMALLEST_ERROR = 1e-4
+# Several designs may be fitted to one run at once; each holds the lock for an instant.
+WAIT_S = 10.0
+SPACE_MARK = ".space."
+ORIGIN = "origin [m]"
+SENSOR_COLUMNS = (
+    "sensor", "weight", "rays", ORIGIN, "azimuth\n[deg]", "elevation\n[deg]", "field of view\n[deg]", "gate [m]",
+)  # fmt: skip
+
+TRACK_COLUMNS = ("ray", "azimuth\n[deg]", "elevation\n[deg]", "gate start\n[m]", "gate end\n[m]", "gate width\n[m]")
+
+
+def number(value: Any, digits: int = 4) -> str:
+    """A figure, a text, or a list or mapping of them, for people; a dash where there is none."""
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {number(item, digits)}" for name, item in value.items())
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(number(item, digits) for item in value) + "]"
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return "-"
+    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
+
+
+def with_error(estimate: dict[str, Any]) -> str:
+    """A figure and its error as far as the error reaches, as `-3.142 +- 0.005`."""
+    value, error = estimate["value"], estimate["error"]
+    if not error or error < SMALLEST_ERROR * abs(value):
+        return number(value)
+    decimals = max(0, ERROR_DIGITS - 1 - math.floor(math.log10(error)))
+    return f"{value:.{decimals}f} +- {error:.{decimals}f}"
+
+
+def show_design(design: Design, rich: RichConsole) -> None:
+    """Print a design's sensors as a table, with angles in degrees; a place that all share stands above it."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    if design.track is not None:
+        show_track(design, design.track, rich)
+        return
+    rays = f"{design.rays} rays per frame" if design.rays else "rays per frame left open"
+    sensors = "1 sensor" if len(design.sensors) == 1 else f"{len(design.sensors)} sensors"
+    title = f"{escape(design.name)}: {sensors}, layout {design.layout}, {rays}"
+    if design.at:
+        title += ", at " + escape(", ".join(f"{name}={value:g}" for name, value in design.at.items()))
+    places = [_place(sensor) for sensor in design.sensors]
+    together = len(set(places)) == 1
+    if together:
+        title += f"\nall at {places[0]} m"
+    table = Table(title=title, title_justify="left")
+    for heading in SENSOR_COLUMNS:
+        if heading != ORIGIN or not together:
+            justify = "left" if heading == SENSOR_COLUMNS[0] else "right"
+            table.add_column(escape(heading), justify=justify, overflow="fold")
+    for sensor, place in list(zip(design.sensors, places, strict=True))[:MAX_SHOWN]:
+        cells = _cells(sensor)
+        table.add_row(*(cells if together else [*cells[:3], place, *cells[3:]]))
+    rich.print(table)
+    if len(design.sensors) > MAX_SHOWN:
+        rich.print(f"... and {len(design.sensors) - MAX_SHOWN} more sensors; --json lists all")
+
+
+def show_track(design: Design, track: Track, rich: RichConsole) -> None:
+    """Print the rays of a track as a table: from where to where each looks and listens over its travel."""
+    from numpy import degrees
+    from rich.markup import escape
+    from rich.table import Table
+
+    from lidardesign.design.layouts.track import travels
+
+    first, last = travels(track)
+    title = f"{escape(design.name)}: {len(track.sensor)} rays at every {track.dimension} from {first:g} to {last:g}"
+    title += f" (travel {last - first:g} m, {len(track.knots)} knots)\nsensors in the middle of their travel"
+    table = Table(title=title + f", at {_place(design.sensors[0])} m", title_justify="left")
+    for heading in TRACK_COLUMNS:
+        justify = "left" if heading == TRACK_COLUMNS[0] else "right"
+        table.add_column(escape(heading), justify=justify, overflow="fold")
+    for ray, sensor in list(enumerate(track.sensor))[:MAX_SHOWN]:
+        gate = track.gate_m[:, ray]
+        table.add_row(
+            escape(design.sensors[sensor].name),
+            _reach(degrees(track.azimuth_rad[:, ray]), 2),
+            _reach(degrees(track.elevation_rad[:, ray]), 2),
+            _reach(gate[:, 0], 3),
+            _reach(gate[:, 1], 3),
+            _reach(gate[:, 1] - gate[:, 0], 3),
+        )
+    rich.print(table)
+    if len(track.sensor) > MAX_SHOWN:
+        rich.print(f"... and {len(track.sensor) - MAX_SHOWN} more rays; --json lists all")
+    rich.print(f"--at {track.dimension}=VALUE shows the rays at one place")
+
+
+def _reach(values: np.ndarray, decimals: int) -> str:
+    """The smallest and the largest value; one where they look the same."""
+    low, high = (f"{round(float(v), decimals) + 0.0:.{decimals}f}" for v in (values.min(), values.max()))
+    return low if low == high else f"{low} .. {high}"
+
+
+def _place(sensor: Sensor) -> str:
+    # -0.0 is the same place as 0.0
+    place = " ".join(f"{round(value, 3) + 0.0:.3f}" for value in sensor.origin_m)
+    travel, _ = sensor.travel_m
+    return f"{place}, travel {travel:.3f}" if travel > 0 else place
+
+
+def _cells(sensor: Sensor) -> list[str]:
+    """What a sensor's row shows, but for its place."""
+    from rich.markup import escape
+
+    horizontal, vertical = sensor.field_of_view_rad
+    start, end = sensor.gate_m
+    return [
+        escape(sensor.name),
+        f"{sensor.weight:.3f}",
+        number(sensor.rays),
+        f"{math.degrees(sensor.azimuth_rad):.2f}",
+        f"{math.degrees(sensor.elevation_rad):.2f}",
+        f"{math.degrees(horizontal):.2f} x {math.degrees(vertical):.2f}",
+        f"{start:.3f} - {end:.3f}",
+    ]
+
+
+def show_constraints(checks: Sequence[ConstraintCheck], rich: RichConsole) -> None:
+    """Print a table of constraints: bound, value and whether it holds.
+
+    The bounds of the design space hold for every sensor; they are shown where they are broken.
+    """
+    from rich.markup import escape
+    from rich.table import Column, Table
+
+    if not checks:
+        return
+    from lidardesign.design.constraints.slack import is_tight
+
+    # names are needed whole, to loosen what they name
+    name = Column("constraint", overflow="fold")
+    table = Table(name, "bound", "value", "left", "holds", title="constraints", title_justify="left")
+    for check in checks:
+        if SPACE_MARK in check.name and check.satisfied:
+            continue
+        holds = "yes" if check.satisfied else "[bold]no[/bold]"
+        holds += ", tight" if check.satisfied and is_tight(check) else ""
+        bound, value = (escape(number(figure, 6)) for figure in (check.bound, check.value))
+        table.add_row(escape(check.name), bound, value, _left(check), holds)
+    if table.row_count:
+        rich.print(table)
+
+
+def _left(check: ConstraintCheck) -> str:
+    """How far a value is inside its bound, with the share of the bound that this is."""
+    from lidardesign.design.constraints.slack import room_left, share_left
+
+    room, share = room_left(check), share_left(check)
+    if room is None or room < 0:
+        return "-"
+    # what is left below the rounding of the checks themselves is nothing
+    if room == 0 or (share is not None and share < SMALLEST_ERROR):
+        return "0"
+    return number(room, 3) if share is None else f"{number(room, 3)} ({number(100 * share, 2)} %)"
+
+
+def show_fit(document: dict[str, Any], design: Design, checks: Sequence[Any], rich: RichConsole) -> None:
+    """Print what `fit` and `constrain` made."""
+    from rich.markup import escape
+
+    show_design(design, rich)
+    if "snap" in document:
+
+        show_snap(document["snap"], rich)
+    show_constraints(checks, rich)
+    figures = {"log-likelihood": "log_likelihood", "ESS": "ess", "admissible mass": "admissible_mass"}
+    estimates = document["error_estimates"]
+    known = [f"{name} {with_error(estimates[key])}" for name, key in figures.items() if key in estimates]
+    rich.print(f"{', '.join(known)}, {number(document['seconds'], 3)} s (+- are standard errors)")
+    rays = estimates.get("rays")
+    if rays is not None and rays["error"] > 0:
+        rich.print(f"whole rays: {number(rays['error'], 2)} of {rays['value']:.0f} are not where the weights say")
+    rich.print(f"design: {escape(str(document['design']))}", soft_wrap=True)
+
+
+def write_design(design: Design, run: Path, path: Path) -> None:
+    """Write a design into its run, under the run's lock, and enter it in the manifest."""
+    from lidardesign.design.files import design_text
+    from lidardesign.run.lock import run_lock
+    from lidardesign.run.manifest import write_recorded
+
+    content = design_text(design, path).encode()
+    with run_lock(run, wait_s=WAIT_S):
+        write_recorded(run, path.relative_to(run).as_posix(), content)
+
+
+COLUMNS = ("sensor", "part", "loss\n[nats]", "field of view\n[deg]", "gate\n[m]", "rays", "Mbit/s")
+
+
+def show_snap(snap: Mapping[str, Any], rich: RichConsole) -> None:
+    """Print which part every sensor became; of each figure what was fitted, then what the part has."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title="sensors as parts of the catalogue: fitted > part", title_justify="left")
+    for heading in COLUMNS:
+        justify = "left" if heading in COLUMNS[:2] else "right"
+        table.add_column(escape(heading), justify=justify, overflow="fold")
+    for row in snap["sensors"]:
+        name = "stays a sensor" if row["part"] is None else row["part"] + (", turned" if row["turned"] else "")
+        table.add_row(
+            escape(row["sensor"]),
+            escape(name),
+            f"{row['loss_nats']:.3f}",
+            _both(row["field_of_view_rad"], _field),
+            _both(row["gate_m"], _gate),
+            _both(row["rays"], str),
+            _both(row["bandwidth_mbps"], number),
+        )
+    rich.print(table)
+    fitted, parts = (snap["log_likelihood"][key] for key in ("fitted", "parts"))
+    rich.print(
+        f"log-likelihood as fitted {number(fitted)}, as parts {number(parts)} nats; losses are of one sensor alone"
+    )
+
+
+def _both(figures: Mapping[str, Any], text: Any) -> str:
+    fitted, part = text(figures["fitted"]), text(figures["part"])
+    return fitted if fitted == part else f"{fitted} > {part}"
+
+
+def _field(angles_rad: list[float]) -> str:
+    return " x ".join(f"{math.degrees(angle):.1f}" for angle in angles_rad)
+
+
+def _gate(gate_m: list[float]) -> str:
+    return " - ".join(f"{end:.2f}" for end in gate_m)

@@ -1,0 +1,163 @@
+"""The tables that `evaluate` prints: scores, differences to the baselines, and equal bandwidth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lidardesign.cli.tables.designs import number
+from lidardesign.cli.tables.grids import print_table
+
+if TYPE_CHECKING:
+    from rich.console import Console as RichConsole
+
+Entry = dict[str, Any]
+MILLIMETRES = 1000.0
+# Differences of an audit are shown to hundredths of what is tolerated, and to so many decimals where nothing is.
+FINER = 2
+SHORT_S = 0.01
+DECIMALS = 4
+
+
+def show_evaluation(document: dict[str, Any], written: Sequence[Path], rich: RichConsole) -> None:
+    """Print an evaluation for people; its JSON form holds more (all pairs, all intervals)."""
+    from rich.markup import escape
+
+    metric = document["metric"]
+    figure = f"{metric['name']} [{metric['unit']}], {metric['better']} is better"
+    scenes = f"over {document['scenes']} held-out scenes" + "".join(f", {text}" for text in document.get("set", []))
+    _show_rows(document["rows"], escape(f"{figure}, {scenes}"), rich)
+    _show_errors(document, rich)
+    designs = {row["design"] for row in document["rows"]} - {row["design"] for row in document["equal_bandwidth"]}
+    against = [pair for pair in document["paired"] if pair["b"] not in designs]
+    unit = escape(metric["unit"])
+    title = f"difference to each baseline \\[{unit}], scene by scene, with its 95 % interval"
+    _show_grid(against, title, ("a", "rays"), "b", _difference, rich)
+    title = f"baselines with as much bandwidth as the design: value \\[{unit}] (rays)"
+    _show_grid(document["equal_bandwidth"], title, ("matched_to", "matched_rays"), "design", _value, rich)
+    _show_effects(document, rich)
+    if "audit" in document:
+        _show_audit(document, rich)
+    for note in document.get("notes", []):
+        rich.print(f"note: {escape(note)}", soft_wrap=True)
+    for path in written:
+        rich.print(f"wrote {escape(str(path))}", soft_wrap=True)
+
+
+def _show_rows(rows: Sequence[Entry], title: str, rich: RichConsole) -> None:
+    detail = next((name for row in rows for name in row["details"]), None)
+    further = [] if detail is None else [detail.replace("_", " ")]
+    headings = ("design", "rays", "value", "95 % interval", "failures", *further, "Mbit/s", "seconds")
+    lines = []
+    for row in rows:
+        interval = f"{number(row['ci_low'])} - {number(row['ci_high'])}"
+        extra = [] if detail is None else [row["details"].get(detail)]
+        cells = (row["rays"], row["value"], interval, row["failures"], *extra, row["bandwidth_mbps"])
+        lines.append([row["design"], *(number(cell) for cell in cells), number(row["seconds"], 2)])
+    print_table(title, headings, lines, rich)
+
+
+def _show_errors(document: Entry, rich: RichConsole) -> None:
+    """How far designs' scores and their differences may be off, the widest of each."""
+    designs = {pair["a"] for pair in document["paired"]}
+    values = [row["half_width"] for row in document["rows"] if row["design"] in designs]
+    differences = [pair["half_width"] for pair in document["paired"]]
+    if not differences:
+        return
+    unit = document["metric"]["unit"]
+    rich.print(
+        f"over other scenes, designs' values may be off by up to {number(max(values), 2)} {unit}, "
+        f"their differences by up to {number(max(differences), 2)} {unit} (half of the 95 % intervals)",
+        markup=False,
+    )
+
+
+def _show_grid(
+    entries: Sequence[Entry],
+    title: str,
+    keys: tuple[str, str],
+    column: str,
+    cell: Callable[[Entry], str],
+    rich: RichConsole,
+) -> None:
+    """One line per design and number of rays, one column per baseline."""
+    if not entries:
+        return
+    columns = list(dict.fromkeys(entry[column] for entry in entries))
+    lines: dict[tuple[Any, ...], dict[str, str]] = {}
+    for entry in entries:
+        lines.setdefault(tuple(entry[key] for key in keys), {})[entry[column]] = cell(entry)
+    rows = [[name, str(rays), *(line.get(other, "-") for other in columns)] for (name, rays), line in lines.items()]
+    print_table(title, ("design", "rays", *columns), rows, rich)
+
+
+def _difference(pair: Entry) -> str:
+    return f"{number(pair['difference'], 3)} ({number(pair['ci_low'], 3)} to {number(pair['ci_high'], 3)})"
+
+
+def _value(row: Entry) -> str:
+    return f"{number(row['value'])} ({row['rays']})"
+
+
+def _show_effects(document: Entry, rich: RichConsole) -> None:
+    """What was simulated and why; one line where nothing is called for."""
+    from rich.markup import escape
+
+    from lidardesign.evaluate.verdicts import plain
+
+    detector, effects = escape(document["detector"]), document["effects"]
+    if not any(effect["on"] or effect["bound"] or effect["lost"] for effect in effects):
+        rich.print(f"effects: none called for with the detector {detector}", soft_wrap=True)
+        return
+    first = effects[0]
+    allowed = f"{MILLIMETRES * first['tolerance']:.3g} mm and {first['lost_tolerance']:.2g} of returns"
+    title = f"effects with the detector {detector}; all that are skipped may change {allowed} together"
+    lines = []
+    for effect in effects:
+        bounds = [plain(MILLIMETRES * effect["bound"], 3), plain(effect["lost"], 2)]
+        cost = plain(effect["seconds"], 2, tiny=SHORT_S)
+        lines.append([_words(effect["name"]), _where_on(effect), *bounds, cost, effect["reason"]])
+    headings = ("effect", "on", "range [mm]", "returns", "cost [s]", "reason")
+    print_table(title, headings, lines, rich, text=("effect", "on", "reason"), wraps=True)
+
+
+def _where_on(effect: Entry) -> str:
+    if not effect["on"]:
+        return "no" if effect["missing"] is None else "missing"
+    return "yes" if effect["scenes_on"] == 1 else f"in {100 * effect['scenes_on']:.0f} %"
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _show_audit(document: Entry, rich: RichConsole) -> None:
+    from rich.markup import escape
+
+    audit = document["audit"]
+    unit = audit["unit"]
+    there = {effect["name"] for effect in document["effects"] if effect["bound"] or effect["lost"]}
+    skipped = ", ".join(_words(name) for name in audit["skipped"] if name in there) or "nothing that is there"
+    verdict = "passed" if audit["passed"] else "failed"
+    title = f"audit {verdict}: the plan skips {skipped}; rows may move by {audit['tolerance']:g} {unit}"
+    planned, everything = f"planned\n[{unit}]", f"all effects\n[{unit}]"
+    moves = "difference (95 % interval)"
+    headings = ("design", "bandwidth\nof", "rays", planned, everything, moves, "seconds\nof both")
+    decimals = _decimals(audit["tolerance"])
+    lines = []
+    for row in audit["rows"]:
+        # adding zero takes the sign from a rounded -0
+        figures = (round(row[name], decimals) + 0.0 for name in ("difference", "ci_low", "ci_high"))
+        moved, low, high = (f"{value:.{decimals}f}" for value in figures)
+        times = f"{number(row['seconds'], 2)}, {number(row['seconds_everything'], 2)}"
+        scores = (number(row["planned"]), number(row["everything"]))
+        matched = row.get("matched_to", "-")
+        lines.append([row["design"], matched, str(row["rays"]), *scores, f"{moved} ({low} to {high})", times])
+    print_table(escape(title), headings, lines, rich, text=headings[:2])
+
+
+def _decimals(tolerance: float) -> int:
+    """As many decimals as tell hundredths of a tolerance."""
+    return max(0, FINER - math.floor(math.log10(tolerance))) if tolerance > 0 else DECIMALS

@@ -1,0 +1,489 @@
+"""The configuration of a run: defaults, preset, file and `--set`, in that order, checked with positions.
+
+The document has the sections task, space, density and learning. Every value remembers where it came from, so
+that an error can point at file, line and column, or at the `--set` that brought it.
+
+`--set KEY=VALUE`: dotted paths into a document of plain values.
+
+Settings of the target density and of learning it, with their defaults, units and presets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+from lidardesign.errors import ConfigError
+from lidardesign.registry import load_task, plugin_guard
+from lidardesign.run.clock import phase
+from lidardesign.run.manifest import verify, write_recorded
+from lidardesign.run.validation import anchor_paths, check_model, suggest
+from lidardesign.run.yaml import Document, KeyPath, dump_yaml, leaves, load_yaml, parse_yaml, resolve_scalar
+from lidardesign.space import DIMENSIONS, FARTHEST_M, DesignSpace
+from lidardesign.task import Task, TaskConfig
+
+Visibility = Literal["auto", "raycast", "quadrature", "off"]
+Preset = Literal["draft", "standard", "fine"]
+PRESETS: tuple[str, ...] = ("draft", "standard", "fine")
+# Between these all squares and products that the density is made of are numbers, in float32 too.
+LONGEST_M, SHORTEST_M = FARTHEST_M, 1 / FARTHEST_M
+FASTEST_PER_M = 1e12
+
+
+class DensitySettings(BaseModel):
+    """The target density p*(d) (design contract, section 2). `None` means: derived from the others."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    sigma_m: float = Field(
+        0.005, ge=SHORTEST_M, le=LONGEST_M, description="standard deviation of the surface proximity [m]"
+    )
+    visibility: Visibility = Field("auto", description="how occlusion is computed; auto probes whether it is needed")
+    attenuation_per_m: float | None = Field(
+        None, gt=0, le=FASTEST_PER_M, description="beta [1/m]; default max(1000, 5 / sigma)"
+    )
+    sharpness_per_m: float | None = Field(
+        None, gt=0, le=FASTEST_PER_M, description="k [1/m] of the quadrature; default max(1000, 5 / sigma)"
+    )
+    margin_m: float | None = Field(None, ge=0, description="m [m]: a surface does not occlude itself; default sigma")
+    quadrature_points: int = Field(64, ge=4, le=4096, description="midpoints of the visibility quadrature")
+    field_resolution: int = Field(64, ge=8, le=512, description="grid points along the longest side of mesh fields")
+    surface_tolerance_nats: float = Field(
+        16.0, gt=0, description="scenes whose surface term is this far below the best one skip visibility [nats]"
+    )
+
+
+class LearningSettings(BaseModel):
+    """The flow, its optimiser and what is measured after training.
+
+    The largest numbers are what a large computer might bear; what is beyond them is a typing error.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    steps: int = Field(1000, ge=1, le=100_000_000, description="optimiser steps")
+    batch: int = Field(1024, ge=2, le=1_000_000, description="design points per step")
+    rate: float = Field(1e-2, gt=0, description="initial Adam step size")
+    frames: int = Field(
+        256, ge=1, le=1_000_000, description="scenes and frames that stand for all in each path-wise step, drawn anew"
+    )
+    layers: int = Field(3, ge=1, le=32, description="autoregressive spline layers per block of the chain")
+    hidden: int = Field(96, ge=4, le=8_192, description="hidden width of each layer's network")
+    bins: int = Field(16, ge=2, le=1_024, description="spline bins per dimension")
+    dtype: Literal["float64", "float32"] = Field(
+        "float32", description="arithmetic of training steps, while it can invert the flow; samples are always float64"
+    )
+    entropy: float = Field(0.0, ge=0, description="eta of the paper; annealed to 0")
+    sigma_start_m: float | None = Field(
+        None, ge=SHORTEST_M, le=LONGEST_M, description="where sigma's annealing starts; default 6 sigma"
+    )
+    anneal: float = Field(0.7, ge=0, le=1, description="share of the path-wise steps over which sigma falls")
+    balance: float = Field(0.5, ge=0, le=1, description="share of the steps, the last ones, that balance by values")
+    balance_proposals: int = Field(
+        65536, ge=256, le=10_000_000, description="independent proposals that balancing draws from"
+    )
+    clip_norm: float = Field(5.0, gt=0, description="gradient norm that steps are clipped to")
+    checkpoint_seconds: float = Field(20.0, gt=0, description="time between checkpoints [s]")
+    samples: int = Field(
+        100_000, ge=1000, le=10_000_000, description="fresh samples for ESS, KL, log Z, fit and constrain"
+    )
+    coverage_proposals: int = Field(
+        8192, ge=256, le=10_000_000, description="independent proposals that coverage is measured on"
+    )
+
+
+PRESET_LEARNING: dict[str, dict[str, Any]] = {
+    "draft": {
+        "steps": 350,
+        "hidden": 64,
+        "samples": 40_000,
+        "balance_proposals": 32768,
+        "coverage_proposals": 4096,
+    },
+    "standard": {},
+    "fine": {"steps": 2400, "batch": 4096, "layers": 4, "hidden": 128, "bins": 24, "samples": 200_000},
+}
+
+
+STRUCTURE_MARKS = ("[", "{", '"', "'")
+
+
+@dataclass(frozen=True)
+class Override:
+    """One `--set`.
+
+    Arguments:
+        path: The dotted key, split.
+        value: The value, read as YAML.
+        where: The option as the user wrote it, for messages.
+    """
+
+    path: KeyPath
+    value: Any
+    where: str
+
+
+def parse_override(text: str, option: str = "--set") -> Override:
+    """Read `KEY=VALUE`; the value is a YAML scalar, or a list or mapping in brackets, and else text.
+
+    Raises:
+        ConfigError: There is no key or no equals sign, or the brackets do not close.
+    """
+    key, equals, value = text.partition("=")
+    where = f"{option} {text}"
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
+        raise ConfigError("is not of the form KEY=VALUE", where=where, allowed="a dotted key, as density.sigma_m=0.005")
+    return Override(tuple(parts), _value(value.strip(), where), where)
+
+
+def _value(text: str, where: str) -> Any:
+    if text.startswith(STRUCTURE_MARKS):
+        return parse_yaml(text, where=where).value
+    try:
+        return resolve_scalar(text)
+    except ValueError as error:
+        raise ConfigError(str(error), where=where, allowed="a finite number") from None
+
+
+def apply_override(values: dict[str, Any], override: Override) -> KeyPath:
+    """Set a value in a document, in place; missing mappings are made, list items are named by their index.
+
+    Returns:
+        The path that was set, with list indices as numbers.
+
+    Raises:
+        ConfigError: The path goes through a value that holds nothing, or past the end of a list.
+    """
+    node: Any = values
+    done: list[str | int] = []
+    for position, part in enumerate(override.path):
+        last = position == len(override.path) - 1
+        key = _key(node, str(part), done, override)
+        done.append(key)
+        if last:
+            node[key] = override.value
+        else:
+            if isinstance(node, dict) and node.get(key) is None:
+                node[key] = {}
+            node = node[key]
+    return tuple(done)
+
+
+def _key(node: Any, part: str, done: list[str | int], override: Override) -> str | int:
+    parent = ".".join(map(str, done))
+    if isinstance(node, dict):
+        return part
+    if isinstance(node, list):
+        if part.isdecimal() and int(part) < len(node):
+            return int(part)
+        allowed = f"0 to {len(node) - 1}" if node else "nothing: the list is empty"
+        raise ConfigError(f"{parent} has no item {part!r}", where=override.where, allowed=allowed)
+    raise ConfigError(f"{parent} is {node!r} and holds no key {part!r}", where=override.where)
+
+
+FILE_NAME = "config.yaml"
+SCHEMA_VERSION = 1
+SECTIONS = ("task", "space", "density", "learning")
+HEADER = ("schema_version", "task_name", "seed", "preset")
+MAX_SEED = 2**63 - 1
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that decides what a run computes.
+
+    Arguments:
+        task_name: The task plugin's name.
+        seed: Root of every random stream.
+        preset: draft, standard or fine.
+        task: The task's own configuration.
+        space: The design space, with the task's bounds or the user's.
+        density: The target density.
+        learning: The flow and its optimiser.
+    """
+
+    task_name: str
+    seed: int
+    preset: str
+    task: TaskConfig
+    space: DesignSpace
+    density: DensitySettings
+    learning: LearningSettings
+
+    def as_document(self) -> dict[str, Any]:
+        """The form that config.yaml has."""
+        return {
+            "schema_version": SCHEMA_VERSION,
+            "task_name": self.task_name,
+            "seed": self.seed,
+            "preset": self.preset,
+            "task": self.task.model_dump(mode="json"),
+            "space": self.space.as_dict(),
+            "density": self.density.model_dump(mode="json"),
+            "learning": self.learning.model_dump(mode="json"),
+        }
+
+
+def _pair(value: Any) -> Any:
+    return (value, value) if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+_Bounds = Annotated[tuple[float, float], BeforeValidator(_pair)]
+
+
+class _SpaceSection(BaseModel):
+    """Bounds that replace the task's: a pair [low, high], or one number that fixes the dimension."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    x_m: _Bounds
+    y_m: _Bounds
+    z_m: _Bounds
+    azimuth_rad: _Bounds
+    elevation_rad: _Bounds
+    range_m: _Bounds
+    condition: tuple[Literal[DIMENSIONS], ...] = Field(())
+    measure: Literal["solid_angle", "angles"] = Field("solid_angle")
+
+
+@dataclass
+class _Layers:
+    """The merged document and the origin of each of its values."""
+
+    values: dict[str, Any]
+    origins: dict[KeyPath, str] = field(default_factory=dict)
+    keys: dict[KeyPath, str] = field(default_factory=dict)
+
+    def merge(self, section: str, values: Mapping[str, Any], origin: str) -> None:
+        """Lay values over a section."""
+        _merge(self.values.setdefault(section, {}), values)
+        for path, _ in leaves(dict(values)):
+            self.origins[(section, *path)] = origin
+
+    def forget(self, path: KeyPath) -> None:
+        """Drop the origins of a path, of all it holds, and of what holds it, before it is replaced."""
+        touching = [known for known in self.origins if known[: len(path)] == path or path[: len(known)] == known]
+        for known in touching:
+            del self.origins[known]
+            self.keys.pop(known, None)
+
+    def origin(self, path: KeyPath, *, key: bool = False) -> str:
+        """Where the value (or key) of a path came from: its own origin, a parent's, or of what it holds."""
+        if key and path in self.keys:
+            return self.keys[path]
+        for length in range(len(path), 0, -1):
+            if path[:length] in self.origins:
+                return self.origins[path[:length]]
+        held = [origin for known, origin in self.origins.items() if known[: len(path)] == path]
+        return held[0] if held else ".".join(map(str, path))
+
+
+@phase("configuration")
+def resolve(
+    task: Task,
+    *,
+    preset: str | None = None,
+    config_file: Path | None = None,
+    overrides: Sequence[str] = (),
+    seed: int | None = None,
+) -> RunConfig:
+    """The configuration of a new run: defaults < preset < the task's suggestions < file < `--set`.
+
+    Arguments:
+        task: The task plugin.
+        preset: draft, standard or fine; None takes the file's, else standard.
+        config_file: A YAML file of the document form (any part of it).
+        overrides: `KEY=VALUE` with dotted keys; a key without a section belongs to the task.
+        seed: None takes the file's, else 0.
+
+    Raises:
+        ConfigError: At file:line:column or at the `--set` option.
+    """
+    document = load_yaml(config_file) if config_file else Document({}, "defaults")
+    header = _header(task, document, preset, seed)
+    layers = _Layers({section: {} for section in SECTIONS})
+    layers.merge("learning", PRESET_LEARNING[header["preset"]], f"preset {header['preset']}")
+    layers.merge("density", task.defaults.density, f"defaults of task {task.name}")
+    layers.merge("learning", task.defaults.learning.get(header["preset"], {}), f"defaults of task {task.name}")
+    _lay_file(layers, task, document)
+    for text in overrides:
+        _lay_override(layers, task, parse_override(text))
+    return _build(task, header, layers)
+
+
+def judged_by(task: Task, config: RunConfig, overrides: Sequence[str], *, option: str = "--set") -> RunConfig:
+    """A run's configuration with other values of the task's own keys, to judge its designs by.
+
+    Raises:
+        ConfigError: At the option; also where the value would change the design space.
+    """
+    layers = _Layers({section: {} for section in SECTIONS})
+    layers.merge("task", config.task.model_dump(mode="json"), FILE_NAME)
+    for text in overrides:
+        override = parse_override(text, option)
+        if override.path[0] in SECTIONS[1:] and len(override.path) > 1:
+            allowed = f"keys of the task {task.name}"
+            raise ConfigError("what was learned cannot be changed", where=override.where, allowed=allowed)
+        _lay_override(layers, task, override)
+    judged = check_model(task.Config, layers.values["task"], layers.origin, "task")
+    with plugin_guard(task.name):
+        same = task.space(judged).as_dict() == task.space(config.task).as_dict()
+    if not same:
+        raise ConfigError(
+            "changes the design space that the run was learned in",
+            where=f"{option} " + ", ".join(overrides),
+            hint=f"learn another run with it: lidardesign learn {task.name} --set KEY=VALUE",
+        )
+    return replace(config, task=judged)
+
+
+@phase("configuration")
+def load_run_config(run: Path) -> tuple[Task, RunConfig]:
+    """The task and configuration of a run folder, checked against the manifest.
+
+    Raises:
+        DataError: There is no such run, or its configuration was damaged or changed.
+        ConfigError: It is of another version of this program.
+        PluginError: The task is installed but broken.
+    """
+    run = Path(run)
+    verify(run, FILE_NAME)
+    return config_of(load_yaml(run / FILE_NAME))
+
+
+def config_of(document: Document) -> tuple[Task, RunConfig]:
+    """The task and configuration of a whole document, as `RunConfig.as_document` makes it.
+
+    Raises:
+        ConfigError: It is of another version of this program.
+        PluginError: The task is installed but broken.
+    """
+    task = load_task(str(document.mapping.get("task_name")))
+    layers = _Layers({section: {} for section in SECTIONS})
+    header = _header(task, document, None, None)
+    _lay_file(layers, task, document)
+    return task, _build(task, header, layers)
+
+
+def save_run_config(config: RunConfig, run: Path) -> None:
+    """Write config.yaml into a run folder, with its hash in the manifest at every moment."""
+    write_recorded(run, FILE_NAME, dump_yaml(config.as_document()).encode())
+
+
+def _header(task: Task, document: Document, preset: str | None, seed: int | None) -> dict[str, Any]:
+    values = document.mapping
+    unknown = [key for key in values if key not in (*HEADER, *SECTIONS)]
+    if unknown:
+        where = document.locate((unknown[0],), key=True)
+        raise ConfigError(
+            f"unknown section {unknown[0]!r}",
+            where=where,
+            allowed=", ".join((*HEADER, *SECTIONS)),
+            hint=suggest(unknown[0], (*HEADER, *SECTIONS)),
+        )
+    if values.get("schema_version", SCHEMA_VERSION) != SCHEMA_VERSION:
+        found = values["schema_version"]
+        raise ConfigError(
+            f"schema version {found!r}",
+            where=document.locate(("schema_version",)),
+            allowed=str(SCHEMA_VERSION),
+            hint="use the version of lidardesign that wrote it, or a newer one",
+        )
+    if values.get("task_name", task.name) != task.name:
+        raise ConfigError(
+            f"the file is for task {values['task_name']!r}",
+            where=document.locate(("task_name",)),
+            allowed=task.name,
+        )
+    return {
+        "preset": _checked_preset(preset or values.get("preset") or "standard", document, preset is not None),
+        "seed": _checked_seed(values.get("seed", 0) if seed is None else seed, document, seed is not None),
+    }
+
+
+def _checked_preset(preset: Any, document: Document, from_option: bool) -> str:
+    if preset not in PRESETS:
+        where = "--preset" if from_option else document.locate(("preset",))
+        raise ConfigError(f"unknown preset {preset!r}", where=where, allowed=", ".join(PRESETS))
+    return preset
+
+
+def _checked_seed(seed: Any, document: Document, from_option: bool) -> int:
+    if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed <= MAX_SEED:
+        where = "--seed" if from_option else document.locate(("seed",))
+        raise ConfigError(f"seed {seed!r}", where=where, allowed=f"a whole number from 0 to {MAX_SEED}")
+    return seed
+
+
+def _lay_file(layers: _Layers, task: Task, document: Document) -> None:
+    for section in SECTIONS:
+        values = document.mapping.get(section)
+        if values is None:
+            continue
+        if not isinstance(values, dict):
+            where = document.locate((section,), key=True)
+            raise ConfigError(f"section {section!r} holds {values!r}", where=where, allowed="keys and values")
+        _merge(layers.values[section], values)
+        for path, _ in leaves(values, (section,)):
+            for length in range(2, len(path) + 1):
+                layers.origins[path[:length]] = document.locate(path[:length])
+                layers.keys[path[:length]] = document.locate(path[:length], key=True)
+    base = Path(document.where).absolute().parent
+    anchor_paths(layers.values["task"], document.mapping.get("task") or {}, task.Config, base)
+
+
+def _lay_override(layers: _Layers, task: Task, override: Override) -> None:
+    path = override.path if override.path[0] in SECTIONS and len(override.path) > 1 else ("task", *override.path)
+    layers.forget(path)
+    path = apply_override(layers.values, replace(override, path=path))
+    layers.origins[path] = override.where
+    if path[0] == "task":
+        touched: Any = override.value
+        for key in reversed(path[1:]):
+            touched = {key: touched}
+        anchor_paths(layers.values["task"], touched, task.Config, Path.cwd())
+
+
+def _build(task: Task, header: dict[str, Any], layers: _Layers) -> RunConfig:
+    config = check_model(task.Config, layers.values["task"], layers.origin, "task")
+    density = check_model(DensitySettings, layers.values["density"], layers.origin, "density")
+    learning = check_model(LearningSettings, layers.values["learning"], layers.origin, "learning")
+    return RunConfig(
+        task_name=task.name,
+        seed=header["seed"],
+        preset=header["preset"],
+        task=config,
+        space=_space(task, config, layers),
+        density=density,
+        learning=learning,
+    )
+
+
+def _space(task: Task, config: TaskConfig, layers: _Layers) -> DesignSpace:
+    given = layers.values["space"]
+    if set(DIMENSIONS) <= set(given):
+        base: dict[str, Any] = {}
+    else:
+        with plugin_guard(task.name):
+            base = task.space(config).as_dict()
+    section = check_model(_SpaceSection, {**base, **given}, layers.origin, "space")
+    try:
+        return DesignSpace.from_dict(section.model_dump())
+    except ConfigError as error:
+        path: KeyPath = tuple((error.where or "space").split("."))
+        raise ConfigError(
+            f"{'.'.join(map(str, path))}: {error.message}", where=layers.origin(path), allowed=error.allowed
+        ) from None
+
+
+def _merge(base: dict[str, Any], values: Mapping[str, Any]) -> None:
+    for key, value in values.items():
+        if isinstance(value, Mapping) and isinstance(base.get(key), dict):
+            _merge(base[key], value)
+        else:
+            base[key] = dict(value) if isinstance(value, Mapping) else value

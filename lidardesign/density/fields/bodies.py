@@ -1,0 +1,264 @@
+"""Many bodies in many columns as flat arrays: one row per body and frame, evaluated in the body's own frame.
+
+A column is a scene, or a frame of a moving scene. Thousands of frames share the shapes of their bodies, so a frame
+costs a pose and a bounding box, never a grid; meshes have one distance grid each, in their own frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+
+from lidardesign.density.fields import grids as interpolation
+from lidardesign.density.fields.grids import Grid, cached_distance_grids, grid_around
+from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, inverse_rigid
+
+KINDS: dict[type, int] = {
+    Sphere: interpolation.SPHERE,
+    Box: interpolation.BOX,
+    Capsule: interpolation.CAPSULE,
+    Plane: interpolation.PLANE,
+    Mesh: interpolation.GRID,
+}
+# Frames of one motion are close together: so many of them are looked at, or passed over, at once.
+GROUP_COLUMNS = 16
+BuildGrid = Callable[[Mesh], tuple[Grid, np.ndarray]]
+Entry = tuple[int, Body, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Grids:
+    """The distance grids of meshes in their own frames, end to end; row 0 stands for bodies without a grid.
+
+    Arguments:
+        values: All distances [m], float32.
+        starts, counts, lows, inverse_steps: Where each grid begins and how it is placed, one row per grid.
+        meshes: The mesh of each grid, from row 1 on.
+        high: Upper corners of the grids, one row per grid.
+        log_weights: log importance at the points of `values`, float32; None: 0 everywhere.
+    """
+
+    values: np.ndarray
+    starts: np.ndarray
+    counts: np.ndarray
+    lows: np.ndarray
+    inverse_steps: np.ndarray
+    high: np.ndarray
+    meshes: tuple[Mesh, ...]
+    log_weights: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Bodies:
+    """Bodies of many columns, sorted by column.
+
+    Arguments:
+        kinds: What each is (`interpolation.SPHERE`, ...), shape (B,).
+        sizes: Radius, radius and half length, or half extents, shape (B, 3) [m].
+        to_body: Rows of the world-to-body transform, shape (B, 3, 4).
+        grid: Row in `grids` of meshes, 0 for others, shape (B,).
+        low, high: World bounding boxes, shape (B, 3); infinite for planes.
+        column: The column of each, ascending, shape (B,).
+        starts: Where each column begins, shape (columns + 1,).
+        grids: Of the meshes.
+        log_weight: log importance: that of each as a whole, and with its mesh's the least and the largest, shape
+            (B, 3); None: 0 everywhere.
+    """
+
+    kinds: np.ndarray
+    sizes: np.ndarray
+    to_body: np.ndarray
+    grid: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    column: np.ndarray
+    starts: np.ndarray
+    grids: Grids
+    log_weight: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.kinds)
+
+    @property
+    def columns(self) -> int:
+        """The number of columns."""
+        return len(self.starts) - 1
+
+    @property
+    def shapes(self) -> tuple[np.ndarray, ...]:
+        """What the kernels need to evaluate one body."""
+        grids = self.grids
+        geometry = (grids.values, grids.starts, grids.counts, grids.lows, grids.inverse_steps)
+        return (self.kinds, self.sizes, self.to_body, self.grid, *geometry)
+
+    @cached_property
+    def mesh_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bounding boxes of the meshes in their own frames by grid row, shape (rows, 3) each [m]."""
+        bounds = [np.zeros((2, 3)), *(mesh.bounds_m for mesh in self.grids.meshes)]
+        return np.stack([b[0] for b in bounds]), np.stack([b[1] for b in bounds])
+
+    @cached_property
+    def edges(self) -> np.ndarray:
+        """The low and then the high sides of the bounding boxes by axis, each beside its neighbours', shape (6, B)."""
+        return np.concatenate([self.low.T, self.high.T])
+
+    @cached_property
+    def group_edges(self) -> np.ndarray:
+        """As `edges`, of boxes around `GROUP_COLUMNS` neighbouring columns each [m]; empty groups are nowhere."""
+        first = np.arange(0, self.columns, GROUP_COLUMNS)
+        rows = self.starts[first]
+        low = np.full((len(first), 3), np.inf)
+        high = np.full((len(first), 3), -np.inf)
+        held = self.starts[np.minimum(first + GROUP_COLUMNS, self.columns)] > rows
+        if held.any():
+            low[held] = np.minimum.reduceat(self.low, rows[held])
+            high[held] = np.maximum.reduceat(self.high, rows[held])
+        return np.concatenate([low.T, high.T])
+
+    def take(self, columns: np.ndarray) -> Bodies:
+        """The bodies of some columns, which become columns 0, 1, ... in this order."""
+        counts = self.starts[columns + 1] - self.starts[columns]
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        rows = np.arange(starts[-1]) - np.repeat(starts[:-1] - self.starts[columns], counts)
+        names = ["kinds", "sizes", "to_body", "grid", "low", "high", *["log_weight"] * (self.log_weight is not None)]
+        fields = {name: getattr(self, name)[rows] for name in names}
+        return replace(self, **fields, column=np.repeat(np.arange(len(columns)), counts), starts=starts)
+
+    def apart(self) -> Bodies:
+        """The same bodies with a column of its own for each."""
+        return replace(self, column=np.arange(len(self)), starts=np.arange(len(self) + 1))
+
+
+def collect_bodies(
+    scenes: Sequence[Scene], chosen: Callable[[Body], bool], *, resolution: int, padding_m: float
+) -> Bodies:
+    """The chosen bodies of all scenes and frames.
+
+    Arguments:
+        scenes: One column per scene and frame, scene by scene.
+        chosen: Which bodies count, as `lambda body: body.is_target`.
+        resolution: Grid points along the longest side of a mesh field.
+        padding_m: How far grids reach beyond their meshes [m].
+    """
+    build = partial(own_grid, resolution=resolution, padding_m=padding_m)
+    return place_bodies(*_entries(scenes, chosen), build)
+
+
+def occluding_bodies(scenes: Sequence[Scene]) -> Bodies:
+    """The occluders of all scenes and frames; their meshes are only cast at, so they have no distance grids."""
+    return place_bodies(*_entries(scenes, lambda body: body.is_occluder), _no_distances)
+
+
+def own_grid(mesh: Mesh, resolution: int, padding_m: float) -> tuple[Grid, np.ndarray]:
+    """The distance grid of a mesh in its own frame."""
+    grid = grid_around(mesh.bounds_m, resolution, padding_m)
+    return grid, cached_distance_grids([mesh], grid)[0]
+
+
+def _no_distances(mesh: Mesh) -> tuple[Grid, np.ndarray]:
+    return grid_around(mesh.bounds_m, 2, 0.0), np.zeros(0, dtype=np.float32)
+
+
+def _entries(scenes: Sequence[Scene], chosen: Callable[[Body], bool]) -> tuple[list[Entry], int]:
+    """The chosen bodies of every scene and frame, and the number of columns."""
+    entries: list[Entry] = []
+    column = 0
+    for scene in scenes:
+        kept = [body for body in scene.bodies if chosen(body)]
+        for frame in range(scene.frames):
+            entries += [(column, body, frame) for body in kept]
+            column += 1
+    return entries, column
+
+
+def place_bodies(entries: Sequence[Entry], columns: int, build_grid: BuildGrid) -> Bodies:
+    """The arrays of bodies, given with their column and frame in ascending order of columns."""
+    poses = np.array([body.pose(frame) for _, body, frame in entries]).reshape(-1, 4, 4)
+    column = np.array([column for column, _, _ in entries], dtype=np.int64)
+    grids, grid = _grids(entries, build_grid)
+    kinds = np.array([KINDS[type(body.shape)] for _, body, _ in entries], dtype=np.int64)
+    sizes = np.array([size_of(body) for _, body, _ in entries], dtype=np.float64).reshape(-1, 3)
+    low, high = _world_bounds(kinds, sizes, grid, grids, poses)
+    return Bodies(
+        kinds=kinds,
+        sizes=sizes,
+        to_body=np.ascontiguousarray(inverse_rigid(poses)[:, :3]),
+        grid=grid,
+        low=low,
+        high=high,
+        column=column,
+        starts=np.searchsorted(column, np.arange(columns + 1)),
+        grids=grids,
+    )
+
+
+def size_of(body: Body) -> tuple[float, float, float]:
+    """The lengths of a primitive as the kernels take them; zeros for planes and meshes."""
+    match body.shape:
+        case Sphere(radius_m=radius):
+            return radius, 0.0, 0.0
+        case Capsule(radius_m=radius, half_length_m=half_length):
+            return radius, half_length, 0.0
+        case Box(half_extents_m=half):
+            return half[0], half[1], half[2]
+        case _:
+            return 0.0, 0.0, 0.0
+
+
+def _grids(entries: Sequence[Entry], build_grid: BuildGrid) -> tuple[Grids, np.ndarray]:
+    """One grid per distinct mesh, and the grid row of every entry."""
+    known: dict[tuple[str, str], int] = {}
+    meshes: list[Mesh] = []
+    built: list[tuple[Grid, np.ndarray]] = []
+    row = np.zeros(len(entries), dtype=np.int64)
+    for index, (_, body, _) in enumerate(entries):
+        mesh = body.shape
+        if isinstance(mesh, Mesh):
+            name = mesh.content_hash, mesh.importance_hash
+            if name not in known:
+                known[name] = len(meshes) + 1
+                meshes.append(mesh)
+                built.append(build_grid(mesh))
+            row[index] = known[name]
+    # row 0 is a grid of one empty cell, so that the kernels always have something to index
+    values = [np.zeros(8, np.float32), *(distances for _, distances in built)]
+    lengths = [len(part) for part in values]
+    counts = [np.full(3, 2), *(grid.counts for grid, _ in built)]
+    lows = [np.zeros(3), *(grid.low for grid, _ in built)]
+    steps = np.array([1.0, *(grid.step for grid, _ in built)])
+    counts, lows = np.array(counts, dtype=np.int64), np.array(lows)
+    grids = Grids(
+        values=np.concatenate(values),
+        starts=np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64),
+        counts=counts,
+        lows=lows,
+        inverse_steps=1.0 / steps,
+        high=lows + (counts - 1) * steps[:, None],
+        meshes=tuple(meshes),
+    )
+    return grids, row
+
+
+def _world_bounds(
+    kinds: np.ndarray, sizes: np.ndarray, grid: np.ndarray, grids: Grids, poses: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """World boxes around every body, shape (B, 3) each; of a mesh, around its whole grid."""
+    centre, half = np.zeros((len(kinds), 3)), sizes.copy()
+    sphere, capsule = kinds == interpolation.SPHERE, kinds == interpolation.CAPSULE
+    half[sphere] = sizes[sphere, :1]
+    half[capsule] = np.stack(
+        [sizes[capsule, 0], sizes[capsule, 0], sizes[capsule, 0] + sizes[capsule, 1]], axis=1
+    ).reshape(-1, 3)
+    mesh = kinds == interpolation.GRID
+    centre[mesh] = (grids.lows[grid[mesh]] + grids.high[grid[mesh]]) / 2
+    half[mesh] = (grids.high[grid[mesh]] - grids.lows[grid[mesh]]) / 2
+    rotation = poses[:, :3, :3]
+    middle = np.einsum("bij,bj->bi", rotation, centre) + poses[:, :3, 3]
+    reach = np.einsum("bij,bj->bi", np.abs(rotation), half)
+    # a sphere is as wide in every turned frame
+    reach[sphere] = half[sphere]
+    reach[kinds == interpolation.PLANE] = np.inf
+    return np.ascontiguousarray(middle - reach), np.ascontiguousarray(middle + reach)

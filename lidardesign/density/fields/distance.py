@@ -1,0 +1,233 @@
+"""Distances of many scenes at once: one column per scene, or per frame of a moving scene.
+
+Meshes at rest share one table (grid points by columns); primitives and moving bodies are evaluated exactly or in
+their own frame by transforming the query. Distances are positive outside and exact for primitives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+
+from lidardesign.density.fields import grids as interpolation
+from lidardesign.density.fields.bodies import Bodies, own_grid, place_bodies
+from lidardesign.density.fields.grids import Grid, cached_distance_grids, grid_around
+from lidardesign.errors import ConfigError
+from lidardesign.scene import Body, Mesh, Scene
+
+MAXIMUM_TABLE_BYTES = 6 * 2**30
+FAR_M = np.float32(1e9)  # the distance of a column without a mesh in the table
+
+
+class Field(Protocol):
+    """Signed distances of all columns, with contracted gradients.
+
+    `shell_m` is half the thickness given to surfaces without an inside where they occlude, shape (columns,).
+    """
+
+    columns: int
+    shell_m: np.ndarray
+
+    def distances(self, points: np.ndarray) -> np.ndarray:
+        """Distances at points: (N, 3) to (N, columns) [m]."""
+        ...
+
+    def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Gradients of sum_c weights_nc * d_c(points_n): (N, 3), (N, columns) to (N, 3)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class TableField:
+    """Meshes at rest: one row of distances per grid point.
+
+    Arguments:
+        table: Shape (grid points, columns) float32 [m].
+        grid: Where the rows are.
+        shell_m: See `Field`.
+        compiled: Whether distances come from the compiled kernels, which take 0.8 s to load.
+    """
+
+    table: np.ndarray
+    grid: Grid
+    shell_m: np.ndarray
+    compiled: bool = True
+
+    @property
+    def columns(self) -> int:
+        """The number of columns."""
+        return self.table.shape[1]
+
+    @property
+    def geometry(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Counts, low corner and inverse step, as the kernels take them."""
+        return self.grid.counts, self.grid.low, 1.0 / self.grid.step
+
+    def distances(self, points: np.ndarray) -> np.ndarray:
+        """See `Field`."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        if not self.compiled:
+            return interpolation.table_distances(self.table, *self.geometry, points)
+        from lidardesign.density.fields import kernels
+
+        out = np.empty((len(points), self.columns), dtype=np.float32)
+        kernels.table_distances(self.table, *self.geometry, points, out)
+        return out
+
+    def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """See `Field`."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        from lidardesign.density.fields import kernels
+
+        out = np.empty_like(points)
+        kernels.table_gradient(self.table, *self.geometry, points, np.ascontiguousarray(weights, np.float64), out)
+        return out
+
+
+class BodyField:
+    """Primitives and moving bodies, each evaluated in its own frame.
+
+    Arguments:
+        bodies: Every body that counts, by column.
+    """
+
+    def __init__(self, bodies: Bodies) -> None:
+        self.bodies = bodies
+        self.columns = bodies.columns
+        self.shell_m = np.zeros(bodies.columns)
+        steps = 1.0 / bodies.grids.inverse_steps
+        unsigned = np.array([False, *(mesh.sign == "unsigned" for mesh in bodies.grids.meshes)])
+        np.maximum.at(self.shell_m, bodies.column, np.where(unsigned, steps, 0.0)[bodies.grid])
+
+    def _evaluate(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        from lidardesign.density.fields import body_kernels
+
+        shape = (len(points), self.columns)
+        distances, nearest = np.empty(shape), np.empty(shape, dtype=np.int64)
+        body_kernels.all_distances(*self.bodies.shapes, self.bodies.starts, points, distances, nearest)
+        return distances, nearest
+
+    def distances(self, points: np.ndarray) -> np.ndarray:
+        """See `Field`."""
+        return self._evaluate(points)[0]
+
+    def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """See `Field`."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        nearest = self._evaluate(points)[1]
+        from lidardesign.density.fields import body_kernels
+
+        # a column without bodies has no nearest one, and no gradient
+        known = np.where(nearest >= 0, weights, 0.0).ravel()
+        rows = np.arange(len(points) + 1) * self.columns
+        out = np.empty_like(points)
+        body_kernels.add_gradients(*self.bodies.shapes, points, rows, nearest.ravel(), known, out)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class UnionField:
+    """The nearest of two fields over the same columns."""
+
+    first: Field
+    second: Field
+
+    @property
+    def columns(self) -> int:
+        """The number of columns."""
+        return self.first.columns
+
+    @property
+    def shell_m(self) -> np.ndarray:
+        """See `Field`."""
+        return np.maximum(self.first.shell_m, self.second.shell_m)
+
+    def distances(self, points: np.ndarray) -> np.ndarray:
+        """See `Field`."""
+        return np.minimum(self.first.distances(points), self.second.distances(points))
+
+    def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """See `Field`."""
+        nearer = self.first.distances(points) <= self.second.distances(points)
+        first = self.first.gradient(points, np.where(nearer, weights, 0.0))
+        return first + self.second.gradient(points, np.where(nearer, 0.0, weights))
+
+
+def scene_columns(scenes: Sequence[Scene]) -> list[tuple[int, int]]:
+    """Scene and frame of every column, in order."""
+    return [(index, frame) for index, scene in enumerate(scenes) for frame in range(scene.frames)]
+
+
+def build_field(
+    scenes: Sequence[Scene], chosen: Callable[[Body], bool], *, resolution: int, padding_m: float,
+    around: Sequence[Scene] | None = None,
+) -> Field:  # fmt: skip
+    """The distances of the chosen bodies of all scenes.
+
+    Arguments:
+        scenes: One column per scene and frame, in the order of `scene_columns`.
+        chosen: Which bodies count, as `lambda body: body.is_target`.
+        resolution: Grid points along the longest side of a mesh field.
+        padding_m: How far grids reach beyond their meshes [m].
+        around: Scenes whose meshes the shared table's grid must hold; these by default.
+    """
+    columns = scene_columns(scenes)
+    at_rest: list[tuple[int, Body]] = []
+    others: list[tuple[int, Body, int]] = []
+    for column, (index, frame) in enumerate(columns):
+        for body in filter(chosen, scenes[index].bodies):
+            if isinstance(body.shape, Mesh) and scenes[index].frames == 1:
+                at_rest.append((column, body))
+            else:
+                others.append((column, body, frame))
+    fields: list[Field] = []
+    if at_rest:
+        grid = _table_grid(scenes if around is None else around, chosen, resolution, padding_m)
+        fields.append(_table_field(at_rest, len(columns), grid))
+    if others or not at_rest:
+        build = partial(own_grid, resolution=resolution, padding_m=padding_m)
+        fields.append(BodyField(place_bodies(others, len(columns), build)))
+    return fields[0] if len(fields) == 1 else UnionField(*fields)
+
+
+def _table_grid(
+    scenes: Sequence[Scene], chosen: Callable[[Body], bool], resolution: int, padding_m: float
+) -> Grid:
+    """The grid around the chosen meshes at rest of all scenes."""
+    bodies = [body for scene in scenes if scene.frames == 1 for body in filter(chosen, scene.bodies)]
+    meshes = [body.shape.transformed(body.pose()) for body in bodies if isinstance(body.shape, Mesh)]
+    corners = np.concatenate([mesh.bounds_m for mesh in meshes])
+    return grid_around(np.stack([corners.min(axis=0), corners.max(axis=0)]), resolution, padding_m)
+
+
+def check_table(grid: Grid, columns: int, tables: int = 1) -> None:
+    """Refuse tables that no memory holds.
+
+    Raises:
+        ConfigError: So it is.
+    """
+    size = grid.size * columns * 4 * tables
+    if size > MAXIMUM_TABLE_BYTES:
+        raise ConfigError(
+            f"fields of {columns} scenes at {grid.size} points need {size / 2**30:.1f} GiB",
+            where="density.field_resolution",
+            allowed=f"{MAXIMUM_TABLE_BYTES / 2**30:.0f} GiB",
+            hint="lower density.field_resolution or use fewer scenes",
+        )
+
+
+def _table_field(bodies: list[tuple[int, Body]], columns: int, grid: Grid) -> TableField:
+    meshes = [body.shape.transformed(body.pose()) for _, body in bodies]
+    check_table(grid, columns)
+    table = np.full((grid.size, columns), FAR_M, dtype=np.float32)
+    shell_m = np.zeros(columns)
+    for (column, _), mesh, values in zip(bodies, meshes, cached_distance_grids(meshes, grid), strict=True):
+        np.minimum(table[:, column], values, out=table[:, column])
+        if mesh.sign == "unsigned":
+            shell_m[column] = grid.step
+    return TableField(table, grid, shell_m)

@@ -1,0 +1,443 @@
+"""How much surfaces count in the target density: log w at the nearest surface point, in the form of `fields`.
+
+Meshes at rest share one table of log weights on the grid of their distances; primitives and moving bodies have theirs
+in their own frames. Between grid points log w is trilinear, so its gradient is exact for what the density uses.
+
+The importance of meshes on grids: log w at the nearest surface point of every grid point, cached on disk.
+
+As with distances (`grids`) the nearest surface point is exact in a narrow band around the surface; beyond it, that of
+the nearest grid point of the band is taken.
+
+Compiled loops over grids of log weights: as those of distances, but constant beyond the grid's faces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numba import njit
+
+from lidardesign.density.fields import grids as interpolation
+from lidardesign.density.fields.bodies import Bodies
+from lidardesign.density.fields.body_kernels import to_frame
+from lidardesign.density.fields.distance import BodyField, Field, TableField, UnionField, check_table, scene_columns
+from lidardesign.density.fields.grids import Grid, cached_distance_grids, cached_grids, narrow_band, nearest_known
+from lidardesign.density.fields.kernels import FAST, corners, locate
+from lidardesign.density.visibility.occlusion import Pairs
+from lidardesign.scene import Body, Mesh, Scene
+
+ALGORITHM = "log importance at the nearest surface point, narrow band 3 cells, filled by distance transform, float32"
+
+
+def log_weight_grid(mesh: Mesh, grid: Grid) -> np.ndarray:
+    """log w at the nearest surface point of all grid points, shape (size,) float32; zeros without an importance."""
+    if mesh.importance is None:
+        return np.zeros(grid.size, dtype=np.float32)
+    # relative to the grid's corner: squares of coordinates far from the origin would lose every digit
+    points, vertices = Grid(np.zeros(3), grid.step, grid.counts).points(), mesh.vertices - grid.low
+    distance, face, closest = narrow_band(points, vertices, mesh.faces.astype(np.int64), grid)
+    known = ~np.isnan(distance)
+    log_weights = np.zeros(grid.size)
+    corners = mesh.faces[face[known]]
+    shares = barycentric(closest[known], vertices[corners])
+    log_weights[known] = np.einsum("nk,nk->n", shares, np.log(mesh.importance)[corners])
+    if not known.all():
+        log_weights[~known] = log_weights[nearest_known(~known, grid)]
+    return log_weights.astype(np.float32)
+
+
+def cached_log_weight_grids(meshes: list[Mesh], grid: Grid) -> list[np.ndarray]:
+    """`log_weight_grid` of each mesh, from the cache where geometry and importance are known."""
+    return cached_grids(meshes, grid, log_weight_grid, lambda mesh: ALGORITHM + mesh.importance_hash)
+
+
+def barycentric(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """The shares of triangles' corners in points on them, (N, 3) and (N, 3, 3) to (N, 3); all are at least 0.
+
+    A triangle without area belongs to its corners evenly.
+    """
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    normal = np.cross(b - a, c - a)
+    opposite = [(b, c), (c, a), (a, b)]
+    areas = np.stack([np.einsum("nk,nk->n", np.cross(p - points, q - points), normal) for p, q in opposite], axis=1)
+    areas = np.maximum(areas, 0.0)
+    total = areas.sum(axis=1, keepdims=True)
+    return np.where(total > 0, areas / np.where(total > 0, total, 1.0), 1 / 3)
+
+
+class LogWeights(Protocol):
+    """log importance of all columns, with contracted gradients."""
+
+    @property
+    def peak(self) -> float:
+        """What no value exceeds."""
+        ...
+
+    def values(self, points: np.ndarray) -> np.ndarray:
+        """log w at points: (N, 3) to (N, columns)."""
+        ...
+
+    def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Gradients of sum_c weights_nc log w_c(points_n): (N, 3), (N, columns) to (N, 3)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class TableWeights:
+    """Meshes at rest: one row of log weights per grid point.
+
+    Arguments:
+        table: Shape (grid points, columns) float32.
+        grid: Where the rows are.
+        compiled: See `fields.TableField`.
+    """
+
+    table: np.ndarray
+    grid: Grid
+    compiled: bool = True
+
+    @cached_property
+    def peak(self) -> float:
+        """See `LogWeights`."""
+        return float(self.table.max())
+
+    @property
+    def _geometry(self) -> tuple[np.ndarray, np.ndarray, float]:
+        return self.grid.counts, self.grid.low, 1.0 / self.grid.step
+
+    def values(self, points: np.ndarray) -> np.ndarray:
+        """See `LogWeights`."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        if not self.compiled:
+            return interpolation.table_values(self.table, *self._geometry, points)
+        from lidardesign.density.fields import importance as importance_kernels
+
+        out = np.empty((len(points), self.table.shape[1]), dtype=np.float32)
+        importance_kernels.table_values(self.table, *self._geometry, points, out)
+        return out
+
+    def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """See `LogWeights`."""
+        from lidardesign.density.fields import importance as importance_kernels
+
+        points, weights = (np.ascontiguousarray(values, dtype=np.float64) for values in (points, weights))
+        out = np.empty_like(points)
+        importance_kernels.table_gradient(self.table, *self._geometry, points, weights, out)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class BodyWeights:
+    """Primitives and moving bodies: a constant for each, and for meshes a grid of their own.
+
+    Arguments:
+        bodies: With their log weights, see `weigh`.
+    """
+
+    bodies: Bodies
+
+    @cached_property
+    def column_peaks(self) -> np.ndarray:
+        """The largest log weight in each column, 0 in one without bodies, shape (columns,)."""
+        peaks = np.full(self.bodies.columns, -np.inf)
+        np.maximum.at(peaks, self.bodies.column, self.bodies.log_weight[:, 2])
+        return np.where(np.isfinite(peaks), peaks, 0.0)
+
+    @property
+    def peak(self) -> float:
+        """See `LogWeights`."""
+        return float(self.column_peaks.max())
+
+    @cached_property
+    def spread(self) -> float:
+        """By how much a log weight may be below the largest of its column [nats]."""
+        below = self.column_peaks[self.bodies.column] - self.bodies.log_weight[:, 1]
+        return float(below.max(initial=0.0))
+
+    def values(self, points: np.ndarray) -> np.ndarray:
+        """See `LogWeights`."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        rows, nearest = self._nearest(points)
+        return self._of_bodies(points, rows, nearest).reshape(len(points), -1)
+
+    def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """See `LogWeights`."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        rows, nearest = self._nearest(points)
+        out = np.zeros_like(points)
+        self._add_gradients(points, rows, nearest, np.ascontiguousarray(weights, dtype=np.float64).ravel(), out)
+        return out
+
+    def of_pairs(self, points: np.ndarray, pairs: Pairs) -> np.ndarray:
+        """log w of pairs of points (N, 3) and columns, shape (P,)."""
+        return self._of_bodies(np.ascontiguousarray(points), pairs.row_starts, pairs.bodies)
+
+    def add_pair_gradients(self, points: np.ndarray, pairs: Pairs, weights: np.ndarray, out: np.ndarray) -> None:
+        """Add the gradients of sum_p weights_p log w_p by the points to `out` (N, 3)."""
+        self._add_gradients(np.ascontiguousarray(points), pairs.row_starts, pairs.bodies, weights, out)
+
+    def _nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where each point's columns begin, (N + 1,), and the nearest body in each, (N * columns,)."""
+        from lidardesign.density.fields import body_kernels
+
+        shape = len(points), self.bodies.columns
+        distances, nearest = np.empty(shape), np.empty(shape, dtype=np.int64)
+        body_kernels.all_distances(*self.bodies.shapes, self.bodies.starts, points, distances, nearest)
+        return np.arange(shape[0] + 1) * shape[1], nearest.ravel()
+
+    @property
+    def _grids(self) -> tuple[np.ndarray, ...]:
+        bodies, grids = self.bodies, self.bodies.grids
+        geometry = (grids.log_weights, grids.starts, grids.counts, grids.lows, grids.inverse_steps)
+        return (bodies.to_body, bodies.grid, *geometry)
+
+    def _of_bodies(self, points: np.ndarray, row_starts: np.ndarray, bodies: np.ndarray) -> np.ndarray:
+        from lidardesign.density.fields import importance as importance_kernels
+
+        constants, out = np.ascontiguousarray(self.bodies.log_weight[:, 0]), np.empty(len(bodies))
+        importance_kernels.pair_values(constants, *self._grids, points, row_starts, bodies, out)
+        return out
+
+    def _add_gradients(
+        self, points: np.ndarray, row_starts: np.ndarray, bodies: np.ndarray, weights: np.ndarray, out: np.ndarray
+    ) -> None:
+        from lidardesign.density.fields import importance as importance_kernels
+
+        importance_kernels.add_pair_gradients(*self._grids, points, row_starts, bodies, weights, out)
+
+
+@dataclass(frozen=True, eq=False)
+class UnionWeights:
+    """The weights of the nearer of two fields over the same columns.
+
+    Arguments:
+        fields: Their distances.
+        first, second: Their weights.
+    """
+
+    fields: UnionField
+    first: LogWeights
+    second: LogWeights
+
+    @property
+    def peak(self) -> float:
+        """See `LogWeights`."""
+        return max(self.first.peak, self.second.peak)
+
+    def _nearer(self, points: np.ndarray) -> np.ndarray:
+        return self.fields.first.distances(points) <= self.fields.second.distances(points)
+
+    def values(self, points: np.ndarray) -> np.ndarray:
+        """See `LogWeights`."""
+        return np.where(self._nearer(points), self.first.values(points), self.second.values(points))
+
+    def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """See `LogWeights`."""
+        nearer = self._nearer(points)
+        first = self.first.gradient(points, np.where(nearer, weights, 0.0))
+        return first + self.second.gradient(points, np.where(nearer, 0.0, weights))
+
+
+def is_weighted(scenes: Sequence[Scene]) -> bool:
+    """Whether any target counts otherwise than 1."""
+    return any(log_weight_range(body) != (0.0, 0.0) for scene in scenes for body in scene.bodies if body.is_target)
+
+
+def importance_notes(scenes: Sequence[Scene]) -> list[str]:
+    """From what to what targets count, where they do not all count 1."""
+    if not is_weighted(scenes):
+        return []
+    ranges = np.array([log_weight_range(body) for scene in scenes for body in scene.bodies if body.is_target])
+    least, largest = np.exp([ranges[:, 0].min(), ranges[:, 1].max()])
+    return [f"importance: parts of the targets count from {least:.2g} to {largest:.2g}"]
+
+
+def log_weight_range(body: Body) -> tuple[float, float]:
+    """The least and the largest log importance of a body's surface."""
+    constant = float(np.log(body.importance))
+    if not isinstance(body.shape, Mesh) or body.shape.importance is None:
+        return constant, constant
+    weights = np.log(body.shape.importance)
+    return constant + float(weights.min()), constant + float(weights.max())
+
+
+def weigh(bodies: Bodies, entries: Sequence[Body]) -> Bodies:
+    """Bodies with their log weights.
+
+    Arguments:
+        bodies: Of all columns; their meshes have grids.
+        entries: The body of each row.
+    """
+    grids, known = bodies.grids, {}
+    values = [np.zeros(8, np.float32)]
+    for row, mesh in enumerate(grids.meshes, start=1):
+        grid = Grid(grids.lows[row], 1.0 / grids.inverse_steps[row], grids.counts[row])
+        values += cached_log_weight_grids([mesh], grid)
+    log_weight = np.empty((len(entries), 3))
+    for row, body in enumerate(entries):
+        # thousands of frames share few bodies
+        if id(body) not in known:
+            known[id(body)] = (float(np.log(body.importance)), *log_weight_range(body))
+        log_weight[row] = known[id(body)]
+    return replace(bodies, log_weight=log_weight, grids=replace(grids, log_weights=np.concatenate(values)))
+
+
+def build_log_weights(scenes: Sequence[Scene], field: Field, *, around: Sequence[Scene]) -> LogWeights | None:
+    """The importance of the targets of scenes; None where all count 1, in all of `around`.
+
+    Arguments:
+        scenes: One column per scene and frame.
+        field: The distances of their targets, as `fields.build_field` gives them.
+        around: The scenes of all ranks, which must agree on whether there are weights.
+    """
+    if not is_weighted(around):
+        return None
+    columns = scene_columns(scenes)
+    at_rest, others = [], []
+    for column, (index, _) in enumerate(columns):
+        for body in scenes[index].bodies:
+            if body.is_target:
+                in_table = isinstance(body.shape, Mesh) and scenes[index].frames == 1
+                (at_rest if in_table else others).append((column, body))
+    if isinstance(field, TableField):
+        return _table_weights(field, at_rest, len(columns))
+    if isinstance(field, BodyField):
+        return BodyWeights(weigh(field.bodies, [body for _, body in others]))
+    first = _table_weights(field.first, at_rest, len(columns))
+    return UnionWeights(field, first, BodyWeights(weigh(field.second.bodies, [body for _, body in others])))
+
+
+def _table_weights(field: TableField, bodies: list[tuple[int, Body]], columns: int) -> TableWeights:
+    check_table(field.grid, columns, tables=2)
+    meshes = [body.shape.transformed(body.pose()) for _, body in bodies]
+    table = np.zeros((field.grid.size, columns), dtype=np.float32)
+    alone = np.bincount([column for column, _ in bodies], minlength=columns) < 2
+    nearest = np.full((field.grid.size, int((~alone).sum())), np.inf, dtype=np.float32)
+    place = np.cumsum(~alone) - 1
+    for (column, body), mesh, values in zip(bodies, meshes, cached_log_weight_grids(meshes, field.grid), strict=True):
+        values = values + np.float32(np.log(body.importance))
+        if alone[column]:
+            table[:, column] = values
+            continue
+        distances = cached_distance_grids([mesh], field.grid)[0]
+        nearer = distances < nearest[:, place[column]]
+        nearest[nearer, place[column]] = distances[nearer]
+        table[nearer, column] = values[nearer]
+    return TableWeights(table, field.grid, field.compiled)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def table_values(table, counts, low, inverse_step, points, out):  # noqa: ANN001, ANN201
+    """Values of all columns at points: table (G, C), points (N, 3), out (N, C)."""
+    cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
+    index, weight = np.zeros(8, np.int64), np.zeros(8, table.dtype)
+    for n in range(points.shape[0]):
+        locate(counts, low, inverse_step, points[n], cell, fraction, excess)
+        corners(counts, cell, fraction, index, weight)
+        for c in range(table.shape[1]):
+            out[n, c] = 0.0
+        for corner in range(8):
+            share, row = weight[corner], table[index[corner]]
+            for c in range(table.shape[1]):
+                out[n, c] += share * row[c]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def table_gradient(table, counts, low, inverse_step, points, weights, out):  # noqa: ANN001, ANN201
+    """Gradients of sum_c weights_nc * value_c(points_n): weights (N, C), out (N, 3)."""
+    cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
+    index, corner_weight, dots = np.zeros(8, np.int64), np.zeros(8), np.zeros(8)
+    for n in range(points.shape[0]):
+        locate(counts, low, inverse_step, points[n], cell, fraction, excess)
+        corners(counts, cell, fraction, index, corner_weight)
+        for corner in range(8):
+            row, total = table[index[corner]], 0.0
+            for c in range(table.shape[1]):
+                total += row[c] * weights[n, c]
+            dots[corner] = total
+        for axis in range(3):
+            out[n, axis] = _slope(dots, fraction, axis) * inverse_step if excess[axis] == 0.0 else 0.0
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _slope(values, fraction, axis):  # noqa: ANN001, ANN202
+    """The derivative of a cell's trilinear value along an axis, per step; values (8,) at its corners."""
+    total = 0.0
+    for corner in range(8):
+        share = 1.0 if (corner >> axis) & 1 else -1.0
+        for k in range(3):
+            if k != axis:
+                share *= fraction[k] if (corner >> k) & 1 else 1.0 - fraction[k]
+        total += share * values[corner]
+    return total
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _corner_values(values, start, counts, low, inverse_step, q, cell, fraction, excess, index, weight, found):  # noqa: ANN001, ANN202
+    """The values at the corners of a point's cell in a grid that begins at `start`, into `found` (8,)."""
+    locate(counts, low, inverse_step, q, cell, fraction, excess)
+    corners(counts, cell, fraction, index, weight)
+    for corner in range(8):
+        found[corner] = values[start + index[corner]]
+
+
+@njit(cache=True, nogil=True)
+def pair_values(  # noqa: ANN201
+    constants, to_body, grid, values, grid_starts, counts, lows, steps,  # noqa: ANN001
+    points, row_starts, bodies, out,  # noqa: ANN001
+):  # fmt: skip
+    """log weights of pairs of a point and a body, listed as `body_kernels.near_columns` does: out (P,).
+
+    Arguments:
+        constants: log weight of each body as a whole, shape (B,).
+        values: log weights of all grids of meshes, end to end; bodies of grid 0 have none.
+        bodies: The body of each pair, -1 for none.
+    """
+    cell, fraction, excess, q = np.zeros(3, np.int64), np.zeros(3), np.zeros(3), np.zeros(3)
+    index, weight, found = np.zeros(8, np.int64), np.zeros(8), np.zeros(8)
+    for n in range(points.shape[0]):
+        for pair in range(row_starts[n], row_starts[n + 1]):
+            b = bodies[pair]
+            if b < 0:
+                out[pair] = 0.0
+                continue
+            total, g = constants[b], grid[b]
+            if g > 0:
+                to_frame(to_body, b, points, n, q)
+                _corner_values(
+                    values, grid_starts[g], counts[g], lows[g], steps[g],
+                    q, cell, fraction, excess, index, weight, found,
+                )  # fmt: skip
+                for corner in range(8):
+                    total += weight[corner] * found[corner]
+            out[pair] = total
+
+
+@njit(cache=True, nogil=True)
+def add_pair_gradients(  # noqa: ANN201
+    to_body, grid, values, grid_starts, counts, lows, steps,  # noqa: ANN001
+    points, row_starts, bodies, weights, out,  # noqa: ANN001
+):  # fmt: skip
+    """Add the gradients of sum_pairs weight * log weight of its body at the point to out (N, 3)."""
+    cell, fraction, excess, q = np.zeros(3, np.int64), np.zeros(3), np.zeros(3), np.zeros(3)
+    index, corner_weight, found = np.zeros(8, np.int64), np.zeros(8), np.zeros(8)
+    for n in range(points.shape[0]):
+        for pair in range(row_starts[n], row_starts[n + 1]):
+            b = bodies[pair]
+            if b < 0 or weights[pair] == 0.0 or grid[b] == 0:
+                continue
+            g = grid[b]
+            to_frame(to_body, b, points, n, q)
+            _corner_values(
+                values, grid_starts[g], counts[g], lows[g], steps[g],
+                q, cell, fraction, excess, index, corner_weight, found,
+            )  # fmt: skip
+            for axis in range(3):
+                if excess[axis] == 0.0:
+                    slope = weights[pair] * _slope(found, fraction, axis) * steps[g]
+                    for k in range(3):
+                        out[n, k] += slope * to_body[b, axis, k]

@@ -1,0 +1,1 @@
+"""The normalizing flow and its bridge to the target."""

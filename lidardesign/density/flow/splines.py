@@ -1,0 +1,132 @@
+"""The splines of the flow: zuko's, with learned outer slopes and circles, and the same function compiled.
+
+On the CPU the compiled kernels run (`spline_kernels`): a layer's splines then cost about what their exponentials do,
+and the derivatives of the inverse are written out too. On other devices `BoundedSpline` runs as array operations; it is
+also what the kernels are tested against.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+from zuko.transforms import MonotonicRQSTransform
+
+from lidardesign.numerics import FLOAT32_ROUNDING, safe_sqrt
+
+BOUND = 1.0
+# Foreign points and base samples are kept this far inside the box, where splines are smooth.
+EDGE = FLOAT32_ROUNDING
+# The smallest slope that a spline may take; its inverse is the steepest: 1e4 resolves a 0.1 mm shell in a 1 m range.
+MINIMUM_SLOPE = 1e-4
+SOFTNESS = 2 / abs(math.log(MINIMUM_SLOPE))
+
+
+class BoundedSpline(MonotonicRQSTransform):
+    """A rational-quadratic spline of [-1, 1] onto itself whose outer slopes are learned as well.
+
+    Arguments:
+        widths: Unconstrained bin widths, with shape (*, K).
+        heights: Unconstrained bin heights, with shape (*, K).
+        derivatives: Unconstrained knot slopes, with shape (*, K + 1).
+        periodic: Mask of the dimensions on a circle, with shape (D,), or None.
+    """
+
+    def __init__(self, widths: Tensor, heights: Tensor, derivatives: Tensor, periodic: Tensor | None = None) -> None:
+        super().__init__(widths, heights, derivatives[..., 1:-1], bound=BOUND, slope=MINIMUM_SLOPE)
+        softened = derivatives / (1 + abs(derivatives / math.log(MINIMUM_SLOPE)))
+        slopes = torch.exp(softened)
+        if periodic is not None:
+            outer = torch.exp((softened[..., :1] + softened[..., -1:]) / 2)
+            tied = torch.cat([outer, slopes[..., 1:-1], outer], dim=-1)
+            slopes = torch.where(periodic[:, None], tied, slopes)
+        self.derivatives = slopes
+        self.periodic = periodic
+        # accumulated widths can pass the bound by rounding; the last knots are exact
+        self.horizontal = torch.cat([self.horizontal[..., :-1], torch.full_like(self.horizontal[..., :1], BOUND)], -1)
+        self.vertical = torch.cat([self.vertical[..., :-1], torch.full_like(self.vertical[..., :1], BOUND)], -1)
+
+    def _turned(self, values: Tensor) -> Tensor:
+        """The periodic dimensions half a turn on."""
+        if self.periodic is None:
+            return values
+        return torch.where(self.periodic, torch.where(values >= 0, values - BOUND, values + BOUND), values)
+
+    def call_and_ladj(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """The spline's values and log slopes at x, with shape (*, D); rounding never leaves [-1, 1]."""
+        y, log_slope = super().call_and_ladj(self._turned(x).clamp(-BOUND + EDGE, BOUND - EDGE))
+        return y.clamp(-BOUND, BOUND), log_slope
+
+    def _call(self, x: Tensor) -> Tensor:
+        return super()._call(self._turned(x).clamp(-BOUND + EDGE, BOUND - EDGE)).clamp(-BOUND, BOUND)
+
+    def _inverse(self, y: Tensor) -> Tensor:
+        """The root inside the bin; its discriminant is positive, but rounding may say otherwise."""
+        y = y.clamp(-BOUND + EDGE, BOUND - EDGE)
+        _, x0, x1, y0, y1, d0, d1, s = self.bin(self.searchsorted(self.vertical, y) - 1)
+        bend = (y - y0) * (d0 + d1 - 2 * s)
+        a, b, c = (y1 - y0) * (s - d0) + bend, (y1 - y0) * d0 - bend, -s * (y - y0)
+        discriminant = b**2 - 4 * a * c
+        share = (2 * c / (-b - safe_sqrt(discriminant))).clamp(0.0, 1.0)
+        return self._turned(x0 + share * (x1 - x0))
+
+
+class _CompiledSpline(torch.autograd.Function):
+    """The kernels as a differentiable function; see `spline`."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, values: Tensor, parameters: Tensor, periodic: Tensor, inverted: bool
+    ) -> tuple[Tensor, Tensor]:
+        from lidardesign.density.flow import spline_kernels
+
+        values, parameters = values.detach().contiguous(), parameters.detach().contiguous()
+        shares = parameters.new_empty(*values.shape, 2 * (parameters.shape[-1] // 3))
+        bins = torch.empty(values.shape, dtype=torch.int32)
+        out, log_slopes = torch.empty_like(values), torch.empty_like(values)
+        arrays = [tensor.numpy() for tensor in (shares, bins, out, log_slopes)]
+        kernel = spline_kernels.inverse if inverted else spline_kernels.forward
+        kernel(parameters.numpy(), values.numpy(), periodic.numpy(), SOFTNESS, EDGE, *arrays)
+        ctx.save_for_backward(parameters, shares, bins, out if inverted else values, periodic)
+        ctx.inverted = inverted
+        return out, log_slopes
+
+    @staticmethod
+    def backward(ctx: Any, by_value: Tensor, by_slope: Tensor) -> tuple[Tensor, Tensor, None, None]:
+        from lidardesign.density.flow import spline_kernels
+
+        parameters, shares, bins, base, periodic = ctx.saved_tensors
+        by_parameters, by_argument = torch.empty_like(parameters), torch.empty_like(base)
+        spline_kernels.gradient(
+            *(tensor.numpy() for tensor in (parameters, shares, bins, base, periodic)),
+            SOFTNESS,
+            ctx.inverted,
+            *(tensor.contiguous().numpy() for tensor in (by_value, by_slope)),
+            by_parameters.numpy(),
+            by_argument.numpy(),
+        )
+        return by_argument, by_parameters, None, None
+
+
+def spline(values: Tensor, parameters: Tensor, periodic: Tensor, *, inverted: bool = False) -> tuple[Tensor, Tensor]:
+    """Values of splines, or of their inverses, and the log slopes of the splines there.
+
+    Arguments:
+        values: In [-1, 1], shape (N, D).
+        parameters: Unconstrained widths, heights and slopes one after another, shape (N, D, 3 K + 1).
+        periodic: Which dimensions lie on a circle, shape (D,).
+        inverted: Whether `values` are outputs whose arguments are wanted.
+
+    Returns:
+        Both of shape (N, D), differentiable by values and parameters.
+    """
+    if values.device.type == "cpu":
+        return _CompiledSpline.apply(values, parameters, periodic, inverted)
+    count = parameters.shape[-1] // 3
+    made = BoundedSpline(*parameters.split([count, count, count + 1], dim=-1), periodic if periodic.any() else None)
+    if inverted:
+        values = made.inv(values)
+        return values, made.call_and_ladj(values)[1]
+    return made.call_and_ladj(values)

@@ -1,0 +1,1 @@
+"""Training the flow, and measuring how good it became."""

@@ -1,0 +1,201 @@
+"""Checkpoints of learning: every array and counter that a bit-identical resume needs, in one safetensors file.
+
+safetensors runs no code and refuses truncated files; the hash in the manifest catches flipped bits and `load` checks
+that values are finite.
+
+What a checkpoint must hold to be resumed: counters, the optimiser's memory of every weight, the random stream.
+
+The flow as it was at a few steps of learning, kept in the run: what more steps bought can then be measured.
+
+Snapshots lie where the target is the final one: when balancing begins, and at a quarter and half of it. Before that,
+steps sharpen the target instead of reducing an error. Within it the error jitters from step to step while steps are
+long, so those two have a twin shortly before: how far twins are apart tells by how much. After the last step the flow
+itself is there.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lidardesign.config import LearningSettings
+from lidardesign.density.flow.flow import DesignFlow
+from lidardesign.errors import DataError
+from lidardesign.run.files import remove_stray_temporaries
+from lidardesign.run.manifest import forget, read_manifest, verify, write_recorded
+
+FORMAT = "lidardesign-1"
+
+
+def save_arrays(run: Path, name: str, arrays: Mapping[str, np.ndarray], state: Mapping[str, Any]) -> None:
+    """Write arrays and plain state atomically, with their hash in the manifest at every moment."""
+    from safetensors.numpy import save
+
+    # one entry only: safetensors writes several in an order that changes from process to process
+    metadata = {FORMAT: json.dumps(dict(state))}
+    write_recorded(run, name, save({key: np.ascontiguousarray(value) for key, value in arrays.items()}, metadata))
+
+
+def load_arrays(run: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays and state of a checkpoint.
+
+    Raises:
+        DataError: The file is missing, damaged, not ours, or holds values that are not finite.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    verify(run, name)
+    path = run / name
+    try:
+        with safe_open(path, framework="np") as file:
+            metadata = file.metadata() or {}
+            arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a mapping
+    except (SafetensorError, OSError) as error:
+        raise DataError(f"cannot be read: {error}", where=str(path), hint="learn the run again") from None
+    if FORMAT not in metadata:
+        found = ", ".join(sorted(metadata)) or "none"
+        newer = found.startswith(FORMAT.rstrip("0123456789"))
+        hint = "use the version of lidardesign that wrote it, or a newer one" if newer else "learn the run again"
+        raise DataError(f"has the format {found!r}", where=str(path), allowed=FORMAT, hint=hint)
+    for key, value in arrays.items():
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            raise DataError(f"{key} holds values that are not finite", where=str(path), hint="learn the run again")
+    return arrays, _state_of(metadata[FORMAT], path)
+
+
+def _state_of(text: str, path: Path) -> dict[str, Any]:
+    try:
+        state = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"its state cannot be read: {error}", where=str(path), hint="learn the run again") from None
+    if not isinstance(state, dict):
+        raise DataError("holds no state", where=str(path), hint="learn the run again")
+    return state
+
+
+COUNTERS = ("step", "skipped", "skipped_in_a_row", "halvings")
+# A step size is divided by 2 to this power.
+MOST_HALVINGS, MOST_STEPS, MOST_SECONDS = 64, 10**12, 1e12
+MOMENTS = ("exp_avg", "exp_avg_sq")
+HINT = "resume with the run's own configuration, or learn the run again"
+
+
+def check_resumable(
+    arrays: Mapping[str, np.ndarray],
+    state: Mapping[str, Any],
+    flow: torch.nn.Module,
+    generator: torch.Generator,
+    path: Path,
+) -> None:
+    """Refuse a checkpoint that is whole, but of which training cannot go on.
+
+    Arguments:
+        arrays, state: Its content.
+        flow: The flow whose weights it should have.
+        generator: The random stream whose state it should have.
+        path: The file.
+
+    Raises:
+        DataError: A counter or an array is missing, or is none.
+    """
+    for name in (*COUNTERS, "doubled_at"):
+        value = state.get(name)
+        most = MOST_HALVINGS if name == "halvings" else MOST_STEPS
+        whole = isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most
+        if not whole and not (name == "doubled_at" and value is None):
+            raise DataError(f"has {name} = {value!r}", where=str(path), allowed="a whole number", hint=HINT)
+    seconds = state.get("seconds")
+    if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds <= MOST_SECONDS:
+        raise DataError(f"has seconds = {seconds!r}", where=str(path), allowed="a number from 0", hint=HINT)
+    weights = {f"flow.{name}": value.numel() for name, value in flow.state_dict().items()}
+    held = {name: array.size for name, array in arrays.items() if name.startswith("flow.")}
+    if held != weights:
+        differing = sorted(name for name in {*held, *weights} if held.get(name) != weights.get(name))
+        raise DataError(f"the checkpoint is of another flow: {differing[0]} differs", where=str(path), hint=HINT)
+    for index, parameter in enumerate(flow.parameters()):
+        start = f"adam.{index}."
+        found = {name: array for name, array in arrays.items() if name.startswith(start)}
+        # the file keeps a single number as a list of one
+        expected = {f"{start}{name}": tuple(parameter.shape) for name in MOMENTS} | {f"{start}step": (1,)}
+        # a weight that no step has moved yet has no moments
+        if found and {name: array.shape for name, array in found.items()} != expected:
+            raise DataError(f"the checkpoint is of another flow: {start[:-1]} differs", where=str(path), hint=HINT)
+        if any(array.dtype.kind != "f" for array in found.values()):
+            raise DataError(f"holds no numbers in {start[:-1]}", where=str(path), hint=HINT)
+        # squares are not negative, and who has moments has taken a step: the optimiser takes roots and divides
+        if found and (found[f"{start}exp_avg_sq"].min() < 0 or found[f"{start}step"].min() < 1):
+            raise DataError(f"holds impossible numbers in {start[:-1]}", where=str(path), hint=HINT)
+    stream, own = arrays.get("generator"), generator.get_state()
+    if stream is None or stream.dtype != np.uint8 or stream.shape != tuple(own.shape):
+        raise DataError("holds no random stream", where=str(path), hint=HINT)
+    try:
+        torch.Generator().set_state(torch.as_tensor(stream.copy()))
+    except RuntimeError as error:
+        raise DataError(f"holds a damaged random stream ({error})", where=str(path), hint=HINT) from None
+
+
+FOLDER = "snapshots"
+# Of the last phase. Error falls by a power of the steps: doublings show it best.
+SHARES = (0.0, 1 / 4, 1 / 2)
+# Twins lie this share of the last phase apart: far enough for the flow to have moved, too near to have learned much.
+TWIN_SHARE = 1 / 32
+_NAME = re.compile(rf"{FOLDER}/step-(\d+)\.safetensors")
+
+
+def last_phase_begins(settings: LearningSettings) -> int:
+    """The step from which on the target is the final one."""
+    pathwise = round((1 - settings.balance) * settings.steps)
+    return pathwise if settings.balance else math.ceil(settings.anneal * pathwise)
+
+
+def rung_steps(settings: LearningSettings) -> tuple[int, ...]:
+    """The steps that a training is judged after, ascending; the last one is its end."""
+    first, steps = last_phase_begins(settings), settings.steps
+    return tuple(sorted({*(first + int(share * (steps - first)) for share in SHARES), steps} - {0}))
+
+
+def twin_step(settings: LearningSettings, step: int) -> int | None:
+    """The step of a rung's twin; None for the first rung, the last one, and where there is no room for one."""
+    twin = step - max(round(TWIN_SHARE * (settings.steps - last_phase_begins(settings))), 1)
+    before = max((rung for rung in rung_steps(settings) if rung < step), default=step)
+    return twin if before < twin and step < settings.steps else None
+
+
+def snapshot_steps(settings: LearningSettings) -> tuple[int, ...]:
+    """The steps after which a snapshot is kept, ascending."""
+    rungs = [step for step in rung_steps(settings) if step < settings.steps]
+    twins = (twin_step(settings, step) for step in rungs)
+    return tuple(sorted({*rungs, *(twin for twin in twins if twin is not None)}))
+
+
+def snapshot_name(step: int) -> str:
+    """The file of a step, relative to the run."""
+    return f"{FOLDER}/step-{step:06d}.safetensors"
+
+
+def save_snapshot(flow: DesignFlow, run: Path, step: int) -> None:
+    """Keep the flow's weights after a step; no clock enters, so that a resumed run writes the same bytes."""
+    weights: dict[str, np.ndarray] = {key: value.detach().cpu().numpy() for key, value in flow.state_dict().items()}
+    save_arrays(run, snapshot_name(step), weights, {"step": step, "features": flow.features, "context": flow.context})
+
+
+def kept_snapshots(run: Path) -> dict[int, str]:
+    """The run's snapshots, step to file, ascending; empty for a run that kept none."""
+    found = (_NAME.fullmatch(name) for name in read_manifest(run)["files"])
+    return dict(sorted((int(match[1]), match[0]) for match in found if match))
+
+
+def clear_snapshots(run: Path, *, beyond: int = 0) -> None:
+    """Remove the snapshots after a step, and what a killed process left of one."""
+    folder = Path(run) / FOLDER
+    if not folder.is_dir():
+        return
+    remove_stray_temporaries(folder)
+    forget(run, [name for step, name in kept_snapshots(run).items() if step > beyond])

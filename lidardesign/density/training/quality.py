@@ -1,0 +1,421 @@
+"""What a learned density is worth, measured on fresh samples of it and on points that know nothing of it.
+
+What a learned density is worth: effective sample size, KL divergence, log Z, and coverage.
+
+The first three come from fresh samples of the flow with unclipped importance weights w = p* / p and cannot see a mode
+that the flow dropped. Coverage can: it is the share of the target's mass, estimated from independent proposals, that
+lies where the flow's density is at least a tenth of the normalised target's.
+
+The share of a learned density's mass that is in the wrong place: its total variation to the normalised target.
+
+Samples of the density alone cannot see what it dropped, and proposals that follow the surfaces alone cannot see what
+leaked away from them. The overlap of both densities is the mean of min(1, pi / p) over samples of p, and that of
+min(1, p / pi) over samples of pi = p* / Z. The two agree at one log Z only, which is the bridge estimate of it with the
+bridge min(p, p* / Z); both means are of values in [0, 1], so no weight can spoil them.
+
+References:
+    Simulating ratios of normalizing constants via a simple identity, Meng and Wong 1996.
+
+How far two densities are apart: the share of the mass that is in the wrong place.
+
+That is their total variation, TV = 1/2 integral |a - b| of the normalised densities. It is the one unit of all errors
+of a density's numerical choices: by the triangle inequality the errors of several choices add up at most.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from scipy.optimize import brentq
+
+from lidardesign.density.flow.flow import DesignFlow
+from lidardesign.density.flow.objective import Coordinates
+from lidardesign.density.target.target import Target
+from lidardesign.density.training.independent import independent_points
+from lidardesign.density.training.losses import TOLERANCE_NATS, draw_conditions, round_trip_nats
+from lidardesign.errors import NumericalError
+from lidardesign.estimates import Estimate, effective_share_error, log_mean_error, standard_error, weighted_mean_error
+from lidardesign.numerics import SLACK, TINY, logsumexp, normalised_weights
+from lidardesign.run.clock import phase
+from lidardesign.samples import Samples
+from lidardesign.scene import Scene
+from lidardesign.space import DesignSpace
+
+# A point counts as covered where p >= COVERED_RATIO * p* / Z.
+COVERED_RATIO = 0.1
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Figures of a learned density against its target, and their standard errors over other samples of the flow.
+
+    Arguments:
+        ess: (sum w)^2 / (N sum w^2), 0 to 1.
+        kl_nats: KL(p || p* / Z) = mean(log p - log p*) + log Z [nats].
+        log_z: log of the integral of p* over the chart.
+        ess_error, kl_error_nats, log_z_error: Their standard errors.
+    """
+
+    ess: float
+    kl_nats: float
+    log_z: float
+    ess_error: float
+    kl_error_nats: float
+    log_z_error: float
+
+    def estimates(self) -> dict[str, Estimate]:
+        """The figures with their errors by name."""
+        return {
+            "ess": Estimate(self.ess, self.ess_error),
+            "kl_nats": Estimate(self.kl_nats, self.kl_error_nats, "nats"),
+            "log_z": Estimate(self.log_z, self.log_z_error, "nats"),
+        }
+
+
+def quality(log_prob: np.ndarray, log_target: np.ndarray, groups: np.ndarray | None = None) -> Quality:
+    """ESS, KL and log Z of samples of p, shapes (N,); with `groups` (one per condition value) each is averaged.
+
+    Raises:
+        NumericalError: A log density is NaN or infinite.
+    """
+    log_weights = log_target - log_prob
+    if not len(log_weights) or not np.isfinite(log_weights).all():
+        raise NumericalError(
+            f"{int((~np.isfinite(log_weights)).sum())} of {len(log_weights)} samples of the flow have no finite weight",
+            hint="a smaller learning.rate, or learning.dtype=float64",
+        )
+    if groups is None:
+        return _quality(log_weights)
+    parts = list(quality_by_group(log_weights, groups).values())
+    figures = (np.mean([getattr(part, name) for part in parts]) for name in ("ess", "kl_nats", "log_z"))
+    # groups have samples of their own
+    errors = ([getattr(part, name) for part in parts] for name in ("ess_error", "kl_error_nats", "log_z_error"))
+    return Quality(*map(float, figures), *(float(np.linalg.norm(error)) / len(parts) for error in errors))
+
+
+def quality_by_group(log_weights: np.ndarray, groups: np.ndarray) -> dict[int, Quality]:
+    """The figures of every condition group by its number, from log p* - log p and groups, shapes (N,)."""
+    return {int(group): _quality(log_weights[groups == group]) for group in np.unique(groups)}
+
+
+def _quality(log_weights: np.ndarray) -> Quality:
+    log_count = math.log(len(log_weights))
+    log_sum = float(logsumexp(log_weights))
+    log_z = log_sum - log_count
+    ess = math.exp(2 * log_sum - float(logsumexp(2 * log_weights)) - log_count)
+    weights = np.exp(log_weights - log_weights.max())
+    mean = log_weights.mean()
+    return Quality(
+        ess=ess,
+        kl_nats=float(log_z - mean),
+        log_z=log_z,
+        ess_error=effective_share_error(weights),
+        # the log of the mean weight less the mean log weight, of the same samples
+        kl_error_nats=standard_error(weights / weights.mean() - 1 - (log_weights - mean)),
+        log_z_error=log_mean_error(weights),
+    )
+
+
+def coverage(
+    log_prob: np.ndarray, log_target: np.ndarray, log_proposal: np.ndarray, log_z: np.ndarray | float
+) -> Estimate:
+    """The covered share of the target's mass, from proposals with their three log densities, shapes (N,).
+
+    With conditions `log_z` has the value of each proposal's condition group, shape (N,). No proposals cover nothing.
+    """
+    if not len(log_target):
+        return Estimate(0.0, None)
+    log_mass = log_target - log_proposal
+    mass = np.exp(log_mass - log_mass.max())
+    covered = log_prob >= log_target - log_z + math.log(COVERED_RATIO)
+    share = float(mass[covered].sum() / mass.sum())
+    return Estimate(share, weighted_mean_error(covered.astype(np.float64), mass))
+
+
+# Where log Z is found to: far below what samples can tell.
+LOG_Z_TOLERANCE_NATS = SLACK
+# A group of fewer points than this on either side is judged by the groups that have more.
+LEAST_POINTS = 8
+# Densities that share less than this share nothing, and the division by it is safe.
+LEAST_SHARED = TINY
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """How far a density is from its target.
+
+    Arguments:
+        misplaced: The total variation, 0 to 1.
+        error: Its standard error over other samples and other proposals.
+        log_z: log of the target's integral, by the bridge.
+    """
+
+    misplaced: float
+    error: float
+    log_z: float
+
+
+@dataclass(frozen=True, eq=False)
+class Sides:
+    """Points of both densities and what is known at them.
+
+    Arguments:
+        at_samples: log p* - log p at samples of p, shape (N,); -inf where p* is 0.
+        at_proposals: log p* - log p at proposals, shape (M,); +inf where p is 0.
+        log_weights: log p* - log q of the proposals, up to a constant, shape (M,).
+        sample_groups, proposal_groups: The condition group of each point, shapes (N,) and (M,), or None.
+    """
+
+    at_samples: np.ndarray
+    at_proposals: np.ndarray
+    log_weights: np.ndarray
+    sample_groups: np.ndarray | None = None
+    proposal_groups: np.ndarray | None = None
+
+
+def overlap(sides: Sides) -> Overlap:
+    """The total variation of a density and its target; with condition groups, their mean.
+
+    Groups are alike in their conditions' share, so the mean over them is that over conditions.
+
+    Raises:
+        NumericalError: A value is NaN, or one side has no points of finite weight.
+    """
+    if sides.sample_groups is None or sides.proposal_groups is None:
+        return _overlap(sides.at_samples, sides.at_proposals, sides.log_weights)
+    parts = []
+    for group in np.unique(sides.sample_groups):
+        mine, theirs = sides.sample_groups == group, sides.proposal_groups == group
+        if min(mine.sum(), theirs.sum()) >= LEAST_POINTS:
+            parts.append(_overlap(sides.at_samples[mine], sides.at_proposals[theirs], sides.log_weights[theirs]))
+    if not parts:
+        return _overlap(sides.at_samples, sides.at_proposals, sides.log_weights)
+    return Overlap(
+        misplaced=float(np.mean([part.misplaced for part in parts])),
+        error=float(np.linalg.norm([part.error for part in parts])) / len(parts),
+        log_z=float(np.mean([part.log_z for part in parts])),
+    )
+
+
+def _overlap(at_samples: np.ndarray, at_proposals: np.ndarray, log_weights: np.ndarray) -> Overlap:
+    _check(at_samples, at_proposals, log_weights)
+    weights = normalised_weights(log_weights)
+    finite = at_samples[np.isfinite(at_samples)]
+    start = float(logsumexp(finite)) - math.log(len(at_samples))
+
+    def gap(log_z: float) -> float:
+        return _mean_kept(at_samples - log_z) - float(weights @ np.exp(np.minimum(log_z - at_proposals, 0.0)))
+
+    low, high = _bracket(gap, start)
+    log_z = float(brentq(gap, low, high, xtol=LOG_Z_TOLERANCE_NATS))
+    kept = np.exp(np.minimum(at_samples - log_z, 0.0))
+    reached = np.exp(np.minimum(log_z - at_proposals, 0.0))
+    shared = float(kept.mean())
+    # of the overlap, p is the lesser density on `rare` and pi on the rest; a shift of log Z trades one for the other
+    rare = float((at_samples >= log_z).mean())
+    rest = shared - rare
+    variances = np.square(kept - shared).mean() / len(kept), float(np.square(weights * (reached - shared)).sum())
+    error = math.hypot(rare * math.sqrt(variances[0]), rest * math.sqrt(variances[1])) / max(shared, LEAST_SHARED)
+    return Overlap(misplaced=1.0 - shared, error=error, log_z=log_z)
+
+
+def _mean_kept(log_ratios: np.ndarray) -> float:
+    return float(np.exp(np.minimum(log_ratios, 0.0)).mean())
+
+
+def _bracket(gap: Callable[[float], float], start: float) -> tuple[float, float]:
+    """Two values of log Z with the root between them; the gap falls from 1 to -1, to 0 where nothing is shared."""
+    low = high = start
+    reach = 1.0
+    while gap(low) < 0:
+        low, reach = low - reach, 2 * reach
+    reach = 1.0
+    while gap(high) > 0:
+        high, reach = high + reach, 2 * reach
+    return low, high
+
+
+def _check(at_samples: np.ndarray, at_proposals: np.ndarray, log_weights: np.ndarray) -> None:
+    if any(np.isnan(values).any() for values in (at_samples, at_proposals, log_weights)):
+        raise NumericalError("a density is NaN at the points that it is compared at")
+    if not np.isfinite(at_samples).any() or not np.isfinite(log_weights).any():
+        raise NumericalError("the target is 0 at all points that the density is compared at")
+
+
+SAMPLE_CHUNK = 16384
+CONDITION_GROUPS = 32
+# So many samples go back to the flow's base.
+ROUND_TRIPS = 1000
+NOT_COVERED = (
+    "coverage could not be measured and counts as 0, and misplaced leaves out what the density dropped: "
+    "no independently drawn ray fits in the space"
+)
+
+
+class Learned(Protocol):
+    """A flow, the target that it was learned for, and the stream that its samples are drawn from."""
+
+    flow: DesignFlow
+    target: Target
+    coordinates: Coordinates
+    generator: torch.Generator
+
+
+@dataclass(frozen=True, eq=False)
+class Probes:
+    """Points that know nothing of a flow.
+
+    Arguments:
+        points: Design points inside the space, shape (N, 6).
+        log_proposal: log of the density that they were drawn from, up to a constant, shape (N,).
+        log_target: log p* at them, shape (N,).
+    """
+
+    points: np.ndarray
+    log_proposal: np.ndarray
+    log_target: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Fresh samples of a flow, and its figures with their errors.
+
+    Arguments:
+        samples: The samples with both log densities.
+        estimates: ess, kl_nats, log_z, coverage, and misplaced: the share of the mass in the wrong place.
+        round_trip_nats: See `round_trip`.
+        notes: What the user should know.
+    """
+
+    samples: Samples
+    estimates: dict[str, Estimate]
+    round_trip_nats: float = 0.0
+    notes: tuple[str, ...] = ()
+
+
+def draw_probes(target: Target, scenes: Sequence[Scene], count: int, generator: np.random.Generator) -> Probes:
+    """At most `count` probes of a target; none where no ray of the space comes near a surface."""
+    ranks = target.ranks
+    points, log_proposal = map(ranks.of_first, independent_points(target, scenes, count, generator))
+    log_target = ranks.spread(target.log_density, points) if len(points) else log_proposal
+    return Probes(points, log_proposal, log_target)
+
+
+@phase("measuring")
+def measure(learned: Learned, probes: Probes, count: int) -> Measured:
+    """The figures of a flow from `count` fresh samples and from probes.
+
+    Raises:
+        NumericalError: A sample has no finite weight.
+    """
+    samples = draw_samples(learned, count)
+    space = samples.space
+    groups = condition_groups(space, samples.points)
+    found = quality(samples.log_prob, samples.log_target, groups)
+    covered, notes = Estimate(0.0, None), []
+    sides = Sides(samples.log_weights, samples.log_weights, samples.log_weights, groups, groups)
+    if len(probes.points):
+        log_prob = log_density_of(learned, probes.points)
+        log_z = _log_z_at(probes.points, samples, groups, found.log_z)
+        covered = coverage(log_prob, probes.log_target, probes.log_proposal, log_z)
+        log_weights = probes.log_target - probes.log_proposal
+        theirs = condition_groups(space, probes.points)
+        sides = Sides(samples.log_weights, probes.log_target - log_prob, log_weights, groups, theirs)
+    else:
+        notes.append(NOT_COVERED)
+    apart = overlap(sides)
+    estimates = {**found.estimates(), "coverage": covered, "misplaced": Estimate(apart.misplaced, apart.error)}
+    off = round_trip_nats(learned.flow, ROUND_TRIPS, torch.Generator().manual_seed(0))
+    if off > TOLERANCE_NATS:
+        notes.append(
+            f"log densities are off by up to {off:.2g} nats: the flow's splines are too steep to be inverted in "
+            "float64; fewer learning.layers are easier to invert"
+        )
+    return Measured(samples, estimates, off, tuple(notes))
+
+
+def draw_samples(learned: Learned, count: int) -> Samples:
+    """Fresh samples of the flow with their log density and log target, in chunks."""
+    points, log_prob = [], []
+    flow, coordinates, ranks = learned.flow, learned.coordinates, learned.target.ranks
+    with torch.no_grad():
+        for start in range(0, count, SAMPLE_CHUNK):
+            size = min(SAMPLE_CHUNK, count - start)
+            conditions = draw_conditions(flow, size, learned.generator)
+            conditions = None if conditions is None else ranks.part(conditions)
+            values, log_density = flow(ranks.part(flow.draw_base(size, learned.generator)), conditions)
+            unit = coordinates.join(values, conditions)
+            points.append(ranks.gather(coordinates.space.from_unit(unit.cpu().double().numpy()), of=size))
+            log_prob.append(ranks.gather(log_density.cpu().double().numpy(), of=size))
+    points = np.concatenate(points)
+    offset = coordinates.log_condition_density - coordinates.log_unit_volume
+    log_target = ranks.spread(learned.target.log_density, points)
+    return Samples(points, np.concatenate(log_prob) + offset, log_target, coordinates.space)
+
+
+def log_density_of(learned: Learned, points: np.ndarray) -> np.ndarray:
+    """The flow's log density per chart volume at any design points, (N, 6) to (N,); -inf outside the space."""
+    return learned.target.ranks.spread(lambda rows: _log_density_of(learned, rows), points)
+
+
+def _log_density_of(learned: Learned, points: np.ndarray) -> np.ndarray:
+    flow, coordinates = learned.flow, learned.coordinates
+    like = next(flow.parameters())
+    # points on the space's faces may leave it by rounding
+    unit = torch.as_tensor(coordinates.space.to_unit(points).clip(-1.0, 1.0)).to(like)
+    conditions = unit[:, coordinates.conditions] if coordinates.conditions else None
+    with torch.no_grad():
+        parts = [
+            flow.log_prob(unit[rows][:, coordinates.learned], None if conditions is None else conditions[rows])
+            for rows in torch.arange(len(unit)).split(SAMPLE_CHUNK)
+        ]
+    log_prob = torch.cat(parts).cpu().double().numpy()
+    log_prob = np.where(coordinates.space.contains(points), log_prob, -np.inf)
+    return log_prob + coordinates.log_condition_density - coordinates.log_unit_volume
+
+
+def condition_groups(space: DesignSpace, points: np.ndarray) -> np.ndarray | None:
+    """Which part of the first conditioning dimension's bounds points (N, 6) lie in, shape (N,)."""
+    if not space.conditioned:
+        return None
+    first = space.conditioned[0]
+    share = (points[:, first] - space.low[first]) / (space.high[first] - space.low[first])
+    return np.clip((share * CONDITION_GROUPS).astype(int), 0, CONDITION_GROUPS - 1)
+
+
+def _log_z_at(points: np.ndarray, samples: Samples, groups: np.ndarray | None, mean_log_z: float) -> np.ndarray | float:
+    """log Z of the condition group of each point; the mean where there are no conditions or no samples."""
+    if groups is None:
+        return mean_log_z
+    by_group = np.full(CONDITION_GROUPS, mean_log_z)
+    for group, part in quality_by_group(samples.log_weights, groups).items():
+        by_group[group] = part.log_z
+    return by_group[condition_groups(samples.space, points)]
+
+
+def misplaced_share(log_first: np.ndarray, log_second: np.ndarray, log_proposal: np.ndarray) -> tuple[float, float]:
+    """The total variation of two unnormalised densities from weighted points, and its standard error.
+
+    Both are normalised by the same points, whose noise therefore largely cancels. The standard error is that of the
+    estimate's influence function (Hampel 1974), the normalisation included.
+
+    Arguments:
+        log_first, log_second: log of the two densities at the points, shape (N,); -inf where they are 0.
+        log_proposal: log of the density that the points were drawn from, up to a constant, shape (N,).
+
+    Raises:
+        NumericalError: A value is NaN or +inf, or one of the densities is 0 at all points.
+    """
+    for log_density in (log_first, log_second):
+        if np.isnan(log_density).any() or np.isposinf(log_density).any() or np.isneginf(log_density).all():
+            raise NumericalError("a density has no finite mass at the points that it is compared at")
+    first, second = (normalised_weights(values - log_proposal) for values in (log_first, log_second))
+    apart = np.abs(first - second) / 2
+    sign = np.sign(first - second) / 2
+    influence = apart - first * (sign @ first) + second * (sign @ second)
+    return float(apart.sum()), float(np.sqrt(np.square(influence).sum()))

@@ -1,0 +1,1 @@
+"""How much of a ray reaches the point that it observes."""

@@ -1,0 +1,187 @@
+"""Two designs beside each other, sensor by sensor.
+
+Sensors of the same names are compared by name; otherwise each sensor of one design with one of the other so that all
+differences together are smallest, where a metre of place and of gate counts as much as a radian at the designs' range.
+
+What a design costs to read out, from its file alone.
+
+Designs that stand or hear so far outside a design space that their lengths are likelier in another unit.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.layouts.rays import split_budget
+from lidardesign.design.sensor import Design, Sensor
+from lidardesign.space import RANGE, DesignSpace
+
+RIGHT_ANGLE_M = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class SensorPair:
+    """Two sensors that stand for one another; one is None where the other design has more.
+
+    Arguments:
+        first, second: Of the first and the second design.
+    """
+
+    first: Sensor | None
+    second: Sensor | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Names and the differences, second minus first: metres, degrees and shares; None for a sensor left over."""
+        named = {"a": self.first.name if self.first else None, "b": self.second.name if self.second else None}
+        if self.first is None or self.second is None:
+            return {**named, "difference": None}
+        first, second = self.first, self.second
+        fields = np.degrees(np.subtract(second.field_of_view_rad, first.field_of_view_rad))
+        gates = np.subtract(second.gate_m, first.gate_m)
+        rays = None if first.rays is None or second.rays is None else second.rays - first.rays
+        return {
+            **named,
+            "difference": {
+                "place_m": float(np.linalg.norm(second.origin_m - first.origin_m)),
+                "boresight_deg": math.degrees(angle_between(first.boresight, second.boresight)),
+                "horizontal_deg": float(fields[0]),
+                "vertical_deg": float(fields[1]),
+                "gate_start_m": float(gates[0]),
+                "gate_end_m": float(gates[1]),
+                "weight": second.weight - first.weight,
+                "rays": rays,
+            },
+        }
+
+
+def angle_between(first: np.ndarray, second: np.ndarray) -> float:
+    """The angle of two unit vectors (3,), exact for the smallest too [rad]."""
+    return 2 * math.atan2(float(np.linalg.norm(first - second)), float(np.linalg.norm(first + second)))
+
+
+def paired_sensors(first: Design, second: Design) -> list[SensorPair]:
+    """The sensors of two designs in pairs, in the order of the first; those left over at the end."""
+    by_name = {sensor.name: sensor for sensor in second.sensors}
+    if {sensor.name for sensor in first.sensors} == set(by_name):
+        return [SensorPair(sensor, by_name[sensor.name]) for sensor in first.sensors]
+    from scipy.optimize import linear_sum_assignment
+
+    rows, columns = linear_sum_assignment(_distances(first, second))
+    pairs = [SensorPair(first.sensors[row], second.sensors[column]) for row, column in zip(rows, columns, strict=True)]
+    lonely = [SensorPair(one, None) for index, one in enumerate(first.sensors) if index not in rows]
+    return pairs + lonely + [SensorPair(None, one) for index, one in enumerate(second.sensors) if index not in columns]
+
+
+def _distances(first: Design, second: Design) -> np.ndarray:
+    """How different each sensor of one design is from each of the other, shape (G, H) [m]."""
+    every = (*first.sensors, *second.sensors)
+    range_m = float(np.mean([sensor.range_m for sensor in every])) or RIGHT_ANGLE_M
+    one, other = (
+        {
+            "place": np.array([sensor.origin_m for sensor in design.sensors]),
+            "look": range_m * np.array([sensor.boresight for sensor in design.sensors]),
+            "gate": np.array([sensor.gate_m for sensor in design.sensors]),
+            "field": range_m * np.array([sensor.field_of_view_rad for sensor in design.sensors]),
+        }
+        for design in (first, second)
+    )
+    return sum(np.linalg.norm(one[key][:, None] - other[key][None], axis=2) for key in one)
+
+
+MODEL_KEYS = ("bin_ps", "bits_per_bin", "rate_hz")
+
+
+@dataclass(frozen=True)
+class Readout:
+    """The bandwidth of a design.
+
+    Arguments:
+        model: The read-out: that of the design's own budget.
+        low_mbps, high_mbps: Least and most over the knots of a track, else the same [Mbit/s]; of one ray where the
+            design leaves its rays open.
+        rays: Rays per frame; None where they are open.
+    """
+
+    model: Bandwidth
+    low_mbps: float
+    high_mbps: float
+    rays: int | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for scripts."""
+        model = {name: getattr(self.model, name) for name in MODEL_KEYS}
+        values = {"low_mbps": self.low_mbps, "high_mbps": self.high_mbps}
+        return {**values, "rays": self.rays, "of_one_ray": self.rays is None, **model}
+
+
+def readout_of(design: Design) -> Readout:
+    """What a design's gates cost, by the read-out of its own constraints or the usual one."""
+    budget = design.constraints.get("budget") or {}
+    model = Bandwidth(**{name: float(budget[name]) for name in MODEL_KEYS if budget.get(name) is not None})
+    track = design.track
+    if track is not None:
+        widths = track.gate_m[..., 1] - track.gate_m[..., 0]
+        found = [model.mbps_of_widths(row) for row in widths]
+        return Readout(model, min(found), max(found), len(track.sensor))
+    if design.ray_table is not None:
+        gates = design.ray_table.gate_m
+        once = model.mbps_of_widths(gates[:, 1] - gates[:, 0])
+        return Readout(model, once, once, len(gates))
+    widths = np.array([sensor.gate_m[1] - sensor.gate_m[0] for sensor in design.sensors])
+    counts = _counts(design)
+    if counts is None:
+        once = float(design.weights @ np.array([model.mbps_of_widths(width) for width in widths]))
+        return Readout(model, once, once, None)
+    once = model.mbps_of_widths(widths, counts)
+    return Readout(model, once, once, int(counts.sum()))
+
+
+def _counts(design: Design) -> np.ndarray | None:
+    """Rays per sensor, shape (G,); None where the design leaves them open."""
+    own = [sensor.rays for sensor in design.sensors]
+    if None not in own:
+        return np.array(own, dtype=np.int64)
+    if design.rays is not None:
+        return split_budget(design.weights, design.rays)
+    return np.ones(len(own), dtype=np.int64) if design.layout == "scan" else None
+
+
+# In sizes of the space: the diagonal of its box of origins and its reach. Rigs of others may stand a bit beside.
+FAR_SIZES = 10.0
+UNIT = "are its lengths in millimetres?"
+
+
+def outside_notes(design: Design, space: DesignSpace) -> list[str]:
+    """What is said of a design far outside a design space, one line at most.
+
+    Arguments:
+        design: Its sensors' mean origins and gates, and its rays' where it has a table of them.
+        space: The design space of the run that it is scored in.
+    """
+    low, high = np.array(space.low[:3]), np.array(space.high[:3])
+    size_m = float(np.linalg.norm(high - low)) + space.high[RANGE]
+    origins_m, starts_m = _places(design)
+    apart_m = np.linalg.norm(np.maximum(np.maximum(origins_m - high, low - origins_m), 0.0), axis=1)
+    if len(apart_m) and apart_m.max() > FAR_SIZES * size_m:
+        return [f"{design.name} stands {apart_m.max():.4g} m outside the run's design space; {UNIT}"]
+    if len(starts_m) and starts_m.max() > FAR_SIZES * size_m:
+        return [
+            f"{design.name} hears from {starts_m.max():.4g} m on, and the run's design space ends at "
+            f"{space.high[RANGE]:.4g} m; {UNIT}"
+        ]
+    return []
+
+
+def _places(design: Design) -> tuple[np.ndarray, np.ndarray]:
+    """Origins (N, 3) and where gates begin (M,) of everything in a design [m]."""
+    origins_m = [np.array([sensor.origin_m for sensor in design.sensors]).reshape(-1, 3)]
+    starts_m = [np.array([sensor.gate_m[0] for sensor in design.sensors])]
+    if design.ray_table is not None:
+        origins_m.append(design.ray_table.origin_m)
+        starts_m.append(design.ray_table.gate_m[:, 0])
+    return np.concatenate(origins_m), np.concatenate(starts_m)

@@ -1,0 +1,1 @@
+"""Constraint files, the bounds that follow from them, and the independent checker."""

@@ -1,0 +1,289 @@
+"""The constraint file (design contract, section 6): its keys, its checks, and what each sensor must keep.
+
+What the bounds mean, here and in `check`, which verifies them on the finished file:
+
+- `gate` and `field_of_view` bound the reported intervals, mean -+ z spread;
+- `origin.low_m`, `high_m` bound the sensor's mean origin; samples are taken from inside the box too;
+- `origin.spread_m.max` bounds the standard deviation of the origin along every direction, `thickness_m.max` that
+  along its thinnest principal direction, so that sensors spread over lines or sheets of any tilt;
+- `origin.mounts_m` lists the points where sensors can be fixed, one sensor at each at most (see `mounts`);
+- `origin.exclude` lists boxes whose interior holds no mean origin, no part of its interval, mean -+ z spread along
+  each axis, and no start of a ray; samples are taken from outside them, and where one takes part of the origin box
+  the intervals keep to that box too (see `origins`);
+- `boresight.azimuth_deg` is an interval on the circle: with `min` above `max` it passes through 0;
+- `snap` replaces sensors by real parts (see `snap`), whose fields of view and gates then keep these bounds;
+- every gate stays inside the range bounds of the design space, whatever the file says.
+
+Entries of `each` apply to the first, second, ... sensor over the common keys.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
+
+from lidardesign.design.sensor import MOST_RAYS
+from lidardesign.errors import ConfigError
+from lidardesign.run.validation import check_model
+
+Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
+Distance = Annotated[float, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0)]
+# The boxes between excluded ones grow faster than their number: with so many a fit still takes seconds.
+MOST_EXCLUDED = 32
+# The short form of `snap`.
+CATALOG = "catalog"
+# So many components of a mixture over all samples fill some 100 MB; a scan has its rays instead.
+MOST_FITTED = 1000
+Count = Annotated[int, Field(ge=1, le=MOST_FITTED)]
+
+
+class _Keys(BaseModel):
+    """Unknown keys are errors; numbers are numbers, not text."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
+
+
+class SensorCount(_Keys):
+    """`{count: 4}` or `{min: 1, max: 8}`."""
+
+    count: Count | None = None
+    min: Count | None = None
+    max: Count | None = None
+
+    @model_validator(mode="after")
+    def _one_form(self) -> SensorCount:
+        if self.count is not None and (self.min is not None or self.max is not None):
+            raise ValueError("give either count, or min and max")
+        return self
+
+
+class DistanceRange(_Keys):
+    """Bounds on a distance [m]."""
+
+    min: Distance | None = None
+    max: Positive | None = None
+
+
+class AngleRange(_Keys):
+    """Bounds on an azimuth [degrees], any number of turns."""
+
+    min: float | None = None
+    max: float | None = None
+
+
+class ElevationRange(_Keys):
+    """Bounds on an elevation [degrees]."""
+
+    min: Annotated[float, Field(ge=-90, le=90)] | None = None
+    max: Annotated[float, Field(ge=-90, le=90)] | None = None
+
+
+class FieldRange(_Keys):
+    """Bounds on a full angle of view [degrees]."""
+
+    min: Annotated[float, Field(ge=0, le=360)] | None = None
+    max: Annotated[float, Field(gt=0, le=360)] | None = None
+
+
+class SpreadLimit(_Keys):
+    """The largest standard deviation of the origin, along any or along its thinnest direction [m]."""
+
+    max: Positive | None = None
+
+
+class ExcludedBox(_Keys):
+    """A box in whose interior no sensor may be [m]; one without volume excludes nothing."""
+
+    low_m: Vector
+    high_m: Vector
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ExcludedBox:
+        for axis, low, high in zip("xyz", self.low_m, self.high_m, strict=True):
+            if low > high:
+                raise ValueError(f"low_m is above high_m along {axis}")
+        return self
+
+
+class Origin(_Keys):
+    """Where a sensor may sit [m]."""
+
+    low_m: Vector | None = None
+    high_m: Vector | None = None
+    fixed_m: Vector | None = None
+    spread_m: SpreadLimit = SpreadLimit()
+    thickness_m: SpreadLimit = SpreadLimit()
+    mounts_m: Annotated[list[Vector], Field(min_length=1)] | None = None
+    exclude: Annotated[list[ExcludedBox], Field(max_length=MOST_EXCLUDED)] | None = None
+
+    @model_validator(mode="after")
+    def _distinct_mounts(self) -> Origin:
+        mounts = [tuple(mount) for mount in self.mounts_m or []]
+        if len(set(mounts)) < len(mounts):
+            raise ValueError("the mounts must differ")
+        return self
+
+
+class Boresight(_Keys):
+    """Where it may point."""
+
+    azimuth_deg: AngleRange = AngleRange()
+    elevation_deg: ElevationRange = ElevationRange()
+
+
+class FieldOfView(_Keys):
+    """How wide it may see, horizontally and vertically in its own frame."""
+
+    horizontal_deg: FieldRange = FieldRange()
+    vertical_deg: FieldRange = FieldRange()
+
+
+class Gate(_Keys):
+    """When it may listen, as one-way distances [m]."""
+
+    start_m: DistanceRange = DistanceRange()
+    end_m: DistanceRange = DistanceRange()
+    width_m: DistanceRange = DistanceRange()
+
+
+class Budget(_Keys):
+    """Rays per frame and the read-out of the whole design."""
+
+    rays: Annotated[int, Field(ge=1, le=MOST_RAYS)] | None = None
+    bandwidth_mbps: Positive | None = None
+    # wider than any part's; beyond them products under- and overflow
+    bin_ps: Annotated[float, Field(ge=0.001, le=1e9)] = 100.0
+    bits_per_bin: Annotated[float, Field(ge=0.001, le=1e9)] = 40.0
+    rate_hz: Annotated[float, Field(ge=0.001, le=1e12)] = 10.0
+
+
+class Snap(_Keys):
+    """Which parts sensors are replaced by; the text `catalog` says all that are shipped.
+
+    Arguments:
+        parts: Names, `NAME:MODE`, or paths of part files and folders; None is the whole catalogue.
+        otherwise: What becomes of a sensor for which no part keeps its constraints: `refuse`, or `keep` it as fitted.
+        pose: Whether parts look where the sensors did (`fitted`), or where they are likeliest (`refitted`).
+    """
+
+    parts: Annotated[list[Annotated[str, Field(min_length=1)]], Field(min_length=1)] | None = None
+    otherwise: Literal["refuse", "keep"] = "refuse"
+    pose: Literal["fitted", "refitted"] = "refitted"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short_form(cls, value: Any) -> Any:
+        if isinstance(value, str) and value != CATALOG:
+            raise ValueError(f"{value!r} is no mapping; the short form is {CATALOG!r}")
+        return {} if value == CATALOG else value
+
+    @model_serializer(mode="wrap")
+    def _short_text(self, handler: SerializerFunctionWrapHandler) -> Any:
+        return handler(self) or CATALOG
+
+
+class SensorConstraints(_Keys):
+    """The keys that may also stand under `each`."""
+
+    origin: Origin = Origin()
+    boresight: Boresight = Boresight()
+    field_of_view: FieldOfView = FieldOfView()
+    gate: Gate = Gate()
+    snap: Snap | None = None
+
+
+class Constraints(SensorConstraints):
+    """A whole constraint file; every key is optional."""
+
+    sensors: SensorCount = SensorCount()
+    budget: Budget = Budget()
+    each: list[SensorConstraints] = []
+
+    @classmethod
+    def from_mapping(
+        cls,
+        values: Mapping[str, Any] | None,
+        *,
+        where: str = "constraints",
+        locate: Callable[..., str] | None = None,
+    ) -> Constraints:
+        """Constraints of plain values, as read from YAML.
+
+        Arguments:
+            values: The mapping; None is an empty one.
+            where: Name of the file or option, for messages.
+            locate: The position `file:line:column` of a key path.
+
+        Raises:
+            ConfigError: Unknown keys, wrong types, numbers outside their physical range.
+        """
+        if values is not None and not isinstance(values, Mapping):
+            found = type(values).__name__
+            raise ConfigError(f"found one {found}", where=where, allowed="a mapping, as `gate: {...}`")
+
+        def named(path: tuple[str | int, ...], *, key: bool = False) -> str:
+            return where
+
+        # YAML writes an empty section as null; it says nothing
+        given = _without_empty(dict(values or {}))
+        return check_model(cls, given, locate or named)
+
+    def of_sensor(self, index: int) -> SensorConstraints:
+        """The constraints of one sensor: its entry of `each` over the common keys."""
+        common = self.model_dump(exclude_none=True, include=set(SensorConstraints.model_fields))
+        if index < len(self.each):
+            common = merged(common, self.each[index].model_dump(exclude_none=True))
+        return SensorConstraints.model_validate(common)
+
+    def name_of(self, index: int, key: str) -> str:
+        """The path under which sensor `index` finds `key`, as `each[1].gate.width_m.max`."""
+        if index < len(self.each):
+            values: Any = self.each[index].model_dump(exclude_none=True)
+            for part in key.split("."):
+                values = values.get(part) if isinstance(values, dict) else None
+            if values is not None:
+                return f"each[{index}].{key}"
+        return key
+
+    def as_document(self) -> dict[str, Any]:
+        """The plain values that were given, for the design file."""
+        return self.model_dump(exclude_none=True, exclude_unset=True)
+
+
+def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Plain values with others laid over them, key by key at every depth."""
+    result = dict(base)
+    for key, value in over.items():
+        both = isinstance(value, Mapping) and isinstance(result.get(key), dict)
+        result[key] = merged(result[key], value) if both else value
+    return result
+
+
+def _without_empty(values: dict[str, Any]) -> dict[str, Any]:
+    kept = {}
+    for key, value in values.items():
+        if isinstance(value, dict):
+            kept[key] = _without_empty(value)
+        elif value is not None:
+            kept[key] = value
+    return kept
+
+
+def check_feasible(
+    constraints: Constraints, space: Any, *, sensors: int | None = None, rays: int | None = None
+) -> None:
+    """Refuse constraints that no design can satisfy; see `feasibility.check_feasible`."""
+    # the checks need the constraint models, and callers look for them here
+    from lidardesign.design.constraints.feasibility import check_feasible as check
+
+    check(constraints, space, sensors=sensors, rays=rays)

@@ -1,0 +1,1 @@
+"""From sensors to rays: grids, density, scans, distributed rays, and tracks."""

@@ -1,0 +1,1 @@
+"""The constrained mixture of sensors and its expectation maximisation."""

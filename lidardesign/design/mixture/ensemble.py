@@ -1,0 +1,286 @@
+"""Fits of several groups of sensors, each on its own samples, as one design's mixture.
+
+Which mounting points the sensors take, where a constraint file lists more than there are sensors.
+
+A mount is a pinned origin. How much of the density sensors at several mounts see together is, per sample, the
+most that any of them sees of its scene point (re-aimed and reweighted as in `support`), summed over samples
+drawn from the density. Mounts are taken one after the other, each time the one that newly sees most: this sum
+is submodular, so the greedy choice sees at least 1 - 1/e of what the best choice sees (G. Nemhauser, L. Wolsey
+and M. Fisher 1978). Sensors with constraints of their own are placed together with their mount.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidardesign.design.constraints.bounds import Bounds, Floors
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.mounts import Mount, fixed_at, matched, mounts_of
+from lidardesign.design.constraints.rules import Group, mean_azimuth, pins_of
+from lidardesign.design.mixture.em import Trace, climb, fit_mixture
+from lidardesign.design.mixture.features import Axes, Features
+from lidardesign.design.mixture.mixture import Mixture, expect, log_density
+from lidardesign.design.mixture.mstep import maximise
+from lidardesign.design.mixture.support import Retarget, re_aimed
+from lidardesign.design.sensor import Sensor
+from lidardesign.errors import InfeasibleError
+from lidardesign.numerics import systematic_draw
+from lidardesign.run.clock import phase
+from lidardesign.samples import Samples
+from lidardesign.space import DesignSpace
+from lidardesign.task import random_generator
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One group of sensors with its samples and bounds.
+
+    Arguments:
+        group: Which sensors, and where they are pinned.
+        share: The group's share of the density, all groups summing to 1.
+        features: Weighted samples.
+        bounds: One row per sensor of the group.
+    """
+
+    group: Group
+    share: float
+    features: Features
+    bounds: Bounds
+
+
+@dataclass(frozen=True, eq=False)
+class Ensemble:
+    """Fitted parts.
+
+    Arguments:
+        parts: What was fitted.
+        traces: One per part.
+    """
+
+    parts: tuple[Part, ...]
+    traces: tuple[Trace, ...]
+
+    @property
+    def log_likelihood(self) -> float:
+        """Weighted mean log density of the samples, given their group [nats]."""
+        return float(sum(p.share * t.log_likelihood for p, t in zip(self.parts, self.traces, strict=True)))
+
+    @property
+    def order(self) -> np.ndarray:
+        """The sensor that each component of all parts, one after the other, stands for."""
+        return np.concatenate([np.array(part.group.sensors) for part in self.parts])
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Shares of the rays in the order of the sensors, summing to 1."""
+        weights = np.empty(len(self.order))
+        pairs = zip(self.parts, self.traces, strict=True)
+        weights[self.order] = np.concatenate([part.share * trace.mixture.weights for part, trace in pairs])
+        return weights / weights.sum()
+
+    @property
+    def widths_m(self) -> np.ndarray:
+        """Gate widths in the order of the sensors [m]."""
+        widths = np.empty(len(self.order))
+        pairs = zip(self.parts, self.traces, strict=True)
+        widths[self.order] = np.concatenate(
+            [2 * part.bounds.interval * trace.mixture.spread_range_m for part, trace in pairs]
+        )
+        return widths
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What happened to components."""
+        return tuple(note for trace in self.traces for note in trace.notes)
+
+    def narrowed(self, width_m: float) -> Ensemble:
+        """The fit continued with gates no wider than a cap [m]."""
+        traces = []
+        for part, trace in zip(self.parts, self.traces, strict=True):
+            bounds = part.bounds.narrowed(width_m)
+            start = admitted(trace.mixture, part.features, bounds)
+            traces.append(replace(climb(start, part.features, bounds), notes=trace.notes))
+        return Ensemble(self.parts, tuple(traces))
+
+    def held_out(self, parts: Sequence[Part]) -> tuple[float, float]:
+        """Mean log density of other samples of the same groups, and its standard error [nats]."""
+        mean, variance = 0.0, 0.0
+        for part, trace in zip(parts, self.traces, strict=True):
+            values, weights = log_density(trace.mixture, part.features), part.features.weights
+            centre = float(weights @ values)
+            mean += part.share * centre
+            variance += part.share**2 * float(np.square(weights) @ np.square(values - centre))
+        return mean, variance**0.5
+
+
+@phase("mixture")
+def fit_parts(parts: Sequence[Part], seed: int, restarts: int) -> Ensemble:
+    """Fit every group."""
+    traces = [
+        fit_mixture(part.features, part.bounds, random_generator(seed, "sensors", index), restarts=restarts)
+        for index, part in enumerate(parts)
+    ]
+    return Ensemble(tuple(parts), tuple(traces))
+
+
+def admitted(mixture: Mixture, features: Features, bounds: Bounds) -> Mixture:
+    """The nearest parameters of a fit inside other bounds: one M-step from its own statistics."""
+    return maximise(mixture, expect(mixture, features), features, bounds, Floors.of(features), 0.0)
+
+
+def sensors_of(ensemble: Ensemble, space: DesignSpace, level: float) -> tuple[Sensor, ...]:
+    """The fitted components as sensors s0, s1, ... in the order of the constraint file."""
+    rows = [
+        _sensor(part, trace.mixture, row, space, level)
+        for part, trace in zip(ensemble.parts, ensemble.traces, strict=True)
+        for row in range(len(part.bounds))
+    ]
+    placed = [rows[i] for i in np.argsort(ensemble.order, kind="stable")]
+    placed = [replace(s, weight=float(w)) for s, w in zip(placed, ensemble.weights, strict=True)]
+    return _named(placed)
+
+
+def heaviest_first(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
+    """Sensors by weight, named s0, s1, ... in that order."""
+    return _named(sorted(sensors, key=lambda s: (-round(s.weight, 9), s.azimuth_rad, s.elevation_rad, s.range_m)))
+
+
+def _named(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
+    return tuple(replace(sensor, name=f"s{index}") for index, sensor in enumerate(sensors))
+
+
+def _sensor(part: Part, mixture: Mixture, row: int, space: DesignSpace, level: float) -> Sensor:
+    axes: Axes = part.features.axes
+    origin = np.array(space.low[:3], dtype=np.float64)
+    for axis, pin in enumerate(part.group.pins):
+        if pin is not None:
+            origin[axis] = pin
+    free = list(axes.origin)
+    origin[free] = mixture.origin_m[row, free]
+    covariance = np.zeros((3, 3))
+    covariance[np.ix_(free, free)] = mixture.origin_covariance_m2[row][np.ix_(free, free)]
+    horizontal, vertical = mixture.spread_rad[row]
+    return Sensor(
+        name="",
+        weight=float(mixture.weights[row]),
+        origin_m=origin,
+        origin_covariance_m2=covariance,
+        azimuth_rad=float(mean_azimuth(mixture.azimuth_rad[row])) if axes.horizontal else axes.azimuth_rad,
+        elevation_rad=float(mixture.elevation_rad[row]) if axes.vertical else axes.elevation_rad,
+        roll_rad=float(mixture.roll_rad[row]),
+        spread_horizontal_rad=float(horizontal * axes.angle_scale) if axes.horizontal else 0.0,
+        spread_vertical_rad=float(vertical) if axes.vertical else 0.0,
+        range_m=float(mixture.range_m[row]),
+        spread_range_m=float(mixture.spread_range_m[row]) if axes.range else 0.0,
+        level=level,
+    )
+
+
+# So many samples tell apart mounts whose shares differ by a hundredth.
+MOUNT_SAMPLES = 4000
+# `auto` takes as few mounts as together see this share of what all see together.
+ENOUGH_SHARE = 0.95
+
+
+def at_mounts(
+    constraints: Constraints, samples: Samples, counts: list[int], retarget: Retarget | None, seed: int
+) -> tuple[Constraints, list[int]]:
+    """The constraints with every mounted sensor fixed at the mount chosen for it, and the counts that are left.
+
+    Where sensors beyond `each` are mounted and their number is open, it is the least of the counts whose mounts
+    see 95 % of what those of the largest count see together.
+
+    Arguments:
+        constraints: Feasible constraints.
+        samples: Samples of the density.
+        counts: Numbers of sensors that may be chosen, ascending.
+        retarget: log p* of design points, (N, 6) to (N,).
+        seed: Root of the draw of samples.
+
+    Raises:
+        ConfigError: There is a choice, but no way to evaluate the target density.
+        InfeasibleError: No mount sees any of the density.
+    """
+    open_count = bool(mounts_of(constraints, len(constraints.each))) and len(counts) > 1
+    count = counts[-1] if mounts_of(constraints, len(constraints.each)) else len(constraints.each)
+    options = [mounts_of(constraints, sensor) for sensor in range(count)]
+    chosen = None if open_count else _only_choice(constraints, options)
+    if chosen is None:
+        views = _views(constraints, samples, options, retarget, seed)
+        chosen, together = _greedy(views, options)
+        if open_count:
+            seen = {n: _greedy(views, options[:n]) for n in counts}
+            count = min(n for n in counts if seen[n][1] >= ENOUGH_SHARE * together)
+            chosen = seen[count][0]
+    fixed = fixed_at(constraints, [chosen.get(sensor) for sensor in range(count)])
+    return fixed, [count] if mounts_of(constraints, len(constraints.each)) else counts
+
+
+def _only_choice(constraints: Constraints, options: list[list[Mount]]) -> dict[int, Mount] | None:
+    """Alike sensors at all the mounts, in the file's order; None where there is something to choose."""
+    if constraints.each or len(options[0]) != len(options):
+        return None
+    return dict(enumerate(options[0]))
+
+
+def _views(
+    constraints: Constraints,
+    samples: Samples,
+    options: list[list[Mount]],
+    retarget: Retarget | None,
+    seed: int,
+) -> dict[tuple[int, Mount], np.ndarray]:
+    """What each sensor would see of each drawn sample's scene point from each of its mounts, (N,) each."""
+    chosen = systematic_draw(samples.weights, MOUNT_SAMPLES, random_generator(seed, "mounts"))
+    last = len(constraints.each)
+    views: dict[tuple[int, Mount], np.ndarray] = {}
+    for sensor, mounts in enumerate(options):
+        for mount in mounts:
+            # sensors beyond the entries of `each` are alike
+            view = views.get((last, mount)) if sensor > last else None
+            if view is None:
+                view = _view(constraints, samples, chosen, sensor, mount, retarget)
+            views[sensor, mount] = view
+    if not any(view.any() for view in views.values()):
+        names = [constraints.name_of(0, "origin.mounts_m")]
+        raise InfeasibleError("no mount sees any of the density", conflicts=names, hint="add mounts elsewhere")
+    return views
+
+
+def _view(
+    constraints: Constraints,
+    samples: Samples,
+    chosen: np.ndarray,
+    sensor: int,
+    mount: Mount,
+    retarget: Retarget | None,
+) -> np.ndarray:
+    places: list[Mount | None] = [None] * sensor
+    fixed = fixed_at(constraints, [*places, mount])
+    pins = pins_of(fixed.of_sensor(sensor), samples.space)
+    return re_aimed(samples, chosen, fixed, Group(pins, (sensor,)), retarget)[1]
+
+
+def _greedy(
+    views: dict[tuple[int, Mount], np.ndarray], options: list[list[Mount]]
+) -> tuple[dict[int, Mount], float]:
+    """The mount of each mounted sensor, and how much of the density they see together."""
+    seen = np.zeros(len(next(iter(views.values()))))
+    left = {sensor: list(mounts) for sensor, mounts in enumerate(options) if mounts}
+    chosen: dict[int, Mount] = {}
+    while left:
+        gains = {
+            (sensor, mount): float(np.maximum(seen, views[sensor, mount]).sum())
+            for sensor, mounts in left.items()
+            for mount in mounts
+            if matched([[m for m in others if m != mount] for other, others in left.items() if other != sensor])
+        }
+        sensor, mount = max(gains, key=lambda pair: gains[pair])
+        chosen[sensor] = mount
+        seen = np.maximum(seen, views[sensor, mount])
+        del left[sensor]
+        left = {other: [m for m in mounts if m != mount] for other, mounts in left.items()}
+    return chosen, float(seen.mean())

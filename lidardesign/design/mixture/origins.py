@@ -1,0 +1,135 @@
+"""Where a sensor's origin may be: its box, minus the boxes that constraints exclude.
+
+What is left is not convex, so it is described by its maximal boxes: a box avoids the interiors of all excluded boxes
+just where it lies in one of the maximal boxes between them. So an interval of origins, which is a box of its own, is
+kept out of all excluded boxes by keeping it in one maximal box, and nothing is lost.
+
+Excluded boxes that take part of the origin box divide what is left of it, and an interval keeps to one of its parts:
+it would otherwise balance on an edge of the origin box, half of it outside, to cover other parts. Where none does,
+the mean alone keeps to the origin box, and its interval, which may be longer, has the excluded boxes beyond to avoid.
+Along axes on which the origin box is thin there is no freedom: an excluded box that does not hold the coordinate there
+is not in the way.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lidardesign.design.constraints.document import SensorConstraints
+from lidardesign.numerics import HALF_DIGITS, SLACK
+from lidardesign.space import DesignSpace
+
+# Origin boxes thinner than this along an axis pin it [m].
+PINNED_BOX_M = SLACK
+# Gaps between excluded boxes narrower than this, in metres and relative to coordinates, leave no place.
+SMALLEST_GAP = HALF_DIGITS
+
+
+class Boxes(NamedTuple):
+    """Boxes with their sides along the axes.
+
+    Arguments:
+        low_m: Lower corners, shape (M, 3); may be -inf.
+        high_m: Upper corners, shape (M, 3); may be inf.
+    """
+
+    low_m: np.ndarray
+    high_m: np.ndarray
+
+
+def origin_box(one: SensorConstraints, space: DesignSpace) -> tuple[np.ndarray, np.ndarray]:
+    """The box of a sensor's mean origin inside the design space, (3,) each [m]; a point where it is fixed."""
+    low, high = (np.array(bound[:3], dtype=np.float64) for bound in (space.low, space.high))
+    if one.origin.low_m is not None:
+        low = np.maximum(low, one.origin.low_m)
+    if one.origin.high_m is not None:
+        high = np.minimum(high, one.origin.high_m)
+    if one.origin.fixed_m is not None:
+        fixed = np.array(one.origin.fixed_m)
+        free = np.isin(np.arange(3), space.free)
+        low = high = np.where(free, fixed, np.array(space.low[:3]))
+    return low, np.maximum(low, high)
+
+
+def excluded(one: SensorConstraints) -> Boxes:
+    """The boxes that a sensor's constraints exclude, flat ones included."""
+    boxes = one.origin.exclude or []
+    low, high = ([getattr(box, key) for box in boxes] for key in ("low_m", "high_m"))
+    return Boxes(np.array(low, dtype=np.float64).reshape(-1, 3), np.array(high, dtype=np.float64).reshape(-1, 3))
+
+
+def inside_excluded(origins_m: np.ndarray, one: SensorConstraints) -> np.ndarray:
+    """Which origins (N, 3) lie in the interior of an excluded box, shape (N,) bool."""
+    inside = np.zeros(len(origins_m), dtype=bool)
+    for low, high in zip(*excluded(one), strict=True):
+        inside |= ((origins_m > low) & (origins_m < high)).all(axis=1)
+    return inside
+
+
+def free_boxes(one: SensorConstraints, space: DesignSpace) -> Boxes:
+    """The maximal boxes between the excluded ones that hold a sensor's intervals; none where all is excluded.
+
+    Where no excluded box meets the origin box they may reach beyond it; along axes without freedom they are the line.
+    """
+    low, high = origin_box(one, space)
+    fixed = high - low <= PINNED_BOX_M
+    middle = (low + high) / 2
+    bottoms, tops = excluded(one)
+    held = np.where(fixed, (bottoms < middle) & (middle < tops), bottoms < tops).all(axis=1)
+    bottoms, tops = bottoms[held], tops[held]
+    inside = (((bottoms < high) & (tops > low)) | fixed).all(axis=1).any()
+    kept = ~fixed & inside
+    free = Boxes(np.where(kept, low, -np.inf)[None], np.where(kept, high, np.inf)[None])
+    for bottom, top in zip(bottoms, tops, strict=True):
+        free = _without(free, bottom, top, low, high, ~fixed)
+    # in an order that is not that of the excluded boxes, for where two are equally good
+    corners = np.unique(np.concatenate(free, axis=1), axis=0)
+    return Boxes(corners[:, :3], corners[:, 3:])
+
+
+def _without(
+    boxes: Boxes, bottom: np.ndarray, top: np.ndarray, low: np.ndarray, high: np.ndarray, axes: np.ndarray
+) -> Boxes:
+    """The maximal boxes inside some others that avoid one more, cut along some axes, with room in [low, high]."""
+    met = ((boxes.low_m < top) & (boxes.high_m > bottom) | ~axes).all(axis=1)
+    lows, highs = [], []
+    for axis in np.flatnonzero(axes):
+        below, above = boxes.high_m[met].copy(), boxes.low_m[met].copy()
+        below[:, axis] = np.minimum(below[:, axis], bottom[axis])
+        above[:, axis] = np.maximum(above[:, axis], top[axis])
+        lows += [boxes.low_m[met], above]
+        highs += [below, boxes.high_m[met]]
+    old = np.concatenate([boxes.low_m, -boxes.high_m], axis=1)[~met]
+    if not lows:
+        return Boxes(old[:, :3], -old[:, 3:])
+    fresh = np.concatenate([np.concatenate(lows), -np.concatenate(highs)], axis=1)
+    fresh = fresh[_roomy(Boxes(fresh[:, :3], -fresh[:, 3:]), low, high, axes)]
+    # no old box lies in a fresh one, which is part of another old box
+    fresh = np.unique(fresh, axis=0)
+    holds = (np.concatenate([old, fresh])[None] <= fresh[:, None]).all(axis=2)
+    corners = np.concatenate([old, fresh[holds.sum(axis=1) == 1]])
+    return Boxes(corners[:, :3], -corners[:, 3:])
+
+
+def _roomy(boxes: Boxes, low: np.ndarray, high: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Which boxes leave room inside [low, high] along some axes, shape (M,) bool."""
+    size = np.maximum(np.maximum(np.abs(low), np.abs(high)), 1.0)
+    needed = np.minimum(SMALLEST_GAP * size, (high - low) / 2)
+    room = np.minimum(boxes.high_m, high) - np.maximum(boxes.low_m, low)
+    return (room > needed)[:, axes].all(axis=1)
+
+
+def box_around(mean_m: np.ndarray, reach_m: np.ndarray, boxes: Boxes) -> tuple[np.ndarray, np.ndarray]:
+    """The box that holds an interval, mean -+ reach (3,) each, or lacks least of it: low and high, (3,) each [m]."""
+    lacking = np.maximum(boxes.low_m - (mean_m - reach_m), 0.0) + np.maximum(mean_m + reach_m - boxes.high_m, 0.0)
+    best = int(np.square(lacking).sum(axis=1).argmin())
+    return boxes.low_m[best], boxes.high_m[best]
+
+
+def nearest_admitted(origins_m: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """The nearest point of any of M boxes, given by corners (M, 3), to each of some origins (N, 3): shape (N, 3)."""
+    clipped = np.clip(origins_m[:, None], low, high)
+    away = np.square(clipped - origins_m[:, None]).sum(axis=2)
+    return np.take_along_axis(clipped, away.argmin(axis=1)[:, None, None], axis=1)[:, 0]

@@ -1,0 +1,204 @@
+r"""Restricting the density to what constrained sensors can measure, and pinning origins.
+
+Which constraints restrict the samples: the origin boxes less what they exclude, the ranges between the
+earliest admitted gate start and the latest admitted gate end, and, where both boresight and field of view are
+bounded, the directions within half of the largest diagonal field of view of an admitted boresight. The others
+bound sensors, not rays. With `each`, a sample is kept where any sensor admits it.
+
+A pinned origin has measure zero. A sample d = (x, v, r) that observes the scene point s is re-aimed at s from
+the pinned origin x': E over (x, s) is with respect to p*(d) / r^2, so the new weight is
+$w(d)\, \frac{p^*(d') / r'^2}{p^*(d) / r^2}$ with d' = aim(x', s).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.feasibility import azimuth_interval
+from lidardesign.design.constraints.rules import Group, Pins
+from lidardesign.design.mixture.origins import inside_excluded, origin_box
+from lidardesign.errors import ConfigError, InfeasibleError, NumericalError
+from lidardesign.numerics import SLACK, effective_count, systematic_draw, wrap_angle
+from lidardesign.samples import Samples
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, aim, direction, observed_point
+
+Retarget = Callable[[np.ndarray], np.ndarray]
+
+# Below this share of the density a design would be fitted to its far tails.
+LEAST_MASS = 1e-3
+# Equal-weight samples per sensor, and in all, that moments of six dimensions need.
+LEAST_SAMPLES_PER_SENSOR = 10
+LEAST_SAMPLES = 50
+# Fixed coordinates and boxes are met to this [m or rad].
+TOLERANCE = SLACK
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """Weighted samples that the sensors of one group may draw on.
+
+    Arguments:
+        points: Design points, shape (N, 6).
+        weights: Unnormalised, shape (N,).
+        total: The sum of weights relative to the whole density, where it has a meaning.
+        effective: The number of equal weights that are worth as much.
+        mass: The share of the density inside the constraints; None where an origin is pinned.
+    """
+
+    points: np.ndarray
+    weights: np.ndarray
+    total: float
+    effective: float
+    mass: float | None = None
+
+
+def admissible(points: np.ndarray, constraints: Constraints, space: DesignSpace, group: Group) -> np.ndarray:
+    """Which design points some sensor of a group may measure, (N, 6) to (N,) bool."""
+    distinct = {min(i, len(constraints.each)) for i in group.sensors}
+    keep = np.zeros(len(points), dtype=bool)
+    for index in sorted(distinct):
+        one = constraints.of_sensor(index)
+        low, high = origin_box(one, space)
+        inside = ((points[:, :3] >= low - TOLERANCE) & (points[:, :3] <= high + TOLERANCE)).all(axis=1)
+        inside &= ~inside_excluded(points[:, :3], one)
+        if one.gate.start_m.min is not None:
+            inside &= points[:, RANGE] >= one.gate.start_m.min
+        if one.gate.end_m.max is not None:
+            inside &= points[:, RANGE] <= one.gate.end_m.max
+        keep |= inside & _in_sight(points, one, space)
+    return keep
+
+
+def _in_sight(points: np.ndarray, one: object, space: DesignSpace) -> np.ndarray:
+    """Directions that a sensor with bounded boresight and bounded field of view can reach."""
+    widest = one.field_of_view.horizontal_deg.max, one.field_of_view.vertical_deg.max
+    aims = one.boresight
+    bounded = any(v is not None for part in (aims.azimuth_deg, aims.elevation_deg) for v in (part.min, part.max))
+    if None in widest or not bounded:
+        return np.ones(len(points), dtype=bool)
+    low, high = azimuth_interval(one, space)
+    middle, half = (low + high) / 2, (high - low) / 2
+    azimuth = middle + np.clip(wrap_angle(points[:, AZIMUTH] - middle), -half, half)
+    bottom = -90.0 if aims.elevation_deg.min is None else aims.elevation_deg.min
+    top = 90.0 if aims.elevation_deg.max is None else aims.elevation_deg.max
+    elevation = np.clip(points[:, ELEVATION], math.radians(bottom), math.radians(top))
+    nearest, ray = direction(azimuth, elevation), direction(points[:, AZIMUTH], points[:, ELEVATION])
+    reach = math.radians(math.hypot(*widest)) / 2
+    return np.einsum("ni,ni->n", nearest, ray) >= math.cos(min(reach, math.pi))
+
+
+def restricted(samples: Samples, constraints: Constraints, group: Group) -> Support:
+    """The samples of p inside the admissible set of a group without pins; `total` is the admissible mass."""
+    keep = admissible(samples.points, constraints, samples.space, group)
+    weights = samples.weights[keep]
+    return Support(samples.points[keep], weights, float(weights.sum()), effective_count(weights))
+
+
+def pinned(
+    samples: Samples,
+    constraints: Constraints,
+    group: Group,
+    retarget: Retarget | None,
+    count: int,
+    generator: np.random.Generator,
+) -> Support:
+    """Samples re-aimed from pinned origin coordinates at the scene points that they observed.
+
+    Arguments:
+        samples: Samples of the density with free origins.
+        constraints: The constraint file.
+        group: Sensors and their pinned coordinates.
+        retarget: log p* of design points, (N, 6) to (N,).
+        count: How many samples are re-aimed; they are drawn by weight first.
+        generator: Source of that draw.
+
+    Raises:
+        ConfigError: No way to evaluate the target density was given.
+    """
+    chosen = systematic_draw(samples.weights, count, generator)
+    aimed, weights = re_aimed(samples, chosen, constraints, group, retarget)
+    used = weights > 0
+    return Support(aimed[used], weights[used], float(weights.sum()) / count, effective_count(weights))
+
+
+def re_aimed(
+    samples: Samples, chosen: np.ndarray, constraints: Constraints, group: Group, retarget: Retarget | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Chosen samples aimed from the pins at what they observed, (N, 6), and their new weights, (N,); 0 where unseen.
+
+    Raises:
+        ConfigError: No way to evaluate the target density was given.
+        NumericalError: The target density is NaN at one of them.
+    """
+    if retarget is None:
+        raise ConfigError(
+            "the origin is free in the learned density, and pinning it needs the target density",
+            where="origin.fixed_m",
+            hint="give the run folder instead of a design file",
+        )
+    points, space = samples.points[chosen], samples.space
+    aimed = space.wrap(_from_pins(points, group.pins))
+    weights = np.zeros(len(aimed))
+    log_old = _per_scene_volume(points, samples.log_target[chosen], space)
+    keep = space.contains(aimed, TOLERANCE) & admissible(aimed, constraints, space, group)
+    keep &= np.isfinite(log_old) & (aimed[:, RANGE] > 0)
+    if not keep.any():
+        return aimed, weights
+    log_target = np.asarray(retarget(aimed[keep]), dtype=np.float64)
+    if log_target.shape != (int(keep.sum()),) or np.isnan(log_target).any():
+        raise NumericalError("the target density is NaN at re-aimed samples", where="origin.fixed_m")
+    with np.errstate(invalid="ignore"):
+        weights[keep] = np.exp(_per_scene_volume(aimed[keep], log_target, space) - log_old[keep])
+    return aimed, weights
+
+
+def _from_pins(points: np.ndarray, pins: Pins) -> np.ndarray:
+    origins = points[:, :3].copy()
+    for axis, value in enumerate(pins):
+        if value is not None:
+            origins[:, axis] = value
+    return aim(origins, observed_point(points))
+
+
+def _per_scene_volume(points: np.ndarray, log_target: np.ndarray, space: DesignSpace) -> np.ndarray:
+    """log p* per volume of observed scene points instead of per chart volume of direction and range."""
+    free = space.free
+    power = (AZIMUTH in free) + (ELEVATION in free)
+    with np.errstate(divide="ignore"):
+        jacobian = power * np.log(points[:, RANGE])
+        if space.measure == "angles" and power == 2:
+            jacobian = jacobian + np.log(np.cos(points[:, ELEVATION]))
+    return log_target - jacobian
+
+
+def check_support(support: Support, group: Group, *, mass: float | None, several: bool) -> None:
+    """Refuse a support that holds too little of the density to fit sensors to.
+
+    Raises:
+        InfeasibleError: With the measured mass.
+    """
+    needed = max(LEAST_SAMPLES, LEAST_SAMPLES_PER_SENSOR * len(group.sensors))
+    which = f"sensors {', '.join(map(str, group.sensors))}" if several else "the sensors"
+    if any(pin is not None for pin in group.pins):
+        place = ", ".join("free" if pin is None else f"{pin:g}" for pin in group.pins)
+        which += f" at ({place}) m"
+    if mass is not None and mass < LEAST_MASS:
+        raise InfeasibleError(
+            f"the constraints of {which} hold {mass:.3g} of the density",
+            admissible_mass=mass,
+            allowed=f"at least {LEAST_MASS:g}",
+            hint="widen the origin box, the gate or the field of view, exclude less, or learn inside the smaller space",
+        )
+    if support.effective < needed:
+        raise InfeasibleError(
+            f"the constraints of {which} leave {support.effective:.0f} effective samples"
+            + ("" if mass is None else f" and {mass:.3g} of the density"),
+            admissible_mass=mass,
+            allowed=f"at least {needed}",
+            hint="learn with more samples or inside the smaller space",
+        )

@@ -1,0 +1,1 @@
+"""Rigs that others made, read as designs."""

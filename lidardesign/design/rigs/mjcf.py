@@ -1,0 +1,281 @@
+"""The rangefinders of a MuJoCo model (MJCF): each is one ray along the +z axis of its site.
+
+Rangefinders of one body that start at one place are one sensor, and so are those of a body that carries the sensor's
+name and whose sites are its rays, NAME_r0, NAME_r1, ..., as `export --format mjcf` writes them; these keep the starts
+of their gates in the rangefinders' user data. Rays stand where the model's bodies do when a simulation begins.
+
+The part of a MuJoCo model that says where its rangefinders are: a model of its own, without any other file.
+
+Bodies, frames, sites and their defaults are kept; shapes, joints, meshes, actuators and plugins are left out, so that
+MuJoCo compiles what is left from text alone, reads nothing from disk and runs nothing. Without joints bodies stand
+where the model puts them, which is where they are when a simulation begins.
+"""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidardesign.design.rigs.rig import Rig, RigSensor
+from lidardesign.errors import DataError
+from lidardesign.run.xml import DEEPEST, Element, read_xml
+from lidardesign.space import angles
+
+ALLOWED = "an MJCF model"
+PLACE = ("pos", "quat", "axisangle", "xyaxes", "zaxis", "euler")
+KEPT = {
+    "compiler": ("angle", "eulerseq"),
+    "default": ("class",),
+    "worldbody": ("childclass",),
+    "body": ("name", "childclass", *PLACE),
+    "frame": ("name", "childclass", *PLACE),
+    "replicate": ("count", "sep", "offset", "euler"),
+    "site": ("name", "class", "size", "type", "fromto", *PLACE),
+    "sensor": (),
+    "rangefinder": ("name", "site", "cutoff", "user"),
+}
+CAMERA = "camera"
+MOST_INCLUDES = 100
+# MuJoCo takes seconds for a thousand copies with sensors, and four times as long for twice as many.
+MOST_COPIES = 1000
+
+
+def stripped_model(path: Path) -> ElementTree.Element:
+    """The model of a file as it is left, with what it includes from its own folder.
+
+    Raises:
+        DataError: A file is no XML, lies outside the model's folder, or the model is one that cannot be read so.
+    """
+    root = read_xml(path, ALLOWED)
+    model = ElementTree.Element("mujoco", {"model": "rig"})
+    _Copier([path.resolve()]).copy_children(root, model, path, depth=1)
+    return model
+
+
+@dataclass
+class _Copier:
+    """Copies what is kept of a model and of what it includes.
+
+    Arguments:
+        seen: The files that were read, the model's own first.
+        copies: How many elements `replicate` makes.
+    """
+
+    seen: list[Path]
+    copies: int = 0
+
+    def copy_children(
+        self, source: ElementTree.Element, target: ElementTree.Element, path: Path, *, depth: int, times: int = 1
+    ) -> None:
+        """Append what is kept of an element's children; `times` is how often it is replicated."""
+        for child in source:
+            where = f"{path}:{child.line if isinstance(child, Element) else 1}"
+            if depth >= DEEPEST:
+                raise DataError("is nested too deep, with what it includes", where=where, allowed=f"{DEEPEST} levels")
+            if child.tag == "include":
+                included, file = _included(child, path, self.seen)
+                self.copy_children(included, target, file, depth=depth + 1, times=times)
+                continue
+            if child.tag == "attach":
+                raise DataError("attaches another model", where=where, allowed="one model, or <include>")
+            if child.tag == "rangefinder" and CAMERA in child.attrib:
+                allowed = "rangefinders of sites: one ray each"
+                raise DataError("has a rangefinder of a camera", where=where, allowed=allowed)
+            if child.tag not in KEPT:
+                continue
+            kept = ElementTree.SubElement(
+                target, child.tag, {name: child.attrib[name] for name in KEPT[child.tag] if name in child.attrib}
+            )
+            inner = times * _count(child, where) if child.tag == "replicate" else times
+            self.copies += inner if inner > 1 else 0
+            if self.copies > MOST_COPIES:
+                raise DataError("replicates too much", where=where, allowed=f"at most {MOST_COPIES} copies")
+            self.copy_children(child, kept, path, depth=depth + 1, times=inner)
+
+
+def _count(element: ElementTree.Element, where: str) -> int:
+    text = element.attrib.get("count", "")
+    if not text.strip().isdecimal() or len(text) > len(str(MOST_COPIES)):
+        raise DataError(f"count is {text[:40]!r}", where=where, allowed=f"a whole number up to {MOST_COPIES}")
+    return int(text)
+
+
+def _included(element: ElementTree.Element, path: Path, seen: list[Path]) -> tuple[Element, Path]:
+    """The root of an included file, which lies in the first file's folder, links followed, and is included once."""
+    where = f"{path}:{element.line if isinstance(element, Element) else 1}"
+    name = element.attrib.get("file", "")
+    folder = seen[0].parent
+    found = (folder / name).resolve()
+    if not name or not found.is_relative_to(folder):
+        raise DataError(
+            f"includes {name!r}, which is outside the model's folder", where=where,
+            hint="copy the file into the model's folder and name it from there",
+        )  # fmt: skip
+    if found in seen or len(seen) > MOST_INCLUDES:
+        raise DataError(f"includes {name!r} again", where=where, allowed=f"each file once, at most {MOST_INCLUDES}")
+    seen.append(found)
+    return read_xml(found, ALLOWED), found
+
+
+KIND = "MuJoCo model"
+# Rays of one sensor that were written with few digits start within this of one another [m].
+SAME_PLACE_M = 1e-4
+# What is left of a sensor's name when its rays are counted: `front_r12` and `front_r13` are of `front`.
+EXPORTED = re.compile(r"_r\d+")
+COUNTED = re.compile(r"[\s_.-]+(r|ray)?[\s_.-]*\d*$|\d+$")
+NO_START = "when gates start is not said: a rangefinder is heard from 0 m on"
+
+
+@dataclass(frozen=True)
+class _Ray:
+    """One rangefinder of the compiled model, in the world's frame.
+
+    Arguments:
+        name: Its own, or its site's.
+        site_name: Its site's.
+        body: The body that it is on; 0 is the world.
+        body_name: That body's name.
+        origin_m, direction: Shape (3,).
+        cutoff_m: How far it is heard; infinite where that is not said.
+        user: Its user data.
+    """
+
+    name: str
+    site_name: str
+    body: int
+    body_name: str
+    origin_m: np.ndarray
+    direction: np.ndarray
+    cutoff_m: float
+    user: tuple[float, ...]
+
+    @property
+    def is_exported(self) -> bool:
+        """Whether it is named as a ray that was exported of the sensor that its body is."""
+        named = self.body > 0 and self.body_name and self.site_name.startswith(self.body_name)
+        return bool(named) and EXPORTED.fullmatch(self.site_name, len(self.body_name)) is not None
+
+    @property
+    def start_m(self) -> float | None:
+        """The start of its gate, where its export left it beside the end."""
+        start, end = (*self.user, 0.0, 0.0)[:2]
+        return start if self.is_exported and 0 <= start <= end == self.cutoff_m else None
+
+
+def read_mjcf(path: Path) -> Rig:
+    """The sensors of a model.
+
+    Raises:
+        DataError: The file is no model, MuJoCo refuses it, or it has no rangefinder.
+    """
+    rays = _rays(stripped_model(path), path)
+    if not rays:
+        raise DataError(
+            "has no rangefinder", where=str(path), allowed="<sensor> with <rangefinder site=...>, one per ray"
+        )
+    groups = _groups(rays)
+    notes = [NO_START] if any(ray.start_m is None for ray in rays) else []
+    of_bodies = Counter(rays[group[0]].body for group in groups)
+    sensors = [_sensor([rays[index] for index in group], np.array(group), of_bodies) for group in groups]
+    return Rig(KIND, sensors, notes, "give the rangefinders a cutoff")
+
+
+def _rays(model: ElementTree.Element, path: Path) -> list[_Ray]:
+    """The rangefinders of what is left of a model, in its order."""
+    import mujoco
+
+    try:
+        compiled = mujoco.MjModel.from_xml_string(ElementTree.tostring(model, encoding="unicode"))
+    except ValueError as error:
+        reason = " ".join(str(error).split()) or "no reason given"
+        raise DataError(f"MuJoCo cannot read it: {reason}", where=str(path), allowed="an MJCF model") from None
+    data = mujoco.MjData(compiled)
+    mujoco.mj_kinematics(compiled, data)
+    kind = int(mujoco.mjtSensor.mjSENS_RANGEFINDER)
+    return [_ray(compiled, data, index) for index in np.flatnonzero(compiled.sensor_type == kind)]
+
+
+def _ray(model: Any, data: Any, index: int) -> _Ray:
+    site = int(model.sensor_objid[index])
+    body = int(model.site_bodyid[site])
+    return _Ray(
+        name=model.sensor(index).name or model.site(site).name,
+        site_name=model.site(site).name,
+        body=body,
+        body_name=model.body(body).name,
+        origin_m=np.array(data.site_xpos[site]),
+        direction=np.array(data.site_xmat[site]).reshape(3, 3)[:, 2],
+        cutoff_m=float(model.sensor_cutoff[index]) or np.inf,
+        user=tuple(float(value) for value in model.sensor_user[index]),
+    )
+
+
+def _groups(rays: Sequence[_Ray]) -> list[list[int]]:
+    """Rays by body and place, in order of appearance."""
+    groups: list[list[int]] = []
+    firsts: dict[tuple[int, ...], list[list[int]]] = {}
+    exported: dict[int, list[int]] = {}
+    for index, ray in enumerate(rays):
+        if ray.is_exported and ray.body in exported:
+            exported[ray.body].append(index)
+            continue
+        cell = np.floor(ray.origin_m / SAME_PLACE_M).astype(np.int64)
+        near = _near(ray, cell, firsts, rays)
+        if near is None:
+            groups.append([index])
+            if ray.is_exported:
+                exported[ray.body] = groups[-1]
+            firsts.setdefault((ray.body, *cell.tolist()), []).append(groups[-1])
+        else:
+            near.append(index)
+    return groups
+
+
+def _near(
+    ray: _Ray, cell: np.ndarray, firsts: dict[tuple[int, ...], list[list[int]]], rays: Sequence[_Ray]
+) -> list[int] | None:
+    """The group whose first ray starts where this one does, looked for in the cell and those around it."""
+    for step in np.ndindex(3, 3, 3):
+        key = (ray.body, *(cell + np.array(step) - 1).tolist())
+        for group in firsts.get(key, []):
+            if np.linalg.norm(rays[group[0]].origin_m - ray.origin_m) <= SAME_PLACE_M:
+                return group
+    return None
+
+
+def _sensor(own: Sequence[_Ray], order: np.ndarray, of_bodies: Mapping[int, int]) -> RigSensor:
+    """One sensor; `of_bodies` says how many each body has."""
+    azimuth, elevation = angles(np.array([ray.direction for ray in own]))
+    start = np.array([ray.start_m or 0.0 for ray in own])
+    end = np.array([ray.cutoff_m for ray in own])
+    return RigSensor(
+        name=_name(own, alone=of_bodies[own[0].body] == 1),
+        origin_m=np.array([ray.origin_m for ray in own]),
+        azimuth_rad=azimuth,
+        elevation_rad=elevation,
+        gate_m=np.stack([start, end], axis=1),
+        order=order,
+    )
+
+
+def _name(own: Sequence[_Ray], *, alone: bool) -> str:
+    """What the names of its rays have in common, or the name of the body that has no other sensor."""
+    if own[0].is_exported:
+        return own[0].body_name
+    if len(own) == 1 and own[0].name:
+        return own[0].name
+    common = COUNTED.sub("", _common([ray.name for ray in own]))
+    return common or (own[0].body_name if alone and own[0].body else "")
+
+
+def _common(names: Sequence[str]) -> str:
+    """The longest text that all names begin with."""
+    shortest = min(names, key=len)
+    return next((shortest[:i] for i in range(len(shortest)) if any(name[i] != shortest[i] for name in names)), shortest)

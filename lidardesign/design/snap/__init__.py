@@ -1,0 +1,1 @@
+"""Fitted sensors replaced by real parts."""

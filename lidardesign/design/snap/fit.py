@@ -1,0 +1,280 @@
+"""A fitted ensemble of sensors as a design of real parts, and what every sensor lost by becoming one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from lidardesign.design.catalog.placing import Pose, interleaved, part_sensor
+from lidardesign.design.constraints.budget import ReadOut
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.mounts import fixed_at
+from lidardesign.design.files import MOST_TABLE_RAYS
+from lidardesign.design.layouts.rays import split_budget
+from lidardesign.design.mixture.ensemble import Ensemble, sensors_of
+from lidardesign.design.mixture.features import Features
+from lidardesign.design.sensor import Design, RayTable, Sensor, interval_factor
+from lidardesign.design.snap.parts import Choice, Options, nearest_parts, options_of, with_parts
+from lidardesign.design.snap.rays import affordable, counts_of, fired, gate_widths, useful_rays, useful_split
+from lidardesign.errors import ConfigError
+from lidardesign.space import DesignSpace, angles
+
+
+@dataclass(frozen=True, eq=False)
+class Snapped:
+    """A design of parts.
+
+    Arguments:
+        design: Its sensors are parts, or stayed as they were, with explicit rays.
+        ensemble: The mixture of the parts' components.
+        report: What the sensors lost, as plain values.
+        notes: One line each.
+    """
+
+    design: Design
+    ensemble: Ensemble
+    report: dict[str, Any]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """One sensor as it was fitted and as the part that it becomes."""
+
+    fitted: Sensor
+    sensor: Sensor
+    choice: Choice
+    pose: Pose | None
+    seen: Features
+
+
+def at_one_place(constraints: Constraints, sensors: Sequence[Sensor]) -> Constraints | None:
+    """The constraints with sensors that become parts fixed at their mean origins; None where they are already."""
+    spread = [
+        bool(np.any(sensor.origin_covariance_m2)) and constraints.of_sensor(index).snap is not None
+        for index, sensor in enumerate(sensors)
+    ]
+    if not any(spread):
+        return None
+    places = [
+        (float(x), float(y), float(z)) if moves else None
+        for (x, y, z), moves in zip((sensor.origin_m for sensor in sensors), spread, strict=True)
+    ]
+    return fixed_at(constraints, places)
+
+
+def snapped(
+    ensemble: Ensemble,
+    constraints: Constraints,
+    space: DesignSpace,
+    read_out: ReadOut,
+    *,
+    level: float,
+    seed: int,
+    name: str,
+) -> Snapped:
+    """The sensors of an ensemble replaced by parts of the catalogue.
+
+    Arguments:
+        ensemble: The fit, its origins without spread where a sensor becomes a part.
+        constraints: What the fit and the parts keep.
+        space: The design space.
+        read_out: Rays and bandwidth.
+        level: The share that intervals hold.
+        seed: Root of the random streams.
+        name: The design's name.
+
+    Raises:
+        InfeasibleError: Constraints that no part, or no choice of parts, keeps.
+        ConfigError: A part that is not there; more rays than a design file holds.
+    """
+    before = sensors_of(ensemble, space, level)
+    options = options_of(constraints, space, [sensor.range_m for sensor in before])
+    if (read_out.rays or 0) > MOST_TABLE_RAYS:
+        raise ConfigError(f"{read_out.rays} rays of parts", where="--rays", allowed=f"at most {MOST_TABLE_RAYS}")
+    choices = nearest_parts(ensemble, options, read_out.rays, seed)
+    fitted_widths = np.array([sensor.gate_m[1] - sensor.gate_m[0] for sensor in before])
+    choices = affordable(choices, options, ensemble.weights, fitted_widths, read_out)
+    held = [(one := constraints.of_sensor(i).snap) is not None and one.pose == "fitted" for i in range(len(before))]
+    refitted = with_parts(ensemble, choices, held)
+    placed = _placed(before, sensors_of(refitted, space, level), choices, ensemble)
+    if not constraints.each:
+        order = sorted(range(len(placed)), key=lambda i: -round(placed[i].sensor.weight, 9))
+        placed = [_renamed(placed[old], f"s{new}") for new, old in enumerate(order)]
+        options = [options[old] for old in order]
+    placed = _apart(placed, constraints)
+    counts = _counts(placed, read_out)
+    design = _design(placed, counts, constraints, level, name)
+    report = {
+        "log_likelihood": {"fitted": ensemble.log_likelihood, "parts": refitted.log_likelihood},
+        "sensors": _rows(placed, options, counts, read_out),
+    }
+    return Snapped(design, refitted, report, _notes(design, options))
+
+
+def _placed(
+    before: Sequence[Sensor], after: Sequence[Sensor], choices: Sequence[Choice], ensemble: Ensemble
+) -> list[_Placed]:
+    """Every sensor with its part at the pose that its component has."""
+    features = {sensor: part.features for part in ensemble.parts for sensor in part.group.sensors}
+    found = []
+    for index, (fitted, sensor, choice) in enumerate(zip(before, after, choices, strict=True)):
+        pose, shape = None, choice.shape
+        if shape is not None:
+            aimed = (sensor.origin_m, sensor.azimuth_rad, sensor.elevation_rad, sensor.roll_rad)
+            pose = shape.pose(*aimed, features[index].axes)
+        one = _Placed(fitted, sensor, choice, pose, features[index])
+        found.append(one if pose is None else _at(one, pose))
+    return found
+
+
+def _at(one: _Placed, pose: Pose) -> _Placed:
+    """A part at a pose, as a sensor."""
+    shape, old = one.choice.shape, one.sensor
+    if shape is None:
+        return one
+    start, end = shape.gate_m
+    sensor = replace(
+        part_sensor(shape.part, pose, name=old.name, weight=old.weight, level=old.level),
+        range_m=(start + end) / 2,
+        spread_range_m=(end - start) / (2 * interval_factor(old.level)),
+    )
+    return replace(one, sensor=sensor, pose=pose)
+
+
+def _apart(placed: Sequence[_Placed], constraints: Constraints) -> list[_Placed]:
+    """Parts of a kind that stand and look alike fire between each other's rays, where they may turn that far."""
+    found = list(placed)
+    alike: list[list[int]] = []
+    for index, one in enumerate(placed):
+        rules = constraints.of_sensor(index)
+        aims = rules.boresight
+        bounded = (rules.snap is not None and rules.snap.pose == "fitted") or any(
+            value is not None for end in (aims.azimuth_deg, aims.elevation_deg) for value in (end.min, end.max)
+        )
+        if one.pose is None or bounded or one.seen.axes.angular < 2:
+            continue
+        group = next((group for group in alike if _look_alike(placed[group[0]], one)), None)
+        if group is None:
+            alike.append([index])
+        else:
+            group.append(index)
+    for group in alike:
+        first = placed[group[0]]
+        if len(group) > 1 and first.choice.shape is not None and first.pose is not None:
+            poses = interleaved(first.choice.shape.part, first.pose, len(group))
+            for index, pose in zip(group, poses, strict=True):
+                found[index] = _at(placed[index], pose)
+    return found
+
+
+def _look_alike(one: _Placed, other: _Placed) -> bool:
+    """Whether two parts are of one kind, at one place, and look less than half a cell apart."""
+    shape, poses = one.choice.shape, (one.pose, other.pose)
+    if shape is None or other.choice.shape is None or poses[0] is None or poses[1] is None:
+        return False
+    if (shape.part.name, shape.turned) != (other.choice.shape.part.name, other.choice.shape.turned):
+        return False
+    columns, rows = shape.part.grid
+    cell = min(shape.part.field_of_view_rad[0] / columns, shape.part.field_of_view_rad[1] / rows)
+    cosine = min(float(a @ b) for a, b in zip(poses[0].frame, poses[1].frame, strict=True))
+    return bool(np.array_equal(poses[0].origin_m, poses[1].origin_m)) and cosine >= math.cos(cell / 2)
+
+
+def _renamed(one: _Placed, name: str) -> _Placed:
+    return replace(one, sensor=replace(one.sensor, name=name))
+
+
+def _counts(placed: Sequence[_Placed], read_out: ReadOut) -> np.ndarray:
+    """Rays of every sensor, shape (G,)."""
+    weights = np.array([one.sensor.weight for one in placed])
+    choices = [one.choice for one in placed]
+    widths = np.array(gate_widths(choices, np.array([np.diff(one.sensor.gate_m)[0] for one in placed])))
+    useful = np.array(
+        [0 if one.pose is None else useful_rays(one.choice, one.pose, one.seen) for one in placed], dtype=np.int64
+    )
+    if read_out.rays is None:
+        return counts_of(useful, weights, widths, read_out)
+    most = np.array([read_out.rays if c.shape is None else min(c.shape.part.rays, read_out.rays) for c in choices])
+    first = np.where(useful > 0, np.minimum(useful, most), most)
+    counts = useful_split(weights, read_out.rays, first, most)
+    if read_out.limit_mbps is not None and read_out.model.mbps_of_widths(widths, counts) > read_out.limit_mbps:
+        # so the parts were found affordable
+        counts = useful_split(weights, read_out.rays, most, most)
+    return counts
+
+
+def _design(placed: Sequence[_Placed], counts: np.ndarray, constraints: Constraints, level: float, name: str) -> Design:
+    # what a part weighs is what it fires
+    total = int(counts.sum())
+    sensors = tuple(
+        replace(one.sensor, rays=int(n), weight=int(n) / total) for one, n in zip(placed, counts, strict=True)
+    )
+    looking = np.concatenate(
+        [fired((one.choice, one.pose), one.sensor, int(n), one.seen) for one, n in zip(placed, counts, strict=True)]
+    )
+    azimuth, elevation = angles(looking)
+    owner = np.repeat(np.arange(len(placed)), counts)
+    gates = [one.sensor.gate_m if one.choice.shape is None else one.choice.shape.gate_m for one in placed]
+    origins = np.array([sensor.origin_m for sensor in sensors], dtype=np.float64)
+    return Design(
+        name=name,
+        sensors=sensors,
+        layout="fixed",
+        rays=total,
+        ray_table=RayTable(origins[owner], azimuth, elevation, np.array(gates)[owner], owner),
+        constraints=constraints.as_document(),
+        level=level,
+    )
+
+
+def _rows(
+    placed: Sequence[_Placed], options: Sequence[Options], counts: np.ndarray, read_out: ReadOut
+) -> list[dict[str, Any]]:
+    """What every sensor was, what it became, and what that costs alone; in the order of the design."""
+    weights = np.array([one.fitted.weight for one in placed])
+    shares = split_budget(weights, int(counts.sum()))
+    rows = []
+    for one, option, n, share in zip(placed, options, counts, shares, strict=True):
+        shape = one.choice.shape
+        loss = 0.0
+        if shape is not None:
+            loss = one.choice.losses[option.shapes.index(shape)]
+        mbps = [
+            read_out.model.mbps_of_widths(np.diff(sensor.gate_m), int(rays))
+            for sensor, rays in ((one.fitted, share), (one.sensor, n))
+        ]
+        rows.append(
+            {
+                "sensor": one.sensor.name,
+                "part": None if shape is None else shape.part.name,
+                "product": None if shape is None else shape.part.product,
+                "turned": shape is not None and shape.turned,
+                "loss_nats": loss,
+                "field_of_view_rad": {"fitted": _field(one.fitted), "part": _field(one.sensor)},
+                "gate_m": {"fitted": list(one.fitted.gate_m), "part": list(one.sensor.gate_m)},
+                "rays": {
+                    "fitted": int(share), "part": int(n), "pattern": None if shape is None else shape.part.rays
+                },
+                "bandwidth_mbps": {"fitted": mbps[0], "part": mbps[1]},
+            }
+        )  # fmt: skip
+    return rows
+
+
+def _field(sensor: Sensor) -> list[float]:
+    return [float(angle) for angle in sensor.field_of_view_rad]
+
+
+def _notes(design: Design, options: Sequence[Options]) -> tuple[str, ...]:
+    notes = []
+    for sensor, option in zip(design.sensors, options, strict=True):
+        if option.lacking:
+            notes.append(f"{sensor.name} stays a sensor of its own: no part keeps {', '.join(option.lacking)}")
+        if sensor.rays == 0:
+            notes.append(f"{sensor.name} sees too little of the density to have one of {design.rays} rays")
+    return tuple(notes)

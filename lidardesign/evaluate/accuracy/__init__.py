@@ -1,0 +1,1 @@
+"""What accuracy costs in time: sweeps over the settings of every numerical choice."""

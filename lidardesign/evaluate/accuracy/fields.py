@@ -1,0 +1,428 @@
+"""What distance fields of meshes cost: grid points along their longest side, and how one reads between them.
+
+Bodies that are primitives are exact at any cost and need no field.
+
+Distances by other means than learning's, to compare it with: exact queries, nearest and tricubic interpolation.
+
+All give distances alone, without gradients, in the form of `fields.Field`.
+
+Settings of a target from its quick ladder: the coarsest distance fields that misplace little enough of its mass.
+
+What is visible is found exactly (by ray casting, or not at all where nothing is in the way), and primitives have exact
+distances: fields of meshes are what a target's accuracy costs time and memory for.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidardesign.config import DensitySettings, RunConfig
+from lidardesign.density.fields.bodies import place_bodies
+from lidardesign.density.fields.distance import BodyField, Field, TableField, scene_columns
+from lidardesign.density.fields.grids import distance_grid, grid_around
+from lidardesign.density.fields.importance import build_log_weights
+from lidardesign.density.target.target import PADDING_SIGMAS, Target
+from lidardesign.density.visibility.quadrature import NoVisibility, Optics, RayBatch, Raycast
+from lidardesign.density.visibility.receiver import HeardVisibility, common_receiver
+from lidardesign.evaluate.accuracy.probes import (
+    BECAUSE,
+    ERROR_OF,
+    TOLERANCE,
+    Probes,
+    draw_probes,
+    few_columns,
+    run_visibility,
+)
+from lidardesign.evaluate.accuracy.settings import Ladder, Rung, timed
+from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
+from lidardesign.numerics import logsumexp
+from lidardesign.run.clock import phase
+from lidardesign.scene import Body, Mesh, Scene, inverse_rigid
+from lidardesign.space import DesignSpace
+
+Chosen = Callable[[Body], bool]
+
+
+class ExactField:
+    """The exact distances of the chosen bodies of all scenes: to meshes by libigl, triangle by triangle.
+
+    Arguments:
+        scenes: One column per scene and frame.
+        chosen: Which bodies count.
+    """
+
+    def __init__(self, scenes: Sequence[Scene], chosen: Chosen) -> None:
+        entries = [
+            (column, body, frame)
+            for column, (index, frame) in enumerate(scene_columns(scenes))
+            for body in filter(chosen, scenes[index].bodies)
+        ]
+        self.columns = len(scene_columns(scenes))
+        self.shell_m = np.zeros(self.columns)
+        self._meshes = [entry for entry in entries if isinstance(entry[1].shape, Mesh)]
+        others = [entry for entry in entries if not isinstance(entry[1].shape, Mesh)]
+        self._others = BodyField(place_bodies(others, self.columns, _no_grid)) if others else None
+
+    def distances(self, points: np.ndarray) -> np.ndarray:
+        """Distances at points: (N, 3) to (N, columns) [m]."""
+        out = np.full((len(points), self.columns), np.inf)
+        if self._others is not None:
+            out = self._others.distances(points)
+        for column, body, frame in self._meshes:
+            to_body = inverse_rigid(body.pose(frame))
+            local = points @ to_body[:3, :3].T + to_body[:3, 3]
+            np.minimum(out[:, column], mesh_distances(body.shape, local), out=out[:, column])
+        return out
+
+
+def _no_grid(mesh: Mesh) -> tuple:
+    raise AssertionError("meshes are asked exactly")
+
+
+def mesh_distances(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+    """The exact distances of points (N, 3) from a mesh in its own frame, negative inside where it has one, (N,)."""
+    import igl
+
+    # relative to the mesh's corner: squares of coordinates far from the origin would lose every digit
+    corner = mesh.bounds_m[0]
+    points, vertices, faces = points - corner, mesh.vertices - corner, mesh.faces.astype(np.int64)
+    distance = igl.signed_distance(points, vertices, faces, sign_type=igl.SIGNED_DISTANCE_TYPE_UNSIGNED)[0]
+    if mesh.sign == "unsigned":
+        return distance
+    return np.where(np.abs(igl.fast_winding_number(vertices, faces, points)) > 0.5, -distance, distance)
+
+
+def fresh_table(scenes: Sequence[Scene], around: Sequence[Scene], resolution: int, padding_m: float) -> TableField:
+    """The table of scenes whose targets are meshes at rest, built anew whatever is cached.
+
+    Arguments:
+        scenes: One column each.
+        around: All scenes that the run's grid holds.
+        resolution, padding_m: See `fields.build_field`.
+    """
+    bounds = np.concatenate([mesh.bounds_m for scene in around for mesh in target_meshes(scene)])
+    grid = grid_around(np.stack([bounds.min(axis=0), bounds.max(axis=0)]), resolution, padding_m)
+    columns = [np.min([distance_grid(mesh, grid) for mesh in target_meshes(scene)], axis=0) for scene in scenes]
+    unsigned = [any(mesh.sign == "unsigned" for mesh in target_meshes(scene)) for scene in scenes]
+    return TableField(np.stack(columns, axis=1), grid, np.where(unsigned, grid.step, 0.0))
+
+
+def fresh_bodies(scenes: Sequence[Scene], resolution: int, padding_m: float) -> BodyField:
+    """The targets of moving scenes with a grid for each of their meshes, built anew whatever is cached."""
+
+    def build(mesh: Mesh) -> tuple:
+        grid = grid_around(mesh.bounds_m, resolution, padding_m)
+        return grid, distance_grid(mesh, grid)
+
+    entries = [
+        (column, body, frame)
+        for column, (index, frame) in enumerate(scene_columns(scenes))
+        for body in scenes[index].bodies
+        if body.is_target
+    ]
+    return BodyField(place_bodies(entries, len(scene_columns(scenes)), build))
+
+
+def target_meshes(scene: Scene) -> list[Mesh]:
+    """The target meshes of a scene at rest, in the world."""
+    return [b.shape.transformed(b.pose()) for b in scene.bodies if b.is_target and isinstance(b.shape, Mesh)]
+
+
+@dataclass(frozen=True, eq=False)
+class InterpolatedField:
+    """A table read with splines of another order than 1.
+
+    Arguments:
+        table: Whose distances, or spline coefficients of them, are read.
+        order: 0 for the nearest grid point, 3 for tricubic splines.
+    """
+
+    table: TableField
+    order: int
+
+    @classmethod
+    def of(cls, table: TableField, order: int) -> InterpolatedField:
+        """The same distances, with the coefficients that splines of an order need."""
+        from scipy.ndimage import spline_filter
+
+        counts = tuple(table.grid.counts)
+        if order < 2:
+            return cls(table, order)
+        columns = [
+            spline_filter(column.reshape(counts), order, output=np.float32, mode="nearest").ravel()
+            for column in table.table.T
+        ]
+        return cls(TableField(np.stack(columns, axis=1), table.grid, table.shell_m), order)
+
+    @property
+    def columns(self) -> int:
+        """The number of columns."""
+        return self.table.columns
+
+    @property
+    def shell_m(self) -> np.ndarray:
+        """See `Field`."""
+        return self.table.shell_m
+
+    def distances(self, points: np.ndarray) -> np.ndarray:
+        """See `Field`; a lower bound outside the grid, as that of learning is."""
+        from scipy.ndimage import map_coordinates
+
+        grid = self.table.grid
+        place = (points - grid.low) / grid.step
+        clamped = np.clip(place, 0.0, grid.counts - 1.0)
+        squared = np.square((place - clamped) * grid.step).sum(axis=1)
+        inner = np.stack(
+            [
+                map_coordinates(
+                    column.reshape(grid.counts), clamped.T, order=self.order, mode="nearest", prefilter=False
+                )
+                for column in self.table.table.T
+            ],
+            axis=1,
+        ).astype(np.float64)
+        outside = squared > 0
+        inner[outside] = np.sqrt(squared[outside, None] + np.square(np.maximum(inner[outside], 0.0)))
+        return inner
+
+
+LABEL = "distance fields"
+RESOLUTIONS = (16, 24, 32, 48, 64, 96, 128)
+# The more scenes, the more their errors average out; so many can be built anew at every resolution.
+COLUMNS = 12
+PROBES = 16_384
+# Resolutions beyond the run's own are measured where building them for all these scenes takes at most so long.
+LONGEST_SECONDS = 20.0
+# A coarse field has its surfaces elsewhere: probes must meet them there too.
+WIDENING = 3.0
+NEAR_SIGMAS = 2.0
+TIMED_POINTS = 1024
+ORDERS = {"nearest": 0, "trilinear": 1, "tricubic": 3}
+DEFAULT_ORDER = "trilinear"
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A few scenes of meshes, and what their fields are compared by.
+
+    Arguments:
+        few: These scenes.
+        scenes: All scenes that share a grid with them.
+        settings: Of the density.
+        target: Their p* with the run's own field.
+        probes: Around their surfaces.
+        observed: The scene points of these, shape (N, 3).
+        log_transmittance: Their log T, shape (N, columns).
+        exact: Their exact distances, shape (N, columns) [m].
+    """
+
+    few: list[Scene]
+    scenes: list[Scene]
+    settings: DensitySettings
+    target: Target
+    probes: Probes
+    observed: np.ndarray
+    log_transmittance: np.ndarray
+    exact: np.ndarray
+
+    @classmethod
+    def of(
+        cls, scenes: list[Scene], space: DesignSpace, settings: DensitySettings, seed: int, visibility: str
+    ) -> Case | None:
+        """A case of training scenes; None where no probe reaches a surface."""
+        few = few_columns(scenes, COLUMNS)
+        receiver, way = common_receiver(few), NoVisibility() if visibility == "off" else Raycast(few)
+        frames = np.array([few[index].frames for index, _ in scene_columns(few)], dtype=np.float64)
+        field = fresh(few, scenes, settings.field_resolution, settings)
+        target = Target(
+            field=field,
+            visibility=way if receiver is None else HeardVisibility(way, receiver),
+            log_column_weights=-np.log(frames),
+            optics=Optics.of(settings),
+            space=space,
+            surface_tolerance_nats=settings.surface_tolerance_nats,
+            importance=build_log_weights(few, field, around=scenes),
+        )
+        probes = draw_probes(target, few, PROBES, seed, "fields", widening=WIDENING)
+        if not len(probes.points):
+            return None
+        rays = RayBatch.of(probes.points)
+        everywhere = np.ones((len(probes.points), len(frames)), dtype=bool)
+        passed = target.visibility.transmittance(rays, everywhere, target.optics, differentiable=False)
+        exact = ExactField(few, lambda body: body.is_target).distances(rays.observed)
+        return cls(few, scenes, settings, target, probes, rays.observed, passed.log_values, exact)
+
+    def log_density(self, distances: np.ndarray) -> np.ndarray:
+        """log p* at the probes from their distances (N, columns)."""
+        surface = self.target.surface_terms(self.observed, distances, self.target.optics.sigma_m)
+        return logsumexp(surface + self.log_transmittance, axis=1)
+
+    def errors(self, field: Field) -> tuple[float, float, dict[str, float]]:
+        """The share of mass in the wrong place, its standard error, and the error of distances near surfaces."""
+        distances = np.asarray(field.distances(self.observed), dtype=np.float64)
+        near = np.abs(self.exact) < NEAR_SIGMAS * self.target.optics.sigma_m
+        apart_m = math.sqrt(np.square((distances - self.exact)[near]).mean()) if near.any() else 0.0
+        return (
+            *self.probes.misplaced(self.log_density(distances), self.log_density(self.exact)),
+            {"distance_error_mm": 1e3 * apart_m},
+        )
+
+
+def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
+    """Resolution and interpolation; empty where no target is a mesh, or no ray meets one."""
+    scenes, config = list(request.request.train), request.config
+    if not any(isinstance(body.shape, Mesh) for scene in scenes for body in scene.bodies if body.is_target):
+        return []
+    visibility = run_visibility(request) or config.density.visibility
+    case = Case.of(scenes, config.space, config.density, config.seed, visibility)
+    if case is None:
+        return []
+    found = [resolution_ladder(case)]
+    return [*found, interpolation_ladder(case)] if isinstance(case.target.field, TableField) else found
+
+
+def resolution_ladder(case: Case) -> Ladder:
+    """Grid points along the longest side of a field, against exact distances."""
+    rungs, left_out = _resolution_rungs(case)
+    return Ladder(
+        knob="density.field_resolution",
+        error_of=ERROR_OF,
+        unit="",
+        against="exact distances to the triangles",
+        tolerance=TOLERANCE,
+        because=BECAUSE,
+        work="building the field of one scene",
+        rungs=rungs,
+        note=_part(case, f"memory is that of all scenes' fields{left_out}"),
+    )
+
+
+def _resolution_rungs(case: Case) -> tuple[list[Rung], str]:
+    """The rungs that do not take too long beyond the run's own, and what the first one that would is called."""
+    rungs: list[Rung] = []
+    for count in sorted({*RESOLUTIONS, case.settings.field_resolution}):
+        if count > case.settings.field_resolution and _predicted_s(case, rungs[-1], count) > LONGEST_SECONDS:
+            return rungs, f"; {count} and more points would take long to measure"
+        rungs.append(_resolution_rung(case, count))
+    return rungs, ""
+
+
+def _predicted_s(case: Case, last: Rung, resolution: int) -> float:
+    """What building the fields at a resolution will take, growing like their volume [s]."""
+    return last.seconds * (resolution / int(last.setting)) ** 3 * len(case.few)
+
+
+def _resolution_rung(case: Case, resolution: int) -> Rung:
+    started = time.perf_counter()
+    field = fresh(case.few, case.scenes, resolution, case.settings)
+    seconds = (time.perf_counter() - started) / len(case.few)
+    error, uncertainty, values = case.errors(field)
+    default = resolution == case.settings.field_resolution
+    return Rung(str(resolution), error, uncertainty, seconds, _bytes(field, case), default, values=values)
+
+
+def _bytes(field: Field, case: Case) -> int:
+    """The memory of the fields of all scenes; moving meshes have one each, however many scenes they are in."""
+    if isinstance(field, TableField):
+        return field.table.nbytes // field.columns * len(scene_columns(case.scenes))
+    return field.bodies.grids.values.nbytes * _meshes(case.scenes) // max(_meshes(case.few), 1)
+
+
+def _meshes(scenes: list[Scene]) -> int:
+    """How many different target meshes scenes have."""
+    shapes = (body.shape for scene in scenes for body in scene.bodies if body.is_target)
+    return len({shape.content_hash for shape in shapes if isinstance(shape, Mesh)})
+
+
+def interpolation_ladder(case: Case) -> Ladder:
+    """How distances between grid points are found, at the run's own resolution."""
+    table, points = case.target.field, case.observed[:TIMED_POINTS]
+    exact = ExactField(case.few, lambda body: body.is_target)
+    _, seconds, memory = timed(lambda: exact.distances(points))
+    ways = {
+        name: table if name == DEFAULT_ORDER else InterpolatedField.of(table, order) for name, order in ORDERS.items()
+    }
+    return Ladder(
+        knob="interpolation of fields",
+        error_of=ERROR_OF,
+        unit="",
+        against="exact distances to the triangles",
+        tolerance=TOLERANCE,
+        because=BECAUSE,
+        work=f"distances of {len(points)} points in {table.columns} scenes",
+        rungs=[
+            *(_way_rung(case, name, field, points) for name, field in ways.items()),
+            Rung("exact", 0.0, 0.0, seconds, memory, reference=True, values={"distance_error_mm": 0.0}),
+        ],
+        note=_part(case, f"with {case.settings.field_resolution} grid points along the longest side"),
+    )
+
+
+def _way_rung(case: Case, name: str, field: Field, points: np.ndarray) -> Rung:
+    _, seconds, memory = timed(lambda: field.distances(points))
+    error, uncertainty, values = case.errors(field)
+    return Rung(name, error, uncertainty, seconds, memory, name == DEFAULT_ORDER, values=values)
+
+
+def fresh(few: list[Scene], scenes: list[Scene], resolution: int, settings: DensitySettings) -> Field:
+    """The field of a few scenes as the run would build it, whatever is cached."""
+    padding_m = PADDING_SIGMAS * settings.sigma_m
+    bodies = [(scene, body) for scene in scenes for body in scene.bodies if body.is_target]
+    if all(isinstance(body.shape, Mesh) and scene.frames == 1 for scene, body in bodies):
+        return fresh_table(few, scenes, resolution, padding_m)
+    return fresh_bodies(few, resolution, padding_m)
+
+
+def _part(case: Case, note: str) -> str:
+    return f"measured on {len(case.few)} of {len(case.scenes)} training scenes; {note}"
+
+
+# Of the whole tolerance: the rest is for learning, whose every halving costs more than that of the fields.
+FIELD_SHARE = 0.2
+
+
+@dataclass(frozen=True)
+class FieldChoice:
+    """Fields for a tolerance.
+
+    Arguments:
+        density: Settings with their resolution.
+        misplaced: The share of the target's mass that they misplace; 0 where distances are exact.
+        note: What was chosen and why, or "".
+    """
+
+    density: DensitySettings
+    misplaced: float
+    note: str = ""
+
+
+@phase("fields")
+def fields_within(scenes: list[Scene], config: RunConfig, tolerance: float, *, fixed: bool) -> FieldChoice:
+    """The coarsest fields that misplace at most a fifth of a tolerance, the finest of the ladder where none does.
+
+    Arguments:
+        scenes: The training scenes.
+        config: The run's configuration.
+        tolerance: The whole tolerance of the density.
+        fixed: Only measure the configuration's own resolution.
+    """
+    density = config.density
+    if not any(isinstance(body.shape, Mesh) for scene in scenes for body in scene.bodies if body.is_target):
+        return FieldChoice(density, 0.0)
+    visibility = "off" if density.visibility == "off" else "raycast"
+    case = Case.of(scenes, config.space, density, config.seed, visibility)
+    if case is None:
+        return FieldChoice(density, 0.0)
+    misplaced = 0.0
+    for resolution in (density.field_resolution,) if fixed else RESOLUTIONS:
+        density = density.model_copy(update={"field_resolution": resolution})
+        misplaced, _, _ = case.errors(fresh(case.few, case.scenes, resolution, density))
+        if misplaced <= FIELD_SHARE * tolerance:
+            break
+    note = f"fields of {density.field_resolution} grid points misplace {misplaced:.2g} of the target's mass"
+    return FieldChoice(density, misplaced, note)

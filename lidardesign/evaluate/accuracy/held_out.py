@@ -1,0 +1,108 @@
+"""The number of held-out scenes: how wide the interval of a difference is, and what so many scenes cost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from lidardesign.evaluate.accuracy.settings import Ladder, Rung
+from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
+from lidardesign.evaluate.results import Evaluation, Row
+from lidardesign.evaluate.statistics import bootstrap_interval
+from lidardesign.task import random_generator
+
+LABEL = "held-out scenes"
+RIVAL = "bounding"
+# Numbers of scenes that are tried where there are more.
+COUNTS = (5, 10, 20, 50, 100, 200)
+# So many sets of scenes are drawn for each; a mean half-width is then known to a few percent beside the scenes' own.
+DRAWS = 32
+RESAMPLES = 1000
+
+
+def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
+    """One ladder: the first design at its largest number of rays against `bounding`; none with fewer than 2 scenes."""
+    pair = _pair(request.evaluation)
+    if pair is None or len(pair[0].per_scene) < 2:
+        return []
+    design, rival = pair
+    differences = np.asarray(design.per_scene, dtype=np.float64) - np.asarray(rival.per_scene, dtype=np.float64)
+    return [_ladder(differences, design, request)]
+
+
+def _pair(evaluation: Evaluation) -> tuple[Row, Row] | None:
+    """The first design's row at its largest number of rays, where designs are closest, and its rival's."""
+    names = [row.design for row in evaluation.rows if not row.baseline]
+    rows = [row for row in evaluation.rows if names and row.design == names[0]]
+    for row in sorted(rows, key=lambda row: -row.rays):
+        for rival in evaluation.rows:
+            if rival.design == RIVAL and rival.rays == row.rays:
+                return row, rival
+    return None
+
+
+def _ladder(differences: np.ndarray, design: Row, request: AccuracyRequest) -> Ladder:
+    metric, total = request.evaluation.metric, len(differences)
+    seconds = _seconds(request.evaluation) / total
+    counts = [count for count in COUNTS if count < total]
+    rungs = [_rung(differences, count, seconds, request.request.seed) for count in (*counts, total)]
+    return Ladder(
+        knob="held-out scenes",
+        error_of=f"half-width of the 95 % interval of {design.design} minus {RIVAL} at {design.rays} rays",
+        unit=metric.unit,
+        against="all scenes that there could be",
+        tolerance=metric.tolerance,
+        because="the task's own tolerance: smaller differences do not matter to it",
+        work="simulating and scoring all rows in so many scenes",
+        rungs=rungs,
+        note=_note(rungs[-1].error, metric.tolerance, metric.unit, total),
+    )
+
+
+def _seconds(evaluation: Evaluation) -> float:
+    """Of all rows in all scenes [s]; rows that fire the same rays have one time, to the last bit."""
+    taken = {row.seconds for row in (*evaluation.rows, *evaluation.equal_bandwidth)}
+    return evaluation.planning_seconds + sum(taken)
+
+
+def _rung(differences: np.ndarray, count: int, seconds: float, seed: int) -> Rung:
+    """The mean half-width over sets of so many scenes; over the one set where all are taken."""
+    total = len(differences)
+    generator = random_generator(seed, "held-out ladder", count)
+    draws = DRAWS if count < total else 1
+    sets = [generator.permutation(total)[:count] for _ in range(draws)] if count < total else [np.arange(total)]
+    intervals = [bootstrap_interval(differences[chosen], seed, resamples=RESAMPLES) for chosen in sets]
+    halves = np.array([(one.high - one.low) / 2 for one in intervals])
+    sign = np.sign(differences.mean())
+    agree = np.mean([sign * one.low > 0 and sign * one.high > 0 for one in intervals])
+    drawn = halves.std(ddof=1) / math.sqrt(draws) if draws > 1 else 0.0
+    return Rung(
+        setting=str(count),
+        error=float(halves.mean()),
+        uncertainty=math.hypot(float(halves.mean()) * relative_error_of_spread(differences), float(drawn)),
+        seconds=seconds * count,
+        default=count == total,
+        values={"told_apart_share": float(agree)},
+    )
+
+
+def relative_error_of_spread(values: np.ndarray) -> float:
+    r"""The relative standard error of a sample's standard deviation, $\sqrt{(m_4 / m_2^2 - 1) / 4 n}$ (Cramer 1946).
+
+    Every half-width is in proportion to it. 0 where all values are equal.
+    """
+    centred = values - values.mean()
+    second = float(np.mean(centred**2))
+    if second == 0:
+        return 0.0
+    return math.sqrt(max(float(np.mean(centred**4)) / second**2 - 1, 0.0) / (4 * len(values)))
+
+
+def _note(half_width: float, tolerance: float, unit: str, total: int) -> str:
+    """How many scenes the tolerance would take: half-widths fall with the root of their number."""
+    if half_width <= tolerance or tolerance <= 0:
+        return ""
+    needed = math.ceil(total * (half_width / tolerance) ** 2)
+    return f"{needed:,} scenes would tell differences of {tolerance:g} {unit} apart"

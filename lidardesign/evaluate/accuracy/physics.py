@@ -1,0 +1,286 @@
+"""Simulating light: how many rays stand for a beam, and what each effect changes and takes."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+
+from lidardesign.design.sensor import Design
+from lidardesign.errors import ConfigError
+from lidardesign.evaluate.accuracy.settings import Ladder, Rung, timed, with_memory
+from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
+from lidardesign.evaluate.baselines.candidates import Positions
+from lidardesign.evaluate.scene_scores import score_lists
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.receiver import path_windows
+from lidardesign.registry import plugin_guard
+from lidardesign.scene import Scene
+from lidardesign.simulate.detector.detector import Detector
+from lidardesign.simulate.detector.files import load_detector
+from lidardesign.simulate.detector.histogram import check_windows
+from lidardesign.simulate.physics import EFFECTS, Physics
+from lidardesign.simulate.plan import Plan, Planner, predicted_seconds
+from lidardesign.simulate.simulate import build_casters
+from lidardesign.task import conditions_of
+
+LABEL = "effects of light"
+# Measured where the evaluation's own detector asks for nothing.
+STAND_IN = "single-photon"
+FOOTPRINT_RAYS = (1, 4, 16, 64, 256)
+# Rays in all frames and positions of a scene: the largest number of rays below this is simulated, else the smallest.
+RAYS_PER_SCENE = 20_000
+# Scenes that are simulated: as many as these rays are enough for, and no more than these. Differences are paired, so
+# that few scenes tell much.
+RAYS, MOST_SCENES = 60_000, 20
+# Thin rays of all beams in all scenes: seconds, and not minutes, for the finest footprint.
+MOST_THIN_RAYS = 6_000_000
+# Effects that take longer than this in one pass over the scenes are left out of all passes [s].
+MOST_SECONDS = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """One design in a few held-out scenes.
+
+    Arguments:
+        request: The evaluation's request.
+        planner: What measures, and how effects are chosen.
+        positions: The design's rays.
+        scenes: The scenes.
+    """
+
+    request: AccuracyRequest
+    planner: Planner
+    positions: Positions
+    scenes: Sequence[Scene]
+
+    @property
+    def rays(self) -> int:
+        """In all frames and positions of a scene."""
+        return sum(len(rays) for rays in self.positions) * self.scenes[0].frames
+
+    @cached_property
+    def casters(self) -> list[list[SceneCaster]]:
+        """Of every scene."""
+        return [build_casters(scene) for scene in self.scenes]
+
+    @cached_property
+    def plans(self) -> list[Plan]:
+        """Of every scene."""
+        pairs = zip(self.scenes, self.casters, strict=True)
+        return [self.planner.plan(scene, list(self.positions), casters) for scene, casters in pairs]
+
+    def score(self, number: int, effects: frozenset[str], detector: Detector) -> float:
+        """The score in a scene under some effects; random numbers are the same whatever the effects."""
+        physics = Physics(detector, effects, self.request.request.seed) if effects else None
+        task, scene = self.request.request.task, self.scenes[number]
+        ((score, _),) = score_lists(task, scene, [self.positions], self.casters[number], physics)
+        return score.value
+
+    def scores(self, effects: frozenset[str], detector: Detector | None = None) -> np.ndarray:
+        """The scores in all scenes, shape (S,)."""
+        measuring = detector or self.planner.detector
+        return np.array([self.score(number, effects, measuring) for number in range(len(self.scenes))])
+
+
+def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
+    """The footprint's ladder where beams have a width, and that of the effects that the scenes have."""
+    if not request.request.designs:
+        return []
+    design, own = request.request.designs[0], request.request.planner.detector
+    planner = request.request.planner
+    if asks_nothing(own):
+        planner = Planner(load_detector(STAND_IN))
+        planner = replace(planner, tolerance=planner.tolerated.within(request.request.task.metric))
+    count, positions = _rays(request, design)
+    frames = request.request.test[0].frames
+    most = max(RAYS // max(sum(len(rays) for rays in positions) * frames, 1), 1)
+    bench = Bench(request, planner, positions, request.request.test[: min(most, MOST_SCENES)])
+    several = len(bench.scenes) > 1
+    note = f"{design.name} with {count} rays in {len(bench.scenes)} scene{'s' if several else ''}"
+    note += "" if several else ", so that differences between scenes are not known"
+    if planner.detector is not own:
+        note += f", measured by {STAND_IN}: the detector of this evaluation, {own.name}, asks for nothing"
+        if not _heard(positions, request.request.test[0], planner.detector):
+            return []
+    found = [_footprint(bench, note, own)] if planner.detector.divergence_rad > 0 else []
+    return [*found, *_effects(bench, note, own)]
+
+
+def _heard(positions: Positions, scene: Scene, detector: Detector) -> bool:
+    """Whether a detector's histogram covers the gates of all rays."""
+    try:
+        for rays in positions:
+            check_windows(path_windows(rays, scene.receiver), detector)
+    except ConfigError:
+        return False
+    return True
+
+
+def asks_nothing(detector: Detector) -> bool:
+    """Whether a detector measures exact first hits."""
+    return (
+        detector.photons is None
+        and detector.bin_s is None
+        and detector.divergence_rad == 0
+        and detector.timing_sigma_s == 0
+    )
+
+
+def _rays(request: AccuracyRequest, design: Design) -> tuple[int, Positions]:
+    """The number of rays that is simulated, and the design's rays."""
+    asked = request.request
+    counts = sorted(set(asked.rays))
+    with plugin_guard(asked.task.name):
+        conditions = conditions_of(asked.task, asked.config, asked.space)
+    each = len(conditions) * asked.test[0].frames
+    count = max([one for one in counts if one * each <= RAYS_PER_SCENE], default=counts[0])
+    samples = asked.samples.get(design.name)
+    return count, tuple(asked.lay_out(design, count, samples, at=condition) for condition in conditions)
+
+
+def _paired(values: np.ndarray, reference: np.ndarray) -> tuple[float, float]:
+    """The size of the mean difference over scenes, and its standard error."""
+    mean, error = _mean(values - reference)
+    return abs(mean), error
+
+
+def _mean(values: np.ndarray) -> tuple[float, float]:
+    """A mean and its standard error, 0 for a single value."""
+    spread = values.std(ddof=1) if len(values) > 1 else 0.0
+    return float(values.mean()), float(spread / math.sqrt(len(values)))
+
+
+def _footprint(bench: Bench, note: str, own: Detector) -> Ladder:
+    detector, metric = bench.planner.detector, bench.request.request.task.metric
+    most = MOST_THIN_RAYS // max(bench.rays * len(bench.scenes), 1)
+    counts = sorted({count for count in FOOTPRINT_RAYS if count <= max(most, 1)} | {detector.footprint_rays})
+    alone = {
+        count: bench.scores(frozenset({"footprint"}), replace(detector, footprint_rays=count)) for count in counts
+    }
+    planned = bench.plans[0].effects - {"multipath"} | {"footprint"}
+    # what is compiled when it is first called is no part of any setting's time
+    bench.score(0, planned, detector)
+    rungs = []
+    for count in counts:
+        error, uncertainty = _mean(np.abs(alone[count] - alone[counts[-1]]))
+        changed = replace(detector, footprint_rays=count)
+        _, seconds, memory = timed(lambda changed=changed: bench.score(0, planned, changed))
+        rungs.append(
+            Rung(
+                str(count),
+                error,
+                uncertainty,
+                seconds,
+                memory,
+                default=detector is own and count == detector.footprint_rays,
+                reference=count == counts[-1],
+            )
+        )
+    return Ladder(
+        knob="footprint_rays",
+        error_of=f"change of a scene's {metric.name}, of the beams' width alone, mean over scenes",
+        unit=metric.unit,
+        against=f"{counts[-1]} rays per beam",
+        tolerance=metric.tolerance,
+        because="the task's own tolerance: smaller differences do not matter to it",
+        work="simulating and scoring one scene with all effects that it calls for",
+        rungs=rungs,
+        note=note,
+    )
+
+
+def _effects(bench: Bench, note: str, own: Detector) -> list[Ladder]:
+    """One ladder: nothing, every effect left out in turn, and all that there are; empty where there is none."""
+    present = {one.name for plan in bench.plans for one in plan.decisions if one.bound.range_m or one.bound.lost}
+    rays, detector = bench.rays * len(bench.scenes), bench.planner.detector
+    dear = {name for name in present if predicted_seconds(name, detector, rays) > MOST_SECONDS}
+    there = [name for name in EFFECTS if name in present - dear]
+    if not there:
+        return []
+    if dear:
+        note += f"; without {', '.join(sorted(dear))}, which take{'s' if len(dear) == 1 else ''} too long here"
+    metric = bench.request.request.task.metric
+    return [
+        Ladder(
+            knob="effects",
+            error_of=f"change of the mean {metric.name} where an effect is left out of all or alone, whichever is more",
+            unit=metric.unit,
+            against="all effects that the scenes have",
+            tolerance=metric.tolerance / len(there),
+            because=f"an equal share of the task's tolerance for each of {len(there)} effects: changes add up",
+            work="simulating and scoring one scene",
+            rungs=_effect_rungs(bench, there, marks=detector is own),
+            note=note,
+        )
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class _Pass:
+    """Scores in all scenes, the median time of one [s] and the most memory [bytes]."""
+
+    values: np.ndarray
+    seconds: float
+    memory_bytes: int | None
+
+
+def _passes(bench: Bench, choices: Mapping[str, Sequence[frozenset[str]]]) -> dict[str, _Pass]:
+    """All scenes under each choice of effects per scene.
+
+    One scene after the other under all choices, so that whatever else the machine does slows all alike.
+    """
+    found: dict[str, list[tuple[float, float, int | None]]] = {name: [] for name in choices}
+    for number in range(len(bench.scenes)):
+        for name, choice in choices.items():
+            started = time.perf_counter()
+            value, memory = with_memory(partial(bench.score, number, choice[number], bench.planner.detector))
+            found[name].append((value, time.perf_counter() - started, memory))
+    return {name: _summed(rows) for name, rows in found.items()}
+
+
+def _summed(rows: Sequence[tuple[float, float, int | None]]) -> _Pass:
+    values, seconds, memory = zip(*rows, strict=True)
+    known = [size for size in memory if size is not None]
+    return _Pass(np.array(values), float(np.median(seconds)), max(known, default=None))
+
+
+def _effect_rungs(bench: Bench, there: Sequence[str], *, marks: bool) -> list[Rung]:
+    """The roughest first; `marks`: the one that the evaluation itself has taken is its default."""
+    everything, count = frozenset(there), len(bench.scenes)
+    planned = [plan.effects & everything for plan in bench.plans]
+    # compiled before anything is timed
+    bench.score(0, everything, bench.planner.detector)
+    settings = {"none": [frozenset()] * count, "all": [everything] * count}
+    settings |= {f"without {name}": [everything - {name}] * count for name in there}
+    if planned not in settings.values():
+        settings[bench.planner.choice if isinstance(bench.planner.choice, str) else "those named"] = planned
+    alone = {f"{name} alone": [frozenset({name})] * count for name in there}
+    found = _passes(bench, settings | alone)
+    full, none = found["all"], found["none"]
+    changes = {
+        f"without {name}": {
+            "left_out": _paired(found[f"without {name}"].values, full.values),
+            "alone": _paired(found[f"{name} alone"].values, none.values),
+        }
+        for name in there
+    }
+    rungs = [_rung(name, found[name], full, changes.get(name, {})) for name in settings if name != "all"]
+    rungs.sort(key=lambda rung: -rung.error)
+    rungs.append(replace(_rung("all", full, full, {}), reference=True))
+    taken = next(name for name, choice in settings.items() if choice == planned)
+    return [replace(rung, default=marks and rung.setting == taken) for rung in rungs]
+
+
+def _rung(setting: str, found: _Pass, full: _Pass, changes: Mapping[str, tuple[float, float]]) -> Rung:
+    """A setting with its error and uncertainty; `changes`: of the metric where an effect is left out or alone."""
+    error = max(changes.values(), default=_paired(found.values, full.values))
+    values = {f"change_{name}": change for name, (change, _) in changes.items()}
+    if changes:
+        values["seconds_saved"] = full.seconds - found.seconds
+    return Rung(setting, *error, found.seconds, found.memory_bytes, values=values)

@@ -1,0 +1,116 @@
+"""What the ladders of a density are measured on: its scenes, and weighted points that know nothing of the flow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from lidardesign.density.fields.distance import scene_columns
+from lidardesign.density.target.prepare import prepare_target
+from lidardesign.density.target.target import Target
+from lidardesign.density.training.independent import independent_points
+from lidardesign.density.training.quality import misplaced_share
+from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
+from lidardesign.run.manifest import read_manifest
+from lidardesign.scene import Body, Scene
+from lidardesign.task import random_generator
+
+# Each of a density's choices may misplace a fiftieth of its mass: half of what the best learned flows miss it by.
+TOLERANCE = 0.02
+BECAUSE = "a fiftieth of the mass is half of what the best learned densities miss"
+ERROR_OF = "share of the density's mass in the wrong place"
+# Moving scenes are thinned to so many frames each before scenes are left out.
+FRAMES_OF_FEW = 4
+# Few draws at a time: each call chooses from candidates of its own, which many draws would exhaust.
+DRAWN_AT_ONCE = 4096
+
+_TARGETS: WeakKeyDictionary[AccuracyRequest, Target] = WeakKeyDictionary()
+
+
+@dataclass(frozen=True, eq=False)
+class Probes:
+    """Distinct weighted points of a density.
+
+    Arguments:
+        points: Design points inside the space, shape (N, 6).
+        log_proposal: log of the density that they were drawn from, up to a constant, shape (N,).
+    """
+
+    points: np.ndarray
+    log_proposal: np.ndarray
+
+    def first(self, count: int) -> Probes:
+        """The first of them, at most `count`."""
+        return Probes(self.points[:count], self.log_proposal[:count])
+
+    def misplaced(self, log_target: np.ndarray, log_reference: np.ndarray) -> tuple[float, float]:
+        """The share of mass in the wrong place and its standard error, from log p* at the points, shapes (N,)."""
+        return misplaced_share(log_target, log_reference, self.log_proposal)
+
+
+def draw_probes(
+    target: Target, scenes: Sequence[Scene], count: int, seed: int, label: str, *, widening: float = 1.0
+) -> Probes:
+    """At most `count` probes of a target, none where no ray of the space comes near a surface.
+
+    Points that were drawn several times count once, with the weight of all: evaluating them again adds nothing.
+
+    Arguments:
+        target: What to probe.
+        scenes: The scenes that it was built of.
+        count: The number of draws.
+        seed: The run's.
+        label: Of the random stream.
+        widening: How many sigmas from the surface probes spread, where other surfaces are to be met too.
+    """
+    wide = replace(target, optics=target.optics.widened(widening * target.optics.sigma_m))
+    generator = random_generator(seed, "accuracy", label)
+    drawn = [
+        independent_points(wide, scenes, min(DRAWN_AT_ONCE, count - start), generator)
+        for start in range(0, count, DRAWN_AT_ONCE)
+    ]
+    points, log_proposal = (np.concatenate(parts) for parts in zip(*drawn, strict=True))
+    _, first, times = np.unique(points, axis=0, return_index=True, return_counts=True)
+    # in the order of drawing, so that a part of them is a fair sample too
+    order = np.argsort(first)
+    first, times = first[order], times[order]
+    return Probes(points[first], log_proposal[first] - np.log(times))
+
+
+def run_target(request: AccuracyRequest) -> Target:
+    """The target of all training scenes as the run learned it, built once per request."""
+    if request not in _TARGETS:
+        _TARGETS[request] = prepare_target(
+            list(request.request.train), request.config, visibility=run_visibility(request)
+        )[0]
+    return _TARGETS[request]
+
+
+def run_visibility(request: AccuracyRequest) -> str | None:
+    """What the run's own probe decided; None where it left no word of it."""
+    return read_manifest(request.run).get("visibility")
+
+
+def few_columns(scenes: Sequence[Scene], most: int) -> list[Scene]:
+    """Scenes with at most `most` columns together, evenly chosen; of moving ones, a few of their frames."""
+    if len(scene_columns(scenes)) <= most:
+        return list(scenes)
+    frames = min(max(scene.frames for scene in scenes), FRAMES_OF_FEW)
+    chosen = np.unique(np.linspace(0, len(scenes) - 1, max(most // frames, 1)).round().astype(int))
+    return [with_frames(scenes[index], min(frames, most)) for index in chosen]
+
+
+def with_frames(scene: Scene, most: int) -> Scene:
+    """A scene with at most so many of its frames, evenly chosen."""
+    if scene.frames <= most:
+        return scene
+    chosen = np.linspace(0, scene.frames - 1, most).round().astype(int)
+    bodies = tuple(_thinned(body, chosen) for body in scene.bodies)
+    return replace(scene, bodies=bodies)
+
+
+def _thinned(body: Body, frames: np.ndarray) -> Body:
+    return body if body.poses.ndim == 2 else replace(body, poses=body.poses[frames])

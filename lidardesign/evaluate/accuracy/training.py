@@ -1,0 +1,241 @@
+"""What learning costs: the misplaced share after a part of the steps, and with other presets."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from lidardesign.config import PRESETS, RunConfig, load_run_config
+from lidardesign.density.learn import FLOW
+from lidardesign.density.target.target import Target
+from lidardesign.density.training.quality import Probes, draw_probes, measure
+from lidardesign.density.training.schedule import goal_of
+from lidardesign.density.training.snapshot_quality import Reached, load_flow, remeasured
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.fit import fit
+from lidardesign.design.layouts.rays import gates_of
+from lidardesign.design.sensor import Design, fitted_layout
+from lidardesign.errors import LidardesignError
+from lidardesign.estimates import Estimate
+from lidardesign.evaluate.accuracy.probes import ERROR_OF, run_target
+from lidardesign.evaluate.accuracy.settings import Ladder, Rung
+from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
+from lidardesign.evaluate.baselines.candidates import Positions
+from lidardesign.evaluate.scene_scores import score_lists
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.registry import plugin_guard
+from lidardesign.run.manifest import read_manifest, verify
+from lidardesign.samples import Samples
+from lidardesign.scene import Scene
+from lidardesign.simulate.simulate import build_casters
+from lidardesign.task import conditions_of, random_generator
+
+LABEL = "training"
+# A misplaced share of a tenth is then known to 5 %.
+SAMPLES = 8192
+PROBES = 8192
+TOLERANCE = 0.1
+BECAUSE = (
+    "a tenth of the rays in the wrong place is at worst a tenth fewer rays: 5 % of an error that falls like their root"
+)
+AGAINST = "the target density"
+# A quick fit shows what a density's errors are worth in the metric; a careful one would take the ladder's time.
+SCORED_SCENES = 8
+RESTARTS = 2
+EM_SAMPLES = 4000
+PRESET_NOTE = "runs of the same task, space and density beside this one"
+STEPS_NOTE = (
+    "fewer steps are what this run had reached then, on its way; a run that is planned for as many does better"
+)
+
+
+def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
+    """The run's own snapshots; the stages of a tolerance, and runs of other presets beside it, where there are any."""
+    seed, target = request.config.seed, run_target(request)
+    generator = random_generator(seed, "accuracy", "training")
+    probes = draw_probes(target, list(request.request.train), PROBES, generator)
+    reached = remeasured(request.run, request.config, target, probes, count=SAMPLES, seed=seed)
+    found = [_steps_ladder(request, reached), *_stages_ladder(request)]
+    return [*found, *_preset_ladder(request, reached[-1], target, probes)]
+
+
+def _steps_ladder(request: AccuracyRequest, reached: Sequence[Reached]) -> Ladder:
+    judge = _Judge(request, reached[-1].samples)
+    scores = [judge.scores(one.samples) for one in reached]
+    rungs = [
+        _rung(str(one.step), _around(one), one.seconds, judge.values(own, scores[-1]), default=one is reached[-1])
+        for one, own in zip(reached, scores, strict=True)
+    ]
+    notes = [STEPS_NOTE] if len(rungs) > 1 else ["this run kept no snapshots; learned again, it keeps some"]
+    return _ladder("learning.steps", "learning up to there", rungs, "; ".join([*notes, *judge.notes]))
+
+
+def _around(reached: Reached) -> dict[str, Estimate]:
+    """The figures of a rung, its error with the jitter from step to step."""
+    return {**reached.estimates, "misplaced": reached.misplaced}
+
+
+def _stages_ladder(request: AccuracyRequest) -> Sequence[Ladder]:
+    """What `learn --tolerance` measured on its way to this run, if it was."""
+    goal = goal_of(request.run)
+    if goal is None or len(goal.stages) < 2:
+        return []
+    rungs = [
+        Rung(str(stage.steps), stage.misplaced, stage.error, stage.seconds, default=stage is goal.stages[-1])
+        for stage in goal.stages
+    ]
+    note = f"measured when the run was learned to a tolerance of {goal.tolerance:g}"
+    return [_ladder("learning.steps, each anew", "learning and measuring", rungs, note)]
+
+
+def _preset_ladder(request: AccuracyRequest, own: Reached, target: Target, probes: Probes) -> Sequence[Ladder]:
+    """Runs of other presets against the same target, in the order of effort; empty where none lies beside this one."""
+    config, seconds = request.config, _seconds(request.run)
+    beside = [_rung_beside(run, other, target, probes, config.seed) for run, other in _presets(request)]
+    rungs = [rung for rung in beside if rung is not None]
+    if not rungs or seconds is None:
+        return []
+    rungs.append(_rung(config.preset, own.estimates, seconds, {}, default=True))
+    rungs.sort(key=lambda rung: PRESETS.index(rung.setting))
+    return [_ladder("preset", "the whole of learn", rungs, PRESET_NOTE)]
+
+
+def _rung_beside(run: Path, config: RunConfig, target: Target, probes: Probes, seed: int) -> Rung | None:
+    """Another run; None where it cannot be measured: this run's figures do not depend on what lies beside it."""
+    try:
+        seconds, learned = _seconds(run), load_flow(run, FLOW, config, target, seed)
+    except LidardesignError:
+        return None
+    if seconds is None:
+        return None
+    return _rung(config.preset, measure(learned, probes, SAMPLES).estimates, seconds, {}, default=False)
+
+
+def _presets(request: AccuracyRequest) -> list[tuple[Path, RunConfig]]:
+    """The finished runs beside this one that learned the same density by other presets, one of each."""
+    mine, found = request.config, {}
+    for folder in sorted(request.run.absolute().parent.iterdir()):
+        config = _config_of(folder)
+        if config is None or config.preset == mine.preset or config.preset in found:
+            continue
+        if (config.task_name, config.task, config.space, config.density) == (
+            mine.task_name, mine.task, mine.space, mine.density
+        ):  # fmt: skip
+            found[config.preset] = (folder, config)
+    return list(found.values())
+
+
+def _config_of(folder: Path) -> RunConfig | None:
+    """The configuration of a finished and sound run; None for anything else that lies there."""
+    if not (folder / FLOW).is_file():
+        return None
+    try:
+        verify(folder, FLOW)
+        return load_run_config(folder)[1]
+    except LidardesignError:
+        return None
+
+
+def _seconds(run: Path) -> float | None:
+    """What the whole of learn took [s]; None where the manifest has no word of it."""
+    found = (read_manifest(run).get("learn") or {}).get("seconds")
+    return float(found) if isinstance(found, float | int) else None
+
+
+def _rung(
+    setting: str, estimates: Mapping[str, Estimate], seconds: float, further: Mapping[str, float], *, default: bool
+) -> Rung:
+    misplaced = estimates["misplaced"]
+    values = {name: estimates[name].value for name in ("ess", "kl_nats", "coverage")}
+    errors = {f"{name}_error": estimates[name].error or 0.0 for name in values}
+    return Rung(
+        setting,
+        misplaced.value,
+        misplaced.error or 0.0,
+        seconds,
+        default=default,
+        values={**values, **errors, **further},
+    )
+
+
+def _ladder(knob: str, work: str, rungs: Sequence[Rung], note: str) -> Ladder:
+    return Ladder(knob, ERROR_OF, "", AGAINST, TOLERANCE, BECAUSE, work, rungs, note)
+
+
+class _Judge:
+    """Scores quick fits, like the first of the run's designs that allows one, to samples of its flow at other times.
+
+    Arguments:
+        request: What is evaluated.
+        samples: Of the flow as it is.
+    """
+
+    def __init__(self, request: AccuracyRequest, samples: Samples) -> None:
+        asked = self._asked = request.request
+        self._retarget = run_target(request).log_density
+        self._rays = sorted(asked.rays)[len(asked.rays) // 2]
+        with plugin_guard(asked.task.name):
+            self._conditions = conditions_of(asked.task, asked.config, asked.space)
+        allowing = (one for one in asked.designs if not one.at and self._laid_out(one, samples) is not None)
+        self._design = next(allowing, None)
+        self._scenes = [(scene, build_casters(scene)) for scene in asked.test[:SCORED_SCENES]] if self._design else []
+
+    @property
+    def notes(self) -> list[str]:
+        """What the scores are of."""
+        if self._design is None:
+            return []
+        scored = f"scores of quick fits like {self._design.name} with {self._rays} rays on {len(self._scenes)} scenes"
+        return [scored]
+
+    def scores(self, samples: Samples) -> np.ndarray | None:
+        """Per scene; None where the samples carry no such design."""
+        positions = self._laid_out(self._design, samples) if self._design else None
+        if positions is None:
+            return None
+        return np.array([self._score(scene, casters, positions) for scene, casters in self._scenes])
+
+    def values(self, scores: np.ndarray | None, last: np.ndarray | None) -> dict[str, float]:
+        """The mean score, and its standard error beside the last rung's, on the same scenes."""
+        if scores is None or last is None:
+            return {}
+        apart = scores - last
+        error = float(apart.std(ddof=1) / math.sqrt(len(apart))) if len(apart) > 1 else 0.0
+        unit = re.sub(r"\W+", "", self._asked.task.metric.unit)
+        name = f"score_{unit}" if unit else "score"
+        return {name: float(scores.mean()), f"{name}_difference_error": error}
+
+    def _laid_out(self, design: Design, samples: Samples) -> Positions | None:
+        """The rays of a quick fit; None where its constraints fix other rays, or the samples are too few for it."""
+        try:
+            found = self._fitted(design, samples)
+            return tuple(self._asked.lay_out(found, self._rays, samples, at=place) for place in self._conditions)
+        except LidardesignError:
+            return None
+
+    def _fitted(self, design: Design, samples: Samples) -> Design:
+        one_per_ray = design.layout == "scan" or design.track is not None
+        return fit(
+            samples,
+            sensors=None if one_per_ray else len(design.sensors),
+            layout=fitted_layout(design.layout),
+            rays=None if design.layout == "grid" and design.ray_table is None else self._rays,
+            constraints=Constraints.from_mapping(dict(design.constraints), where=f"constraints of {design.name}"),
+            seed=self._asked.seed,
+            restarts=RESTARTS,
+            em_samples=EM_SAMPLES,
+            level=design.level,
+            name=design.name,
+            gates=None if one_per_ray else gates_of(design, samples),
+            retarget=self._retarget,
+        ).design
+
+    def _score(self, scene: Scene, casters: Sequence[SceneCaster], positions: Positions) -> float:
+        planner = self._asked.planner
+        physics = planner.physics(planner.plan(scene, list(positions), casters), self._asked.seed)
+        ((score, _),) = score_lists(self._asked.task, scene, [positions], casters, physics)
+        return score.value

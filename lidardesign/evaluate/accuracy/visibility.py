@@ -1,0 +1,290 @@
+"""What visibility costs: none, quadrature or ray casting against opaque geometry; and midpoints of the quadrature.
+
+Visibility by opaque geometry: T = 1 up to the margin in front of the first hit, 0 behind it.
+
+The closed form that ways to compute visibility are compared with; it has no gradient.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from lidardesign.config import DensitySettings
+from lidardesign.density.fields.distance import Field, TableField, build_field
+from lidardesign.density.target.frames import FramesTarget
+from lidardesign.density.target.target import PADDING_SIGMAS, Target, build_target
+from lidardesign.density.visibility.occlusion import Blocked, BodyRaycast, NoOcclusion, Pairs
+from lidardesign.density.visibility.quadrature import (
+    NoVisibility,
+    Optics,
+    Quadrature,
+    RayBatch,
+    Raycast,
+    RayGradient,
+    Visibility,
+)
+from lidardesign.density.visibility.receiver import HeardVisibility, common_receiver
+from lidardesign.evaluate.accuracy.probes import (
+    BECAUSE,
+    ERROR_OF,
+    TOLERANCE,
+    Probes,
+    draw_probes,
+    few_columns,
+    run_target,
+    run_visibility,
+)
+from lidardesign.evaluate.accuracy.settings import Ladder, Rung, timed
+from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
+from lidardesign.scene import Mesh, Scene
+from lidardesign.space import DesignSpace
+
+# log T of hidden points: far below anything that counts, and finite
+LOG_OPAQUE = -1e4
+
+
+def opaque_target(target: Target, scenes: list[Scene]) -> Target:
+    """The same target with opaque occluders; scenes are those that it was built of."""
+    if isinstance(target, FramesTarget):
+        return replace(target, visibility=OpaqueBodies(BodyRaycast.of(scenes)))
+    receiver, way = common_receiver(scenes), Opaque(Raycast(scenes))
+    return replace(target, visibility=way if receiver is None else HeardVisibility(way, receiver))
+
+
+@dataclass(frozen=True, eq=False)
+class _Hidden:
+    log_values: np.ndarray
+
+    def gradient(self, weights: np.ndarray) -> RayGradient:
+        return RayGradient.zeros(len(self.log_values))
+
+
+class Opaque:
+    """Exact first hits on opaque scenes."""
+
+    name = "opaque"
+
+    def __init__(self, exact: Visibility) -> None:
+        self._exact, self.rows_at_once = exact, exact.rows_at_once
+
+    def transmittance(
+        self, rays: RayBatch, active: np.ndarray, optics: Optics, *, differentiable: bool = True
+    ) -> _Hidden:
+        """See `Visibility`; its gradient is 0 wherever there is one."""
+        return _Hidden(_opaque(self._exact.transmittance(rays, active, optics, differentiable=False).log_values))
+
+
+class OpaqueBodies:
+    """Exact first hits on opaque bodies of many columns."""
+
+    name = "opaque"
+
+    def __init__(self, exact: BodyRaycast) -> None:
+        self._exact = exact
+
+    def take(self, columns: np.ndarray) -> OpaqueBodies:
+        """The same for some columns."""
+        return OpaqueBodies(self._exact.take(columns))
+
+    def blocked(self, rays: RayBatch, pairs: Pairs, optics: Optics) -> Blocked:
+        """log T of every pair."""
+        found = self._exact.blocked(rays, pairs, optics)
+        return replace(found, log_values=_opaque(found.log_values), attenuation_per_m=0.0)
+
+
+def _opaque(log_values: np.ndarray) -> np.ndarray:
+    return np.where(log_values < 0, LOG_OPAQUE, 0.0)
+
+
+LABEL = "visibility"
+POINTS = (16, 32, 64, 128, 256)
+REFERENCE_POINTS = 512
+# Errors of cheap ways, of the quadrature on a common table, and of that over bodies one by one.
+PROBES, TABLE_PROBES, BODY_PROBES = 32_768, 8192, 2048
+BODY_BATCH = 256
+# A quadrature over bodies without a common table evaluates every body at every midpoint of every probe.
+MOST_BODIES = 120
+# Compiled loops are loaded before anything is timed.
+WARM_UP_PROBES = 32
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Scenes and what visibility is measured on there.
+
+    Arguments:
+        scenes: What p* is the density of.
+        off, cast: The target without visibility and with ray casting.
+        integrated: The target with quadrature.
+        probes: Points that know nothing of the flow.
+        few: How many of these a quadrature is evaluated at.
+        batch: How many of them are timed.
+    """
+
+    scenes: list[Scene]
+    off: Target
+    cast: Target
+    integrated: Target
+    probes: Probes
+    few: int
+    batch: int
+
+    @classmethod
+    def of(
+        cls, scenes: list[Scene], space: DesignSpace, settings: DensitySettings, seed: int, batch: int = 1024
+    ) -> Case:
+        """The targets of scenes, and probes.
+
+        Arguments:
+            scenes: All are used: see `affordable_scenes`.
+            space: The design space.
+            settings: Of the density.
+            seed: The root of the probes.
+                batch: The number of points that is timed, fewer where bodies are evaluated one by one.
+        """
+        cast = build_target(scenes, space, settings, "raycast")
+        if isinstance(cast, FramesTarget):
+            off = replace(cast, visibility=NoOcclusion())
+            integrated = build_target(scenes, space, settings, "quadrature")
+        else:
+            off = replace(cast, visibility=_heard(NoVisibility(), scenes))
+            way = Quadrature(_occluders(cast, scenes, settings), settings.quadrature_points)
+            integrated = replace(cast, visibility=_heard(way, scenes))
+        shared = isinstance(one_way(integrated.visibility).field, TableField)
+        few, batch = (TABLE_PROBES, batch) if shared else (BODY_PROBES, min(BODY_BATCH, batch))
+        return cls(scenes, off, cast, integrated, draw_probes(cast, scenes, PROBES, seed, "visibility"), few, batch)
+
+    @cached_property
+    def exact(self) -> np.ndarray:
+        """log p* at the probes where occluders are opaque, shape (N,)."""
+        return opaque_target(self.cast, self.scenes).log_density(self.probes.points)
+
+    @property
+    def is_blind(self) -> bool:
+        """Whether no probe reaches a surface, or none sees one."""
+        return bool(self.exact.max(initial=LOG_OPAQUE) < LOG_OPAQUE / 2)
+
+    def quadrature(self, points: int) -> Target:
+        """The target with so many midpoints."""
+        field = one_way(self.integrated.visibility).field
+        return replace(self.integrated, visibility=_heard(Quadrature(field, points), self.scenes))
+
+    def rung(self, setting: str, target: Target, exact: np.ndarray, *, default: bool) -> Rung:
+        """A target's error at as many probes as there are exact values (N,), and its time for a batch."""
+        probes, batch = self.probes.first(len(exact)), self.probes.points[: self.batch]
+        target.log_density_and_gradient(batch[:WARM_UP_PROBES])
+        _, seconds, memory = timed(lambda: target.log_density_and_gradient(batch))
+        error, uncertainty = probes.misplaced(target.log_density(probes.points), exact)
+        return Rung(setting, error, uncertainty, seconds, memory, default=default)
+
+    @property
+    def work(self) -> str:
+        """What is timed."""
+        return f"log p* with its gradient at {min(self.batch, len(self.probes.points))} design points"
+
+
+def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
+    """Ways against opaque geometry, and points of the quadrature against many; empty where no ray sees a target."""
+    scenes, config = list(request.request.train), request.config
+    few = affordable_scenes(scenes)
+    case = Case.of(few, config.space, config.density, config.seed, config.learning.batch)
+    if case.is_blind:
+        return []
+    default, points = _own_setting(request)
+    part = _part(few, scenes)
+    unused = "" if default == "quadrature" else f"this run's visibility is {default}"
+    return [
+        replace(visibility_ladder(case, points, default), note=part),
+        replace(points_ladder(case, points if default == "quadrature" else None), note=_joined(unused, part)),
+    ]
+
+
+def visibility_ladder(case: Case, points: int, default: str) -> Ladder:
+    """No visibility, the quadrature with its own points, and ray casting.
+
+    Arguments:
+        case: What they are measured on.
+        points: Of the quadrature.
+        default: off, quadrature or raycast: what the run uses.
+    """
+    exact, quadrature = case.exact, case.quadrature(points)
+    rungs = [
+        case.rung("off", case.off, exact, default=default == "off"),
+        case.rung("quadrature", quadrature, exact[: case.few], default=default == "quadrature"),
+        case.rung("raycast", case.cast, exact, default=default == "raycast"),
+    ]
+    return Ladder(
+        "density.visibility", ERROR_OF, "", "opaque geometry, by exact first hits", TOLERANCE, BECAUSE, case.work, rungs
+    )
+
+
+def points_ladder(case: Case, default: int | None) -> Ladder:
+    """Midpoints of the quadrature against many of them; `default` is what the run uses, None without quadrature."""
+    probes = case.probes.first(case.few).points
+    exact = case.quadrature(REFERENCE_POINTS).log_density(probes)
+    rungs = [
+        case.rung(str(count), case.quadrature(count), exact, default=count == default)
+        for count in sorted({*POINTS, *([default] if default else [])})
+    ]
+    return Ladder(
+        knob="density.quadrature_points",
+        error_of=ERROR_OF,
+        unit="",
+        against=f"the integral with {REFERENCE_POINTS} points",
+        tolerance=TOLERANCE,
+        because=BECAUSE,
+        work=case.work,
+        rungs=rungs,
+    )
+
+
+def one_way(visibility: Visibility) -> Visibility:
+    """The way from the ray's origin, also where light comes back to a receiver."""
+    return visibility.one_way if isinstance(visibility, HeardVisibility) else visibility
+
+
+def _part(few: list[Scene], scenes: list[Scene]) -> str:
+    """Which part of the scenes was measured; "" where it was all of them."""
+    if few is scenes:
+        return ""
+    frames = f", {few[0].frames} frames of each" if scenes[0].frames > few[0].frames else ""
+    return f"measured on {len(few)} of {len(scenes)} training scenes{frames}"
+
+
+def _joined(*notes: str) -> str:
+    return "; ".join(note for note in notes if note)
+
+
+def _heard(way: Visibility, scenes: list[Scene]) -> Visibility:
+    """A way from the ray's origin, and back to the receiver where there is one."""
+    receiver = common_receiver(scenes)
+    return way if receiver is None else HeardVisibility(way, receiver)
+
+
+def _occluders(target: Target, scenes: list[Scene], settings: DensitySettings) -> Field:
+    """Distances to the occluders: those to the targets where they are the same bodies."""
+    if all(body.role == "both" for scene in scenes for body in scene.bodies):
+        return target.field
+    padding_m = PADDING_SIGMAS * settings.sigma_m
+    return build_field(scenes, lambda body: body.is_occluder, resolution=settings.field_resolution, padding_m=padding_m)
+
+
+def affordable_scenes(scenes: list[Scene]) -> list[Scene]:
+    """All scenes where their occluders share a table, else as many as a fine quadrature can evaluate."""
+    occluders = [body for scene in scenes for body in scene.bodies if body.is_occluder]
+    if all(isinstance(body.shape, Mesh) and body.poses.ndim == 2 for body in occluders):
+        return scenes
+    per_column = max(sum(body.is_occluder for body in scene.bodies) for scene in scenes)
+    return few_columns(scenes, max(MOST_BODIES // max(per_column, 1), 1))
+
+
+def _own_setting(request: AccuracyRequest) -> tuple[str, int]:
+    """What the run's probe decided, and the points of its quadrature, refined as they were."""
+    name = run_visibility(request) or request.config.density.visibility
+    if name != "quadrature":
+        return name, request.config.density.quadrature_points
+    return name, one_way(run_target(request).visibility).points

@@ -1,0 +1,176 @@
+"""What a baseline may take: layouts of any number of rays, with one ray list for every condition value.
+
+Most designs have one list of rays. Where a task's scenes are seen from several condition values (a robot's
+positions), a design has one list per value; all have the same number of rays.
+
+Even placements of exactly N rays over boxes of any number of origin and angle axes, without randomness.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.layouts.grid import grid_tangent, low_discrepancy
+from lidardesign.design.layouts.rays import fire_times
+from lidardesign.design.sensor import MOST_RAYS
+from lidardesign.errors import ConfigError
+from lidardesign.geometry.rays import Rays
+from lidardesign.numerics import EPSILON
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
+
+RAY_AXES = 5  # x, y, z, azimuth, elevation: everything but the range
+# A gate without width hears nothing, since gates are open at their end. Ranges that never vary get the width
+# of the default 100 ps bin around them.
+SMALLEST_GATE_M = 0.015
+
+
+def even_unit(count: int, extents: np.ndarray) -> np.ndarray:
+    """Exactly `count` even points in the unit cube of the axes given by their extents, shape (count, k).
+
+    No axis gives equal points, one a cell-centred line, two a cell-centred grid with cells as square as
+    whole rays allow, more a low-discrepancy sequence.
+    """
+    if len(extents) == 2:
+        return grid_tangent(float(extents[0]), float(extents[1]), count) / extents + 0.5
+    if len(extents) == 1:
+        return (np.arange(count)[:, None] + 0.5) / count
+    return low_discrepancy(count, len(extents))
+
+
+def even_placement(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
+    """Even points over the axes of a box that have a width, shapes (5,), (5,) to (count, 5).
+
+    Two axes in the same unit (two lengths, or azimuth and elevation) get square cells in that unit; a length
+    beside an angle gets cells that are square relative to the box.
+    """
+    low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+    free = np.flatnonzero(high > low)
+    extents = (high - low)[free]
+    if len(free) == 2 and (free[0] < AZIMUTH) != (free[1] < AZIMUTH):
+        extents = np.ones(2)
+    points = np.tile(low, (count, 1))
+    points[:, free] += even_unit(count, extents) * (high - low)[free]
+    return np.clip(points, low, high)
+
+
+def rays_at(points: np.ndarray, gate_m: np.ndarray) -> Rays:
+    """Rays of one sensor at (x, y, z, azimuth, elevation), shape (N, 5 or 6), all with one gate (2,) [m].
+
+    They fire one after another over a frame, as a design's do.
+    """
+    count = len(points)
+    return Rays(
+        origin_m=points[:, :3],
+        direction=direction(points[:, AZIMUTH], points[:, ELEVATION]),
+        gate_m=np.tile(gate_m, (count, 1)),
+        sensor=np.zeros(count),
+        time_s=fire_times(count, Bandwidth().rate_hz),
+    )
+
+
+def opened_gate(start_m: float, end_m: float) -> np.ndarray:
+    """A gate that hears both its ends, shape (2,) [m]; one without width gets `SMALLEST_GATE_M`."""
+    if end_m > start_m:
+        return np.array([start_m, np.nextafter(end_m, np.inf)])
+    start = max(0.0, start_m - SMALLEST_GATE_M / 2)
+    return np.array([start, start + SMALLEST_GATE_M])
+
+
+CENTRAL_SHARE = 0.99
+
+Positions = tuple[Rays, ...]  # one list of rays per condition value, in the task's order
+
+
+class Spot(NamedTuple):
+    """Where and for which scene rays are laid out.
+
+    Arguments:
+        space: The design space at a condition value.
+        number: Which of the values it is.
+        scene: The held-out scene, for what is drawn anew in each.
+    """
+
+    space: DesignSpace
+    number: int = 0
+    scene: int = 0
+
+
+class Candidate(Protocol):
+    """One layout that a baseline may take; `drawn_anew` says whether it differs from scene to scene."""
+
+    name: str
+    drawn_anew: bool
+
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
+        """Exactly `count` rays in each of the spaces."""
+        ...
+
+    def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
+        """As many rays as fit in a bandwidth [Mbit/s], the same number in each space; none where not one fits."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """A layout whose rays all have one gate.
+
+    Arguments:
+        name: For messages.
+        place: Even or random points (x, y, z, azimuth, elevation) of any number, (count, spot) to (count, 5).
+        gate_m: The gate of all its rays, shape (2,).
+        drawn_anew: Whether the points differ from scene to scene.
+    """
+
+    name: str
+    place: Callable[[int, Spot], np.ndarray]
+    gate_m: np.ndarray
+    drawn_anew: bool = False
+
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
+        """See `Candidate`."""
+        spots = [Spot(space, number, scene) for number, space in enumerate(spaces)]
+        return tuple(rays_at(self.place(count, spot), self.gate_m) for spot in spots)
+
+    def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
+        """See `Candidate`.
+
+        Raises:
+            ConfigError: More rays than any sensor fires fit in.
+        """
+        width_m = self.gate_m[1] - self.gate_m[0]
+        single = bandwidth.mbps_of_widths(np.array([width_m]))
+        # the ratio of two multiples of one bin may lie an ulp below a whole number
+        count = math.floor(limit_mbps / single * (1 + EPSILON))
+        if count > MOST_RAYS:
+            raise ConfigError(
+                f"a design of {limit_mbps:.3g} Mbit/s compares with baselines of {count:.3g} rays",
+                where="bandwidth",
+                allowed=f"at most {MOST_RAYS:,} rays",
+                hint="narrow the design's gates: they are far longer than the task's ranges",
+            )
+        while count and bandwidth.mbps_of_widths(np.array([width_m]), count) > limit_mbps:
+            count -= 1
+        return self.positions(spaces, count)
+
+
+def mean_mbps(positions: Positions, bandwidth: Bandwidth) -> float:
+    """What reading rays out costs, averaged over condition values [Mbit/s]."""
+    return math.fsum(bandwidth.mbps(rays) for rays in positions) / len(positions)
+
+
+def whole_range(space: DesignSpace) -> np.ndarray:
+    """The gate that hears all of a space's range, shape (2,) [m]."""
+    return opened_gate(space.low[RANGE], space.high[RANGE])
+
+
+def central(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of the central 99 % of each column, (N, ...) to two of shape (...)."""
+    tail = (1 - CENTRAL_SHARE) / 2
+    low, high = np.quantile(values, [tail, 1 - tail], axis=0)
+    return low, np.maximum(low, high)

@@ -1,0 +1,344 @@
+"""The simple rivals of every design.
+
+Each is built for exactly N rays, alone from the design space and from the training scenes. A baseline is one or
+more candidate layouts; where there are several, the best on training scenes is taken at each number of rays.
+
+- `uniform`: rays even in azimuth and elevation over the whole design space (the paper's grid), with the whole
+  range as their gate. Free origin axes join the layout: two free axes in all give a grid, more a
+  low-discrepancy set.
+- `random`: rays uniform in the measure of the design space, with the whole range as their gate, drawn anew for
+  every scene.
+- `bounding`: see `lidardesign.evaluate.baselines.simple`.
+- `occupancy`: see `lidardesign.evaluate.baselines.occupancy`.
+- `no-visibility`: see `lidardesign.evaluate.baselines.no_visibility`.
+- `catalog:NAME`: see `lidardesign.evaluate.baselines.catalog`.
+- `cma`: see `lidardesign.evaluate.cma.candidate`.
+
+Where the density has conditions, every baseline is laid out at each of their values, in what is left free there.
+
+The baseline `bounding`: what an engineer would build in five minutes from where the training returns are.
+
+One even layout, cropped per axis to the central 99 % of the training returns in angle and range. With free
+origins the better of two, on training scenes: parallel rays (vertical where the space allows it) from an even grid
+over the returns' box, and an even or low-discrepancy set in the central 99 % box of origins and angles. Where the
+density has conditions, one box is cropped over all of their values, and stands at each value as it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.errors import ConfigError
+from lidardesign.evaluate.baselines.candidates import (
+    RAY_AXES,
+    Candidate,
+    Layout,
+    Positions,
+    Spot,
+    central,
+    even_placement,
+    opened_gate,
+    whole_range,
+)
+from lidardesign.evaluate.baselines.catalog import FAMILY, Density, part_candidates, scene_points, split_argument
+from lidardesign.evaluate.baselines.observed import DENSE_RAYS, Observed, TrainingViews, dense_points
+from lidardesign.evaluate.baselines.occupancy import occupancy
+from lidardesign.evaluate.baselines.part_poses import ScenePoints
+from lidardesign.geometry.rays import Rays
+from lidardesign.run.clock import phase
+from lidardesign.scene import Scene
+from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace, direction
+from lidardesign.task import random_generator
+
+# an origin axis within 45 degrees of parallel rays only moves them along themselves
+ALIGNED = math.cos(math.pi / 4)
+
+
+def bounding(views: TrainingViews) -> list[Layout]:
+    """The layouts to choose from; none where dense rays return nothing."""
+    space = views.space
+    observed = views.hits(dense_points(space))
+    if not len(observed.points):
+        return []
+    low, high = central(observed.points)
+    cropped = _boxed("cropped", space, low, high, opened_gate(low[RANGE], high[RANGE]))
+    if not [axis for axis in space.free if axis < AZIMUTH and axis not in space.conditioned]:
+        return [cropped]
+    parallel = _parallel(views, observed)
+    return [cropped] if parallel is None else [parallel, cropped]
+
+
+def _boxed(name: str, space: DesignSpace, low: np.ndarray, high: np.ndarray, gate_m: np.ndarray) -> Layout:
+    """Even rays in a box whose conditions take the values of the spot."""
+    conditions = [DIMENSIONS.index(one) for one in space.condition]
+    conditions = [axis for axis in conditions if axis < RAY_AXES]
+
+    def place(count: int, spot: Spot) -> np.ndarray:
+        lowest, highest = np.array(low[:RAY_AXES]), np.array(high[:RAY_AXES])
+        lowest[conditions] = np.array(spot.space.low)[conditions]
+        highest[conditions] = np.array(spot.space.high)[conditions]
+        return even_placement(lowest, highest, count)
+
+    return Layout(name, place, gate_m)
+
+
+def _parallel(views: TrainingViews, observed: Observed) -> Layout | None:
+    """Parallel rays from an even grid over the returns' box, within the admissible origins.
+
+    An origin axis that runs along the rays stays at the bound behind the scene. None where such rays
+    return nothing.
+    """
+    space = views.space
+    azimuth, elevation = parallel_angles(space, observed)
+    looking = direction(azimuth, elevation)
+    low, high = central(observed.hits_m)
+    low, high = (np.clip(end, space.low[:3], space.high[:3]) for end in (low, high))
+    for axis in np.flatnonzero(np.abs(looking) > ALIGNED):
+        low[axis] = high[axis] = space.low[axis] if looking[axis] > 0 else space.high[axis]
+    low, high = np.append(low, [azimuth, elevation]), np.append(high, [azimuth, elevation])
+    seen = views.hits(even_placement(low, high, DENSE_RAYS))
+    if not len(seen.points):
+        return None
+    nearest, furthest = central(seen.points[:, RANGE])
+    return _boxed("parallel", space, low, high, opened_gate(float(nearest), float(furthest)))
+
+
+def parallel_angles(space: DesignSpace, observed: Observed) -> tuple[float, float]:
+    """Straight down where the space allows it, else straight up, else the median direction of the returns."""
+    middle = np.median(observed.points[:, AZIMUTH])
+    pole = math.pi / 2
+    for elevation in (-pole, pole):
+        if space.low[ELEVATION] <= elevation <= space.high[ELEVATION]:
+            return float(middle), elevation
+    return float(middle), float(np.median(observed.points[:, ELEVATION]))
+
+
+Judge = Callable[[Sequence[Positions]], Sequence[float]]
+NO_VISIBILITY = "no-visibility"
+CMA = "cma"
+
+
+class Option(NamedTuple):
+    """A candidate at a number of rays."""
+
+    candidate: Candidate
+    positions: Positions
+
+
+class Baselines:
+    """Builds baselines for one design space and one set of training scenes, which it traces once.
+
+    Arguments:
+        space: The design space.
+        train: Training scenes.
+        seed: Root of the baselines that are drawn.
+        judge: What lists of rays are worth on training scenes, lower is better; None counts missing returns.
+        conditions: The condition values that rays are laid out at.
+        without_visibility: Makes the layout that stands for `no-visibility`; called when that is asked for.
+        density: What a run has learned, or None where it has no samples; called when a baseline looks there.
+        optimised: Makes the layout that stands for `cma`; called when that is asked for.
+    """
+
+    def __init__(
+        self,
+        space: DesignSpace,
+        train: Sequence[Scene],
+        seed: int,
+        judge: Judge | None = None,
+        *,
+        conditions: Sequence[Mapping[str, float]] = ({},),
+        without_visibility: Callable[[], Candidate] | None = None,
+        density: Callable[[], Density | None] | None = None,
+        optimised: Callable[[TrainingViews], Candidate] | None = None,
+    ) -> None:
+        self.space, self.train, self.seed = space, train, seed
+        self.spaces = [space.at(condition) for condition in conditions]
+        self.views = TrainingViews(space, train)
+        self.without_visibility, self.density, self.optimised = without_visibility, density, optimised
+        self._judge = judge or self.views.missing_returns
+        self._candidates: dict[str, list[Candidate]] = {}
+        self._worth: dict[tuple[str, str, int], float] = {}
+
+    @cached_property
+    def scene_points(self) -> ScenePoints:
+        """What parts of the catalogue are to see, the same for all."""
+        return scene_points(self)
+
+    def positions(self, name: str, count: int) -> Positions:
+        """A baseline at exactly `count` rays."""
+        return self.best([(name, self.options(name, count))])[0].positions
+
+    def positions_within(self, name: str, limit_mbps: float, bandwidth: Bandwidth) -> Positions:
+        """A baseline with as many rays as fit in a bandwidth [Mbit/s]."""
+        return self.best([(name, self.options_within(name, limit_mbps, bandwidth))])[0].positions
+
+    def options(self, name: str, count: int) -> list[Option]:
+        """All candidates of a baseline at a number of rays."""
+        return [Option(one, one.positions(self.spaces, count)) for one in self.candidates(name)]
+
+    def options_within(self, name: str, limit_mbps: float, bandwidth: Bandwidth) -> list[Option]:
+        """All candidates of a baseline with as many rays as fit in a bandwidth [Mbit/s]."""
+        return [Option(one, one.positions_within(self.spaces, limit_mbps, bandwidth)) for one in self.candidates(name)]
+
+    def candidates(self, name: str) -> list[Candidate]:
+        """The layouts that a baseline chooses from.
+
+        Raises:
+            ConfigError: There is no such baseline.
+        """
+        if name not in self._candidates:
+            family, argument = baseline_of(name)
+            self._candidates[name] = family.build(self, argument)
+        return self._candidates[name]
+
+    @phase("baselines")
+    def best(self, choices: Sequence[tuple[str, list[Option]]]) -> list[Option]:
+        """Of each baseline's options the one that is worth most on training scenes, the first of equals.
+
+        All that still have to be judged are judged together.
+        """
+        unknown = {
+            key: option.positions
+            for name, options in choices
+            for key, option in _keyed(name, options)
+            if len(options) > 1 and key not in self._worth
+        }
+        if unknown:
+            self._worth.update(zip(unknown, self._judge(list(unknown.values())), strict=True))
+        return [
+            min(_keyed(name, options), key=lambda one: self._worth.get(one[0], 0.0))[1] for name, options in choices
+        ]
+
+
+def _keyed(name: str, options: Sequence[Option]) -> list[tuple[tuple[str, str, int], Option]]:
+    return [((name, one.candidate.name, len(one.positions[0])), one) for one in options]
+
+
+def build_baseline(
+    name: str,
+    space: DesignSpace,
+    train_scenes: Sequence[Scene],
+    count: int,
+    seed: int,
+    judge: Judge | None = None,
+) -> Rays:
+    """One baseline at exactly `count` rays, for a space without conditions.
+
+    `Baselines` builds many without tracing the scenes anew.
+    """
+    return Baselines(space, train_scenes, seed, judge).positions(name, count)[0]
+
+
+def _uniform(source: Baselines, argument: str) -> list[Candidate]:
+    def place(count: int, spot: Spot) -> np.ndarray:
+        low, high = np.array(spot.space.low[:RAY_AXES]), np.array(spot.space.high[:RAY_AXES])
+        return even_placement(low, high, count)
+
+    return [Layout("even", place, whole_range(source.space))]
+
+
+def _random(source: Baselines, argument: str) -> list[Candidate]:
+    def place(count: int, spot: Spot) -> np.ndarray:
+        # the first position draws what a space without conditions draws
+        later = [spot.number] if spot.number else []
+        generator = random_generator(source.seed, "random baseline", count, spot.scene, *later)
+        return spot.space.sample(count, generator)
+
+    return [Layout("random", place, whole_range(source.space), drawn_anew=True)]
+
+
+def _bounding(source: Baselines, argument: str) -> list[Candidate]:
+    return list(bounding(source.views)) or _uniform(source, argument)
+
+
+def _occupancy(source: Baselines, argument: str) -> list[Candidate]:
+    layout = occupancy(source.space, source.train, source.seed)
+    return _random(source, argument) if layout is None else [layout]
+
+
+def _no_visibility(source: Baselines, argument: str) -> list[Candidate]:
+    if source.without_visibility is None:
+        raise ConfigError(
+            "there is no design to fit anew without occlusion",
+            where=f"--baseline {NO_VISIBILITY}",
+            allowed="at least one design whose run is there",
+            hint="evaluate the run, or a design that lies in it",
+        )
+    return [source.without_visibility()]
+
+
+def _catalog(source: Baselines, argument: str) -> list[Candidate]:
+    return list(part_candidates(source, argument))
+
+
+def _cma(source: Baselines, argument: str) -> list[Candidate]:
+    if source.optimised is None:
+        raise ConfigError(
+            "there is no design whose sensors could be varied",
+            where=f"--baseline {CMA}",
+            allowed="at least one design",
+        )
+    return [source.optimised(source.views)]
+
+
+class Family(NamedTuple):
+    """A kind of baseline: its name on the command line is `NAME`, or `NAME:ARGUMENT` where it takes one.
+
+    Arguments:
+        build: The candidates to choose from, of a source and the argument (empty where there is none).
+        argument: What follows the colon, for messages; empty where nothing may.
+        optional: Whether the argument may be left out.
+        check: Raises ConfigError for an argument that cannot be used, before anything is built.
+    """
+
+    build: Callable[[Baselines, str], list[Candidate]]
+    argument: str = ""
+    optional: bool = False
+    check: Callable[[str], object] | None = None
+
+    def named(self, name: str) -> list[str]:
+        """How this family is asked for, for messages."""
+        return [name] * (self.optional or not self.argument) + [f"{name}:{self.argument}"] * bool(self.argument)
+
+
+BASELINES: dict[str, Family] = {
+    "uniform": Family(_uniform),
+    "random": Family(_random),
+    "bounding": Family(_bounding),
+    "occupancy": Family(_occupancy),
+    NO_VISIBILITY: Family(_no_visibility),
+    FAMILY: Family(_catalog, "NAME", check=split_argument),
+    CMA: Family(_cma),
+}
+
+
+def baseline_of(name: str, *, where: str = "baselines") -> tuple[Family, str]:
+    """The family that a baseline's name belongs to, and its argument (empty where there is none).
+
+    Raises:
+        ConfigError: There is no such baseline, its argument is missing or not wanted, or it cannot be used.
+    """
+    kind, colon, argument = name.partition(":")
+    family = BASELINES.get(kind)
+    known = ", ".join(one for kind, family in BASELINES.items() for one in family.named(kind))
+    if family is None:
+        raise ConfigError(f"unknown baseline {name!r}", where=where, allowed=known)
+    if colon and not family.argument:
+        raise ConfigError(f"the baseline {kind!r} takes nothing after its name", where=where, allowed=kind)
+    if not argument and (colon or (family.argument and not family.optional)):
+        allowed = " or ".join(family.named(kind))
+        raise ConfigError(f"the baseline {name!r} lacks what it is to be of", where=where, allowed=allowed)
+    if argument and family.check is not None:
+        family.check(argument)
+    return family, argument
+
+
+def is_baseline(name: str) -> bool:
+    """Whether a name is a baseline's, or would be read as one."""
+    return name.partition(":")[0] in BASELINES

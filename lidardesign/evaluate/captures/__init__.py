@@ -1,0 +1,1 @@
+"""What a lab captured, and designs scored by it."""

@@ -1,0 +1,268 @@
+"""A captured scan seen through a list of rays: of each ray the nearest pixel, and its histogram inside the ray's gate.
+
+What a design would have measured is cut out of what was captured: a ray takes the pixel that looks its way, and hears
+only the bins whose middles lie in its gate.
+
+Ranges from captured histograms, cut to the bins that each ray hears.
+
+They are found as `lidardesign.simulate.detector.estimate_kernels` finds them in simulated histograms. Where a gate
+holds too few photons to tell the background, its threshold takes the level that is usual in the whole capture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from lidardesign.design.galvo import degree_frame, middle_boresight_deg, scan_angles_deg, scan_directions
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.evaluate.baselines.candidates import even_unit
+from lidardesign.evaluate.captures.capture import Capture
+from lidardesign.geometry.rays import Rays
+from lidardesign.numerics import EPSILON
+from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, Estimator
+
+# Histograms are worked on so many bins at a time, which bounds memory at some 150 MB.
+CHUNK_BINS = 1 << 22
+
+
+@dataclass(frozen=True)
+class Estimation:
+    """How a range follows from a histogram.
+
+    Arguments:
+        estimator: Its highest bin, or the log-matched filter with the pulse.
+        false_alarm: Probability that background alone is taken for a return, over all bins that a ray hears.
+    """
+
+    estimator: Estimator = "peak"
+    false_alarm: float = 0.01
+
+
+def measured(
+    capture: Capture, pixel: np.ndarray, first: np.ndarray, last: np.ndarray, estimation: Estimation
+) -> tuple[np.ndarray, np.ndarray]:
+    """Ranges [m], NaN without a return, and counts of pixels (K,) between bins (K,) and (K,), each of shape (K,).
+
+    Raises:
+        DataError: The matched filter is asked for, and the capture does not say how wide its pulse is.
+    """
+    from lidardesign.simulate.detector.estimate_kernels import find_returns
+
+    matched = estimation.estimator == "matched"
+    if matched and capture.pulse_fwhm_ps is None:
+        raise DataError(
+            "the matched filter needs the width of the pulse, and the capture has no pulse_fwhm_ps",
+            where="--estimator matched",
+            hint="add pulse_fwhm_ps to the capture, or take --estimator peak",
+        )
+    pulse_ps = capture.pulse_fwhm_ps or 0.0
+    half = int(pulse_ps / (2 * capture.bin_ps))
+    place, photons = np.full(len(pixel), np.nan), np.zeros(len(pixel))
+    for begin, end in _chunks(last - first):
+        counts, offset = _cut(capture, pixel[begin:end], first[begin:end], last[begin:end])
+        photons[begin:end] = np.diff(np.concatenate([[0], np.cumsum(counts)])[offset])
+        known = np.full(end - begin, capture.background_per_bin)
+        sigma_ps = pulse_ps / FWHM_PER_SIGMA
+        place[begin:end] = find_returns(
+            counts,
+            offset,
+            np.ones((end - begin, 2)),
+            capture.bin_ps,
+            sigma_ps,
+            half,
+            known,
+            estimation.false_alarm,
+            matched,
+        )
+    return capture.start_m[pixel] + (first + place) * capture.bin_m, photons
+
+
+def _chunks(lengths: np.ndarray) -> Iterator[tuple[int, int]]:
+    """Rays whose bins are worked on together, as begin and end."""
+    ends = np.cumsum(lengths)
+    begin = 0
+    while begin < len(lengths):
+        before = ends[begin - 1] if begin else 0
+        end = max(int(np.searchsorted(ends, before + CHUNK_BINS, side="right")), begin + 1)
+        yield begin, end
+        begin = end
+
+
+def _cut(capture: Capture, pixel: np.ndarray, first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The counts that rays hear one after the other, and where each begins in them, (K + 1,)."""
+    lengths = np.maximum(last - first, 0)
+    offset = np.concatenate([[0], np.cumsum(lengths)])
+    at = np.arange(offset[-1]) - np.repeat(offset[:-1] - first, lengths)
+    return capture.counts[np.repeat(pixel, lengths), at].astype(np.int64), offset
+
+
+# A ray that starts further from the scanner than this was not captured: it sees other surfaces.
+SAME_PLACE_M = 0.005
+
+
+class Captured(IntEnum):
+    """Whether a capture has what a ray would have measured."""
+
+    YES = 0
+    OTHER_PLACE = 1
+    OUT_OF_FIELD = 2
+    OUT_OF_WINDOW = 3
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedScan:
+    """What rays measure in a capture, N of them.
+
+    Arguments:
+        captured: Values of `Captured`, shape (N,).
+        pixel: The pixel that each ray takes, -1 where it was not captured, shape (N,).
+        away_rad: The angle between the ray and its pixel, or the nearest one, shape (N,).
+        first_bin, last_bin: The bins that it hears, the last one excluded, shape (N,).
+        photons: Counts in them, shape (N,).
+        range_m: The measured one-way range [m], NaN without a return, shape (N,).
+        points_m: Measured points along the pixels, NaN without a return, shape (N, 3).
+    """
+
+    captured: np.ndarray
+    pixel: np.ndarray
+    away_rad: np.ndarray
+    first_bin: np.ndarray
+    last_bin: np.ndarray
+    photons: np.ndarray
+    range_m: np.ndarray
+    points_m: np.ndarray
+
+    @property
+    def returned(self) -> np.ndarray:
+        """Mask of the rays with a return, shape (N,)."""
+        return np.isfinite(self.range_m)
+
+
+def scan(
+    capture: Capture, rays: Rays, within_rad: float, estimation: Estimation, name: str | None = None
+) -> CapturedScan:
+    """What a list of rays measures in a capture.
+
+    Arguments:
+        capture: The captured histograms.
+        rays: The rays; their gates are one-way ranges.
+        within_rad: The largest angle between a ray and the pixel that it takes [rad].
+        estimation: How ranges follow from histograms.
+        name: Whose rays they are, for the message.
+
+    Raises:
+        DataError: Not one ray was captured.
+    """
+    chord, nearest = cKDTree(capture.direction).query(rays.direction)
+    away = 2 * np.arcsin(np.minimum(np.asarray(chord) / 2, 1.0))
+    first, last = gate_bins(capture, nearest, rays.gate_m)
+    offset = np.linalg.norm(rays.origin_m - capture.origin_m, axis=1)
+    captured = np.full(len(rays), Captured.YES, dtype=np.int64)
+    captured[last <= first] = Captured.OUT_OF_WINDOW
+    captured[away > within_rad] = Captured.OUT_OF_FIELD
+    captured[offset > SAME_PLACE_M] = Captured.OTHER_PLACE
+    _refuse_nothing_captured(capture, rays, captured, away, offset, name)
+    pixel = np.where(captured == Captured.YES, nearest, -1)
+    return _measured(capture, captured, pixel, away, first, last, estimation)
+
+
+def scan_pixels(capture: Capture, estimation: Estimation) -> CapturedScan:
+    """What every pixel measures in its whole histogram."""
+    pixels = np.arange(len(capture))
+    first, last = gate_bins(capture, pixels, np.tile(_heard_m(capture), (len(capture), 1)))
+    captured = np.where(first < last, Captured.YES, Captured.OUT_OF_WINDOW)
+    taken = np.where(first < last, pixels, -1)
+    return _measured(capture, captured, taken, np.zeros(len(capture)), first, last, estimation)
+
+
+def gate_bins(capture: Capture, pixel: np.ndarray, gate_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The bins of pixels (N,) whose middles lie in gates (N, 2) [m], start <= middle < end.
+
+    First and last (excluded), each of shape (N,).
+    """
+    places = (gate_m - capture.start_m[pixel, None]) / capture.bin_m - 0.5
+    bins = np.clip(np.ceil(places), 0, capture.bins).astype(np.int64)
+    return bins[:, 0], bins[:, 1]
+
+
+def whole_window(rays: Rays, capture: Capture) -> Rays:
+    """The same rays without gates: they hear all that was captured."""
+    return Rays(rays.origin_m, rays.direction, np.tile(_heard_m(capture), (len(rays), 1)), rays.sensor, rays.time_s)
+
+
+def _heard_m(capture: Capture) -> np.ndarray:
+    """The captured window from the pulse on: what is counted before it left the scanner comes from no surface."""
+    return np.maximum(capture.window_m, 0.0)
+
+
+def uniform_rays(capture: Capture, count: int) -> Rays:
+    """So many rays even over the field of a capture, without gates: what a scanner without a design would fire.
+
+    A cell-centred grid in scan angles over all pixels and half a pixel round them.
+    """
+    frame = degree_frame(*middle_boresight_deg(capture.direction))
+    seen = scan_angles_deg(frame, capture.direction)
+    half = np.degrees(capture.spacing_rad or 0.0) / 2
+    low, high = seen.min(axis=0) - half, seen.max(axis=0) + half
+    # a scan along a line, or of a single pixel, has no extent across it
+    extents = np.maximum(high - low, EPSILON)
+    looking = scan_directions(frame, low + even_unit(count, extents) * (high - low))
+    none = np.zeros(count)
+    rays = Rays(np.tile(capture.origin_m, (count, 1)), looking, np.zeros((count, 2)), none, none)
+    return whole_window(rays, capture)
+
+
+def default_within_rad(capture: Capture) -> float:
+    """The angle within which a pixel stands for a ray: as far as neighbouring pixels are apart.
+
+    Raises:
+        ConfigError: All pixels look one way.
+    """
+    if capture.spacing_rad is None:
+        raise ConfigError(
+            "all pixels look one way, so that there is no spacing to go by",
+            where="--within-deg",
+            allowed="an angle in degrees",
+        )
+    return capture.spacing_rad
+
+
+def _measured(
+    capture: Capture,
+    captured: np.ndarray,
+    pixel: np.ndarray,
+    away: np.ndarray,
+    first: np.ndarray,
+    last: np.ndarray,
+    estimation: Estimation,
+) -> CapturedScan:
+    taken = np.flatnonzero(pixel >= 0)
+    range_m, photons = np.full(len(pixel), np.nan), np.zeros(len(pixel))
+    range_m[taken], photons[taken] = measured(capture, pixel[taken], first[taken], last[taken], estimation)
+    points = capture.origin_m + range_m[:, None] * capture.direction[pixel]
+    return CapturedScan(captured, pixel, away, first, last, photons, range_m, points)
+
+
+def _refuse_nothing_captured(
+    capture: Capture, rays: Rays, captured: np.ndarray, away: np.ndarray, offset: np.ndarray, name: str | None
+) -> None:
+    """Refuse rays of which none was captured: the two are of other places or in other frames."""
+    if not len(rays) or (captured == Captured.YES).any():
+        return
+    counts = {reason: int((captured == reason).sum()) for reason in Captured}
+    start, end = capture.window_m
+    text = {
+        Captured.OTHER_PLACE: f"they start {offset.min():.4g} m from {capture.origin_m.tolist()} or further",
+        Captured.OUT_OF_FIELD: f"they look {np.degrees(away.min()):.3g} degrees past the nearest pixel or more",
+        Captured.OUT_OF_WINDOW: f"their gates hold no bin between {start:.4g} and {end:.4g} m",
+    }[max((Captured.OTHER_PLACE, Captured.OUT_OF_FIELD, Captured.OUT_OF_WINDOW), key=lambda reason: counts[reason])]
+    raise DataError(
+        f"none of the {len(rays)} rays was captured: {text}",
+        where=name,
+        hint="give the capture's origin_m and directions in the design's frame, and start_ps from the scanner",
+    )

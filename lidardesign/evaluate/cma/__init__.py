@@ -1,0 +1,1 @@
+"""The rival that optimises the metric directly, by CMA-ES."""

@@ -1,0 +1,259 @@
+"""The baseline `cma`: what direct optimisation of the metric finds, within a budget of time per number of rays.
+
+It varies the sensors that the first design has, under the design's constraints and with its layout of rays, and asks
+the task's metric on training scenes alone (see `cma_search`). A design whose rays follow from samples of the density
+(layout `density`), or from the pattern of a part (`fixed`), is followed with even rays in its sensors' fields.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints, Gate
+from lidardesign.design.files import design_document
+from lidardesign.design.sensor import MOST_RAYS, Design
+from lidardesign.evaluate.baselines.candidates import Positions, opened_gate, whole_range
+from lidardesign.evaluate.baselines.observed import TrainingViews, dense_points
+from lidardesign.evaluate.cma.models import Amount, Model, SensorModel
+from lidardesign.evaluate.cma.objective import TrainingObjective
+from lidardesign.evaluate.cma.search import Budget, Found, Progress, Search
+from lidardesign.evaluate.cma.sensor_parameters import Setting
+from lidardesign.evaluate.cma.starts import scan_starts, starts
+from lidardesign.evaluate.cma.track import TrackFigures, TrackModel, Way
+from lidardesign.numerics import COARSE_SLACK
+from lidardesign.run.clock import phase
+from lidardesign.simulate.detector.detector import IDEAL
+from lidardesign.space import DIMENSIONS, DesignSpace
+from lidardesign.task import Metric, random_generator
+
+NAME = "cma"
+# Rays of a track are given at so many places, linear in between.
+TRACK_PLACES = 2
+# A scan within a bandwidth has at most so many times the rays of the design that it follows.
+MOST_RAYS_FACTOR = 4
+
+DEFAULT_SECONDS = 60.0
+# Layouts whose rays follow from the sensors alone.
+OWN_LAYOUTS = ("grid", "scan", "distributed")
+
+Show = Callable[[str, Progress], None]
+
+
+@dataclass(frozen=True)
+class CmaSettings:
+    """How the baseline `cma` searches.
+
+    Arguments:
+        budget: Of each search: every number of rays, and every bandwidth, is one.
+        show: Told where each search stands, with what it is for.
+    """
+
+    budget: Budget = field(default_factory=lambda: Budget(DEFAULT_SECONDS))
+    show: Show | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A search and what came of it.
+
+    Arguments:
+        rays: The number of rays that it ended with.
+        limit_mbps: The bandwidth that it kept to; None: it was asked for this number of rays.
+        found: What it found.
+        broken: Names of constraints that the independent checker says are broken: none.
+        parameters: How many numbers it varied.
+        design: What it found, as a design.
+    """
+
+    rays: int
+    limit_mbps: float | None
+    found: Found
+    broken: Sequence[str]
+    parameters: int
+    design: Design
+
+    def note(self, followed: str, metric: Metric) -> str:
+        """What people are told of it.
+
+        Arguments:
+            followed: The name of the design whose sensors it varied.
+            metric: Of the values.
+        """
+        found = self.found
+        limit = "" if self.limit_mbps is None else f" in {self.limit_mbps:.3g} Mbit/s"
+        broken = f"; it breaks {', '.join(self.broken)}" * bool(self.broken)
+        return (
+            f"cma at {self.rays} rays{limit}: {self.parameters} numbers of the sensors of {followed} varied for "
+            f"{found.seconds:.0f} s, {found.candidates} candidates, {found.start_value:.4g} to {found.value:.4g} "
+            f"{metric.unit} on {found.scenes} training scenes{broken}"
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """The JSON form."""
+        found = self.found
+        names = ("seconds", "evaluations", "scenes", "value")
+        return {
+            "rays": self.rays,
+            "limit_mbps": self.limit_mbps,
+            "sensors": len(self.design.sensors),
+            "parameters": self.parameters,
+            "seconds": found.seconds,
+            "cpu_seconds": found.cpu_seconds,
+            "candidates": found.candidates,
+            "evaluations": found.evaluations,
+            "restarts": found.restarts,
+            "training_scenes": found.scenes,
+            "start_value": found.start_value,
+            "value": found.value,
+            "satisfied": not self.broken,
+            "broken": list(self.broken),
+            "curve": [dict(zip(names, point, strict=True)) for point in found.curve],
+        }
+
+
+@dataclass(eq=False)
+class CmaCandidate:
+    """The layout of the baseline `cma`; every number of rays and every bandwidth is a search of its own.
+
+    Arguments:
+        followed: The design whose sensors, constraints and layout are taken.
+        space: The design space.
+        conditions: The condition values that rays are laid out at.
+        views: The training scenes.
+        objective: The metric on them.
+        settings: How long each search takes.
+        seed: Root of the random numbers.
+    """
+
+    followed: Design
+    space: DesignSpace
+    conditions: Sequence[Mapping[str, float]]
+    views: TrainingViews
+    objective: TrainingObjective
+    settings: CmaSettings
+    seed: int
+    name: str = NAME
+    drawn_anew: bool = False
+    _known: dict[tuple[int | None, float | None], tuple[Positions, Record]] = field(default_factory=dict)
+
+    def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
+        """See `lidardesign.evaluate.baselines.candidates.Candidate`."""
+        return self._searched((count, None), Amount(count))
+
+    def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
+        """See `lidardesign.evaluate.baselines.candidates.Candidate`: the number of rays is part of what is searched."""
+        return self._searched((None, limit_mbps), Amount(None, limit_mbps, bandwidth))
+
+    @phase("cma")
+    def _searched(self, key: tuple[int | None, float | None], amount: Amount) -> Positions:
+        if key not in self._known:
+            budget = self.settings.budget
+            began = budget.clock()
+            models = self._models(amount)
+            generator = random_generator(self.seed, "cma", str(key))
+            label = f"cma, {amount.count} rays" if amount.count else f"cma, {amount.limit_mbps:.3g} Mbit/s"
+            told = self.settings.show
+            show = None if told is None else (lambda progress: told(label, progress))
+            found = Search(models, amount, self.objective, budget, generator, show, began).run()
+            if not self._varies_gates(amount):
+                found = self._cropped(found, amount)
+            self._known[key] = found.model.positions(found.vector, amount), self._record(found, amount)
+        return self._known[key][0]
+
+    def record_of(self, positions: Positions) -> Record | None:
+        """How these rays were found."""
+        return next((record for known, record in self._known.values() if known is positions), None)
+
+    def _varies_gates(self, amount: Amount) -> bool:
+        """Whether a wider gate could be worse: where it costs, where it is bounded, or where light is counted."""
+        one = self._constraints()
+        bounded = one.gate != Gate() or any(other.gate != Gate() for other in one.each)
+        ideal = self.objective.planner.detector == IDEAL
+        return not ideal or bounded or amount.limit_mbps is not None or one.budget.bandwidth_mbps is not None
+
+    def _cropped(self, found: Found, amount: Amount) -> Found:
+        """The same rays with gates from the nearest to the furthest return that their sensor had."""
+        positions = found.model.positions(found.vector, amount)
+        sensor, range_m = self.objective.returned(positions, range(found.scenes))
+        gates = np.tile(whole_range(self.space), (int(max(rays.sensor.max() for rays in positions)) + 1, 1))
+        for index in np.unique(sensor):
+            own = range_m[sensor == index]
+            # a gate goes through its mean and spread: rounding must not cut the outermost returns off
+            gates[index] = opened_gate((1 - COARSE_SLACK) * float(own.min()), (1 + COARSE_SLACK) * float(own.max()))
+        model = found.model.with_gates(found.vector, gates)
+        return replace(found, model=model, vector=model.zero)
+
+    def _record(self, found: Found, amount: Amount) -> Record:
+        design = found.model.design(found.vector, amount)
+        broken = []
+        if design.rays:
+            checks = check_design(design_document(design), design.constraints, self._setting(amount).space)
+            broken = [check.name for check in checks if not check.satisfied]
+        return Record(design.rays or 0, amount.limit_mbps, found, broken, found.model.size, design)
+
+    def _constraints(self) -> Constraints:
+        return Constraints.from_mapping(self._document(), where=f"constraints of {self.followed.name}")
+
+    def _setting(self, amount: Amount) -> Setting:
+        design = self.followed
+        layout = design.layout if design.layout in OWN_LAYOUTS else "grid"
+        space = self.space
+        if space.conditioned:
+            bolted = self.conditions[len(self.conditions) // 2] if design.track is None else {}
+            space = space.at({**bolted, **design.at})
+        return Setting(space, self._constraints(), design.level, layout, design.at, self._varies_gates(amount))
+
+    def _document(self) -> dict[str, Any]:
+        """The followed design's constraints; the number of rays is that of the comparison."""
+        document = dict(self.followed.constraints)
+        if "budget" in document:
+            document["budget"] = {key: value for key, value in document["budget"].items() if key != "rays"}
+        return document
+
+    def _models(self, amount: Amount) -> list[Model]:
+        """Every start as a model whose vector 0 it is."""
+        setting, views = self._setting(amount), self.views
+        if setting.space != views.space:
+            views = TrainingViews(setting.space, views.train)
+        document = self._document()
+        if self.followed.track is not None:
+            return self._tracks(setting, views, amount, document)
+        count = len(self.followed.sensors)
+        if setting.layout == "scan":
+            count = self._scan_rays(amount)
+        return [SensorModel(setting, one, self.conditions, document) for one in starts(setting, views, count)]
+
+    def _scan_rays(self, amount: Amount) -> int:
+        """The number of rays of a scan: as asked, or what a bandwidth pays for at the followed design's gates."""
+        if amount.count is not None:
+            return amount.count
+        own = self.followed
+        widths = np.array([end - start for start, end in (sensor.gate_m for sensor in own.sensors)])
+        spent = amount.bandwidth.mbps_of_widths(widths)
+        affordable = math.floor(len(widths) * (amount.limit_mbps or 0.0) / spent)
+        return int(np.clip(affordable, 1, min(MOST_RAYS, MOST_RAYS_FACTOR * len(widths))))
+
+    def _tracks(
+        self, setting: Setting, views: TrainingViews, amount: Amount, document: Mapping[str, object]
+    ) -> list[Model]:
+        track = self.followed.track
+        places = np.linspace(track.knots[0], track.knots[-1], TRACK_PLACES)
+        way = Way(DIMENSIONS.index(track.dimension), places)
+        middle = setting.space.at({track.dimension: float(places.mean())})
+        observed = views.hits(dense_points(setting.space))
+        found: list[Model] = []
+        for sensors in scan_starts(replace(setting, space=middle), views, observed, self._scan_rays(amount)):
+            figures = TrackFigures(
+                azimuth=np.tile([one.azimuth_rad for one in sensors], (TRACK_PLACES, 1)),
+                elevation=np.tile([one.elevation_rad for one in sensors], (TRACK_PLACES, 1)),
+                gate=np.tile([one.gate_m for one in sensors], (TRACK_PLACES, 1, 1)),
+            )
+            found.append(TrackModel(setting, way, figures, self.conditions, document))
+        return found

@@ -1,0 +1,365 @@
+"""Direct optimisation of a metric by CMA-ES (N. Hansen's `cma`), within a budget of time.
+
+The best of some starts, by the metric on a few training scenes, is where the search begins. All candidates of a step
+are scored in the same scenes; their number doubles as the budget is used up until it takes in all that there are,
+and the last share is kept to compare the finalists (every start that a search began from, the best of every stage, and
+the mean of the last distribution) on all of them. A search that has converged begins anew at the best found so far,
+with twice the population. Vectors beyond the constraints stand for their projection, and are ranked behind it by how
+far they lie beyond.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from lidardesign.evaluate.baselines.candidates import Positions
+from lidardesign.evaluate.cma.models import Amount, Model
+from lidardesign.evaluate.cma.objective import OutOfTimeError, TrainingObjective
+from lidardesign.numerics import TINY
+
+# Scenes that the first steps see; as many as baselines are compared on. With 4, tracks of an arm that were best there
+# were more than twice as far off on 16.
+FIRST_SCENES = 8
+# More training scenes than these tell finalists no better apart, and cost the search its time.
+MOST_SCENES = 40
+# The share of the budget in which finalists are compared, at most.
+FINAL_SHARE = 0.2
+# Stages end after shares of 1 - 2^(-n / pace) of the budget: 0.37, 0.6, 0.75, ... of it.
+STAGE_PACE = 1.5
+STEP = 0.3  # the first standard deviation, in units of the parameters' own steps
+# Beyond so many numbers a full covariance takes longer to learn than any budget lasts: variances alone are adapted.
+MOST_CORRELATED = 250
+MOST_POPULATION = 4  # times the usual one
+CURVE_POINTS = 200
+STARTS_AT_ONCE = 8
+# Of more starts than that, the best in so many scenes are looked at in more.
+START_SCENES = 2
+
+
+@dataclass(frozen=True)
+class Budget:
+    """When a search ends: after some seconds, or so many evaluations, whichever comes first.
+
+    Arguments:
+        seconds: Wall time [s].
+        evaluations: Scores of one candidate in one scene.
+        clock: Tells the time [s].
+    """
+
+    seconds: float
+    evaluations: float = math.inf
+    clock: Callable[[], float] = time.perf_counter
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a search stands.
+
+    Arguments:
+        share: Of the budget that is used up.
+        evaluations: Scores of one candidate in one scene so far.
+        best: The best score so far in the scenes of this stage, in the metric's own direction.
+    """
+
+    share: float
+    evaluations: int
+    best: float
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What a search found.
+
+    Arguments:
+        model: Of the parameters that were best.
+        vector: The best parameters, projected.
+        start_value, value: Of the start and the best, on all scenes that finalists are compared on; in the metric's
+            own direction.
+        seconds, cpu_seconds: What it took, and what the processor worked for it: less where others use it too [s].
+        candidates, evaluations: Candidates that were scored, and scores of one candidate in one scene.
+        scenes: The number of training scenes that the finalists were compared on.
+        restarts: Searches that converged before the end.
+        curve: The best score so far, as (seconds, evaluations, scenes, value): falls within a stage, and may jump
+            where the next stage sees more scenes.
+    """
+
+    model: Model
+    vector: np.ndarray
+    start_value: float
+    value: float
+    seconds: float
+    cpu_seconds: float
+    candidates: int
+    evaluations: int
+    scenes: int
+    restarts: int
+    curve: Sequence[tuple[float, int, int, float]]
+
+
+@dataclass(eq=False)
+class _Best:
+    """The best parameters so far, and what they are worth in the scenes of the stage."""
+
+    model: Model
+    vector: np.ndarray
+    value: float
+
+
+class Search:
+    """One search; `run` it once.
+
+    Arguments:
+        starts: Models whose vector 0 is a start, the likeliest to be good first.
+        amount: The number of rays, or the bandwidth.
+        objective: The metric on training scenes.
+        budget: When to end.
+        generator: Of all its random numbers.
+        show: Told where the search stands after every step.
+        began: When the budget's clock showed that work began, as on the starts; None: now.
+    """
+
+    def __init__(
+        self,
+        starts: Sequence[Model],
+        amount: Amount,
+        objective: TrainingObjective,
+        budget: Budget,
+        generator: np.random.Generator,
+        show: Callable[[Progress], None] | None = None,
+        began: float | None = None,
+    ) -> None:
+        self._starts, self._amount, self._objective, self._budget = starts, amount, objective, budget
+        self._generator, self._show = generator, show
+        self._began, self._worked = budget.clock() if began is None else began, time.process_time()
+        self._candidates = self._evaluations = self._restarts = 0
+        self._last = min(len(objective.scenes), MOST_SCENES)
+        self._stages = _stages(self._last)
+        self._per_evaluation = 0.0
+        self._curve: list[tuple[float, int, int, float]] = []
+        self._finalists: list[_Best] = []
+
+    def run(self) -> Found:
+        """Search until the budget is used up."""
+        stage = 0
+        best = self._best_start(self._stages[0])
+        start = _Best(best.model, best.vector, best.value)
+        self._finalists = [start]
+        strategy = _Strategy(best.model, best.vector, self._generator)
+        while best.model.size and not self._over(strategy.population * self._stages[stage]):
+            wanted = self._stage()
+            if wanted > stage:
+                stage = wanted
+                self._finalists.append(_Best(best.model, best.vector, best.value))
+                best = self._rescored(best, self._stages[stage])
+            try:
+                self._step(strategy, best, self._stages[stage])
+            except OutOfTimeError:
+                break
+            if strategy.converged():
+                self._restarts += 1
+                strategy = _Strategy(best.model, best.vector, self._generator, self._restarts)
+        self._finalists.append(best)
+        if best.model.size:
+            self._finalists.append(_Best(strategy.model, strategy.model.projected(strategy.mean), math.inf))
+        return self._chosen(start)
+
+    def _best_start(self, scenes: int) -> _Best:
+        """The best of all starts: of many, the best on few scenes are compared on more.
+
+        The first one where the time ends before they are scored.
+        """
+        starts = [_Best(model, model.zero, math.inf) for model in self._starts]
+        if len(starts) > STARTS_AT_ONCE:
+            starts = self._ranked(starts, min(START_SCENES, scenes))[:STARTS_AT_ONCE]
+        best = self._ranked(starts, scenes)[0]
+        self._note(best, scenes)
+        return best
+
+    def _ranked(self, starts: Sequence[_Best], scenes: int) -> list[_Best]:
+        """Starts by what they are worth in the first scenes, the best first; those that are not scored come last."""
+        found = [_Best(one.model, one.vector, math.inf) for one in starts]
+        for first in range(0, len(found), STARTS_AT_ONCE):
+            group = found[first : first + STARTS_AT_ONCE]
+            try:
+                values = self._values([one.model.positions(one.vector, self._amount) for one in group], scenes)
+            except OutOfTimeError:
+                break
+            for one, value in zip(group, values, strict=True):
+                one.value = float(value)
+        return sorted(found, key=lambda one: one.value)
+
+    def _rescored(self, best: _Best, scenes: int) -> _Best:
+        try:
+            value = float(self._values([best.model.positions(best.vector, self._amount)], scenes)[0])
+        except OutOfTimeError:
+            return best
+        again = _Best(best.model, best.vector, value)
+        self._note(again, scenes)
+        return again
+
+    def _step(self, strategy: _Strategy, best: _Best, scenes: int) -> None:
+        """One population: asked, scored, told; the best is kept.
+
+        Raises:
+            OutOfTimeError: The budget ended before all were scored.
+        """
+        vectors = strategy.ask()
+        admitted = [strategy.model.projected(vector) for vector in vectors]
+        values = self._values([strategy.model.positions(one, self._amount) for one in admitted], scenes)
+        strategy.tell(vectors, admitted, values)
+        first = int(values.argmin())
+        if values[first] < best.value:
+            best.model, best.vector, best.value = strategy.model, admitted[first], float(values[first])
+        self._note(best, scenes)
+
+    def _values(self, lists: Sequence[Positions], scenes: int) -> np.ndarray:
+        """Mean scores over the first scenes, lower is better, shape (lists,)."""
+        began = self._budget.clock()
+        values = self._objective.values(lists, range(scenes), self._over)
+        self._candidates += len(lists)
+        self._evaluations += values.size
+        spent = (self._budget.clock() - began) / values.size
+        # a running mean: the first scenes also build what is kept of them
+        self._per_evaluation = spent if not self._per_evaluation else 0.7 * self._per_evaluation + 0.3 * spent
+        return values.mean(axis=1)
+
+    def _share(self, ahead: int = 0) -> float:
+        """The share of the budget that is used up with so many evaluations more, and those of the finalists."""
+        finalists = (len(self._finalists) + 2) * self._last
+        # more than that, and they are compared on fewer scenes
+        kept = min(finalists * self._per_evaluation, FINAL_SHARE * self._budget.seconds)
+        finalists = min(finalists, FINAL_SHARE * self._budget.evaluations)
+        elapsed = (self._budget.clock() - self._began + kept + ahead * self._per_evaluation) / self._budget.seconds
+        counted = (self._evaluations + finalists + ahead) / self._budget.evaluations
+        return max(elapsed, counted)
+
+    def _over(self, ahead: int = 0) -> bool:
+        return self._share(ahead) >= 1.0
+
+    def _stage(self) -> int:
+        """The number of the stage: each takes half as large a share of what is left as the one before had."""
+        return min(int(-math.log2(max(1.0 - self._share(), TINY)) * STAGE_PACE), len(self._stages) - 1)
+
+    def _chosen(self, start: _Best) -> Found:
+        """The best finalist on all scenes."""
+        unique = {(id(one.model), one.vector.tobytes()): one for one in self._finalists}
+        lists = [one.model.positions(one.vector, self._amount) for one in unique.values()]
+        scenes = self._final_scenes(len(lists))
+        values = self._objective.values(lists, range(scenes)).mean(axis=1)
+        self._evaluations += len(lists) * scenes
+        worth = dict(zip(unique, (float(value) for value in values), strict=True))
+        best = min(worth, key=lambda key: worth[key])
+        sign = self._objective.sign
+        seconds = self._budget.clock() - self._began
+        self._curve.append((seconds, self._evaluations, scenes, sign * worth[best]))
+        return Found(
+            model=unique[best].model,
+            vector=unique[best].vector,
+            start_value=sign * worth[id(start.model), start.vector.tobytes()],
+            value=sign * worth[best],
+            seconds=seconds,
+            cpu_seconds=time.process_time() - self._worked,
+            candidates=self._candidates,
+            evaluations=self._evaluations,
+            scenes=scenes,
+            restarts=self._restarts,
+            curve=_thinned(self._curve),
+        )
+
+    def _final_scenes(self, finalists: int) -> int:
+        """The number of scenes that finalists can be compared on: all, or as many as time and evaluations are left."""
+        left = self._budget.seconds - (self._budget.clock() - self._began)
+        affordable = left / max(finalists * self._per_evaluation, TINY)
+        affordable = min(affordable, (self._budget.evaluations - self._evaluations) / finalists)
+        return int(np.clip(affordable, self._stages[0], self._last))
+
+    def _note(self, best: _Best, scenes: int) -> None:
+        value = self._objective.sign * best.value
+        last = self._curve[-1][2:] if self._curve else None
+        if last != (scenes, value):
+            self._curve.append((self._budget.clock() - self._began, self._evaluations, scenes, value))
+        if self._show is not None:
+            self._show(Progress(min(self._share(), 1.0), self._evaluations, value))
+
+
+def _stages(scenes: int) -> list[int]:
+    """Numbers of scenes, doubling up to all."""
+    found = [min(FIRST_SCENES, scenes)]
+    while found[-1] < scenes:
+        found.append(min(2 * found[-1], scenes))
+    return found
+
+
+def _thinned(curve: Sequence[tuple[float, int, int, float]]) -> list[tuple[float, int, int, float]]:
+    """The curve at so many of its points, its last among them."""
+    if len(curve) <= CURVE_POINTS:
+        return list(curve)
+    kept = np.unique(np.linspace(0, len(curve) - 1, CURVE_POINTS).round().astype(np.int64))
+    return [curve[index] for index in kept]
+
+
+@dataclass(eq=False)
+class _Strategy:
+    """The evolution strategy about a vector of one model.
+
+    Arguments:
+        model: Whose vectors it varies.
+        mean_at_start: The first mean.
+        generator: Of its random numbers.
+        restart: How often a search has begun anew; each time the population doubles, up to a limit.
+    """
+
+    model: Model
+    mean_at_start: np.ndarray
+    generator: np.random.Generator
+    restart: int = 0
+    _inner: Any = field(init=False)
+
+    def __post_init__(self) -> None:
+        # loaded here: it takes a second, and few evaluations ask for it
+        import cma
+
+        usual = 4 + int(3 * math.log(max(self.model.size, 2)))
+        population = usual * min(2**self.restart, MOST_POPULATION)
+        options = {
+            "popsize": population,
+            "CMA_diagonal": self.model.size > MOST_CORRELATED,
+            "seed": math.nan,  # the generator below is the only source of random numbers
+            "randn": lambda *shape: self.generator.standard_normal(shape),
+            "verbose": -9,
+        }
+        self._inner = cma.CMAEvolutionStrategy(self.mean_at_start, STEP, options)
+
+    @property
+    def population(self) -> int:
+        """The number of vectors that it asks for at a time."""
+        return int(self._inner.popsize)
+
+    @property
+    def mean(self) -> np.ndarray:
+        """The mean of the distribution."""
+        return np.asarray(self._inner.mean)
+
+    def ask(self) -> list[np.ndarray]:
+        """A population."""
+        return list(self._inner.ask())
+
+    def tell(self, vectors: Sequence[np.ndarray], admitted: Sequence[np.ndarray], values: np.ndarray) -> None:
+        """Scores of the admitted vectors; those beyond the constraints are ranked behind by how far they lie beyond.
+
+        The distance is in units of the distribution, the penalty in those of the scores' own spread.
+        """
+        spread = float(np.subtract(*np.percentile(values, [75, 25])))
+        beyond = [float(np.square(one - other).mean()) for one, other in zip(vectors, admitted, strict=True)]
+        penalty = np.array(beyond) / self._inner.sigma**2
+        self._inner.tell(vectors, (values + spread * penalty).tolist())
+
+    def converged(self) -> bool:
+        """Whether it has nothing left to find."""
+        return bool(self._inner.stop())

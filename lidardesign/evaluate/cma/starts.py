@@ -1,0 +1,337 @@
+"""Where a direct search starts: what an engineer would try first, with as many sensors as the design has.
+
+All are built from where training returns are. Sensors at given origins tile the returns as they see them, in every
+arrangement of rows, with equal weights or weights by returns; another tiling covers the whole space. Sensors whose
+origins are spread out tile the origins, and look in parallel or at where the returns are. Scans are the even layouts
+that `bounding` and `uniform` take, with one gate, or with gates by the returns next to each ray.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from lidardesign.design.layouts.grid import low_discrepancy
+from lidardesign.design.sensor import Coupling, Sensor, boresight_frame
+from lidardesign.evaluate.baselines.candidates import RAY_AXES, Spot, central, even_placement, opened_gate, whole_range
+from lidardesign.evaluate.baselines.observed import Observed, TrainingViews, dense_points, unrolled
+from lidardesign.evaluate.baselines.simple import bounding, parallel_angles
+from lidardesign.evaluate.cma.models import with_gate
+from lidardesign.evaluate.cma.sensor_parameters import NARROWEST_RAD, Setting, admitted_origins
+from lidardesign.numerics import TINY, sphere_exp, sphere_log
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, angles, direction
+
+# Returns further apart than this from their middle are tiled in azimuth and elevation, others in a tangent plane.
+TANGENT_RAD = math.radians(70)
+# A central 99 % means nothing from fewer returns.
+FEWEST_RETURNS = 20
+# The angular spread of sensors whose rays are parallel, to start with.
+PARALLEL_RAD = math.radians(2)
+
+Start = tuple[Sensor, ...]
+
+
+class Tile(NamedTuple):
+    """A part of a plane: its corners (2,) each."""
+
+    low: np.ndarray
+    high: np.ndarray
+
+
+def starts(setting: Setting, views: TrainingViews, count: int) -> list[Start]:
+    """The sensors to start from, the likeliest to be good first; duplicates may occur.
+
+    Arguments:
+        setting: What all candidates share.
+        views: The training scenes.
+        count: The number of sensors; of a scan, of rays.
+    """
+    observed = views.hits(dense_points(setting.space))
+    if setting.layout == "scan":
+        return scan_starts(setting, views, observed, count)
+    if setting.spread_axes:
+        found = [*_focused(setting, observed, count), *_parallel(setting, observed, count), *_even(setting, count)]
+    else:
+        found = [*_tilings(setting, observed, count), *_even(setting, count)]
+    return found if setting.gates else [_opened(setting, start) for start in found]
+
+
+def _opened(setting: Setting, start: Start) -> Start:
+    """The same sensors with gates over the whole range."""
+    return tuple(with_gate(sensor, *whole_range(setting.space).tolist()) for sensor in start)
+
+
+def tiles(low: np.ndarray, high: np.ndarray, count: int, rows: int) -> list[Tile]:
+    """A rectangle in as many equal tiles as asked for, in rows along its second axis."""
+    edges = np.round(np.arange(rows + 1) * count / rows).astype(np.int64)
+    found = []
+    for bottom, top in pairwise(edges.tolist()):
+        across = top - bottom
+        for column in range(across):
+            share_low = np.array([column / across, bottom / count])
+            share_high = np.array([(column + 1) / across, top / count])
+            found.append(Tile(low + share_low * (high - low), low + share_high * (high - low)))
+    return found
+
+
+def _tilings(setting: Setting, observed: Observed, count: int) -> Iterator[Start]:
+    """Every arrangement of tiles over the returns, from every set of origins."""
+    if not len(observed.points):
+        return
+    for origins in _origin_sets(setting, observed, count):
+        distinct, which = np.unique(origins, axis=0, return_inverse=True)
+        views = [_seen(setting, observed, origin) for origin in distinct]
+        ends = [Tile(*central(view.places)) for view in views]
+        if len(distinct) > 1:  # from several places, each may look at everything
+            parts = enumerate(which.ravel())
+            yield tuple(_tile_sensor(setting, views[v], ends[v], index, 1.0 / count)[0] for index, v in parts)
+        for rows in range(1, count + 1):
+            split = [tiles(*end, count, rows) for end in ends]
+            sensors = [
+                _tile_sensor(setting, views[view], split[view][index], index, 1.0 / count)
+                for index, view in enumerate(which.ravel())
+            ]
+            yield tuple(sensor for sensor, _ in sensors)
+            returns = np.array([seen for _, seen in sensors], dtype=np.float64)
+            if count > 1 and returns.min() > 0:
+                yield tuple(replace(one, weight=n / returns.sum()) for (one, n) in sensors)
+
+
+def _origin_sets(setting: Setting, observed: Observed, count: int) -> list[np.ndarray]:
+    """Origins (G, 3) each: the middle of what is admitted, and where that is a box, spread over it."""
+    bounds = setting.bounds(count)
+    middle = (bounds.origin_low + bounds.origin_high) / 2
+    sets = [admitted_origins(middle, bounds, setting.constraints)]
+    if setting.axes.origin:
+        spread = bounds.origin_low + low_discrepancy(count, 3) * (bounds.origin_high - bounds.origin_low)
+        sets.append(admitted_origins(spread, bounds, setting.constraints))
+        low, high = central(observed.points[:, :3])
+        seen = np.tile((low + high) / 2, (count, 1))
+        sets.append(admitted_origins(seen, bounds, setting.constraints))
+    return sets
+
+
+class _Seen(NamedTuple):
+    """The returns as an origin sees them: where in a plane (K, 2), how far (K,), and the frame of a tangent plane.
+
+    Without a frame the plane is that of azimuth and elevation.
+    """
+
+    origin: np.ndarray
+    places: np.ndarray
+    distance: np.ndarray
+    frame: np.ndarray | None
+
+
+def _seen(setting: Setting, observed: Observed, origin: np.ndarray) -> _Seen:
+    away = observed.hits_m - origin
+    distance = np.linalg.norm(away, axis=1)
+    looking = away / np.maximum(distance, TINY)[:, None]
+    frame = boresight_frame(*(float(angle) for angle in angles(looking.mean(axis=0))))
+    if setting.axes.angular == 2 and (looking @ frame[0]).min() > math.cos(TANGENT_RAD):
+        return _Seen(origin, sphere_log(looking @ frame.T), distance, frame)
+    turned, raised = angles(looking)
+    return _Seen(origin, np.stack([unrolled(turned), raised], axis=1), distance, None)
+
+
+def _tile_sensor(setting: Setting, seen: _Seen, tile: Tile, index: int, weight: float) -> tuple[Sensor, int]:
+    """The sensor of one tile of the returns, and how many returns lie in it."""
+    middle = (tile.low + tile.high) / 2
+    if seen.frame is None:
+        azimuth, elevation = middle.tolist()
+        field = (tile.high - tile.low) * [math.cos(elevation), 1.0]
+    else:
+        azimuth, elevation = (float(angle[0]) for angle in angles(sphere_exp(middle[None]) @ seen.frame))
+        field = tile.high - tile.low
+    inside = ((seen.places >= tile.low) & (seen.places <= tile.high)).all(axis=1)
+    gate = _gate(setting, seen.distance[inside] if inside.sum() >= FEWEST_RETURNS else seen.distance)
+    return _sensor(setting, index, weight, seen.origin, (azimuth, elevation), field, gate), int(inside.sum())
+
+
+def _gate(setting: Setting, range_m: np.ndarray) -> np.ndarray:
+    """The central 99 % of distances inside the range of the space, shape (2,) [m]."""
+    lowest, highest = whole_range(setting.space)
+    low, high = np.clip(central(range_m), lowest, highest)
+    return opened_gate(float(low), float(high))
+
+
+def _sensor(
+    setting: Setting,
+    index: int,
+    weight: float,
+    origin: np.ndarray,
+    boresight: tuple[float, float],
+    field: np.ndarray,
+    gate: np.ndarray,
+) -> Sensor:
+    """A sensor whose intervals are a field of view (2,) [rad] and a gate (2,) [m]."""
+    spread = np.asarray(field, dtype=np.float64) / (2 * setting.interval)
+    return Sensor(
+        name=f"s{index}",
+        weight=weight,
+        origin_m=np.asarray(origin, dtype=np.float64),
+        origin_covariance_m2=np.zeros((3, 3)),
+        azimuth_rad=boresight[0],
+        elevation_rad=boresight[1],
+        roll_rad=0.0,
+        spread_horizontal_rad=float(spread[0]),
+        spread_vertical_rad=float(spread[1]),
+        range_m=float(gate.mean()),
+        spread_range_m=float(gate[1] - gate[0]) / (2 * setting.interval),
+        level=setting.level,
+    )
+
+
+def _even(setting: Setting, count: int) -> list[Start]:
+    """The whole space in tiles whose cells are as square as can be, with the whole range."""
+    space = setting.space
+    bounds = setting.bounds(count)
+    low, high = (np.array(end)[[AZIMUTH, ELEVATION]] for end in (space.low, space.high))
+    width, height = (high - low) * [math.cos((low[1] + high[1]) / 2), 1.0]
+    rows = int(np.clip(round(math.sqrt(count * height / max(width, NARROWEST_RAD))), 1, count))
+    origins = bounds.origin_low + low_discrepancy(count, 3) * (bounds.origin_high - bounds.origin_low)
+    origins = admitted_origins(origins, bounds, setting.constraints)
+    found = []
+    for index, tile in enumerate(tiles(low, high, count, rows)):
+        azimuth, elevation = ((tile.low + tile.high) / 2).tolist()
+        field = (tile.high - tile.low) * [math.cos(elevation), 1.0]
+        gate = whole_range(space)
+        one = _sensor(setting, index, 1.0 / count, origins[index], (azimuth, elevation), field, gate)
+        if setting.spread_axes:
+            extent = (bounds.origin_high - bounds.origin_low)[index] / math.sqrt(count)
+            one = _spread_out(setting, one, extent, 0.0, one.spread_horizontal_rad, one.spread_vertical_rad)
+        found.append(one)
+    return [tuple(found)]
+
+
+def _spread_out(setting: Setting, sensor: Sensor, extent_m: np.ndarray, focus: float, *spread_rad: float) -> Sensor:
+    """A sensor whose origins fill a box, with rays that meet at its mean range over the focus (0: parallel)."""
+    along = np.isin(np.arange(3), setting.spread_axes)
+    deviation = np.where(along, np.maximum(extent_m, 0.0) / (2 * setting.interval), 0.0)
+    slopes = -focus * sensor.frame[1:] / max(sensor.range_m, NARROWEST_RAD)
+    moving = np.sqrt(np.square(slopes * deviation).sum(axis=1))
+    coupling = Coupling(slopes, np.zeros(3), np.zeros(2), np.array(spread_rad), sensor.spread_range_m)
+    whole = np.hypot(spread_rad, moving)
+    return replace(
+        sensor,
+        origin_covariance_m2=np.diag(np.square(deviation)),
+        spread_horizontal_rad=float(whole[0]),
+        spread_vertical_rad=float(whole[1]),
+        coupling=coupling,
+    )
+
+
+def _origin_tiles(setting: Setting, low: np.ndarray, high: np.ndarray, count: int) -> Iterator[list[Tile]]:
+    """Boxes of origins (3,) each: every arrangement of tiles along the two longest spread axes."""
+    axes = sorted(setting.spread_axes, key=lambda axis: low[axis] - high[axis])[:2]
+    for rows in range(1, count + 1) if len(axes) == 2 else (1,):
+        pair = (axes * 2)[:2]
+        plane = tiles(low[pair], high[pair], count, rows)
+        boxes = [Tile(low.copy(), high.copy()) for _ in plane]
+        for box, tile in zip(boxes, plane, strict=True):
+            for place, axis in enumerate(axes):
+                box.low[axis], box.high[axis] = tile.low[place], tile.high[place]
+        yield boxes
+
+
+def _parallel(setting: Setting, observed: Observed, count: int) -> Iterator[Start]:
+    """Origins over the returns, looking straight down where that is admitted."""
+    if not len(observed.points):
+        return
+    azimuth, elevation = parallel_angles(setting.space, observed)
+    bounds = setting.bounds(count)
+    looking = direction(azimuth, elevation)
+    low, high = central(observed.hits_m)
+    low, high = (np.clip(end, setting.space.low[:3], setting.space.high[:3]) for end in (low, high))
+    spread = 2 * setting.interval * np.full(2, PARALLEL_RAD)
+    for boxes in _origin_tiles(setting, low, high, count):
+        origins = admitted_origins(np.array([(box.low + box.high) / 2 for box in boxes]), bounds, setting.constraints)
+        start = []
+        for index, (origin, box) in enumerate(zip(origins, boxes, strict=True)):
+            gate = _gate(setting, np.maximum((observed.hits_m - origin) @ looking, 0.0))
+            one = _sensor(setting, index, 1.0 / count, origin, (azimuth, elevation), spread, gate)
+            start.append(_spread_out(setting, one, box.high - box.low, 0.0, PARALLEL_RAD, PARALLEL_RAD))
+        yield tuple(start)
+
+
+def _focused(setting: Setting, observed: Observed, count: int) -> Iterator[Start]:
+    """Origins over all that see returns, each part looking at the middle of what it sees, or half as focused."""
+    if not len(observed.points):
+        return
+    bounds = setting.bounds(count)
+    low, high = central(observed.points[:, :3])
+    for boxes in _origin_tiles(setting, low, high, count):
+        origins = admitted_origins(np.array([(box.low + box.high) / 2 for box in boxes]), bounds, setting.constraints)
+        for focus in (1.0, 0.5):
+            parts = enumerate(zip(origins, boxes, strict=True))
+            yield tuple(
+                _looking_at(setting, observed, index, origin, box, count, focus) for index, (origin, box) in parts
+            )
+
+
+def _looking_at(
+    setting: Setting, observed: Observed, index: int, origin: np.ndarray, box: Tile, count: int, focus: float
+) -> Sensor:
+    """The sensor whose origins fill a box, looking at what is seen from there."""
+    axes = list(setting.spread_axes)
+    starts_m = observed.points[:, :3]
+    inside = ((starts_m >= box.low) & (starts_m <= box.high))[:, axes].all(axis=1)
+    chosen = inside if inside.sum() >= FEWEST_RETURNS else np.ones(len(inside), dtype=bool)
+    hits, middle = observed.hits_m[chosen], observed.hits_m[chosen].mean(axis=0)
+    azimuth, elevation = (float(angle) for angle in angles(middle - origin))
+    gate = _gate(setting, np.linalg.norm(hits - origin, axis=1))
+    one = _sensor(setting, index, 1.0 / count, origin, (azimuth, elevation), np.zeros(2), gate)
+    across = (hits - middle) @ one.frame[1:].T / max(float(np.linalg.norm(middle - origin)), NARROWEST_RAD)
+    residual = np.maximum(across.std(axis=0), NARROWEST_RAD)
+    return _spread_out(setting, one, box.high - box.low, focus, *residual.tolist())
+
+
+def scan_starts(setting: Setting, views: TrainingViews, observed: Observed, count: int) -> list[Start]:
+    """Even rays with one gate, as the simple rivals have them, and with gates by the returns next to each ray."""
+    found = []
+    for points, gate in scan_layouts(setting.space, views, observed, count):
+        every = np.tile(gate if setting.gates else whole_range(setting.space), (count, 1))
+        for gates in (every, nearby_gates(setting, observed, points, every))[: 1 + setting.gates]:
+            rays = zip(points, gates, strict=True)
+            found.append(
+                tuple(
+                    _sensor(setting, i, 1.0 / count, point[:3], (point[AZIMUTH], point[ELEVATION]), np.zeros(2), one)
+                    for i, (point, one) in enumerate(rays)
+                )
+            )
+    return found
+
+
+def scan_layouts(
+    space: DesignSpace, views: TrainingViews, observed: Observed, count: int
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Points (N, 5) and one gate (2,) each: those of `bounding`, at equal shares of the returns, and of `uniform`."""
+    found = [(layout.place(count, Spot(space)), layout.gate_m) for layout in bounding(views)]
+    angular = [axis for axis in (AZIMUTH, ELEVATION) if axis in space.free]
+    if len(angular) == 1 and len(observed.points) and found:
+        points = found[0][0].copy()
+        points[:, angular[0]] = np.quantile(observed.points[:, angular[0]], (np.arange(count) + 0.5) / count)
+        found.append((points, found[0][1]))
+    low, high = np.array(space.low[:RAY_AXES]), np.array(space.high[:RAY_AXES])
+    return [*found, (even_placement(low, high, count), whole_range(space))]
+
+
+def nearby_gates(setting: Setting, observed: Observed, points: np.ndarray, gates: np.ndarray) -> np.ndarray:
+    """Gates (N, 2) by the returns whose rays are nearest to each ray; where they are few, the one it had [m]."""
+    free = [axis for axis in range(RAY_AXES) if axis in setting.space.free]
+    if not (free and len(observed.points)):
+        return gates
+    scale = np.maximum(np.ptp(observed.points[:, free], axis=0), TINY)
+    nearest = cKDTree(points[:, free] / scale).query(observed.points[:, free] / scale)[1]
+    found = gates.copy()
+    for ray in range(len(points)):
+        range_m = observed.points[nearest == ray, RANGE]
+        if len(range_m) >= FEWEST_RETURNS:
+            found[ray] = _gate(setting, range_m)
+    return found

@@ -1,0 +1,272 @@
+"""Error against seconds, one panel per ladder, on logarithmic axes: what the pictures have in common, and the picture.
+
+A line joins the settings that no other one beats in both; those that are beaten are pale. The tolerance is a dashed
+line, the run's own setting has a ring, the one to choose has another colour. A reference, whose error is nothing,
+stands on the lower edge as a triangle, as do settings whose errors are too small to show.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from lidardesign.evaluate.accuracy.settings import Ladder, Rung
+from lidardesign.evaluate.figures.canvas import (
+    LETTERS_POINTS,
+    PAGE_INCHES,
+    SMALL_POINTS,
+    label_powers,
+    label_ticks,
+    new_figure,
+    plain_label,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLUMNS = 3
+PANEL_INCHES = (PAGE_INCHES / COLUMNS, 2.2)
+# Axes span at least so many times their smallest value, and end so far beyond what they show.
+LEAST_SPAN = 4.0
+BEYOND = 1.5
+# Ticks lie at 1, 2 and 5 where an axis spans less than this or has one power of ten at most, else at powers of ten.
+FINE_TICKS_SPAN = 60.0
+# Errors below this share of the largest, or of the tolerance, stand on the lower edge: nobody looks there.
+SHOWN_SHARE = 1e-4
+LINE, CHOSEN, TOLERANCE = "#0072B2", "#D55E00", "#555555"
+PALE = 0.45
+LONGEST_SETTING = 22
+# Points per inch, and a line of the settings' text [points].
+POINTS, LINE_POINTS = 72.0, 8.0
+# Text on marks whose places along the axis differ by more than this share of it does not meet.
+TEXT_SHARE = 0.45
+LEFT_FROM = 0.66
+# Of a panel's height, what its title and axis take.
+MARGIN_INCHES = 0.75
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A rung in a panel.
+
+    Arguments:
+        rung: The rung.
+        x: Its seconds.
+        y: Its error, or the panel's lower edge.
+        low, high: Ends of its error bar, one standard error each way, within the panel.
+        on_edge: Whether its error is too small to show.
+        chosen: Whether it is the one to choose.
+        beaten: Whether another rung is both faster and more accurate.
+    """
+
+    rung: Rung
+    x: float
+    y: float
+    low: float
+    high: float
+    on_edge: bool
+    chosen: bool
+    beaten: bool
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A ladder as it is drawn.
+
+    Arguments:
+        ladder: The ladder.
+        marks: Its rungs, the roughest first.
+        seconds, errors: Ends of both axes.
+    """
+
+    ladder: Ladder
+    marks: tuple[Mark, ...]
+    seconds: tuple[float, float]
+    errors: tuple[float, float]
+
+    @property
+    def shows_tolerance(self) -> bool:
+        """Whether the tolerance has a place on the axis."""
+        return self.errors[0] <= self.ladder.tolerance <= self.errors[1]
+
+    @property
+    def front(self) -> list[Mark]:
+        """The marks that no other one beats, the fastest first."""
+        return sorted((mark for mark in self.marks if not mark.beaten), key=lambda mark: (mark.x, -mark.y))
+
+    @property
+    def error_title(self) -> str:
+        """The vertical axis: what the error is, with its unit."""
+        return f"error [{self.ladder.unit}]" if self.ladder.unit else "error [share]"
+
+
+def panels(ladders: Sequence[Ladder]) -> list[Panel]:
+    """One panel per ladder that has two rungs or more."""
+    return [_panel(ladder) for ladder in ladders if len(ladder.rungs) > 1]
+
+
+def _panel(ladder: Ladder) -> Panel:
+    seconds = [rung.seconds for rung in ladder.rungs if rung.seconds > 0] or [1.0]
+    errors = _error_axis(ladder)
+    chosen = ladder.chosen
+    marks = tuple(_mark(rung, min(seconds), errors, rung is chosen, _beaten(rung, ladder)) for rung in ladder.rungs)
+    return Panel(ladder, marks, _spanned(min(seconds), max(seconds)), errors)
+
+
+def _error_axis(ladder: Ladder) -> tuple[float, float]:
+    known = [rung.error for rung in ladder.rungs if rung.error > 0 and math.isfinite(rung.error)]
+    tolerance = [ladder.tolerance] if ladder.tolerance > 0 and math.isfinite(ladder.tolerance) else []
+    largest = max([*known, *tolerance], default=1.0)
+    shown = [error for error in [*known, *tolerance] if error >= SHOWN_SHARE * largest]
+    low, high = _spanned(min(shown, default=1.0), largest)
+    # room for what stands on the edge
+    return (low / BEYOND, high)
+
+
+def _spanned(low: float, high: float) -> tuple[float, float]:
+    """Ends of a logarithmic axis that holds both values and is not too short."""
+    missing = max(LEAST_SPAN / (high / low), 1.0)
+    factor = BEYOND * math.sqrt(missing)
+    return low / factor, high * factor
+
+
+def _beaten(rung: Rung, ladder: Ladder) -> bool:
+    """Whether another rung is at least as good in seconds and in error, and better in one of them."""
+    return any(
+        other.seconds <= rung.seconds and other.error <= rung.error and (other.seconds, other.error) != own
+        for own in [(rung.seconds, rung.error)]
+        for other in ladder.rungs
+    )
+
+
+def has_fine_ticks(ends: tuple[float, float]) -> bool:
+    """Whether an axis between these ends needs ticks between the powers of ten."""
+    low, high = ends
+    powers = math.floor(math.log10(high)) - math.ceil(math.log10(low)) + 1
+    return high < FINE_TICKS_SPAN * low or powers < 2
+
+
+def _mark(rung: Rung, least_seconds: float, errors: tuple[float, float], chosen: bool, beaten: bool) -> Mark:
+    low, high = errors
+    on_edge = rung.error <= low
+    # what has no finite error stands on the upper edge
+    y = low if on_edge else rung.error if math.isfinite(rung.error) else high
+    uncertainty = rung.uncertainty if math.isfinite(rung.uncertainty) else 0.0
+    ends = max(y - uncertainty, low), min(y + uncertainty, high)
+    return Mark(rung, max(rung.seconds, least_seconds), y, min(ends[0], y), max(ends[1], y), on_edge, chosen, beaten)
+
+
+def pareto_picture(ladders: Sequence[Ladder]) -> Figure | None:
+    """All panels, a page wide; None where there is nothing to draw."""
+    shown = panels(ladders)
+    if not shown:
+        return None
+    columns = min(COLUMNS, len(shown))
+    rows = math.ceil(len(shown) / columns)
+    figure = new_figure(columns * PANEL_INCHES[0], rows * PANEL_INCHES[1] + 0.5)
+    for number, panel in enumerate(shown):
+        _draw(figure.add_subplot(rows, columns, number + 1), panel)
+    figure.legend(*_legend(), loc="outside lower center", ncols=4 if columns > 1 else 2, frameon=False)
+    return figure
+
+
+def _draw(axes: Axes, panel: Panel) -> None:
+    front = panel.front
+    _dress(axes, panel)
+    if panel.shows_tolerance:
+        axes.axhline(panel.ladder.tolerance, color=TOLERANCE, linestyle="dashed", linewidth=1.1, zorder=1.5)
+    axes.plot([mark.x for mark in front], [mark.y for mark in front], color=LINE, alpha=PALE, linewidth=1.3, zorder=2)
+    for mark in panel.marks:
+        _draw_mark(axes, mark)
+    places = label_places(panel, POINTS * (PANEL_INCHES[1] - MARGIN_INCHES), LINE_POINTS)
+    for mark, (across, up, side) in zip(panel.marks, places, strict=True):
+        axes.annotate(
+            plain_label(mark.rung.setting, LONGEST_SETTING),
+            (mark.x, mark.y),
+            xytext=(across, up),
+            textcoords="offset points",
+            ha=side,
+            va="center",
+            fontsize=SMALL_POINTS,
+            color=CHOSEN if mark.chosen else "#333333",
+            # lines behind the text would strike it through
+            bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.6},
+            zorder=3.5,
+        )
+
+
+def _dress(axes: Axes, panel: Panel) -> None:
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlim(*panel.seconds)
+    axes.set_ylim(*panel.errors)
+    for axis, ends in ((axes.xaxis, panel.seconds), (axes.yaxis, panel.errors)):
+        if has_fine_ticks(ends):
+            label_ticks(axis, None)
+        else:
+            # on axes of one or two powers of ten there would be names at all ticks, which do not fit
+            label_powers(axis)
+    axes.set_title(plain_label(panel.ladder.knob, 48), fontsize=LETTERS_POINTS, loc="left", color="#222222")
+    axes.set_xlabel("seconds")
+    axes.set_ylabel(plain_label(panel.error_title, 40))
+    axes.tick_params(labelsize=SMALL_POINTS)
+    axes.set_axisbelow(True)
+    axes.grid(True, which="major", color="#e2e2e2", linewidth=0.7, zorder=0.5)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _draw_mark(axes: Axes, mark: Mark) -> None:
+    colour, alpha = (CHOSEN, 1.0) if mark.chosen else (LINE, PALE if mark.beaten else 1.0)
+    if mark.high > mark.y or mark.low < mark.y:
+        axes.plot([mark.x, mark.x], [mark.low, mark.high], color=colour, linewidth=1.0, alpha=alpha, zorder=3)
+    look = {"linestyle": "none", "clip_on": False, "zorder": 4}
+    shape = "v" if mark.on_edge else "o"
+    axes.plot(mark.x, mark.y, marker=shape, markersize=4.5, color=colour, alpha=alpha, markeredgewidth=0, **look)
+    if mark.rung.default:
+        axes.plot(mark.x, mark.y, marker="o", markersize=8.5, color="none", markeredgecolor="#222222", **look)
+
+
+def label_places(panel: Panel, height: float, line: float) -> list[tuple[float, float, str]]:
+    """Where each mark's setting is written: offsets to the right and upwards, and the side of the text that is aligned.
+
+    To the right of its mark, to the left in the right third of the panel; moved up where texts would meet.
+
+    Arguments:
+        panel: The panel.
+        height, line: Of the panel and of a line of text, in one unit, which the offsets have too.
+    """
+    across = [_share(mark.x, panel.seconds) for mark in panel.marks]
+    wanted = [height * _share(mark.y, panel.errors) for mark in panel.marks]
+    placed: dict[int, float] = {}
+    # from the lower edge upwards, so that nothing is pushed below it
+    for index in sorted(range(len(wanted)), key=lambda index: (wanted[index], across[index])):
+        near = [up for other, up in placed.items() if abs(across[other] - across[index]) < TEXT_SHARE]
+        up = max(wanted[index], line * 0.6)
+        placed[index] = max([up, *(other + line for other in near if other + line > up)])
+    left = [share > LEFT_FROM for share in across]
+    return [
+        (-line if left[index] else line, placed[index] - wanted[index], "right" if left[index] else "left")
+        for index in range(len(wanted))
+    ]
+
+
+def _share(value: float, ends: tuple[float, float]) -> float:
+    """How far along a logarithmic axis a value stands."""
+    low, high = ends
+    return math.log(value / low) / math.log(high / low)
+
+
+def _legend() -> tuple[list[object], list[str]]:
+    from matplotlib.lines import Line2D
+
+    dot = {"linestyle": "none", "marker": "o"}
+    handles = [
+        Line2D([], [], color=CHOSEN, markersize=4.5, **dot),
+        Line2D([], [], color="none", markeredgecolor="#222222", markersize=8.5, **dot),
+        Line2D([], [], color=LINE, linestyle="none", marker="v", markersize=4.5),
+        Line2D([], [], color=TOLERANCE, linestyle="dashed", linewidth=1.0),
+    ]
+    return handles, ["the one to choose", "the run's own", "reference, or next to no error", "tolerance"]

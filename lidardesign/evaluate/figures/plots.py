@@ -1,0 +1,59 @@
+"""Everything that the report shows, as pictures for papers: each as PNG and as SVG, in one folder.
+
+Nothing is imported before a picture is asked for, nothing needs a display, and the same figures give the same bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lidardesign.evaluate.figures.bounds import constraints_picture, effects_picture
+from lidardesign.evaluate.figures.canvas import looks, write_pictures
+from lidardesign.evaluate.figures.density import field_picture, marginals_picture
+from lidardesign.evaluate.figures.figure_data import Pictured
+from lidardesign.evaluate.figures.scene import scene_picture
+from lidardesign.evaluate.figures.scores import curve_picture, differences_picture, times_picture
+from lidardesign.evaluate.results import Evaluation
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SCENE, MARGINALS, FIELD = "scene", "density_marginals", "density_field"
+RAYS, BANDWIDTH, DIFFERENCES = "score_against_rays", "score_against_bandwidth", "paired_differences"
+CONSTRAINTS, EFFECTS, ACCURACY, TIMES = "constraints", "effects", "accuracy", "times"
+
+
+def write_plots(evaluation: Evaluation, directory: Path, pictured: Pictured | None = None) -> list[Path]:
+    """Write all pictures that there is something to draw for; returns the files, in the order of the report.
+
+    The folder is made where it is missing.
+    """
+    written: list[Path] = []
+    with looks():
+        for stem, draw in pictures(evaluation, pictured or Pictured()).items():
+            figure = draw()
+            if figure is not None:
+                written += write_pictures(figure, Path(directory), stem)
+    return written
+
+
+def pictures(evaluation: Evaluation, pictured: Pictured) -> dict[str, Callable[[], Figure | None]]:
+    """What draws each picture, by the stem of its files; None comes back where there is nothing to draw."""
+    from lidardesign.evaluate.figures.pareto import pareto_picture
+
+    shown, density = pictured.shown, pictured.density
+    ladders = evaluation.accuracy.ladders if evaluation.accuracy is not None else ()
+    return {
+        SCENE: lambda: scene_picture(shown) if shown is not None and shown.designs else None,
+        MARGINALS: lambda: marginals_picture(density) if density is not None and density.marginals else None,
+        FIELD: lambda: field_picture(density) if density is not None and density.planes else None,
+        RAYS: lambda: curve_picture(evaluation, "rays"),
+        BANDWIDTH: lambda: curve_picture(evaluation, "bandwidth"),
+        DIFFERENCES: lambda: differences_picture(evaluation) if evaluation.paired else None,
+        CONSTRAINTS: lambda: constraints_picture(pictured.tightness),
+        EFFECTS: lambda: effects_picture(evaluation.effects),
+        ACCURACY: lambda: pareto_picture(ladders),
+        TIMES: lambda: times_picture(pictured.times),
+    }

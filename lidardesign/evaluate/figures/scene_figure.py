@@ -1,0 +1,173 @@
+"""What the 3D view of the report shows: designs at the robot's positions, and what becomes of their rays in time.
+
+So many rays, positions and frames are kept as a page can hold; which are left out is said in `Shown`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lidardesign.design.sensor import Design
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Outcome, Rays
+from lidardesign.scene import Scene
+from lidardesign.simulate.simulate import build_casters, gate_outcomes, simulate_many
+
+if TYPE_CHECKING:
+    from lidardesign.simulate.plan import Planner
+
+MOST_STEPS = 25  # positions, and frames, that a slider goes through
+MOST_RAYS = 2000  # drawn per design
+MOST_PLACED_RAYS = 30_000  # rays of all designs at all positions: 24 bytes each
+MOST_RAY_STEPS = 120_000  # the same at all frames: 5 bytes each
+FEWEST_RAYS = 300  # of a design, for which frames are given up
+
+Conditions = Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class ShownDesign:
+    """A design with its rays at each of P positions and T frames; N rays are drawn.
+
+    Arguments:
+        design: As it is in its file.
+        placed: The design at each position.
+        rays: The drawn rays at each position, N each.
+        length_m: How far each ray is drawn: to its return, the first hit, or the end of its gate, shape (P, T, N).
+        outcome: Values of `Outcome`, shape (P, T, N).
+        fired: The number of its rays.
+    """
+
+    design: Design
+    placed: tuple[Design, ...]
+    rays: tuple[Rays, ...]
+    length_m: np.ndarray
+    outcome: np.ndarray
+    fired: int
+
+    @property
+    def ends_m(self) -> np.ndarray:
+        """Where the drawn rays end at every position and frame, shape (P, T, N, 3) [m]."""
+        origin = np.stack([rays.origin_m for rays in self.rays])
+        direction = np.stack([rays.direction for rays in self.rays])
+        return origin[:, None] + self.length_m[..., None] * direction[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A scene with designs in it.
+
+    Arguments:
+        scene: The scene.
+        frames: The frames of it that are shown, ascending.
+        places: The condition values that are shown, ascending; one empty entry without conditions.
+        designs: The designs, with their rays there.
+        physics: Whether a detector's effects decide what becomes of rays, or geometry alone.
+        all_places: How many condition values there are.
+    """
+
+    scene: Scene
+    frames: tuple[int, ...]
+    places: tuple[Conditions, ...]
+    designs: tuple[ShownDesign, ...]
+    physics: bool = False
+    all_places: int = 1
+
+    @cached_property
+    def directions(self) -> np.ndarray:
+        """All rays' directions, shape (K, 3)."""
+        return np.concatenate([np.zeros((0, 3)), *(rays.direction for one in self.designs for rays in one.rays)])
+
+
+def shown_in(
+    scene: Scene,
+    designs: Sequence[Design],
+    places: Sequence[Conditions],
+    placed: Callable[[Design, Conditions], Design],
+    laid_out: Callable[[Design, Conditions], Rays],
+    *,
+    planner: Planner | None = None,
+    seed: int = 0,
+) -> Shown:
+    """Put designs into a scene.
+
+    Arguments:
+        scene: The scene.
+        designs: The designs.
+        places: The condition values that they are evaluated at, ascending.
+        placed: A design as it is at a condition value.
+        laid_out: Its rays there; at every condition value as many.
+        planner: How effects are chosen; None: geometry alone.
+        seed: Of the effects' random numbers.
+    """
+    chosen = tuple(places[index] for index in _spread(len(places), MOST_STEPS))
+    every = [[laid_out(design, at) for at in chosen] for design in designs]
+    frames = _spread(scene.frames, _frame_count(len(designs) * len(chosen)))
+    outcomes = _outcomes(scene, every, frames, planner, seed)
+    budget = _ray_budget(len(designs) * len(chosen), len(frames))
+    found = []
+    for design, rays, (length_m, outcome) in zip(designs, every, outcomes, strict=True):
+        keep = np.array(_spread(len(rays[0]), budget), dtype=np.int64)
+        at = tuple(placed(design, where) for where in chosen)
+        drawn = tuple(one.subset(keep) for one in rays)
+        found.append(ShownDesign(design, at, drawn, length_m[..., keep], outcome[..., keep], len(rays[0])))
+    return Shown(scene, frames, chosen, tuple(found), planner is not None, len(places))
+
+
+def _spread(count: int, most: int) -> tuple[int, ...]:
+    """At most `most` of `count` indices, evenly from the first to the last."""
+    return tuple(np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()) if count else ()
+
+
+def _frame_count(placed: int) -> int:
+    """How many frames leave enough rays to each of so many placed designs."""
+    return min(MOST_STEPS, max(5, MOST_RAY_STEPS // (max(placed, 1) * FEWEST_RAYS)))
+
+
+def _ray_budget(placed: int, frames: int) -> int:
+    """How many rays of each of so many placed designs can be drawn."""
+    share = min(MOST_PLACED_RAYS / max(placed, 1), MOST_RAY_STEPS / max(placed * frames, 1))
+    return max(min(MOST_RAYS, math.floor(share)), 1)
+
+
+def _outcomes(
+    scene: Scene, every: Sequence[Sequence[Rays]], frames: Sequence[int], planner: Planner | None, seed: int
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Drawn lengths and outcomes of each design's rays, shape (P, T, N) each."""
+    casters = build_casters(scene) if planner is not None else None
+    drawn = [casters[frame] if casters else SceneCaster(scene, frame) for frame in frames]
+    found = [_first_hits(rays, drawn) for rays in every]
+    if planner is None or casters is None:
+        return found
+    lists = [rays for one in every for rays in one]
+    physics = planner.physics(planner.plan(scene, lists, casters), seed)
+    if physics is None:
+        return found
+    repeats = [place for one in every for place in range(len(one))]
+    measured = iter(simulate_many(scene, lists, casters=casters, physics=physics, repeats=repeats))
+    for rays, (length_m, outcome) in zip(every, found, strict=True):
+        for place in range(len(rays)):
+            returns = next(measured)
+            for step, frame in enumerate(frames):
+                outcome[place, step] = returns[frame].outcome
+                heard = returns[frame].returned
+                length_m[place, step][heard] = returns[frame].range_m[heard]
+    return found
+
+
+def _first_hits(rays: Sequence[Rays], casters: Sequence[SceneCaster]) -> tuple[np.ndarray, np.ndarray]:
+    """Lengths to the first hit or the gate's end, and outcomes by geometry alone, shape (P, T, N) each."""
+    shape = (len(rays), len(casters), len(rays[0]))
+    length_m, outcome = np.zeros(shape, dtype=np.float32), np.full(shape, Outcome.MISS, dtype=np.uint8)
+    for place, one in enumerate(rays):
+        for step, caster in enumerate(casters):
+            range_m = caster.first_hit(one.origin_m, one.direction).range_m
+            length_m[place, step] = np.minimum(range_m, one.gate_m[:, 1])
+            outcome[place, step] = gate_outcomes(range_m, one.gate_m)
+    return length_m, outcome

@@ -1,0 +1,1 @@
+"""Refinement on training scenes."""

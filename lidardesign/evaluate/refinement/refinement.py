@@ -1,0 +1,315 @@
+"""Refinement: a design looks at training scenes, and its density learns where the error is.
+
+Each round tries how wide intervals should be: another level, or samples spread further in range, because scenes that
+were not learned from are elsewhere; where every ray has a gate of its own, the first one also tries gates by what rays
+meet in training scenes. Then it takes the residuals of the best design so far on some training scenes, moves the
+density towards them (see `attention`), and fits again under the same constraints. Whatever scores better on other
+training scenes is kept. A step that gains nothing is halved; after two rounds in a row without a gain it ends.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from lidardesign.design.fit_result import FitResult
+from lidardesign.errors import InfeasibleError, NumericalError
+from lidardesign.evaluate.baselines.candidates import Positions
+from lidardesign.evaluate.refinement.attention import Attention
+from lidardesign.evaluate.refinement.regating import has_ray_gates
+from lidardesign.evaluate.refinement.reweighting import Reweighting
+from lidardesign.evaluate.scene_scores import checked_residuals, checked_score
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Returns
+from lidardesign.run.clock import phase
+from lidardesign.scene import Scene
+from lidardesign.simulate.simulate import build_casters, simulate
+from lidardesign.task import Task
+
+FIRST_STEP = 0.5
+# So many rounds in a row without a gain end it.
+PATIENCE = 2
+# A wider interval costs bandwidth: ten percent more of it have to bring at least one percent of the score.
+WORTH_SHARE = 0.1
+# Levels that are tried, and how far samples are spread in range, in the density's own sigma.
+LEVELS = (0.8, 0.9, 0.95, 0.98, 0.99, 0.999)
+SPREADS = (0.0, 2.0, 4.0)
+MILLIMETRES = 1000.0
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What refinement chooses beside where to look.
+
+    Arguments:
+        level: The share that intervals hold.
+        range_spread_m: Standard deviation by which samples are spread in range [m].
+        traced_gates: Whether rays get gates by what they would hear themselves on training scenes.
+    """
+
+    level: float
+    range_spread_m: float = 0.0
+    traced_gates: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A design that was fitted on the way.
+
+    Arguments:
+        result: What the fit gave.
+        positions: Its rays per condition value.
+        bandwidth_mbps: What these cost to read out [Mbit/s].
+    """
+
+    result: FitResult
+    positions: Positions
+    bandwidth_mbps: float
+
+
+class Refit(Protocol):
+    """Fits a design anew, with the same constraints."""
+
+    def __call__(self, reweighting: Reweighting | None, shape: Shape) -> Trial:
+        """The design of a reweighted density."""
+        ...
+
+
+@dataclass(frozen=True)
+class Round:
+    """What one trial brought.
+
+    Arguments:
+        number: The round, 0 is the design that it starts with.
+        change: What was changed, in words.
+        score: The mean score on the held-back scenes; None where the fit was refused.
+        bandwidth_mbps: Of the design [Mbit/s].
+        kept: Whether it is the best so far.
+        seconds: What it took [s].
+    """
+
+    number: int
+    change: str
+    score: float | None
+    bandwidth_mbps: float | None
+    kept: bool
+    seconds: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """The keys that scripts read."""
+        return {
+            "round": self.number,
+            "change": self.change,
+            "score": self.score,
+            "bandwidth_mbps": self.bandwidth_mbps,
+            "kept": self.kept,
+            "seconds": self.seconds,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """The best design that was found, and how.
+
+    Arguments:
+        trial: The best design.
+        reweighting: What its density was multiplied by; None where nothing was gained.
+        shape: Its level and spread.
+        rounds: Everything that was tried.
+        looked_at, judged_on: Numbers of training scenes.
+    """
+
+    trial: Trial
+    reweighting: Reweighting | None
+    shape: Shape
+    rounds: tuple[Round, ...]
+    looked_at: int
+    judged_on: int
+
+    @property
+    def start(self) -> float:
+        """The score on the held-back scenes that it began with."""
+        return float(self.rounds[0].score or 0.0)
+
+    @property
+    def end(self) -> float:
+        """The score on the held-back scenes of the best."""
+        return float([one.score for one in self.rounds if one.kept][-1] or 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _State:
+    """A design on the way: how it scores (lower is better), and what it was fitted to."""
+
+    trial: Trial
+    score: float
+    log_factors: np.ndarray
+    shape: Shape
+
+
+class Refiner:
+    """Refines one design.
+
+    Arguments:
+        task: A task that gives residuals.
+        refit: How designs are fitted.
+        look: Training scenes whose residuals move the density.
+        judge: Other training scenes, which say what is kept.
+        attention: Anchors over the density.
+        sigma_m: The density's own spread, the unit in which samples are spread in range [m].
+        spreads: Whether samples may be spread in range.
+        progress: Called with everything that was tried.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        refit: Refit,
+        look: Sequence[Scene],
+        judge: Sequence[Scene],
+        attention: Attention,
+        *,
+        sigma_m: float,
+        spreads: bool = True,
+        progress: Callable[[Round], None] | None = None,
+    ) -> None:
+        self.task, self.refit, self.attention = task, refit, attention
+        self.look, self.judge = [(s, build_casters(s)) for s in look], [(s, build_casters(s)) for s in judge]
+        self.spreads = tuple(sigma_m * one for one in SPREADS) if spreads else (0.0,)
+        self.progress = progress
+        self.sign = 1.0 if task.metric.better == "lower" else -1.0
+        self.rounds: list[Round] = []
+        self._tested: set[tuple[bytes, Shape]] = set()
+        self._favoured = ""
+
+    @phase("refinement")
+    def run(self, rounds: int, shape: Shape, log_factors: np.ndarray | None = None) -> Refinement:
+        """Refine a design by at most so many rounds.
+
+        Arguments:
+            rounds: At most so many.
+            shape: What it starts with.
+            log_factors: What the density is multiplied by at the anchors to start with, shape (K,); None is 1.
+
+        Raises:
+            InfeasibleError, ConfigError: The design that it starts with cannot be fitted.
+        """
+        best = self._started(shape, np.zeros(len(self.attention.points_m)) if log_factors is None else log_factors)
+        step, idle, gains = FIRST_STEP, 0, None
+        for number in range(1, rounds + 1):
+            before = best
+            if number == 1 and _may_be_traced(best.trial):
+                shape = replace(best.shape, traced_gates=True)
+                best = self._tried(number, "gates by traced returns", best, shape=shape)
+            best = self._climbed(number, best, "range_spread_m" if number % 2 else "level")
+            gains = self._gains(best) if gains is None or best is not before else gains
+            found = self._stepped(number, best, gains, step)
+            idle = idle + 1 if found is before else 0
+            if found is best:
+                step /= 2
+            else:
+                best, gains = found, None
+            if idle == PATIENCE:
+                break
+        found = self._reweighting(best.log_factors)
+        return Refinement(best.trial, found, best.shape, tuple(self.rounds), len(self.look), len(self.judge))
+
+    def _reweighting(self, log_factors: np.ndarray) -> Reweighting | None:
+        return self.attention.reweighting(log_factors) if np.any(log_factors) else None
+
+    def _started(self, shape: Shape, log_factors: np.ndarray) -> _State:
+        started = time.perf_counter()
+        first = self.refit(self._reweighting(log_factors), shape)
+        best = _State(first, self._score(first), log_factors, shape)
+        self._note(Round(0, "start", self.sign * best.score, first.bandwidth_mbps, True, _since(started)))
+        return best
+
+    def _climbed(self, number: int, best: _State, name: str) -> _State:
+        """Wider intervals as long as they are worth it; narrower ones where the first wider one is not."""
+        ladder = np.array(LEVELS if name == "level" else self.spreads)
+        place = int(np.argmin(np.abs(ladder - getattr(best.shape, name))))
+        for direction in (1, -1):
+            before = best
+            while 0 <= place + direction < len(ladder):
+                value = float(ladder[place + direction])
+                found = self._tried(number, _words(name, value), best, shape=replace(best.shape, **{name: value}))
+                if found is best:
+                    break
+                best, place = found, place + direction
+            if best is not before:
+                break
+        return best
+
+    def _gains(self, best: _State) -> dict[str, np.ndarray]:
+        """Where the error of a design is, in each sense that a step may follow."""
+        seen = []
+        for scene, casters in self.look:
+            returns = _returns(scene, casters, best.trial.positions)
+            seen.append((checked_residuals(self.task, scene, returns), returns))
+        return self.attention.gains(seen)
+
+    def _stepped(self, number: int, best: _State, gains: dict[str, np.ndarray], step: float) -> _State:
+        """The design after a step towards its error, where that is better; what was better last goes first."""
+        for name in sorted(gains, key=lambda name: name != self._favoured):
+            factors = self.attention.moved(best.log_factors, gains[name], step)
+            if not np.any(factors - best.log_factors):
+                continue
+            found = self._tried(number, f"towards {name}, step {step:g}", best, log_factors=factors)
+            if found is not best:
+                self._favoured = name
+                return found
+        return best
+
+    def _tried(self, number: int, change: str, best: _State, **changed: Any) -> _State:
+        """The better of a design and a changed one; more bandwidth has to be worth it."""
+        started = time.perf_counter()
+        wanted = replace(best, **changed)
+        key = (wanted.log_factors.tobytes(), wanted.shape)
+        if key in self._tested:  # it was not better than a design that this one is no worse than
+            return best
+        self._tested.add(key)
+        try:
+            trial = self.refit(self._reweighting(wanted.log_factors), wanted.shape)
+        except (InfeasibleError, NumericalError) as error:
+            self._note(Round(number, f"{change}: {error.message}", None, None, False, _since(started)))
+            return best
+        found = replace(wanted, trial=trial, score=self._score(trial))
+        more = trial.bandwidth_mbps / best.trial.bandwidth_mbps - 1 if wanted.shape != best.shape else 0.0
+        kept = found.score < best.score - WORTH_SHARE * max(more, 0.0) * abs(best.score)
+        self._note(Round(number, change, self.sign * found.score, trial.bandwidth_mbps, kept, _since(started)))
+        return found if kept else best
+
+    def _score(self, trial: Trial) -> float:
+        """The mean score on the held-back scenes, turned so that lower is better."""
+        values = [
+            checked_score(self.task, scene, _returns(scene, casters, trial.positions)).value
+            for scene, casters in self.judge
+        ]
+        return self.sign * float(np.mean(values))
+
+    def _note(self, one: Round) -> None:
+        self.rounds.append(one)
+        if self.progress:
+            self.progress(one)
+
+
+def _may_be_traced(trial: Trial) -> bool:
+    """Whether every ray has a gate of its own, at one place."""
+    return len(trial.positions) == 1 and has_ray_gates(trial.result.design)
+
+
+def _words(name: str, value: float) -> str:
+    return f"level {value:g}" if name == "level" else f"ranges spread by {MILLIMETRES * value:g} mm"
+
+
+def _returns(scene: Scene, casters: Sequence[SceneCaster], positions: Positions) -> list[Returns]:
+    """One list of returns per condition value and frame."""
+    return [frame for rays in positions for frame in simulate(scene, rays, casters=casters)]
+
+
+def _since(started: float) -> float:
+    return time.perf_counter() - started

@@ -1,0 +1,423 @@
+"""The report's curves of scores, as plain plotly documents.
+
+plotly reads a little HTML in names, so every name is escaped here. Legends are in the page itself, where they can be
+switched from the keyboard too.
+
+The learned density as plain plotly documents: marginals beside those of designs, and the field it observes.
+
+The report's section on what accuracy costs: error against seconds as an interactive figure, and a table.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from lidardesign.evaluate.accuracy.settings import Ladder, Rung
+from lidardesign.evaluate.figures.curves import Against, Series, axis_titles, log_ticks, logarithmic, position, series
+from lidardesign.evaluate.figures.density_views import Marginal, PlaneDensity
+from lidardesign.evaluate.figures.pareto import (
+    CHOSEN,
+    LINE,
+    PALE,
+    TOLERANCE,
+    Mark,
+    Panel,
+    has_fine_ticks,
+    label_places,
+    panels,
+)
+from lidardesign.evaluate.report.view import encoded
+from lidardesign.evaluate.results import Evaluation
+from lidardesign.evaluate.verdicts import plain, table
+
+FONT = {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 14, "color": "#1f2933"}
+SYMBOLS = {
+    "o": "circle",
+    "s": "square",
+    "^": "triangle-up",
+    "D": "diamond",
+    "v": "triangle-down",
+    "P": "cross",
+    "x": "x-thin-open",
+    "+": "cross-thin-open",
+    "*": "asterisk-open",
+    "1": "y-down-open",
+    "d": "diamond-tall-open",
+}
+DASH_NAMES = {"solid": "solid", "dashed": "dash", "dashdot": "dashdot", "dotted": "dot"}
+
+
+def curve_figure(evaluation: Evaluation, against: Against) -> dict[str, Any]:
+    """Score against rays or bandwidth: a line and an interval band per name."""
+    curves = series(evaluation)
+    across, up = axis_titles(evaluation, against)
+    rows = [row for curve in curves for row in curve.rows]
+    places = [position(row, against) for row in rows]
+    ticks = (
+        {"tickvals": sorted(set(places)), "tickformat": "~g"} if against == "rays" else {"tickformat": "~g"}
+    )
+    axis = {"gridcolor": "#e4e7eb", "zeroline": False, "linecolor": "#9aa5b1", "ticks": "outside"}
+    layout = {
+        "font": FONT,
+        "paper_bgcolor": "#ffffff",
+        "plot_bgcolor": "#ffffff",
+        "margin": {"l": 74, "r": 16, "t": 12, "b": 56},
+        "xaxis": {**axis, **_scale(places), **ticks, "title": {"text": across}},
+        "yaxis": {
+            **axis,
+            **_scale([row.value for row in rows]),
+            "tickformat": "~g",
+            "title": {"text": html.escape(up).replace(", ", "<br>"), "font": {"size": 13}},
+        },
+        "showlegend": False,
+        "hovermode": "closest",
+    }
+    return {"data": [trace for curve in curves for trace in _curve_traces(curve, against)], "layout": layout}
+
+
+def _scale(values: Sequence[float]) -> dict[str, Any]:
+    return {"type": "log", "tickvals": log_ticks(values)} if logarithmic(values) else {"type": "linear"}
+
+
+def _curve_traces(curve: Series, against: Against) -> list[dict[str, Any]]:
+    across = [position(row, against) for row in curve.rows]
+    name = html.escape(curve.name)
+    red, green, blue = (int(curve.colour[i : i + 2], 16) for i in (1, 3, 5))
+    band = {
+        "type": "scatter",
+        "x": [*across, *across[::-1]],
+        "y": [*(row.ci_high for row in curve.rows), *(row.ci_low for row in reversed(curve.rows))],
+        "fill": "toself",
+        "fillcolor": f"rgba({red},{green},{blue},0.13)",
+        "line": {"width": 0},
+        "mode": "lines",
+        "hoverinfo": "skip",
+        "showlegend": False,
+        "legendgroup": name,
+    }
+    line = {
+        "type": "scatter",
+        "x": across,
+        "y": [row.value for row in curve.rows],
+        "name": name,
+        "legendgroup": name,
+        "mode": "lines+markers",
+        "line": {
+            "color": curve.colour,
+            "width": 1.5 if curve.baseline else 2.5,
+            "dash": DASH_NAMES[curve.dash],
+        },
+        "marker": {
+            "symbol": SYMBOLS[curve.marker],
+            "size": 8,
+            "color": curve.colour,
+            "line": {"color": curve.colour, "width": 1.5},
+        },
+        "text": [
+            f"{row.rays} rays, {row.bandwidth_mbps:.3g} Mbit/s, {row.failures} failures" for row in curve.rows
+        ],
+        "hovertemplate": "%{y:.4g}<br>%{text}<extra>%{fullData.name}</extra>",
+    }
+    return [band, line]
+
+
+# One hue from light to dark: it reads the same without colour vision and on paper.
+SCALE = [[0.0, "#ffffff"], [0.2, "#d6e6f4"], [0.45, "#6baed6"], [0.7, "#2171b5"], [1.0, "#08306b"]]
+FILL, INK, QUIET = "#b8c1cb", "#1f2933", "#7b8794"
+MOST_DESIGNS = 6  # drawn beside a marginal
+AXIS = {"gridcolor": "#e4e7eb", "zeroline": False, "linecolor": "#9aa5b1", "ticks": "outside", "tickformat": "~g"}
+
+
+def marginal_figure(marginal: Marginal, looks: Mapping[str, Series]) -> dict[str, Any]:
+    """One marginal as a filled outline, those of designs as lines."""
+    density = {
+        **_steps(marginal.edges, marginal.heights),
+        "fill": "tozeroy",
+        "fillcolor": FILL,
+        "line": {"color": QUIET, "width": 1},
+        "hoverinfo": "skip",
+    }
+    lines = [
+        {
+            **_steps(marginal.edges, heights),
+            "line": {"color": looks[name].colour, "width": 2, "dash": DASH_NAMES[looks[name].dash]},
+            "name": html.escape(name),
+            "hovertemplate": "%{y:.3g}<extra>%{fullData.name}</extra>",
+        }
+        for name, heights in list(marginal.designs.items())[:MOST_DESIGNS]
+        if name in looks
+    ]
+    layout = {
+        **_looks(),
+        "xaxis": {**AXIS, "title": {"text": marginal.label}, "range": [marginal.edges[0], marginal.edges[-1]]},
+        "yaxis": {**AXIS, "title": {"text": marginal.unit}, "range": [0, marginal.top]},
+        "hovermode": "closest",
+    }
+    return {"data": [density, *lines], "layout": layout}
+
+
+def plane_figure(plane: PlaneDensity) -> dict[str, Any]:
+    """The field of a plane as shades, and the outlines of what stands in it."""
+    across, up = ((edges[:-1] + edges[1:]) / 2 for edges in plane.edges)
+    heat = {
+        "type": "heatmap",
+        "x": across.tolist(),
+        "y": up.tolist(),
+        "z": _array(plane.heights),
+        "colorscale": SCALE,
+        "zmin": 0,
+        "colorbar": {"title": {"text": plane.unit}, "thickness": 12, "tickformat": "~g", "len": 0.9},
+        "hovertemplate": f"%{{x:.3f}}, %{{y:.3f}} m: %{{z:.3g}} {html.escape(plane.unit)}<extra></extra>",
+    }
+    outlines = [
+        _outline(across, up, covered, dash)
+        for covered, dash in ((plane.targets, "solid"), (plane.others, "dot"))
+        if covered.any() and not covered.all()
+    ]
+    layout = {
+        **_looks(),
+        "xaxis": {**AXIS, "title": {"text": plane.labels[0]}, "constrain": "domain", "showgrid": False},
+        "yaxis": {**AXIS, "title": {"text": plane.labels[1]}, "constrain": "domain", "showgrid": False},
+    }
+    layout["yaxis"]["scaleanchor"] = "x"
+    return {"data": [heat, *outlines], "layout": layout}
+
+
+def _outline(across: np.ndarray, up: np.ndarray, covered: np.ndarray, dash: str) -> dict[str, Any]:
+    return {
+        "type": "contour",
+        "x": across.tolist(),
+        "y": up.tolist(),
+        "z": _array(covered),
+        "contours": {"start": 0.5, "end": 0.5, "size": 1, "coloring": "none"},
+        "line": {"color": INK, "width": 1.2, "dash": dash},
+        "showscale": False,
+        "hoverinfo": "skip",
+    }
+
+
+def _array(values: np.ndarray) -> dict[str, str]:
+    """A matrix as plotly's own short form."""
+    rows, columns = values.shape
+    return {"dtype": "f4", "bdata": encoded(values, "<f4"), "shape": f"{rows}, {columns}"}
+
+
+def _steps(edges: np.ndarray, heights: np.ndarray) -> dict[str, Any]:
+    """A histogram's outline."""
+    return {
+        "type": "scatter",
+        "mode": "lines",
+        "x": np.repeat(edges, 2).tolist(),
+        "y": [0.0, *np.repeat(heights, 2).tolist(), 0.0],
+    }
+
+
+def _looks() -> dict[str, Any]:
+    return {
+        "font": {**FONT, "size": 12},
+        "paper_bgcolor": "#ffffff",
+        "plot_bgcolor": "#ffffff",
+        "margin": {"l": 58, "r": 12, "t": 10, "b": 46},
+        "showlegend": False,
+    }
+
+
+COLUMNS = 2
+ROW_PX = 300
+# The share of the figure's width between panels; pixels above panels for titles, below for axes, and per line of text.
+BETWEEN, ABOVE_PX, BELOW_PX, LINE_PX = 0.13, 34, 46, 11
+RING = "#222222"
+BYTES_PER_MB = 1e6
+
+
+def pareto_height_px(ladders: Sequence[Ladder]) -> int:
+    """The height that the figure needs [px]."""
+    return ROW_PX * math.ceil(len(panels(ladders)) / COLUMNS)
+
+
+def pareto_figure(ladders: Sequence[Ladder]) -> dict[str, Any]:
+    """All panels, two beside each other; hovering tells what a rung is."""
+    shown = panels(ladders)
+    rows = math.ceil(len(shown) / COLUMNS)
+    layout: dict[str, Any] = {
+        "font": {**FONT, "size": 12},
+        "paper_bgcolor": "#ffffff",
+        "plot_bgcolor": "#ffffff",
+        "margin": {"l": 62, "r": 12, "t": 4, "b": 4},
+        "showlegend": False,
+        "hovermode": "closest",
+        "annotations": [],
+    }
+    traces: list[dict[str, Any]] = []
+    for index, panel in enumerate(shown):
+        name = "" if index == 0 else str(index + 1)
+        traces += _traces(panel, name)
+        layout |= _axes(panel, name, index, rows)
+        layout["annotations"] += [_title(panel, name), *_settings(panel, name)]
+    return {"data": traces, "layout": layout}
+
+
+def _traces(panel: Panel, name: str) -> list[dict[str, Any]]:
+    where = {"xaxis": f"x{name}", "yaxis": f"y{name}", "type": "scatter"}
+    front = panel.front
+    line = {
+        **where,
+        "x": [mark.x for mark in front],
+        "y": [mark.y for mark in front],
+        "mode": "lines",
+        "line": {"color": LINE, "width": 1.5},
+        "opacity": PALE,
+        "hoverinfo": "skip",
+    }
+    tolerance = [{**where, **_tolerance(panel)}] if panel.shows_tolerance else []
+    return [*tolerance, line, {**where, **_marks(panel)}]
+
+
+def _marks(panel: Panel) -> dict[str, Any]:
+    marks = panel.marks
+    colours = [CHOSEN if mark.chosen else LINE for mark in marks]
+    return {
+        "x": [mark.x for mark in marks],
+        "y": [mark.y for mark in marks],
+        "mode": "markers",
+        "cliponaxis": False,
+        "marker": {
+            "symbol": ["triangle-down" if mark.on_edge else "circle" for mark in marks],
+            "size": [13 if mark.rung.default else 9 for mark in marks],
+            "color": colours,
+            "opacity": [PALE if mark.beaten and not (mark.chosen or mark.rung.default) else 1.0 for mark in marks],
+            "line": {"color": RING, "width": [2.5 if mark.rung.default else 0 for mark in marks]},
+        },
+        "error_y": {
+            "type": "data",
+            "symmetric": False,
+            "array": [mark.high - mark.y for mark in marks],
+            "arrayminus": [mark.y - mark.low for mark in marks],
+            "thickness": 1,
+            "width": 0,
+            "color": LINE,
+        },
+        "customdata": [_told(mark, panel.ladder) for mark in marks],
+        "hovertemplate": "%{customdata}<extra></extra>",
+    }
+
+
+def _settings(panel: Panel, name: str) -> list[dict[str, Any]]:
+    """The setting beside each mark."""
+    places = label_places(panel, ROW_PX - ABOVE_PX - BELOW_PX, LINE_PX)
+    return [
+        {
+            "text": html.escape(mark.rung.setting),
+            "xref": f"x{name}",
+            "yref": f"y{name}",
+            "x": math.log10(mark.x),
+            "y": math.log10(mark.y),
+            "xshift": across,
+            "yshift": up,
+            "xanchor": side,
+            "yanchor": "middle",
+            "showarrow": False,
+            "bgcolor": "rgba(255,255,255,0.75)",
+            "borderpad": 0,
+            "font": {"size": 10, "color": CHOSEN if mark.chosen else "#333333"},
+        }
+        for mark, (across, up, side) in zip(panel.marks, places, strict=True)
+    ]
+
+
+def _told(mark: Mark, ladder: Ladder) -> str:
+    rung, unit = mark.rung, html.escape(ladder.unit)
+    error = "the reference" if rung.reference else f"error {rung.error:.3g} &#177; {rung.uncertainty:.1g} {unit}"
+    lines = [f"<b>{html.escape(rung.setting)}</b>", error, f"{rung.seconds:.3g} s"]
+    if rung.memory_bytes is not None:
+        lines.append(f"{rung.memory_bytes / BYTES_PER_MB:.3g} MB")
+    lines += ["the one to choose"] if mark.chosen else []
+    lines += ["the run's own"] if rung.default else []
+    return "<br>".join(line.strip() for line in lines)
+
+
+def _axes(panel: Panel, name: str, index: int, rows: int) -> dict[str, Any]:
+    """Both axes of a panel in its place: across, then down."""
+    row, column = divmod(index, COLUMNS)
+    width = (1 - BETWEEN) / COLUMNS
+    left = column * (width + BETWEEN)
+    top = 1 - (row + ABOVE_PX / ROW_PX) / rows
+    bottom = 1 - (row + 1 - BELOW_PX / ROW_PX) / rows
+    look = {
+        "type": "log",
+        "gridcolor": "#e4e7eb",
+        "linecolor": "#9aa5b1",
+        "ticks": "outside",
+        "zeroline": False,
+    }
+    seconds = {**look, **_ticks(panel.seconds), "domain": [left, left + width], "anchor": f"y{name}"}
+    errors = {**look, **_ticks(panel.errors), "domain": [bottom, top], "anchor": f"x{name}"}
+    seconds |= {"title": {"text": "seconds", "standoff": 4, "font": {"size": 11}}}
+    errors |= {"title": {"text": html.escape(panel.error_title), "standoff": 4, "font": {"size": 11}}}
+    return {f"xaxis{name}": seconds, f"yaxis{name}": errors}
+
+
+def _ticks(ends: tuple[float, float]) -> dict[str, Any]:
+    low, high = ends
+    spacing = {"dtick": "D2"} if has_fine_ticks(ends) else {"dtick": 1}
+    return {**spacing, "range": [math.log10(low), math.log10(high)], "tickformat": "~g", "tickfont": {"size": 10}}
+
+
+def _title(panel: Panel, name: str) -> dict[str, Any]:
+    return {
+        "text": f"<b>{html.escape(panel.ladder.knob)}</b>",
+        "xref": f"x{name} domain",
+        "yref": f"y{name} domain",
+        "x": 0,
+        "y": 1.0,
+        "yshift": 2,
+        "xanchor": "left",
+        "yanchor": "bottom",
+        "showarrow": False,
+        "font": {"size": 13},
+    }
+
+
+def _tolerance(panel: Panel) -> dict[str, Any]:
+    """A dashed line across the panel; a trace, because shapes vanish behind grid lines in the same place."""
+    limit = panel.ladder.tolerance
+    return {
+        "x": list(panel.seconds),
+        "y": [limit, limit],
+        "mode": "lines",
+        "line": {"color": TOLERANCE, "width": 1.2, "dash": "dash"},
+        "hoverinfo": "skip",
+    }
+
+
+def accuracy_tables(ladders: Sequence[Ladder]) -> str:
+    """Every ladder with all its rungs, what its figures mean and its verdict."""
+    return "".join(_table(ladder) for ladder in ladders)
+
+
+def _table(ladder: Ladder) -> str:
+    unit = f" [{ladder.unit}]" if ladder.unit else ""
+    limit = f"{ladder.tolerance:.3g} {ladder.unit}".rstrip()
+    about = (
+        f"Error: {ladder.error_of}, against {ladder.against}. Tolerance: {limit}, {ladder.because}. Seconds: "
+        f"{ladder.work}." + (f" Note: {ladder.note}." if ladder.note else "")
+    )
+    headings = ("setting", f"error{unit}", "standard error", "seconds", "MB", "verdict")
+    chosen = ladder.chosen
+    lines = [(_cells(rung), "better" if rung is chosen else "open", False) for rung in ladder.rungs]
+    words = {"better": "to choose", "open": ""}
+    return f"<h3>{html.escape(ladder.knob)}: {html.escape(ladder.verdict)}</h3><p>{html.escape(about)}</p>" + table(
+        headings, lines, text_columns=1, words=words, caption=f"Settings of {ladder.knob}."
+    )
+
+
+def _cells(rung: Rung) -> list[str]:
+    """The setting, its error and uncertainty, seconds and memory; the last cell is for the verdict."""
+    memory = "" if rung.memory_bytes is None else plain(rung.memory_bytes / BYTES_PER_MB, 3, tiny=1.0)
+    error = ("reference", "") if rung.reference else (f"{rung.error:.3g}", f"{rung.uncertainty:.2g}")
+    return [rung.setting + (" (run)" if rung.default else ""), *error, f"{rung.seconds:.3g}", memory, ""]

@@ -1,0 +1,161 @@
+"""Small pieces of the report's markup: sections, figures, folds, and swatches that tell lines apart without colour.
+
+Everything that comes from outside is escaped here or where it is put in.
+
+The frame of the report's page: head, style, scripts, and a policy that forbids every connection.
+"""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from collections.abc import Sequence
+from importlib.resources import files
+from typing import Any
+
+# Tables of more rows are folded away; printing opens them.
+MOST_ROWS = 40
+SWATCH_PX = (34, 12)
+STROKES = {
+    "solid": "",
+    "dash": "6 3",
+    "dashed": "6 3",
+    "dashdot": "7 3 2 3",
+    "dot": "2 3",
+    "dotted": "2 3",
+    "longdash": "11 4",
+}
+# Marks of curves and of rays' ends, as closed shapes (filled) and strokes, about (0, 0) in a box of 8.
+SHAPES = {
+    "o": "M-4 0a4 4 0 1 0 8 0a4 4 0 1 0 -8 0Z",
+    "s": "M-4 -4H4V4H-4Z",
+    "^": "M0 -4.5L4.5 3.5H-4.5Z",
+    "v": "M0 4.5L4.5 -3.5H-4.5Z",
+    "D": "M0 -5L5 0L0 5L-5 0Z",
+    "P": "M-1.5 -4.5H1.5V-1.5H4.5V1.5H1.5V4.5H-1.5V1.5H-4.5V-1.5H-1.5Z",
+}
+LINES = {
+    "x": "M-4 -4L4 4M-4 4L4 -4",
+    "+": "M-4.5 0H4.5M0 -4.5V4.5",
+    "*": "M-4 -4L4 4M-4 4L4 -4M-4.5 0H4.5",
+    "1": "M0 0V4.5M0 0L4 -3M0 0L-4 -3",
+    "d": "M0 -5L3.5 0L0 5L-3.5 0Z",
+    "plus": "M-4.5 0H4.5M0 -4.5V4.5",
+    "diamond": "M0 -5L5 0L0 5L-5 0Z",
+    "square": "M-4 -4H4V4H-4Z",
+}
+
+
+def section(heading: str, content: str, identifier: str = "") -> str:
+    """A section of the page with its heading, and a place to link to."""
+    anchor = f' id="{identifier}"' if identifier else ""
+    return f"<section{anchor}><h2>{html.escape(heading)}</h2>\n{content}</section>"
+
+
+def paragraphs(sentences: Sequence[str], kind: str = "") -> str:
+    """One paragraph per sentence."""
+    mark = f' class="{kind}"' if kind else ""
+    return "".join(f"<p{mark}>{html.escape(sentence)}</p>" for sentence in sentences)
+
+
+def definitions(values: Sequence[tuple[str, str]]) -> str:
+    """Names and values beside each other."""
+    items = (f"<dt>{html.escape(name)}</dt><dd><code>{html.escape(value)}</code></dd>" for name, value in values)
+    return f"<dl>{''.join(items)}</dl>"
+
+
+def folded(content: str, rows: int, summary: str) -> str:
+    """Content of so many rows: folded away where there are many."""
+    if rows <= MOST_ROWS:
+        return content
+    return f"<details><summary>{html.escape(summary)} ({rows} rows)</summary>{content}</details>"
+
+
+def figure(document: dict[str, Any], identifier: str, height_px: int, caption: str, kind: str = "") -> str:
+    """A place for a plotly figure, the figure as data, and what it shows in words."""
+    mark = f' class="{kind}"' if kind else ""
+    name = html.escape(caption)
+    return (
+        f'<figure><div id="{identifier}"{mark} role="img" aria-label="{name}" style="height:{height_px}px"></div>'
+        f"<figcaption>{name}</figcaption></figure>{embedded(document, data_figure=identifier)}"
+    )
+
+
+def embedded(document: Any, **attributes: str) -> str:
+    """A document as a script of data, in which no text can end the script."""
+    marks = "".join(f' {name.replace("_", "-")}="{html.escape(value)}"' for name, value in attributes.items())
+    return f'<script type="application/json"{marks}>{script_safe(json.dumps(document, allow_nan=False))}</script>'
+
+
+def script_safe(text: str) -> str:
+    """JSON in which no character means anything to a reader of markup."""
+    escapes = {"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "\u2028": "\\u2028", "\u2029": "\\u2029"}
+    return re.sub("[<>&\u2028\u2029]", lambda found: escapes[found.group()], text)
+
+
+def swatch(colour: str, dash: str | None, mark: str | None = None) -> str:
+    """A piece of a line as it is drawn, with its mark; without a dash a filled box."""
+    width, height = SWATCH_PX
+    middle = f"translate({width / 2} {height / 2})"
+    if dash is None:
+        drawn = f'<rect x="8" width="18" height="{height}" fill="{colour}"/>'
+    else:
+        strokes = f' stroke-dasharray="{STROKES[dash]}"' if STROKES[dash] else ""
+        drawn = f'<line x2="{width}" y1="6" y2="6" stroke="{colour}" stroke-width="2.2"{strokes}/>'
+    if mark in SHAPES:
+        drawn += f'<path d="{SHAPES[mark]}" transform="{middle}" fill="{colour}"/>'
+    elif mark in LINES:
+        drawn += f'<path d="{LINES[mark]}" transform="{middle}" fill="none" stroke="{colour}" stroke-width="1.6"/>'
+    return f'<svg width="{width}" height="{height}" aria-hidden="true">{drawn}</svg>'
+
+
+def switch(label: str, *, picture: str = "", count: str = "", checked: bool = True, **data: str) -> str:
+    """A box to tick with its label, the look of what it switches, and a place for a count."""
+    marks = "".join(f' data-{name}="{html.escape(value)}"' for name, value in data.items())
+    ticked = " checked" if checked else ""
+    output = f'<output data-count="{html.escape(count)}"></output>' if count else ""
+    return (
+        f'<label class="switch"><input type="checkbox"{marks}{ticked}>{picture}'
+        f"<span>{html.escape(label)}</span>{output}</label>"
+    )
+
+
+# plotly compiles the functions that draw 3D at run time, hence unsafe-eval; nothing can be fetched or sent.
+POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval'; style-src 'unsafe-inline'; "
+    "img-src data: blob:; worker-src blob:; font-src data:; base-uri 'none'; form-action 'none'"
+)
+STYLE = "report.css"
+SCRIPTS = ("scene.js", "page.js")
+
+
+def asset(name: str) -> str:
+    """The text of a file of the page."""
+    return files("lidardesign.evaluate.report").joinpath("assets", name).read_text(encoding="utf-8")
+
+
+def page(title: str, lead: str, body: str, plotly: str, links: Sequence[tuple[str, str]] = ()) -> str:
+    """A whole page.
+
+    Arguments:
+        title: Its name.
+        lead: What stands under it.
+        body: Trusted markup.
+        plotly: The source of plotly, a trusted script.
+        links: Identifiers of sections and their headings.
+    """
+    name = html.escape(title)
+    items = "".join(f'<li><a href="#{identifier}">{html.escape(heading)}</a></li>' for identifier, heading in links)
+    scripts = "".join(f"<script>{source}</script>\n" for source in (plotly, *map(asset, SCRIPTS)))
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{name}</title>\n<style>{asset(STYLE)}</style>\n</head>\n"
+        '<body>\n<a class="skip" href="#content">Skip to the result</a>\n<main>\n'
+        f"<header><h1>{name}</h1><p>{html.escape(lead)}</p>"
+        f'<nav aria-label="Sections"><ul>{items}</ul></nav></header>\n<div id="content">\n{body}\n</div>\n</main>\n'
+        # scripts come last, so that the text is there before them
+        f"{scripts}</body>\n</html>\n"
+    )

@@ -1,0 +1,210 @@
+"""One HTML page about an evaluation: result, designs in a scene, curves, rivals, density, constraints, costs.
+
+The page is one file that works offline and makes no network request: plotly is inside it, and its content
+security policy forbids every connection. All names are escaped.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from lidardesign.design.constraints.slack import Tightness
+from lidardesign.evaluate.accuracy.settings import Ladder
+from lidardesign.evaluate.figures.curves import DASHES, Series, series
+from lidardesign.evaluate.figures.density_views import DensityView
+from lidardesign.evaluate.figures.scene_figure import Shown
+from lidardesign.evaluate.report.figures import (
+    FONT,
+    MOST_DESIGNS,
+    accuracy_tables,
+    curve_figure,
+    marginal_figure,
+    pareto_figure,
+    pareto_height_px,
+    plane_figure,
+)
+from lidardesign.evaluate.report.markup import embedded, figure, folded, page, paragraphs, section, swatch, switch
+from lidardesign.evaluate.report.tables import (
+    CommandTimes,
+    Reproduction,
+    audit_section,
+    constraints_table,
+    effects_section,
+    reproduction,
+    times_tables,
+)
+from lidardesign.evaluate.report.view import view_section
+from lidardesign.evaluate.results import Evaluation
+from lidardesign.evaluate.verdicts import (
+    bandwidth_table,
+    held_out,
+    paired_table,
+    rows_table,
+    sensors_table,
+    summary_sentences,
+)
+from lidardesign.run.files import write_atomic
+
+RAYS_ID, BANDWIDTH_ID, ACCURACY_ID = "curve-rays", "curve-bandwidth", "accuracy-figure"
+CURVE_PX, SMALL_PX, PLANE_PX = 440, 250, 400
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """Everything that a report is made of.
+
+    Arguments:
+        evaluation: What was found.
+        shown: The designs in a held-out scene.
+        title: The page's title.
+        density: The learned density as it can be looked at; None where a run has no samples.
+        density_m: Points that it observes, drawn by their weights, shape (K, 3) [m].
+        constraints: How tight each constraint is, by the name of the design.
+        times: Where the time of each command went.
+        reproduce: How to get the same figures again.
+    """
+
+    evaluation: Evaluation
+    shown: Shown
+    title: str
+    density: DensityView | None = None
+    density_m: np.ndarray | None = None
+    constraints: Mapping[str, Sequence[Tightness]] = field(default_factory=dict)
+    times: Sequence[CommandTimes] = ()
+    reproduce: Reproduction = field(default_factory=Reproduction)
+
+
+def write_report(report: Report, path: Path) -> None:
+    """Write the page, whole or not at all."""
+    write_atomic(Path(path), report_html(report))
+
+
+def report_html(report: Report) -> str:
+    """The page as text."""
+    evaluation = report.evaluation
+    metric = evaluation.metric
+    parts = [part for part in _parts(report) if part[2]]
+    body = "\n".join(section(heading, content, identifier) for identifier, heading, content in parts)
+    lead = f"{metric.name} in {metric.unit}, {metric.better} is better."
+    links = [(identifier, heading) for identifier, heading, _ in parts]
+    return page(report.title, lead, embedded(FONT, id="page-font") + body, _plotly_source(), links)
+
+
+def _parts(report: Report) -> list[tuple[str, str, str]]:
+    """Identifier, heading and content of every section; empty content where there is nothing to tell."""
+    evaluation = report.evaluation
+    # lines without marks are told apart by their dashes
+    looks = {curve.name: curve for curve in series(evaluation)}
+    looks = {name: replace(look, dash=DASHES[index % len(DASHES)]) for index, (name, look) in enumerate(looks.items())}
+    shown = [looks[one.design.name] for one in report.shown.designs]
+    ladders = evaluation.accuracy.ladders if evaluation.accuracy else ()
+    result = paragraphs(summary_sentences(evaluation)) + paragraphs(evaluation.notes, "note")
+    return [
+        ("result", "Result", result),
+        ("scene", "Designs in a scene", view_section(report.shown, shown, report.density_m)),
+        ("curves", "Score against rays and bandwidth", _curves(evaluation)),
+        ("scores", "All scores", rows_table(evaluation)),
+        ("rivals", "Against the rivals at equal rays", _rivals(evaluation)),
+        ("bandwidth", "Against the rivals at equal bandwidth", _at_equal_bandwidth(evaluation)),
+        ("density", "The learned density", _density(report.density, looks) if report.density else ""),
+        ("constraints", "Constraints and how tight each is", _constraints(report.constraints)),
+        ("physics", "Physics", effects_section(evaluation) if evaluation.effects else ""),
+        ("audit", "Audit of the physics", audit_section(evaluation, evaluation.audit) if evaluation.audit else ""),
+        ("accuracy", "What accuracy costs", _accuracy(ladders)),
+        ("sensors", "Sensors", _sensors(report.shown)),
+        ("time", "Where the time went", times_tables(report.times)),
+        ("reproduce", "How to reproduce this", reproduction(report.reproduce)),
+    ]
+
+
+def _curves(evaluation: Evaluation) -> str:
+    """Both curves with one legend, whose boxes switch curves in both."""
+    legend = "".join(
+        switch(curve.name, picture=swatch(curve.colour, curve.dash, curve.marker), curve=str(index))
+        for index, curve in enumerate(series(evaluation))
+    )
+    scenes = f"over {held_out(evaluation.scenes)}"
+    return (
+        f'<fieldset><legend>Curves shown</legend><div class="curves-shown">{legend}</div></fieldset>'
+        + figure(curve_figure(evaluation, "rays"), RAYS_ID, CURVE_PX, f"Score against rays per frame: means {scenes}, "
+                 "with 95 % bootstrap intervals as bands.", "curves")
+        + figure(curve_figure(evaluation, "bandwidth"), BANDWIDTH_ID, CURVE_PX, "The same scores against the bandwidth "
+                 "that it takes to read the gates out.", "curves")
+    )  # fmt: skip
+
+
+def _rivals(evaluation: Evaluation) -> str:
+    return folded(paired_table(evaluation), len(evaluation.paired), "All paired differences")
+
+
+def _at_equal_bandwidth(evaluation: Evaluation) -> str:
+    if not evaluation.equal_bandwidth:
+        return ""
+    return folded(bandwidth_table(evaluation), len(evaluation.equal_bandwidth), "All rows at equal bandwidth")
+
+
+def _density(view: DensityView, looks: Mapping[str, Series]) -> str:
+    """Marginals, and the field in space, side by side where there is room."""
+    names = list(view.marginals[0].designs) if view.marginals else []
+    drawn = [name for name in names if name in looks][:MOST_DESIGNS]
+    legend = "".join(
+        f'<span class="switch">{swatch(looks[name].colour, looks[name].dash)}<span>{html.escape(name)}</span></span>'
+        for name in drawn
+    )
+    legend = f'<span class="switch">{swatch("#b8c1cb", None)}<span>learned density</span></span>{legend}'
+    about = (
+        f"Drawn from {view.samples:,} weighted samples, worth {view.effective:,.0f} equal ones. "
+        "Below, how much of the density observes each place, seen along an axis, over the outlines of targets (solid) "
+        f"and occluders (dotted) of {view.scene}."
+    )
+    marginals = "".join(
+        figure(marginal_figure(one, looks), f"marginal-{index}", SMALL_PX, f"Share of the density along {one.label}")
+        for index, one in enumerate(view.marginals)
+    )
+    planes = "".join(
+        figure(plane_figure(one), f"plane-{index}", PLANE_PX, f"What is observed, {' and '.join(one.labels)}", "plane")
+        for index, one in enumerate(view.planes)
+    )
+    more = len(names) - len(drawn)
+    further = f"<p>{more} further designs are not drawn here.</p>" if more else ""
+    return (
+        f'<p>{html.escape(about)}</p><div class="curves-shown">{legend}</div>{further}'
+        f'<div class="tiles">{marginals}</div><div class="tiles wide">{planes}</div>'
+    )
+
+
+def _constraints(found: Mapping[str, Sequence[Tightness]]) -> str:
+    return "".join(constraints_table(name, bounds) for name, bounds in found.items())
+
+
+def _sensors(shown: Shown) -> str:
+    parts = []
+    for one in shown.designs:
+        parts.append(folded(sensors_table(one.design), len(one.design.sensors), f"Sensors of {one.design.name}"))
+    return "".join(parts)
+
+
+def _accuracy(ladders: Sequence[Ladder]) -> str:
+    """The figure of all ladders, how to read it, and their tables."""
+    if not ladders:
+        return "<p>It was not measured: <code>lidardesign evaluate --accuracy</code> does, in some minutes.</p>"
+    read = (
+        "Error against seconds on this machine, one panel per numerical choice. Orange is the cheapest setting inside "
+        "the tolerance (dashed), a ring the one of this run; pale settings are beaten in both; triangles on the lower "
+        "edge have no error to show, references among them."
+    )
+    height = pareto_height_px(ladders)
+    picture = figure(pareto_figure(ladders), ACCURACY_ID, height, "Error against seconds") if height else ""
+    wide = f'<div class="scroll" tabindex="0"><div class="panels">{picture}</div></div>'
+    return f"<p>{read}</p>{wide}{accuracy_tables(ladders)}"
+
+
+def _plotly_source() -> str:
+    from plotly.offline import get_plotlyjs
+
+    return get_plotlyjs()

@@ -1,0 +1,258 @@
+"""The report's tables beside the scores: constraints and how tight each is, where the time went, how to reproduce.
+
+The report's tables about physics: what was simulated and why, and what skipping the rest changes.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from lidardesign.design.constraints.slack import Tightness
+from lidardesign.evaluate.report.markup import definitions
+from lidardesign.evaluate.results import Audit, AuditRow, EffectSummary, Evaluation
+from lidardesign.evaluate.verdicts import TINY, figure, plain, table
+from lidardesign.run.clock import INSIDE, OTHER
+
+# Phases of a smaller share of their command are left out; `other` has what they took.
+LEAST_SHARE = 0.005
+DEEPEST = 2
+MEBIBYTE = 1024**2
+PERCENT = 100.0
+
+
+@dataclass(frozen=True)
+class CommandTimes:
+    """Where the time of one command went.
+
+    Arguments:
+        command: Its name, as `learn`.
+        when: When it ended, as written in the run.
+        phases: Seconds by phase, phases inside of phases as "learning/target".
+        memory_bytes: The most memory that it took; None where that is not known.
+    """
+
+    command: str
+    when: str
+    phases: Mapping[str, float]
+    memory_bytes: int | None = None
+
+    @property
+    def seconds(self) -> float:
+        """All of its time [s]."""
+        return math.fsum(seconds for name, seconds in self.phases.items() if INSIDE not in name)
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """How to get the same figures again.
+
+    Arguments:
+        commands: What was typed, in order, with what each is for.
+        facts: Seed, versions and the like, by name.
+        config: The run's configuration as YAML; empty where there is none.
+    """
+
+    commands: Sequence[tuple[str, str]] = ()
+    facts: Sequence[tuple[str, str]] = field(default_factory=tuple)
+    config: str = ""
+
+
+def constraints_table(name: str, found: Sequence[Tightness]) -> str:
+    """One row per bound of a design, the tightest sensor, what room it leaves and how much of the bound is used."""
+    if not found:
+        return f"<p>{html.escape(name)} has no constraints.</p>"
+    headings = ("constraint", "bound", "closest", "room", "used", "verdict")
+    head = _head(headings, text=(0, 4))
+    rows = "".join(_constraint_row(one) for one in found)
+    caption = f"Constraints of {name}. Closest: the sensor with the least room. Used: the share of the bound."
+    return _scrolled(head, rows, caption)
+
+
+def _constraint_row(one: Tightness) -> str:
+    owner = f"{html.escape(one.sensor)}: " if one.sensor else ""
+    how = {"broken": "worse", "at the bound": "open", "kept": "better"}[one.word]
+    verdict = one.word
+    if one.sensors > 1 and (one.broken or one.tight):
+        verdict += f" ({one.broken or one.tight} of {one.sensors})"
+    room = "-" if one.room is None else _room(one.room, one.bound)
+    bound, value = html.escape(number(one.bound)), html.escape(number(one.value))
+    cells = f'<td class="wraps">{bound}</td><td class="wraps">{owner}{value}</td><td>{room}</td>'
+    used = f'<td class="bars">{_used(one)}</td>'
+    name = f'<th scope="row" class="name">{html.escape(one.name)}</th>'
+    return f'<tr>{name}{cells}{used}<td class="{how}">{verdict}</td></tr>'
+
+
+def _room(room: float, bound: Any) -> str:
+    """The room under a bound; next to none is none."""
+    size = max(abs(float(value)) for value in (bound if isinstance(bound, list | tuple) else [bound]))
+    return "0" if abs(room) < TINY * size else number(room)
+
+
+def _used(one: Tightness) -> str:
+    """A bar that is full where a design is at its bound; in words for who cannot see it."""
+    if one.share is None:
+        return "-"
+    used = min(max(1.0 - one.share, 0.0), 1.0)
+    kind = " broken" if one.broken else " full" if one.tight else ""
+    label = f"{PERCENT * used:.0f} % used"
+    width = f"{PERCENT * used:.1f}%"
+    return f'<span class="room{kind}" role="img" aria-label="{label}"><i style="width:{width}"></i></span>'
+
+
+def number(value: Any) -> str:
+    """A figure, a text, or a list or mapping of them, for people; of a list of places how many there are."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {number(item)}" for name, item in value.items())
+    if isinstance(value, list | tuple) and value and isinstance(value[0], list | tuple):
+        return f"{len(value)} places"
+    if isinstance(value, list | tuple):
+        return ", ".join(number(item) for item in value)
+    if value is None:
+        return "-"
+    # adding zero takes the sign from a -0
+    return f"{value + 0.0:.4g}" if isinstance(value, float) else str(value)
+
+
+def times_tables(commands: Sequence[CommandTimes]) -> str:
+    """Every command with its phases, their seconds and shares as bars."""
+    return "".join(_times_table(one) for one in commands if one.seconds > 0)
+
+
+def _times_table(one: CommandTimes) -> str:
+    head = _head(("phase", "seconds", "share", "bar"), text=(0, 3))
+    memory = "" if one.memory_bytes is None else f", at most {one.memory_bytes / MEBIBYTE:,.0f} MiB of memory"
+    when = f" ({one.when})" if one.when else ""
+    caption = f"{one.command}: {one.seconds:.2f} s{memory}{when}. Hatched phases are parts of the one above."
+    rows = "".join(_time_row(name, seconds, one.seconds) for name, seconds in _main_phases(one).items())
+    return _scrolled(head, rows, caption)
+
+
+def _main_phases(one: CommandTimes) -> dict[str, float]:
+    """Phases of two levels that matter, and what all others took."""
+    shown = {
+        name: seconds
+        for name, seconds in one.phases.items()
+        if name != OTHER and name.count(INSIDE) < DEEPEST and seconds >= LEAST_SHARE * one.seconds
+    }
+    rest = one.seconds - math.fsum(seconds for name, seconds in shown.items() if INSIDE not in name)
+    return {**shown, OTHER: max(rest, 0.0)}
+
+
+def _time_row(name: str, seconds: float, total: float) -> str:
+    *outside, own = name.split(INSIDE)
+    share = PERCENT * seconds / total
+    indent = f' style="padding-left:{12 + 20 * len(outside)}px"'
+    inside = " inside" if outside else ""
+    return (
+        f'<tr><th scope="row" class="name"{indent}>{html.escape(own)}</th><td>{seconds:.2f}</td><td>{share:.0f} %</td>'
+        f'<td class="bars"><span class="bar{inside}" aria-hidden="true" style="width:{share:.1f}%"></span></td></tr>'
+    )
+
+
+def reproduction(how: Reproduction) -> str:
+    """Commands, seeds, versions, and the configuration that the run was learned with."""
+    parts = [f"<p>{html.escape(what)}</p><pre>{html.escape(command)}</pre>" for what, command in how.commands]
+    parts.append(definitions(how.facts))
+    if how.config:
+        config = f"<pre>{html.escape(how.config)}</pre>"
+        parts.append(f"<details><summary>The run's configuration</summary>{config}</details>")
+    return "".join(parts)
+
+
+def _head(headings: Sequence[str], text: Sequence[int]) -> str:
+    """Headings of columns, those of text on the left."""
+    return "".join(
+        f'<th scope="col"{" class=text" if index in text else ""}>{html.escape(heading)}</th>'
+        for index, heading in enumerate(headings)
+    )
+
+
+def _scrolled(head: str, rows: str, caption: str) -> str:
+    label = html.escape(caption)
+    return (
+        f'<div class="scroll" tabindex="0" role="region" aria-label="{label}">'
+        f"<table><caption><span>{label}</span></caption><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>"
+    )
+
+
+MILLIMETRES = 1000.0
+SHORT_S = 0.01  # costs from here on are shown as their limit
+
+
+def effects_section(evaluation: Evaluation) -> str:
+    """What could change the scores, and what of it was simulated; one sentence where nothing could."""
+    effects = evaluation.effects
+    detector = html.escape(evaluation.detector)
+    if not any(effect.on or effect.range_m or effect.lost for effect in effects):
+        return f"<p>The detector is {detector}. No scene calls for any effect: returns are exact first hits.</p>"
+    tolerance = effects[0].tolerance
+    head = (
+        f"<p>The detector is {detector}. For each effect, the most that it could change in any scene and row: errors "
+        f"of range (rms) and the share of returns lost, invented or misplaced. All that is skipped may change "
+        f"{MILLIMETRES * tolerance.range_m:.3g} mm and {tolerance.lost:.2g} of the returns together.</p>"
+    )
+    headings = ["effect", "simulated", "reason", "range [mm]", "returns", "cost [s]"]
+    caption = "The plan of effects: what was simulated, why, and what it costs."
+    lines = [(_effect_cells(effect), "", False) for effect in effects]
+    return f'{head}<div class="reasons">{table(headings, lines, text_columns=3, caption=caption)}</div>'
+
+
+def audit_section(evaluation: Evaluation, audit: Audit) -> str:
+    """Every row under the plan and under all effects, with a verdict each."""
+    planned, everything = audit.seconds
+    there = {effect.name for effect in evaluation.effects if effect.range_m or effect.lost}
+    skipped = html.escape(", ".join(_words(name) for name in audit.skipped if name in there))
+    skipped = skipped or "nothing that is there"
+    passed = "failed" if audit.failed else "passed"
+    head = (
+        f"<p>The audit {passed}. The plan skips {skipped}; all rows took {planned:.2f} s under it and "
+        f"{everything:.2f} s under all effects, with the same random numbers. A mean may move by {audit.tolerance:g} "
+        f"{html.escape(audit.unit)}, the metric's tolerance; the largest difference is {audit.worst:.2g}.</p>"
+    )
+    unit = audit.unit
+    headings = ["design", "rays", f"planned [{unit}]", f"all [{unit}]", "difference", "95 % interval"]
+    lines = [
+        (_audit_cells(row), "worse" if row in audit.failed else "better", bool(index and _starts(audit.rows, index)))
+        for index, row in enumerate(audit.rows)
+    ]
+    words = {"worse": "too far", "better": "within"}
+    headings += ["planned [s]", "all [s]", "moved"]
+    return head + table(headings, lines, text_columns=1, words=words, caption="Every row under the plan and under all.")
+
+
+def _starts(rows: Sequence[AuditRow], index: int) -> bool:
+    """Whether a row begins a group: another design, or the rows at equal bandwidth of another one."""
+    row, before = rows[index], rows[index - 1]
+    if row.matched_to is None:
+        return row.design != before.design
+    return (row.matched_to, row.matched_rays) != (before.matched_to, before.matched_rays)
+
+
+def _effect_cells(effect: EffectSummary) -> list[str]:
+    shown = [_words(effect.name), _simulated(effect), effect.reason]
+    bounds = (plain(MILLIMETRES * effect.range_m, 3), plain(effect.lost, 2))
+    return [*shown, *bounds, plain(effect.seconds, 2, tiny=SHORT_S)]
+
+
+def _simulated(effect: EffectSummary) -> str:
+    if effect.on:
+        return "yes" if effect.scenes_on == 1 else f"in {100 * effect.scenes_on:.0f} % of scenes"
+    return "no" if effect.missing is None else "not possible here"
+
+
+def _audit_cells(row: AuditRow) -> list[str]:
+    name = row.design if row.matched_to is None else f"{row.design} (bandwidth of {row.matched_to})"
+    cells = [name, str(row.rays), figure(row.planned), figure(row.everything), f"{row.difference:.2g}"]
+    return [*cells, f"{row.ci_low:.2g} to {row.ci_high:.2g}", *_times(row), ""]
+
+
+def _times(row: AuditRow) -> list[str]:
+    return [f"{row.seconds:.2f}", f"{row.seconds_everything:.2f}"]
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")

@@ -1,0 +1,374 @@
+"""The report's section with the 3D view: its switches, sliders and buttons, and the data that it is drawn from.
+
+What the report's 3D view is drawn from, as one JSON document: numbers as base64 of little-endian arrays.
+
+Bodies at rest are merged, moving ones keep their own frame and a pose per frame; sensors are a few numbers each, and
+the page draws their fields of view and gates; a ray is where it starts, where it looks, how far it goes and what
+becomes of it. The page's script (`assets/scene.js`) puts together what is switched on.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from lidardesign.design.layouts.grid import field_on_sphere
+from lidardesign.design.sensor import Design, Sensor, interval_factor
+from lidardesign.evaluate.figures.curves import Series
+from lidardesign.evaluate.figures.drawing import (
+    MOST_FACES,
+    SMALLEST_SPREAD_M,
+    drawn_share,
+    gate_shell,
+    origin_lines,
+    own_triangles,
+    round_steps,
+    scene_bounds,
+)
+from lidardesign.evaluate.figures.scene_figure import Shown, ShownDesign
+from lidardesign.evaluate.report.markup import embedded, swatch, switch
+from lidardesign.geometry.rays import Outcome
+from lidardesign.numerics import EPSILON_FLOAT32
+from lidardesign.scene import Body
+
+MOST_SENSORS = 40  # drawn as frusta and switched one by one; a scan has hundreds, and its rays say it all
+MOST_BODIES = 2000  # of a scene, the largest first
+MARGIN = 1.0  # of the scene's extent: rays that go farther are cut there
+# More rays that hit nothing would hide everything else.
+MANY_RAYS, FAINT = 300, 0.22
+LARGEST_UINT16 = 65_535
+# What tells outcomes apart beside their colours (Okabe and Ito 2008): dashes of lines, marks at their ends.
+OUTCOMES = (
+    (Outcome.RETURN, "return", "#009E73", "solid", "plus"),
+    (Outcome.OCCLUDED, "occluded", "#D55E00", "dash", "x"),
+    (Outcome.AFTER_GATE, "behind the gate", "#0072B2", "dot", "diamond"),
+    (Outcome.MISS, "nothing hit", "#6b7280", "longdash", None),
+    (Outcome.NOT_DETECTED, "not detected", "#CC79A7", "dashdot", "square"),
+)
+# Dashes of plotly by those of curves.
+DASHES = {"solid": "solid", "dashed": "dash", "dashdot": "dashdot", "dotted": "dot"}
+
+
+def view_document(shown: Shown, looks: Sequence[Series], density_m: np.ndarray | None = None) -> dict[str, Any]:
+    """The document of a view.
+
+    Arguments:
+        shown: The scene, and the designs in it.
+        looks: The colour and dash of each design, in the same order.
+        density_m: Points that the learned density observes, shape (K, 3) [m].
+    """
+    bodies = drawn_bodies(shown)
+    bounds = view_bounds(shown)
+    share, steps = drawn_share(shown.scene), round_steps(shown.scene)
+    moving = [body for body in bodies if body.poses.ndim == 3]
+    return {
+        "frames": len(shown.frames),
+        "places": len(shown.places),
+        "bounds": bounds.tolist(),
+        "camera": camera(shown.directions),
+        "outcomes": [
+            {"code": int(code), "colour": colour, "dash": dash, "symbol": symbol}
+            for code, _, colour, dash, symbol in OUTCOMES
+        ],
+        "rest": [_resting(bodies, target, bounds, share, steps) for target in (True, False)],
+        "moving": [_moving(body, shown, bounds, share, steps) for body in moving],
+        "designs": [_design(one, look) for one, look in zip(shown.designs, looks, strict=True)],
+        "density": None if density_m is None else encoded(density_m, "<f4"),
+        "many": MANY_RAYS,
+        "faint": FAINT,
+    }
+
+
+def encoded(values: np.ndarray, kind: str) -> str:
+    """An array as base64 of its little-endian bytes, row by row."""
+    return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode("ascii")
+
+
+def drawn_bodies(shown: Shown) -> list[Body]:
+    """The bodies that are drawn: the largest, where there are very many."""
+    bodies = list(shown.scene.bodies)
+    if len(bodies) <= MOST_BODIES:
+        return bodies
+    sizes = [_size(body) for body in bodies]
+    largest = np.argsort(sizes, kind="stable")[::-1][:MOST_BODIES]
+    return [bodies[index] for index in np.sort(largest)]
+
+
+def _size(body: Body) -> float:
+    """The extent of a body [m]; of a plane infinite."""
+    shape = body.shape
+    if hasattr(shape, "bounds_m"):
+        return float(np.ptp(shape.bounds_m, axis=0).max())
+    lengths = [value for entry in vars(shape).values() for value in np.atleast_1d(entry)]
+    return float(max(lengths, default=np.inf))
+
+
+def view_bounds(shown: Shown) -> np.ndarray:
+    """The box that is drawn, shape (2, 3) [m]: scene, sensors, and their rays as far as they stay near."""
+    rays = [one for design in shown.designs for one in design.rays]
+    each = [scene_bounds(shown.scene, frame, rays) for frame in {shown.frames[0], shown.frames[-1]}]
+    low, high = np.min([one[0] for one in each], axis=0), np.max([one[1] for one in each], axis=0)
+    reach = MARGIN * float((high - low).max())
+    ends = np.concatenate([np.zeros((0, 3)), *(design.ends_m.reshape(-1, 3) for design in shown.designs)])
+    ends = np.concatenate([ends, *(shell for design in shown.designs for shell in _shells(design))])
+    if len(ends):
+        low = np.minimum(low, np.maximum(ends.min(axis=0), low - reach))
+        high = np.maximum(high, np.minimum(ends.max(axis=0), high + reach))
+    return np.stack([low, high])
+
+
+def _shells(one: ShownDesign) -> list[np.ndarray]:
+    """Gates and origins that are drawn, at the first and the last position."""
+    if len(one.design.sensors) > MOST_SENSORS:
+        return []
+    found = []
+    for design in (one.placed[0], one.placed[-1]):
+        for sensor in design.sensors:
+            starts = origin_lines(sensor, design.level)
+            found += [gate_shell(sensor)[0], starts[~np.isnan(starts[:, 0])]]
+    return found
+
+
+def is_flat(directions: np.ndarray) -> bool:
+    """Whether all rays lie in planes of constant z: a world that is looked at as a map."""
+    return bool(len(directions)) and float(np.abs(directions[:, 2]).max()) < EPSILON_FLOAT32
+
+
+def camera(directions: np.ndarray) -> dict[str, Any]:
+    """From behind and above the sensors; a world in the plane z = 0 is looked at from above, as on paper."""
+    if is_flat(directions):
+        up, center = {"x": 0, "y": 1, "z": 0}, {"x": 0, "y": 0, "z": 0}
+        return {"eye": {"x": 0, "y": 0, "z": 1.9}, "up": up, "center": center}
+    up = {"x": 0, "y": 0, "z": 1}
+    return {"eye": _side_view(directions), "up": up, "center": {"x": 0, "y": 0, "z": -0.1}}
+
+
+def _side_view(directions: np.ndarray) -> dict[str, float]:
+    """A camera beside the mean direction of the rays, a little behind the sensors and above them."""
+    mean = directions.mean(axis=0) if len(directions) else np.array([1.0, 0.0, 0.0])
+    forward = np.array([mean[0], mean[1], 0.0])
+    length = np.linalg.norm(forward)
+    forward = forward / length if length > EPSILON_FLOAT32 else np.array([1.0, 0.0, 0.0])
+    eye = 1.25 * np.array([-forward[1], forward[0], 0.0]) - 1.0 * forward + np.array([0.0, 0.0, 0.7])
+    return {name: float(value) for name, value in zip("xyz", eye, strict=True)}
+
+
+def _mesh(vertices: np.ndarray, faces: np.ndarray) -> dict[str, Any]:
+    wide = len(vertices) > LARGEST_UINT16
+    return {"vertices": encoded(vertices, "<f4"), "faces": encoded(faces, "<u4" if wide else "<u2"), "wide": wide}
+
+
+def _resting(bodies: Sequence[Body], target: bool, bounds: np.ndarray, share: float, steps: int) -> dict[str, Any]:
+    """All bodies at rest of one role as one mesh in the world."""
+    pieces = []
+    for body in bodies:
+        if body.is_target == target and body.poses.ndim == 2:
+            vertices, faces = own_triangles(body, body.poses, bounds, share, steps)
+            pieces.append((vertices @ body.poses[:3, :3].T + body.poses[:3, 3], faces))
+    offsets = np.cumsum([0, *(len(vertices) for vertices, _ in pieces)])
+    vertices = np.concatenate([np.zeros((0, 3)), *(vertices for vertices, _ in pieces)])
+    moved = (faces + start for (_, faces), start in zip(pieces, offsets[:-1], strict=True))
+    return _mesh(vertices, np.concatenate([np.zeros((0, 3), dtype=np.int64), *moved]))
+
+
+def _moving(body: Body, shown: Shown, bounds: np.ndarray, share: float, steps: int) -> dict[str, Any]:
+    """A body in its own frame, with the upper three rows of its pose at every frame that is shown."""
+    poses = np.stack([body.pose(frame) for frame in shown.frames])
+    vertices, faces = own_triangles(body, poses[0], bounds, share, steps)
+    return {"target": body.is_target, "poses": encoded(poses[:, :3], "<f4"), **_mesh(vertices, faces)}
+
+
+def _design(one: ShownDesign, look: Series) -> dict[str, Any]:
+    few = len(one.design.sensors) <= MOST_SENSORS
+    first = one.rays[0]
+    return {
+        "name": html.escape(one.design.name),
+        "colour": look.colour,
+        "dash": DASHES[look.dash],
+        "sensors": len(one.design.sensors) if few else 0,
+        "cones": encoded(np.stack([_cones(design) for design in one.placed]), "<f4") if few else "",
+        "rays": len(first),
+        "owner": encoded(first.sensor, "<u2"),
+        "origin": encoded(np.stack([rays.origin_m for rays in one.rays]), "<f4"),
+        "direction": encoded(np.stack([rays.direction for rays in one.rays]), "<f4"),
+        "length": encoded(one.length_m, "<f4"),
+        "outcome": encoded(one.outcome, "|u1"),
+    }
+
+
+def _cones(design: Design) -> np.ndarray:
+    """What a sensor's drawing follows from, shape (S, 25): see `_cone`."""
+    return np.stack([_cone(sensor, design.level) for sensor in design.sensors])
+
+
+def _cone(sensor: Sensor, level: float) -> np.ndarray:
+    """Origin, forward, horizontal and vertical (3 each), field of view, gate (2 each), three axes of its origins."""
+    variances, axes = np.linalg.eigh(sensor.origin_covariance_m2)
+    reach = interval_factor(level) * np.sqrt(np.clip(variances, 0.0, None))
+    # what hardly spreads looks like one place; the largest axis comes first
+    spread = np.where(reach < SMALLEST_SPREAD_M, 0.0, reach) * axes
+    return np.concatenate(
+        [sensor.origin_m, sensor.frame.ravel(), field_on_sphere(sensor), sensor.gate_m, spread.T[::-1].ravel()]
+    )
+
+
+SCENE_ID = "view-scene"
+DENSITY_COLOUR = "#7b2d8b"
+CAMERA = (
+    ("left", "Turn left"),
+    ("right", "Turn right"),
+    ("up", "Higher"),
+    ("down", "Lower"),
+    ("closer", "Closer"),
+    ("farther", "Farther"),
+    ("above", "From above"),
+    ("reset", "First view"),
+)
+
+OF_SOLID = ("up", "down", "above")
+
+
+def view_section(shown: Shown, looks: Sequence[Series], density_m: np.ndarray | None) -> str:
+    """Everything of the view; `looks` are the designs' colours and dashes, `density_m` (K, 3) observed points."""
+    document = view_document(shown, looks, density_m)
+    stage = (
+        f'<div class="stage"><div id="{SCENE_ID}" tabindex="0" role="application" aria-label="3D view of the scene. '
+        'Arrow keys turn it, plus and minus go closer and farther, Home shows the first view."></div>'
+        '<img id="view-printed" alt="The 3D view as it stood when the page was printed">'
+        f"{_camera_buttons(is_flat(shown.directions))}</div>"
+    )
+    controls = "".join(
+        (_sliders(shown), _outcomes(shown), _layers(shown, density_m is not None), _designs(shown, looks))
+    )
+    return (
+        f"{''.join(f'<p>{html.escape(text)}</p>' for text in told(shown))}"
+        f'<noscript><p class="note">The view needs JavaScript; all figures stand in the tables too.</p></noscript>'
+        f'<div class="view">{stage}<div class="controls" role="group" aria-label="What is shown">{controls}</div></div>'
+        f'<p id="view-status" role="status" aria-live="polite"></p>{embedded(document, id="view-data")}'
+    )
+
+
+def told(shown: Shown) -> list[str]:
+    """Which scene is shown, how to read it, and what is left out."""
+    how = (
+        f"Held-out scene {shown.scene.name}. Lines run from where each ray starts to its first hit, or to the end of "
+        "its gate; frusta are the sensors' fields of view, tinted shells their gates, ellipses where their rays start."
+    )
+    left_out = []
+    if drawn_share(shown.scene) < 1:
+        left_out.append(f"about {MOST_FACES:,} triangles of the meshes are drawn")
+    if len(shown.scene.bodies) > MOST_BODIES:
+        left_out.append(f"the largest {MOST_BODIES} of {len(shown.scene.bodies)} bodies are drawn")
+    if len(shown.frames) < shown.scene.frames:
+        left_out.append(f"{len(shown.frames)} of {shown.scene.frames} frames are shown")
+    if len(shown.places) < shown.all_places:
+        left_out.append(f"{len(shown.places)} of {shown.all_places} positions are shown")
+    for one in shown.designs:
+        if len(one.rays[0]) < one.fired:
+            left_out.append(f"{len(one.rays[0])} of {one.fired} rays of {one.design.name} are drawn")
+    reason = "the detector's effects decide what returns" if shown.physics else ""
+    further = "; ".join([*left_out, *([reason] if reason else [])])
+    return [how, *([further[0].upper() + further[1:] + "."] if further else [])]
+
+
+def place_labels(shown: Shown) -> list[str]:
+    """What each position is called."""
+    return [", ".join(f"{name} = {value:.4g}" for name, value in place.items()) for place in shown.places]
+
+
+def frame_labels(shown: Shown) -> list[str]:
+    """What each frame is called."""
+    rate_hz, frames = shown.scene.frame_rate_hz, shown.scene.frames
+    return [f"frame {frame + 1} of {frames}, {frame / rate_hz:.2f} s" for frame in shown.frames]
+
+
+def _camera_buttons(flat: bool) -> str:
+    """What moves the camera; a world in a plane is always seen from above."""
+    moves = [(how, word) for how, word in CAMERA if not (flat and how in OF_SOLID)]
+    buttons = "".join(f'<button type="button" data-camera="{how}">{word}</button>' for how, word in moves)
+    save = '<button type="button" id="view-save">Save picture</button>'
+    return f'<div class="buttons" role="group" aria-label="Camera">{buttons}{save}</div>'
+
+
+def _sliders(shown: Shown) -> str:
+    """One slider over positions, one over frames, where there is more than one."""
+    names = " and ".join(shown.places[0]) or "position"
+    found = ""
+    for step, title, labels in (
+        ("place", f"Position: {names}", place_labels(shown)),
+        ("frame", "Time", frame_labels(shown)),
+    ):
+        if len(labels) > 1:
+            middle = len(labels) // 2
+            named = html.escape(json.dumps(labels))
+            found += (
+                f'<div class="slider"><label for="view-{step}">{html.escape(title)}</label>'
+                f'<output for="view-{step}"></output><input type="range" id="view-{step}" data-step="{step}" min="0" '
+                f'max="{len(labels) - 1}" step="1" value="{middle}" data-labels="{named}"></div>'
+            )
+    return found
+
+
+def _outcomes(shown: Shown) -> str:
+    """One switch per outcome that any ray has, with the look of its rays and how many are drawn."""
+    there = {int(code) for one in shown.designs for code in np.unique(one.outcome)} | {int(Outcome.RETURN)}
+    switches = "".join(
+        switch(name, picture=swatch(colour, dash, symbol), count=str(int(code)), outcome=str(int(code)))
+        for code, name, colour, dash, symbol in OUTCOMES
+        if int(code) in there
+    )
+    return _group("Rays", switches)
+
+
+def _layers(shown: Shown, density: bool) -> str:
+    occluders = any(not body.is_target for body in shown.scene.bodies)
+    layers = [switch("scene", picture=swatch("#c9b8a8", None), layer="scene")]
+    layers += [switch("occluders", picture=swatch("#6b7280", None), layer="occluders")] if occluders else []
+    layers += [switch("fields of view", layer="fields"), switch("gates", layer="gates")]
+    layers += [switch("where rays start", layer="starts")]
+    if density:
+        dots = swatch(DENSITY_COLOUR, "dotted")
+        layers.append(switch("what the learned density observes", picture=dots, checked=False, layer="density"))
+    return _group("Shown", "".join(layers))
+
+
+def _designs(shown: Shown, looks: Sequence[Series]) -> str:
+    """A switch per design, and one per sensor inside of it."""
+    parts = []
+    for number, (one, look) in enumerate(zip(shown.designs, looks, strict=True)):
+        picture = swatch(look.colour, DASHES[look.dash])
+        parts.append(switch(one.design.name, picture=picture, checked=number == 0, design=str(number)))
+        parts.append(_sensors(one, number))
+    return _group("Designs", "".join(parts)) if parts else ""
+
+
+def _sensors(one: ShownDesign, number: int) -> str:
+    sensors = one.design.sensors
+    if len(sensors) > MOST_SENSORS:
+        return f'<p class="sensors">{len(sensors)} sensors, drawn by their rays</p>'
+    rays = np.bincount(one.rays[0].sensor, minlength=len(sensors))
+    rows = "".join(
+        switch(f"{sensor.name}: {count} {'ray' if count == 1 else 'rays'}", sensor=f"{number}.{index}")
+        for index, (sensor, count) in enumerate(zip(sensors, rays, strict=False))
+    )
+    word = "sensor" if len(sensors) == 1 else "sensors"
+    name = html.escape(one.design.name)
+    buttons = "".join(
+        f'<button type="button" data-every="{number}" data-to="{to}" aria-label="{label} sensors of {name}">{label}'
+        "</button>"
+        for to, label in (("on", "All"), ("off", "None"))
+    )
+    return (
+        f'<details class="sensors"{" open" if number == 0 and len(sensors) <= 12 else ""}>'
+        f"<summary>{len(sensors)} {word} of {name}</summary>"
+        f'<div class="buttons">{buttons}</div>{rows}</details>'
+    )
+
+
+def _group(title: str, content: str) -> str:
+    return f"<fieldset><legend>{html.escape(title)}</legend>{content}</fieldset>"

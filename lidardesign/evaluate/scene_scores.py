@@ -1,0 +1,264 @@
+"""The checked score of lists of rays in a scene.
+
+One pass over scenes: many sets of rays, scored in each scene under the effects that it calls for.
+
+A scene is the unit of work: all its rays are planned and traced together, and what comes of it depends on nothing
+else. So scenes can be scored one after the other here, or by workers (`lidardesign.evaluate.workers.pool`), to the same
+numbers.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from lidardesign.errors import PluginError
+from lidardesign.evaluate.baselines.candidates import Positions
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Rays, Returns
+from lidardesign.geometry.triangles import SecondCasts
+from lidardesign.registry import plugin_guard
+from lidardesign.run.clock import phase
+from lidardesign.scene import Scene
+from lidardesign.simulate.physics import Physics
+from lidardesign.simulate.plan import Plan, Planner
+from lidardesign.simulate.simulate import build_casters, simulate, simulate_many
+from lidardesign.task import Residuals, Score, Task
+
+if TYPE_CHECKING:
+    from lidardesign.evaluate.baselines.candidates import Positions
+    from lidardesign.evaluate.request import EvaluationRequest
+
+
+# Rays times frames that are traced together: their returns take 24 bytes each.
+MOST_RETURNS = 4_000_000
+
+
+def score_lists(
+    task: Task,
+    scene: Scene,
+    jobs: Sequence[Positions],
+    casters: Sequence[SceneCaster],
+    physics: Physics | None = None,
+) -> Iterator[tuple[Score, float]]:
+    """Scores of many sets of rays in one scene, in their order, each with its share of the time [s].
+
+    As many are traced together as a bounded memory allows. Chance is the same for all sets and another one at each
+    position.
+
+    Arguments:
+        task: Whose score is taken.
+        scene: The scene.
+        jobs: The sets of rays.
+        casters: One per frame.
+        physics: The detector and the effects that are on; None: geometry alone.
+    """
+    for group in _groups(jobs, scene.frames):
+        started = time.perf_counter()
+        lists = [rays for positions in group for rays in positions]
+        repeats = [number for positions in group for number in range(len(positions))]
+        found = iter(simulate_many(scene, lists, casters=casters, physics=physics, repeats=repeats))
+        rays = sum(_count(positions) for positions in group)
+        per_ray = (time.perf_counter() - started) / max(rays, 1)
+        for positions in group:
+            returns = [frame for _ in positions for frame in next(found)]
+            started = time.perf_counter()
+            score = checked_score(task, scene, returns)
+            yield score, time.perf_counter() - started + per_ray * _count(positions)
+
+
+def _count(positions: Positions) -> int:
+    return sum(len(rays) for rays in positions)
+
+
+def _groups(jobs: Sequence[Positions], frames: int) -> Iterator[list[Positions]]:
+    group: list[Positions] = []
+    size = 0
+    for positions in jobs:
+        returns = _count(positions) * frames
+        if group and size + returns > MOST_RETURNS:
+            yield group
+            group, size = [], 0
+        group.append(positions)
+        size += returns
+    if group:
+        yield group
+
+
+def score_scene(task: Task, scene: Scene, rays: Rays, casters: Sequence[SceneCaster]) -> Score:
+    """The checked score of one list of rays in one scene; see `checked_score`."""
+    return checked_score(task, scene, simulate(scene, rays, casters=casters))
+
+
+@phase("metric")
+def checked_score(task: Task, scene: Scene, returns: Sequence[Returns]) -> Score:
+    """What a task makes of returns in a scene; a failure has the metric's worst value.
+
+    A value beyond the worst one counts as the worst, so that failing is never the better choice.
+
+    Raises:
+        PluginError: The task's score raised, or returned something that is no finite score.
+    """
+    where = f"task {task.name}, metric {task.metric.name}, scene {scene.name}"
+    try:
+        with plugin_guard(task.name):
+            score = task.score(scene, returns)
+    except PluginError as error:
+        raise PluginError(f"scoring failed: {error.message}", where=where, hint=error.hint) from error
+    if not isinstance(score, Score):
+        raise PluginError(
+            f"score returned {type(score).__name__}", where=where, allowed="lidardesign.task.Score"
+        )
+    _check_details(score, where)
+    if score.failed:
+        return Score(float(task.metric.worst), failed=True, details=score.details)
+    if not _is_number(score.value) or not math.isfinite(score.value):
+        raise PluginError(
+            f"score returned {score.value!r}",
+            where=where,
+            allowed="a finite number",
+            hint="where there are too few returns, return Score(metric.worst, failed=True)",
+        )
+    clip = min if task.metric.better == "lower" else max
+    return Score(clip(float(score.value), float(task.metric.worst)), details=score.details)
+
+
+def gives_residuals(task: Task) -> bool:
+    """Whether a task says where in a scene the error is."""
+    return callable(getattr(task, "residuals", None))
+
+
+@phase("metric")
+def checked_residuals(task: Task, scene: Scene, returns: Sequence[Returns]) -> Residuals:
+    """Where the error of returns is in a scene, by a task that gives residuals.
+
+    Raises:
+        PluginError: The task's code raised, or returned something else.
+    """
+    where = f"task {task.name}, residuals, scene {scene.name}"
+    try:
+        with plugin_guard(task.name):
+            found = task.residuals(scene, returns)  # type: ignore[attr-defined]
+    except PluginError as error:
+        raise PluginError(f"residuals failed: {error.message}", where=where, hint=error.hint) from error
+    if not isinstance(found, Residuals):
+        raise PluginError(
+            f"residuals returned {type(found).__name__}", where=where, allowed="lidardesign.task.Residuals"
+        )
+    return found
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+
+
+def _check_details(score: Score, where: str) -> None:
+    if not isinstance(score.details, Mapping) or not all(isinstance(name, str) for name in score.details):
+        raise PluginError(
+            f"score returned the details {score.details!r}", where=where, allowed="numbers by name, as {'seen': 3.0}"
+        )
+    bad = [name for name, value in score.details.items() if not _is_number(value)]
+    if bad:
+        raise PluginError(
+            f"score returned the detail {bad[0]!r}: {score.details[bad[0]]!r}", where=where, allowed="a number"
+        )
+
+
+Progress = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class ScenePass:
+    """Sets of rays to be scored in all held-out scenes.
+
+    Arguments:
+        fired: The sets of rays that are fired in a scene, by its number.
+        planner: How their effects are chosen.
+        plans: The plan of every scene where it is known already; empty: they are made.
+    """
+
+    fired: Callable[[int], Sequence[Positions]]
+    planner: Planner
+    plans: Sequence[Plan] = ()
+
+    def known(self, number: int) -> Plan | None:
+        """The plan of a scene, if it is known."""
+        return self.plans[number] if self.plans else None
+
+
+@dataclass(frozen=True, eq=False)
+class SceneScores:
+    """What came of a scene.
+
+    Arguments:
+        plan: What was simulated.
+        planning_seconds: Time to find that out [s].
+        scores: Of every set of rays, in their order, each with its share of the time [s].
+        second_casts: How often meshes had to be asked twice, in planning too.
+    """
+
+    plan: Plan
+    planning_seconds: float
+    scores: Sequence[tuple[Score, float]]
+    second_casts: SecondCasts = field(default_factory=SecondCasts)
+
+
+class Scorer(Protocol):
+    """Scores all held-out scenes of a request, in their order."""
+
+    def __call__(
+        self, request: EvaluationRequest, scene_pass: ScenePass, progress: Progress | None
+    ) -> Sequence[SceneScores]:
+        """As `score_here`."""
+        ...
+
+
+def score_here(request: EvaluationRequest, scene_pass: ScenePass, progress: Progress | None) -> list[SceneScores]:
+    """Score scene by scene in this process, so that only one scene's casters are held at a time.
+
+    Arguments:
+        request: Whose held-out scenes, task and seed are taken.
+        scene_pass: What is fired, and under which effects.
+        progress: Called with the scenes done, all scenes, and the name of the scene.
+    """
+    found = []
+    for number, scene in enumerate(request.test):
+        if progress:
+            progress(number, len(request.test), scene.name)
+        lists = scene_pass.fired(number)
+        known = scene_pass.known(number)
+        found.append(score_in_scene(request.task, scene, lists, scene_pass.planner, known, request.seed))
+    if progress:
+        progress(len(request.test), len(request.test), "")
+    return found
+
+
+def score_in_scene(
+    task: Task, scene: Scene, lists: Sequence[Positions], planner: Planner, known: Plan | None, seed: int
+) -> SceneScores:
+    """Score sets of rays in one scene.
+
+    Arguments:
+        task: Whose score is taken.
+        scene: The scene.
+        lists: The sets of rays.
+        planner: How effects are chosen.
+        known: The plan; None makes it for all the rays together.
+        seed: Root of the effects' random streams.
+
+    Raises:
+        ConfigError: An effect that was named cannot be simulated here, or a gate lies outside the histogram.
+        PluginError: The task's score raised, or returned something that is no finite score.
+    """
+    casters = build_casters(scene)
+    started = time.perf_counter()
+    plan = known or planner.plan(scene, [rays for positions in lists for rays in positions], casters)
+    seconds = time.perf_counter() - started
+    scores = list(score_lists(task, scene, lists, casters, planner.physics(plan, seed)))
+    second_casts = sum((caster.second_casts for caster in casters), SecondCasts())
+    return SceneScores(plan, seconds, scores, second_casts)

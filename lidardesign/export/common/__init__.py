@@ -1,0 +1,1 @@
+"""What several formats share: names, poses, columns, XML, and reading back."""

@@ -1,0 +1,244 @@
+"""Where sensors are mounted and which rays they fire from there, as robots and simulators hold it.
+
+A mount has the sensor's place and boresight frame: x forward, y to the left (growing azimuth), z up. By fixed axes
+(URDF, SDF) its rotation is roll = the sensor's roll, pitch = -elevation, yaw = azimuth. The rays are given in that
+frame. What starts elsewhere than at its sensor's place is told in notes, and so are gates of single rays.
+
+Rays by the place where they start, and rays that were read place by place.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidardesign.design.layouts.rays import DEFAULT_RATE_HZ
+from lidardesign.design.sensor import Design, Sensor
+from lidardesign.errors import DataError
+from lidardesign.estimates import ROUNDING, Estimate
+from lidardesign.export.common.names import identifiers
+from lidardesign.export.common.read_back import angles_between
+from lidardesign.geometry.rays import Rays
+from lidardesign.numerics import SLACK
+from lidardesign.space import angles
+
+# Origins and gates closer than this are the same.
+SAME_M = SLACK
+
+
+@dataclass(frozen=True, eq=False)
+class Mount:
+    """One sensor where it is mounted, and what it fires.
+
+    Arguments:
+        name: An identifier, unique in the design.
+        sensor: What is mounted.
+        index: Its index in the design.
+        origin_m: The mean of where its rays start, shape (3,).
+        ray: Indices of its rays, shape (N,), N >= 1.
+        azimuth_rad, elevation_rad: Of its rays in its frame, azimuths from -pi to pi, shape (N,).
+        gate_m: The narrowest gate that holds those of all its rays, start and end.
+        spread_m: How far from its place its rays start at most.
+        gate_excess_m: How much wider than a ray's own gate `gate_m` is at most.
+    """
+
+    name: str
+    sensor: Sensor
+    index: int
+    origin_m: np.ndarray
+    ray: np.ndarray
+    azimuth_rad: np.ndarray
+    elevation_rad: np.ndarray
+    gate_m: tuple[float, float]
+    spread_m: float
+    gate_excess_m: float
+
+    @property
+    def roll_pitch_yaw_rad(self) -> tuple[float, float, float]:
+        """About the fixed axes x, y, z, in this order."""
+        return self.sensor.roll_rad, -self.sensor.elevation_rad, self.sensor.azimuth_rad
+
+    @property
+    def quaternion(self) -> tuple[float, float, float, float]:
+        """The rotation from its frame to the world as (w, x, y, z)."""
+        return quaternion(*self.roll_pitch_yaw_rad)
+
+
+def mounts(design: Design, rays: Rays) -> list[Mount]:
+    """The sensors of a design that fire rays, in their order."""
+    names = identifiers([sensor.name for sensor in design.sensors])
+    order = np.argsort(rays.sensor, kind="stable")
+    edges = np.searchsorted(rays.sensor[order], np.arange(len(design.sensors) + 1))
+    return [
+        _mount(name, sensor, index, rays, order[edges[index] : edges[index + 1]])
+        for index, (name, sensor) in enumerate(zip(names, design.sensors, strict=True))
+        if edges[index] < edges[index + 1]
+    ]
+
+
+def _mount(name: str, sensor: Sensor, index: int, rays: Rays, ray: np.ndarray) -> Mount:
+    origin = rays.origin_m[ray].mean(axis=0)
+    # a mean of equal numbers need not be that number
+    origin = rays.origin_m[ray[0]] if (rays.origin_m[ray] == rays.origin_m[ray[0]]).all() else origin
+    azimuth, elevation = angles(rays.direction[ray] @ sensor.frame.T)
+    gate = rays.gate_m[ray]
+    start, end = float(gate[:, 0].min()), float(gate[:, 1].max())
+    return Mount(
+        name,
+        sensor,
+        index,
+        origin,
+        ray,
+        np.where(azimuth > np.pi, azimuth - 2 * np.pi, azimuth),
+        elevation,
+        (start, end),
+        float(np.linalg.norm(rays.origin_m[ray] - origin, axis=1).max()),
+        float(np.maximum(gate[:, 0] - start, end - gate[:, 1]).max()),
+    )
+
+
+def quaternion(roll_rad: float, pitch_rad: float, yaw_rad: float) -> tuple[float, float, float, float]:
+    """The unit quaternion (w, x, y, z) of rotations about the fixed axes x, y, z, in this order."""
+    cos_r, sin_r = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
+    cos_p, sin_p = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
+    cos_y, sin_y = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
+    return (
+        cos_r * cos_p * cos_y + sin_r * sin_p * sin_y,
+        sin_r * cos_p * cos_y - cos_r * sin_p * sin_y,
+        cos_r * sin_p * cos_y + sin_r * cos_p * sin_y,
+        cos_r * cos_p * sin_y - sin_r * sin_p * cos_y,
+    )
+
+
+def fire_times_s(rays: Rays, rate_hz: float) -> np.ndarray:
+    """When rays fire in a frame of another rate than they were laid out for [s]."""
+    return rays.time_s * (DEFAULT_RATE_HZ / rate_hz)
+
+
+def design_losses(design: Design, mounted: Sequence[Mount]) -> list[str]:
+    """What no format of mounted sensors holds of a design, and sensors that fire nothing."""
+    notes = ["weights, spreads and origin covariances of the sensors are not held"]
+    if design.constraints:
+        notes.append("the constraints of the design are not held")
+    silent = len(design.sensors) - len(mounted)
+    if silent:
+        notes.append(f"{silent} of {len(design.sensors)} sensors fire no ray and are left out")
+    return notes
+
+
+def origin_losses(mounted: Sequence[Mount]) -> list[str]:
+    """What formats lose in which all rays of a sensor start at one place."""
+    spread = [one for one in mounted if one.spread_m > SAME_M]
+    if not spread:
+        return []
+    rays, worst = sum(len(one.ray) for one in spread), max(one.spread_m for one in spread)
+    return [
+        f"{rays} rays of {len(spread)} sensors start all over them: they start at their middle, up to {worst:.3g} m off"
+    ]
+
+
+def gate_losses(mounted: Sequence[Mount]) -> list[str]:
+    """What formats lose in which all rays of a sensor have one gate."""
+    wider = [one for one in mounted if one.gate_excess_m > SAME_M]
+    if not wider:
+        return []
+    worst = max(one.gate_excess_m for one in wider)
+    return [
+        f"the rays of {len(wider)} of {len(mounted)} sensors have gates of their own: the sensor's is the narrowest "
+        f"that holds them all, up to {worst:.3g} m wider"
+    ]
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """What was read back of one mount: its place, unit vectors of its rays (M, 3), its gate; NaN is not held."""
+
+    origin_m: np.ndarray
+    direction: np.ndarray
+    gate_m: tuple[float, float]
+
+
+def held_rounding(rays: Rays, mounted: Sequence[Mount], found: Sequence[Held]) -> dict[str, Estimate]:
+    """The largest differences from what one place, one gate and other rays make of a sensor's.
+
+    A direction is off by the angle to the nearest ray that its sensor fires.
+    """
+    from scipy.spatial import cKDTree
+
+    origin, ray, gate = [0.0], [0.0], [0.0]
+    for mount, held in zip(mounted, found, strict=True):
+        origin.append(float(np.linalg.norm(rays.origin_m[mount.ray] - held.origin_m, axis=1).max()))
+        looking = rays.direction[mount.ray]
+        nearest = held.direction[cKDTree(held.direction).query(looking)[1]]
+        ray.append(float(angles_between(looking, nearest).max()))
+        difference = np.abs(rays.gate_m[mount.ray] - np.array(held.gate_m))
+        gate.append(float(np.nanmax(difference, initial=0.0)))
+    fired = sum(len(held.direction) for held in found)
+    return {
+        "origin_m": Estimate(None, max(origin), "m", ROUNDING),
+        "direction_rad": Estimate(None, max(ray), "rad", ROUNDING),
+        "gate_m": Estimate(None, max(gate), "m", ROUNDING),
+        "rays": Estimate(None, float(abs(fired - len(rays))), "", ROUNDING),
+    }
+
+
+# Rays as read from one part of a file: indices of shape (K,), origins, directions (K, 3) and gates (K, 2).
+Part = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Rays of one sensor that start at one place.
+
+    Arguments:
+        name: An identifier, unique in the design: that of the sensor, numbered where it has several places.
+        mount: The sensor.
+        origin_m: The place [m], shape (3,).
+        ray: Indices of its rays in their order, shape (K,).
+    """
+
+    name: str
+    mount: Mount
+    origin_m: np.ndarray
+    ray: np.ndarray
+
+
+def places(mounted: Sequence[Mount], rays: Rays) -> list[Place]:
+    """The places of all sensors, by sensor and then in the order in which they first fire."""
+    found = []
+    for mount in mounted:
+        origins, first, place = np.unique(rays.origin_m[mount.ray], axis=0, return_index=True, return_inverse=True)
+        place = place.reshape(-1)
+        members = np.split(mount.ray[np.argsort(place, kind="stable")], np.cumsum(np.bincount(place))[:-1])
+        for number, here in enumerate(np.argsort(first)):
+            name = mount.name if len(origins) == 1 else f"{mount.name}_place_{number}"
+            found.append(Place(name, mount, origins[here], members[here]))
+    return found
+
+
+def require_rays(design: Design, rays: Rays, what: str) -> None:
+    """Refuse a design without rays, for a format that is made of them.
+
+    Raises:
+        DataError: There are none.
+    """
+    if not len(rays):
+        raise DataError(f"has no rays, and {what} holds nothing else", where=design.name, hint="give --rays N")
+
+
+def rays_of_parts(written: Rays, parts: Sequence[Part], where: str) -> Rays:
+    """Rays that were read part by part, in the order of those that were written, with their sensors and times.
+
+    Raises:
+        DataError: The parts are not the rays.
+    """
+    index = np.concatenate([part[0] for part in parts]) if parts else np.zeros(0, dtype=np.int64)
+    same = all(len(part[0]) == len(value) for part in parts for value in part[1:])
+    if not same or not np.array_equal(np.sort(index), np.arange(len(written))):
+        raise DataError("does not hold what was written", where=where, hint="export it again, to another disk")
+    order = np.argsort(index)
+    origin, looking, gate = (np.concatenate([part[k] for part in parts])[order] for k in (1, 2, 3))
+    return Rays(origin, looking, gate, written.sensor, written.time_s)

@@ -1,0 +1,1 @@
+"""Rays, bodies, and where they meet."""

@@ -1,0 +1,134 @@
+"""Weighted samples of the learned density, kept in the run so that `fit` and `constrain` need no flow."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from lidardesign.errors import DataError
+from lidardesign.numerics import normalised_weights, systematic_draw
+from lidardesign.run.arrays import guarded, read_npz
+from lidardesign.run.clock import phase
+from lidardesign.run.manifest import verify, write_recorded
+from lidardesign.space import RANGE, DesignSpace
+
+FILE_NAME = "samples.npz"
+NUMBERS = ("points", "log_prob", "log_target")
+DAMAGED_HINT = "learn the run again"
+NOT_FINITE = "holds values that are not finite"
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Samples of the flow with what is needed to weight them to the target.
+
+    Arguments:
+        points: Design points, shape (N, 6).
+        log_prob: The density that they were drawn from, per chart volume, shape (N,).
+        log_target: log p* at them, unnormalised, shape (N,).
+        space: The design space of both densities.
+
+    Raises:
+        DataError: Values that are no numbers; log p* alone may be -inf.
+    """
+
+    points: np.ndarray
+    log_prob: np.ndarray
+    log_target: np.ndarray
+    space: DesignSpace
+
+    def __post_init__(self) -> None:
+        finite = np.isfinite(self.points).all() and np.isfinite(self.log_prob).all()
+        if not (finite and (self.log_target < np.inf).all()):
+            raise DataError(NOT_FINITE, where="samples", hint=DAMAGED_HINT)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def log_weights(self) -> np.ndarray:
+        """log p* - log p, the unclipped importance weights, shape (N,)."""
+        return self.log_target - self.log_prob
+
+    @cached_property
+    def weights(self) -> np.ndarray:
+        """Importance weights that sum to 1, shape (N,)."""
+        try:
+            return normalised_weights(self.log_weights)
+        except ValueError:
+            raise DataError("no sample of the run has a finite weight", hint="learn the run again") from None
+
+    @property
+    def effective_sample_size(self) -> float:
+        """ESS = (sum w)^2 / (N sum w^2), a share of N between 0 and 1."""
+        return float(1.0 / (len(self) * np.square(self.weights).sum()))
+
+    def subset(self, keep: np.ndarray) -> Samples:
+        """The samples at an index or mask."""
+        return Samples(self.points[keep], self.log_prob[keep], self.log_target[keep], self.space)
+
+    def reweighted(self, log_factors: np.ndarray) -> Samples:
+        """The samples with log p* moved by so much at each of them, shape (N,): of another target density."""
+        return replace(self, log_target=self.log_target + log_factors)
+
+    def retargeted(self, log_target: np.ndarray) -> Samples:
+        """The samples with another log p*, shape (N,), which they may have where the old one is -inf."""
+        return replace(self, log_target=log_target)
+
+    def spread_in_range(self, spread_m: float, generator: np.random.Generator) -> Samples:
+        """The samples with normal noise on their ranges, inside the space: what scenes that were not seen may be.
+
+        Weights stay; log p* is no longer that of the moved points.
+        """
+        low, high = self.space.low[RANGE], self.space.high[RANGE]
+        points = self.points.copy()
+        points[:, RANGE] = np.clip(points[:, RANGE] + spread_m * generator.normal(size=len(self)), low, high)
+        return replace(self, points=points)
+
+    def resample(self, count: int, generator: np.random.Generator) -> np.ndarray:
+        """Design points drawn from p* by systematic importance resampling, shape (count, 6)."""
+        return self.points[generator.permutation(systematic_draw(self.weights, count, generator))]
+
+
+def save_samples(samples: Samples, run: Path) -> None:
+    """Write the samples into a run folder, atomically, with their hash in the manifest at every moment."""
+    buffer = io.BytesIO()
+    np.savez(
+        buffer,
+        points=samples.points,
+        log_prob=samples.log_prob,
+        log_target=samples.log_target,
+        space=np.frombuffer(json.dumps(samples.space.as_dict()).encode(), dtype=np.uint8),
+    )
+    write_recorded(run, FILE_NAME, buffer.getvalue())
+
+
+@phase("samples")
+def load_samples(run: Path) -> Samples:
+    """Read the samples of a run folder.
+
+    Raises:
+        DataError: The file is missing, damaged, or holds values that are not finite.
+    """
+    verify(run, FILE_NAME)
+    path = run / FILE_NAME
+    arrays = read_npz(path, hint=DAMAGED_HINT)
+    missing = [name for name in (*NUMBERS, "space") if name not in arrays]
+    if missing:
+        raise DataError(f"has no {', '.join(missing)}", where=str(path), hint=DAMAGED_HINT)
+    points, log_prob, log_target = (arrays[name] for name in NUMBERS)
+    count = len(points) if points.ndim else 0
+    for array, shape in ((points, (count, 6)), (log_prob, (count,)), (log_target, (count,))):
+        if array.shape != shape or array.dtype != np.float64 or not count:
+            found, allowed = f"holds an array of {array.dtype} of shape {array.shape}", f"float64 of shape {shape}"
+            raise DataError(found, where=str(path), allowed=allowed, hint=DAMAGED_HINT)
+    space = guarded(lambda: DesignSpace.from_dict(json.loads(arrays["space"].tobytes())), path, DAMAGED_HINT)
+    try:
+        return Samples(points, log_prob, log_target, space)
+    except DataError as error:
+        raise DataError(error.message, where=str(path), hint=error.hint) from None

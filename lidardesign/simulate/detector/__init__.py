@@ -1,0 +1,1 @@
+"""What a receiver and its laser do to light."""

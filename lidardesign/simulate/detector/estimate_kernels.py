@@ -1,0 +1,337 @@
+"""Compiled loops that find the return in a histogram, and say whether it is one.
+
+The range is the middle of the highest bin, or the maximum of the log-matched filter: the likelihood of a pulse of the
+known shape g at a bin k in an even background b,
+
+    L(k) = sum_j h_{k+j} log(1 + s g_j / b) - s sum_j g_j,
+
+over the bins k + j in the window, with as many signal photons s as stand out (Rapp and Goyal 2017; the second term
+only tells pulses that the window cuts off), refined by a parabola through its neighbours.
+
+It is reported if the photons within one full width at half maximum around it are more than the background alone
+brings anywhere in the window with the allowed probability: bins * P(Poisson(b m) >= n) <= false_alarm, m bins wide.
+
+Compiled loops that find the return in a histogram and know that the detector is blind after a count.
+
+A pulse can only be counted in while it is alive. With the counts so far, the share a_b of pulses that are alive in bin
+b is known, and the counts expected there are a_b (b + s g) per alive pulse (Coates 1968, for any dead time). So a level
+of background is a level per alive share, and the log-matched filter (see `estimate_kernels`) becomes
+
+    L(k) = sum_j h_{k+j} log(1 + s g_j / b) - s sum_j a_{k+j} g_j,
+
+with h the photons that arrived in alive pulses, of which only one per pulse and bin was counted.
+What pile-up has taken away is not brought back: a pulse in a bin with few alive pulses has few counts.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from lidardesign.numerics import ROUNDING
+
+# Outside of this many standard deviations around a pulse, photons are background
+PULSE_REACH = 4.0
+# With fewer photons outside of the pulse than this, the level that is known beforehand is the better one
+FEW_PHOTONS = 10
+# A level that is measured in less than this many bins is none
+LEAST_BINS = 0.5
+# Above this mean, Poisson's tail is taken as a normal one
+NORMAL_MEAN = 1e5
+# Terms of a tail's sum that are smaller than this share of it do not change it
+TAIL_PRECISION = ROUNDING
+
+
+@njit(cache=True, nogil=True)
+def at_least(number, mean):  # noqa: ANN001, ANN201
+    """P(Poisson(mean) >= number); 1 where the number is not above the mean."""
+    if number <= mean or number <= 0:
+        return 1.0
+    if mean <= 0:
+        return 0.0
+    if mean > NORMAL_MEAN:
+        return 0.5 * math.erfc((number - 0.5 - mean) / math.sqrt(2.0 * mean))
+    term = math.exp(number * math.log(mean) - mean - math.lgamma(number + 1.0))
+    total, k = term, number
+    while term > TAIL_PRECISION * total:
+        k += 1
+        term *= mean / k
+        total += term
+    return total
+
+
+@njit(cache=True, nogil=True)
+def pulse_shape(width, sigma, longest):  # noqa: ANN001, ANN201
+    """The share of a pulse in each bin around the one that it is centred in, as far as bins can lie apart."""
+    reach = min(math.ceil(PULSE_REACH * sigma / width), max(longest - 1, 0))
+    shape = np.ones(2 * reach + 1)
+    if sigma > 0:
+        scale = width / (math.sqrt(2.0) * sigma)
+        for j in range(-reach, reach + 1):
+            shape[j + reach] = 0.5 * (math.erf((j + 0.5) * scale) - math.erf((j - 0.5) * scale))
+    return shape
+
+
+@njit(cache=True, nogil=True)
+def _fullest(counts, half):  # noqa: ANN001, ANN202
+    """The middle of the bins b - half to b + half that hold the most, the first of equals."""
+    size = len(counts)
+    total = 0
+    for b in range(min(half, size)):
+        total += counts[b]
+    best, most = 0, -1
+    for b in range(size):
+        if b + half < size:
+            total += counts[b + half]
+        if b - half - 1 >= 0:
+            total -= counts[b - half - 1]
+        if total > most:
+            best, most = b, total
+    return best
+
+
+@njit(cache=True, nogil=True)
+def _sum_around(counts, middle, half):  # noqa: ANN001, ANN202
+    total = 0
+    for b in range(max(middle - half, 0), min(middle + half, len(counts) - 1) + 1):
+        total += counts[b]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def vertex(score, best):  # noqa: ANN001, ANN201
+    """By how much of a bin the vertex of the parabola through a maximum and its neighbours lies off it."""
+    if best == 0 or best == len(score) - 1:
+        return 0.0
+    left, middle, right = score[best - 1], score[best], score[best + 1]
+    if not (math.isfinite(left) and math.isfinite(right)):
+        return 0.0
+    bend = left - 2 * middle + right
+    return 0.5 * (left - right) / bend if bend < 0 else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _matched(counts, shape, below, signal, level, score):  # noqa: ANN001, ANN202
+    """The bin of the largest log-likelihood, and by how much of a bin its vertex lies off the bin's middle.
+
+    `below` are the running sums of the pulse's shape, from 0 on.
+    """
+    size, reach = len(counts), len(shape) // 2
+    weight = np.log1p(signal / level * shape)
+    score[:size] = -signal
+    for edge in range(min(reach, size)):
+        for b in (edge, size - 1 - edge):
+            inside = below[min(reach, size - 1 - b) + reach + 1] - below[max(-reach, -b) + reach]
+            score[b] = -signal * inside
+    for b in range(size):
+        if counts[b] > 0:
+            for j in range(max(-reach, b - size + 1), min(reach, b) + 1):
+                score[b - j] += counts[b] * weight[j + reach]
+    best = 0
+    for b in range(1, size):
+        if score[b] > score[best]:
+            best = b
+    return best, vertex(score[:size], best)
+
+
+@njit(cache=True, nogil=True)
+def _heard(first, last, size, ends):  # noqa: ANN001, ANN202
+    """How many bins are listened to between two, both included, where the outermost ones are listened to in part."""
+    count = last - first + 1.0
+    if first == 0:
+        count -= 1.0 - ends[0]
+    if last == size - 1:
+        count -= 1.0 - ends[1]
+    return count
+
+
+@njit(cache=True, nogil=True)
+def find_returns(counts, offset, ends, width, sigma, half, known_level, false_alarm, matched):  # noqa: ANN001, ANN201
+    """Where each ray's return is, in bins from its first bin's start, NaN without one, shape (N,).
+
+    Arguments are the flat counts and where rays begin in them, the shares of a ray's first and last bin that lie in its
+    window (N, 2), a bin's width and a photon's timing error in the same unit, bins on either side of a bin that belong
+    to its pulse, the background per bin that is known beforehand (N,), the allowed probability of a false alarm, and
+    whether to take the matched filter's maximum or the highest bin.
+    """
+    found = np.full(len(offset) - 1, np.nan)
+    longest = 0
+    for i in range(len(offset) - 1):
+        longest = max(longest, offset[i + 1] - offset[i])
+    shape = pulse_shape(width, sigma, longest)
+    below = np.concatenate((np.zeros(1), np.cumsum(shape)))
+    reach = len(shape) // 2
+    score = np.empty(longest)
+    for i in range(len(offset) - 1):
+        mine = counts[offset[i] : offset[i + 1]]
+        size, total = len(mine), mine.sum()
+        if total == 0:
+            continue
+        middle = _fullest(mine, half)
+        pulse = _sum_around(mine, middle, reach)
+        own = _heard(max(middle - reach, 0), min(middle + reach, size - 1), size, ends[i])
+        others = _heard(0, size - 1, size, ends[i]) - own
+        level = (total - pulse) / others if others > LEAST_BINS else known_level[i]
+        if total - pulse < FEW_PHOTONS:
+            level = max(level, known_level[i])
+        within = 0.0
+        if matched:
+            signal = max(pulse - level * own, 1.0)
+            # less than one photon in the whole window cannot be told from none
+            best, within = _matched(mine, shape, below, signal, max(level, 1.0 / size), score)
+        else:
+            best = mine.argmax()
+        around = _heard(max(best - half, 0), min(best + half, size - 1), size, ends[i])
+        if size * at_least(_sum_around(mine, best, half), level * around) <= false_alarm:
+            found[i] = best + 0.5 + within
+    return found
+
+
+# How often the place of the pulse is used to tell it from the background that it is then found in
+PASSES = 3
+
+
+@njit(cache=True, nogil=True)
+def alive_shares(counts, pulses, dead, period):  # noqa: ANN001, ANN201
+    """The share of pulses that are alive in each bin, given all counts of a frame; times in bins.
+
+    Blind are the pulses with a count less than a dead time ago, in the same pulse or in one before.
+    """
+    size = len(counts)
+    running = np.zeros(size + 1)
+    for b in range(size):
+        running[b + 1] = running[b] + counts[b]
+    alive = np.empty(size)
+    for b in range(size):
+        blind = running[b] - running[min(max(math.floor(b - dead) + 1, 0), b)]
+        # pulses back so far that any count of theirs still blinds, then those of which only the late ones do
+        back = max(math.ceil((dead - b) / period) - 1, 0)
+        blind += back * running[size]
+        since = b + (back + 1) * period - dead
+        while since < size:
+            blind += running[size] - running[min(max(math.floor(since) + 1, 0), size)]
+            back += 1
+            since = b + (back + 1) * period - dead
+        alive[b] = max(1.0 - blind / pulses, 1.0 / pulses)
+    return alive
+
+
+@njit(cache=True, nogil=True)
+def arrived(counted, pulses):  # noqa: ANN001, ANN201
+    """How many photons fell into so many alive pulses of which `counted` had at least one, as far as that tells."""
+    return -pulses * math.log1p(-min(counted / pulses, 1.0 - 1.0 / (pulses + 1.0)))
+
+
+@njit(cache=True, nogil=True)
+def _running(values):  # noqa: ANN001, ANN202
+    sums = np.zeros(len(values) + 1)
+    for b in range(len(values)):
+        sums[b + 1] = sums[b] + values[b]
+    return sums
+
+
+@njit(cache=True, nogil=True)
+def _around(sums, middle, half):  # noqa: ANN001, ANN202
+    """The sum of bins middle - half to middle + half, as far as there are any."""
+    return sums[min(middle + half + 1, len(sums) - 1)] - sums[max(middle - half, 0)]
+
+
+@njit(cache=True, nogil=True)
+def _stands_out(counted, room, level, half):  # noqa: ANN001, ANN202
+    """The middle of the bins that hold the most beyond their level, by running sums."""
+    best, most = 0, -np.inf
+    for b in range(len(counted) - 1):
+        excess = _around(counted, b, half) - level * _around(room, b, half)
+        if excess > most:
+            best, most = b, excess
+    return best
+
+
+@njit(cache=True, nogil=True)
+def _corrected_heard(alive, shape, middle):  # noqa: ANN001, ANN202
+    """The share of a pulse in a bin's middle that falls into alive pulses."""
+    reach, total = len(shape) // 2, 0.0
+    for b in range(max(middle - reach, 0), min(middle + reach, len(alive) - 1) + 1):
+        total += alive[b] * shape[b - middle + reach]
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _corrected_matched(counts, alive, shape, signal, level, score):  # noqa: ANN001, ANN202
+    """The bin of the largest log-likelihood, and by how much of a bin its vertex lies off the bin's middle.
+
+    Only bins that a photon speaks for are considered.
+    """
+    size, reach = len(counts), len(shape) // 2
+    weight = np.log1p(signal / level * shape)
+    score[:size] = 0.0
+    for b in range(size):
+        if counts[b] > 0:
+            for j in range(max(-reach, b - size + 1), min(reach, b) + 1):
+                score[b - j] += counts[b] * weight[j + reach]
+    best, most = 0, -np.inf
+    for b in range(size):
+        spoken_for = score[b] > 0
+        score[b] = score[b] - signal * _corrected_heard(alive, shape, b) if spoken_for else -np.inf
+        if score[b] > most:
+            best, most = b, score[b]
+    return best, vertex(score[:size], best)
+
+
+@njit(cache=True, nogil=True)
+def find_corrected(  # noqa: ANN201
+    counts,  # noqa: ANN001
+    offset,  # noqa: ANN001
+    ends,  # noqa: ANN001
+    width,  # noqa: ANN001
+    sigma,  # noqa: ANN001
+    half,  # noqa: ANN001
+    known_level,  # noqa: ANN001
+    false_alarm,  # noqa: ANN001
+    matched,  # noqa: ANN001
+    pulses,  # noqa: ANN001
+    dead,  # noqa: ANN001
+    period,  # noqa: ANN001
+):
+    """As `find_returns`, with the pulses of a frame, and dead time and time between pulses in bins."""
+    found = np.full(len(offset) - 1, np.nan)
+    longest = 0
+    for i in range(len(offset) - 1):
+        longest = max(longest, offset[i + 1] - offset[i])
+    score = np.empty(longest)
+    for i in range(len(offset) - 1):
+        mine = counts[offset[i] : offset[i + 1]]
+        size, total = len(mine), mine.sum()
+        if total == 0:
+            continue
+        shape = pulse_shape(width, sigma, size)
+        reach = len(shape) // 2
+        alive = alive_shares(mine, pulses, dead, period)
+        photons = np.empty(size)
+        for b in range(size):
+            photons[b] = arrived(mine[b], alive[b] * pulses)
+        alive[0] *= ends[i, 0]
+        alive[-1] *= ends[i, 1]
+        counted, room, light = _running(mine), _running(alive), _running(photons)
+        level, within = total / room[size], 0.0
+        best = _stands_out(counted, room, level, half)
+        for _ in range(PASSES):
+            before = best
+            pulse, own = _around(counted, best, reach), _around(room, best, reach)
+            others = room[size] - own
+            level = (total - pulse) / others if others > LEAST_BINS else known_level[i]
+            if total - pulse < FEW_PHOTONS:
+                level = max(level, known_level[i])
+            if matched:
+                ambient = max(arrived(level, pulses), 1.0 / size)
+                signal = max(_around(light, best, reach) - ambient * own, 1.0) / _corrected_heard(alive, shape, best)
+                best, within = _corrected_matched(photons, alive, shape, signal, ambient, score)
+            else:
+                best = _stands_out(counted, room, level, 0)
+            if best == before:
+                break
+        if size * at_least(_around(counted, best, half), level * _around(room, best, half)) <= false_alarm:
+            found[i] = best + 0.5 + within
+    return found

@@ -1,0 +1,399 @@
+"""Expected counts of signal and background, and how likely a detector misses the one or mistakes the other for it.
+
+Counts are Poisson. A return is the highest of B bins, or where a pulse fits best, reported if the m bins of one pulse's
+width around it hold at least k counts, the fewest that background alone brings to any of B such places with at most the
+detector's probability of a false alarm.
+
+Expected counts of light that the emitter did not send, and of what the air sends back.
+
+What a detector that is blind after each count leaves of echoes and of background: pile-up, for all bounds.
+
+Per pulse s counts of the echo, m counts before it and w in the whole gate are expected. Of the echo the first photon
+counts, with the probability exp(-m) (1 - exp(-s)); every count also blinds the c pulses that its dead time reaches
+into, which leaves the share 1 / (1 + c (1 - exp(-w))) of them. Of K photons, normal with sigma, the first is early by
+at most sigma min(sqrt(2 ln K), (K - 1) / sqrt(pi)), in the mean over K >= 1 as well (both bounds are concave in K or
+linear; Jensen), with E K = s / (1 - exp(-s)).
+
+Background is thinned alike: from all of it at the gate's start to exp(-m) under the echo. Its mean level, which returns
+are judged by, lies below its start, so that the start itself may be taken for a return.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from lidardesign.geometry.receiver import range_of_path
+from lidardesign.numerics import COARSE_SLACK, EPSILON, TINY, safe_divide
+from lidardesign.scene import SPEED_OF_LIGHT_M_S
+from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, Detector, metres
+from lidardesign.simulate.detector.histogram import bin_width_m
+from lidardesign.simulate.detector.light import spectral_irradiance
+from lidardesign.simulate.effects.first_hits import Sight
+
+# Rays pass a receiver no nearer than this share of their way: differences of arctangents are then exact to 1e-9.
+NEAREST_SHARE = COARSE_SLACK
+
+
+def ambient_per_metre(sight: Sight) -> np.ndarray:
+    """Ambient and dark counts per pulse and metre of range, shape (N,).
+
+    What a ray meets has the radiance reflectance E / pi, seen through the aperture and the pixel's field of view, and
+    what meets nothing sees no light; a metre of range takes 2 / c.
+    """
+    photons, ambient = sight.detector.photons, sight.scene.ambient
+    rate_hz = np.full(len(sight), photons.dark_hz)
+    if ambient is not None:
+        irradiance = spectral_irradiance(ambient, photons.wavelength_m, photons.filter_m)
+        power_w = irradiance / math.pi * photons.filter_m * photons.aperture_m2 * photons.field_of_view_sr
+        reflectance = np.array([*(body.reflectance for body in sight.scene.bodies), 0.0])[sight.hits.body]
+        rate_hz += reflectance * power_w * photons.efficiency / photons.photon_energy_j
+    return rate_hz * 2 / SPEED_OF_LIGHT_M_S
+
+
+def haze_per_pulse(sight: Sight, emitted: np.ndarray, bin_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Counts per pulse that the air sends back, at most: in the window up to the return, and in one bin, shapes (N,).
+
+    From r to r + dr it sends beta Omega(r) exp(-2 alpha r) dr into an aperture, a disc of radius a seen under the solid
+    angle Omega = 2 pi (1 - r / sqrt(r^2 + a^2)), with the integral 2 pi (r - sqrt(r^2 + a^2)); what fades within the
+    window is not taken off. Before the range 1 / (1 / f + sqrt(pixel / A)), f that of what the ray meets, haze is
+    blurred beyond the pixel, which catches pixel / (1 - r / f)^2 instead. Of a fixed receiver see `_beside`.
+    """
+    photons, medium = sight.detector.photons, sight.scene.medium
+    if medium is None:
+        return np.zeros(len(sight)), np.zeros(len(sight))
+    start, end = sight.window_m[:, 0], sight.window_m[:, 0] + sight.before_m
+    light = emitted * photons.efficiency * medium.backscatter_per_m_sr
+    light = light * np.exp(-2 * medium.extinction_per_m * start)
+    if sight.scene.receiver is not None:
+        whole, fullest = _beside(sight, end, bin_m)
+        return light * whole, light * fullest
+    focus = 1 / np.maximum(sight.hits.range_m, TINY)
+    sharp = 1 / (focus + math.sqrt(photons.field_of_view_sr / photons.aperture_m2))
+    sharp = np.clip(sharp, start, end)
+    before = safe_divide(sharp - start, (1 - start * focus) * (1 - sharp * focus))
+    squared = photons.aperture_m2 / math.pi
+    near, far = np.sqrt(sharp**2 + squared), np.sqrt(end**2 + squared)
+    # differences of roots without their cancellation
+    behind = 2 * math.pi * (end - sharp) * (1 - (end + sharp) / (far + near))
+    whole = light * (photons.field_of_view_sr * before + behind)
+    return whole, np.minimum(2 * math.pi * light * bin_m * squared / (near * (near + sharp)), whole)
+
+
+def _beside(sight: Sight, end_m: np.ndarray, bin_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Solid angle times length of the haze that a fixed receiver hears, up to half paths (N,), and in one bin, (N,).
+
+    It sees all of a ray that passes it at the distance h, c from the ray's start: at most the integral of
+    A / (h^2 + (r - c)^2), A / h times the difference of arctan((r - c) / h), and no more than half of all around. Half
+    a path grows by (1 + (r - c) / b) / 2 per range, b the way from there to the receiver: least where the ray starts.
+    """
+    rays, receiver = sight.rays, sight.scene.receiver
+    aperture_m2 = sight.detector.photons.aperture_m2
+    ends = [range_of_path(rays, receiver, path_m) for path_m in (sight.window_m[:, 0], end_m)]
+    low, high = (np.nan_to_num(range_m, nan=0.0) for range_m in ends)
+    offset = np.asarray(receiver.origin_m) - rays.origin_m
+    along = np.einsum("nk,nk->n", offset, rays.direction)
+    aside = np.linalg.norm(offset - along[:, None] * rays.direction, axis=1)
+    # a ray through the receiver itself: so close that the limit of all around decides
+    aside = np.maximum(aside, NEAREST_SHARE * (1 + np.abs(along)))
+    seen = aperture_m2 / aside * (np.arctan((high - along) / aside) - np.arctan((low - along) / aside))
+    length = np.maximum(high - low, 0.0)
+    whole = np.clip(seen, 0.0, 2 * math.pi * length)
+    nearest = np.hypot(aside, np.clip(along, low, np.maximum(low, high)) - along)
+    slowest = (1 + (low - along) / np.hypot(aside, low - along)) / 2
+    in_bin = np.minimum(safe_divide(bin_m, slowest, np.inf), length)
+    return whole, np.minimum(np.minimum(aperture_m2 / nearest**2, 2 * math.pi) * in_bin, whole)
+
+
+# Steps of the logarithm, 1 % each, in which levels of background are told apart.
+LEVELS_PER_UNIT = 100
+# Counts from here on are shown as whole numbers.
+MANY = 100
+# The highest of a histogram's bins strays by this many of (sigma^5 / (n b))^(1/4), see `peak_error_m`.
+PEAK_STRAY = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Echo:
+    """What arrives of the echoes of N rays.
+
+    Arguments:
+        signal: Counts, shape (N,).
+        sigma_m: How far one photon strays, shape (N,) [m].
+        level: Counts per bin besides ambient and dark ones, shape (N,).
+    """
+
+    signal: np.ndarray
+    sigma_m: np.ndarray
+    level: np.ndarray | float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Counts:
+    """Counts per frame of every ray of a sight, for a detector that counts photons.
+
+    Arguments:
+        sight: What the rays meet.
+    """
+
+    sight: Sight
+
+    @cached_property
+    def pulses(self) -> np.ndarray:
+        """Pulses of each ray in a frame, shape (N,)."""
+        return self._by_sharing("pulses")
+
+    @cached_property
+    def signal_per_pulse(self) -> np.ndarray:
+        """Counts of a return in clear air, 0 where there is none, shape (N,)."""
+        return np.where(self.sight.returned, self._of_first_hit, 0.0)
+
+    @cached_property
+    def _of_first_hit(self) -> np.ndarray:
+        photons = self.sight.detector.photons
+        return self._by_sharing("emitted") * photons.aperture_m2 * photons.efficiency * self.sight.gain
+
+    def leaked(self, sigma_m: np.ndarray) -> np.ndarray:
+        """Counts that the pulse of a hit outside the gate spills into it in a frame, in clear air, shape (N,).
+
+        The part of a Gaussian inside the window, at most its part beyond the nearer end.
+        """
+        from scipy.special import ndtr
+
+        share = ndtr(-self.sight.gate_edge_m / np.maximum(sigma_m, TINY))
+        return np.where(self.sight.returned, 0.0, self._of_first_hit * self.pulses * share)
+
+    @cached_property
+    def signal(self) -> np.ndarray:
+        """Counts of the first hit in a frame, in clear air, shape (N,)."""
+        return self.signal_per_pulse * self.pulses
+
+    @property
+    def typical(self) -> str:
+        """The median of `in_air` over returns, for people."""
+        returned = self.in_air[self.sight.returned]
+        return count_text(float(np.median(returned))) if len(returned) else "no"
+
+    @cached_property
+    def in_air(self) -> np.ndarray:
+        """`signal` weakened by the air, shape (N,)."""
+        medium = self.sight.scene.medium
+        if medium is None:
+            return self.signal
+        path_m = self.sight.window_m[:, 0] + self.sight.before_m
+        return self.signal * np.exp(-2 * medium.extinction_per_m * path_m)
+
+    @cached_property
+    def background_per_metre(self) -> np.ndarray:
+        """Ambient light and dark counts per pulse and metre, shape (N,)."""
+        return ambient_per_metre(self.sight)
+
+    @cached_property
+    def haze_per_pulse(self) -> tuple[np.ndarray, np.ndarray]:
+        """Counts that the air sends back: in the whole window, and in its fullest bin, shapes (N,)."""
+        return haze_per_pulse(self.sight, self._by_sharing("emitted"), self.bin_m)
+
+    @cached_property
+    def bin_m(self) -> float:
+        """The width of a histogram's bins [m]."""
+        return bin_width_m(self.sight.detector)
+
+    @cached_property
+    def bins(self) -> np.ndarray:
+        """How many of them a window has, shape (N,)."""
+        return np.maximum(np.ceil(self.sight.width_m / self.bin_m), 1.0)
+
+    @cached_property
+    def per_bin(self) -> np.ndarray:
+        """Ambient and dark counts per bin in a frame, shape (N,)."""
+        return self.background_per_metre * self.bin_m * self.pulses
+
+    @cached_property
+    def pulse_bins(self) -> int:
+        """How many bins a pulse is wide, at half of its height: 2 half + 1."""
+        return 2 * int(FWHM_PER_SIGMA * metres(self.sight.detector.timing_sigma_s) / (2 * self.bin_m)) + 1
+
+    def needed(self, per_bin: np.ndarray) -> np.ndarray:
+        """The fewest counts in a pulse's width that are reported in so much background per bin (N,), shape (N,).
+
+        Levels and numbers of bins are rounded up to one of `LEVELS_PER_UNIT` per factor e: few are worked out.
+        """
+        level, bins = (_rounded_up(values) for values in (per_bin * self.pulse_bins, self.bins))
+        # pairs as complex numbers: those are told apart fastest
+        pairs, place = np.unique(level + 1j * bins, return_inverse=True)
+        return needed_counts(pairs.real, pairs.imag, self.sight.detector.false_alarm)[place]
+
+    def missed(self, signal: np.ndarray, per_bin: np.ndarray | float, sigma_m: np.ndarray) -> np.ndarray:
+        """Probability that the echo's bins hold fewer counts than it takes to be reported, shape (N,).
+
+        Arguments:
+            signal: Counts of the echo, shape (N,).
+            per_bin: Background counts in each bin, shape (N,).
+            sigma_m: How far one photon strays, shape (N,) [m].
+        """
+        from scipy.special import pdtr
+
+        per_bin = np.broadcast_to(per_bin, signal.shape)
+        expected = signal * share_in_bins(self.pulse_bins, self.bin_m, sigma_m) + per_bin * self.pulse_bins
+        return pdtr(self.needed(per_bin) - 1, expected)
+
+    def more_missed(self, before: Echo, after: Echo) -> np.ndarray:
+        """How much more often an echo is missed, in the light of the surroundings or in the dark, shape (N,)."""
+        changes = [
+            self.missed(after.signal, level + after.level, after.sigma_m)
+            - self.missed(before.signal, level + before.level, before.sigma_m)
+            for level in (self.per_bin, np.zeros_like(self.per_bin))
+        ]
+        return np.maximum(np.maximum(*changes), 0.0)
+
+    def mistaken(
+        self, signal: np.ndarray, other: np.ndarray, per_bin: np.ndarray, sigma_m: np.ndarray
+    ) -> np.ndarray:
+        """Bound of the probability that another bin beats the echo's, shape (N,).
+
+        The union over all bins of P(X >= Y) <= exp(-(sqrt(E Y) - sqrt(E X))^2), Chernoff's bound for a difference of
+        Poisson counts X of the fullest other bin (`other`) and Y of the echo's. The matched filter compares places as
+        wide as a pulse, no worse than by their sums.
+        """
+        wide = self.pulse_bins if self.sight.detector.estimator == "matched" else 1
+        expected = signal * share_in_bins(wide, self.bin_m, sigma_m) + wide * per_bin
+        lead = np.maximum(np.sqrt(expected) - np.sqrt(wide * other), 0.0)
+        return np.minimum((self.bins - 1) * np.exp(-(lead**2)), 1.0)
+
+    def error_m(self, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
+        """How far the range from so many photons strays, rms, shape (N,) [m]."""
+        return estimate_error_m(self.sight.detector, signal, sigma_m)
+
+    def _by_sharing(self, name: str) -> np.ndarray:
+        shared, place = np.unique(self.sight.sharing, return_inverse=True)
+        return np.array([getattr(self.sight.detector.photons, name)(int(rays)) for rays in shared])[place]
+
+
+def _rounded_up(values: np.ndarray) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        return np.exp(np.ceil(LEVELS_PER_UNIT * np.log(values)) / LEVELS_PER_UNIT)
+
+
+def count_text(number: float) -> str:
+    """An expected count for people."""
+    return f"{number:,.0f}" if number >= MANY else f"{number:.2g}"
+
+
+def share_in_bins(count: int, bin_m: float, sigma_m: np.ndarray) -> np.ndarray:
+    """Share of an echo's photons in an odd number of bins, in the worst case: it lies on an edge of the middle one."""
+    from scipy.special import erf
+
+    spread_m = math.sqrt(2) * np.maximum(sigma_m, TINY)
+    return 0.5 * (erf((count - 1) / 2 * bin_m / spread_m) + erf((count + 1) / 2 * bin_m / spread_m))
+
+
+def needed_counts(per_bin: np.ndarray, bins: np.ndarray, false_alarm: float) -> np.ndarray:
+    """Fewest counts k >= 1 that B bins of Poisson background reach with a probability of at most that, shape (N,).
+
+    The union over bins: B P(X >= k) <= false_alarm.
+    """
+    from scipy.special import pdtr, pdtrik
+
+    allowed = np.clip(false_alarm / bins, EPSILON, 1.0)
+    least = np.maximum(per_bin, TINY)
+    quiet = -np.expm1(-least) <= allowed
+    with np.errstate(invalid="ignore"):
+        needed = np.ceil(np.nan_to_num(pdtrik(1 - allowed, least))) + 1
+    # the inverse is of a smooth curve through the steps: one step more where it fell short
+    needed += 1 - pdtr(needed - 1, least) > allowed
+    return np.where(quiet, 1.0, np.maximum(needed, 1.0))
+
+
+def estimate_error_m(detector: Detector, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
+    """How far the range from n photons (N,) that stray by sigma (N,) [m] strays, rms, shape (N,) [m].
+
+    The matched filter averages: sigma / sqrt(n). The highest bin is a mode: it strays to where the expected counts
+    n b f fall short of the peak's by about their own noise; with f a Gaussian, e^4 = (8 sqrt(2 pi)) sigma^5 / (n b) up
+    to a factor (Chernoff 1964: a mode converges slower than a mean), and no further than the earliest photon, which the
+    highest bin may hold where most bins hold one: sigma sqrt(1 + ln n).
+    """
+    count = np.maximum(signal, 1.0)
+    averaged = sigma_m / np.sqrt(count)
+    if detector.estimator == "matched":
+        return averaged
+    mode = PEAK_STRAY * (sigma_m**5 / (count * bin_width_m(detector))) ** 0.25
+    return np.minimum(np.maximum(averaged, mode), sigma_m * np.sqrt(1 + np.log(count)))
+
+
+def changed_share(signal: np.ndarray, fewer: np.ndarray) -> np.ndarray:
+    """Share of an echo's photons that are not there any more, shape (N,)."""
+    return np.clip(1 - safe_divide(fewer, signal, 1.0), 0.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Blindness:
+    """What is counted of the light of N rays.
+
+    Arguments:
+        left: Counts of the echo, shape (N,).
+        awake: The share of the background at the gate's start that is counted, shape (N,).
+        under: That of the background under the echo, shape (N,).
+        level: That of all background, shape (N,).
+        early: How early the first of an echo's photons is, in standard deviations, at most, shape (N,).
+        per_pulse: Counts per pulse that arrive, shape (N,).
+    """
+
+    left: np.ndarray
+    awake: np.ndarray
+    under: np.ndarray
+    level: np.ndarray
+    early: np.ndarray
+    per_pulse: np.ndarray
+
+    @classmethod
+    def of(cls, counts: Counts, *, ambient: bool = True, haze: bool = True) -> Blindness:
+        """With ambient light and dark counts, and with what the air sends back, or as if there were none."""
+        sight, photons = counts.sight, counts.sight.detector.photons
+        echo = safe_divide(counts.in_air, counts.pulses)
+        from_air = counts.haze_per_pulse[0] * haze
+        per_metre = counts.background_per_metre * ambient
+        whole = per_metre * sight.width_m + from_air + echo
+        if photons.dead_s == 0:
+            every = np.ones(len(sight))
+            return cls(counts.in_air, every, every, every, np.zeros(len(sight)), whole)
+        first = -np.expm1(-echo)
+        covered = np.floor((photons.dead_s + sight.width_m / metres(1)) * photons.repetition_hz)
+        awake = 1 / (1 + covered * -np.expm1(-whole))
+        under = awake * np.exp(-(per_metre * sight.before_m + from_air))
+        level = awake * safe_divide(-np.expm1(-whole), whole, 1.0)
+        several = np.maximum(safe_divide(echo, first, 1.0), 1.0)
+        early = np.minimum(np.sqrt(2 * np.log(several)), (several - 1) / math.sqrt(math.pi))
+        return cls(counts.pulses * under * first, awake, under, level, early, whole)
+
+
+def missed_behind(counts: Counts, blind: Blindness, sigma_m: np.ndarray) -> np.ndarray:
+    """Probability that what is left of an echo falls below what its gate's mean background asks for, shape (N,)."""
+    from scipy.special import pdtr
+
+    width = counts.pulse_bins
+    expected = blind.left * share_in_bins(width, counts.bin_m, sigma_m) + width * counts.per_bin * blind.under
+    return pdtr(counts.needed(counts.per_bin * blind.level) - 1, expected)
+
+
+def unevenness(counts: Counts, blind: Blindness) -> np.ndarray:
+    """How much more often background is taken for a return because there is more of it where gates start, (N,).
+
+    The union over all bins of what the start's level makes, less what the mean level does.
+    """
+    from scipy.special import pdtrc
+
+    needed = counts.needed(counts.per_bin * blind.level)
+    mean, start = (counts.pulse_bins * counts.per_bin * share for share in (blind.level, blind.awake))
+    return np.clip(counts.bins * (pdtrc(needed - 1, start) - pdtrc(needed - 1, mean)), 0.0, 1.0)
+
+
+def variance_of_missing(counts: Counts, before: np.ndarray, left: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
+    """Variance by what is not there: all of the error where many photons are gone, its share where few are, (N,)."""
+    gone = changed_share(before, left)
+    error = counts.error_m(left, sigma_m) ** 2
+    if counts.sight.detector.estimator == "matched":
+        return error * gone
+    return error * np.minimum(2 * np.sqrt(gone), 1.0)

@@ -1,0 +1,224 @@
+"""What all rays of a scene's frame meet, and the light that comes back from it: what bounds are worked out from.
+
+Depth edges between neighbouring rays: how likely a step aside leads to another surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Hits, Outcome, Rays
+from lidardesign.geometry.receiver import path_of_range, path_windows
+from lidardesign.numerics import safe_divide
+from lidardesign.scene import Scene
+from lidardesign.simulate.detector.detector import Detector, metres
+from lidardesign.simulate.detector.histogram import resolution_m
+from lidardesign.simulate.detector.light import Beams
+from lidardesign.simulate.physics import direct_echoes
+from lidardesign.simulate.simulate import gate_outcomes
+
+# A surface that is grazed more flatly than this counts as met at it: ranges then change by up to 50 times a step aside.
+FLATTEST_COSINE = 0.02
+# Rays whose ends a step aside is compared with.
+NEIGHBOURS = 4
+# The matched filter takes photons up to so many standard deviations from its pulse's centre into account.
+PULSE_REACH = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Stake:
+    """What an effect could change, ray by ray.
+
+    Arguments:
+        squared_m2: Mean squared error of the range of a return, (N,) [m^2].
+        lost: Probability that a return is lost, or invented, or taken from somewhere else, (N,).
+        reason: Why, in one line.
+    """
+
+    squared_m2: np.ndarray
+    lost: np.ndarray
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """First hits of all rays in a frame.
+
+    Arguments:
+        scene: What they meet.
+        frame: The time frame.
+        detector: What hears their light.
+        rays: Those of all lists, N.
+        row: The list of each, ascending, shape (N,).
+        sharing: How many rays share its emitter's energy, shape (N,).
+        hits: What they meet first.
+        caster: Of the frame, for the few further rays that a bound may need.
+    """
+
+    scene: Scene
+    frame: int
+    detector: Detector
+    rays: Rays
+    row: np.ndarray
+    sharing: np.ndarray
+    hits: Hits
+    caster: SceneCaster
+
+    @classmethod
+    def of(cls, scene: Scene, frame: int, detector: Detector, lists: Sequence[Rays], caster: SceneCaster) -> Sight:
+        """What lists of rays meet in a frame."""
+        names = ("origin_m", "direction", "gate_m", "sensor", "time_s")
+        rays = Rays(*(np.concatenate([getattr(one, name) for one in lists]) for name in names))
+        sizes = np.array([len(one) for one in lists])
+        row = np.repeat(np.arange(len(lists)), sizes)
+        hits = caster.first_hit(rays.origin_m, rays.direction)
+        return cls(scene, frame, detector, rays, row, sizes[row], hits, caster)
+
+    def __len__(self) -> int:
+        return len(self.rays)
+
+    def nothing(self, reason: str) -> Stake:
+        """No error, and nothing lost."""
+        return Stake(np.zeros(len(self)), np.zeros(len(self)), reason)
+
+    @cached_property
+    def neighbours(self) -> np.ndarray:
+        """The `NEIGHBOURS` rays of the same list that end nearest to each; itself where there are fewer, (N, K)."""
+        ends = self.rays.origin_m + self._typical_range_m * self.rays.direction
+        # the lists side by side, further from each other than the rays of any
+        apart = 4 * (1 + np.abs(ends).max(initial=0.0) + np.abs(self.rays.origin_m).max(initial=0.0))
+        places = np.concatenate([self.rays.origin_m, ends, apart * self.row[:, None]], axis=1)
+        from scipy.spatial import cKDTree
+
+        away, near = cKDTree(places).query(places, k=NEIGHBOURS + 1, distance_upper_bound=apart)
+        own = np.arange(len(self))[:, None]
+        return np.where(np.isfinite(away), near, own)
+
+    @cached_property
+    def _typical_range_m(self) -> float:
+        met = self.range_m[self.hits.body >= 0]
+        return float(np.median(met)) if len(met) else 1.0
+
+    @cached_property
+    def returned(self) -> np.ndarray:
+        """Which rays have a return by geometry alone, shape (N,)."""
+        return gate_outcomes(self.hits.range_m, self.rays.gate_m) == Outcome.RETURN
+
+    @cached_property
+    def range_m(self) -> np.ndarray:
+        """Ranges of first hits, 0 where there is none, shape (N,) [m]."""
+        return np.where(self.hits.body >= 0, self.hits.range_m, 0.0)
+
+    @cached_property
+    def cosine(self) -> np.ndarray:
+        """Of incidence at the first hit, at least `FLATTEST_COSINE`; 1 on a miss, shape (N,)."""
+        along = np.abs(np.einsum("nk,nk->n", self.hits.normal, self.rays.direction))
+        return np.where(self.hits.body >= 0, np.maximum(along, FLATTEST_COSINE), 1.0)
+
+    @cached_property
+    def tangent(self) -> np.ndarray:
+        """Of incidence: how much the range changes by a step aside, shape (N,)."""
+        return np.sqrt(np.maximum(1 / self.cosine**2 - 1, 0.0))
+
+    @cached_property
+    def window_m(self) -> np.ndarray:
+        """Gates as half paths, shape (N, 2) [m]."""
+        return path_windows(self.rays, self.scene.receiver)
+
+    @cached_property
+    def width_m(self) -> np.ndarray:
+        """How much of half a path each ray listens to: no return is further off than that, shape (N,) [m]."""
+        return self.window_m[:, 1] - self.window_m[:, 0]
+
+    @cached_property
+    def path_m(self) -> np.ndarray:
+        """Half paths of first hits, 0 where there is none, shape (N,) [m]."""
+        return path_of_range(self.rays, self.scene.receiver, self.range_m)
+
+    @cached_property
+    def before_m(self) -> np.ndarray:
+        """How much of its window lies before a ray's return; the whole window without one, shape (N,) [m]."""
+        return np.where(self.returned, np.clip(self.path_m - self.window_m[:, 0], 0.0, self.width_m), self.width_m)
+
+    @cached_property
+    def gate_edge_m(self) -> np.ndarray:
+        """How far a first hit lies from the nearer end of its window, infinite on a miss, shape (N,) [m]."""
+        away_m = np.abs(self.path_m[:, None] - self.window_m).min(axis=1)
+        return np.where(self.hits.body >= 0, away_m, np.inf)
+
+    @cached_property
+    def gain(self) -> np.ndarray:
+        """Share of a ray's light that its first hit sends to 1 m^2 of aperture, inside or outside the gate, (N,)."""
+        echoes = direct_echoes(self.scene, Beams.of(self.rays), self.hits)
+        gain = np.zeros(len(self))
+        gain[echoes.ray] = echoes.gain
+        return gain
+
+    @cached_property
+    def beam_m(self) -> np.ndarray:
+        """Radius of each beam at its first hit; 0 where beams are lines, shape (N,) [m]."""
+        detector = self.detector
+        half_rad = detector.divergence_rad / 2 if detector.footprint_rays > 1 else 0.0
+        return half_rad * self.range_m
+
+    def sigma_m(self, *, jitter: bool = True) -> np.ndarray:
+        """How far one photon of an echo strays: the pulse, timing errors, and a slanted beam's spread, (N,) [m].
+
+        A beam that is even over a disc of radius a strays by a / 2 along any axis, times the tangent of incidence.
+        """
+        timed = self.detector.timing_sigma_s if jitter else self.detector.pulse_sigma_s
+        return np.hypot(metres(timed), self.beam_m * self.tangent / 2)
+
+    @cached_property
+    def resolution_m(self) -> float:
+        """Echoes closer than this are one: a bin or the width of the pulse, whichever is more [m].
+
+        The matched filter averages over all of a pulse, far into its tails.
+        """
+        detector = self.detector
+        told_apart = resolution_m(detector)
+        averages = detector.photons is not None and detector.estimator == "matched"
+        return max(told_apart, PULSE_REACH * metres(detector.timing_sigma_s)) if averages else told_apart
+
+
+# A step in range counts as an edge where it exceeds the slope of both surfaces this many times over.
+STEEPER = 2.0
+
+
+def edge_probability(sight: Sight, aside_m: np.ndarray) -> np.ndarray:
+    """Probability that an edge lies within a distance aside of where a ray ends, shape (N,).
+
+    Two neighbouring rays, a distance d apart, that end on different bodies, or further apart in range than the slope
+    of either explains, have an edge somewhere between them: within a <= d of one with the probability a / d, wherever
+    it is. The nearest few of each list are asked. An estimate: edges between rays that both end on one
+    surface are not seen, in expectation over where rays fall they weigh as much as those that are.
+
+    Arguments:
+        sight: What rays meet.
+        aside_m: How far aside, shape (N,) [m].
+    """
+    if not aside_m.any():
+        return np.zeros(len(sight))
+    range_m, body, tangent = sight.range_m, sight.hits.body, sight.tangent
+    met = body >= 0
+    chance = np.zeros(len(sight))
+    for other in sight.neighbours.T:
+        reach_m = np.minimum(sight.hits.range_m, sight.hits.range_m[other])
+        apart_m = _apart_m(sight, other, np.where(np.isfinite(reach_m), reach_m, 0.0))
+        sloped_m = STEEPER * apart_m * (1 + tangent + tangent[other])
+        edge = (body != body[other]) | (met & met[other] & (np.abs(range_m - range_m[other]) > sloped_m))
+        further = np.maximum(aside_m, aside_m[other])
+        share = np.minimum(safe_divide(further, apart_m, 1.0), 1.0)
+        chance = np.maximum(chance, np.where(edge & (further > 0), share, 0.0))
+    return chance
+
+
+def _apart_m(sight: Sight, other: np.ndarray, reach_m: np.ndarray) -> np.ndarray:
+    """How far rays are from others (N,) at ranges (N,) along both, shape (N,) [m]."""
+    origin, direction = sight.rays.origin_m, sight.rays.direction
+    return np.linalg.norm(origin - origin[other] + reach_m[:, None] * (direction - direction[other]), axis=1)

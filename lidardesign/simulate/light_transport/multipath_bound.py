@@ -1,0 +1,244 @@
+r"""How much light may come back by way of other surfaces, and how far it may move a range, without simulating it.
+
+From a matt point P some directions lead to other surfaces Q: F is their share of P's view, weighted with the cosine.
+All that a flood sends to P by way of them, relative to what it sends P directly, is
+
+    share = mean over Q of rho_Q E(Q) / E(P)  +  mean over Q and what Q sees, R, of rho_Q rho_R E(R) / E(P)  + ...
+
+with E = cosine / distance^2 to the emitter, 0 in its shadow. The first two sums are measured by casting rays; all the
+others are at most mean(rho_Q rho_R) once E_max / E(P) / (1 - once), once = rho F_max for the largest reflectance: a
+geometric series, since no point gets more than that part of what the brightest has. With the receiver in the emitter's
+place the same holds for a beam whose detours a fixed receiver hears, by reciprocity. A pixel that is lit through itself
+alone gets back
+
+    share = mean over Q of rho_P rho_Q (form factor of the pixel's spot from Q), at most rho_P rho_Q,
+    and by all later surfaces at most the same times once / (1 - once), late by as much more as there are.
+
+Light that is late by d moves a range by at most its share times d; what is late by more than a detector tells apart
+makes a peak of its own, which may be taken for the echo where all of it outweighs that. Directions are laid out evenly
+(Lambert's equal-area disc), not drawn: shares are measured to within a few hundredths. A surface that fills less than a
+hundredth of a view may be missed by a point, and is met by others as often as it should.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Hits, Rays
+from lidardesign.geometry.receiver import in_view
+from lidardesign.numerics import COARSE_SLACK
+from lidardesign.scene import Scene
+
+# Points whose view is measured, directions from each, and from what they meet: up to forty thousand rays.
+MOST_POINTS, DIRECTIONS, FURTHER_DIRECTIONS = 64, 64, 4
+# A surface that a pixel grazes more flatly than this counts as met at it: a spot is then 50 times as long as wide.
+FLATTEST_COSINE = 0.02
+GOLDEN_ANGLE_RAD = math.pi * (3 - math.sqrt(5))
+# Rays start this share of their distance above a surface, so as not to hit it again.
+CLEARANCE = COARSE_SLACK
+# Bounces between white walls all around never end; a share this close to 1 stands for theirs.
+WHITEST = 0.999
+
+
+@dataclass(frozen=True, eq=False)
+class Detours:
+    """Bounds for a sample of rays.
+
+    Arguments:
+        chosen: Which rays, shape (K,).
+        share: Light by detours over direct light, at most, shape (K,).
+        apart: The part of it that is late by more than a detector's resolution, at most, shape (K,).
+        shift_m: How far the rest may move a range, at most, shape (K,) [m].
+        seen: Share of the view that other surfaces fill, shape (K,).
+    """
+
+    chosen: np.ndarray
+    share: np.ndarray
+    apart: np.ndarray
+    shift_m: np.ndarray
+    seen: np.ndarray
+
+
+def series(once: float) -> float:
+    """What all further bounces add to 1, of which each keeps a share: once / (1 - once), finite for any share."""
+    kept = min(once, WHITEST)
+    return kept / (1 - kept)
+
+
+def lamp_bound(
+    scene: Scene, rays: Rays, hits: Hits, caster: SceneCaster, lamp_m: np.ndarray | None, resolution_m: float
+) -> Detours:
+    """Detours of a flood at the rays' origins, or of beams that a fixed receiver hears in all of its field of view.
+
+    A flood shines everywhere as it does along each ray.
+
+    Arguments:
+        scene: What light meets, and its receiver.
+        rays: N of them.
+        hits: What they meet.
+        caster: Of this frame.
+        lamp_m: Where light comes from, or is heard, shape (3,) [m]; None: at each ray's origin.
+        resolution_m: Half paths that a detector does not tell apart [m].
+    """
+    chosen = _sample(hits)
+    lamp = rays.origin_m[chosen] if lamp_m is None else np.tile(np.asarray(lamp_m, dtype=float), (len(chosen), 1))
+    place = rays.origin_m[chosen] + hits.range_m[chosen, None] * rays.direction[chosen]
+    start = _Ends(np.arange(len(chosen)), np.ones(len(chosen)), place, hits.normal[chosen], np.zeros(len(chosen)))
+    direct_m = np.linalg.norm(lamp - place, axis=1)
+    own = np.maximum(np.einsum("kj,kj->k", start.normal, lamp - place), 0.0) / direct_m**3
+    first = _next(scene, caster, start, DIRECTIONS)
+    second = _next(scene, caster, first, FURTHER_DIRECTIONS)
+    # a pixel that looks at a flood's spots sees them wherever they are; a receiver hears what is in its view
+    viewed = scene if lamp_m is not None else None
+    lit = [_lit(ends, lamp[ends.point], caster, viewed) for ends in (first, second)]
+    brightest = max([own.max(initial=0.0), *(light.max(initial=0.0) for light, _ in lit)])
+    seen = first.seen(len(chosen))
+    most = max(body.reflectance for body in scene.bodies)
+    with np.errstate(divide="ignore"):
+        over_own = np.where(own > 0, 1 / own, 0.0)
+    late = _Late(len(chosen), resolution_m)
+    for ends, (light, away_m) in zip((first, second), lit, strict=True):
+        late.add(
+            ends.point, ends.weight * light * over_own[ends.point], (ends.path_m + away_m - direct_m[ends.point]) / 2
+        )
+    twice = np.bincount(second.point, second.weight, len(chosen))
+    rest = twice * series(most * seen.max(initial=0.0)) * brightest * over_own
+    return late.detours(chosen, rest, rest * resolution_m, seen)
+
+
+def pixel_bound(
+    scene: Scene, rays: Rays, hits: Hits, caster: SceneCaster, pixel_sr: float, resolution_m: float
+) -> Detours:
+    """Detours of scanned beams that only the pixel around each beam hears; arguments as in `lamp_bound`."""
+    chosen = _sample(hits)
+    distance_m, normal = hits.range_m[chosen], hits.normal[chosen]
+    place = rays.origin_m[chosen] + distance_m[:, None] * rays.direction[chosen]
+    own = np.array([body.reflectance for body in scene.bodies])[hits.body[chosen]]
+    start = _Ends(np.arange(len(chosen)), own, place, normal, np.zeros(len(chosen)))
+    cosine = np.abs(np.einsum("kj,kj->k", normal, rays.direction[chosen]))
+    spot_m2 = pixel_sr * distance_m**2 / np.maximum(cosine, FLATTEST_COSINE)
+    ends = _next(scene, caster, start, DIRECTIONS)
+    back = place[ends.point] - ends.place
+    facing = np.maximum(np.einsum("mj,mj->m", ends.normal, back), 0.0)
+    leaving = np.maximum(-np.einsum("mj,mj->m", normal[ends.point], back), 0.0)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        factor = np.fmin(facing * leaving * spot_m2[ends.point] / (math.pi * ends.path_m**4), 1.0)
+    late = _Late(len(chosen), resolution_m)
+    late.add(ends.point, ends.weight * factor, ends.path_m)
+    seen = ends.seen(len(chosen))
+    further = series(max(body.reflectance for body in scene.bodies) * seen.max(initial=0.0))
+    # the k-th bounce more comes from k times as far: sum over k of k once^(k - 1) = 1 / (1 - once)^2
+    return late.detours(chosen, late.share * further, late.moved_m * ((1 + further) ** 2 - 1), seen)
+
+
+@dataclass(frozen=True, eq=False)
+class _Ends:
+    """Where paths that started at points have got to, as flat lists.
+
+    Arguments:
+        point: The point that each started at.
+        weight: The share of its view that each stands for, times the reflectances met.
+        place, normal: Where it is on which surface, (M, 3).
+        path_m: How long it is [m].
+    """
+
+    point: np.ndarray
+    weight: np.ndarray
+    place: np.ndarray
+    normal: np.ndarray
+    path_m: np.ndarray
+
+    def seen(self, points: int) -> np.ndarray:
+        """The share of the directions from each point that met something, after one step."""
+        return np.bincount(self.point, minlength=points) / DIRECTIONS
+
+
+class _Late:
+    """Shares of light by how late they are, added up by point."""
+
+    def __init__(self, points: int, resolution_m: float) -> None:
+        self._resolution_m = resolution_m
+        self.near, self.apart, self.moved_m = np.zeros(points), np.zeros(points), np.zeros(points)
+
+    @property
+    def share(self) -> np.ndarray:
+        return self.near + self.apart
+
+    def add(self, point: np.ndarray, share: np.ndarray, late_m: np.ndarray) -> None:
+        near, points = late_m < self._resolution_m, len(self.near)
+        self.near += np.bincount(point, share * near, points)
+        self.apart += np.bincount(point, share * ~near, points)
+        self.moved_m += np.bincount(point, share * near * np.maximum(late_m, 0.0), points)
+
+    def detours(self, chosen: np.ndarray, rest: np.ndarray, rest_moved_m: np.ndarray, seen: np.ndarray) -> Detours:
+        """With the rest of the light, which may be late by anything."""
+        moved_m = self.moved_m + np.minimum(rest_moved_m, rest * self._resolution_m)
+        # a mean of the echo and what is near to it lies no further off than its share of the furthest
+        beside = self.near + rest
+        shift_m = np.minimum(moved_m, self._resolution_m * beside / (1 + beside))
+        return Detours(chosen, self.share + rest, self.apart + rest, shift_m, seen)
+
+
+def _sample(hits: Hits) -> np.ndarray:
+    """Rays that hit something, evenly out of all of them."""
+    met = np.flatnonzero(hits.body >= 0)
+    return met[np.unique(np.linspace(0, len(met) - 1, min(MOST_POINTS, len(met))).astype(int))]
+
+
+def _next(scene: Scene, caster: SceneCaster, ends: _Ends, directions: int) -> _Ends:
+    """What is met from the ends of paths, in so many directions each."""
+    direction = _hemispheres(ends.normal, directions)
+    source = np.repeat(np.arange(len(ends.point)), directions)
+    start = _lifted(ends.place, ends.normal)[source]
+    found = caster.first_hit(start, direction)
+    met = np.flatnonzero(found.body >= 0)
+    source, reached = source[met], found.range_m[met]
+    reflectance = np.array([body.reflectance for body in scene.bodies])[found.body[met]]
+    return _Ends(
+        ends.point[source],
+        ends.weight[source] * reflectance / directions,
+        start[met] + reached[:, None] * direction[met],
+        found.normal[met],
+        ends.path_m[source] + reached,
+    )
+
+
+def _lit(ends: _Ends, lamp_m: np.ndarray, caster: SceneCaster, viewed: Scene | None) -> tuple[np.ndarray, np.ndarray]:
+    """What places get from lamps (M, 3), cosine / distance^2, and how far those are [m], both (M,)."""
+    places = _lifted(ends.place, ends.normal)
+    toward = lamp_m - places
+    away_m = np.linalg.norm(toward, axis=1)
+    cosine = np.einsum("mj,mj->m", toward, ends.normal) / away_m
+    asked = cosine > 0
+    if viewed is not None and viewed.receiver is not None:
+        asked &= in_view(viewed.receiver, places)
+    asked = np.flatnonzero(asked)
+    free = caster.first_hit(places[asked], toward[asked]).range_m >= away_m[asked]
+    light = np.zeros(len(places))
+    light[asked] = np.where(free, cosine[asked] / away_m[asked] ** 2, 0.0)
+    return light, away_m
+
+
+def _lifted(places: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    if not len(places):
+        return places
+    return places + CLEARANCE * (1 + np.ptp(places, axis=0).max()) * normal
+
+
+def _hemispheres(normal: np.ndarray, directions: int) -> np.ndarray:
+    """Directions above surfaces with normals (M, 3), dense as the cosine, turned from each to the next, (M D, 3)."""
+    number = np.arange(directions)
+    radius = np.sqrt((number + 0.5) / directions)
+    angle = GOLDEN_ANGLE_RAD * (number + directions * np.arange(len(normal))[:, None])
+    other = np.eye(3)[np.abs(normal).argmin(axis=1)]
+    left = np.cross(other, normal)
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    up = np.cross(normal, left)
+    x, y = radius * np.cos(angle), radius * np.sin(angle)
+    height = np.sqrt(1 - radius**2)[:, None]
+    spread = x[..., None] * left[:, None] + y[..., None] * up[:, None] + height * normal[:, None]
+    return spread.reshape(-1, 3)

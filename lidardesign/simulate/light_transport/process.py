@@ -1,0 +1,236 @@
+"""The process that the light-transport simulator runs in: found, started, asked, and reported on when it dies.
+
+With the wrong LLVM the simulator aborts its whole process, so it gets one of its own, kept for the next request:
+importing and compiling take most of the time of a small one. Arrays travel through files of a temporary folder,
+without pickle.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import importlib.metadata
+import importlib.util
+import io
+import json
+import os
+import queue
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidardesign.errors import ConfigError, NumericalError
+
+WORKER = "lidardesign.simulate.light_transport.worker"
+# The simulator's packages and the oldest versions that answer as its tests expect.
+PACKAGES = {"mitsuba": (3, 9), "mitransient": (1, 3), "drjit": (1, 0)}
+# Older ones cannot select instructions for the kernels and abort (14 to 16), or are refused.
+OLDEST_LLVM = 19
+LLVM_FOLDERS = (
+    "/usr/lib/*-linux-gnu",
+    "/usr/lib64",
+    "/usr/lib",
+    "/usr/local/lib",
+    "/usr/lib/llvm-*/lib",
+    "/usr/lib64/llvm*/lib",
+)
+LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
+TIME_LIMIT_S = 600.0
+HINT = (
+    "pip install 'lidardesign[transport]' and an LLVM library of version 19 or newer (Debian, Ubuntu: apt install "
+    f"libllvm19), or name one in {LLVM_VARIABLE}"
+)
+# What names an error, or else the end of what was printed, is enough to tell what went wrong.
+SHOWN_LINES = 4
+
+
+def missing() -> str | None:
+    """What keeps the simulator from running here, in one line; None if nothing does. Imports nothing of it."""
+    absent = [name for name in PACKAGES if importlib.util.find_spec(name) is None]
+    if absent:
+        return f"not installed: {', '.join(absent)}"
+    for name, oldest in PACKAGES.items():
+        found = importlib.metadata.version(name)
+        if tuple(int(part) for part in re.findall(r"\d+", found)[:2]) < oldest:
+            return f"{name} {found} is too old: {'.'.join(map(str, oldest))} or newer is needed"
+    if llvm_library() is None:
+        named = os.environ.get(LLVM_VARIABLE)
+        if named:
+            return f"{LLVM_VARIABLE} names {named}, which is no LLVM library of version {OLDEST_LLVM} or newer"
+        return f"no LLVM library of version {OLDEST_LLVM} or newer was found"
+    return None
+
+
+def llvm_library() -> str | None:
+    """The path of the newest usable LLVM library; the one that the environment names comes first."""
+    named = os.environ.get(LLVM_VARIABLE)
+    if named:
+        version = llvm_version(Path(named).name)
+        usable = Path(named).is_file() and (version is None or version >= OLDEST_LLVM)
+        return named if usable else None
+    return _newest_installed()
+
+
+@lru_cache(maxsize=1)
+def _newest_installed() -> str | None:
+    found = {}
+    for folder in LLVM_FOLDERS:
+        for path in Path("/").glob(f"{folder[1:]}/libLLVM*.so*"):
+            version = llvm_version(path.name)
+            if version is not None and version >= OLDEST_LLVM and path.exists():
+                found.setdefault(version, str(path))
+    return found[max(found)] if found else None
+
+
+def llvm_version(file_name: str) -> int | None:
+    """The major version in a library's file name: libLLVM-19.so, libLLVM.so.19.1, libLLVM-14.0.6.so.1."""
+    match = re.match(r"libLLVM-(\d+)|libLLVM\.so\.(\d+)", file_name)
+    return int(match.group(1) or match.group(2)) if match else None
+
+
+def ask(
+    request: Mapping[str, Any], arrays: Mapping[str, np.ndarray], *, limit_s: float = TIME_LIMIT_S
+) -> dict[str, np.ndarray]:
+    """Have the simulator answer one request.
+
+    Arguments:
+        request: Numbers and shapes, as JSON.
+        arrays: Arrays by name.
+        limit_s: How long the answer may take [s].
+
+    Raises:
+        ConfigError: The simulator is not usable here.
+        NumericalError: It failed, died, or took too long; the message says which and why.
+    """
+    with tempfile.TemporaryDirectory(prefix="lidardesign-light-") as name:
+        folder = Path(name)
+        (folder / "request.json").write_text(json.dumps(request), encoding="utf-8")
+        np.savez(folder / "request.npz", **arrays)
+        with _one_at_a_time:
+            _worker().ask(folder, limit_s)
+        failure = folder / "error.txt"
+        if failure.exists():
+            lines = failure.read_text(encoding="utf-8").strip().splitlines()
+            raise NumericalError(f"the light-transport simulator failed: {lines[-1]}", hint="report it with the scene")
+        with np.load(folder / "result.npz", allow_pickle=False) as stored:
+            return {key: stored[key] for key in stored.files}
+
+
+class Worker:
+    """One running simulator.
+
+    Arguments:
+        command: What to run.
+        environment: Its environment.
+    """
+
+    def __init__(self, command: list[str], environment: Mapping[str, str]) -> None:
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            # a request that is written is gone: nothing is left over to be written to a process that died
+            bufsize=0,
+            env=dict(environment),
+            # where this package is found, and nothing of a user's folder is mistaken for a library
+            cwd=Path(__file__).parents[3],
+        )
+        self.owner = os.getpid()
+        self._lines: queue.Queue[str | None] = queue.Queue()
+        threading.Thread(target=self._read, daemon=True).start()
+        self._started = False
+
+    @property
+    def alive(self) -> bool:
+        """Whether this process may ask it."""
+        return self.owner == os.getpid() and self._process.poll() is None
+
+    def ask(self, folder: Path, limit_s: float) -> None:
+        """Wait until the request in a folder is answered.
+
+        Raises:
+            NumericalError: It died, or took longer than the limit [s]; it is ended then.
+        """
+        if not self._started:
+            self._await("ready", limit_s)
+            self._started = True
+        # if it died since, its last words follow
+        with contextlib.suppress(OSError, ValueError):
+            self._process.stdin.write(f"{folder}\n".encode())
+        self._await("done", limit_s)
+
+    def end(self) -> None:
+        """End it, at the latest a moment later."""
+        self._process.kill()
+        self._process.wait()
+        self._process.stdin.close()
+
+    def _read(self) -> None:
+        with io.TextIOWrapper(io.BufferedReader(self._process.stdout), "utf-8", "replace") as printed:
+            for line in printed:
+                self._lines.put(line.rstrip("\n"))
+        self._lines.put(None)
+
+    def _await(self, word: str, limit_s: float) -> None:
+        printed: list[str] = []
+        while True:
+            try:
+                line = self._lines.get(timeout=limit_s)
+            except queue.Empty:
+                self.end()
+                raise NumericalError(
+                    f"the light-transport simulator gave no answer within {limit_s:g} s",
+                    hint="fewer rays, samples or bounces",
+                ) from None
+            if line == word:
+                return
+            if line is None:
+                # for whoever asks again
+                self._lines.put(None)
+                self.end()
+                raise NumericalError(_epitaph(self._process.returncode, printed), hint=HINT)
+            printed.append(line)
+
+
+def _epitaph(code: int, printed: list[str]) -> str:
+    names = {int(number): number.name for number in signal.Signals}
+    cause = f"was ended by {names.get(-code, -code)}" if code < 0 else f"ended with exit code {code}"
+    errors = [line.strip() for line in printed if "error" in line.lower()]
+    said = "\n".join((errors or [line for line in printed if line.strip()])[-SHOWN_LINES:])
+    return f"the light-transport simulator's process {cause}" + (f"; it said:\n{said}" if said else "")
+
+
+_running: list[Worker] = []
+_one_at_a_time = threading.Lock()
+
+
+def _worker() -> Worker:
+    reason = missing()
+    if reason is not None:
+        raise ConfigError(f"the light-transport simulator cannot run: {reason}", hint=HINT)
+    if not _running or not _running[0].alive:
+        end_worker()
+        environment = {**os.environ, LLVM_VARIABLE: str(llvm_library())}
+        _running[:] = [Worker([sys.executable, "-m", WORKER], environment)]
+    return _running[0]
+
+
+def end_worker() -> None:
+    """End the simulator's process, if this process runs one."""
+    for worker in _running:
+        if worker.owner == os.getpid():
+            worker.end()
+    _running.clear()
+
+
+atexit.register(end_worker)

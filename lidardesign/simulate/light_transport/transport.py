@@ -1,0 +1,417 @@
+"""Transients of a scene by a light-transport simulator (mitsuba with mitransient), where it is installed.
+
+What single rays see is rendered: the radiance that arrives along each ray, by the length of the whole path from the
+light to the ray's origin. Conventions: reflection is Lambertian (reflectance / pi), surfaces are two-sided and shaded
+by their geometric normals, the air is empty, nothing moves within a frame. A light has an intensity I [W/sr]; a matt
+point at distance d from it, whose normal is turned by theta, has the radiance L = reflectance * I * cos(theta) /
+(pi d^2). By Helmholtz's reciprocity light may be sent either way: with I = 1 W/sr at a *receiver*, the radiance seen
+along a *beam* is the beam's gain, the share of its light that reaches 1 m^2 of aperture (`Echoes.gain`).
+
+A frame of a scene as shapes of the light-transport simulator: float32 around a centre of its own.
+
+Spheres and the sides of capsules stay exact, boxes become twelve triangles. An infinite plane ends where little light
+could come from: it is as large as `PLANE_REACHES` times the distance to what is looked at, in squares that grow
+outward, so that what is near keeps its accuracy.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from lidardesign.errors import ConfigError
+from lidardesign.geometry.raycast import shared_caster
+from lidardesign.geometry.rays import Hits, Rays
+from lidardesign.geometry.receiver import receiver_axes
+from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Receiver, Scene, Sphere
+from lidardesign.simulate.light_transport.process import TIME_LIMIT_S, ask, missing
+
+# Half sizes of a plane's nested squares, in reaches. What lies further sends back less than 1e-4 of its light.
+PLANE_REACHES = (2.0, 10.0, 100.0)
+_SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float)
+_BOX_QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+
+
+def exported(
+    scene: Scene, frame: int, centre_m: np.ndarray, reach_m: float, *, matt: bool = False
+) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
+    """The shapes of a frame as JSON and their arrays.
+
+    Arguments:
+        scene: The scene; all of its bodies, whatever their role.
+        frame: The time frame.
+        centre_m: What becomes the origin, shape (3,) [m].
+        reach_m: The furthest distance from it that is looked at [m].
+        matt: Whether what mirrors and glass do not scatter is lost.
+    """
+    shapes, arrays = [], {}
+    for number, body in enumerate(scene.bodies):
+        document, own = _shape(body, frame, centre_m, reach_m)
+        shares = {"reflectance": float(body.reflectance), "specular": 0.0, "transmission": 0.0}
+        if not matt:
+            shares |= {"specular": float(body.specular), "transmission": float(body.transmission)}
+        shapes.append({**document, **shares})
+        arrays.update({f"{name}{number}": values for name, values in own.items()})
+    return shapes, arrays
+
+
+def _shape(
+    body: Body, frame: int, centre_m: np.ndarray, reach_m: float
+) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    pose, shape = body.pose(frame), body.shape
+    rotation, place = pose[:3, :3], pose[:3, 3] - centre_m
+    if isinstance(shape, Sphere):
+        return _round([place, place], shape.radius_m), {}
+    if isinstance(shape, Capsule):
+        half = shape.half_length_m * rotation[:, 2]
+        return _round([place - half, place + half], shape.radius_m), {}
+    if isinstance(shape, Plane):
+        nearest = rotation[:, 2] * (rotation[:, 2] @ place)
+        vertices, faces = _plane(max(reach_m, float(np.linalg.norm(nearest))))
+        return {"kind": "mesh"}, {"vertices": vertices @ rotation.T + nearest, "faces": faces}
+    vertices, faces = _box(shape) if isinstance(shape, Box) else _triangles(shape)
+    return {"kind": "mesh"}, {"vertices": vertices @ rotation.T + place, "faces": faces}
+
+
+def _round(ends: list[np.ndarray], radius_m: float) -> dict[str, Any]:
+    return {"kind": "round", "ends": [end.tolist() for end in ends], "radius": float(radius_m)}
+
+
+def _triangles(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    return mesh.vertices, mesh.faces
+
+
+def _box(box: Box) -> tuple[np.ndarray, np.ndarray]:
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    return signs * np.array(box.half_extents_m), _split(_BOX_QUADS)
+
+
+def _plane(reach_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Nested squares around the point of the plane z = 0 below the centre."""
+    rings = [_SQUARE * (reaches * reach_m) for reaches in PLANE_REACHES]
+    quads = [(0, 1, 2, 3)]
+    for ring in range(len(rings) - 1):
+        inner, outer = 4 * ring, 4 * (ring + 1)
+        quads += [(outer + k, outer + (k + 1) % 4, inner + (k + 1) % 4, inner + k) for k in range(4)]
+    return np.concatenate(rings), _split(quads)
+
+
+def _split(quads: Any) -> np.ndarray:
+    return np.array([[a, b, c] if half == 0 else [a, c, d] for a, b, c, d in quads for half in (0, 1)], dtype=np.int32)
+
+
+# Rays of one request: what they need in memory stays small, and the numbers of rays that kernels are compiled for few.
+CHUNK_RAYS = 16_384
+CHUNK_VALUES = 1 << 23
+FEWEST_RAYS = 16
+EVERYWHERE = -2.0  # a cosine that every direction exceeds
+# Points closer than this share of the reach are one: some hundred times the rounding of float32 paths.
+SAME_PLACE = 1e-4
+
+
+def available() -> bool:
+    """Whether the simulator can be used here: installed, with an LLVM library that it works with. Imports nothing."""
+    return missing() is None
+
+
+@dataclass(frozen=True, eq=False)
+class Lights:
+    """Small lights, M of them; each shines where its limits allow, as the laser or, sent backwards, the receiver does.
+
+    Arguments:
+        origin_m: Where they are [m], shape (M, 3).
+        axes: Forward, left and up of each as rows, shape (M, 3, 3).
+        intensity: In the forward direction [W/sr], shape (M,).
+        least_cosine: Directions closer than this to forward are lit, shape (M,).
+        tangents: Limits of |left| / forward and |up| / forward, infinite for none, shape (M, 2).
+        lambertian: Whether the intensity falls with the cosine from forward, shape (M,).
+        radius_m: Closer than this, light grows no stronger: the size of what a point stands for [m], shape (M,).
+        lead_m: Length of the light's path before it gets here [m], shape (M,).
+    """
+
+    origin_m: np.ndarray
+    axes: np.ndarray
+    intensity: np.ndarray
+    least_cosine: np.ndarray
+    tangents: np.ndarray
+    lambertian: np.ndarray
+    radius_m: np.ndarray
+    lead_m: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.origin_m)
+
+    @classmethod
+    def flood(cls, origin_m: np.ndarray, intensity: float = 1.0) -> Lights:
+        """Lights at points (M, 3) that shine everywhere alike; 1 W has the intensity 1 / (4 pi)."""
+        return cls._of(origin_m, np.tile([0.0, 0.0, 1.0], (len(origin_m), 1)), intensity)
+
+    @classmethod
+    def spot(cls, origin_m: np.ndarray, direction: np.ndarray, half_angle_rad: float, intensity: float) -> Lights:
+        """Lights at points (M, 3) that shine evenly into a cone; 1 W has the intensity 1 / (2 pi (1 - cos))."""
+        return replace(
+            cls._of(origin_m, direction, intensity), least_cosine=np.full(len(origin_m), math.cos(half_angle_rad))
+        )
+
+    @classmethod
+    def beams(
+        cls, hits: Hits, rays: Rays, reflectance: np.ndarray, *, watts: float = 1.0, radius_m: np.ndarray | None = None
+    ) -> Lights:
+        """The patches that thin beams light: matt points where rays first hit, with the power of what they reflect.
+
+        Arguments:
+            hits: First hits of the rays; all of them hit something.
+            rays: The beams, M of them.
+            reflectance: Where each hits, shape (M,).
+            watts: The power of each beam.
+            radius_m: The size of each patch [m], shape (M,).
+        """
+        points = rays.origin_m + hits.range_m[:, None] * rays.direction
+        made = cls._of(points, hits.normal, 1.0)
+        return replace(
+            made,
+            intensity=watts * reflectance / math.pi,
+            least_cosine=np.zeros(len(rays)),
+            lambertian=np.ones(len(rays), dtype=bool),
+            radius_m=np.zeros(len(rays)) if radius_m is None else radius_m,
+            lead_m=hits.range_m,
+        )
+
+    @classmethod
+    def receiver(cls, receiver: Receiver) -> Lights:
+        """A fixed receiver's aperture, sent backwards: 1 W/sr within its field of view."""
+        axes = receiver_axes(receiver)
+        made = cls._of(np.asarray(receiver.origin_m)[None], axes[:1], 1.0)
+        tangents = np.tan([[receiver.horizontal_rad / 2, receiver.vertical_rad / 2]])
+        return replace(made, axes=axes[None], least_cosine=np.zeros(1), tangents=tangents)
+
+    @classmethod
+    def _of(cls, origin_m: np.ndarray, forward: np.ndarray, intensity: float) -> Lights:
+        count = len(origin_m)
+        zeros = np.zeros(count)
+        return cls(
+            np.asarray(origin_m, dtype=float),
+            _axes(np.broadcast_to(np.asarray(forward, dtype=float), (count, 3))),
+            np.full(count, float(intensity)),
+            np.full(count, EVERYWHERE),
+            np.full((count, 2), np.inf),
+            np.zeros(count, dtype=bool),
+            zeros,
+            zeros,
+        )
+
+
+@dataclass(frozen=True)
+class PathBins:
+    """Equal bins of path lengths, less the rays' baselines where they have some.
+
+    Arguments:
+        width_m: Of one bin: whole paths, there and back [m].
+        count: How many.
+        start_m: Where the first begins [m].
+    """
+
+    width_m: float
+    count: int
+    start_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.width_m) and self.width_m > 0 and self.count > 0 and math.isfinite(self.start_m)):
+            raise ConfigError(f"{self}", where="bins", allowed="a finite start, a width above 0 m, one bin or more")
+
+    @property
+    def centres_m(self) -> np.ndarray:
+        """Centres of the bins [m], shape (count,)."""
+        return self.start_m + (np.arange(self.count) + 0.5) * self.width_m
+
+
+@dataclass(frozen=True, eq=False)
+class Transients:
+    """Light that arrives along N rays by the length of its path [W / (m^2 sr)] for lights in W/sr.
+
+    Arguments:
+        bins: The path lengths.
+        ray, cell: Where light arrives, each pair once, shape (K,).
+        radiance: How much, shape (K,).
+        steady: What arrives along each ray in all, also outside of the bins, shape (N,).
+    """
+
+    bins: PathBins
+    ray: np.ndarray
+    cell: np.ndarray
+    radiance: np.ndarray
+    steady: np.ndarray
+
+    @property
+    def binned(self) -> np.ndarray:
+        """The radiance of every ray in every bin, shape (N, count)."""
+        table = np.zeros((len(self.steady), self.bins.count))
+        table[self.ray, self.cell] = self.radiance
+        return table
+
+
+def render_transient(
+    scene: Scene,
+    frame: int,
+    rays: Rays,
+    lights: Lights,
+    bins: PathBins,
+    *,
+    bounces: int = 1,
+    samples: int = 1,
+    seed: int = 0,
+    direct: bool = True,
+    matt: bool = False,
+    own_light: bool = False,
+    cone_sr: np.ndarray | None = None,
+    baseline_m: np.ndarray | None = None,
+    limit_s: float = TIME_LIMIT_S,
+) -> Transients:
+    """The transients along rays of light that met 1 to `bounces` surfaces.
+
+    Arguments:
+        scene: What light meets.
+        frame: The time frame.
+        rays: What is looked along, N of them; gates play no part.
+        lights: Where light comes from, M of them.
+        bins: Path lengths to tell apart.
+        bounces: Most surfaces that light meets: 1 is the direct component, exact for thin rays, one light, one sample.
+        samples: Light paths per ray; standard errors fall with its root.
+        seed: Of the simulator's random numbers; a ray's depend on its number in the list, and on samples and bins.
+        direct: Whether light that meets one surface alone counts.
+        matt: Whether mirrors and glass swallow the light that they do not scatter.
+        own_light: Whether ray n sees light n alone; otherwise all of them.
+        cone_sr: Solid angle around each ray that its radiance is the mean of [sr], shape (N,); None: thin rays.
+        baseline_m: Length to take off the paths of each ray [m], shape (N,); None: 0.
+        limit_s: How long a request may take [s].
+
+    Raises:
+        ConfigError: The simulator is not usable here, or numbers that are not allowed.
+        NumericalError: It died or took too long.
+    """
+    count = len(rays)
+    _check(count, lights, bounces, samples, own_light)
+    if not count or not len(lights):
+        nothing = np.zeros(0, dtype=np.int64)
+        return Transients(bins, nothing, nothing, np.zeros(0), np.zeros(count))
+    first = shared_caster(scene, frame).first_hit(rays.origin_m, rays.direction)
+    centre_m, reach_m = _neighbourhood(first, rays, lights)
+    shapes, arrays = exported(scene, frame, centre_m, reach_m, matt=matt)
+    columns = _ray_columns(rays, first, centre_m, cone_sr)
+    columns["baseline"] = bins.start_m + (np.zeros(count) if baseline_m is None else baseline_m)
+    columns["dark_radius"] = np.full(count, 0.0 if direct else SAME_PLACE * reach_m)
+    request = {"shapes": shapes, "samples": samples, "bins": bins.count, "width_m": bins.width_m}
+    request |= {"bounces": bounces, "own": own_light}
+    arrays |= (light_columns := _light_columns(lights, centre_m, reach_m))
+    by_ray = columns | (light_columns if own_light else {})
+    parts = []
+    for number, rows in enumerate(_chunks(count, bins.count)):
+        mine = arrays | {name: values[rows] for name, values in by_ray.items()}
+        parts.append((rows[0], ask({**request, "seed": _seed(seed, number)}, mine, limit_s=limit_s)))
+    return _joined(bins, count, parts)
+
+
+def _joined(bins: PathBins, count: int, answers: list[tuple[int, dict[str, np.ndarray]]]) -> Transients:
+    """What all requests found, by the first ray of each, without the rays that filled up the last."""
+    parts = [{**found, "ray": found["ray"] + start} for start, found in answers]
+    ray, cell, radiance, steady = (
+        np.concatenate([part[name] for part in parts]) for name in ("ray", "cell", "radiance", "steady")
+    )
+    real = ray < count
+    return Transients(bins, ray[real], cell[real], radiance[real].astype(float), steady[:count].astype(float))
+
+
+def pixel_rays(receiver: Receiver, columns: int, rows: int) -> tuple[Rays, np.ndarray]:
+    """A receiver's field of view as a camera's pixels: a ray through each one's centre, and its solid angle [sr].
+
+    Pixels are equal on the image plane; their solid angles add up to the field's.
+    """
+    half = np.tan([receiver.horizontal_rad / 2, receiver.vertical_rad / 2])
+    left, up = (
+        (2 * (np.arange(number) + 0.5) / number - 1) * extent
+        for number, extent in zip((columns, rows), half, strict=True)
+    )
+    grid = np.stack(np.meshgrid(left, up, indexing="ij"), axis=-1).reshape(-1, 2)
+    ahead = np.concatenate([np.ones((len(grid), 1)), grid], axis=1)
+    length = np.linalg.norm(ahead, axis=1)
+    area = 4 * half[0] * half[1] / len(grid)
+    count = len(grid)
+    rays = Rays(
+        np.tile(np.asarray(receiver.origin_m, dtype=float), (count, 1)),
+        (ahead / length[:, None]) @ receiver_axes(receiver),
+        np.tile(np.asarray(receiver.range_m, dtype=float), (count, 1)),
+        np.zeros(count),
+        np.zeros(count),
+    )
+    return rays, area / length**3
+
+
+def _check(count: int, lights: Lights, bounces: int, samples: int, own_light: bool) -> None:
+    if bounces < 1 or samples < 1:
+        raise ConfigError(f"{bounces} bounces, {samples} samples", where="light transport", allowed="1 or more")
+    if own_light and count != len(lights):
+        raise ConfigError(f"{len(lights)} lights of {count} rays", where="own_light", allowed="one for each ray")
+
+
+def _neighbourhood(first: Hits, rays: Rays, lights: Lights) -> tuple[np.ndarray, float]:
+    """The middle of all ends and first hits of paths, shape (3,), and the furthest of them from it [m]."""
+    seen = np.isfinite(first.range_m)
+    points = rays.origin_m[seen] + first.range_m[seen, None] * rays.direction[seen]
+    points = np.concatenate([points, rays.origin_m, lights.origin_m])
+    centre_m = (points.min(axis=0) + points.max(axis=0)) / 2
+    return centre_m, float(np.linalg.norm(points - centre_m, axis=1).max())
+
+
+def _ray_columns(rays: Rays, first: Hits, centre_m: np.ndarray, cone_sr: np.ndarray | None) -> dict[str, np.ndarray]:
+    met_m = np.where(np.isfinite(first.range_m), first.range_m, 0.0)
+    origin = rays.origin_m - centre_m
+    return {
+        "origin": origin,
+        "direction": rays.direction,
+        "dark_place": origin + met_m[:, None] * rays.direction,
+        "cone_cosine_m1": np.zeros(len(rays)) if cone_sr is None else np.asarray(cone_sr) / (2 * math.pi),
+    }
+
+
+def _light_columns(lights: Lights, centre_m: np.ndarray, reach_m: float) -> dict[str, np.ndarray]:
+    return {
+        "light": lights.origin_m - centre_m,
+        "light_forward": lights.axes[:, 0],
+        "light_left": lights.axes[:, 1],
+        "light_up": lights.axes[:, 2],
+        "light_cosine": lights.least_cosine,
+        "light_left_tan": lights.tangents[:, 0],
+        "light_up_tan": lights.tangents[:, 1],
+        "light_lambert": lights.lambertian.astype(float),
+        "light_intensity": lights.intensity,
+        "light_radius": lights.radius_m,
+        # a patch does not light itself
+        "light_itself": np.where(lights.lambertian, SAME_PLACE * reach_m, 0.0),
+        "light_lead": lights.lead_m,
+    }
+
+
+def _chunks(count: int, bins: int) -> list[np.ndarray]:
+    """Rays in requests; the last one is filled up with its last ray to a power of two, for which kernels are known."""
+    size = max(FEWEST_RAYS, min(CHUNK_RAYS, CHUNK_VALUES // bins))
+    chunks = [np.arange(start, min(start + size, count)) for start in range(0, count, size)]
+    last = chunks[-1]
+    full = max(FEWEST_RAYS, 1 << (len(last) - 1).bit_length())
+    return [*chunks[:-1], np.concatenate([last, np.full(full - len(last), last[-1])])]
+
+
+def _seed(seed: int, chunk: int) -> int:
+    return int(np.random.SeedSequence([seed, chunk]).generate_state(1)[0])
+
+
+def _axes(forward: np.ndarray) -> np.ndarray:
+    """Forward, left and up as rows for forward directions (M, 3), shape (M, 3, 3)."""
+    forward = forward / np.linalg.norm(forward, axis=1, keepdims=True)
+    # the coordinate axis that is furthest from forward cannot be parallel to it
+    other = np.eye(3)[np.abs(forward).argmin(axis=1)]
+    left = np.cross(other, forward)
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    return np.stack([forward, left, np.cross(forward, left)], axis=1)

@@ -1,0 +1,283 @@
+"""The process that renders: mitsuba and mitransient live here and nowhere else.
+
+Run as `python -m lidardesign.simulate.light_transport.worker`. Every line on standard input names a folder with
+`request.json` (numbers, shapes) and `request.npz` (arrays); the answer is `result.npz` or `error.txt` in that folder
+and one line on standard output. A library that aborts takes this process down, not the program that asked.
+
+Transport (intersections, scattering, several bounces, times of flight) is mitransient's `transient_path`. Its ends are
+ours, `light_transport_ends`, because no stock sensor is a list of rays and no stock emitter a list of lit patches.
+
+The two ends of light paths in the simulator's process: a sensor that is a list of rays, and a list of small lights.
+
+Made from the modules given, not imported: only the simulator's process has them. What a sensor and an emitter are asked
+is mitsuba's protocol; a path's length counts from the ray's origin to the light, and on by the light's own lead.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import traceback
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidardesign.numerics import TINY_FLOAT32
+from lidardesign.simulate.light_transport import worker as ends
+
+# Plain float32 on the CPU, one channel: light of one wavelength.
+VARIANT = "llvm_ad_mono"
+
+
+def _surface(shape: dict[str, Any]) -> dict[str, Any]:
+    """Matt, mirroring and clear shares of a body's light as one material, the same on both sides."""
+    clear, mirror = shape["transmission"], shape["specular"]
+    solid = max(1.0 - clear, TINY_FLOAT32)
+    matt_share = max(solid - mirror, TINY_FLOAT32)
+    material: dict[str, Any] = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 1.0}}
+    material["reflectance"]["value"] = min(shape["reflectance"] / matt_share, 1.0)
+    if mirror > 0:
+        glossy = {"type": "conductor", "material": "none"}
+        material = {"type": "blendbsdf", "weight": mirror / solid, "matt": material, "glossy": glossy}
+    material = {"type": "twosided", "inner": material}
+    if clear > 0:
+        material = {"type": "mask", "opacity": 1.0 - clear, "inner": material}
+    return material
+
+
+def _shapes(mi: Any, request: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    made: dict[str, Any] = {}
+    for number, shape in enumerate(request["shapes"]):
+        surface = _surface(shape)
+        name = f"body{number}"
+        if shape["kind"] == "mesh":
+            made[name] = _mesh(mi, name, surface, arrays[f"vertices{number}"], arrays[f"faces{number}"])
+            continue
+        ends, radius = shape["ends"], shape["radius"]
+        for end, centre in enumerate(ends[: 1 if ends[0] == ends[1] else 2]):
+            made[f"{name}_{end}"] = {"type": "sphere", "center": centre, "radius": radius, "bsdf": surface}
+        if ends[0] != ends[1]:
+            made[name] = {"type": "cylinder", "p0": ends[0], "p1": ends[1], "radius": radius, "bsdf": surface}
+    return made
+
+
+def _mesh(mi: Any, name: str, surface: dict[str, Any], vertices: np.ndarray, faces: np.ndarray) -> Any:
+    properties = mi.Properties()
+    properties["surface"] = mi.load_dict(surface)
+    mesh = mi.Mesh(name, vertex_count=len(vertices), face_count=len(faces), props=properties)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = np.ascontiguousarray(vertices, dtype=np.float32).ravel()
+    parameters["faces"] = np.ascontiguousarray(faces, dtype=np.uint32).ravel()
+    parameters.update()
+    return mesh
+
+
+def _render(mi: Any, dr: Any, request: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    samples, rays = int(request["samples"]), len(arrays["origin"])
+    film = {
+        "type": "transient_hdr_film",
+        "width": rays,
+        "height": 1,
+        "rfilter": {"type": "box"},
+        "temporal_bins": int(request["bins"]),
+        "bin_width_opl": float(request["width_m"]),
+    }
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            **_shapes(mi, request, arrays),
+            "lights": {"type": "lidardesign_lights"},
+            "sensor": {
+                "type": "lidardesign_rays",
+                "film": film,
+                "sampler": {"type": "independent", "sample_count": samples},
+            },
+        }
+    )
+    # a path of n surfaces has depth n + 1, the light counted
+    depth = int(request["bounces"]) + 1
+    integrator = mi.load_dict({"type": "transient_path", "max_depth": depth, "rr_depth": depth})
+    ends.current[:] = [ends.Job(mi, dr, arrays, samples, bool(request["own"]))]
+    steady, transient = integrator.render(scene, seed=int(request["seed"]), spp=samples)
+    binned = np.asarray(transient)[0, :, :, 0]
+    ray, cell = np.nonzero(binned)
+    return {"ray": ray, "cell": cell, "radiance": binned[ray, cell], "steady": np.asarray(steady)[0, :, 0]}
+
+
+def answer(folder: Path, mi: Any, dr: Any) -> None:
+    """Render the request in a folder and leave the result or the error beside it."""
+    try:
+        request = json.loads((folder / "request.json").read_text(encoding="utf-8"))
+        with np.load(folder / "request.npz", allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        np.savez(folder / "result.npz", **_render(mi, dr, request, arrays))
+    except Exception:
+        # whatever goes wrong in here is the asking side's to report
+        (folder / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
+
+
+def main() -> None:
+    """Serve requests until standard input ends."""
+    import drjit as dr
+    import mitsuba as mi
+
+    mi.set_variant(VARIANT)
+    import mitransient  # noqa: F401 (registers its integrator and film)
+
+    ends.register(mi, dr)
+    print("ready", flush=True)
+    for line in sys.stdin:
+        answer(Path(line.rstrip("\n")), mi, dr)
+        print("done", flush=True)
+
+
+if __name__ == "__main__":
+    main()
+
+
+RAY_COLUMNS = ("origin", "direction", "cone_cosine_m1", "baseline", "dark_place", "dark_radius")
+LIGHT_COLUMNS = (
+    "light",
+    "light_forward",
+    "light_left",
+    "light_up",
+    "light_cosine",
+    "light_left_tan",
+    "light_up_tan",
+    "light_lambert",
+    "light_intensity",
+    "light_radius",
+    "light_itself",
+    "light_lead",
+)
+
+
+class Job:
+    """What the sensor and the emitter of a request share; its arrays live as long as kernels may read them.
+
+    Arguments:
+        mi, dr: mitsuba with its variant set, and drjit.
+        arrays: The columns of rays and lights.
+        samples: Paths per ray.
+        own: Whether ray n sees light n alone; otherwise all of them.
+    """
+
+    def __init__(self, mi: Any, dr: Any, arrays: dict[str, np.ndarray], samples: int, own: bool) -> None:
+        self._dr, self.samples, self.own = dr, samples, own
+        # not written into the kernel, so that one kernel serves all numbers of lights
+        self.lights = dr.opaque(mi.UInt32, len(arrays["light"]))
+        self._columns: dict[str, Any] = {}
+        for name in (*RAY_COLUMNS, *LIGHT_COLUMNS):
+            values = np.ascontiguousarray(arrays[name].T, dtype=np.float32)
+            self._columns[name] = (mi.Float if values.ndim == 1 else mi.Vector3f)(values)
+
+    def at(self, name: str, index: Any) -> Any:
+        """A column's values at indices."""
+        values = self._columns[name]
+        return self._dr.gather(type(values), values, index)
+
+
+current: list[Job] = []
+
+
+def register(mi: Any, dr: Any) -> None:
+    """Make `lidardesign_rays` and `lidardesign_lights` known; they work on the one job in `current`."""
+    mi.register_sensor("lidardesign_rays", _ray_list(mi, dr))
+    mi.register_emitter("lidardesign_lights", _lights(mi, dr))
+
+
+def _ray_list(mi: Any, dr: Any) -> type:
+    class RayList(mi.Sensor):
+        """Rays with an origin each, spread evenly within a cone around their directions."""
+
+        def __init__(self, properties: Any) -> None:
+            super().__init__(properties)
+            self.m_needs_sample_3 = True
+
+        def sample_ray(self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True) -> Any:
+            job = current[0]
+            ray = dr.arange(mi.UInt32, dr.width(sample2)) // job.samples
+            axis, cosine_m1 = job.at("direction", ray), job.at("cone_cosine_m1", ray)
+            # 1 - cos of a narrow cone is kept apart: cos alone would round to 1
+            drop, turn = sample3.x * cosine_m1, dr.two_pi * sample3.y
+            sine = dr.safe_sqrt(drop * (2 - drop))
+            local = mi.Vector3f(sine * dr.cos(turn), sine * dr.sin(turn), 1 - drop)
+            spread = dr.normalize(mi.Frame3f(axis).to_world(local))
+            direction = dr.select(cosine_m1 > 0, spread, axis)
+            # nothing moves: time is free to carry the ray's number along the path, exact below 2^24
+            return mi.Ray3f(mi.Point3f(job.at("origin", ray)), direction, mi.Float(ray), []), mi.Spectrum(1)
+
+        def sample_ray_differential(
+            self, time: Any, sample1: Any, sample2: Any, sample3: Any, active: Any = True
+        ) -> Any:
+            ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
+            return mi.RayDifferential3f(ray), weight
+
+        def bbox(self) -> Any:
+            return mi.BoundingBox3f()
+
+        def to_string(self) -> str:
+            return "RayList[]"
+
+    return RayList
+
+
+def _lights(mi: Any, dr: Any) -> type:
+    class Lights(mi.Emitter):
+        """Points that send light into a part of what lies in front of them, or everywhere."""
+
+        def __init__(self, properties: Any) -> None:
+            super().__init__(properties)
+            self.m_flags = mi.EmitterFlags.DeltaPosition
+
+        def sample_direction(self, it: Any, sample: Any, active: Any = True) -> Any:
+            job = current[0]
+            ray = mi.UInt32(it.time + 0.5)
+            chosen = mi.UInt32(sample.x * mi.Float(job.lights))
+            index = ray if job.own else dr.minimum(chosen, job.lights - 1)
+            place = mi.Point3f(job.at("light", index))
+            offset = place - it.p
+            distance = dr.norm(offset)
+            toward = offset / dr.maximum(distance, dr.smallest(mi.Float))
+            strength = _strength(dr, job, index, -toward, distance)
+            dark = dr.norm(it.p - mi.Point3f(job.at("dark_place", ray))) < job.at("dark_radius", ray)
+            strength = dr.select(dark, 0, strength)
+            if not job.own:
+                strength *= mi.Float(job.lights)
+            ds = dr.zeros(mi.DirectionSample3f)
+            ds.p, ds.n, ds.d, ds.time = place, -toward, toward, it.time
+            ds.dist = distance + job.at("light_lead", index) - job.at("baseline", ray)
+            lit = active & (strength > 0)
+            ds.pdf, ds.delta = dr.select(lit, mi.Float(1), 0), mi.Bool(True)
+            ds.emitter = mi.EmitterPtr(self)
+            return ds, mi.Spectrum(dr.select(lit, strength, 0))
+
+        def pdf_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+            return mi.Float(0)
+
+        def eval_direction(self, it: Any, ds: Any, active: Any = True) -> Any:
+            return mi.Spectrum(0)
+
+        def eval(self, si: Any, active: Any = True) -> Any:
+            return mi.Spectrum(0)
+
+        def bbox(self) -> Any:
+            return mi.BoundingBox3f()
+
+        def to_string(self) -> str:
+            return "Lights[]"
+
+    return Lights
+
+
+def _strength(dr: Any, job: Job, index: Any, away: Any, distance: Any) -> Any:
+    """The irradiance of lights at a distance in a direction away from them, on a surface that faces them."""
+    forward, left, up = (dr.dot(away, job.at(f"light_{name}", index)) for name in ("forward", "left", "up"))
+    inside = (forward >= job.at("light_cosine", index)) & (distance > job.at("light_itself", index))
+    inside &= dr.abs(left) <= job.at("light_left_tan", index) * dr.abs(forward)
+    inside &= dr.abs(up) <= job.at("light_up_tan", index) * dr.abs(forward)
+    intensity = job.at("light_intensity", index)
+    intensity *= dr.select(job.at("light_lambert", index) > 0, dr.maximum(forward, 0), 1)
+    near = dr.maximum(distance, job.at("light_radius", index))
+    return dr.select(inside, intensity / dr.square(near), 0)

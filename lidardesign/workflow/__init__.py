@@ -1,0 +1,1 @@
+"""The application layer: runs, fits, refinement and evaluation as whole steps."""

@@ -1,0 +1,277 @@
+"""`learn --tolerance` and `--time-budget`: how long to learn follows from how good, or how soon."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from lidardesign.cli.output import Console
+from lidardesign.errors import ConfigError, DataError, ThresholdError
+from lidardesign.run.clock import phase
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from lidardesign.config import RunConfig
+    from lidardesign.density.learn import LearnProgress, LearnResult
+    from lidardesign.density.ranks import Ranks
+    from lidardesign.density.training.schedule import ToleranceGoal
+    from lidardesign.task import Task
+
+TOLERANCE, TIME_BUDGET = "--tolerance", "--time-budget"
+# More is a mistake in the unit; the numbers of steps that it makes are beyond what a file may hold.
+LONGEST_S = 366 * 24 * 3600.0
+STEPS_KEY, FIELDS_KEY = "learning.steps", "density.field_resolution"
+GOAL = "goal"
+# What passes before the command's clock runs, where the system does not tell: the program's own imports take 0.3 s.
+STARTUP_S = 0.5
+# A process that is older than this did something else before.
+MOST_STARTUP_S = 30.0
+# Where Linux says when a process began, in ticks since the computer was started; the fields after its name in brackets.
+_STATUS, _STARTED_FIELD = Path("/proc/self/stat"), 19
+
+Tolerance = Annotated[
+    float | None,
+    typer.Option(
+        TOLERANCE,
+        metavar="SHARE",
+        help="Learn until at most this share of the density's mass is in the wrong place, in stages of doubled steps "
+        "from an eighth to four times those of the preset; exit 1 when none is good enough.",
+        show_default=False,
+    ),
+]
+TimeBudget = Annotated[
+    float | None,
+    typer.Option(
+        TIME_BUDGET,
+        metavar="SECONDS",
+        help="Learn as many steps as let the command end within this time; they are planned from its own first steps.",
+        show_default=False,
+    ),
+]
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What decides the number of steps, where the configuration does not.
+
+    Arguments:
+        tolerance: The misplaced share to reach.
+        time_budget_s: The time to end within.
+        fixed_fields: Whether the resolution of distance fields is the user's own choice.
+    """
+
+    tolerance: float | None = None
+    time_budget_s: float | None = None
+    fixed_fields: bool = field(default=False, compare=False)
+
+    @property
+    def is_none(self) -> bool:
+        """Whether the configuration decides."""
+        return self.tolerance is None and self.time_budget_s is None
+
+    def as_dict(self) -> dict[str, Any]:
+        """What the manifest has of it before anything is learned."""
+        if self.tolerance is not None:
+            return {"tolerance": self.tolerance}
+        return {"time_budget_s": self.time_budget_s}
+
+
+def checked_goal(
+    tolerance: float | None, time_budget_s: float | None, given: Mapping[str, Any], ranks: Ranks
+) -> Goal:
+    """The goal of the two options.
+
+    Arguments:
+        tolerance, time_budget_s: The options.
+        given: The other options of the configuration.
+        ranks: Who learns together.
+
+    Raises:
+        ConfigError: Both, a value that is none, or a number of steps beside a time.
+    """
+    if tolerance is not None and time_budget_s is not None:
+        raise ConfigError("both decide the number of steps", where=f"{TOLERANCE}, {TIME_BUDGET}", allowed="one of them")
+    if tolerance is not None and not 0 < tolerance < 1:
+        raise ConfigError(f"{tolerance:g}", where=TOLERANCE, allowed="a share between 0 and 1, as 0.1")
+    keys = {text.partition("=")[0].strip() for text in given["overrides"]}
+    if time_budget_s is None:
+        return Goal(tolerance, fixed_fields=given["config_file"] is not None or FIELDS_KEY in keys)
+    if not 0 < time_budget_s <= LONGEST_S:
+        raise ConfigError(f"{time_budget_s:g}", where=TIME_BUDGET, allowed="seconds above 0, a year at most")
+    if STEPS_KEY in keys:
+        raise ConfigError(f"the time decides {STEPS_KEY}", where=TIME_BUDGET, hint=f"leave out --set {STEPS_KEY}")
+    if given["config_file"] is not None:
+        _refuse_steps_in(given["config_file"])
+    if ranks.size > 1:
+        raise ConfigError("plans steps for one rank", where=TIME_BUDGET, hint=f"--set {STEPS_KEY}=N, or {TOLERANCE}")
+    return Goal(None, time_budget_s)
+
+
+def _refuse_steps_in(path: Path) -> None:
+    """Refuse a configuration file that sets what the time decides."""
+    from lidardesign.run.yaml import leaves, load_yaml
+
+    document, key = load_yaml(path), tuple(STEPS_KEY.split("."))
+    if key in dict(leaves(document.value)):
+        where = f"{TIME_BUDGET}, {document.locate(key)}"
+        raise ConfigError(f"the time decides {STEPS_KEY}", where=where, hint=f"leave out {STEPS_KEY} there")
+
+
+def resumed_goal(asked: Goal, run: Path) -> Goal:
+    """The goal that a run was started with.
+
+    Raises:
+        ConfigError: Another one is asked for.
+        DataError: The manifest's word of it is damaged.
+    """
+    from lidardesign.run.manifest import DAMAGED_HINT, FILE_NAME, read_manifest
+
+    found = read_manifest(run).get(GOAL) or {}
+    stored = Goal(found.get("tolerance"), found.get("time_budget_s"))
+    if not all(isinstance(value, float | int | None) for value in stored.as_dict().values()):
+        raise DataError(f"the manifest's {GOAL!r} is damaged", where=str(run / FILE_NAME), hint=DAMAGED_HINT)
+    if asked.is_none or asked == stored:
+        return stored
+    where = TOLERANCE if asked.tolerance is not None else TIME_BUDGET
+    (key, value), begun = next(iter(asked.as_dict().items())), "neither goal"
+    if not stored.is_none:
+        begun = " = ".join(str(part) for part in next(iter(stored.as_dict().items())))
+    raise ConfigError(
+        f"the run was started with {begun}, not {key} = {value:g}", where=where, hint="resume without it"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Learner:
+    """Learns one task in one folder.
+
+    Arguments:
+        task: The plugin.
+        run: The folder.
+        device: auto, cpu or cuda.
+        progress: Called about every tenth step.
+        ranks: Who learns together.
+        console: Whose clock the time budget is measured by.
+    """
+
+    task: Task
+    run: Path
+    device: str
+    progress: Callable[[LearnProgress], None]
+    ranks: Ranks
+    console: Console
+
+    def learn(self, config: RunConfig, goal: Goal, *, resume: bool) -> LearnResult:
+        """Learn a configuration, or to a goal, or go on with it."""
+        with phase("libraries"):
+            from lidardesign.density.learn import learn as learn_density
+            from lidardesign.run.manifest import read_manifest
+
+        options: dict[str, Any] = {"device": self.device, "progress": self.progress, "ranks": self.ranks}
+        if goal.tolerance is not None:
+            return self._to_tolerance(config, goal, resume, options)
+        if goal.time_budget_s is not None and not resume:
+            return self._within(config, goal.time_budget_s, options)
+        result = learn_density(self.task, config, self.run, resume=resume, **options)
+        return result if goal.is_none else replace(result, goal=read_manifest(self.run)[GOAL])
+
+    def _to_tolerance(self, config: RunConfig, goal: Goal, resume: bool, options: dict[str, Any]) -> LearnResult:
+        from lidardesign.density.learn import learn as learn_density
+        from lidardesign.density.training.schedule import goal_of, learn_to_tolerance
+        from lidardesign.density.training.training_data import prepare_ground
+
+        begun, note = goal_of(self.run), ""
+        if begun is None:
+            config, begun, note = self._begun(config, goal)
+        ground = prepare_ground(self.task, config, self.ranks)
+
+        def once(staged: RunConfig, going_on: bool) -> LearnResult:
+            return learn_density(self.task, staged, self.run, resume=going_on, ground=ground, **options)
+
+        result, reached = learn_to_tolerance(config, self.run, begun, once, resume=resume)
+        tried = ", ".join(f"{stage.misplaced:.3g} with {stage.steps}" for stage in reached.stages)
+        told = f"misplaced {tried} steps; the tolerance is {reached.tolerance:g}"
+        return self._whole(result, "; ".join(filter(None, [told, note])), reached.as_dict())
+
+    def _begun(self, config: RunConfig, goal: Goal) -> tuple[RunConfig, ToleranceGoal, str]:
+        """The configuration with fields for the tolerance, and what they leave of it to learning."""
+        from lidardesign.density.training.schedule import ToleranceGoal
+        from lidardesign.density.training.training_data import training_scenes
+        from lidardesign.evaluate.accuracy.fields import fields_within
+
+        scenes = training_scenes(self.task, config)
+        chosen = fields_within(scenes, config, goal.tolerance, fixed=goal.fixed_fields)
+        if chosen.misplaced >= goal.tolerance:
+            raise ConfigError(
+                f"{chosen.note}, which leaves nothing to learning",
+                where=TOLERANCE,
+                allowed=f"above {chosen.misplaced:.2g}",
+                hint=f"a larger {FIELDS_KEY}, or a larger tolerance",
+            )
+        begun = ToleranceGoal(goal.tolerance, config.learning.steps, (), chosen.misplaced)
+        return replace(config, density=chosen.density), begun, chosen.note
+
+    def _within(self, config: RunConfig, time_budget_s: float, options: dict[str, Any]) -> LearnResult:
+        from lidardesign.density.learn import choose_device
+        from lidardesign.density.learn import learn as learn_density
+        from lidardesign.density.training.schedule import Timekeeper
+        from lidardesign.density.training.training_data import prepare_ground
+
+        if self.ranks.size > 1:  # also where a run is started anew whose goal is in its manifest
+            raise ConfigError("plans steps for one rank", where=TIME_BUDGET, hint="resume the run on one rank")
+        place = choose_device(self.device)
+        clock, age = self.console.clock, _age_s()
+        startup = STARTUP_S if age is None or age - clock.seconds > MOST_STARTUP_S else age - clock.seconds
+        keeper = Timekeeper(time_budget_s, lambda: clock.seconds + startup, config, self.run)
+        ground = prepare_ground(self.task, config)
+        with phase("planning"):
+            planned = keeper.plan(ground, place)
+        result = learn_density(self.task, planned, self.run, ground=ground, replan=keeper.replan, **options)
+        plan = keeper.planned
+        told = (
+            f"{plan.pathwise_steps} + {plan.balancing_steps} steps fit into {time_budget_s:g} s: "
+            f"{1e3 * plan.pathwise_s:.0f} and {1e3 * plan.balancing_s:.0f} ms each"
+        )
+        return self._whole(result, told, plan.as_dict())
+
+    def _whole(self, result: LearnResult, told: str, goal: dict[str, Any]) -> LearnResult:
+        """A result with all the time that its goal took."""
+        seconds = round(self.console.clock.seconds, 3)
+        return replace(result, notes=(*result.notes, told), goal=goal, seconds=seconds)
+
+
+def _age_s() -> float | None:
+    """How long this process has been running [s]; None where the system does not tell."""
+    try:
+        ticks = int(_STATUS.read_text(encoding="ascii").rpartition(")")[2].split()[_STARTED_FIELD])
+        return time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
+    except (OSError, ValueError, IndexError, AttributeError):
+        return None
+
+
+def check_met(result: LearnResult, goal: Goal) -> None:
+    """Exit 1 where the tolerance was not reached.
+
+    Raises:
+        ThresholdError: With what was reached.
+    """
+    if goal.tolerance is None or result.goal["met"]:
+        return
+    error = result.error_estimates["misplaced"].error
+    doubt = "" if error is None else f" +- {error:.2g}"
+    fields = result.goal["target_misplaced"]
+    if fields:
+        doubt += f", and {fields:.2g} of the target's by its distance fields,"
+    raise ThresholdError(
+        f"{result.misplaced:.3g}{doubt} of the density's mass is in the wrong place after {result.steps} steps",
+        where=TOLERANCE,
+        allowed=f"at most {goal.tolerance:g}",
+        hint="--preset fine learns a larger flow; the run is finished and can be used as it is",
+    )

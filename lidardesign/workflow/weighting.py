@@ -1,0 +1,125 @@
+"""How the samples of a run are weighted for a design: by other settings of the task, and by what refinement found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from lidardesign.errors import ConfigError
+
+if TYPE_CHECKING:
+    from lidardesign.design.sensor import Design
+    from lidardesign.evaluate.refinement.reweighting import Reweighting
+    from lidardesign.samples import Samples
+    from lidardesign.workflow.layouts import RunTarget
+    from lidardesign.workflow.runs import Run
+
+KEY = "weighting"
+OPTION = "--weight"
+# Refinement spreads by a few sigma of the density, which is at most the largest length: ten times `space.FARTHEST_M`,
+# which stands here as a number because --help loads no numpy.
+WIDEST_SPREAD_M = 1e10
+
+
+@dataclass(frozen=True, eq=False)
+class Weighting:
+    """What the density of a run is multiplied by for a design.
+
+    Arguments:
+        settings: Settings of the task, as KEY=VALUE: the target becomes that of their scenes.
+        reweighting: A factor over the scene, by refinement.
+        range_spread_m: Standard deviation by which samples are spread in range, by refinement [m].
+        origin: Where the settings were said: an option, or a design.
+    """
+
+    settings: tuple[str, ...] = ()
+    reweighting: Reweighting | None = None
+    range_spread_m: float = 0.0
+    origin: str = OPTION
+
+    def __bool__(self) -> bool:
+        return bool(self.settings or self.reweighting is not None or self.range_spread_m)
+
+    @classmethod
+    def of(cls, design: Design) -> Weighting:
+        """What a design says about its samples.
+
+        Raises:
+            ConfigError: It says something else.
+        """
+        document = design.provenance.get(KEY)
+        return cls() if document is None else cls.from_document(document, f"{KEY} of design {design.name}")
+
+    @classmethod
+    def from_document(cls, document: Any, where: str) -> Weighting:
+        """What `as_document` gave."""
+        from lidardesign.evaluate.refinement.reweighting import FIT_AGAIN, Reweighting
+
+        known = {"set", "factors", "range_spread_m"}
+        if not isinstance(document, Mapping) or not set(document) <= known:
+            allowed = f"some of the keys {', '.join(sorted(known))}"
+            raise ConfigError("is no weighting", where=where, allowed=allowed, hint=FIT_AGAIN)
+        settings, spread = document.get("set", ()), document.get("range_spread_m", 0.0)
+        listed = isinstance(settings, Sequence) and not isinstance(settings, str)
+        if not (listed and all(isinstance(text, str) for text in settings)):
+            raise ConfigError(f"set is {settings!r}", where=where, allowed="a list of KEY=VALUE", hint=FIT_AGAIN)
+        number = isinstance(spread, int | float) and not isinstance(spread, bool)
+        if not (number and 0 <= spread <= WIDEST_SPREAD_M):
+            allowed = f"0 to {WIDEST_SPREAD_M:g}"
+            raise ConfigError(f"range_spread_m is {spread!r}", where=where, allowed=allowed, hint=FIT_AGAIN)
+        factors = document.get("factors")
+        reweighting = None if factors is None else Reweighting.from_document(factors, f"{where}: factors")
+        return cls(tuple(settings), reweighting, float(spread), f"{where}: set")
+
+    def as_document(self) -> dict[str, Any]:
+        """Plain values, as they stand in the provenance of a design."""
+        document: dict[str, Any] = {}
+        if self.settings:
+            document["set"] = list(self.settings)
+        if self.range_spread_m:
+            document["range_spread_m"] = self.range_spread_m
+        if self.reweighting is not None:
+            document["factors"] = self.reweighting.as_document()
+        return document
+
+    def log_target(self, samples: Samples, target: RunTarget) -> Samples:
+        """The samples with the log p* that they have under the settings and the factor; ranges stay."""
+        if self.settings:
+            return samples.retargeted(target(samples.points))
+        if self.reweighting is not None:
+            return samples.reweighted(self.reweighting.log_factor(samples.points))
+        return samples
+
+    def spread(self, samples: Samples, seed: int) -> Samples:
+        """The samples spread in range, where that was found worth it."""
+        from lidardesign.task import random_generator
+
+        if not self.range_spread_m:
+            return samples
+        return samples.spread_in_range(self.range_spread_m, random_generator(seed, "range spread"))
+
+
+def weighted_samples(run: Run, weighting: Weighting, target: RunTarget) -> Samples:
+    """The samples of a run as a design was fitted to them.
+
+    Raises:
+        DataError: The samples are damaged, or no sample is worth anything under the weighting.
+    """
+    from lidardesign.samples import load_samples
+
+    samples = weighting.log_target(load_samples(run.folder), target)
+    return weighting.spread(samples, run.config.seed)
+
+
+def designs_samples(made: Sequence[tuple[Design, Run]], targets: Mapping[str, RunTarget]) -> dict[str, Samples]:
+    """The samples of designs by their names; designs with the same weighting of a run share them."""
+    known: dict[Any, Samples] = {}
+    found = {}
+    for design, run in made:
+        weighting = Weighting.of(design)
+        key = (run.folder, design.name if weighting else None)
+        if key not in known:
+            known[key] = weighted_samples(run, weighting, targets[design.name])
+        found[design.name] = known[key]
+    return found
