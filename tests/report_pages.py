@@ -9,7 +9,7 @@ import numpy as np
 from lidardesign.design.constraints.check import ConstraintCheck
 from lidardesign.design.constraints.slack import tightness
 from lidardesign.design.layouts.track import placed
-from lidardesign.design.sensor import Design, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.evaluate.figures.density_views import density_view
 from lidardesign.evaluate.figures.scene_figure import shown_in
 from lidardesign.evaluate.report.report import Report
@@ -87,7 +87,7 @@ def make_shown(name="plain", designs=2, places=PLACES, rays=25, scene=None, **fu
     made = []
     for number in range(designs):
         sensors = (make_sensor(f"a {name}", 0.2), make_sensor(f"b {name}", -0.2, 0.1))
-        made.append(Design(name if number == 0 else f"{name} {number}", sensors))
+        made.append(DesignSpec(name if number == 0 else f"{name} {number}", sensors))
 
     def laid_out(design, at):
         return moved_to(make_rays(rays, 2, lift=0.05), at)

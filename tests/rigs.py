@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidardesign.design.sensor import Design, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.geometry.rays import Rays
 from lidardesign.space import angles, direction
 
@@ -46,7 +46,7 @@ def rig():
     rays = Rays(origin, looking, gate, owner, np.arange(len(owner)) / (10.0 * len(owner)))
     # rays of different sensors take turns
     shuffled = generator.permutation(len(owner))
-    return Design("a rig", sensors, rays=len(owner)), rays.subset(shuffled)
+    return DesignSpec("a rig", sensors, rays=len(owner)), rays.subset(shuffled)
 
 
 def even(columns, rows, azimuth_rad, elevation_rad):
@@ -65,7 +65,7 @@ def spinning(columns=36, rows=4):
         np.tile(one.origin_m, (count, 1)), local @ one.frame, np.tile((0.5, 9.0), (count, 1)), np.zeros(count),
         np.arange(count) / (10.0 * count),
     )  # fmt: skip
-    return Design("spinner", (one,), rays=count), rays
+    return DesignSpec("spinner", (one,), rays=count), rays
 
 
 def farthest_nearest(wanted, fired):

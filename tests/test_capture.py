@@ -12,7 +12,7 @@ from command_line import caller
 from lidardesign.design.files import save_design
 from lidardesign.design.galvo import degree_frame, scan_directions
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import Design, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.evaluate.captures import scan as capture_ranges
 from lidardesign.evaluate.captures.capture import Capture, load_capture
@@ -55,7 +55,7 @@ def noisy(files):
 
 def ball_design(rays=150):
     numbers = (0.0, 0.0, 0.0, 0.1, 0.1, 0.52, 0.042)
-    return Design("ball", (Sensor("ball", 1.0, np.zeros(3), np.zeros((3, 3)), *numbers),), rays=rays)
+    return DesignSpec("ball", (Sensor("ball", 1.0, np.zeros(3), np.zeros((3, 3)), *numbers),), rays=rays)
 
 
 def looking(scan_deg, gate=(0.3, 2.0), origin=(0.0, 0.0, 0.0)):

@@ -17,7 +17,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document
-from lidardesign.design.sensor import Design, Sensor, Track, tangent_coordinates
+from lidardesign.design.sensor import DesignSpec, Sensor, Track, tangent_coordinates
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.candidates import mean_mbps, whole_range
 from lidardesign.evaluate.baselines.observed import TrainingViews, dense_points
@@ -362,16 +362,16 @@ def track(count=3):
     aimed = np.tile(np.linspace(-0.2, 0.2, count), (3, 1))
     gate = np.tile([2.0, 3.5], (3, count, 1))
     followed = Track("x_m", knots, np.zeros((3, count)), aimed, gate, np.arange(count))
-    return Design("mine", sensors(count), layout="scan", rays=count, track=followed)
+    return DesignSpec("mine", sensors(count), layout="scan", rays=count, track=followed)
 
 
 FOLLOWED = {
-    "grid": (Design("mine", sensors(2)), FIXED, AHEAD),
-    "density": (Design("mine", sensors(2), layout="density"), FIXED, AHEAD),
-    "scan": (Design("mine", sensors(6), layout="scan", rays=6), FIXED, AHEAD),
-    "distributed": (Design("mine", sensors(2, CEILING), layout="distributed"), CEILING, BELOW),
+    "grid": (DesignSpec("mine", sensors(2)), FIXED, AHEAD),
+    "density": (DesignSpec("mine", sensors(2), layout="density"), FIXED, AHEAD),
+    "scan": (DesignSpec("mine", sensors(6), layout="scan", rays=6), FIXED, AHEAD),
+    "distributed": (DesignSpec("mine", sensors(2, CEILING), layout="distributed"), CEILING, BELOW),
     "track": (track(), AISLE, balls(np.array([3.0, 0, 0.1]), 0.3)),
-    "bounded": (Design("mine", sensors(2), constraints=RULES["gate"] | {"budget": {"rays": 9}}), FIXED, AHEAD),
+    "bounded": (DesignSpec("mine", sensors(2), constraints=RULES["gate"] | {"budget": {"rays": 9}}), FIXED, AHEAD),
 }
 
 

@@ -13,7 +13,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.compare import angle_between, paired_sensors, readout_of
 from lidardesign.design.files import load_design, save_design
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import Design, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.space import direction
 
 
@@ -34,7 +34,7 @@ def test_a_design_does_not_differ_from_itself_however_its_sensors_are_ordered_an
     for _ in range(5):
         order = generator.permutation(6)
         other = tuple(replace(own[index], name=f"other{place}") for place, index in enumerate(order))
-        pairs = paired_sensors(Design("a", own), Design("b", other))
+        pairs = paired_sensors(DesignSpec("a", own), DesignSpec("b", other))
         assert [pair.first.name for pair in pairs] == [sensor.name for sensor in own]
         for pair in pairs:
             assert all(value in (0, None) for value in pair.as_dict()["difference"].values())
@@ -43,12 +43,12 @@ def test_a_design_does_not_differ_from_itself_however_its_sensors_are_ordered_an
 def test_sensors_of_the_same_names_are_compared_by_name():
     own = sensors(0, 3)
     swapped = tuple(replace(sensor, name=own[index].name) for index, sensor in enumerate(own[::-1]))
-    pairs = paired_sensors(Design("a", own), Design("b", swapped[::-1]))
+    pairs = paired_sensors(DesignSpec("a", own), DesignSpec("b", swapped[::-1]))
     assert [(pair.first.name, pair.second.name) for pair in pairs] == [("s0", "s0"), ("s1", "s1"), ("s2", "s2")]
 
 
 def test_differences_turn_their_sign_with_the_order_and_sensors_left_over_are_named():
-    first, second = Design("a", sensors(2, 2)), Design("b", sensors(3, 4, "t"))
+    first, second = DesignSpec("a", sensors(2, 2)), DesignSpec("b", sensors(3, 4, "t"))
     there = [pair.as_dict() for pair in paired_sensors(first, second)]
     back = {pair.as_dict()["b"]: pair.as_dict() for pair in paired_sensors(second, first)}
     assert sorted(pair["b"] for pair in there) == ["t0", "t1", "t2", "t3"]
@@ -69,7 +69,7 @@ def test_an_angle_is_exact_for_the_smallest_and_the_largest():
 
 def test_what_a_design_costs_is_what_its_rays_cost():
     for seed in range(5):
-        design = Design("d", sensors(seed, 4), rays=101)
+        design = DesignSpec("d", sensors(seed, 4), rays=101)
         assert readout_of(design).high_mbps == pytest.approx(Bandwidth().mbps(lay_out(design)))
         slow = replace(design, constraints={"budget": {"rate_hz": 2.0, "bin_ps": 250.0}})
         model = Bandwidth(bin_ps=250.0, rate_hz=2.0)

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import Design, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace, angles
 
@@ -37,7 +37,7 @@ def looking_along(directions, azimuth=0.0, elevation=0.0, half_angle=1.6, log_we
     along = np.column_stack([np.zeros((len(directions), 3)), *angles(directions), np.ones(len(directions))])
     level = np.zeros(len(along))
     samples = Samples(along, level, level if log_weights is None else log_weights, SPACE)
-    return Design("d", (sensor,), layout="density"), samples
+    return DesignSpec("d", (sensor,), layout="density"), samples
 
 
 def nearest(directions):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from lidardesign.design.sensor import Coupling, Design, Sensor, Track
+from lidardesign.design.sensor import Coupling, DesignSpec, Sensor, Track
 from lidardesign.evaluate.figures.density_views import (
     PERCENT,
     density_view,
@@ -111,7 +111,7 @@ def test_a_condition_has_no_marginal():
 
 def test_a_sensors_origin_and_range_are_normal_beside_the_density():
     sensor = make_sensor()
-    found = {m.dimension: m for m in marginals(even(ANYWHERE), [Design("one", (sensor,))])}
+    found = {m.dimension: m for m in marginals(even(ANYWHERE), [DesignSpec("one", (sensor,))])}
     for name, mean, spread in (("x_m", 0.1, 0.2), ("y_m", -0.2, 0.1), ("range_m", 1.7, 0.2)):
         one = found[name]
         expected = np.diff(ndtr((one.edges - mean) / spread)) / np.diff(one.edges)
@@ -120,7 +120,7 @@ def test_a_sensors_origin_and_range_are_normal_beside_the_density():
 
 def test_sensors_count_by_their_weights():
     near, far = make_sensor(name="near", weight=3.0, range_m=1.0), make_sensor(name="far", weight=1.0, range_m=2.5)
-    points, weights = mixture_points(Design("two", (near, far)))
+    points, weights = mixture_points(DesignSpec("two", (near, far)))
     assert weights.sum() == pytest.approx(1.0)
     assert weights[points[:, RANGE] < 1.75].sum() == pytest.approx(0.75, abs=0.002)
 
@@ -129,7 +129,7 @@ def test_rays_follow_their_origins_where_a_sensor_says_how():
     coupling = Coupling(
         np.array([[0.5, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([1.0, 0, 0]), np.zeros(2), np.array([0.01, 0.02]), 0.03
     )
-    points, _ = mixture_points(Design("bent", (make_sensor(coupling=coupling),)))
+    points, _ = mixture_points(DesignSpec("bent", (make_sensor(coupling=coupling),)))
     slope = np.polyfit(points[:, 0], points[:, RANGE], 1)
     assert slope[0] == pytest.approx(1.0, abs=0.01)
     rest = points[:, RANGE] - np.polyval(slope, points[:, 0])
@@ -139,7 +139,7 @@ def test_rays_follow_their_origins_where_a_sensor_says_how():
 def test_a_track_counts_along_its_whole_way():
     knots = np.array([0.0, 1.0])
     track = Track("x_m", knots, np.zeros((2, 3)), np.zeros((2, 3)), np.tile([1.0, 2.0], (2, 3, 1)), np.zeros(3, int))
-    points, _ = mixture_points(Design("moving", (make_sensor(),), track=track))
+    points, _ = mixture_points(DesignSpec("moving", (make_sensor(),), track=track))
     assert set(np.round(points[:, 0], 6)) == {0.0, 1.0}
 
 
@@ -171,7 +171,7 @@ def test_a_flat_world_has_one_plane_and_a_single_spot_none():
 def test_one_heavy_sample_is_drawn_without_a_number_that_is_none():
     points = FIXED.sample(50, np.random.default_rng(3))
     view = density_view(
-        samples_of(points, FIXED, np.r_[0.0, np.full(49, -np.inf)]), BALL, [Design("d", (make_sensor(),))]
+        samples_of(points, FIXED, np.r_[0.0, np.full(49, -np.inf)]), BALL, [DesignSpec("d", (make_sensor(),))]
     )
     assert view.effective == pytest.approx(1.0)
     for one in view.marginals:
@@ -181,7 +181,7 @@ def test_one_heavy_sample_is_drawn_without_a_number_that_is_none():
 
 def test_what_stands_out_far_beyond_the_density_is_cut_off():
     pinned = make_sensor(origin_covariance_m2=np.zeros((3, 3)))
-    one = marginals(even(ANYWHERE), [Design("pinned", (pinned,))])[0]
+    one = marginals(even(ANYWHERE), [DesignSpec("pinned", (pinned,))])[0]
     assert one.designs["pinned"].max() > one.top
     assert one.heights.max() < one.top
 
@@ -206,7 +206,7 @@ def test_silhouettes_cover_the_area_of_what_stands_there():
 
 
 def test_the_same_samples_give_the_same_view():
-    first, second = (density_view(even(ANYWHERE), BALL, [Design("d", (make_sensor(),))]) for _ in range(2))
+    first, second = (density_view(even(ANYWHERE), BALL, [DesignSpec("d", (make_sensor(),))]) for _ in range(2))
     for one, other in zip(first.marginals, second.marginals, strict=True):
         assert np.array_equal(one.heights, other.heights)
         assert np.array_equal(one.designs["d"], other.designs["d"])

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import Coupling, Design, RayTable, Sensor
+from lidardesign.design.sensor import Coupling, DesignSpec, RayTable, Sensor
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.evaluate.entries import entries_of, middle_condition
 from lidardesign.evaluate.score import EvaluationRequest, evaluate
@@ -89,7 +89,7 @@ def aisle_request(task, **changes):
         "config": TaskConfig(),
         "space": AISLE,
         "seed": 3,
-        "designs": [Design("cart", (upward(),))],
+        "designs": [DesignSpec("cart", (upward(),))],
         "rays": (6, 10),
         "baselines": ("uniform", "random", "bounding", "occupancy"),
         "train": shelves(4, 1),
@@ -243,7 +243,7 @@ def explicit(design, count):
 
 
 def test_turning_sensors_and_world_by_a_quarter_changes_no_score():
-    plain = Design("plain", ceiling_sensors())
+    plain = DesignSpec("plain", ceiling_sensors())
     table = explicit(plain, 300)
     turned = [replace(one, sensors=tuple(map(turned_sensor, one.sensors))) for one in (plain, table)]
     turned[1] = replace(turned[1], ray_table=turned_table(table.ray_table))
@@ -269,7 +269,7 @@ def test_turning_sensors_and_world_by_a_quarter_changes_no_score():
 
 def test_all_baselines_of_moving_scenes_have_free_origins_inside_the_space():
     request = EvaluationRequest(
-        task=SeenTask(), config=TaskConfig(), space=CEILING, seed=0, designs=[Design("d", ceiling_sensors())],
+        task=SeenTask(), config=TaskConfig(), space=CEILING, seed=0, designs=[DesignSpec("d", ceiling_sensors())],
         rays=(50,), baselines=("uniform", "random", "bounding", "occupancy"), train=carried(3, 6, 1),
         test=carried(2, 4, 2),
     )  # fmt: skip
@@ -289,10 +289,10 @@ def test_a_twin_stands_for_no_visibility_with_as_many_rays():
     def twin():
         made.append(1)
         points = np.tile([0.0, 0, 1, 0, -1.2, 1], (3, 1))
-        return Design("no-visibility", ceiling_sensors()[:2]), Samples(points, np.zeros(3), np.zeros(3), CEILING)
+        return DesignSpec("no-visibility", ceiling_sensors()[:2]), Samples(points, np.zeros(3), np.zeros(3), CEILING)
 
     request = EvaluationRequest(
-        task=SeenTask(), config=TaskConfig(), space=CEILING, seed=0, designs=[Design("d", ceiling_sensors())],
+        task=SeenTask(), config=TaskConfig(), space=CEILING, seed=0, designs=[DesignSpec("d", ceiling_sensors())],
         rays=(40, 80), baselines=("no-visibility",), train=carried(1, 4, 1), test=carried(2, 4, 2),
         without_visibility=twin,
     )  # fmt: skip

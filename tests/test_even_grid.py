@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from rigs import even, farthest_nearest, sensor
 
 from lidardesign.design.layouts.grid import grid_tangent
-from lidardesign.design.sensor import Design, tangent_directions
+from lidardesign.design.sensor import DesignSpec, tangent_directions
 from lidardesign.export.common.even_grid import EvenGrid, grid_losses, nearest_grid
 from lidardesign.export.common.names import identifier, identifiers, renamed_note, xml_text
 from lidardesign.export.common.poses import mounts, quaternion
@@ -72,7 +72,7 @@ def test_notes_count_the_rays_that_move():
         np.zeros((196, 3)), direction(azimuth, elevation) @ one.frame, np.tile((0.0, 1.0), (196, 1)), np.zeros(196),
         np.zeros(196),
     )  # fmt: skip
-    mounted = mounts(Design("d", (one,)), rays)
+    mounted = mounts(DesignSpec("d", (one,)), rays)
     (note,) = grid_losses(mounted, rays)
     assert "replaced by even grids (14 x 14 of s)" in note
     told = float(note.split("at most ")[1].split(" deg")[0])
@@ -86,7 +86,7 @@ def test_a_mounts_rotation_is_its_sensors_frame(seed):
     elevation = (np.pi / 2, -np.pi / 2)[seed] if seed < 2 else generator.uniform(-1.5, 1.5)
     one = sensor("s", generator.normal(size=3), generator.uniform(0, 6.3), elevation, generator.uniform(-3, 3))
     rays = Rays(one.origin_m[None], one.frame[:1], np.ones((1, 2)), np.zeros(1), np.zeros(1))
-    (mount,) = mounts(Design("d", (one,)), rays)
+    (mount,) = mounts(DesignSpec("d", (one,)), rays)
     np.testing.assert_allclose(rotations_of_quaternions(np.array(mount.quaternion)), one.frame.T, atol=1e-15)
     roll, pitch, yaw = mount.roll_pitch_yaw_rad
     about = [quaternion(*angles_rad) for angles_rad in ((roll, 0, 0), (0, pitch, 0), (0, 0, yaw))]

@@ -8,7 +8,7 @@ import pytest
 
 from lidardesign.design.files import load_design
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import Design, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.export.common.columns import ray_columns
 from lidardesign.export.registry import EXPORTERS, find_exporter
@@ -28,7 +28,7 @@ def design(count=2):
         )
         for i in range(count)
     )
-    return Design("two", sensors, rays=37, constraints={"gate": {"width_m": {"max": 1.0}}})
+    return DesignSpec("two", sensors, rays=37, constraints={"gate": {"width_m": {"max": 1.0}}})
 
 
 def read_csv(path):

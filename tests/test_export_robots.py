@@ -11,7 +11,7 @@ from rigs import NASTY, even, farthest_nearest, read_sdf, rig, sdf_reader, spinn
 
 from lidardesign.design.files import load_design
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.export import mjcf
 from lidardesign.export.common.names import identifier
@@ -115,7 +115,7 @@ def test_a_ray_along_any_axis_is_a_site_that_looks_there(tmp_path):
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     rays = type(RAYS)(np.zeros((6, 3)), axes, np.tile((0.0, 0.0), (6, 1)), np.zeros(6), np.zeros(6))
     for index, one in enumerate(DESIGN.sensors):
-        design = Design("axes", (one,))
+        design = DesignSpec("axes", (one,))
         path = tmp_path / f"{index}.xml"
         EXPORTERS["mjcf"].write(design, rays, path)
         model = mujoco.MjModel.from_xml_path(str(path))
@@ -128,7 +128,7 @@ def test_a_ray_along_any_axis_is_a_site_that_looks_there(tmp_path):
 def test_two_sensors_of_one_name_are_two_bodies(tmp_path):
     import mujoco
 
-    twins = Design("twins", (DESIGN.sensors[0], DESIGN.sensors[0]), rays=2)
+    twins = DesignSpec("twins", (DESIGN.sensors[0], DESIGN.sensors[0]), rays=2)
     path = tmp_path / "twins.xml"
     EXPORTERS["mjcf"].write(twins, lay_out(twins, 2), path)
     model = mujoco.MjModel.from_xml_path(str(path))
@@ -139,7 +139,7 @@ def test_no_name_is_a_word_of_the_format(reader, tmp_path):
     import mujoco
 
     for name in ("world", "include", "__model__", "a::b", "a\x00\nb", "x" * 5000):
-        design = Design(name, tuple(replace(one, name=name) for one in DESIGN.sensors[:1]))
+        design = DesignSpec(name, tuple(replace(one, name=name) for one in DESIGN.sensors[:1]))
         rays = RAYS.subset(RAYS.sensor == 0)
         path = tmp_path / "named"
         EXPORTERS["mjcf"].write(design, rays, path)
@@ -227,7 +227,7 @@ def test_urdfdom_finds_a_link_per_sensor(exported):
 def test_no_sensor_takes_the_name_of_what_holds_it(tmp_path, name):
     one = replace(DESIGN.sensors[0], name=name)
     path = tmp_path / "named.urdf"
-    EXPORTERS["urdf"].write(Design(name, (one,)), RAYS.subset(RAYS.sensor == 0), path)
+    EXPORTERS["urdf"].write(DesignSpec(name, (one,)), RAYS.subset(RAYS.sensor == 0), path)
     assert len(check_urdf(path)) == 2
 
 
@@ -341,7 +341,7 @@ def test_another_or_a_damaged_file_is_no_round_trip(exported, tmp_path, name):
     exporter = EXPORTERS[name]
     with pytest.raises(DataError):
         exporter.rounding(DESIGN, RAYS, tmp_path / "none")
-    one, first = Design("one", DESIGN.sensors[:1]), RAYS.subset(RAYS.sensor == 0)
+    one, first = DesignSpec("one", DESIGN.sensors[:1]), RAYS.subset(RAYS.sensor == 0)
     path = tmp_path / "out"
     exporter.write(one, first, path)
     with pytest.raises(DataError):

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidardesign.design.sensor import Design, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.export.common.poses import mounts
 from lidardesign.export.registry import EXPORTERS
@@ -49,7 +49,7 @@ def design(names=NASTY, roll=True):
         origin, spreads = generator.uniform(-3, 3, 3), generator.uniform(0.05, 0.2, 2)
         pose = (azimuth, elevation, turn if roll else 0.0)
         sensors.append(Sensor(name, 1 / len(names), origin, np.zeros((3, 3)), *pose, *spreads, 4.0, 0.5))
-    return Design("a <design> & 'more'", tuple(sensors), constraints={"gate": {"width_m": {"max": 9.0}}})
+    return DesignSpec("a <design> & 'more'", tuple(sensors), constraints={"gate": {"width_m": {"max": 9.0}}})
 
 
 def rays_of(some, count=9, spread_m=0.0, own_gates=False, seed=1):
@@ -411,7 +411,7 @@ def rendered(tmp_path_factory):
         Sensor(name, 0.5, place, np.zeros((3, 3)), 1.0, -1.2, 0.4, 0.1, 0.1, 1.25, 0.1)
         for name, place in zip(names, at, strict=True)
     )
-    some = Design("floor", sensors)
+    some = DesignSpec("floor", sensors)
     rays = rays_of(some, count=40)
     rays = Rays(rays.origin_m, rays.direction, np.tile(GATE_M, (len(rays), 1)), rays.sensor, rays.time_s)
     folder = tmp_path_factory.mktemp("mitsuba")
@@ -539,7 +539,7 @@ def test_ply_frusta_hold_what_lies_in_the_field_of_view_and_gate(written):
 
 def test_ply_leaves_out_frusta_that_have_no_width(tmp_path):
     thin = Sensor("thin", 1.0, np.zeros(3), np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.1)
-    some = Design("scan", (thin,), layout="scan")
+    some = DesignSpec("scan", (thin,), layout="scan")
     notes = EXPORTERS["ply"].write(some, rays_of(some, count=1), tmp_path / "out")
     assert "1 of 1 sensors have no width, so no frustum" in notes
     assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["beams.ply", "rays.ply"]
@@ -588,7 +588,7 @@ def test_names_that_look_like_the_format_do_not_become_part_of_it(tmp_path):
 @pytest.mark.parametrize(("name", "what"), [("stl", "solids"), ("ply", "frusta")])
 def test_shapes_of_sensors_that_are_regions_stand_in_their_middles_and_say_so(tmp_path, name, what):
     wide = Sensor("wide", 1.0, np.zeros(3), np.diag([1.0, 0, 0]), 0.0, 0.0, 0.0, 0.1, 0.1, 1.0, 0.1)
-    some = Design("region", (wide,))
+    some = DesignSpec("region", (wide,))
     notes = EXPORTERS[name].write(some, rays_of(some), tmp_path / "out")
     assert f"1 sensors are regions of up to 3.92 m: {what} stand in their middles" in notes
 

@@ -10,7 +10,7 @@ import pytest
 from command_line import caller, make_run
 
 from lidardesign.design.files import load_design, save_design
-from lidardesign.design.sensor import Design, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import DataError
 from lidardesign.run.xml import read_xml
 
@@ -141,7 +141,7 @@ def test_a_sensor_table_of_the_research_code_may_still_lack_its_header(tmp_path)
     from lidardesign.design.rigs.sensor_csv import write_sensor_csv
 
     sensor = Sensor("s", 1.0, np.zeros(3), np.zeros((3, 3)), 1.0, 0.0, 0.0, 0.1, 0.1, 0.5, 0.1)
-    write_sensor_csv(Design("d", (sensor,)), tmp_path / "table.csv")
+    write_sensor_csv(DesignSpec("d", (sensor,)), tmp_path / "table.csv")
     lines = (tmp_path / "table.csv").read_text().splitlines()
     (tmp_path / "bare.csv").write_text(lines[1] + "\n")
     assert load_design(tmp_path / "bare.csv").sensors[0].azimuth_rad == 1.0

@@ -19,7 +19,7 @@ from lidardesign.design.files import (
     save_design,
 )
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import Coupling, Design, RayTable, Sensor, interval_factor
+from lidardesign.design.sensor import Coupling, DesignSpec, RayTable, Sensor, interval_factor
 from lidardesign.errors import ConfigError, DataError, NumericalError
 from lidardesign.run.yaml import dump_yaml, parse_yaml
 
@@ -96,7 +96,7 @@ def designs(draw):
         draw(sensors(name, float(share), level, rays if own else None))
         for name, share, rays in zip(names, shares, counts, strict=True)
     )
-    return Design(
+    return DesignSpec(
         name=draw(words), sensors=chosen, rays=total, ray_table=table, level=level,
         layout=draw(st.sampled_from(["grid", "density", "scan", "distributed"])),
         constraints={"gate": {"width_m": {"max": draw(length)}}},

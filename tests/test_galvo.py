@@ -19,7 +19,7 @@ from lidardesign.design.galvo import (
     scan_directions,
 )
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import Design, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.export.galvo import COLUMNS, is_galvo_file, read, short_tour, travel, write
 from lidardesign.geometry.rays import Rays
@@ -34,7 +34,7 @@ def sensor(name, azimuth, elevation, *, origin=HERE, spread=0.05, covariance=Non
 
 
 def design(*sensors, rays=60):
-    return Design("faces", sensors or (sensor("left", 3.05, 0.02), sensor("right", 3.3, -0.04)), rays=rays)
+    return DesignSpec("faces", sensors or (sensor("left", 3.05, 0.02), sensor("right", 3.3, -0.04)), rays=rays)
 
 
 def mirrored(beam, normal):

@@ -17,7 +17,7 @@ from lidardesign.design.files import load_design, save_design
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.rigs.rig import aim_of
 from lidardesign.design.sensor import (
-    Design,
+    DesignSpec,
     RayTable,
     Sensor,
     boresight_frame,
@@ -52,7 +52,7 @@ def rig(seed=0, counts=(7, 1, 4), names=NASTY):
         Sensor(name, n / total, origin, np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.1, 0.1, 1.0, 0.2, rays=n)
         for name, n, origin in zip(names, counts, origins, strict=True)
     )
-    return Design("rig", sensors, layout="fixed", rays=total, ray_table=table)
+    return DesignSpec("rig", sensors, layout="fixed", rays=total, ray_table=table)
 
 
 def assert_same_rays(found, expected, tolerance=EXACT):
@@ -750,7 +750,7 @@ def test_sensors_like_a_planar_scanner_stay_planar():
         for name, (across, up) in fields.items()
     )
     space = DesignSpace((0,) * 3 + (0, -1.5, 0), (0,) * 3 + (6, 1.5, 9))
-    found = constraints_like(Design("rig", sensors), space, Constraints(), rays=None).as_document()["each"]
+    found = constraints_like(DesignSpec("rig", sensors), space, Constraints(), rays=None).as_document()["each"]
     narrow = pytest.approx(1e-3)
     assert [one.get("field_of_view", {}) for one in found] == [
         {"horizontal_deg": {"max": pytest.approx(math.degrees(1))}, "vertical_deg": {"max": narrow}},

@@ -17,12 +17,12 @@ from lidardesign.design.files import load_design
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.layouts.shared_fields import seen_from
-from lidardesign.design.sensor import Design, interval_factor
+from lidardesign.design.sensor import DesignSpec, interval_factor
 from lidardesign.errors import InfeasibleError
 from lidardesign.space import observed_point
 
 LEVELS = (0.8, 0.95, 0.99)
-STILL = drawn_from(Design("d", three_sensors()), 12_000)
+STILL = drawn_from(DesignSpec("d", three_sensors()), 12_000)
 # samples, and how they are fitted
 CASES = {
     "grid": (STILL, {"layout": "grid", "sensors": 3, "rays": 60}),

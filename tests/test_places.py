@@ -11,7 +11,7 @@ from lidardesign.design.constraints.document import Constraints, check_feasible
 from lidardesign.design.constraints.mounts import SAME_PLACE_M, settled
 from lidardesign.design.constraints.rig_constraints import constraints_like
 from lidardesign.design.files import design_document, load_design
-from lidardesign.design.sensor import Design, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import InfeasibleError
 from lidardesign.space import DesignSpace
 
@@ -24,7 +24,7 @@ def rig(*origins_m):
         Sensor(f"lidar {i}", 1 / len(origins_m), np.array(origin), np.zeros((3, 3)), 3.0, 0, 0, 0.1, 0.1, 0.5, 0.1)
         for i, origin in enumerate(origins_m)
     )
-    return Design("rig", sensors)
+    return DesignSpec("rig", sensors)
 
 
 @pytest.mark.parametrize("told", [PLACE_M, 0.451044647, 0.451, 0.4515])

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from lidardesign.design.constraints.slack import Tightness
-from lidardesign.design.sensor import Design, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.evaluate.figures.bounds import constraints_picture
 from lidardesign.evaluate.figures.canvas import (
     COLUMN_INCHES,
@@ -95,13 +95,13 @@ def make_rays(count=25):
 
 
 def make_shown(names=("first",)):
-    designs = [Design(name, (make_sensor(),)) for name in names]
+    designs = [DesignSpec(name, (make_sensor(),)) for name in names]
     return shown_in(BALL, designs, [{}], lambda design, at: design, lambda design, at: make_rays())
 
 
 def make_pictured(names=("first",)):
     samples = Samples(SPACE.sample(2000, np.random.default_rng(0)), np.zeros(2000), np.zeros(2000), SPACE)
-    view = density_view(samples, BALL, [Design(name, (make_sensor(),)) for name in names])
+    view = density_view(samples, BALL, [DesignSpec(name, (make_sensor(),)) for name in names])
     bounds = [
         Tightness("gate.width_m.max", 0.5, 0.5, "s0", 0.0, 0.0, 1, 1, 0),
         Tightness("origin.fixed_m", [0, 0, 0], [0, 0, 0], "", None, None, 1, 0, 0),
@@ -257,7 +257,7 @@ def test_planes_are_seen_from_their_front_only():
 
 def test_a_room_is_cut_open_where_its_walls_hide_the_sensors():
     room = Scene((Body(Box((6.0, 6.0, 6.0)), "room", "both"),), "room")
-    design = Design("inside", (make_sensor(),))
+    design = DesignSpec("inside", (make_sensor(),))
     shown = shown_in(room, [design], [{}], lambda design, at: design, lambda design, at: make_rays())
     view = view_of(shown.directions, framed_points(shown, 0, 0))
     image, cut = opened(shown, 0, 0, view, 60)
@@ -309,10 +309,10 @@ def test_phases_add_up_to_the_time_of_the_command():
 
 
 def test_a_design_without_constraints_has_no_bounds_to_draw():
-    free = tightness_of(Design("free", (make_sensor(),)), SPACE)
+    free = tightness_of(DesignSpec("free", (make_sensor(),)), SPACE)
     assert {one.name.split(".")[0] for one in free} == {"space"}
     assert constraints_picture({"free": free}) is None
-    bound = Design("bound", (make_sensor(),), constraints={"gate": {"width_m": {"max": 1.0}}})
+    bound = DesignSpec("bound", (make_sensor(),), constraints={"gate": {"width_m": {"max": 1.0}}})
     (row,) = [one for one in tightness_of(bound, SPACE) if one.name == "gate.width_m.max"]
     assert row.room == pytest.approx(1.0 - 2 * 1.959964 * 0.2, abs=1e-5)
 

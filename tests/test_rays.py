@@ -21,7 +21,7 @@ from lidardesign.design.layouts.rays import (
 from lidardesign.design.layouts.shared_fields import log_density, members, seen_from
 from lidardesign.design.sensor import (
     MOST_RAYS,
-    Design,
+    DesignSpec,
     Sensor,
     Track,
     interval_factor,
@@ -204,7 +204,7 @@ def test_no_ray_stands_on_the_edge_of_its_field():
 @pytest.mark.parametrize("spread", [0.05, 0.4, 1.7])
 def test_all_rays_are_inside_the_field_of_view_also_straight_down(elevation, layout, spread):
     looking = sensor(elevation_rad=elevation, spread_horizontal_rad=spread)
-    design = Design("d", (looking,), layout=layout)
+    design = DesignSpec("d", (looking,), layout=layout)
     rays = lay_out(design, 137, drawn_from(design))
     tangent = coordinates(design, rays)
     horizontal, vertical = looking.field_of_view_rad
@@ -214,7 +214,7 @@ def test_all_rays_are_inside_the_field_of_view_also_straight_down(elevation, lay
 
 
 def test_a_field_beyond_the_sphere_is_shrunk_so_that_no_ray_goes_round():
-    design = Design("d", (sensor(spread_horizontal_rad=4.0, spread_vertical_rad=2.0),))
+    design = DesignSpec("d", (sensor(spread_horizontal_rad=4.0, spread_vertical_rad=2.0),))
     rays = lay_out(design, 50)
     assert len(np.unique(np.round(rays.direction, 9), axis=0)) == 50
     assert len(lay_out(design, 1)) == 1
@@ -226,7 +226,7 @@ def test_a_field_beyond_the_sphere_is_shrunk_so_that_no_ray_goes_round():
 @pytest.mark.parametrize("layout", ["grid", "density"])
 @pytest.mark.parametrize("gates", ["sensor", "ray"])
 def test_turning_a_design_about_the_vertical_turns_its_rays(layout, gates):
-    design = Design("d", three_sensors(), layout=layout)
+    design = DesignSpec("d", three_sensors(), layout=layout)
     samples = drawn_from(design)
     rays = lay_out(design, 100, samples, gates=gates)
     moved_design, moved_samples, turn = turned(design, samples, TURN)
@@ -238,7 +238,7 @@ def test_turning_a_design_about_the_vertical_turns_its_rays(layout, gates):
 
 @pytest.mark.parametrize("layout", ["grid", "density"])
 def test_permuting_the_sensors_permutes_their_rays(layout):
-    design = Design("d", three_sensors(), layout=layout)
+    design = DesignSpec("d", three_sensors(), layout=layout)
     samples = drawn_from(design)
     order = [2, 0, 1]
     shuffled = replace(design, sensors=tuple(design.sensors[i] for i in order))
@@ -250,7 +250,7 @@ def test_permuting_the_sensors_permutes_their_rays(layout):
 @pytest.mark.parametrize("layout", ["grid", "density"])
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 50])
 def test_rays_are_ordered_by_sensor_and_fire_evenly_over_the_frame(layout, count):
-    design = Design("d", three_sensors(), layout=layout)
+    design = DesignSpec("d", three_sensors(), layout=layout)
     rays = lay_out(design, count, drawn_from(design), rate_hz=20)
     assert len(rays) == count
     assert (np.diff(rays.sensor) >= 0).all()
@@ -259,7 +259,7 @@ def test_rays_are_ordered_by_sensor_and_fire_evenly_over_the_frame(layout, count
 
 
 def test_the_same_call_gives_the_same_bits():
-    design = Design("d", three_sensors(), layout="density")
+    design = DesignSpec("d", three_sensors(), layout="density")
     first, second = (lay_out(design, 60, drawn_from(design), gates="ray") for _ in range(2))
     assert (first.direction == second.direction).all()
     assert (first.gate_m == second.gate_m).all()
@@ -267,36 +267,36 @@ def test_the_same_call_gives_the_same_bits():
 
 def test_rays_of_each_sensor_can_be_fixed_by_the_design():
     own = tuple(replace(s, rays=n) for s, n in zip(three_sensors(), (1, 2, 30), strict=True))
-    design = Design("d", own)
+    design = DesignSpec("d", own)
     assert own_count(design) == 33
     assert np.bincount(lay_out(design).sensor).tolist() == [1, 2, 30]
     assert np.bincount(lay_out(design, 10).sensor).tolist() == [5, 3, 2]
 
 
 def test_a_frame_lasts_a_tenth_of_a_second_unless_told_otherwise():
-    design = Design("d", three_sensors())
+    design = DesignSpec("d", three_sensors())
     np.testing.assert_allclose(lay_out(design, 8).time_s, np.arange(8) / 80.0)
     np.testing.assert_array_equal(lay_out(design, 8, rate_hz=10.0).time_s, lay_out(design, 8).time_s)
 
 
 def test_a_sensor_may_have_no_rays_of_its_own_number():
     own = tuple(replace(s, rays=n) for s, n in zip(three_sensors(), (0, 2, 30), strict=True))
-    design = Design("d", own)
+    design = DesignSpec("d", own)
     assert own_count(design) == 32
     assert np.bincount(lay_out(design).sensor, minlength=3).tolist() == [0, 2, 30]
 
 
 def test_a_design_was_made_for_the_number_that_it_names_then_for_that_of_its_table_then_of_its_sensors():
     own = tuple(replace(s, rays=n) for s, n in zip(three_sensors(), (1, 2, 30), strict=True))
-    table = make_ray_table(Design("d", own), 40)
-    assert own_count(Design("d", own, rays=7, ray_table=table)) == 7
-    assert own_count(Design("d", own, ray_table=table)) == 40
-    assert own_count(Design("d", own, layout="scan")) == 33
-    assert own_count(Design("d", three_sensors(), layout="scan")) == 3
+    table = make_ray_table(DesignSpec("d", own), 40)
+    assert own_count(DesignSpec("d", own, rays=7, ray_table=table)) == 7
+    assert own_count(DesignSpec("d", own, ray_table=table)) == 40
+    assert own_count(DesignSpec("d", own, layout="scan")) == 33
+    assert own_count(DesignSpec("d", three_sensors(), layout="scan")) == 3
 
 
 def test_a_table_is_laid_out_anew_whatever_table_the_design_has_and_its_time_is_that_of_rays():
-    design = Design("d", three_sensors())
+    design = DesignSpec("d", three_sensors())
     narrow = replace(design, sensors=three_sensors(spread_horizontal_rad=0.01))
     old = replace(design, ray_table=make_ray_table(narrow, 40))
     with running() as clock:
@@ -307,7 +307,7 @@ def test_a_table_is_laid_out_anew_whatever_table_the_design_has_and_its_time_is_
 
 def test_a_design_without_a_number_of_rays_asks_for_one():
     with pytest.raises(ConfigError, match="--rays"):
-        lay_out(Design("d", three_sensors()))
+        lay_out(DesignSpec("d", three_sensors()))
 
 
 # --- density
@@ -323,14 +323,14 @@ def test_more_rays_stand_where_the_density_is():
     origin = np.tile(wide.origin_m, (10000, 1))
     points = np.column_stack([origin, azimuth, elevation, np.full(10000, 1.0)])
     samples = Samples(points, np.zeros(10000), np.zeros(10000), SPACE)
-    tangent = coordinates(Design("d", (wide,)), lay_out(Design("d", (wide,), layout="density"), 100, samples))
+    tangent = coordinates(DesignSpec("d", (wide,)), lay_out(DesignSpec("d", (wide,), layout="density"), 100, samples))
     near = np.abs(tangent[:, 0] - 0.25) < 0.1
     assert near.sum() > 55
     assert (tangent[:, 0] < 0).sum() > 5
 
 
 def test_a_density_layout_needs_samples_unless_its_table_has_that_many_rays():
-    design = Design("d", three_sensors(), layout="density", rays=40)
+    design = DesignSpec("d", three_sensors(), layout="density", rays=40)
     samples = drawn_from(design)
     kept = replace(design, ray_table=make_ray_table(design, 40, samples, "ray"))
     direct, tabled = lay_out(design, 40, samples, gates="ray"), lay_out(kept)
@@ -343,7 +343,7 @@ def test_a_density_layout_needs_samples_unless_its_table_has_that_many_rays():
 
 
 def test_as_many_samples_as_rays_are_the_rays_row_by_row_upwards():
-    design = Design("d", (sensor(),), layout="density")
+    design = DesignSpec("d", (sensor(),), layout="density")
     samples = drawn_from(design, 40)
     inside = members(design, samples.points, samples.weights)[0].tangent
     exact = coordinates(design, lay_out(design, len(inside), samples))
@@ -354,7 +354,7 @@ def test_as_many_samples_as_rays_are_the_rays_row_by_row_upwards():
 
 
 def test_repeated_samples_are_one_place_for_a_ray():
-    design = Design("d", (sensor(),), layout="density")
+    design = DesignSpec("d", (sensor(),), layout="density")
     samples = drawn_from(design, 40)
     twice = samples.subset(np.r_[np.arange(40), np.arange(40)])
     distinct = len(members(design, samples.points, samples.weights)[0])
@@ -368,14 +368,14 @@ def test_rays_of_one_row_go_from_one_side_to_the_other():
     generator = np.random.default_rng(8)
     angle, distance = generator.normal(0, 0.1, 2000), generator.normal(1, 0.1, 2000)
     points = np.column_stack([np.tile(fan.origin_m, (2000, 1)), angle, np.zeros(2000), distance])
-    design = Design("d", (fan,), layout="density")
+    design = DesignSpec("d", (fan,), layout="density")
     tangent = coordinates(design, lay_out(design, 20, Samples(points, np.zeros(2000), np.zeros(2000), SPACE)))
     assert (tangent[:, 1] == 0).all()
     assert (np.diff(tangent[:, 0]) > 0).all()
 
 
 def test_rays_of_a_density_layout_follow_the_seed_and_their_order_does_not():
-    design = Design("d", (sensor(),), layout="density")
+    design = DesignSpec("d", (sensor(),), layout="density")
     samples = drawn_from(design)
     one, other = (coordinates(design, lay_out(design, 30, samples, seed=seed)) for seed in (0, 1))
     assert not np.array_equal(one, other)
@@ -385,25 +385,25 @@ def test_rays_of_a_density_layout_follow_the_seed_and_their_order_does_not():
 
 
 def test_what_is_missing_is_said_with_the_number_of_rays_that_the_design_has():
-    design = Design("d", three_sensors(), layout="density", rays=40)
+    design = DesignSpec("d", three_sensors(), layout="density", rays=40)
     kept = replace(design, ray_table=make_ray_table(design, 40, drawn_from(design)))
     words = r"41 rays in the layout `density`(.|\n)*40 rays(.|\n)*fit RUN --layout density --rays 41"
     with pytest.raises(ConfigError, match=words):
         lay_out(kept, 41)
     with pytest.raises(ConfigError, match="gates per ray need samples") as caught:
-        lay_out(Design("d", three_sensors()), 41, gates="ray")
+        lay_out(DesignSpec("d", three_sensors()), 41, gates="ray")
     assert caught.value.allowed is None
 
 
 def test_a_sensor_with_too_few_samples_falls_back_to_the_grid():
-    design = Design("d", three_sensors(), layout="density")
+    design = DesignSpec("d", three_sensors(), layout="density")
     few = drawn_from(design).subset(np.arange(5))
     even = lay_out(replace(design, layout="grid"), 60)
     assert (lay_out(design, 60, few).direction == even.direction).all()
 
 
 def test_every_ray_of_a_scan_is_a_component():
-    design = Design("d", three_sensors(), layout="scan")
+    design = DesignSpec("d", three_sensors(), layout="scan")
     rays = lay_out(design)
     assert len(rays) == 3
     np.testing.assert_allclose(rays.direction, [s.boresight for s in design.sensors], atol=1e-15)
@@ -416,7 +416,7 @@ def test_every_ray_of_a_scan_is_a_component():
 
 def test_a_scan_of_another_number_of_rays_is_fitted_anew_and_keeps_its_constraints():
     narrow = {"gate": {"width_m": {"max": 0.15}}, "budget": {"rays": 3}}
-    design = Design("d", three_sensors(), layout="scan", constraints=narrow)
+    design = DesignSpec("d", three_sensors(), layout="scan", constraints=narrow)
     samples = drawn_from(design)
     rays = lay_out(design, 40, samples)
     assert len(rays) == 40
@@ -426,7 +426,7 @@ def test_a_scan_of_another_number_of_rays_is_fitted_anew_and_keeps_its_constrain
 
 
 def test_a_refit_is_remembered_by_number_and_seed():
-    design, samples = Design("d", three_sensors(), layout="scan"), drawn_from(Design("d", three_sensors()), 600)
+    design, samples = DesignSpec("d", three_sensors(), layout="scan"), drawn_from(DesignSpec("d", three_sensors()), 600)
     first = refitted(design, 5, samples)
     assert refitted(design, 5, samples, 0) is first
     assert refitted(design, 5, samples, 1) is not first
@@ -438,14 +438,14 @@ def test_a_refit_is_remembered_by_number_and_seed():
 
 def test_a_scan_from_a_pinned_origin_is_not_fitted_anew_without_its_target():
     pinned = {"origin": {"fixed_m": [0.1, -0.2, 0.3]}, "budget": {"rays": 3}}
-    design = Design("d", three_sensors(), layout="scan", constraints=pinned)
+    design = DesignSpec("d", three_sensors(), layout="scan", constraints=pinned)
     with pytest.raises(ConfigError, match=r"pinned origin(.|\n)*4 rays(.|\n)*3 rays(.|\n)*--layout scan --rays 4"):
         lay_out(design, 4, drawn_from(design, 600))
 
 
 def test_one_ray_is_not_a_scan_of_three_sensors():
     with pytest.raises(ConfigError, match="one ray of each"):
-        lay_out(Design("d", three_sensors(), layout="scan", rays=1))
+        lay_out(DesignSpec("d", three_sensors(), layout="scan", rays=1))
 
 
 # --- conditions
@@ -466,7 +466,7 @@ def no_target(points):
 
 
 def test_even_rays_ask_no_target_density_where_the_samples_have_conditions():
-    design = Design("d", three_sensors(), layout="grid", rays=30)
+    design = DesignSpec("d", three_sensors(), layout="grid", rays=30)
     samples = along_rails(design)
     np.testing.assert_array_equal(lay_out(design, 40, samples).direction, lay_out(design, 40).direction)
     with pytest.raises(ConfigError, match="x_m"):
@@ -477,7 +477,7 @@ def test_even_rays_ask_no_target_density_where_the_samples_have_conditions():
 
 
 def test_a_density_layout_asks_the_target_density_at_its_place_unless_its_table_answers():
-    design = Design("d", three_sensors(), layout="density", rays=30)
+    design = DesignSpec("d", three_sensors(), layout="density", rays=30)
     samples = along_rails(design)
     with pytest.raises(ConfigError, match="x_m"):
         lay_out(design, 30, samples, at={"x_m": 1.0})
@@ -492,7 +492,7 @@ def test_a_density_layout_asks_the_target_density_at_its_place_unless_its_table_
 
 def test_distributed_rays_are_laid_out_by_their_sensors_where_no_target_density_is_known():
     spread = np.eye(3) * 0.01
-    design = Design("d", three_sensors(origin_covariance_m2=spread), layout="distributed", rays=30)
+    design = DesignSpec("d", three_sensors(origin_covariance_m2=spread), layout="distributed", rays=30)
     samples = along_rails(design)
     alone, asked = lay_out(design, 30, at={"x_m": 1.0}), lay_out(design, 30, samples, at={"x_m": 1.0})
     np.testing.assert_array_equal(alone.direction, asked.direction)
@@ -501,7 +501,7 @@ def test_distributed_rays_are_laid_out_by_their_sensors_where_no_target_density_
 
 
 def test_a_table_of_another_number_of_rays_does_not_answer():
-    design = Design("d", three_sensors(), layout="density", rays=30)
+    design = DesignSpec("d", three_sensors(), layout="density", rays=30)
     kept = replace(design, ray_table=make_ray_table(design, 30, drawn_from(design)))
     samples = along_rails(design)
     with pytest.raises(ConfigError, match="x_m"):
@@ -510,7 +510,7 @@ def test_a_table_of_another_number_of_rays_does_not_answer():
 
 
 def test_a_scan_asks_the_target_density_for_other_rays_and_for_gates_of_their_own_alone():
-    design = Design("d", three_sensors(), layout="scan")
+    design = DesignSpec("d", three_sensors(), layout="scan")
     samples = along_rails(design)
     assert len(lay_out(design, 3, samples, at={"x_m": 1.0})) == 3
     for changes in ({"count": 5}, {"count": 3, "gates": "ray"}):
@@ -524,7 +524,7 @@ def tracked():
     elevation = np.array([[0.0, 0.1, 0.2], [0.2, 0.1, 0.0]])
     gate = np.tile([0.5, 1.5], (2, 3, 1))
     track = Track("x_m", np.array([0.0, 1.0]), np.full((2, 3), 1.0), elevation, gate, np.zeros(3, dtype=np.int64))
-    return Design("t", (sensor(),), layout="scan", rays=3, track=track)
+    return DesignSpec("t", (sensor(),), layout="scan", rays=3, track=track)
 
 
 def test_a_track_gives_its_own_number_of_rays_at_a_place_and_others_by_samples_alone():
@@ -546,7 +546,7 @@ def test_a_track_gives_its_own_number_of_rays_at_a_place_and_others_by_samples_a
 
 
 def test_gates_per_ray_leave_an_even_grid_as_it_is():
-    design = Design("d", three_sensors())
+    design = DesignSpec("d", three_sensors())
     samples = drawn_from(design)
     own = lay_out(design, 60, samples, gates="ray")
     np.testing.assert_array_equal(own.direction, lay_out(design, 60).direction)
@@ -555,7 +555,7 @@ def test_gates_per_ray_leave_an_even_grid_as_it_is():
 
 @pytest.mark.parametrize("layout", ["grid", "density"])
 def test_rays_share_the_gate_of_their_sensor_unless_they_are_to_have_their_own(layout):
-    design = Design("d", three_sensors(), layout=layout)
+    design = DesignSpec("d", three_sensors(), layout=layout)
     rays = lay_out(design, 60, drawn_from(design))
     for index, component in enumerate(design.sensors):
         assert (rays.gate_m[rays.sensor == index] == component.gate_m).all()
@@ -572,7 +572,7 @@ def test_rays_share_the_gate_of_their_sensor_unless_they_are_to_have_their_own(l
     ],
 )
 def test_a_table_tells_by_two_rays_of_one_sensor_whose_gates_its_rays_keep(layout, samples, wide, expected):
-    design = Design("d", three_sensors())
+    design = DesignSpec("d", three_sensors())
     table = make_ray_table(design, 30)
     gate = table.gate_m.copy()
     gate[list(wide), 1] += 0.1
@@ -581,7 +581,7 @@ def test_a_table_tells_by_two_rays_of_one_sensor_whose_gates_its_rays_keep(layou
 
 
 def test_no_table_and_one_ray_of_each_sensor_tell_nothing_of_gates():
-    design = Design("d", three_sensors())
+    design = DesignSpec("d", three_sensors())
     samples = drawn_from(design, 60)
     assert gates_of(design, samples) is None
     single = replace(design, ray_table=make_ray_table(replace(design, layout="scan"), 3))
@@ -590,7 +590,7 @@ def test_no_table_and_one_ray_of_each_sensor_tell_nothing_of_gates():
 
 
 def test_distributed_rays_have_gates_of_their_own_or_of_their_sensor():
-    design = Design("d", three_sensors(origin_covariance_m2=np.eye(3) * 0.01), layout="distributed")
+    design = DesignSpec("d", three_sensors(origin_covariance_m2=np.eye(3) * 0.01), layout="distributed")
     samples = drawn_from(design, 3000)
     samples.points[:, 5] += 0.3 * (samples.points[:, 3] - 1.0)
     own, shared = lay_out(design, 30, samples), lay_out(design, 30, samples, gates="sensor")
@@ -602,7 +602,7 @@ def test_distributed_rays_have_gates_of_their_own_or_of_their_sensor():
 
 @pytest.mark.parametrize(("count", "own"), [(19, False), (20, True)])
 def test_a_ray_has_a_gate_of_its_own_from_twenty_samples_on(count, own):
-    design = Design("d", (sensor(),))
+    design = DesignSpec("d", (sensor(),))
     distance = np.linspace(0.9, 1.1, count)
     points = np.column_stack([np.tile([0.1, -0.2, 0.3, 1.0, -0.3], (count, 1)), distance])
     rays = lay_out(design, 1, Samples(points, np.zeros(count), np.zeros(count), SPACE), gates="ray")
@@ -610,7 +610,7 @@ def test_a_ray_has_a_gate_of_its_own_from_twenty_samples_on(count, own):
 
 
 def test_samples_at_one_range_make_no_gate_of_their_own():
-    design = Design("d", (sensor(),))
+    design = DesignSpec("d", (sensor(),))
     points = np.tile([0.1, -0.2, 0.3, 1.0, -0.3, 1.0], (50, 1))
     rays = lay_out(design, 1, Samples(points, np.zeros(50), np.zeros(50), SPACE), gates="ray")
     assert (rays.gate_m[0] == design.sensors[0].gate_m).all()
@@ -618,7 +618,7 @@ def test_samples_at_one_range_make_no_gate_of_their_own():
 
 @pytest.mark.parametrize("layout", ["grid", "density"])
 def test_a_gate_per_ray_is_within_its_sensors_gate_and_holds_the_level_of_what_it_sees(layout):
-    design = Design("d", (sensor(),), layout=layout, level=0.9)
+    design = DesignSpec("d", (sensor(),), layout=layout, level=0.9)
     samples = drawn_from(design, 20000)
     rays = lay_out(design, 30, samples, gates="ray")
     start, end = design.sensors[0].gate_m
@@ -641,13 +641,13 @@ def test_a_slanted_surface_needs_a_fraction_of_the_gate_per_ray():
     elevation = generator.uniform(-0.1, 0.1, 8000)
     points = np.column_stack([np.tile(flat.origin_m, (8000, 1)), azimuth, elevation, distance])
     samples = Samples(points, np.zeros(8000), np.zeros(8000), SPACE)
-    rays = lay_out(Design("d", (flat,)), 100, samples, gates="ray")
-    seen = np.abs(coordinates(Design("d", (flat,)), rays)[:, 0]) < 0.25
+    rays = lay_out(DesignSpec("d", (flat,)), 100, samples, gates="ray")
+    seen = np.abs(coordinates(DesignSpec("d", (flat,)), rays)[:, 0]) < 0.25
     assert np.ptp(rays.gate_m[seen], axis=1).mean() < 0.25 * np.ptp(flat.gate_m)
 
 
 def test_gates_per_ray_need_samples_and_fall_back_where_there_are_few():
-    design = Design("d", (sensor(),))
+    design = DesignSpec("d", (sensor(),))
     with pytest.raises(ConfigError, match="gates per ray"):
         lay_out(design, 10, gates="ray")
     few = drawn_from(design, 12)
@@ -655,7 +655,7 @@ def test_gates_per_ray_need_samples_and_fall_back_where_there_are_few():
 
 
 def test_a_gate_that_would_begin_behind_the_sensor_begins_at_it():
-    rays = lay_out(Design("d", (sensor(range_m=0.05, spread_range_m=0.2),)), 4)
+    rays = lay_out(DesignSpec("d", (sensor(range_m=0.05, spread_range_m=0.2),)), 4)
     assert (rays.gate_m[:, 0] == 0).all()
 
 
@@ -693,9 +693,9 @@ def test_a_sample_belongs_to_the_sensor_that_sees_its_scene_point_best():
     points = np.array(
         [[-0.99, 0, 0, 1.0, -0.3, 1.0], [0.99, 0, 0, 1.0, -0.3, 1.0], [0, 0, 0, 4.0, -0.3, 1.0]]
     )
-    assert owners(Design("d", (left, right)), points) == [0, 1, -1]
-    assert owners(Design("d", (left, replace(right, weight=0.0))), points) == [0, -1, -1]
-    assert owners(Design("d", (left, replace(left, name="m"))), points) == [0, -1, -1]
+    assert owners(DesignSpec("d", (left, right)), points) == [0, 1, -1]
+    assert owners(DesignSpec("d", (left, replace(right, weight=0.0))), points) == [0, -1, -1]
+    assert owners(DesignSpec("d", (left, replace(left, name="m"))), points) == [0, -1, -1]
 
 
 def test_samples_of_a_distributed_origin_are_aimed_anew_from_the_mean_origin():
@@ -707,7 +707,7 @@ def test_samples_of_a_distributed_origin_are_aimed_anew_from_the_mean_origin():
         roll_rad=0.0,
     )
     beside = np.array([[0.0, 0.2, 0.0, -math.atan2(0.2, 1.0), 0.0, math.hypot(0.2, 1.0)]])
-    found = members(Design("d", (component,)), beside, np.ones(1))[0]
+    found = members(DesignSpec("d", (component,)), beside, np.ones(1))[0]
     np.testing.assert_allclose(found.tangent, [[0, 0]], atol=1e-12)
     np.testing.assert_allclose(found.range_m, [1.0])
 
@@ -718,7 +718,7 @@ def test_the_share_of_a_sensors_own_samples_inside_is_the_level_to_the_third_pow
     count = 40000
     origin = np.tile(component.origin_m, (count, 1))
     drawn = generator.normal([1.0, 0.0, 1.0], [0.05, 0.05, 0.1], (count, 3))
-    inside = members(Design("d", (component,)), np.column_stack([origin, drawn]), np.ones(count))[0]
+    inside = members(DesignSpec("d", (component,)), np.column_stack([origin, drawn]), np.ones(count))[0]
     assert interval_factor(0.95) == pytest.approx(1.959964, abs=1e-6)
     assert len(inside) / count == pytest.approx(0.95**3, abs=0.006)
 
@@ -731,7 +731,7 @@ def test_a_fan_without_height_keeps_its_samples_and_lays_them_out_in_its_plane()
     )
     points = np.column_stack([np.tile(fan.origin_m, (4000, 1)), drawn])
     samples = Samples(points, np.zeros(4000), np.zeros(4000), SPACE)
-    design = Design("d", (fan, replace(fan, name="t", azimuth_rad=2.0)), layout="density")
+    design = DesignSpec("d", (fan, replace(fan, name="t", azimuth_rad=2.0)), layout="density")
     assert np.mean(np.array(owners(design, points)) == 0) > 0.85
     tangent = coordinates(design, lay_out(design, 20, samples))[:10]
     np.testing.assert_allclose(tangent[:, 1], 0, atol=1e-12)

@@ -9,7 +9,7 @@ import pytest
 
 from lidardesign.design.galvo import SPEED_OF_LIGHT_M_PER_PS
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import Design, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import DataError
 from lidardesign.export import csv, npz
 from lidardesign.export.common.read_back import angles_between, rays_rounding
@@ -23,7 +23,7 @@ def design(roll=0.0):
         Sensor(f"s{i}", 0.5, np.array([0.1, -0.2, 1 / 3]), np.zeros((3, 3)), 0.1 * i, -0.07, roll, 0.05, 0.02, 1.0, 0.1)
         for i in range(2)
     )
-    return Design("two", sensors, rays=37)
+    return DesignSpec("two", sensors, rays=37)
 
 
 RAYS = lay_out(design(), 37)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from lidardesign_tasks.flatland import FlatlandTask
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.sensor import Design, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError, InfeasibleError, NumericalError, PluginError
 from lidardesign.evaluate.refinement.attention import Attention
 from lidardesign.evaluate.refinement.refinement import LEVELS, PATIENCE, SPREADS, Refiner, Shape, Trial
@@ -53,7 +53,7 @@ def rays_at(x, gate=(0.0, 1.2)):
 def trial(*positions, layout="grid"):
     """A design of a fit that never was, and its rays."""
     sensor = Sensor("s0", 1.0, np.zeros(3), np.zeros((3, 3)), 1.57, 0.0, 0.0, 0.1, 0.0, 0.8, 0.1, rays=1)
-    result = SimpleNamespace(design=Design("d", (sensor,), layout))
+    result = SimpleNamespace(design=DesignSpec("d", (sensor,), layout))
     return Trial(result, positions, float(np.mean([Bandwidth().mbps(rays) for rays in positions])))
 
 

@@ -13,7 +13,7 @@ from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import Design, RayTable, Sensor, interval_factor
+from lidardesign.design.sensor import DesignSpec, RayTable, Sensor, interval_factor
 from lidardesign.evaluate.refinement.regating import Gating, has_ray_gates
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.simulate.simulate import build_casters, simulate
@@ -46,13 +46,13 @@ def beam(index, azimuth, gate, rays=1):
 
 def scan(gates, constraints=None):
     sensors = [beam(index, azimuth, gate) for index, (azimuth, gate) in enumerate(zip(ANGLES, gates, strict=True))]
-    return Design("d", tuple(sensors), "scan", rays=15, constraints=constraints or {})
+    return DesignSpec("d", tuple(sensors), "scan", rays=15, constraints=constraints or {})
 
 
 def table(gates, constraints=None):
     sensor = Sensor("s0", 1.0, np.zeros(3), np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.2, 0.1, 2.0, 1.0, rays=15)
     rays = RayTable(np.zeros((15, 3)), ANGLES, np.zeros(15), np.asarray(gates, float), np.zeros(15, dtype=int))
-    return Design("d", (sensor,), "density", rays=15, ray_table=rays, constraints=constraints or {})
+    return DesignSpec("d", (sensor,), "density", rays=15, ray_table=rays, constraints=constraints or {})
 
 
 def gates_like(start, end):
@@ -202,7 +202,7 @@ def test_which_designs_have_gates_of_single_rays():
     assert has_ray_gates(scan(gates_like(1.0, 2.0)))
     even = np.tile([1.0, 2.0], (15, 1))
     assert not has_ray_gates(table(even))
-    assert not has_ray_gates(Design("d", per_ray.sensors, "grid"))
+    assert not has_ray_gates(DesignSpec("d", per_ray.sensors, "grid"))
     two = replace(per_ray.ray_table, sensor=(np.arange(15) > 6).astype(int), gate_m=np.where(
         (np.arange(15) > 6)[:, None], [1.0, 2.0], [2.0, 3.0]))  # fmt: skip
     # two sensors with a gate each

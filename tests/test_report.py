@@ -21,7 +21,7 @@ from report_pages import (
     ray_segments,
 )
 
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.evaluate.figures.curves import series
 from lidardesign.evaluate.figures.drawing import (
     FEWEST_STEPS,
@@ -323,7 +323,7 @@ def test_long_scenes_and_many_rays_are_thinned_evenly_and_the_page_says_so():
 
 
 def test_a_scan_of_hundreds_of_sensors_is_drawn_by_its_rays_alone():
-    design = Design("scan", tuple(make_sensor(f"s{i}") for i in range(MOST_SENSORS + 1)), layout="scan")
+    design = DesignSpec("scan", tuple(make_sensor(f"s{i}") for i in range(MOST_SENSORS + 1)), layout="scan")
     shown = make_shown(designs=1)
     one = replace(shown.designs[0], design=design, placed=(design,) * len(PLACES))
     document = view_document(replace(shown, designs=(one,)), looks_of(shown))

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidardesign.design.fit import fit
-from lidardesign.design.sensor import Design, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.evaluate.refinement.reweighting import LARGEST_LOG_FACTOR, NEIGHBOURS, Reweighting
 from lidardesign.run.yaml import dump_yaml, parse_yaml
@@ -219,7 +219,7 @@ def test_spreading_in_range_moves_ranges_alone_and_stays_in_the_space():
 
 def design_with(weighting):
     sensor = Sensor("s0", 1.0, (0.0, 0.0, 0.0), np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.1, 0.1, 1.0, 0.1)
-    return Design("d", (sensor,), provenance={KEY: weighting})
+    return DesignSpec("d", (sensor,), provenance={KEY: weighting})
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from lidardesign.design.layouts.grid import low_discrepancy
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.mixture.mixture import log_density
 from lidardesign.design.mixture.support import pinned, restricted
-from lidardesign.design.sensor import Design, tangent_coordinates, tangent_directions
+from lidardesign.design.sensor import DesignSpec, tangent_coordinates, tangent_directions
 from lidardesign.evaluate.baselines.occupancy import OccupancyGrid
 from lidardesign.evaluate.baselines.simple import build_baseline
 from lidardesign.geometry.surface import sample_body
@@ -356,7 +356,7 @@ def test_draws_from_a_pinned_origin_have_the_density_at_that_origin():
 
 
 def one_sensor(layout, rays, **changes):
-    return Design(name="d", sensors=(sensor(**changes),), layout=layout, rays=rays)
+    return DesignSpec(name="d", sensors=(sensor(**changes),), layout=layout, rays=rays)
 
 
 def field_mass(one, edges, density):

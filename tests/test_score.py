@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.sensor import Design, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.evaluate.score import EvaluationRequest, evaluate, worse_than_threshold
 from lidardesign.scene import Body, Scene, Sphere, rigid
@@ -72,7 +72,7 @@ def design(name="aimed", azimuth=0.0, spread=0.03, range_m=2.65, weight=1.0):
     sensor = Sensor(
         "s0", weight, np.zeros(3), np.zeros((3, 3)), azimuth, 0.0, 0.0, spread, spread, range_m, 0.05
     )
-    return Design(name, (sensor,))
+    return DesignSpec(name, (sensor,))
 
 
 def make_request(designs=None, **changes):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from lidardesign.design.files import load_design
 from lidardesign.design.rigs.sensor_csv import COLUMNS, looks_like_sensor_csv, read_sensor_csv, write_sensor_csv
-from lidardesign.design.sensor import Design, Sensor, tangent_coordinates
+from lidardesign.design.sensor import DesignSpec, Sensor, tangent_coordinates
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.space import direction
 
@@ -43,7 +43,7 @@ def designs(draw):
                 spread_range_m=draw(st.floats(0, 100)),
             )
         )
-    return Design(name="table", sensors=tuple(sensors))
+    return DesignSpec(name="table", sensors=tuple(sensors))
 
 
 FIELDS = (
@@ -131,7 +131,7 @@ def test_the_moving_robots_variant_is_read_at_one_position_and_refused_at_severa
 
 def test_straight_down_is_written_with_the_azimuth_spread_cut_at_a_turn(tmp_path):
     sensor = Sensor("down", 1.0, np.zeros(3), np.zeros((3, 3)), 0.5, -math.pi / 2, 0.0, 0.2, 0.1, 1.0, 0.1)
-    notes = write_sensor_csv(Design("d", (sensor,)), tmp_path / "d.csv")
+    notes = write_sensor_csv(DesignSpec("d", (sensor,)), tmp_path / "d.csv")
     assert any("pole" in note for note in notes)
     loaded = load_design(tmp_path / "d.csv").sensors[0]
     assert np.isfinite(loaded.spread_horizontal_rad)
@@ -141,7 +141,7 @@ def test_straight_down_is_written_with_the_azimuth_spread_cut_at_a_turn(tmp_path
 
 def test_a_quarter_turn_of_roll_swaps_the_spreads_and_is_noted(tmp_path):
     sensor = Sensor("r", 1.0, np.zeros(3), np.zeros((3, 3)), 0.5, 0.0, math.pi / 2, 0.2, 0.1, 1.0, 0.1)
-    notes = write_sensor_csv(Design("d", (sensor,)), tmp_path / "d.csv")
+    notes = write_sensor_csv(DesignSpec("d", (sensor,)), tmp_path / "d.csv")
     assert any("roll" in note for note in notes)
     loaded = load_design(tmp_path / "d.csv").sensors[0]
     assert (loaded.spread_horizontal_rad, loaded.spread_vertical_rad) == pytest.approx((0.1, 0.2))
@@ -149,7 +149,7 @@ def test_a_quarter_turn_of_roll_swaps_the_spreads_and_is_noted(tmp_path):
 
 def test_another_level_is_noted(tmp_path):
     sensor = Sensor("r", 1.0, np.zeros(3), np.zeros((3, 3)), 0.5, 0.0, 0.0, 0.2, 0.1, 1.0, 0.1, level=0.9)
-    design = Design("d", (sensor,), level=0.9)
+    design = DesignSpec("d", (sensor,), level=0.9)
     assert any("0.9 is not held" in note for note in write_sensor_csv(design, tmp_path / "d.csv"))
     plain = replace(design, level=0.95)
     assert not any("is not held: intervals" in note for note in write_sensor_csv(plain, tmp_path / "d.csv"))

@@ -17,7 +17,7 @@ from lidardesign.design.files import design_document
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts.rays import lay_out, split_budget
 from lidardesign.design.layouts.shared_fields import bandwidth_limit, shared_rays
-from lidardesign.design.sensor import Design, Sensor, interval_factor, tangent_coordinates
+from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor, tangent_coordinates
 from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
 
@@ -75,7 +75,7 @@ def test_rays_lie_in_fields_however_wide(horizontal, vertical, roll, count, seed
     turn = DesignSpace((0, 0, 0, -math.pi, -math.pi / 2, 0.2), (0, 0, 0, math.pi, math.pi / 2, 3.0))
     points = turn.sample(1500, np.random.default_rng(seed))
     samples = Samples(points, np.zeros(1500), np.zeros(1500), turn)
-    design = Design("d", (wide_sensor(horizontal, vertical, roll=roll),), layout="density")
+    design = DesignSpec("d", (wide_sensor(horizontal, vertical, roll=roll),), layout="density")
     found = shared_rays(design, np.array([count]), samples, 0)
     if found is not None:
         assert len(found.sensor) == count
@@ -120,7 +120,7 @@ def test_few_samples_with_nearly_all_weight_leave_no_ray_without_direction():
     points = SPACE.sample(8000, generator)
     log_target = np.where(np.arange(8000) < 5, 12.0, 0.0)
     samples = Samples(points, np.zeros(8000), log_target, SPACE)
-    design = Design("d", (wide_sensor(2.4, 1.8),), layout="density")
+    design = DesignSpec("d", (wide_sensor(2.4, 1.8),), layout="density")
     found = shared_rays(design, np.array([30]), samples, 0)
     np.testing.assert_allclose(np.linalg.norm(found.direction, axis=1), 1.0, rtol=1e-12)
     assert len(np.unique(np.round(found.direction, 9), axis=0)) == 30
@@ -203,7 +203,7 @@ def test_rays_of_several_places_start_at_the_origins_of_their_sensors():
         replace(wide_sensor(1.6, 1.2, f"s{index}", 0.25), origin_m=np.array(origin, dtype=float))
         for index, origin in enumerate([(-0.4, 0, 0), (0.4, 0, 0), (-0.4, 0, 0), (0.1, 0, 0)])
     ]
-    design = Design("d", tuple(sensors), layout="density")
+    design = DesignSpec("d", tuple(sensors), layout="density")
     shares = split_budget(design.weights, 90)
     rays = lay_out(design, 90, samples, gates="ray")
     assert len(rays) == 90

@@ -24,7 +24,7 @@ from lidardesign.design.layouts.quantise import lloyd
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.layouts.track import interpolated, placed, travels
 from lidardesign.design.layouts.track_fit import fit_track
-from lidardesign.design.sensor import Design, Sensor, Track
+from lidardesign.design.sensor import DesignSpec, Sensor, Track
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.run.yaml import dump_yaml, parse_yaml
 from lidardesign.samples import Samples
@@ -367,7 +367,7 @@ def test_a_track_needs_a_place_between_its_ends(free, at):
 
 def bolted(**changes):
     sensor = Sensor("s", 1.0, np.array([0.37, 0.0, 0.1]), np.diag([0.01, 0.0, 0.0]), 0.3, 0.1, 0.0, 0.1, 0.1, 1.0, 0.1)
-    return Design("bolted", (sensor,), rays=9, **changes)
+    return DesignSpec("bolted", (sensor,), rays=9, **changes)
 
 
 @given(at=st.floats(-10, 10))

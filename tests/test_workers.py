@@ -11,7 +11,7 @@ from lidardesign_tasks.flatland import FlatlandConfig, FlatlandTask
 from test_score import MissTask
 
 from lidardesign import errors
-from lidardesign.design.sensor import Design, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.evaluate.scene_scores import ScenePass, SceneScores
 from lidardesign.evaluate.score import EvaluationRequest, evaluate
@@ -39,7 +39,7 @@ def make_request(**changes):
         "config": config,
         "space": space,
         "seed": SEED,
-        "designs": [Design("aimed", (sensor,))],
+        "designs": [DesignSpec("aimed", (sensor,))],
         "rays": (8, 16),
         "train": task.scenes(config, "train", SEED),
         "test": task.scenes(config, "test", SEED),

@@ -23,7 +23,7 @@ from lidardesign.design.catalog.library import load_library
 from lidardesign.design.catalog.part import Part
 from lidardesign.design.files import load_design
 from lidardesign.design.layouts.rays import own_count
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError
 from lidardesign.space import angles
 
@@ -55,7 +55,7 @@ def draw_pattern(axes: Axes, part: Part) -> None:
     axes.set_aspect("equal", adjustable="datalim")
 
 
-def draw_rows(axes: list[Axes], parts: list[Part], designs: list[tuple[str, Design]]) -> None:
+def draw_rows(axes: list[Axes], parts: list[Part], designs: list[tuple[str, DesignSpec]]) -> None:
     """A row per design and part: field of view, range gate, rays per frame."""
     fields, gates, rays = axes
     labels = []

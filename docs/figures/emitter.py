@@ -25,7 +25,7 @@ from matplotlib.patches import Polygon
 
 from lidardesign.design.files import load_design
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Scene
 from lidardesign.simulate.detector.detector import IDEAL
@@ -79,7 +79,7 @@ def draw_detector(axes: Axes, camera: Camera, scene: Scene, half_m: np.ndarray) 
     axes.add_patch(Polygon(eye, closed=True, facecolor=DETECTOR, edgecolor="white", linewidth=0.8, zorder=6))
 
 
-def draw_light(axes: Axes, camera: Camera, scene: Scene, design: Design) -> int:
+def draw_light(axes: Axes, camera: Camera, scene: Scene, design: DesignSpec) -> int:
     """Rays that are heard, and where they end; the number of them."""
     rays = lay_out(design, RAYS)
     (returns,) = simulate(scene, rays, physics=Physics(IDEAL, frozenset({"shadowing"})))
@@ -110,7 +110,7 @@ def label(figure: Figure, left: float, name: str, rows: dict[str, Any], heard: i
     figure.text(left, 0.052, interval, fontsize=11, color="#52606d", va="center")
 
 
-def picture(scene: Scene, half_m: np.ndarray, designs: dict[str, Design], evaluation: dict[str, Any]) -> Figure:
+def picture(scene: Scene, half_m: np.ndarray, designs: dict[str, DesignSpec], evaluation: dict[str, Any]) -> Figure:
     """The whole picture."""
     figure = Figure(figsize=(16.0, 5.0), dpi=100, facecolor="white")
     FigureCanvasAgg(figure)

@@ -31,7 +31,7 @@ from lidardesign.config import RunConfig, load_run_config
 from lidardesign.design.files import load_design
 from lidardesign.design.layouts.grid import field_on_sphere
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import Design, Sensor, tangent_directions
+from lidardesign.design.sensor import DesignSpec, Sensor, tangent_directions
 from lidardesign.evaluate.figures.canvas import looks, picture
 from lidardesign.evaluate.figures.density import field_picture, marginals_picture
 from lidardesign.evaluate.figures.density_views import density_view
@@ -62,7 +62,7 @@ HEAT = LinearSegmentedColormap.from_list("heat", ["#1b2a6b", "#7b2a8b", "#d5483c
 GATES = LinearSegmentedColormap.from_list("gates", ["#f0a202", "#d5483c", "#8a2f8f", "#2c4bb0"])
 
 
-def computed(run: Path, learn: bool) -> tuple[Design, dict[str, Any]]:
+def computed(run: Path, learn: bool) -> tuple[DesignSpec, dict[str, Any]]:
     """Ten sensors with rays laid out by the density, and their evaluation beside an even layout and the baselines."""
     if learn:
         command("learn", "face", "--preset", "draft", "--out", run)
@@ -128,7 +128,7 @@ def outline(sensor: Sensor) -> np.ndarray:
     return tangent_directions(sensor.frame, np.stack([across * horizontal, along * vertical], axis=1))
 
 
-def draw_sensors(axes: Axes, gates: Axes, view: HeadView, design: Design) -> None:
+def draw_sensors(axes: Axes, gates: Axes, view: HeadView, design: DesignSpec) -> None:
     """Fields of view over the head, coloured by where their gates are, and the gates beside them."""
     view.draw(axes, 1.0)
     order = sorted(design.sensors, key=lambda sensor: sensor.range_m)
@@ -256,7 +256,7 @@ class SideView:
         axes.legend(handles, names, loc="lower right", frameon=False, fontsize=12, labelcolor=INK)
 
 
-def draw_rays(axes: Axes, view: HeadView, rays: Rays, design: Design) -> None:
+def draw_rays(axes: Axes, view: HeadView, rays: Rays, design: DesignSpec) -> None:
     """Where each ray looks, coloured by its sensor as the fields of view are."""
     view.draw(axes, 1.0)
     order = sorted(range(len(design.sensors)), key=lambda index: design.sensors[index].range_m)
@@ -273,7 +273,13 @@ def caption(figure: Figure, left: float, top: float, number: int, word: str, exp
 
 
 def overview(
-    side: SideView, view: HeadView, samples: Samples, design: Design, rays: Rays, found: Returns, scores: dict[str, Any]
+    side: SideView,
+    view: HeadView,
+    samples: Samples,
+    design: DesignSpec,
+    rays: Rays,
+    found: Returns,
+    scores: dict[str, Any],
 ) -> Figure:
     """The whole way, in six parts."""
     figure = Figure(figsize=SIZE_INCHES, dpi=DOTS_PER_INCH, facecolor=PAPER)

@@ -26,7 +26,7 @@ from scipy.ndimage import gaussian_filter
 
 from lidardesign.design.files import load_design
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.geometry.rays import Outcome
 from lidardesign.samples import Samples, load_samples
 from lidardesign.scene import Scene
@@ -42,7 +42,7 @@ SEEN, UNSEEN, BEAM, GATE = "#5fa777", "#d9c7a3", "#7b8794", "#d5483c"
 HEAT = LinearSegmentedColormap.from_list("paper", ["#ffffff", "#cfe0f2", "#6fa3d6", "#1f5fa8"])
 
 
-def draw_shelf(axes: Axes, scene: Scene, design: Design, azimuth_rad: float) -> None:
+def draw_shelf(axes: Axes, scene: Scene, design: DesignSpec, azimuth_rad: float) -> None:
     """The plane that the sensor looks into: what stands there, the rays, and where each of them listens."""
     rays = lay_out(design, at={"x_m": POSITION_M})
     (returns,) = simulate(scene, rays)
@@ -79,7 +79,7 @@ def draw_density(axes: Axes, samples: Samples) -> None:
     axes.imshow(density.T, extent=extent, origin="lower", aspect="auto", cmap=HEAT, vmax=top, interpolation="bicubic")
 
 
-def draw_track(axes: Axes, gates: Axes, design: Design) -> None:
+def draw_track(axes: Axes, gates: Axes, design: DesignSpec) -> None:
     """Every ray's elevation and gate along the aisle."""
     track = design.track
     assert track is not None
@@ -101,7 +101,7 @@ def draw_track(axes: Axes, gates: Axes, design: Design) -> None:
     gates.set_xlabel("position along the aisle [m]", color=INK, fontsize=12)
 
 
-def picture(scene: Scene, samples: Samples, design: Design) -> Figure:
+def picture(scene: Scene, samples: Samples, design: DesignSpec) -> Figure:
     """The whole picture."""
     figure = Figure(figsize=(13.0, 6.4), dpi=90, facecolor="white")
     FigureCanvasAgg(figure)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from lidardesign.cli.output import Console
     from lidardesign.design.constraints.document import Constraints
-    from lidardesign.design.sensor import Design
+    from lidardesign.design.sensor import DesignSpec
     from lidardesign.workflow.learning_budget import Goal
     from lidardesign.workflow.run_lifecycle import Job
     from lidardesign.workflow.runs import Run
@@ -335,7 +335,7 @@ def _fit_steps(settings: Mapping[str, Any], task: str) -> list[str]:
 
 def evaluate_plan(
     run: Run,
-    designs: Sequence[tuple[Design, Path]],
+    designs: Sequence[tuple[DesignSpec, Path]],
     *,
     rays: Sequence[int],
     baselines: Sequence[str],

@@ -13,7 +13,7 @@ from lidardesign.run.clock import phase
 if TYPE_CHECKING:
     import numpy as np
 
-    from lidardesign.design.sensor import Design
+    from lidardesign.design.sensor import DesignSpec
     from lidardesign.evaluate.figures.figure_data import Pictured
     from lidardesign.evaluate.report.report import Report
     from lidardesign.evaluate.report.tables import CommandTimes, Reproduction
@@ -114,7 +114,7 @@ def _reproduction(request: EvaluationRequest, run: Run) -> Reproduction:
     return Reproduction(commands, facts, config.read_text(encoding="utf-8") if config.is_file() else "")
 
 
-def _made_by(design: Design) -> str:
+def _made_by(design: DesignSpec) -> str:
     """What a design's file says of where it came from."""
     known = design.provenance
     further = {name: value for name, value in known.items() if name not in ("versions", "task", "run")}

@@ -18,7 +18,7 @@ import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.layouts.rays import split_budget
-from lidardesign.design.sensor import Design, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.space import RANGE, DesignSpace
 
 RIGHT_ANGLE_M = 1.0
@@ -64,7 +64,7 @@ def angle_between(first: np.ndarray, second: np.ndarray) -> float:
     return 2 * math.atan2(float(np.linalg.norm(first - second)), float(np.linalg.norm(first + second)))
 
 
-def paired_sensors(first: Design, second: Design) -> list[SensorPair]:
+def paired_sensors(first: DesignSpec, second: DesignSpec) -> list[SensorPair]:
     """The sensors of two designs in pairs, in the order of the first; those left over at the end."""
     by_name = {sensor.name: sensor for sensor in second.sensors}
     if {sensor.name for sensor in first.sensors} == set(by_name):
@@ -77,7 +77,7 @@ def paired_sensors(first: Design, second: Design) -> list[SensorPair]:
     return pairs + lonely + [SensorPair(None, one) for index, one in enumerate(second.sensors) if index not in columns]
 
 
-def _distances(first: Design, second: Design) -> np.ndarray:
+def _distances(first: DesignSpec, second: DesignSpec) -> np.ndarray:
     """How different each sensor of one design is from each of the other, shape (G, H) [m]."""
     every = (*first.sensors, *second.sensors)
     range_m = float(np.mean([sensor.range_m for sensor in every])) or RIGHT_ANGLE_M
@@ -119,7 +119,7 @@ class Readout:
         return {**values, "rays": self.rays, "of_one_ray": self.rays is None, **model}
 
 
-def readout_of(design: Design) -> Readout:
+def readout_of(design: DesignSpec) -> Readout:
     """What a design's gates cost, by the read-out of its own constraints or the usual one."""
     budget = design.constraints.get("budget") or {}
     model = Bandwidth(**{name: float(budget[name]) for name in MODEL_KEYS if budget.get(name) is not None})
@@ -141,7 +141,7 @@ def readout_of(design: Design) -> Readout:
     return Readout(model, once, once, int(counts.sum()))
 
 
-def _counts(design: Design) -> np.ndarray | None:
+def _counts(design: DesignSpec) -> np.ndarray | None:
     """Rays per sensor, shape (G,); None where the design leaves them open."""
     own = [sensor.rays for sensor in design.sensors]
     if None not in own:
@@ -156,7 +156,7 @@ FAR_SIZES = 10.0
 UNIT = "are its lengths in millimetres?"
 
 
-def outside_notes(design: Design, space: DesignSpace) -> list[str]:
+def outside_notes(design: DesignSpec, space: DesignSpace) -> list[str]:
     """What is said of a design far outside a design space, one line at most.
 
     Arguments:
@@ -177,7 +177,7 @@ def outside_notes(design: Design, space: DesignSpace) -> list[str]:
     return []
 
 
-def _places(design: Design) -> tuple[np.ndarray, np.ndarray]:
+def _places(design: DesignSpec) -> tuple[np.ndarray, np.ndarray]:
     """Origins (N, 3) and where gates begin (M,) of everything in a design [m]."""
     origins_m = [np.array([sensor.origin_m for sensor in design.sensors]).reshape(-1, 3)]
     starts_m = [np.array([sensor.gate_m[0] for sensor in design.sensors])]

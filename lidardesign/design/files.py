@@ -28,7 +28,7 @@ from lidardesign.design.sensor import (
     LEVELS,
     MOST_RAYS,
     Coupling,
-    Design,
+    DesignSpec,
     RayTable,
     Sensor,
     Track,
@@ -134,7 +134,7 @@ TABLE_KEYS = (
 )
 
 
-def design_document(design: Design) -> dict[str, Any]:
+def design_document(design: DesignSpec) -> dict[str, Any]:
     """The plain document of a design, in the order in which it is written."""
     document: dict[str, Any] = {
         "schema_version": SCHEMA_VERSION,
@@ -178,7 +178,7 @@ def _table_document(table: RayTable) -> dict[str, list[float] | list[int]]:
     return {key: column.tolist() for key, column in zip(TABLE_KEYS, columns, strict=True)}
 
 
-def save_design(design: Design, path: Path) -> None:
+def save_design(design: DesignSpec, path: Path) -> None:
     """Write a design file, atomically.
 
     Raises:
@@ -188,7 +188,7 @@ def save_design(design: Design, path: Path) -> None:
     write_atomic(Path(path), design_text(design, path))
 
 
-def design_text(design: Design, path: Path) -> str:
+def design_text(design: DesignSpec, path: Path) -> str:
     """What a design's file holds.
 
     Raises:
@@ -213,7 +213,7 @@ def design_text(design: Design, path: Path) -> str:
 
 
 @phase("designs")
-def load_design(path: Path, reach_m: float | None = None) -> Design:
+def load_design(path: Path, reach_m: float | None = None) -> DesignSpec:
     """Read a design from a design file, the research code's sensor CSV or a rig of others, told apart by content.
 
     The design takes the file's stem as its name, as tables name designs by their files. `readers.dispatch` has the
@@ -249,7 +249,7 @@ def load_design(path: Path, reach_m: float | None = None) -> Design:
 
 def design_from_document(
     document: Any, where: str = "design", *, locate: LocateKey | Document | None = None
-) -> Design:
+) -> DesignSpec:
     """Build a design from its plain document.
 
     Arguments:
@@ -270,7 +270,7 @@ def design_from_document(
     table = _ray_table(keys["ray_table"], len(sensors)) if "ray_table" in keys else None
     track = read_track(keys["track"], len(sensors)) if "track" in keys else None
     _check_rays(keys, sensors, rays, table, track)
-    return Design(
+    return DesignSpec(
         name=keys["name"].text() if "name" in keys else Path(where).stem,
         sensors=sensors,
         layout=keys["layout"].choice(LAYOUTS) if "layout" in keys else "grid",  # type: ignore[arg-type]

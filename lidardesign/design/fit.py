@@ -25,7 +25,7 @@ from lidardesign.design.mixture.coupling import couplings
 from lidardesign.design.mixture.ensemble import Ensemble, Part, at_mounts, fit_parts, heaviest_first, sensors_of
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.support import Retarget, Support, check_support, pinned, restricted
-from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, Design, Layout, Sensor, interval_factor
+from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, DesignSpec, Layout, Sensor, interval_factor
 from lidardesign.design.snap.fit import Snapped, at_one_place, snapped
 from lidardesign.design.snap.parts import wants_parts
 from lidardesign.errors import ConfigError
@@ -148,7 +148,7 @@ def _along_condition(
 
 
 @phase("checks")
-def _checked(design: Design, constraints: Constraints, samples: Samples) -> list[ConstraintCheck]:
+def _checked(design: DesignSpec, constraints: Constraints, samples: Samples) -> list[ConstraintCheck]:
     return check_design(_document(design), constraints, samples.space)
 
 
@@ -173,7 +173,7 @@ def _solved(
 
 def _made(
     request: _Request, read_out: ReadOut, sensors: int | str | None, layout: Layout, gates: Gates, name: str
-) -> tuple[list[Support], Ensemble, Design, Snapped | None]:
+) -> tuple[list[Support], Ensemble, DesignSpec, Snapped | None]:
     """Samples, what was fitted to them, and the design that it stands for."""
     if wants_parts(request.constraints):
         supports, snap = _snapped(request, read_out, sensors, name)
@@ -369,11 +369,11 @@ def _design(
     request: _Request,
     name: str,
     gates: Gates,
-) -> Design:
+) -> DesignSpec:
     if total is not None:
         counts = split_budget(np.array([s.weight for s in sensors]), total)
         sensors = tuple(replace(s, rays=int(n)) for s, n in zip(sensors, counts, strict=True))
-    design = Design(
+    design = DesignSpec(
         name=name,
         sensors=sensors,
         layout=layout,
@@ -392,7 +392,7 @@ def _design(
     return replace(design, sensors=sensors, ray_table=table)
 
 
-def _document(design: Design) -> dict[str, Any]:
+def _document(design: DesignSpec) -> dict[str, Any]:
     """The written form that the checker reads."""
     # files reads and writes all formats; only its document is needed here
     from lidardesign.design.files import design_document

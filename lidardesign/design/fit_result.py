@@ -16,7 +16,7 @@ from lidardesign.design.constraints.check import ConstraintCheck
 from lidardesign.design.mixture.ensemble import Ensemble
 from lidardesign.design.mixture.mixture import log_density
 from lidardesign.design.mixture.support import Support
-from lidardesign.design.sensor import Design, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.estimates import ROUNDING, Estimate, as_documents, effective_share_error
 from lidardesign.samples import Samples
 
@@ -38,7 +38,7 @@ class FitResult:
         snap: What sensors lost that became parts, as plain values; None where none did.
     """
 
-    design: Design
+    design: DesignSpec
     log_likelihood: float
     admissible_mass: float | None
     ess: float

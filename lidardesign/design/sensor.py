@@ -238,7 +238,7 @@ class Track:
 
 
 @dataclass(frozen=True, eq=False)
-class Design:
+class DesignSpec:
     """A LiDAR system: sensors, how its rays are laid out, and where it came from.
 
     Arguments:

@@ -12,7 +12,7 @@ from typing import Any
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.evaluate.baselines.catalog import Density
 from lidardesign.evaluate.baselines.no_visibility import LayOut
@@ -57,7 +57,7 @@ class EvaluationRequest:
     config: Any
     space: DesignSpace
     seed: int
-    designs: Sequence[Design]
+    designs: Sequence[DesignSpec]
     rays: Sequence[int]
     baselines: Sequence[str] = ("uniform", "random", "bounding")
     bandwidth: Bandwidth = field(default_factory=Bandwidth)
@@ -66,7 +66,7 @@ class EvaluationRequest:
     train: Sequence[Scene] = ()
     test: Sequence[Scene] = ()
     lay_out: LayOut = lay_out
-    without_visibility: Callable[[], tuple[Design, Samples]] | None = None
+    without_visibility: Callable[[], tuple[DesignSpec, Samples]] | None = None
     density: Callable[[], Density | None] | None = None
     cma: CmaSettings = field(default_factory=CmaSettings)
     planner: Planner = field(default_factory=Planner)
@@ -96,25 +96,25 @@ class EvaluationRequest:
             raise ConfigError(f"{min(self.rays)} rays", where="--rays", allowed="1 or more")
 
 
-def pattern_size(design: Design) -> int | None:
+def pattern_size(design: DesignSpec) -> int | None:
     """The rays of a design's fixed pattern; None where a design can be laid out at any number."""
     return len(design.ray_table.sensor) if design.layout == "fixed" and design.ray_table is not None else None
 
 
-def can_fire(design: Design, count: int) -> bool:
+def can_fire(design: DesignSpec, count: int) -> bool:
     """Whether a design has so many rays."""
     size = pattern_size(design)
     return size is None or count <= size
 
 
-def usual_numbers(designs: Iterable[Design], budgets: Iterable[int]) -> list[int]:
+def usual_numbers(designs: Iterable[DesignSpec], budgets: Iterable[int]) -> list[int]:
     """The numbers to evaluate at where none is asked for: the task's, and those that smaller fixed patterns have."""
     usual = set(budgets)
     sizes = {size for size in map(pattern_size, designs) if size is not None}
     return sorted(usual | {size for size in sizes if size < max(usual)})
 
 
-def fired_numbers(designs: Sequence[Design], counts: Iterable[int]) -> list[int]:
+def fired_numbers(designs: Sequence[DesignSpec], counts: Iterable[int]) -> list[int]:
     """Those of some numbers of rays that any design can fire, in their order; all without a design.
 
     Raises:
@@ -133,7 +133,7 @@ def fired_numbers(designs: Sequence[Design], counts: Iterable[int]) -> list[int]
     return kept
 
 
-def left_out(designs: Sequence[Design], counts: Iterable[int]) -> list[str]:
+def left_out(designs: Sequence[DesignSpec], counts: Iterable[int]) -> list[str]:
     """Which designs have no row at which numbers of rays, one line each, for people."""
     asked = sorted(set(counts))
     lines = []

@@ -6,7 +6,7 @@ import html
 import math
 from collections.abc import Mapping, Sequence
 
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.evaluate.results import Evaluation, Paired, Row, leading_detail
 
 MOST_SENSORS = 60  # listed in a table
@@ -111,7 +111,7 @@ def bandwidth_table(evaluation: Evaluation) -> str:
     return table(headings, lines, text_columns=2, caption=caption)
 
 
-def sensors_table(design: Design) -> str:
+def sensors_table(design: DesignSpec) -> str:
     """A design's sensors in degrees and metres."""
     headings = [
         "sensor",

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.even_grid import EvenGrid, grid_of, grid_sensor_losses
@@ -33,7 +33,7 @@ MIRROR = np.diag([1.0, -1.0, 1.0])
 NARROWEST_DEG = 0.001
 
 
-def write(design: Design, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+def write(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the file, atomically; returns notes of what the format cannot hold.
 
     Raises:
@@ -50,7 +50,7 @@ def write(design: Design, rays: Rays, path: Path, rate_hz: float = Bandwidth().r
     return _losses(design, mounted, rays)
 
 
-def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """How far the rays that CARLA fires are from the design's; its sensors have no gate start, so only ends count.
 
     Raises:
@@ -155,7 +155,7 @@ def _held(sensor: Mapping[str, Any], step_s: float) -> Held:
     return Held(MIRROR @ location, world, (math.nan, float(attributes["range"])))
 
 
-def _losses(design: Design, mounted: Sequence[Mount], rays: Rays) -> list[str]:
+def _losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
     notes = grid_sensor_losses(design, mounted, rays)
     late = [one.gate_m[0] for one in mounted if one.gate_m[0] > 0]
     if late:

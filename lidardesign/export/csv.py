@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.columns import losses, ray_columns, rays_of
@@ -15,7 +15,7 @@ from lidardesign.geometry.rays import Rays
 from lidardesign.run.files import write_atomic
 
 
-def write(design: Design, rays: Rays, path: Path) -> list[str]:
+def write(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     """Write the file, atomically; returns notes of what the format cannot hold."""
     columns = ray_columns(rays)
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
@@ -39,6 +39,6 @@ def read(path: Path) -> Rays:
     return rays_of(dict(zip(names, values.T, strict=True)), path)
 
 
-def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose."""
     return rays_rounding(rays, read(path), path)

@@ -33,7 +33,7 @@ from lidardesign.design.galvo import (
     scan_directions,
 )
 from lidardesign.design.layouts.rays import fire_times
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.columns import losses
@@ -230,7 +230,7 @@ class Position:
     own_travel_deg: float
 
 
-def write(design: Design, rays: Rays, path: Path) -> list[str]:
+def write(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     """Write the file, atomically; returns what it came to and notes of what the format cannot hold.
 
     Raises:
@@ -251,12 +251,12 @@ def write(design: Design, rays: Rays, path: Path) -> list[str]:
     return [*_summary(positions), *losses(design), "firing times follow from the order of the rows"]
 
 
-def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose: gates open outward to whole picoseconds; firing times are not held."""
     return rays_rounding(rays, read(path), path, times=False)
 
 
-def plan(design: Design, rays: Rays) -> list[Position]:
+def plan(design: DesignSpec, rays: Rays) -> list[Position]:
     """The positions of a scanner that fires all rays, in the order of the rays that need them first.
 
     Raises:
@@ -315,7 +315,7 @@ def _position(origin_m: np.ndarray, rays: Rays, chosen: np.ndarray) -> Position:
     return Position(origin_m, boresight, chosen[order], angles_deg[order], travel(angles_deg))
 
 
-def _refuse_spread_origins(design: Design, rays: Rays, place: np.ndarray) -> None:
+def _refuse_spread_origins(design: DesignSpec, rays: Rays, place: np.ndarray) -> None:
     for index, sensor in enumerate(design.sensors):
         places = len(np.unique(place[rays.sensor == index]))
         if places > 1:
@@ -327,7 +327,7 @@ def _refuse_spread_origins(design: Design, rays: Rays, place: np.ndarray) -> Non
             )
 
 
-def _refuse_far_rays(design: Design, rays: Rays, positions: list[Position]) -> None:
+def _refuse_far_rays(design: DesignSpec, rays: Rays, positions: list[Position]) -> None:
     """Refuse the design where mirrors would have to turn beyond `LIMIT_DEG`, with how many rays and the worst."""
     ray = np.concatenate([one.ray for one in positions] or [np.zeros(0, dtype=np.int64)])
     angles_deg = np.concatenate([one.angles_deg for one in positions] or [np.zeros((0, 2))])
@@ -346,7 +346,7 @@ def _refuse_far_rays(design: Design, rays: Rays, positions: list[Position]) -> N
     )
 
 
-def _refuse_late_gates(design: Design, rays: Rays) -> None:
+def _refuse_late_gates(design: DesignSpec, rays: Rays) -> None:
     latest_m = float(gate_m(np.array([[MOST_WHOLE, 0]]))[0, 1])
     end_m = rays.gate_m[:, 1].max(initial=0.0)
     if end_m > latest_m:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.export.common.names import write_folder
 from lidardesign.export.common.poses import Mount, design_losses, mounts, rays_of_parts, require_rays
@@ -40,7 +40,7 @@ MM_PER_M = 1000
 QUARTER_TURN_DEG = 90.0
 
 
-def write(design: Design, rays: Rays, path: Path, rate_hz: float) -> list[str]:
+def write(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> list[str]:
     """Write the folder; returns notes of what the format cannot hold.
 
     Raises:
@@ -99,7 +99,7 @@ def _platforms() -> Element:
     return root
 
 
-def _survey(design: Design, mount: Mount, rays: Rays, pulse_hz: int) -> Element:
+def _survey(design: DesignSpec, mount: Mount, rays: Rays, pulse_hz: int) -> Element:
     """One leg of one pulse, at the place where the sensor's first ray starts."""
     root = element("document")
     survey = child(
@@ -118,7 +118,7 @@ def _survey(design: Design, mount: Mount, rays: Rays, pulse_hz: int) -> Element:
     return root
 
 
-def read(path: Path, design: Design, rays: Rays) -> Rays:
+def read(path: Path, design: DesignSpec, rays: Rays) -> Rays:
     """The rays of a folder that `write` made of a design and its rays, with their sensors and times.
 
     Raises:
@@ -150,6 +150,6 @@ def _part(ray: np.ndarray, scanner: Element | None, survey: Path) -> Part:
         raise DataError(f"holds no survey of this design: {error}", where=str(survey)) from error
 
 
-def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose."""
     return rays_rounding(rays, read(path, design, rays), path, times=False)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.names import renamed_note
@@ -72,7 +72,7 @@ def whole_rate_hz(rate_hz: float) -> int:
     return round(rate_hz)
 
 
-def losses(design: Design, mounted: Sequence[Mount], rate_hz: float) -> list[str]:
+def losses(design: DesignSpec, mounted: Sequence[Mount], rate_hz: float) -> list[str]:
     """Notes of what Isaac's profiles cannot hold."""
     notes = [*design_losses(design, mounted), *origin_losses(mounted)]
     if whole_rate_hz(rate_hz) != rate_hz:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.names import write_folder
@@ -37,7 +37,7 @@ OPTICS = {
 LEAST_REFLECTANCE_RANGE_M = 270.0
 
 
-def write(design: Design, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+def write(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the folder's files, each atomically; returns notes of what the format cannot hold.
 
     Raises:
@@ -51,7 +51,7 @@ def write(design: Design, rays: Rays, path: Path, rate_hz: float = Bandwidth().r
     return [*losses(design, mounted, rate_hz), f"a profile has no pose: places stand in {MOUNTS}", optics, *notes]
 
 
-def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose.
 
     Raises:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.poses import Mount, mounts
@@ -40,7 +40,7 @@ _PRIM = re.compile(r'^    def OmniLidar "(?P<name>[^"]*)"')
 _ATTRIBUTE = re.compile(r"^        (?:uniform )?(?P<type>[a-z0-9]+(?:\[\])?) (?P<name>[\w:]+) = (?P<value>.*)$")
 
 
-def write(design: Design, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+def write(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the layer, atomically; returns notes of what the format cannot hold."""
     mounted, whole_hz = mounts(design, rays), whole_rate_hz(rate_hz)
     lines = [
@@ -62,7 +62,7 @@ def write(design: Design, rays: Rays, path: Path, rate_hz: float = Bandwidth().r
     return losses(design, mounted, rate_hz)
 
 
-def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose.
 
     Raises:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.export.common.names import write_folder
 from lidardesign.export.common.poses import Place, design_losses, mounts, places, rays_of_parts, require_rays
@@ -36,7 +36,7 @@ DEPTH = 2
 MM_PER_M = 1000
 
 
-def write(design: Design, rays: Rays, path: Path) -> list[str]:
+def write(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     """Write the folder; returns notes of what the format cannot hold.
 
     Raises:
@@ -116,7 +116,7 @@ def _add_vector(parent: Element, tag: str, name: str, values: np.ndarray) -> Non
     child(parent, tag, name=name, x=x, y=y, z=z)
 
 
-def read(path: Path, design: Design, rays: Rays) -> Rays:
+def read(path: Path, design: DesignSpec, rays: Rays) -> Rays:
     """The rays of a folder that `write` made of a design and its rays, with their sensors and times.
 
     Raises:
@@ -141,6 +141,6 @@ def _part(place: Place, path: Path) -> Part:
         raise DataError(f"holds no sensor of this design: {error}", where=str(path), hint="export it again") from error
 
 
-def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose, gates on whole bins that rays share included."""
     return rays_rounding(rays, read(path, design, rays), path, times=False)

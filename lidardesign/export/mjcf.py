@@ -14,7 +14,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.names import distinct, xml_text
@@ -32,7 +32,7 @@ WORLD = "world"
 SITE_SIZE_M = 0.002
 
 
-def write(design: Design, rays: Rays, path: Path) -> list[str]:
+def write(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     """Write the model, atomically; returns notes of what the format cannot hold."""
     mounted = mounts(design, rays)
     bodies = distinct([xml_text(one.sensor.name) for one in mounted], " ", taken=[WORLD])
@@ -66,7 +66,7 @@ def read(path: Path) -> Rays:
         raise DataError(f"is no model of rangefinders: {error!r}", where=str(path)) from error
 
 
-def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose."""
     if not len(rays):
         return rays_rounding(rays, rays, path)
@@ -122,7 +122,7 @@ def _floats(one: Element, name: str) -> np.ndarray:
     return np.array(one.attrib[name].split(), dtype=np.float64)
 
 
-def _losses(design: Design, mounted: Sequence[Mount], rays: Rays) -> list[str]:
+def _losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
     notes = design_losses(design, mounted)
     late = rays.gate_m[rays.gate_m[:, 0] > 0, 0]
     if len(late):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.columns import losses, ray_columns, rays_of
 from lidardesign.export.common.read_back import rays_rounding
@@ -16,7 +16,7 @@ from lidardesign.run.arrays import NUMERIC_KINDS, read_npz
 from lidardesign.run.files import write_atomic
 
 
-def write(design: Design, rays: Rays, path: Path) -> list[str]:
+def write(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     """Write the file, atomically; returns notes of what the format cannot hold."""
     buffer = io.BytesIO()
     names = np.array([sensor.name for sensor in design.sensors], dtype=np.str_)
@@ -34,6 +34,6 @@ def read(path: Path) -> Rays:
     return rays_of(read_npz(path, kinds=NUMERIC_KINDS + "U", hint="export it again"), path)
 
 
-def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose: nothing, they are kept bit for bit."""
     return rays_rounding(rays, read(path), path)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import ROUNDING, Estimate
 from lidardesign.export.common.poses import (
@@ -42,7 +42,7 @@ NANOSECONDS_PER_S = 10**9
 MOST_US = 2**32 - 1
 
 
-def write(design: Design, rays: Rays, path: Path, rate_hz: float) -> list[str]:
+def write(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> list[str]:
     """Write the file, atomically; returns notes of what the format cannot hold.
 
     Raises:
@@ -98,7 +98,7 @@ def _vector(values: np.ndarray) -> dict[str, float]:
     return dict(zip("xyz", values.tolist(), strict=True))
 
 
-def read(path: Path, design: Design, rays: Rays) -> tuple[Rays, float]:
+def read(path: Path, design: DesignSpec, rays: Rays) -> tuple[Rays, float]:
     """The rays of a file that `write` made of a design and its rays, with their own gates, and the frame rate [Hz].
 
     Raises:
@@ -129,7 +129,7 @@ def _part(place: Place, lidar: dict[str, Any], rays: Rays) -> Part:
     return place.ray, origin, unit_vectors(looking @ turn.T), rays.gate_m[place.ray]
 
 
-def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose: times are whole microseconds; gates are not held."""
     found, rate_hz = read(path, design, rays)
     errors = rays_rounding(rays, found, path, times=False)

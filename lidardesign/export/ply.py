@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidardesign.design.layouts.grid import field_on_sphere
-from lidardesign.design.sensor import Design, tangent_directions
+from lidardesign.design.sensor import DesignSpec, tangent_directions
 from lidardesign.errors import DataError
 from lidardesign.export.common.names import write_folder
 from lidardesign.export.common.read_back import rays_rounding
@@ -42,7 +42,7 @@ PARTS = 12
 LONGEST_NAME = 60
 
 
-def write(design: Design, rays: Rays, path: Path) -> list[str]:
+def write(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     """Write the folder; returns notes of what the format cannot hold."""
     comments = [
         f"comment sensor {index} {json.dumps(one.name[:LONGEST_NAME])}" for index, one in enumerate(design.sensors)
@@ -164,6 +164,6 @@ def read(path: Path) -> Rays:
     return Rays(origin, looking, gate, table["sensor"], table["time"])
 
 
-def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose: nothing, they are kept bit for bit."""
     return rays_rounding(rays, read(path), path)

@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError
 from lidardesign.estimates import Estimate
 from lidardesign.geometry.rays import Rays
@@ -41,7 +41,7 @@ class Exporter:
     folder: bool = False
     rated: bool = False
 
-    def write(self, design: Design, rays: Rays, path: Path, rate_hz: float | None = None) -> list[str]:
+    def write(self, design: DesignSpec, rays: Rays, path: Path, rate_hz: float | None = None) -> list[str]:
         """Write the file, atomically; returns notes of what the format cannot hold.
 
         Arguments:
@@ -74,7 +74,7 @@ class Exporter:
                 f"{self.name} holds no frame rate", where="--rate-hz", allowed=f"with {rated}" if rated else "none"
             )
 
-    def rounding(self, design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+    def rounding(self, design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
         """What the numbers in a file that was just written lose, by reading it back: the largest error of each kind.
 
         Raises:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.estimates import ROUNDING, Estimate
 from lidardesign.export.common.names import identifier, renamed_note, write_folder
@@ -45,7 +45,7 @@ SDF_VERSION = "1.9"
 POSE_NUMBERS = 6
 
 
-def write(design: Design, rays: Rays, path: Path, rate_hz: float) -> list[str]:
+def write(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> list[str]:
     """Write the folder; returns notes of what the format cannot hold.
 
     Raises:
@@ -69,7 +69,7 @@ def write(design: Design, rays: Rays, path: Path, rate_hz: float) -> list[str]:
     return [*notes, *_notes(design, mounted, path)]
 
 
-def _notes(design: Design, mounted: list[Mount], path: Path) -> list[str]:
+def _notes(design: DesignSpec, mounted: list[Mount], path: Path) -> list[str]:
     notes = [
         f"{MODEL} names the patterns by their absolute paths in {path.resolve()}: export again where they move",
         f"the plugin fires all rays of a frame at once; the {TIMES} files hold when each fires, for "
@@ -107,7 +107,7 @@ def _add_sensor(link: Element, mount: Mount, rays: Rays, pattern: Path, rate_hz:
     child(plugin, "pattern_preset_path", text=pattern)
 
 
-def read(path: Path, design: Design, rays: Rays) -> tuple[Rays, float]:
+def read(path: Path, design: DesignSpec, rays: Rays) -> tuple[Rays, float]:
     """The rays of a folder that `write` made of a design and its rays, with their sensors, and the frame rate [Hz].
 
     Raises:
@@ -155,7 +155,7 @@ def _floats(path: Path, shape: tuple[int, ...]) -> np.ndarray:
         raise DataError(f"cannot be read as a pattern: {error}", where=str(path), hint="export it again") from error
 
 
-def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose: patterns are float32."""
     found, rate_hz = read(path, design, rays)
     late_s = float(np.abs(found.time_s - fire_times_s(rays, rate_hz)).max())

@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.even_grid import EvenGrid, grid_of, grid_sensor_losses
@@ -29,7 +29,7 @@ LINK = "lidar"
 NEAREST_M = 0.001
 
 
-def write(design: Design, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+def write(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the model, atomically; returns notes of what the format cannot hold."""
     mounted = mounts(design, rays)
     sensors = [sensor_element(one, rate_hz, posed=True) for one in mounted]
@@ -39,14 +39,14 @@ def write(design: Design, rays: Rays, path: Path, rate_hz: float = Bandwidth().r
     return losses(design, mounted, rays)
 
 
-def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """How far the rays that Gazebo fires are from the design's."""
     mounted = mounts(design, rays)
     found = read_xml(path, "sdf").findall(f"model/link[@name='{LINK}']/sensor")
     return held_rounding(rays, mounted, matched([held(one, path) for one in found], mounted, path))
 
 
-def losses(design: Design, mounted: Sequence[Mount], rays: Rays) -> list[str]:
+def losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
     """Notes of what gpu_lidar sensors cannot hold."""
     near = [one for one in mounted if one.gate_m[0] < NEAREST_M]
     late = [one.gate_m[0] for one in mounted if one.gate_m[0] >= NEAREST_M]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.estimates import ROUNDING, Estimate
 from lidardesign.export.common.names import identifier
@@ -33,7 +33,7 @@ KEYWORDS = ("solid", "facet", "loop", "vertex")
 _VERTEX = re.compile(r"^\s*vertex (\S+) (\S+) (\S+)$", re.MULTILINE)
 
 
-def write(design: Design, rays: Rays, path: Path) -> list[str]:
+def write(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     """Write the file, atomically; returns notes of what the format cannot hold."""
     write_atomic(path, "".join(_solid(index, sensor) for index, sensor in enumerate(design.sensors)))
     notes = [
@@ -88,7 +88,7 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return tip / MM_PER_M, np.stack([np.cross(across, up), across, up], axis=1)
 
 
-def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose, of places, boresights and rolls."""
     places, frames = read(path)
     if len(places) != len(design.sensors):

@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.names import identifier
@@ -28,7 +28,7 @@ _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 BASE_MASS_KG, BASE_INERTIA_KG_M2 = 0.1, 0.0001
 
 
-def write(design: Design, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+def write(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the description, atomically; returns notes of what the format cannot hold."""
     mounted = mounts(design, rays)
     parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent=BASE)]
@@ -37,14 +37,14 @@ def write(design: Design, rays: Rays, path: Path, rate_hz: float = Bandwidth().r
     return [*notes(design, mounted, rays), mass]
 
 
-def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """How far the rays of the described sensors are from the design's."""
     mounted = mounts(design, rays)
     found = held_sensors(read_xml(path, "robot"), path)
     return held_rounding(rays, mounted, matched(found, mounted, path))
 
 
-def notes(design: Design, mounted: Sequence[Mount], rays: Rays) -> list[str]:
+def notes(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
     """Notes of what a description of links and Gazebo sensors cannot hold."""
     return [
         *losses(design, mounted, rays),

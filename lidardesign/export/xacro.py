@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.names import identifier
@@ -23,7 +23,7 @@ NAMESPACE = "http://www.ros.org/wiki/xacro"
 MACRO = "xacro:macro"
 
 
-def write(design: Design, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+def write(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the macro, atomically; returns how to use it and notes of what the format cannot hold."""
     name, mounted = identifier(design.name), mounts(design, rays)
     parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent="${parent}", prefix="${prefix}")]
@@ -33,7 +33,7 @@ def write(design: Design, rays: Rays, path: Path, rate_hz: float = Bandwidth().r
     return [usage, *notes(design, mounted, rays)]
 
 
-def rounding(design: Design, rays: Rays, path: Path) -> dict[str, Estimate]:
+def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """How far the rays of the described sensors are from the design's.
 
     Raises:

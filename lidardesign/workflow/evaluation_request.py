@@ -14,7 +14,7 @@ from lidardesign.workflow.runs import open_run, reach_beside, read_design, run_o
 
 if TYPE_CHECKING:
     from lidardesign.cli.output import Console
-    from lidardesign.design.sensor import Design
+    from lidardesign.design.sensor import DesignSpec
     from lidardesign.evaluate.score import EvaluationRequest
     from lidardesign.workflow.runs import Run
 
@@ -25,7 +25,7 @@ ALWAYS = ("uniform", "random", "bounding")
 class JudgedDesign:
     """One design to evaluate and the run that it came from."""
 
-    design: Design
+    design: DesignSpec
     path: Path
     run: Run | None
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from lidardesign.density.target.target import Target
-    from lidardesign.design.sensor import Design
+    from lidardesign.design.sensor import DesignSpec
     from lidardesign.evaluate.baselines.catalog import Density
     from lidardesign.geometry.rays import Rays
     from lidardesign.samples import Samples
@@ -75,7 +75,7 @@ class Layouts:
     targets: Mapping[str, RunTarget]
 
     def __call__(
-        self, design: Design, count: int, samples: Samples | None, *, at: Mapping[str, float] | None = None
+        self, design: DesignSpec, count: int, samples: Samples | None, *, at: Mapping[str, float] | None = None
     ) -> Rays:
         """A design's rays at a number of rays, with a gate per ray where its own table has one per ray."""
         from lidardesign.design.layouts.rays import gates_of, lay_out
@@ -84,12 +84,12 @@ class Layouts:
         return lay_out(design, count, samples, gates=gates, at=at, retarget=self.targets.get(design.name))
 
 
-def may_need_samples(design: Design) -> bool:
+def may_need_samples(design: DesignSpec) -> bool:
     """Whether another number of rays of a design may follow from samples of its run."""
     return design.layout != "fixed" and (design.layout != "grid" or design.ray_table is not None)
 
 
-def twin_without_visibility(design: Design, run: Run, layouts: Layouts) -> tuple[Design, Samples]:
+def twin_without_visibility(design: DesignSpec, run: Run, layouts: Layouts) -> tuple[DesignSpec, Samples]:
     """A design's twin of the density without its occlusion term, and the samples that it was fitted to.
 
     Raises:
@@ -121,7 +121,7 @@ def learned_density(run: Run) -> Density | None:
     return Density(load_samples(run.folder), RunTarget(run)) if (run.folder / FILE_NAME).exists() else None
 
 
-def layouts_of(made: Sequence[tuple[Design, Run]]) -> Layouts:
+def layouts_of(made: Sequence[tuple[DesignSpec, Run]]) -> Layouts:
     """The layouts of designs by their runs; the twin takes the first run's target without occlusion."""
     by_folder = {run.folder: RunTarget(run) for _, run in made}
     targets = {}

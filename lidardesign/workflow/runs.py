@@ -20,7 +20,7 @@ from lidardesign.run.files import is_input, is_there
 if TYPE_CHECKING:
     from lidardesign.cli.output import Console
     from lidardesign.config import RunConfig
-    from lidardesign.design.sensor import Design
+    from lidardesign.design.sensor import DesignSpec
     from lidardesign.scene import Scene
     from lidardesign.task import Split, Task
 
@@ -73,7 +73,7 @@ def open_run(folder: Path) -> Run:
     return Run(folder, task, config)
 
 
-def read_design(path: Path, console: Console, reach_m: float | None = None) -> Design:
+def read_design(path: Path, console: Console, reach_m: float | None = None) -> DesignSpec:
     """A design file or a rig of others, or standard input for `-`.
 
     One of a run that is not as it was written says so: it may be cut, or mended by hand. A rig says what its file
@@ -118,7 +118,7 @@ def _difference(path: Path) -> str | None:
         return None
 
 
-def open_target(path: Path, console: Console) -> tuple[Run | None, Design | None]:
+def open_target(path: Path, console: Console) -> tuple[Run | None, DesignSpec | None]:
     """Open what a command was given: a run folder, or a design file and the run that it came from.
 
     Returns:
@@ -135,13 +135,13 @@ def open_target(path: Path, console: Console) -> tuple[Run | None, Design | None
     return run_of(design, path), design
 
 
-def run_of(design: Design, path: Path) -> Run | None:
+def run_of(design: DesignSpec, path: Path) -> Run | None:
     """The run that a design came from, if it is there."""
     folder = folder_of(design, path)
     return None if folder is None else open_run(folder)
 
 
-def folder_of(design: Design, path: Path) -> Path | None:
+def folder_of(design: DesignSpec, path: Path) -> Path | None:
     """The folder of the run that a design came from, if it is there: its provenance names it relative to its file."""
     named = design.provenance.get("run")
     if not isinstance(named, str):
@@ -265,7 +265,7 @@ def reach_beside(files: Iterable[Path], runs: Sequence[Run]) -> float | None:
     return None
 
 
-def tell_notes(design: Design, shown: str, console: Console) -> None:
+def tell_notes(design: DesignSpec, shown: str, console: Console) -> None:
     """Say what the file of a rig did not: only what was read from others has such notes."""
     notes = design.provenance.get("notes")
     if "source" in design.provenance and isinstance(notes, list):
@@ -273,7 +273,7 @@ def tell_notes(design: Design, shown: str, console: Console) -> None:
             console.note(f"note: {shown}: {note}")
 
 
-def budgets_within(designs: Iterable[Design], budgets: Sequence[int], console: Console) -> list[int]:
+def budgets_within(designs: Iterable[DesignSpec], budgets: Sequence[int], console: Console) -> list[int]:
     """The numbers of rays to evaluate at where none is asked for: those that every fixed ray list has.
 
     Where a rig has fewer rays than the task's largest budget, its own number takes the place of those beyond it.

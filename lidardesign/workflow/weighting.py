@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from lidardesign.errors import ConfigError
 
 if TYPE_CHECKING:
-    from lidardesign.design.sensor import Design
+    from lidardesign.design.sensor import DesignSpec
     from lidardesign.evaluate.refinement.reweighting import Reweighting
     from lidardesign.samples import Samples
     from lidardesign.workflow.layouts import RunTarget
@@ -42,7 +42,7 @@ class Weighting:
         return bool(self.settings or self.reweighting is not None or self.range_spread_m)
 
     @classmethod
-    def of(cls, design: Design) -> Weighting:
+    def of(cls, design: DesignSpec) -> Weighting:
         """What a design says about its samples.
 
         Raises:
@@ -112,7 +112,7 @@ def weighted_samples(run: Run, weighting: Weighting, target: RunTarget) -> Sampl
     return weighting.spread(samples, run.config.seed)
 
 
-def designs_samples(made: Sequence[tuple[Design, Run]], targets: Mapping[str, RunTarget]) -> dict[str, Samples]:
+def designs_samples(made: Sequence[tuple[DesignSpec, Run]], targets: Mapping[str, RunTarget]) -> dict[str, Samples]:
     """The samples of designs by their names; designs with the same weighting of a run share them."""
     known: dict[Any, Samples] = {}
     found = {}

@@ -20,7 +20,7 @@ from lidardesign.config import resolve
 from lidardesign.design.files import design_document
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.rigs.sensor_csv import QUERY_COLUMN, write_sensor_csv
-from lidardesign.design.sensor import Coupling, Design, RayTable, Sensor, Track
+from lidardesign.design.sensor import Coupling, DesignSpec, RayTable, Sensor, Track
 from lidardesign.export import csv as csv_format
 from lidardesign.export import galvo
 from lidardesign.export import npz as npz_format
@@ -60,7 +60,7 @@ def sensor(index: int = 0, *, spread_m: float = 0.0, coupled: bool = False) -> S
     )  # fmt: skip
 
 
-def sample_designs() -> list[Design]:
+def sample_designs() -> list[DesignSpec]:
     """A grid, explicit rays, a scan along a track, and a distributed design with couplings."""
     pair = (sensor(0), sensor(1))
     table = RayTable(
@@ -72,11 +72,11 @@ def sample_designs() -> list[Design]:
     spread = (sensor(0, spread_m=0.1, coupled=True), sensor(1, spread_m=0.2))
     constraints = {"gate": {"width_m": {"max": 0.5}}}
     return [
-        Design("grid", pair, rays=60, constraints=constraints, provenance={"run": "..", "seed": 3}),
-        Design("rays", pair, layout="density", rays=4, ray_table=table),
-        Design("track", pair, layout="scan", rays=2, track=track),
-        Design("spread", spread, layout="distributed", rays=40, level=0.99),
-        Design("own", tuple(replace(one, rays=7) for one in pair), rays=14, at={"x_m": 0.5}),
+        DesignSpec("grid", pair, rays=60, constraints=constraints, provenance={"run": "..", "seed": 3}),
+        DesignSpec("rays", pair, layout="density", rays=4, ray_table=table),
+        DesignSpec("track", pair, layout="scan", rays=2, track=track),
+        DesignSpec("spread", spread, layout="distributed", rays=40, level=0.99),
+        DesignSpec("own", tuple(replace(one, rays=7) for one in pair), rays=14, at={"x_m": 0.5}),
     ]
 
 

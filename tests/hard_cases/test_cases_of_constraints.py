@@ -31,7 +31,7 @@ from lidardesign.design.mixture.ensemble import admitted
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.mixture import log_density
 from lidardesign.design.mixture.support import LEAST_MASS
-from lidardesign.design.sensor import Design, interval_factor
+from lidardesign.design.sensor import DesignSpec, interval_factor
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.evaluate.metrics import DRAW_ROUNDS
 from lidardesign.samples import Samples
@@ -525,7 +525,7 @@ class TestBudgetsThatDoNotDivide:
     @pytest.mark.parametrize("count", [0, 1, 2, 3, 4])
     @pytest.mark.parametrize("layout", ["grid", "density", "distributed"])
     def test_layouts_take_any_number_of_rays(self, layout, count):
-        design = Design("d", three_sensors(), layout=layout)
+        design = DesignSpec("d", three_sensors(), layout=layout)
         rays = lay_out(design, count, drawn_from(design, 2000))
         assert len(rays) == count
         assert np.bincount(rays.sensor, minlength=3).tolist() == split_budget(design.weights, count).tolist()

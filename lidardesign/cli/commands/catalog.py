@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from lidardesign.design.catalog.part import Part
     from lidardesign.design.catalog.placing import Pose
-    from lidardesign.design.sensor import Design
+    from lidardesign.design.sensor import DesignSpec
 
 # How several parts at one place are turned against each other.
 ARRANGEMENTS = ("interleaved", "beside")
@@ -203,7 +203,7 @@ def _refuse_without_out(given: dict[str, Any]) -> None:
             raise ConfigError("says how a design is made", where=option, hint="--out FILE.yaml writes one")
 
 
-def _design(part: Part, given: dict[str, Any], name: str, console: Console) -> Design:
+def _design(part: Part, given: dict[str, Any], name: str, console: Console) -> DesignSpec:
     """The design that the options ask for."""
     from lidardesign.design.catalog.placing import interleaved, part_design, parts_for, side_by_side
     from lidardesign.design.sensor import MOST_RAYS
@@ -256,7 +256,7 @@ def _origin(text: str | None) -> np.ndarray:
     return origin
 
 
-def _write(design: Design, out: Path) -> None:
+def _write(design: DesignSpec, out: Path) -> None:
     """Write the design, and say what to do where it has more rays than a file takes."""
     from lidardesign.design.files import MOST_TABLE_RAYS, save_design
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
     from lidardesign.cli.output import Console
-    from lidardesign.design.sensor import Design
+    from lidardesign.design.sensor import DesignSpec
     from lidardesign.evaluate.score import Evaluation, EvaluationRequest
     from lidardesign.workflow.evaluation_request import JudgedDesign
     from lidardesign.workflow.runs import Run
@@ -137,7 +137,7 @@ def _scores(
     }
 
 
-def _check_fired(designs: Sequence[Design], counts: Sequence[int], console: Console) -> None:
+def _check_fired(designs: Sequence[DesignSpec], counts: Sequence[int], console: Console) -> None:
     """Say where a design has no row; a design that has none at all is refused."""
     from lidardesign.evaluate.request import fired_numbers, left_out
 
@@ -151,14 +151,14 @@ def _keys(rows: Sequence[dict[str, Any]]) -> set[tuple[str, int]]:
     return {(row["design"], row["rays"]) for row in rows}
 
 
-def _own_count(design: Design) -> int | None:
+def _own_count(design: DesignSpec) -> int | None:
     """The number of rays that a design was made for; None where it leaves it open."""
     from lidardesign.design.compare import readout_of
 
     return readout_of(design).rays
 
 
-def _counts(designs: Sequence[Design], own: Sequence[int | None], run: Run, console: Console) -> list[int]:
+def _counts(designs: Sequence[DesignSpec], own: Sequence[int | None], run: Run, console: Console) -> list[int]:
     """Rays at which two designs are compared: what both were made for, else the budgets that both have."""
     from lidardesign.workflow.runs import budgets_within
 

@@ -25,7 +25,7 @@ from lidardesign.workflow.weighting import Weighting
 if TYPE_CHECKING:
     from lidardesign.cli.output import Console
     from lidardesign.design.constraints.document import Constraints
-    from lidardesign.design.sensor import Design
+    from lidardesign.design.sensor import DesignSpec
     from lidardesign.run.yaml import KeyPath
     from lidardesign.workflow.runs import Run
 
@@ -96,7 +96,7 @@ def constrain(
         )
 
 
-def _usual(constraints: Constraints, design: Design | None, run: Run) -> str:
+def _usual(constraints: Constraints, design: DesignSpec | None, run: Run) -> str:
     """The layout where none is named: the design's, else the task's; sensors that become parts are fitted as grids."""
     from lidardesign.design.sensor import fitted_layout
     from lidardesign.design.snap.parts import wants_parts
@@ -106,7 +106,7 @@ def _usual(constraints: Constraints, design: Design | None, run: Run) -> str:
     return fitted_layout(design.layout) if design else usual_layout(run)
 
 
-def _weighting(given: list[str] | None, design: Design | None, console: Console) -> Weighting:
+def _weighting(given: list[str] | None, design: DesignSpec | None, console: Console) -> Weighting:
     """How samples are weighted: by the options, else as they were for the design."""
     own = Weighting.of(design) if design else Weighting()
     if not given:
@@ -116,7 +116,7 @@ def _weighting(given: list[str] | None, design: Design | None, console: Console)
     return Weighting(tuple(given))
 
 
-def _level(given: float | None, design: Design | None, usual: float) -> float:
+def _level(given: float | None, design: DesignSpec | None, usual: float) -> float:
     """The level of intervals: the option's, else the design's, else the task's."""
     if given is not None:
         return given
@@ -169,7 +169,7 @@ def load_constraints(file: Path | None, overrides: list[str], console: Console |
     return Constraints.from_mapping(values, where=str(file) if file else "constraints", locate=locate)
 
 
-def _sensors(given: Any, constraints: Constraints, design: Design | None, usual: int) -> Any:
+def _sensors(given: Any, constraints: Constraints, design: DesignSpec | None, usual: int) -> Any:
     """The number of sensors: the option's, then what the constraints ask for, the design's, the task's."""
     from lidardesign.design.constraints.mounts import is_mounted
 
@@ -186,7 +186,7 @@ def _sensors(given: Any, constraints: Constraints, design: Design | None, usual:
 def _rays(
     given: int | None,
     constraints: Constraints,
-    design: Design | None,
+    design: DesignSpec | None,
     may_stay_open: bool,
     budgets: tuple[int, ...],
 ) -> int | None:

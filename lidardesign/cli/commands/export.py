@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from lidardesign.cli.dry_run import Plan
     from lidardesign.design.mixture.support import Retarget
-    from lidardesign.design.sensor import Design
+    from lidardesign.design.sensor import DesignSpec
     from lidardesign.estimates import Estimate
     from lidardesign.export.registry import Exporter
     from lidardesign.geometry.rays import Rays
@@ -195,7 +195,7 @@ def _target(path: Path, out: Path | None, exporter: Exporter) -> Path:
     return target
 
 
-def _plan(design: Design, path: Path, target: Path, exporter: Exporter, asked: _Asked) -> Plan:
+def _plan(design: DesignSpec, path: Path, target: Path, exporter: Exporter, asked: _Asked) -> Plan:
     """What this export would do.
 
     Raises:
@@ -224,7 +224,7 @@ def _plan(design: Design, path: Path, target: Path, exporter: Exporter, asked: _
     )
 
 
-def _largest_budget(design: Design, path: Path) -> int:
+def _largest_budget(design: DesignSpec, path: Path) -> int:
     """The rays of a design that leaves them open: the largest number that its task is evaluated at.
 
     Raises:
@@ -257,8 +257,8 @@ def _shown_rounding(rounding: Mapping[str, Estimate]) -> str:
 
 @phase("rays")
 def design_and_rays(
-    design: Design, path: Path, name: str, count: int | None, at: Mapping[str, float], seed: int, console: Console
-) -> tuple[Design, Rays]:
+    design: DesignSpec, path: Path, name: str, count: int | None, at: Mapping[str, float], seed: int, console: Console
+) -> tuple[DesignSpec, Rays]:
     """A design and its explicit rays at a condition; another number of rays may need the samples of its run.
 
     A scan of another number of rays has other sensors, so the design that is exported is that one. A design that
@@ -288,7 +288,7 @@ def design_and_rays(
     return placed(design, at) if at or design.track is not None else design, laid_out
 
 
-def _samples(run: Run, design: Design, at: Mapping[str, float]) -> tuple[Samples, Retarget]:
+def _samples(run: Run, design: DesignSpec, at: Mapping[str, float]) -> tuple[Samples, Retarget]:
     """The samples that a design follows from: of all conditions for a track, else of the design's own."""
     from lidardesign.design.mixture.conditions import conditioned
     from lidardesign.workflow.layouts import RunTarget
@@ -302,7 +302,7 @@ def _samples(run: Run, design: Design, at: Mapping[str, float]) -> tuple[Samples
     return samples, retarget
 
 
-def _is_open(design: Design) -> bool:
+def _is_open(design: DesignSpec) -> bool:
     """Whether nothing in a design says how many rays it fires."""
     counted = all(sensor.rays is not None for sensor in design.sensors)
     return design.rays is None and design.ray_table is None and not counted and design.layout != "scan"

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from lidardesign.design.constraints.check import ConstraintCheck
     from lidardesign.design.constraints.document import Constraints
     from lidardesign.design.fit import FitResult
-    from lidardesign.design.sensor import Design
+    from lidardesign.design.sensor import DesignSpec
     from lidardesign.space import DesignSpace
     from lidardesign.workflow.runs import Run
 
@@ -198,7 +198,7 @@ def fit_and_write(
     console.result(document, lambda rich: _show(document, design, checks, rich))
 
 
-def _show(document: dict[str, Any], design: Design, checks: Sequence[ConstraintCheck], rich: RichConsole) -> None:
+def _show(document: dict[str, Any], design: DesignSpec, checks: Sequence[ConstraintCheck], rich: RichConsole) -> None:
     """Print what was fitted, after the rounds of its refinement."""
     from lidardesign.cli.tables.designs import show_fit
     from lidardesign.workflow.refine import show_refinement
@@ -207,7 +207,7 @@ def _show(document: dict[str, Any], design: Design, checks: Sequence[ConstraintC
     show_fit(document, design, checks, rich)
 
 
-def _finished(result: FitResult, names: Sequence[str], made_by: Mapping[str, Any]) -> tuple[FitResult, Design]:
+def _finished(result: FitResult, names: Sequence[str], made_by: Mapping[str, Any]) -> tuple[FitResult, DesignSpec]:
     """The result with sensors of these names, if they are as many, and its design with where it came from."""
     design = result.design
     if len(names) == len(design.sensors):
@@ -226,7 +226,7 @@ def _document(result: FitResult, path: Path, checks: Sequence[ConstraintCheck]) 
     }
 
 
-def check_written(design: Design, constraints: Constraints | None, space: DesignSpace) -> list[ConstraintCheck]:
+def check_written(design: DesignSpec, constraints: Constraints | None, space: DesignSpace) -> list[ConstraintCheck]:
     """Check a design's own text against its constraints with code that the fit does not share.
 
     Raises:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from lidardesign.cli.output import Console
     from lidardesign.design.compare import Readout
     from lidardesign.design.constraints.check import ConstraintCheck
-    from lidardesign.design.sensor import Design
+    from lidardesign.design.sensor import DesignSpec
     from lidardesign.workflow.runs import Run
 
 SpaceOf = Annotated[
@@ -67,7 +67,7 @@ def show(
         console.result(_document(loaded, design, checks, readout), print_all, show_costs=False)
 
 
-def _tell_outside(design: Design, path: Path, run: Run | None, console: Console) -> None:
+def _tell_outside(design: DesignSpec, path: Path, run: Run | None, console: Console) -> None:
     """Say where a design stands far outside the design space of the run that it is shown in, or came from."""
     from lidardesign.design.compare import outside_notes
     from lidardesign.errors import LidardesignError
@@ -82,7 +82,7 @@ def _tell_outside(design: Design, path: Path, run: Run | None, console: Console)
         console.note(f"note: {line}")
 
 
-def _document(loaded: Design, path: Path, checks: list[ConstraintCheck], readout: Readout) -> dict[str, Any]:
+def _document(loaded: DesignSpec, path: Path, checks: list[ConstraintCheck], readout: Readout) -> dict[str, Any]:
     from lidardesign.design.constraints.slack import is_tight, room_left
     from lidardesign.design.files import track_document
 
@@ -102,7 +102,7 @@ def _document(loaded: Design, path: Path, checks: list[ConstraintCheck], readout
     }
 
 
-def _checks(design: Design, path: Path, run: Run | None, console: Console) -> list[ConstraintCheck]:
+def _checks(design: DesignSpec, path: Path, run: Run | None, console: Console) -> list[ConstraintCheck]:
     """Every constraint that the design was made under, checked anew; in its run's design space where that is there."""
     from lidardesign.design.constraints.check import check_design
     from lidardesign.design.files import design_document

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
     from lidardesign.design.constraints.check import ConstraintCheck
-    from lidardesign.design.sensor import Design, Sensor, Track
+    from lidardesign.design.sensor import DesignSpec, Sensor, Track
 
 
 MAX_SHOWN = 20
@@ -55,7 +55,7 @@ def with_error(estimate: dict[str, Any]) -> str:
     return f"{value:.{decimals}f} +- {error:.{decimals}f}"
 
 
-def show_design(design: Design, rich: RichConsole) -> None:
+def show_design(design: DesignSpec, rich: RichConsole) -> None:
     """Print a design's sensors as a table, with angles in degrees; a place that all share stands above it."""
     from rich.markup import escape
     from rich.table import Table
@@ -85,7 +85,7 @@ def show_design(design: Design, rich: RichConsole) -> None:
         rich.print(f"... and {len(design.sensors) - MAX_SHOWN} more sensors; --json lists all")
 
 
-def show_track(design: Design, track: Track, rich: RichConsole) -> None:
+def show_track(design: DesignSpec, track: Track, rich: RichConsole) -> None:
     """Print the rays of a track as a table: from where to where each looks and listens over its travel."""
     from numpy import degrees
     from rich.markup import escape
@@ -185,7 +185,7 @@ def _left(check: ConstraintCheck) -> str:
     return number(room, 3) if share is None else f"{number(room, 3)} ({number(100 * share, 2)} %)"
 
 
-def show_fit(document: dict[str, Any], design: Design, checks: Sequence[Any], rich: RichConsole) -> None:
+def show_fit(document: dict[str, Any], design: DesignSpec, checks: Sequence[Any], rich: RichConsole) -> None:
     """Print what `fit` and `constrain` made."""
     from rich.markup import escape
 
@@ -204,7 +204,7 @@ def show_fit(document: dict[str, Any], design: Design, checks: Sequence[Any], ri
     rich.print(f"design: {escape(str(document['design']))}", soft_wrap=True)
 
 
-def write_design(design: Design, run: Path, path: Path) -> None:
+def write_design(design: DesignSpec, run: Path, path: Path) -> None:
     """Write a design into its run, under the run's lock, and enter it in the manifest."""
     from lidardesign.design.files import design_text
     from lidardesign.run.lock import run_lock

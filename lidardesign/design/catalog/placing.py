@@ -17,7 +17,7 @@ from lidardesign.design.layouts.grid import grid_rows, grid_tangent
 from lidardesign.design.sensor import (
     DEFAULT_LEVEL,
     MOST_RAYS,
-    Design,
+    DesignSpec,
     RayTable,
     Sensor,
     boresight_frame,
@@ -182,7 +182,7 @@ def part_design(
     name: str | None = None,
     level: float = DEFAULT_LEVEL,
     wanted: Wanted | None = None,
-) -> Design:
+) -> DesignSpec:
     """A design of real parts at poses, with the explicit rays of their patterns; see `part_rays`.
 
     Its layout is `fixed`: at fewer rays it fires an evenly spread subset, more it does not have.
@@ -198,7 +198,7 @@ def part_design(
         part_sensor(part, pose, name=f"s{index}", weight=1 / len(poses), rays=int(shares[index]), level=level)
         for index, pose in enumerate(poses)
     )
-    return Design(
+    return DesignSpec(
         name=name or part.name.replace(":", "-"),
         sensors=sensors,
         layout="fixed",

@@ -14,7 +14,7 @@ import numpy as np
 
 from lidardesign.design.constraints.document import MOST_FITTED, Constraints, SensorConstraints, merged
 from lidardesign.design.constraints.mounts import misses, place_text, settled_place
-from lidardesign.design.sensor import Design, Sensor, interval_factor
+from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.numerics import SLACK
 from lidardesign.space import DIMENSIONS, DesignSpace
@@ -28,7 +28,7 @@ SHARED = tuple(SensorConstraints.model_fields)
 
 
 def constraints_like(
-    rig: Design, space: DesignSpace, asked: Constraints, *, rays: int | None, hint: str | None = None
+    rig: DesignSpec, space: DesignSpace, asked: Constraints, *, rays: int | None, hint: str | None = None
 ) -> Constraints:
     """The constraints of a rig below those that were asked for.
 
@@ -79,7 +79,7 @@ def _placed(asked: Mapping[str, Any]) -> bool:
     return any(key in asked.get("origin", {}) for key in PLACES)
 
 
-def _check_places(rig: Design, space: DesignSpace, placed: Sequence[bool], hint: str | None) -> None:
+def _check_places(rig: DesignSpec, space: DesignSpace, placed: Sequence[bool], hint: str | None) -> None:
     """Refuse a rig whose sensors stand where the design space has no place, of those that the user puts nowhere."""
     boxes = {sensor.name: _box(sensor) for sensor, own in zip(rig.sensors, placed, strict=False) if not own}
     beyond = {name: axes for name, box in boxes.items() if (axes := misses(*box, space))}
@@ -127,7 +127,7 @@ def _box(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
     return sensor.origin_m - half, sensor.origin_m + half
 
 
-def moved_notes(rig: Design, space: DesignSpace, constraints: Constraints) -> list[str]:
+def moved_notes(rig: DesignSpec, space: DesignSpace, constraints: Constraints) -> list[str]:
     """Which sensors of a rig are taken to stand where the space fixes their place, as they stand next to it."""
     moved = []
     for sensor, one in zip(rig.sensors, constraints.each, strict=False):
@@ -142,7 +142,7 @@ def moved_notes(rig: Design, space: DesignSpace, constraints: Constraints) -> li
     return [f"{names}: {max(off for _, off in moved):.2g} mm from where the run's sensors stand: taken to stand there"]
 
 
-def taken_over(rig: Design, constraints: Constraints, asked: Constraints) -> list[str]:
+def taken_over(rig: DesignSpec, constraints: Constraints, asked: Constraints) -> list[str]:
     """What a rig's likeness says, one line each, for people."""
     sensors, own = len(rig.sensors), asked.as_document()
     said = [f"{sensors} sensor" + "s" * (sensors > 1)]

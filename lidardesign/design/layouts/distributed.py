@@ -48,7 +48,7 @@ from lidardesign.design.layouts.shared_fields import FIELD_ROUNDING_RAD, SMALLES
 from lidardesign.design.mixture.coupling import conditional_means, conditional_spreads, relative
 from lidardesign.design.mixture.features import Axes, Features, looks
 from lidardesign.design.mixture.origins import box_around, free_boxes, inside_excluded, origin_box
-from lidardesign.design.sensor import Design, Sensor, interval_factor, tangent_directions
+from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor, tangent_directions
 from lidardesign.numerics import ROUNDING, SLACK, angle_over_sine, systematic_draw
 from lidardesign.samples import Samples
 from lidardesign.space import AZIMUTH, ELEVATION, FULL_TURN, RANGE, DesignSpace, aim, angles, direction, observed_point
@@ -94,7 +94,7 @@ SMALLEST_AXIS_SHARE = ROUNDING
 
 
 def owned(
-    design: Design, points: np.ndarray, weights: np.ndarray, space: DesignSpace, constraints: Constraints
+    design: DesignSpec, points: np.ndarray, weights: np.ndarray, space: DesignSpace, constraints: Constraints
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """The samples of each sensor: their indices and, as it fires them, their design points.
 
@@ -204,7 +204,7 @@ class Beams:
     gate_m: np.ndarray
 
 
-def distributed_beams(design: Design, shares: np.ndarray, samples: Samples | None, seed: int) -> list[Beams]:
+def distributed_beams(design: DesignSpec, shares: np.ndarray, samples: Samples | None, seed: int) -> list[Beams]:
     """The rays of each sensor: by the samples inside it, by its Gaussian where there are fewer than rays.
 
     Arguments:
@@ -230,7 +230,7 @@ def distributed_beams(design: Design, shares: np.ndarray, samples: Samples | Non
     return beams
 
 
-def _space_of(design: Design) -> DesignSpace:
+def _space_of(design: DesignSpec) -> DesignSpace:
     """The box in which a design may lay out rays when only its file is known: where its own rays start."""
     table = design.ray_table if design.ray_table is not None and len(design.ray_table.sensor) else None
     origins = np.stack([s.origin_m for s in design.sensors]) if table is None else table.origin_m

@@ -26,7 +26,15 @@ from lidardesign.design.layouts.shared_fields import Members, members, narrowed,
 from lidardesign.design.layouts.track import moved, placed
 from lidardesign.design.mixture.conditions import conditioned
 from lidardesign.design.mixture.support import Retarget
-from lidardesign.design.sensor import MOST_RAYS, Design, Layout, RayTable, Sensor, interval_factor, tangent_directions
+from lidardesign.design.sensor import (
+    MOST_RAYS,
+    DesignSpec,
+    Layout,
+    RayTable,
+    Sensor,
+    interval_factor,
+    tangent_directions,
+)
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import sphere_exp, sphere_log, systematic_draw, unit_vectors
@@ -41,7 +49,9 @@ DEFAULT_RATE_HZ = 10.0
 REMAINDER_DECIMALS = 9
 
 # A design is asked for at many places of a track; the samples and the design decide what a refit finds.
-_REFITS: WeakKeyDictionary[Samples, WeakKeyDictionary[Design, dict[tuple[int, int], Design]]] = WeakKeyDictionary()
+_REFITS: WeakKeyDictionary[Samples, WeakKeyDictionary[DesignSpec, dict[tuple[int, int], DesignSpec]]] = (
+    WeakKeyDictionary()
+)
 
 
 def split_budget(weights: np.ndarray, count: int) -> np.ndarray:
@@ -71,7 +81,7 @@ def split_budget(weights: np.ndarray, count: int) -> np.ndarray:
 
 
 def lay_out(
-    design: Design,
+    design: DesignSpec,
     count: int | None = None,
     samples: Samples | None = None,
     *,
@@ -123,7 +133,7 @@ def lay_out(
 
 
 def _on_track(
-    design: Design, count: int | None, samples: Samples | None, at: Mapping[str, float], rate_hz: float, seed: int
+    design: DesignSpec, count: int | None, samples: Samples | None, at: Mapping[str, float], rate_hz: float, seed: int
 ) -> Rays:
     """The rays of a track at a position; another number of them is another track."""
     total = own_count(design) if count is None else count
@@ -133,7 +143,7 @@ def _on_track(
     return _laid_out(here if total else replace(here, ray_table=None), total, None, "sensor", rate_hz, seed)
 
 
-def _asks_samples(design: Design, count: int | None, gates: Gates) -> bool:
+def _asks_samples(design: DesignSpec, count: int | None, gates: Gates) -> bool:
     """Whether the rays of a design at a count follow from samples of the density."""
     total = own_count(design) if count is None else count
     if total == 0 or (design.ray_table is not None and len(design.ray_table.sensor) == total):
@@ -144,7 +154,7 @@ def _asks_samples(design: Design, count: int | None, gates: Gates) -> bool:
 
 
 def _laid_out(
-    design: Design, count: int | None, samples: Samples | None, gates: Gates, rate_hz: float, seed: int
+    design: DesignSpec, count: int | None, samples: Samples | None, gates: Gates, rate_hz: float, seed: int
 ) -> Rays:
     """The rays of a design where it stands, see `lay_out`."""
     total = own_count(design) if count is None else count
@@ -184,7 +194,7 @@ def own_gates(layout: Layout) -> Gates:
     return "ray" if layout == "distributed" else "sensor"
 
 
-def gates_of(design: Design, samples: Samples | None) -> Gates | None:
+def gates_of(design: DesignSpec, samples: Samples | None) -> Gates | None:
     """The gates that a design's rays keep at another number of rays; None where its own table tells nothing.
 
     A table tells by two rays of one sensor. Rays that start where others do have gates of their own by samples only.
@@ -200,7 +210,7 @@ def gates_of(design: Design, samples: Samples | None) -> Gates | None:
 
 
 def _distributed_rays(
-    design: Design, shares: np.ndarray, samples: Samples | None, gates: Gates, rate_hz: float, seed: int
+    design: DesignSpec, shares: np.ndarray, samples: Samples | None, gates: Gates, rate_hz: float, seed: int
 ) -> Rays:
     beams = distributed_beams(design, shares, samples, seed)
     origin, looking, gate = (
@@ -214,7 +224,7 @@ def _distributed_rays(
 
 @phase("rays")
 def make_ray_table(
-    design: Design, count: int, samples: Samples | None = None, gates: Gates | None = None, *, seed: int = 0
+    design: DesignSpec, count: int, samples: Samples | None = None, gates: Gates | None = None, *, seed: int = 0
 ) -> RayTable:
     """The explicit rays of a design's layout, laid out anew, as they are kept in its file."""
     rays = lay_out(replace(design, ray_table=None), count, samples, gates=gates, seed=seed)
@@ -222,7 +232,7 @@ def make_ray_table(
     return RayTable(rays.origin_m, azimuth, elevation, rays.gate_m, rays.sensor)
 
 
-def own_count(design: Design) -> int:
+def own_count(design: DesignSpec) -> int:
     """The number of rays that a design was made for.
 
     Raises:
@@ -244,7 +254,7 @@ def fire_times(count: int, rate_hz: float) -> np.ndarray:
     return np.arange(count) / (max(count, 1) * rate_hz)
 
 
-def _shares(design: Design, total: int) -> np.ndarray:
+def _shares(design: DesignSpec, total: int) -> np.ndarray:
     """Rays per sensor: the design's own at its own number, one each in a scan, else by weight."""
     own = [sensor.rays for sensor in design.sensors]
     if None not in own and sum(n or 0 for n in own) == total:
@@ -258,7 +268,7 @@ def _shares(design: Design, total: int) -> np.ndarray:
     return split_budget(design.weights, total)
 
 
-def refitted(design: Design, total: int, samples: Samples | None, seed: int = 0) -> Design:
+def refitted(design: DesignSpec, total: int, samples: Samples | None, seed: int = 0) -> DesignSpec:
     """A scan of another number of rays: every ray is a component, so the components are others.
 
     Keeps the design's constraints, but for the number of rays itself.
@@ -274,7 +284,7 @@ def refitted(design: Design, total: int, samples: Samples | None, seed: int = 0)
     return known[total, seed]
 
 
-def _refit(design: Design, total: int, samples: Samples, seed: int) -> Design:
+def _refit(design: DesignSpec, total: int, samples: Samples, seed: int) -> DesignSpec:
     # fit lays out what it fits, so it stands above this module
     from lidardesign.design.fit import fit
 
@@ -301,7 +311,7 @@ def _refit(design: Design, total: int, samples: Samples, seed: int) -> Design:
     return fitted.design
 
 
-def _needs_samples(design: Design, total: int, gates: Gates) -> ConfigError:
+def _needs_samples(design: DesignSpec, total: int, gates: Gates) -> ConfigError:
     wanted = "gates per ray" if gates == "ray" else f"{total} rays in the layout `{design.layout}`"
     return ConfigError(
         f"{wanted} need samples of the learned density, and a design file alone has none",
@@ -311,7 +321,7 @@ def _needs_samples(design: Design, total: int, gates: Gates) -> ConfigError:
     )
 
 
-def _fewer(design: Design, total: int) -> RayTable:
+def _fewer(design: DesignSpec, total: int) -> RayTable:
     """An evenly spread subset of a fixed design's rays, each sensor's in proportion."""
     table = design.ray_table
     if table is None or total > len(table.sensor):
@@ -372,7 +382,7 @@ def _field_ends(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
     return -half, half
 
 
-def _ray_gates(design: Design, tangents: list[np.ndarray], seen: list[Members], space: DesignSpace) -> np.ndarray:
+def _ray_gates(design: DesignSpec, tangents: list[np.ndarray], seen: list[Members], space: DesignSpace) -> np.ndarray:
     """The gate of each ray, from the ranges of the samples that are nearest to it, shape (N, 2) [m].
 
     Inside its sensor's gate, and moved no further than the design's constraints ask: they bound every ray.

@@ -23,7 +23,7 @@ from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.constraints.rules import bounds_of
 from lidardesign.design.layouts.gates import Heard, gates_within
 from lidardesign.design.layouts.quantise import lloyd, samples_for
-from lidardesign.design.sensor import Design, Sensor, interval_factor, tangent_coordinates, tangent_directions
+from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor, tangent_coordinates, tangent_directions
 from lidardesign.numerics import ROUNDING, angle_over_sine, systematic_draw, unit_vectors
 from lidardesign.samples import Samples
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, aim, direction, observed_point
@@ -57,7 +57,7 @@ class Members:
         return len(self.index)
 
 
-def members(design: Design, points: np.ndarray, weights: np.ndarray) -> list[Members]:
+def members(design: DesignSpec, points: np.ndarray, weights: np.ndarray) -> list[Members]:
     """The samples inside each sensor's field of view and gate, each sample with one sensor at most.
 
     Rays start at their sensor's mean origin. So each sample is aimed anew, from there at the scene point that
@@ -157,7 +157,7 @@ class SharedRays:
     sensor: np.ndarray
 
 
-def shared_rays(design: Design, shares: np.ndarray, samples: Samples, seed: int) -> SharedRays | None:
+def shared_rays(design: DesignSpec, shares: np.ndarray, samples: Samples, seed: int) -> SharedRays | None:
     """The rays of a design whose sensors stand at one place or at a few; None where its samples are too few.
 
     Arguments:
@@ -232,7 +232,7 @@ def _in_fields(directions: np.ndarray, sensor: np.ndarray, sensors: Sequence[Sen
     return inside
 
 
-def ray_gates(design: Design, heard: Heard, sensor: np.ndarray, samples: Samples) -> np.ndarray:
+def ray_gates(design: DesignSpec, heard: Heard, sensor: np.ndarray, samples: Samples) -> np.ndarray:
     """Gates by what rays hear, inside their sensors' bounds and the design's bandwidth, shape (N, 2) [m]."""
     constraints = Constraints.from_mapping(design.constraints, where=f"constraints of {design.name}")
     count = len(design.sensors)
@@ -241,7 +241,7 @@ def ray_gates(design: Design, heard: Heard, sensor: np.ndarray, samples: Samples
     return gates_within(heard, bounds, design.level, model, limit)
 
 
-def narrowed(design: Design, gates: np.ndarray, sensor: np.ndarray, samples: Samples) -> np.ndarray:
+def narrowed(design: DesignSpec, gates: np.ndarray, sensor: np.ndarray, samples: Samples) -> np.ndarray:
     """Gates (N, 2) [m] that were not priced, where they are too wide for the design's bandwidth: towards their middles.
 
     Rays of which too little is known count as hearing most in the middle of their gates.
@@ -266,7 +266,7 @@ def bandwidth_limit(constraints: Constraints, rays: int) -> tuple[Bandwidth, int
     return model, max(int(budget.bandwidth_mbps / one_bin), rays)
 
 
-def _seen(design: Design, samples: Samples) -> _Seen:
+def _seen(design: DesignSpec, samples: Samples) -> _Seen:
     """The samples inside the fields and gates of sensors, each with one of them."""
     parts = members(design, samples.points, samples.weights)
     return _Seen(

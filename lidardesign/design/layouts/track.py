@@ -14,7 +14,7 @@ import numpy as np
 
 from lidardesign.design.constraints.rules import mean_azimuth
 from lidardesign.design.mixture.conditions import shown
-from lidardesign.design.sensor import Design, RayTable, Sensor, Track, interval_factor
+from lidardesign.design.sensor import DesignSpec, RayTable, Sensor, Track, interval_factor
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Rays
 from lidardesign.space import DIMENSIONS
@@ -23,7 +23,7 @@ from lidardesign.space import DIMENSIONS
 TRAVELLED = DIMENSIONS[:3]
 
 
-def placed(design: Design, at: Mapping[str, float]) -> Design:
+def placed(design: DesignSpec, at: Mapping[str, float]) -> DesignSpec:
     """The design as it is at one value of its conditions.
 
     A track gives its rays there, as an explicit table with one sensor per ray. Other designs are bolted onto what
@@ -48,7 +48,7 @@ def placed(design: Design, at: Mapping[str, float]) -> Design:
     return replace(design, sensors=sensors, ray_table=table, at={**design.at, **at})
 
 
-def moved(rays: Rays, design: Design, at: Mapping[str, float]) -> Rays:
+def moved(rays: Rays, design: DesignSpec, at: Mapping[str, float]) -> Rays:
     """Rays of a design that is no track, with every origin's named coordinate at a value.
 
     Raises:
@@ -92,7 +92,7 @@ def travels(track: Track) -> tuple[float, float]:
     return float(track.knots[0]), float(track.knots[-1])
 
 
-def _on_track(design: Design, track: Track, at: Mapping[str, float]) -> Design:
+def _on_track(design: DesignSpec, track: Track, at: Mapping[str, float]) -> DesignSpec:
     """The rays of a track at a position, as a scan with an explicit table."""
     unknown = [name for name in at if name != track.dimension and at[name] != design.at.get(name)]
     if unknown:
@@ -156,13 +156,13 @@ def _moved(origin_m: np.ndarray, moves: Mapping[int, float]) -> np.ndarray:
     return moved
 
 
-def _origins(track: Track, design: Design, value: float) -> np.ndarray:
+def _origins(track: Track, design: DesignSpec, value: float) -> np.ndarray:
     """Where the rays of a track start, shape (N, 3) [m]."""
     means = np.array([sensor.origin_m for sensor in design.sensors], dtype=np.float64)[track.sensor]
     return _moved(means, {DIMENSIONS.index(track.dimension): value})
 
 
-def _check_coordinate(design: Design, name: str, value: float) -> None:
+def _check_coordinate(design: DesignSpec, name: str, value: float) -> None:
     """Only origins move; a design for one direction or range is not one for another."""
     if name not in DIMENSIONS:
         raise ConfigError(f"{name!r} is no dimension of the design space", where="--at", allowed=", ".join(DIMENSIONS))

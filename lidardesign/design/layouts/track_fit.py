@@ -30,7 +30,7 @@ from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.mixture import Mixture, log_density
 from lidardesign.design.mixture.origins import free_boxes, origin_box
 from lidardesign.design.mixture.support import Support, check_support, restricted
-from lidardesign.design.sensor import DEFAULT_LEVEL, Design, Sensor, Track, interval_factor
+from lidardesign.design.sensor import DEFAULT_LEVEL, DesignSpec, Sensor, Track, interval_factor
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.numerics import SLACK
 from lidardesign.run.clock import phase
@@ -58,7 +58,7 @@ class FittedTrack(NamedTuple):
         support: The samples that were admitted.
     """
 
-    design: Design
+    design: DesignSpec
     log_likelihood: float
     admissible_mass: float
     ess: float
@@ -110,7 +110,7 @@ def fit_track(
     azimuth, elevation = _admitted(centres, along, bounds)
     track = _with_gates(along, labels, azimuth, elevation, bounds, level, read_out)
     sensors, score, error = _sensors(along, labels, track, bounds, level)
-    design = Design(
+    design = DesignSpec(
         name=name, sensors=sensors, layout="scan", rays=read_out.rays, constraints=constraints.as_document(),
         level=level, track=track, at=fixed_conditions(samples.space),
     )  # fmt: skip

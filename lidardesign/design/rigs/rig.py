@@ -16,7 +16,7 @@ import numpy as np
 from lidardesign.design.sensor import (
     DEFAULT_LEVEL,
     MOST_RAYS,
-    Design,
+    DesignSpec,
     RayTable,
     Sensor,
     boresight_frame,
@@ -90,7 +90,7 @@ class Rig:
     end_hint: str
 
 
-def rig_design(rig: Rig, path: Path, reach_m: float | None) -> Design:
+def rig_design(rig: Rig, path: Path, reach_m: float | None) -> DesignSpec:
     """The design that fires the rays of a rig.
 
     Arguments:
@@ -122,7 +122,7 @@ def rig_design(rig: Rig, path: Path, reach_m: float | None) -> Design:
     sensors = tuple(_sensor(one, name, total) for one, name in zip(gated, names, strict=True))
     provenance = {"source": path.name, "format": rig.kind, "notes": notes}
     table = _table(gated)
-    return Design(path.stem, sensors, layout="fixed", rays=total, ray_table=table, provenance=provenance)
+    return DesignSpec(path.stem, sensors, layout="fixed", rays=total, ray_table=table, provenance=provenance)
 
 
 def _closed(gate_m: np.ndarray, reach_m: float | None) -> np.ndarray:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidardesign.design.sensor import DEFAULT_LEVEL, Design, Sensor
+from lidardesign.design.sensor import DEFAULT_LEVEL, DesignSpec, Sensor
 from lidardesign.errors import DataError
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.run.files import write_atomic
@@ -42,7 +42,7 @@ def looks_like_sensor_csv(head: bytes) -> bool:
     return "," in first and ":" not in first and not first.startswith(YAML_BEGINNINGS)
 
 
-def read_sensor_csv(path: Path) -> Design:
+def read_sensor_csv(path: Path) -> DesignSpec:
     """Read a sensor table; the header is optional, weights are normalised (noted in the provenance).
 
     The variant with a first column x_query describes a moving robot; it is read where it has one position.
@@ -60,7 +60,7 @@ def read_sensor_csv(path: Path) -> Design:
         notes.append(f"weights summed to {total:.6g} and were normalised")
         sensors = [replace(sensor, weight=sensor.weight / total) for sensor in sensors]
     provenance = {"source": path.name, "format": "sensor CSV of the research code", "notes": notes}
-    return Design(name=path.stem, sensors=tuple(sensors), provenance=provenance)
+    return DesignSpec(name=path.stem, sensors=tuple(sensors), provenance=provenance)
 
 
 def _rows(path: Path) -> tuple[list[tuple[dict[str, float], str]], list[str]]:
@@ -162,7 +162,7 @@ def _sensor(row: dict[str, float], index: int, where: str) -> Sensor:
     )
 
 
-def write_sensor_csv(design: Design, path: Path) -> list[str]:
+def write_sensor_csv(design: DesignSpec, path: Path) -> list[str]:
     """Write a sensor table with its header, atomically; returns what the table cannot hold."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
@@ -194,7 +194,7 @@ def _unrolled(sensor: Sensor) -> tuple[float, float]:
     return math.hypot(cosine * horizontal, sine * vertical), math.hypot(sine * horizontal, cosine * vertical)
 
 
-def _losses(design: Design) -> list[str]:
+def _losses(design: DesignSpec) -> list[str]:
     notes = ["names, ray counts, layout, constraints and provenance are not held; a reader takes level 0.95"]
     if design.level != DEFAULT_LEVEL:
         notes.append(f"the level {design.level:g} is not held: intervals are read back at {DEFAULT_LEVEL:g}")

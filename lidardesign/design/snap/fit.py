@@ -17,7 +17,7 @@ from lidardesign.design.files import MOST_TABLE_RAYS
 from lidardesign.design.layouts.rays import split_budget
 from lidardesign.design.mixture.ensemble import Ensemble, sensors_of
 from lidardesign.design.mixture.features import Features
-from lidardesign.design.sensor import Design, RayTable, Sensor, interval_factor
+from lidardesign.design.sensor import DesignSpec, RayTable, Sensor, interval_factor
 from lidardesign.design.snap.parts import Choice, Options, nearest_parts, options_of, with_parts
 from lidardesign.design.snap.rays import affordable, counts_of, fired, gate_widths, useful_rays, useful_split
 from lidardesign.errors import ConfigError
@@ -35,7 +35,7 @@ class Snapped:
         notes: One line each.
     """
 
-    design: Design
+    design: DesignSpec
     ensemble: Ensemble
     report: dict[str, Any]
     notes: tuple[str, ...]
@@ -208,7 +208,9 @@ def _counts(placed: Sequence[_Placed], read_out: ReadOut) -> np.ndarray:
     return counts
 
 
-def _design(placed: Sequence[_Placed], counts: np.ndarray, constraints: Constraints, level: float, name: str) -> Design:
+def _design(
+    placed: Sequence[_Placed], counts: np.ndarray, constraints: Constraints, level: float, name: str
+) -> DesignSpec:
     # what a part weighs is what it fires
     total = int(counts.sum())
     sensors = tuple(
@@ -221,7 +223,7 @@ def _design(placed: Sequence[_Placed], counts: np.ndarray, constraints: Constrai
     owner = np.repeat(np.arange(len(placed)), counts)
     gates = [one.sensor.gate_m if one.choice.shape is None else one.choice.shape.gate_m for one in placed]
     origins = np.array([sensor.origin_m for sensor in sensors], dtype=np.float64)
-    return Design(
+    return DesignSpec(
         name=name,
         sensors=sensors,
         layout="fixed",
@@ -270,7 +272,7 @@ def _field(sensor: Sensor) -> list[float]:
     return [float(angle) for angle in sensor.field_of_view_rad]
 
 
-def _notes(design: Design, options: Sequence[Options]) -> tuple[str, ...]:
+def _notes(design: DesignSpec, options: Sequence[Options]) -> tuple[str, ...]:
     notes = []
     for sensor, option in zip(design.sensors, options, strict=True):
         if option.lacking:

@@ -25,7 +25,7 @@ from lidardesign.design.mixture.em import fit_mixture
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.mixture import log_density
 from lidardesign.design.mixture.support import LEAST_SAMPLES
-from lidardesign.design.sensor import Design, fitted_layout, interval_factor
+from lidardesign.design.sensor import DesignSpec, fitted_layout, interval_factor
 from lidardesign.evaluate.accuracy.settings import Ladder, Rung, with_memory
 from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
 from lidardesign.numerics import effective_count, systematic_draw
@@ -79,7 +79,7 @@ def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
     return [*found, _ladder("seeds of the fit", f"{usual:,} samples", named, design, work)]
 
 
-def _ladder(knob: str, beside: str, rungs: Sequence[Rung], design: Design, work: str) -> Ladder:
+def _ladder(knob: str, beside: str, rungs: Sequence[Rung], design: DesignSpec, work: str) -> Ladder:
     fitted = f"{len(design.sensors)} sensors, as {design.name} has"
     where = f", at {shown(design.at)}" if design.at else ""
     held = ", without its constraints" if design.constraints else ""
@@ -96,7 +96,7 @@ def _ladder(knob: str, beside: str, rungs: Sequence[Rung], design: Design, work:
     )
 
 
-def _command_seconds(run: Path, design: Design) -> float | None:
+def _command_seconds(run: Path, design: DesignSpec) -> float | None:
     """How long the command takes that fits such a design, from its start to its end [s]; None where it fails.
 
     It works on a copy of what it reads of the run, so that the run stays as it is.
@@ -121,7 +121,7 @@ def _command_seconds(run: Path, design: Design) -> float | None:
     return min(taken)
 
 
-def _samples(request: AccuracyRequest, design: Design) -> Samples | None:
+def _samples(request: AccuracyRequest, design: DesignSpec) -> Samples | None:
     """The samples that a design was fitted to, at its condition where it has one; None without any."""
     samples = request.request.samples.get(design.name)
     if samples is None and (request.run / FILE_NAME).exists():

@@ -10,7 +10,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.accuracy.settings import Ladder, Rung, timed, with_memory
 from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
@@ -132,7 +132,7 @@ def asks_nothing(detector: Detector) -> bool:
     )
 
 
-def _rays(request: AccuracyRequest, design: Design) -> tuple[int, Positions]:
+def _rays(request: AccuracyRequest, design: DesignSpec) -> tuple[int, Positions]:
     """The number of rays that is simulated, and the design's rays."""
     asked = request.request
     counts = sorted(set(asked.rays))

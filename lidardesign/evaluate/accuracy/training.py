@@ -18,7 +18,7 @@ from lidardesign.density.training.snapshot_quality import Reached, load_flow, re
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts.rays import gates_of
-from lidardesign.design.sensor import Design, fitted_layout
+from lidardesign.design.sensor import DesignSpec, fitted_layout
 from lidardesign.errors import LidardesignError
 from lidardesign.estimates import Estimate
 from lidardesign.evaluate.accuracy.probes import ERROR_OF, run_target
@@ -209,7 +209,7 @@ class _Judge:
         name = f"score_{unit}" if unit else "score"
         return {name: float(scores.mean()), f"{name}_difference_error": error}
 
-    def _laid_out(self, design: Design, samples: Samples) -> Positions | None:
+    def _laid_out(self, design: DesignSpec, samples: Samples) -> Positions | None:
         """The rays of a quick fit; None where its constraints fix other rays, or the samples are too few for it."""
         try:
             found = self._fitted(design, samples)
@@ -217,7 +217,7 @@ class _Judge:
         except LidardesignError:
             return None
 
-    def _fitted(self, design: Design, samples: Samples) -> Design:
+    def _fitted(self, design: DesignSpec, samples: Samples) -> DesignSpec:
         one_per_ray = design.layout == "scan" or design.track is not None
         return fit(
             samples,

@@ -17,7 +17,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts.rays import gates_of
-from lidardesign.design.sensor import Design, fitted_layout
+from lidardesign.design.sensor import DesignSpec, fitted_layout
 from lidardesign.evaluate.baselines.candidates import Positions, mean_mbps
 from lidardesign.geometry.rays import Rays
 from lidardesign.samples import Samples
@@ -34,13 +34,13 @@ class LayOut(Protocol):
     """How a design becomes a ray list of a given length at a condition value."""
 
     def __call__(
-        self, design: Design, count: int, samples: Samples | None, *, at: Mapping[str, float] | None = None
+        self, design: DesignSpec, count: int, samples: Samples | None, *, at: Mapping[str, float] | None = None
     ) -> Rays:
         """As `lidardesign.design.layouts.rays.lay_out`."""
         ...
 
 
-def fitted_twin(design: Design, samples: Samples, *, name: str, retarget: LogTarget | None = None) -> Design:
+def fitted_twin(design: DesignSpec, samples: Samples, *, name: str, retarget: LogTarget | None = None) -> DesignSpec:
     """A design fitted to other samples as a given one was fitted to its own.
 
     Arguments:
@@ -78,7 +78,7 @@ class TwinCandidate:
     drawn_anew = False
 
     def __init__(
-        self, design: Design, samples: Samples, conditions: Sequence[Mapping[str, float]], lay_out: LayOut
+        self, design: DesignSpec, samples: Samples, conditions: Sequence[Mapping[str, float]], lay_out: LayOut
     ) -> None:
         self.name = design.name
         self._design, self._samples, self._conditions, self._lay_out = design, samples, conditions, lay_out

@@ -18,7 +18,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints, Gate
 from lidardesign.design.files import design_document
-from lidardesign.design.sensor import MOST_RAYS, Design
+from lidardesign.design.sensor import MOST_RAYS, DesignSpec
 from lidardesign.evaluate.baselines.candidates import Positions, opened_gate, whole_range
 from lidardesign.evaluate.baselines.observed import TrainingViews, dense_points
 from lidardesign.evaluate.cma.models import Amount, Model, SensorModel
@@ -77,7 +77,7 @@ class Record:
     found: Found
     broken: Sequence[str]
     parameters: int
-    design: Design
+    design: DesignSpec
 
     def note(self, followed: str, metric: Metric) -> str:
         """What people are told of it.
@@ -132,7 +132,7 @@ class CmaCandidate:
         seed: Root of the random numbers.
     """
 
-    followed: Design
+    followed: DesignSpec
     space: DesignSpace
     conditions: Sequence[Mapping[str, float]]
     views: TrainingViews

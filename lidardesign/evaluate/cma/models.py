@@ -23,7 +23,7 @@ import numpy as np
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.budget import BIN_MARGIN, ReadOut
 from lidardesign.design.layouts.rays import lay_out, split_budget
-from lidardesign.design.sensor import MOST_RAYS, Design, Sensor, interval_factor
+from lidardesign.design.sensor import MOST_RAYS, DesignSpec, Sensor, interval_factor
 from lidardesign.evaluate.baselines.candidates import Positions, mean_mbps
 from lidardesign.evaluate.cma.sensor_parameters import (
     NARROWEST_RAD,
@@ -224,7 +224,7 @@ class Model(Protocol):
         """The nearest vector that keeps the constraints."""
         ...
 
-    def design(self, vector: np.ndarray, amount: Amount) -> Design:
+    def design(self, vector: np.ndarray, amount: Amount) -> DesignSpec:
         """The design of a projected vector; its number of rays may be 0 where a bandwidth pays for none."""
         ...
 
@@ -294,7 +294,7 @@ class SensorModel:
         """See `Model`."""
         return self.coordinates.projected(vector)
 
-    def design(self, vector: np.ndarray, amount: Amount) -> Design:
+    def design(self, vector: np.ndarray, amount: Amount) -> DesignSpec:
         """See `Model`."""
         figures = self.coordinates.figures(vector)
         count = self._count(figures, amount)
@@ -314,15 +314,15 @@ class SensorModel:
         start = [with_gate(sensor, *gate) for sensor, gate in zip(sensors, gates_m.tolist(), strict=True)]
         return SensorModel(self.setting, start, self.conditions, self._document)
 
-    def laid_out(self, design: Design) -> Positions:
+    def laid_out(self, design: DesignSpec) -> Positions:
         """The rays of a design at every condition value."""
         return tuple(lay_out(design, design.rays, None, at=condition) for condition in self.conditions)
 
-    def _design(self, figures: Figures, count: int) -> Design:
+    def _design(self, figures: Figures, count: int) -> DesignSpec:
         setting = self.setting
         scan = setting.layout == "scan"
         shares = np.ones(len(figures)) if scan and count else split_budget(np.exp(figures.log_weight), count)
-        return Design(
+        return DesignSpec(
             name="cma",
             sensors=sensors_of(figures, setting, [int(share) for share in shares]),
             layout=setting.layout,  # type: ignore[arg-type]
@@ -356,7 +356,7 @@ class SensorModel:
             return read_out.model.mbps_of_widths(_widths(figures), shares) <= (read_out.limit_mbps or math.inf)
         return read_out.fits(_widths(figures), np.exp(figures.log_weight), count)
 
-    def _raised(self, figures: Figures, design: Design, amount: Amount) -> Design:
+    def _raised(self, figures: Figures, design: DesignSpec, amount: Amount) -> DesignSpec:
         """More rays, where gates of their own leave bandwidth over."""
         if self.setting.layout != "distributed":
             return design

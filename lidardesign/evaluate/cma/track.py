@@ -18,7 +18,7 @@ from lidardesign.design.constraints.budget import ReadOut
 from lidardesign.design.layouts.gates import admissible_gates
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.layouts.track import boresight_azimuth
-from lidardesign.design.sensor import Design, Sensor, Track
+from lidardesign.design.sensor import DesignSpec, Sensor, Track
 from lidardesign.evaluate.baselines.candidates import Positions
 from lidardesign.evaluate.cma.models import GATE_SHARE, LOG_WIDTH, Amount, widest_bins
 from lidardesign.evaluate.cma.sensor_parameters import NARROWEST_RAD, Setting
@@ -92,7 +92,7 @@ class TrackModel:
         bounds = self._bounds if math.isinf(narrowed_m) else self._bounds.narrowed(narrowed_m)
         return self._admitted(self._decoded(vector), bounds)
 
-    def design(self, vector: np.ndarray, amount: Amount) -> Design:
+    def design(self, vector: np.ndarray, amount: Amount) -> DesignSpec:
         """See `cma_models.Model`; the number of rays is the start's, or 0 where a bandwidth pays for no such number."""
         figures = self.figures(vector)
         count = figures.azimuth.shape[1]
@@ -172,12 +172,12 @@ class TrackModel:
             gate = np.maximum(np.stack([centre - half, centre + half], axis=1), 0.0).reshape(places, count, 2)
         return TrackFigures(azimuth, elevation, gate)
 
-    def _design(self, figures: TrackFigures, count: int) -> Design:
+    def _design(self, figures: TrackFigures, count: int) -> DesignSpec:
         setting, total = self.setting, figures.azimuth.shape[1]
         name = DIMENSIONS[self.way.dimension]
         track = Track(name, self.way.places, figures.azimuth, figures.elevation, figures.gate, np.arange(total))
         at = {key: value for key, value in setting.at.items() if key != name}
-        return Design(
+        return DesignSpec(
             name="cma", sensors=self._sensors(figures), layout="scan", rays=count, constraints=self._document,
             level=setting.level, track=track, at=at,
         )  # fmt: skip

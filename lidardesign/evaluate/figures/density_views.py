@@ -19,7 +19,7 @@ from scipy.special import ndtri
 
 from lidardesign.design.layouts.grid import low_discrepancy
 from lidardesign.design.layouts.track import placed
-from lidardesign.design.sensor import Design, Sensor, tangent_directions
+from lidardesign.design.sensor import DesignSpec, Sensor, tangent_directions
 from lidardesign.evaluate.figures.drawing import body_triangles, drawn_share
 from lidardesign.numerics import FULL_TURN, effective_count, wrap_turn
 from lidardesign.samples import Samples
@@ -31,7 +31,7 @@ FEWEST = 64  # of a sensor
 PLACES = 9  # along a track
 
 
-def mixture_points(design: Design) -> tuple[np.ndarray, np.ndarray]:
+def mixture_points(design: DesignSpec) -> tuple[np.ndarray, np.ndarray]:
     """Points of a design's mixture and their weights, shapes (N, 6) and (N,); the weights sum to 1.
 
     A track counts at evenly spread knots, equally.
@@ -62,7 +62,7 @@ def sensor_points(sensor: Sensor, normal: np.ndarray) -> np.ndarray:
     return np.column_stack([origin + sensor.origin_m, azimuth, elevation, np.maximum(range_m, 0.0)])
 
 
-def _along_track(design: Design) -> list[Design]:
+def _along_track(design: DesignSpec) -> list[DesignSpec]:
     track = design.track
     if track is None:
         return [design]
@@ -215,7 +215,7 @@ class DensityView:
 
 
 def density_view(
-    samples: Samples, scene: Scene, designs: Sequence[Design] = (), frame: int | None = None
+    samples: Samples, scene: Scene, designs: Sequence[DesignSpec] = (), frame: int | None = None
 ) -> DensityView:
     """The views of a density: marginals beside those of designs, and where in space it looks.
 
@@ -237,7 +237,7 @@ def density_view(
     )
 
 
-def marginals(samples: Samples, designs: Sequence[Design] = ()) -> tuple[Marginal, ...]:
+def marginals(samples: Samples, designs: Sequence[DesignSpec] = ()) -> tuple[Marginal, ...]:
     """One per free dimension that the density is not conditioned on: over a condition it is even by definition."""
     space, weights = samples.space, samples.weights
     start = turn_start(samples.points[:, AZIMUTH], weights, space)

@@ -9,7 +9,7 @@ from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.slack import SPACE_MARK, Tightness, tightness
 from lidardesign.design.files import design_document
 from lidardesign.design.layouts.track import placed
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.evaluate.entries import ordered_conditions
 from lidardesign.evaluate.figures.density_views import DensityView, density_view
 from lidardesign.evaluate.figures.scene_figure import Conditions, Shown, shown_in
@@ -53,7 +53,7 @@ def shown_of(request: EvaluationRequest, *, physics: bool) -> Shown:
 
     most = max(fired_numbers(request.designs, request.rays))
 
-    def laid_out(design: Design, at: Conditions) -> Rays:
+    def laid_out(design: DesignSpec, at: Conditions) -> Rays:
         count = design.rays or pattern_size(design) or most
         return request.lay_out(design, count, request.samples.get(design.name), at=at)
 
@@ -74,7 +74,7 @@ def density_of(request: EvaluationRequest) -> DensityView | None:
     return None if density is None else density_view(density.samples, request.test[0], request.designs)
 
 
-def tightness_of(design: Design, space: DesignSpace) -> list[Tightness]:
+def tightness_of(design: DesignSpec, space: DesignSpace) -> list[Tightness]:
     """How tight each constraint of a design is, by the independent checker; the bounds of its space last."""
     checks = check_design(design_document(design), design.constraints, space)
     found = tightness(checks, [sensor.name for sensor in design.sensors])

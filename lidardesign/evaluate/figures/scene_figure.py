@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome, Rays
 from lidardesign.scene import Scene
@@ -44,8 +44,8 @@ class ShownDesign:
         fired: The number of its rays.
     """
 
-    design: Design
-    placed: tuple[Design, ...]
+    design: DesignSpec
+    placed: tuple[DesignSpec, ...]
     rays: tuple[Rays, ...]
     length_m: np.ndarray
     outcome: np.ndarray
@@ -87,10 +87,10 @@ class Shown:
 
 def shown_in(
     scene: Scene,
-    designs: Sequence[Design],
+    designs: Sequence[DesignSpec],
     places: Sequence[Conditions],
-    placed: Callable[[Design, Conditions], Design],
-    laid_out: Callable[[Design, Conditions], Rays],
+    placed: Callable[[DesignSpec, Conditions], DesignSpec],
+    laid_out: Callable[[DesignSpec, Conditions], Rays],
     *,
     planner: Planner | None = None,
     seed: int = 0,

@@ -16,7 +16,7 @@ from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.constraints.rules import bounds_of
 from lidardesign.design.layouts.gates import Heard, gates_within
 from lidardesign.design.layouts.shared_fields import bandwidth_limit
-from lidardesign.design.sensor import Design, RayTable, Sensor, interval_factor
+from lidardesign.design.sensor import DesignSpec, RayTable, Sensor, interval_factor
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
@@ -45,7 +45,7 @@ class Gating:
     sigma_m: float
 
     @phase("gates")
-    def __call__(self, design: Design, rays: Rays, spread_m: float = 0.0) -> Design:
+    def __call__(self, design: DesignSpec, rays: Rays, spread_m: float = 0.0) -> DesignSpec:
         """The design with gates by returns, in its bandwidth budget or else in no more than it had.
 
         A ray without returns keeps its own gate, and all keep theirs where new ones would hold fewer returns.
@@ -93,7 +93,7 @@ class Gating:
         return Heard(spread, np.ones(len(spread)), np.repeat(np.concatenate(indices), QUANTILES), len(rays))
 
 
-def has_ray_gates(design: Design) -> bool:
+def has_ray_gates(design: DesignSpec) -> bool:
     """Whether every ray of a design has a gate of its own, which does not move along a track."""
     if design.track is not None:
         return False
@@ -106,7 +106,7 @@ def has_ray_gates(design: Design) -> bool:
     return bool((table.gate_m != table.gate_m[first[1]][first[2].reshape(-1)]).any())
 
 
-def _with_gates(design: Design, gates: np.ndarray) -> Design:
+def _with_gates(design: DesignSpec, gates: np.ndarray) -> DesignSpec:
     if design.layout != "scan":
         table = design.ray_table
         assert isinstance(table, RayTable)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.design.layouts.grid import field_on_sphere
-from lidardesign.design.sensor import Design, Sensor, interval_factor
+from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor
 from lidardesign.evaluate.figures.curves import Series
 from lidardesign.evaluate.figures.drawing import (
     MOST_FACES,
@@ -201,7 +201,7 @@ def _design(one: ShownDesign, look: Series) -> dict[str, Any]:
     }
 
 
-def _cones(design: Design) -> np.ndarray:
+def _cones(design: DesignSpec) -> np.ndarray:
     """What a sensor's drawing follows from, shape (S, 25): see `_cone`."""
     return np.stack([_cone(sensor, design.level) for sensor in design.sensors])
 

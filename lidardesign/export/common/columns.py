@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.design.sensor import MOST_RAYS, Design
+from lidardesign.design.sensor import MOST_RAYS, DesignSpec
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.geometry.rays import Rays
 from lidardesign.space import FARTHEST_M, angles
@@ -70,7 +70,7 @@ def _check_numbers(origin: Any, ray: Any, gate: Any, sensor: Any, time: Any) -> 
         raise ValueError("a sensor is no whole number of 0 or more")
 
 
-def losses(design: Design) -> list[str]:
+def losses(design: DesignSpec) -> list[str]:
     """What a ray list says nothing of."""
     notes = ["sensors appear by index only: their weights, spreads and origin covariances are not held"]
     if design.constraints:

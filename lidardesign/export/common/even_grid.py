@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidardesign.design.sensor import Design
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.export.common.poses import Mount, design_losses, gate_losses, origin_losses
 from lidardesign.export.common.read_back import angles_between
 from lidardesign.geometry.rays import Rays
@@ -143,7 +143,7 @@ def grid_of(mount: Mount) -> EvenGrid:
     return nearest_grid(mount.azimuth_rad, mount.elevation_rad)
 
 
-def grid_sensor_losses(design: Design, mounted: Sequence[Mount], rays: Rays) -> list[str]:
+def grid_sensor_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
     """Notes of what sensors with one place, one gate and an even grid of rays cannot hold."""
     notes = [
         *design_losses(design, mounted),

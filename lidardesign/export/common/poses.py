@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidardesign.design.layouts.rays import DEFAULT_RATE_HZ
-from lidardesign.design.sensor import Design, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import DataError
 from lidardesign.estimates import ROUNDING, Estimate
 from lidardesign.export.common.names import identifiers
@@ -67,7 +67,7 @@ class Mount:
         return quaternion(*self.roll_pitch_yaw_rad)
 
 
-def mounts(design: Design, rays: Rays) -> list[Mount]:
+def mounts(design: DesignSpec, rays: Rays) -> list[Mount]:
     """The sensors of a design that fire rays, in their order."""
     names = identifiers([sensor.name for sensor in design.sensors])
     order = np.argsort(rays.sensor, kind="stable")
@@ -118,7 +118,7 @@ def fire_times_s(rays: Rays, rate_hz: float) -> np.ndarray:
     return rays.time_s * (DEFAULT_RATE_HZ / rate_hz)
 
 
-def design_losses(design: Design, mounted: Sequence[Mount]) -> list[str]:
+def design_losses(design: DesignSpec, mounted: Sequence[Mount]) -> list[str]:
     """What no format of mounted sensors holds of a design, and sensors that fire nothing."""
     notes = ["weights, spreads and origin covariances of the sensors are not held"]
     if design.constraints:
@@ -219,7 +219,7 @@ def places(mounted: Sequence[Mount], rays: Rays) -> list[Place]:
     return found
 
 
-def require_rays(design: Design, rays: Rays, what: str) -> None:
+def require_rays(design: DesignSpec, rays: Rays, what: str) -> None:
     """Refuse a design without rays, for a format that is made of them.
 
     Raises:
