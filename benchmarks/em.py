@@ -18,11 +18,11 @@ from common import median_ratio, parser, report
 from sklearn.mixture import GaussianMixture
 from threadpoolctl import threadpool_limits
 
-from lidardesign.design.constraints.bounds import Bounds, Floors
-from lidardesign.design.mixture.em import fit_mixture, seed
+from lidardesign.design.mixture.bounds import Bounds, Floors
+from lidardesign.design.mixture.em import fit_mixture, seed_mixture
 from lidardesign.design.mixture.features import Axes, Features
+from lidardesign.design.mixture.m_step import maximise
 from lidardesign.design.mixture.mixture import expect, log_density
-from lidardesign.design.mixture.mstep import maximise
 from lidardesign.design.sensor import interval_factor
 from lidardesign.samples import load_samples
 from lidardesign.space import DesignSpace
@@ -77,7 +77,7 @@ def rival(points: np.ndarray, iterations: int) -> float:
 def ours(features: Features, bounds: Bounds, iterations: int) -> float:
     """Seconds per iteration: one E-step and one M-step each."""
     generator = np.random.default_rng(0)
-    mixture = seed(features, bounds, generator)
+    mixture = seed_mixture(features, bounds, generator)
     floors = Floors.of(features)
     start = time.perf_counter()
     for _ in range(iterations):

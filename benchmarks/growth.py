@@ -118,11 +118,11 @@ def simulation(options: Any) -> tuple[Table, list[str]]:
 
 def mixtures(options: Any) -> tuple[Table, list[str]]:
     """EM on samples of a mixture of as many components, by the number of sensors."""
-    from lidardesign.design.constraints.bounds import Bounds, Floors
-    from lidardesign.design.mixture.em import fit_mixture, seed
+    from lidardesign.design.mixture.bounds import Bounds, Floors
+    from lidardesign.design.mixture.em import fit_mixture, seed_mixture
     from lidardesign.design.mixture.features import Axes, Features
+    from lidardesign.design.mixture.m_step import maximise
     from lidardesign.design.mixture.mixture import expect
-    from lidardesign.design.mixture.mstep import maximise
     from lidardesign.design.sensor import interval_factor
     from lidardesign.space import DesignSpace
 
@@ -131,7 +131,7 @@ def mixtures(options: Any) -> tuple[Table, list[str]]:
         points = clusters(space, count, options.samples)
         features = Features.of(points, np.ones(len(points)), Axes.of(space), space)
         bounds, floors = Bounds.unbounded(count, interval_factor(0.95)), Floors.of(features)
-        start = seed(features, bounds, np.random.default_rng(0))
+        start = seed_mixture(features, bounds, np.random.default_rng(0))
 
         def iteration(start=start, features=features, bounds=bounds, floors=floors) -> None:
             maximise(start, expect(start, features), features, bounds, floors, 1.0)

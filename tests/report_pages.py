@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from lidardesign.design.constraints.check import ConstraintCheck
-from lidardesign.design.constraints.slack import tightness
+from lidardesign.design.constraints.slack import constraint_slack
 from lidardesign.design.layouts.track import placed
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.evaluate.figures.density_views import density_view
@@ -114,7 +114,7 @@ def make_report(name="plain", designs=2, **further):
         title=name,
         density=density_view(samples, shown.scene, made),
         density_m=samples.points[:300, :3] + np.array([2.0, 0, 0]),
-        constraints={design.name: tightness(checks, names) for design in made[:1]},
+        constraints={design.name: constraint_slack(checks, names) for design in made[:1]},
         times=[CommandTimes(f"learn {name}", "now", {"learning": 8.0, "learning/target": 5.0, "other": 2.0}, 2**20)],
         reproduce=Reproduction([("what", name)], [("seed", name)], f"config: {name}"),
     )

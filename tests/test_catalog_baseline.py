@@ -14,7 +14,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.catalog.library import find_part
 from lidardesign.design.catalog.placing import Pose, part_rays
 from lidardesign.design.sensor import boresight_frame
-from lidardesign.design.snap.shapes import Shape, gate_inside, in_view, shapes_of, worth_firing
+from lidardesign.design.snap.shapes import PartShape, gate_inside, in_view, shapes_of, worth_firing
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.catalog import Density, part_notes, split_argument
 from lidardesign.evaluate.baselines.part_poses import CLUTTER, PosedPart, ScenePoints, places
@@ -354,7 +354,7 @@ def test_a_shape_is_where_its_component_looks_upright_and_turned():
 def test_a_part_whose_range_does_not_meet_the_spaces_has_no_shape():
     near = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 0.5))
     assert shapes_of(find_part("vlp-16"), near) == []
-    assert isinstance(shapes_of(find_part("vl53l5cx"), near)[0], Shape)
+    assert isinstance(shapes_of(find_part("vl53l5cx"), near)[0], PartShape)
     held = DesignSpace((0, 0, 0, -0.5, -0.5, 0.3), (0, 0, 0, 0.5, 0.5, 0.3))
     assert gate_inside(find_part("vl53l5cx"), held) == find_part("vl53l5cx").range_m
     assert gate_inside(find_part("vlp-16"), held) is None

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from lidardesign.design.constraints.check import check_design
-from lidardesign.design.constraints.document import Constraints, DistanceRange, Gate, check_feasible
+from lidardesign.design.constraints.document import Constraints, DistanceRange, Gate
+from lidardesign.design.constraints.feasibility import check_feasible
 from lidardesign.design.files import design_document, design_from_document
 from lidardesign.design.fit import fit
 from lidardesign.design.sensor import MOST_RAYS

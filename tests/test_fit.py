@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.rules import Group
 from lidardesign.design.files import design_document
 from lidardesign.design.fit import fit
-from lidardesign.design.mixture.support import pinned, restricted
+from lidardesign.design.mixture.bounds import Group
+from lidardesign.design.mixture.support import pin_samples, restrict_samples
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace, aim, observed_point
@@ -158,7 +158,7 @@ def test_pinning_a_free_origin_needs_the_target():
 def test_samples_of_a_pinned_origin_have_the_density_seen_from_there():
     where = [0.04, -0.03, 0.02]
     rules = constrained(origin={"fixed_m": where})
-    support = pinned(MOVING, rules, Group(tuple(where), (0,)), log_target, 8000, np.random.default_rng(0))
+    support = pin_samples(MOVING, rules, Group(tuple(where), (0,)), log_target, 8000, np.random.default_rng(0))
     weights = support.weights / support.weights.sum()
     fixed = DesignSpace((*where, *FREE.low[3:]), (*where, *FREE.high[3:]))
     direct = blob(fixed, 40_000, seed=3)
@@ -202,7 +202,7 @@ def test_a_thin_box_pins_one_coordinate():
 
 def test_the_support_outside_the_gate_is_left_out():
     rules = constrained(gate={"end_m": {"max": 0.6}})
-    support = restricted(FIXED, rules, Group((None, None, None), (0,)))
+    support = restrict_samples(FIXED, rules, Group((None, None, None), (0,)))
     assert support.points[:, 5].max() <= 0.6
     assert support.total == pytest.approx(FIXED.weights[FIXED.points[:, 5] <= 0.6].sum())
 

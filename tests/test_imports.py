@@ -12,7 +12,7 @@ import pytest
 from command_line import caller, make_run
 
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.rig_constraints import constraints_like
+from lidardesign.design.constraints.rig_constraints import rig_constraints
 from lidardesign.design.files import load_design, save_design
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.rigs.rig import aim_of
@@ -750,7 +750,7 @@ def test_sensors_like_a_planar_scanner_stay_planar():
         for name, (across, up) in fields.items()
     )
     space = DesignSpace((0,) * 3 + (0, -1.5, 0), (0,) * 3 + (6, 1.5, 9))
-    found = constraints_like(DesignSpec("rig", sensors), space, Constraints(), rays=None).as_document()["each"]
+    found = rig_constraints(DesignSpec("rig", sensors), space, Constraints(), rays=None).as_document()["each"]
     narrow = pytest.approx(1e-3)
     assert [one.get("field_of_view", {}) for one in found] == [
         {"horizontal_deg": {"max": pytest.approx(math.degrees(1))}, "vertical_deg": {"max": narrow}},

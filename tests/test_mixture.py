@@ -9,9 +9,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from lidardesign.design.constraints.bounds import Bounds, Floors
-from lidardesign.design.mixture.em import climb, fit_mixture, from_labels, seed
+from lidardesign.design.mixture.bounds import Bounds, Floors
+from lidardesign.design.mixture.em import fit_mixture, from_labels, run_em, seed_mixture
 from lidardesign.design.mixture.features import Axes, Features
+from lidardesign.design.mixture.m_step import fit_field, fit_gate, maximise
 from lidardesign.design.mixture.mixture import (
     Mixture,
     angle_ratio,
@@ -23,7 +24,6 @@ from lidardesign.design.mixture.mixture import (
     mean_directions,
     responsibilities,
 )
-from lidardesign.design.mixture.mstep import fit_field, fit_gate, maximise
 from lidardesign.design.sensor import boresight_frame, interval_factor, tangent_coordinates, tangent_directions
 from lidardesign.numerics import logsumexp, wrap_angle
 from lidardesign.space import DesignSpace, angles, direction
@@ -272,7 +272,7 @@ def test_one_narrow_component_equals_the_sample_moments_of_scikit_learn():
     rival.fit(points[:, 3:])
     start = rival.predict(points[:, 3:])
     features = features_of(points, POINT)
-    ours = climb(
+    ours = run_em(
         from_labels(features, start, Bounds.unbounded(2, Z)),
         features,
         Bounds.unbounded(2, Z),
@@ -347,9 +347,9 @@ def test_the_log_likelihood_never_decreases_and_every_bound_holds(data, count, s
     generator = np.random.default_rng(seed_number)
     bounds = data.draw(random_bounds(count))
     features = features_of(drawn(random_mixture(generator, 3, width=0.8), 600, generator))
-    start = seed(features, bounds, generator)
+    start = seed_mixture(features, bounds, generator)
     assert_keeps(start, bounds)
-    trace = climb(start, features, bounds, iterations=25)
+    trace = run_em(start, features, bounds, iterations=25)
     values = [expect(start, features).log_likelihood, *trace.history]
     assert (np.diff(values) >= 0).all()
     assert_keeps(trace.mixture, bounds)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.mounts import matched, most_mounted
+from lidardesign.design.constraints.origins import most_mounted, mounts_suffice
 from lidardesign.design.files import design_document
 from lidardesign.design.fit import fit
 from lidardesign.errors import ConfigError, InfeasibleError
@@ -152,7 +152,7 @@ def test_the_checker_finds_sensors_that_left_or_share_a_mount():
 def test_a_matching_is_found_exactly_where_one_exists(options):
     mounts = [[(float(i), 0.0, 0.0) for i in own] for own in options]
     exists = any(len(set(pick)) == len(pick) for pick in itertools.product(*options))
-    assert matched(mounts) == exists
+    assert mounts_suffice(mounts) == exists
 
 
 def test_the_number_of_sensors_is_limited_only_where_all_of_them_are_mounted():

@@ -10,14 +10,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidardesign.design.constraints.bounds import Bounds, Floors
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.rules import bounds_of
-from lidardesign.design.mixture.em import climb, seed
+from lidardesign.design.constraints.origins import box_around, free_boxes, inside_excluded, nearest_admitted, origin_box
+from lidardesign.design.mixture.bounds import Bounds, Floors, bounds_of
+from lidardesign.design.mixture.em import run_em, seed_mixture
 from lidardesign.design.mixture.features import Axes, Features
-from lidardesign.design.mixture.mstep import fit_gate
-from lidardesign.design.mixture.origin_step import Box, Limits, best_origins, improved, objective, projected
-from lidardesign.design.mixture.origins import box_around, free_boxes, inside_excluded, nearest_admitted, origin_box
+from lidardesign.design.mixture.m_step import fit_gate
+from lidardesign.design.mixture.origin_step import (
+    IntervalBoxes,
+    OriginLimits,
+    best_origins,
+    improved,
+    objective,
+    projected,
+)
 from lidardesign.space import DesignSpace
 
 SPACE = DesignSpace((0, 0, 0, 0.0, -1.5, 0.1), (6, 6, 6, 2 * math.pi, 1.5, 4.0))
@@ -156,7 +162,8 @@ def box_of(free_low, free_high, low=-4.0, high=4.0, most=np.inf):
     free_low, free_high = np.atleast_2d(free_low).astype(float), np.atleast_2d(free_high).astype(float)
     count = len(free_low)
     low, high = np.maximum(free_low, low), np.minimum(free_high, high)
-    return Box(low, high, free_low, free_high, Z, np.full(count, 1e-12), np.full(count, most), np.full(count, np.inf))
+    variances = (np.full(count, value) for value in (1e-12, most, np.inf))
+    return IntervalBoxes(low, high, free_low, free_high, Z, *variances)
 
 
 def assert_inside(point, covariance, box):
@@ -252,7 +259,7 @@ def limits_of(free_low, free_high, count):
     free_low, free_high = (np.broadcast_to(side, (count, *np.shape(side))) for side in (free_low, free_high))
     bound = np.full((count, 3), 4.0)
     infinite = np.full(count, np.inf)
-    return Limits(-bound, bound, free_low, free_high, Z, np.full(count, 1e-12), infinite, infinite)
+    return OriginLimits(-bound, bound, free_low, free_high, Z, np.full(count, 1e-12), infinite, infinite)
 
 
 def test_the_best_of_the_boxes_is_taken():
@@ -300,7 +307,7 @@ def test_the_likelihood_never_falls_and_all_iterates_keep_out(boxes, count, numb
         return
     features = Features.of(points, np.ones(len(points)), Axes.of(SPACE), SPACE)
     bounds = bounds_of(constraints, SPACE, tuple(range(count)), Z)
-    trace = climb(seed(features, bounds, generator), features, bounds, iterations=15)
+    trace = run_em(seed_mixture(features, bounds, generator), features, bounds, iterations=15)
     assert (np.diff(trace.history) >= 0).all()
     assert Floors.of(features).origin_m > 0
     for mean, covariance in zip(trace.mixture.origin_m, trace.mixture.origin_covariance_m2, strict=True):

@@ -7,9 +7,10 @@ import pytest
 from command_line import caller, make_run
 
 from lidardesign.design.constraints.check import check_design
-from lidardesign.design.constraints.document import Constraints, check_feasible
-from lidardesign.design.constraints.mounts import SAME_PLACE_M, settled
-from lidardesign.design.constraints.rig_constraints import constraints_like
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.feasibility import check_feasible
+from lidardesign.design.constraints.origins import SAME_PLACE_M, snap_to_space
+from lidardesign.design.constraints.rig_constraints import rig_constraints
 from lidardesign.design.files import design_document, load_design
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import InfeasibleError
@@ -31,10 +32,10 @@ def rig(*origins_m):
 def test_a_place_that_was_rounded_is_the_place(told):
     constraints = Constraints.from_mapping({"origin": {"fixed_m": [told, 0.5, 0]}})
     check_feasible(constraints, SPACE)
-    found, notes = settled(constraints, SPACE)
+    found, notes = snap_to_space(constraints, SPACE)
     assert found.origin.fixed_m == [PLACE_M, 0.5, 0.0]
     assert len(notes) == (abs(told - PLACE_M) > 1e-9)
-    like = constraints_like(rig((told, 0.5, 0)), SPACE, Constraints(), rays=None)
+    like = rig_constraints(rig((told, 0.5, 0)), SPACE, Constraints(), rays=None)
     assert like.each[0].origin.fixed_m == [PLACE_M, 0.5, 0.0]
     document = design_document(rig((PLACE_M, 0.5, 0)))
     kept = {check.name: check.satisfied for check in check_design(document, constraints, SPACE)}
@@ -44,20 +45,20 @@ def test_a_place_that_was_rounded_is_the_place(told):
 def test_a_place_that_is_another_stays_another():
     far = PLACE_M + 1.01 * SAME_PLACE_M
     constraints = Constraints.from_mapping({"origin": {"fixed_m": [far, 0.5, 0]}})
-    assert settled(constraints, SPACE) == (constraints, [])
+    assert snap_to_space(constraints, SPACE) == (constraints, [])
     with pytest.raises(InfeasibleError, match="x_m of the origin"):
         check_feasible(constraints, SPACE)
     with pytest.raises(
         InfeasibleError, match=r"stand at x 0\.451045, y 0 to 1, z 0 m; the rig's lidar 1 at x 0\.452055"
     ):
-        constraints_like(rig((PLACE_M, 0.5, 0), (far, 0.5, 0)), SPACE, Constraints(), rays=None)
+        rig_constraints(rig((PLACE_M, 0.5, 0), (far, 0.5, 0)), SPACE, Constraints(), rays=None)
     free = Constraints.from_mapping({"origin": {"fixed_m": [PLACE_M, 0.1234567, 0]}})
-    assert settled(free, SPACE) == (free, [])
+    assert snap_to_space(free, SPACE) == (free, [])
 
 
 def test_a_place_that_the_user_gives_is_not_the_rigs():
     own = Constraints.from_mapping({"origin": {"low_m": [0, 0, 0], "high_m": [1, 1, 1]}})
-    found = constraints_like(rig((3.0, 0.5, 0)), SPACE, own, rays=None)
+    found = rig_constraints(rig((3.0, 0.5, 0)), SPACE, own, rays=None)
     assert found.each[0].origin.fixed_m is None
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lidardesign.design.constraints.slack import Tightness
+from lidardesign.design.constraints.slack import ConstraintSlack
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.evaluate.figures.bounds import constraints_picture
 from lidardesign.evaluate.figures.canvas import (
@@ -103,9 +103,9 @@ def make_pictured(names=("first",)):
     samples = Samples(SPACE.sample(2000, np.random.default_rng(0)), np.zeros(2000), np.zeros(2000), SPACE)
     view = density_view(samples, BALL, [DesignSpec(name, (make_sensor(),)) for name in names])
     bounds = [
-        Tightness("gate.width_m.max", 0.5, 0.5, "s0", 0.0, 0.0, 1, 1, 0),
-        Tightness("origin.fixed_m", [0, 0, 0], [0, 0, 0], "", None, None, 1, 0, 0),
-        Tightness(f"field of view {NASTY}", 20.0, 30.0, "s0", -10.0, -0.5, 1, 0, 1),
+        ConstraintSlack("gate.width_m.max", 0.5, 0.5, "s0", 0.0, 0.0, 1, 1, 0),
+        ConstraintSlack("origin.fixed_m", [0, 0, 0], [0, 0, 0], "", None, None, 1, 0, 0),
+        ConstraintSlack(f"field of view {NASTY}", 20.0, 30.0, "s0", -10.0, -0.5, 1, 0, 1),
     ]
     times = {"learn": {"scenes": 1.0, "learning": 9.0, "learning/target": 5.0, "other": 0.5}}
     return Pictured(make_shown(names), view, dict.fromkeys(names, bounds), times)

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.constraints.bounds import Bounds
 from lidardesign.design.layouts.gates import Heard, _Prices, central_intervals, gates_within
+from lidardesign.design.mixture.bounds import Bounds
 from lidardesign.design.sensor import interval_factor
 
 Z = interval_factor(0.95)

@@ -21,12 +21,12 @@ from lidardesign.density.training.quality import draw_samples, log_density_of
 from lidardesign.density.training.snapshot_quality import FlatTarget
 from lidardesign.density.visibility.quadrature import Optics
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.rules import groups
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts.grid import low_discrepancy
 from lidardesign.design.layouts.rays import lay_out
+from lidardesign.design.mixture.bounds import groups
 from lidardesign.design.mixture.mixture import log_density
-from lidardesign.design.mixture.support import pinned, restricted
+from lidardesign.design.mixture.support import pin_samples, restrict_samples
 from lidardesign.design.sensor import DesignSpec, tangent_coordinates, tangent_directions
 from lidardesign.evaluate.baselines.occupancy import OccupancyGrid
 from lidardesign.evaluate.baselines.simple import build_baseline
@@ -260,7 +260,7 @@ def bump(points):
 def restricted_draws(document, space=BOX, log_p_star=bump, count=8000):
     samples, constraints = samples_of(log_p_star, space), Constraints.from_mapping(document)
     (group,) = groups(constraints, space, 1)
-    support = restricted(samples, constraints, group)
+    support = restrict_samples(samples, constraints, group)
     drawn = support.points[systematic_draw(support.weights, count, np.random.default_rng(10))]
     return support, drawn
 
@@ -343,7 +343,7 @@ def test_draws_from_a_pinned_origin_have_the_density_at_that_origin():
     samples = samples_of(log_p_star, space)
     constraints = Constraints.from_mapping({"origin": {"fixed_m": [0.04, 0, 0]}})
     (group,) = groups(constraints, space, 1)
-    support = pinned(samples, constraints, group, log_p_star, 60_000, np.random.default_rng(11))
+    support = pin_samples(samples, constraints, group, log_p_star, 60_000, np.random.default_rng(11))
     drawn = support.points[systematic_draw(support.weights, 4000, np.random.default_rng(12))]
     assert (drawn[:, 0] == 0.04).all()
     edges = [np.linspace(-0.8, 0.8, 15), np.linspace(-0.7, 0.7, 13), np.linspace(0.5, 2.0, 13)]

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidardesign.design.catalog.library import find_part, load_library
-from lidardesign.design.constraints.budget import ReadOut
+from lidardesign.design.constraints.budget import BandwidthBudget
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document, design_from_document, load_design
@@ -22,7 +22,15 @@ from lidardesign.design.fit import fit
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.mixture.mixture import Mixture
 from lidardesign.design.sensor import tangent_coordinates
-from lidardesign.design.snap.parts import Choice, Options, nearest_parts, options_of, parts_of, wants_parts, with_parts
+from lidardesign.design.snap.parts import (
+    PartChoice,
+    PartOptions,
+    fit_part_poses,
+    nearest_parts,
+    part_options,
+    parts_of,
+    wants_parts,
+)
 from lidardesign.design.snap.rays import affordable, capped_split, counts_of, useful_split
 from lidardesign.design.snap.shapes import shapes_of
 from lidardesign.errors import ConfigError, InfeasibleError
@@ -177,7 +185,7 @@ RULES = st.fixed_dictionaries(
 @given(rules=RULES)
 def test_a_sensor_may_become_the_parts_whose_own_figures_keep_its_constraints(rules):
     constraints = Constraints.from_mapping({"snap": {"otherwise": "keep"}, **rules})
-    (found,) = options_of(constraints, SPACE, [1.5])
+    (found,) = part_options(constraints, SPACE, [1.5])
     expected = {part.name for part in parts_of(constraints.snap) if naive_keeps(part, rules)}
     assert {shape.part.name for shape in found.shapes} == expected
     assert bool(found.lacking) == (not expected)
@@ -264,7 +272,7 @@ def test_losses_are_what_the_mixture_loses_by_each_part_alone():
     assert isinstance(ensemble, Ensemble)
     (group,), (trace,) = ensemble.parts, ensemble.traces
     shapes = [shape for name in ("vl53l5cx", "tmf8828") for shape in shapes_of(find_part(name), SPACE)]
-    choices = nearest_parts(ensemble, [Options(shapes, True), Options(shapes, True)], 200, seed=0)
+    choices = nearest_parts(ensemble, [PartOptions(shapes, True), PartOptions(shapes, True)], 200, seed=0)
     heaviest = int(np.argmax(trace.mixture.weights))
     before = group.features.weights @ log_density(trace.mixture, group.features)
     for shape, loss in zip(shapes, choices[heaviest].losses, strict=True):
@@ -282,14 +290,14 @@ def fitted_ensemble(sensors=2):
     from lidardesign.design import fit as module
 
     request = module._Request(samples(), Constraints(), 1, 4, 20_000, 0.95, None)
-    return module._solved(request, ReadOut.of(Constraints(), None), sensors, "grid")[3]
+    return module._solved(request, BandwidthBudget.of(Constraints(), None), sensors, "grid")[3]
 
 
 def test_refitting_poses_never_lowers_the_likelihood_and_keeps_the_shapes_and_shares():
     ensemble = fitted_ensemble()
     shape = shapes_of(find_part("vl53l5cx"), SPACE)[0]
-    choices = [Choice(shape, (0.0,)), Choice(shape, (0.0,))]
-    moved, still = (with_parts(ensemble, choices, [held, held]) for held in (False, True))
+    choices = [PartChoice(shape, (0.0,)), PartChoice(shape, (0.0,))]
+    moved, still = (fit_part_poses(ensemble, choices, [held, held]) for held in (False, True))
     (history,) = (trace.history for trace in moved.traces)
     assert (np.diff(history) >= 0).all()
     assert moved.log_likelihood > still.log_likelihood
@@ -413,12 +421,12 @@ def test_rays_that_look_at_something_go_first():
 
 def test_rays_that_nobody_asked_for_are_those_that_see_something():
     useful = np.array([40, 10])
-    free = ReadOut.of(Constraints(), None)
+    free = BandwidthBudget.of(Constraints(), None)
     widths = np.array([1.0, 1.0])
     assert counts_of(useful, np.array([0.5, 0.5]), widths, free).tolist() == [40, 10]
     mixed = counts_of(np.array([40, 0]), np.array([0.8, 0.2]), widths, free)
     assert mixed.tolist() == [40, 10]
-    tight = ReadOut.of(Constraints.from_mapping({"budget": {"bandwidth_mbps": 0.3}}), None)
+    tight = BandwidthBudget.of(Constraints.from_mapping({"budget": {"bandwidth_mbps": 0.3}}), None)
     few = counts_of(useful, np.array([0.5, 0.5]), widths, tight)
     assert tight.mbps(widths, few, int(few.sum())) <= 0.3 * 1.2
     assert tight.model.mbps_of_widths(widths, few) <= 0.3
@@ -427,12 +435,12 @@ def test_rays_that_nobody_asked_for_are_those_that_see_something():
 
 def test_choices_that_are_affordable_stay():
     shape = shapes_of(find_part("vl53l5cx"), SPACE)[0]
-    options = [Options([shape], True)]
-    choice = [Choice(shape, (0.1,))]
-    found = affordable(choice, options, np.ones(1), np.ones(1), ReadOut.of(Constraints(), 64))
+    options = [PartOptions([shape], True)]
+    choice = [PartChoice(shape, (0.1,))]
+    found = affordable(choice, options, np.ones(1), np.ones(1), BandwidthBudget.of(Constraints(), 64))
     assert found == choice
     with pytest.raises(InfeasibleError, match="have 64 rays, 1 fewer"):
-        affordable(choice, options, np.ones(1), np.ones(1), ReadOut.of(Constraints(), 65))
+        affordable(choice, options, np.ones(1), np.ones(1), BandwidthBudget.of(Constraints(), 65))
 
 
 # places

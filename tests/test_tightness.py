@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lidardesign.design.constraints.check import ConstraintCheck
-from lidardesign.design.constraints.slack import room_of, tightness
+from lidardesign.design.constraints.slack import constraint_slack, room_of
 
 
 def check(name, bound, value, satisfied=True):
@@ -35,7 +35,7 @@ def test_a_bound_of_many_sensors_is_told_once_by_the_closest():
     found = [
         check(f"{name}.gate.width_m.max", 0.1, width) for name, width in zip(names, (0.05, 0.0999, 0.08), strict=True)
     ]
-    (told,) = tightness(found, names)
+    (told,) = constraint_slack(found, names)
     assert (told.name, told.sensor, told.sensors, told.tight, told.broken) == ("gate.width_m.max", "s.1", 3, 1, 0)
     assert told.value == 0.0999
     assert told.word == "at the bound"
@@ -44,7 +44,7 @@ def test_a_bound_of_many_sensors_is_told_once_by_the_closest():
 def test_sensors_with_bounds_of_their_own_are_told_apart_and_broken_ones_come_first():
     found = [check("a.gate.end_m.max", 1.0, 0.2), check("b.gate.end_m.max", 2.0, 2.5, False)]
     found.append(check("c.gate.end_m.max", 2.0, 0.1))
-    loose, broken = tightness(found, ["a", "b", "c"])
+    loose, broken = constraint_slack(found, ["a", "b", "c"])
     assert (loose.word, loose.room) == ("kept", pytest.approx(0.8))
     assert (broken.word, broken.sensor, broken.broken, broken.sensors) == ("broken", "b", 1, 2)
     assert broken.room == pytest.approx(-0.5)

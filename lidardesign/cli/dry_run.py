@@ -293,7 +293,7 @@ def fit_plan(
 
     verify(run.folder, SAMPLES)
     if constraints is not None:
-        from lidardesign.design.constraints.document import check_feasible
+        from lidardesign.design.constraints.feasibility import check_feasible
 
         counted = choices["sensors"] if isinstance(choices["sensors"], int) else None
         check_feasible(constraints, run.config.space, sensors=counted, rays=choices["rays"])

@@ -9,24 +9,31 @@ from typing import Any, Literal
 
 import numpy as np
 
-from lidardesign.design.constraints.budget import ReadOut, within_budget
+from lidardesign.design.constraints.budget import BandwidthBudget, fit_within_budget
 from lidardesign.design.constraints.check import ConstraintCheck, check_design
 from lidardesign.design.constraints.document import MOST_FITTED, Constraints
 from lidardesign.design.constraints.feasibility import check_feasible, most_rays
-from lidardesign.design.constraints.mounts import is_mounted, most_mounted, placement_notes, settled
-from lidardesign.design.constraints.rules import bounds_of, groups
+from lidardesign.design.constraints.origins import is_mounted, most_mounted, placement_notes, snap_to_space
 from lidardesign.design.fit_result import FitResult, fit_estimates, likelihood_error
 from lidardesign.design.layouts.quantise import SAMPLES_PER_RAY
 from lidardesign.design.layouts.rays import Gates, make_ray_table, own_gates, split_budget
 from lidardesign.design.layouts.scan import fit_scan, rays_of
 from lidardesign.design.layouts.track_fit import fit_track
+from lidardesign.design.mixture.bounds import bounds_of, groups
 from lidardesign.design.mixture.conditions import fixed_conditions
-from lidardesign.design.mixture.coupling import couplings
-from lidardesign.design.mixture.ensemble import Ensemble, Part, at_mounts, fit_parts, heaviest_first, sensors_of
+from lidardesign.design.mixture.coupling import add_couplings
+from lidardesign.design.mixture.ensemble import (
+    Ensemble,
+    GroupSamples,
+    choose_mounts,
+    fit_parts,
+    heaviest_first,
+    sensors_of,
+)
 from lidardesign.design.mixture.features import Axes, Features
-from lidardesign.design.mixture.support import Retarget, Support, check_support, pinned, restricted
+from lidardesign.design.mixture.support import Retarget, Support, check_support, pin_samples, restrict_samples
 from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, DesignSpec, Layout, Sensor, interval_factor
-from lidardesign.design.snap.fit import Snapped, at_one_place, snapped
+from lidardesign.design.snap.fit import SnappedDesign, fix_part_origins, snap_design
 from lidardesign.design.snap.parts import wants_parts
 from lidardesign.errors import ConfigError
 from lidardesign.estimates import Estimate
@@ -103,12 +110,12 @@ def fit(
         ConfigError: Options that do not fit together.
     """
     started = time.perf_counter()
-    constraints, moved = settled(Constraints() if constraints is None else constraints, samples.space)
+    constraints, moved = snap_to_space(Constraints() if constraints is None else constraints, samples.space)
     _check_options(constraints, samples, sensors, layout, rays)
     if samples.space.conditioned:
         return _along_condition(samples, constraints, rays, level, seed, name)
     request = _Request(samples, constraints, seed, restarts, em_samples, level, retarget)
-    read_out = ReadOut.of(constraints, rays)
+    read_out = BandwidthBudget.of(constraints, rays)
     supports, ensemble, design, snap = _made(request, read_out, sensors, layout, gates or own_gates(layout), name)
     checks = _checked(design, constraints, samples)
     score = Estimate(ensemble.log_likelihood, likelihood_error(ensemble, supports), "nats")
@@ -153,7 +160,7 @@ def _checked(design: DesignSpec, constraints: Constraints, samples: Samples) -> 
 
 
 def _solved(
-    request: _Request, read_out: ReadOut, sensors: int | str | None, layout: Layout
+    request: _Request, read_out: BandwidthBudget, sensors: int | str | None, layout: Layout
 ) -> tuple[list[Support], tuple[Sensor, ...], int | None, Ensemble]:
     """Samples, sensors, rays per frame, and the fit that keeps its budget."""
     constraints, space = request.constraints, request.samples.space
@@ -164,16 +171,16 @@ def _solved(
         beams, fit = fit_scan(part.features, space, constraints, part.group, read_out, request.level, request.seed)
         return supports, beams, len(beams), fit
     supports, ensemble = _fitted(request, sensors, read_out.rays)
-    ensemble, total = within_budget(ensemble, Ensemble.narrowed, lambda e: (e.widths_m, e.weights), read_out)
-    fitted = couplings(ensemble, sensors_of(ensemble, space, request.level))
+    ensemble, total = fit_within_budget(ensemble, Ensemble.narrowed, lambda e: (e.widths_m, e.weights), read_out)
+    fitted = add_couplings(ensemble, sensors_of(ensemble, space, request.level))
     if not constraints.each:
         fitted = heaviest_first(fitted)
     return supports, fitted, total, ensemble
 
 
 def _made(
-    request: _Request, read_out: ReadOut, sensors: int | str | None, layout: Layout, gates: Gates, name: str
-) -> tuple[list[Support], Ensemble, DesignSpec, Snapped | None]:
+    request: _Request, read_out: BandwidthBudget, sensors: int | str | None, layout: Layout, gates: Gates, name: str
+) -> tuple[list[Support], Ensemble, DesignSpec, SnappedDesign | None]:
     """Samples, what was fitted to them, and the design that it stands for."""
     if wants_parts(request.constraints):
         supports, snap = _snapped(request, read_out, sensors, name)
@@ -186,17 +193,17 @@ def _made(
 
 
 def _snapped(
-    request: _Request, read_out: ReadOut, sensors: int | str | None, name: str
-) -> tuple[list[Support], Snapped]:
+    request: _Request, read_out: BandwidthBudget, sensors: int | str | None, name: str
+) -> tuple[list[Support], SnappedDesign]:
     """Samples, and the design of the parts that sensors become."""
     constraints, space = request.constraints, request.samples.space
     # the parts have gates of their own: the budget is theirs
     free = replace(read_out, limit_mbps=None, rays=None)
     supports, fitted, _, ensemble = _solved(request, free, sensors, "grid")
-    fixed = at_one_place(constraints, fitted)
+    fixed = fix_part_origins(constraints, fitted)
     if fixed is not None:
         supports, fitted, _, ensemble = _solved(replace(request, constraints=fixed), free, len(fitted), "grid")
-    parts = snapped(ensemble, constraints, space, read_out, level=request.level, seed=request.seed, name=name)
+    parts = snap_design(ensemble, constraints, space, read_out, level=request.level, seed=request.seed, name=name)
     moved = () if fixed is None else (ONE_PLACE,)
     design = replace(parts.design, at=fixed_conditions(space))
     return supports, replace(parts, design=design, notes=(*moved, *parts.notes))
@@ -267,7 +274,7 @@ def _sensor_counts(constraints: Constraints, sensors: int | str | None, rays: in
 def _fitted(request: _Request, sensors: int | str | None, rays: int | None) -> tuple[list[Support], Ensemble]:
     counts = _sensor_counts(request.constraints, sensors, rays)
     if is_mounted(request.constraints):
-        fixed, counts = at_mounts(request.constraints, request.samples, counts, request.retarget, request.seed)
+        fixed, counts = choose_mounts(request.constraints, request.samples, counts, request.retarget, request.seed)
         request = replace(request, constraints=fixed)
     supports = _supports(request, counts[-1])
     count = counts[0] if len(counts) == 1 else _chosen_count(request, supports, counts)
@@ -284,10 +291,10 @@ def _supports(request: _Request, count: int) -> list[Support]:
     for index, group in enumerate(members):
         free = all(pin is None for pin in group.pins)
         if free:
-            support = restricted(request.samples, request.constraints, group)
+            support = restrict_samples(request.samples, request.constraints, group)
         else:
             generator = random_generator(request.seed, "pinned", index)
-            support = pinned(
+            support = pin_samples(
                 request.samples, request.constraints, group, request.retarget, request.em_samples, generator
             )
         mass = support.total if free else None
@@ -303,7 +310,7 @@ def _mass(supports: list[Support]) -> float | None:
 
 
 @phase("features")
-def _features(request: _Request, supports: list[Support], count: int) -> list[Part]:
+def _features(request: _Request, supports: list[Support], count: int) -> list[GroupSamples]:
     """Features, bounds and shares of each group of sensors.
 
     Pinned groups share by how much density each pinned origin sees; against groups with a free origin, whose
@@ -321,7 +328,7 @@ def _features(request: _Request, supports: list[Support], count: int) -> list[Pa
         points, weights = _thinned(support, request.em_samples, random_generator(request.seed, "em", index))
         features = Features.of(points, weights, Axes.of(space, group.pins), space)
         bounds = bounds_of(request.constraints, space, group.sensors, request.interval)
-        parts.append(Part(group, float(shares[index]), features, bounds))
+        parts.append(GroupSamples(group, float(shares[index]), features, bounds))
     return parts
 
 
@@ -351,7 +358,7 @@ def _chosen_count(request: _Request, supports: list[Support], counts: list[int])
     return min(count for count, (mean, _) in scores.items() if mean >= scores[top][0] - scores[top][1])
 
 
-def _split(parts: list[Part], seed: int) -> tuple[list[Part], list[Part]]:
+def _split(parts: list[GroupSamples], seed: int) -> tuple[list[GroupSamples], list[GroupSamples]]:
     """Samples for fitting and for judging, apart."""
     train, test = [], []
     for index, part in enumerate(parts):

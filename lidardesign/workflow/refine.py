@@ -150,8 +150,8 @@ class Fitter:
     @cached_property
     def may_spread(self) -> bool:
         """Whether samples may be spread in range: not where weights at other places have to be worked out for them."""
-        from lidardesign.design.constraints.mounts import is_mounted
-        from lidardesign.design.constraints.rules import groups
+        from lidardesign.design.constraints.origins import is_mounted
+        from lidardesign.design.mixture.bounds import groups
 
         constraints = self.order.constraints
         if self.order.at:

@@ -33,7 +33,7 @@ def likeness(
     if like is None:
         return _settled(asked, run.config.space, console), layout, ()
     from lidardesign.design.constraints.document import Constraints
-    from lidardesign.design.constraints.rig_constraints import constraints_like, moved_notes, taken_over
+    from lidardesign.design.constraints.rig_constraints import moved_notes, rig_constraints, rig_notes
     from lidardesign.workflow.runs import reach_of, read_design
 
     layout = layout or LAYOUTS[0]
@@ -42,8 +42,8 @@ def likeness(
     rig = read_design(like, console, reach_of([run]))
     own = Constraints() if asked is None else asked
     space = run.config.space
-    found = constraints_like(rig, space, own, rays=rays, hint=_hint(run))
-    for line in (*taken_over(rig, found, own), *moved_notes(rig, space, found)):
+    found = rig_constraints(rig, space, own, rays=rays, hint=_hint(run))
+    for line in (*rig_notes(rig, found, own), *moved_notes(rig, space, found)):
         console.note(f"note: {line}")
     return _settled(found, space, console), layout, tuple(sensor.name for sensor in rig.sensors)
 
@@ -57,11 +57,11 @@ def _hint(run: Run) -> str:
 
 def _settled(constraints: Asked, space: DesignSpace, console: Console) -> Asked:
     """The constraints with pinned origins where the space fixes them; says which were moved there."""
-    from lidardesign.design.constraints.mounts import settled
+    from lidardesign.design.constraints.origins import snap_to_space
 
     if constraints is None:
         return constraints
-    found, notes = settled(constraints, space)
+    found, notes = snap_to_space(constraints, space)
     for note in notes:
         console.note(f"note: {note}")
     return found

@@ -82,7 +82,7 @@ def _spaces() -> list[object]:
 def read_constraints(path: Path) -> object:
     """As `constrain --constraints` does, up to the check that any design can satisfy them."""
     from lidardesign.cli.commands.constrain import load_constraints
-    from lidardesign.design.constraints.document import check_feasible
+    from lidardesign.design.constraints.feasibility import check_feasible
     from lidardesign.errors import InfeasibleError
     from lidardesign.run.yaml import dump_yaml, parse_yaml
 

@@ -20,14 +20,15 @@ from test_fit import FREE, MOVING, log_target
 from test_rays import drawn_from, three_sensors
 
 import lidardesign.design.constraints.check as checker
-from lidardesign.design.constraints.bounds import Bounds
 from lidardesign.design.constraints.check import check_design
-from lidardesign.design.constraints.document import Constraints, check_feasible
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.feasibility import check_feasible
 from lidardesign.design.files import design_document, design_from_document
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts.rays import MOST_RAYS, lay_out, split_budget
+from lidardesign.design.mixture.bounds import Bounds
 from lidardesign.design.mixture.em import fit_mixture
-from lidardesign.design.mixture.ensemble import admitted
+from lidardesign.design.mixture.ensemble import admitted_mixture
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.mixture import log_density
 from lidardesign.design.mixture.support import LEAST_MASS
@@ -379,7 +380,7 @@ def clamp_and_mstep():
     features = Features.of(points, np.ones(2000), Axes.of(space), space)
     start = fit_mixture(features, Bounds.unbounded(2, Z), np.random.default_rng(1))
     two = Bounds.unbounded(2, Z).narrowed(0.2)
-    clamped = admitted(start.mixture, features, Bounds.unbounded(2, Z))
+    clamped = admitted_mixture(start.mixture, features, Bounds.unbounded(2, Z))
     rows = {name: getattr(clamped, name).copy() for name in clamped.__dataclass_fields__}
     rows["spread_range_m"] = np.minimum(rows["spread_range_m"], 0.2 / (2 * Z))
     after = float(features.weights @ log_density(type(clamped)(**rows), features))

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from test_mixture import POINT, WHOLE, Z, drawn, features_of, naive_log_density, random_mixture
 from test_track import shelves
 
-from lidardesign.design.constraints.bounds import Bounds, Floors
 from lidardesign.design.files import design_document
 from lidardesign.design.fit import fit
-from lidardesign.design.mixture.em import climb, fit_mixture, seed
+from lidardesign.design.mixture.bounds import Bounds, Floors
+from lidardesign.design.mixture.em import fit_mixture, run_em, seed_mixture
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.mixture import Mixture, expect, log_density, responsibilities
 from lidardesign.samples import Samples
@@ -115,8 +115,8 @@ class TestSamplesThatDoNotFillTheirSpace:
         # some samples weigh next to nothing
         features = features_of(points, weights=10.0 ** -generator.uniform(0, decades, len(points)))
         bounds = Bounds.unbounded(count, Z)
-        start = seed(features, bounds, generator)
-        trace = climb(start, features, bounds, iterations=30)
+        start = seed_mixture(features, bounds, generator)
+        trace = run_em(start, features, bounds, iterations=30)
         values = [expect(start, features).log_likelihood, *trace.history]
         assert (np.diff(values) >= 0).all()
         assert_finite(trace.mixture)
@@ -281,7 +281,7 @@ class TestSamplesFarFromEveryComponent:
         generator = np.random.default_rng(10)
         mixture = random_mixture(generator, 2)
         features = features_of(np.concatenate([drawn(mixture, 500, generator), far_away(mixture, 1000, generator)]))
-        trace = climb(mixture, features, Bounds.unbounded(2, Z))
+        trace = run_em(mixture, features, Bounds.unbounded(2, Z))
         assert expect(mixture, features).log_likelihood < -1e4
         assert trace.log_likelihood > -20
         assert (np.diff(trace.history) >= 0).all()

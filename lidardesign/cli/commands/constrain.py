@@ -171,7 +171,7 @@ def load_constraints(file: Path | None, overrides: list[str], console: Console |
 
 def _sensors(given: Any, constraints: Constraints, design: DesignSpec | None, usual: int) -> Any:
     """The number of sensors: the option's, then what the constraints ask for, the design's, the task's."""
-    from lidardesign.design.constraints.mounts import is_mounted
+    from lidardesign.design.constraints.origins import is_mounted
 
     asked = constraints.sensors
     if given is not None or asked.count is not None:

@@ -23,7 +23,7 @@ Fitted = TypeVar("Fitted")
 
 
 @dataclass(frozen=True)
-class ReadOut:
+class BandwidthBudget:
     """The bandwidth of sensors whose rays share the sensor's gate.
 
     Arguments:
@@ -39,7 +39,7 @@ class ReadOut:
     names: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, constraints: Constraints, rays: int | None) -> ReadOut:
+    def of(cls, constraints: Constraints, rays: int | None) -> BandwidthBudget:
         """The read-out that a constraint file and an option ask for."""
         budget = constraints.budget
         names = ["budget.rays"] if budget.rays is not None else ["--rays"] if rays is not None else []
@@ -68,11 +68,11 @@ class ReadOut:
         return max(rays, len(widths_m))
 
 
-def within_budget(
+def fit_within_budget(
     fitted: Fitted,
     refit: Callable[[Fitted, float], Fitted],
     shape: Callable[[Fitted], tuple[np.ndarray, np.ndarray]],
-    read_out: ReadOut,
+    read_out: BandwidthBudget,
 ) -> tuple[Fitted, int | None]:
     """A design that keeps the bandwidth budget, and its number of rays.
 
@@ -112,7 +112,7 @@ def within_budget(
     )
 
 
-def _affordable_bins(read_out: ReadOut, widths: np.ndarray, weights: np.ndarray, rays: int) -> int:
+def _affordable_bins(read_out: BandwidthBudget, widths: np.ndarray, weights: np.ndarray, rays: int) -> int:
     """The largest common cap in bins that keeps the budget with the present weights, at least 1."""
     counts = split_budget(weights, rays)
     bins = read_out.model.bins(widths)

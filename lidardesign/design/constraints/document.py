@@ -141,7 +141,7 @@ class Boresight(_Keys):
     elevation_deg: ElevationRange = ElevationRange()
 
 
-class FieldOfView(_Keys):
+class FieldOfViewRange(_Keys):
     """How wide it may see, horizontally and vertically in its own frame."""
 
     horizontal_deg: FieldRange = FieldRange()
@@ -197,7 +197,7 @@ class SensorConstraints(_Keys):
 
     origin: Origin = Origin()
     boresight: Boresight = Boresight()
-    field_of_view: FieldOfView = FieldOfView()
+    field_of_view: FieldOfViewRange = FieldOfViewRange()
     gate: Gate = Gate()
     snap: Snap | None = None
 
@@ -277,13 +277,3 @@ def _without_empty(values: dict[str, Any]) -> dict[str, Any]:
         elif value is not None:
             kept[key] = value
     return kept
-
-
-def check_feasible(
-    constraints: Constraints, space: Any, *, sensors: int | None = None, rays: int | None = None
-) -> None:
-    """Refuse constraints that no design can satisfy; see `feasibility.check_feasible`."""
-    # the checks need the constraint models, and callers look for them here
-    from lidardesign.design.constraints.feasibility import check_feasible as check
-
-    check(constraints, space, sensors=sensors, rays=rays)

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.document import Constraints, SensorConstraints
-from lidardesign.design.constraints.mounts import most_mounted, mounts_of, settled_place
-from lidardesign.design.mixture.origins import free_boxes
+from lidardesign.design.constraints.origins import free_boxes, most_mounted, mounts_of, snap_place_to_space
 from lidardesign.errors import InfeasibleError
 from lidardesign.numerics import SLACK
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace
@@ -84,7 +83,7 @@ def _check_count(constraints: Constraints, sensors: int | None) -> None:
 def _check_origin(constraints: Constraints, one: SensorConstraints, index: int, space: DesignSpace) -> None:
     low_name, high_name = (constraints.name_of(index, f"origin.{key}_m") for key in ("low", "high"))
     fixed_name = constraints.name_of(index, "origin.fixed_m")
-    place = None if one.origin.fixed_m is None else settled_place(one.origin.fixed_m, space)
+    place = None if one.origin.fixed_m is None else snap_place_to_space(one.origin.fixed_m, space)
     for axis in range(3):
         bounds = f"space.{DIMENSIONS[axis]}"
         lows = [_Bound(space.low[axis], bounds)]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.design.constraints.document import MOST_FITTED, Constraints, SensorConstraints, merged
-from lidardesign.design.constraints.mounts import misses, place_text, settled_place
+from lidardesign.design.constraints.origins import axes_outside, place_text, snap_place_to_space
 from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.numerics import SLACK
@@ -27,7 +27,7 @@ MOST_NAMED = 4
 SHARED = tuple(SensorConstraints.model_fields)
 
 
-def constraints_like(
+def rig_constraints(
     rig: DesignSpec, space: DesignSpace, asked: Constraints, *, rays: int | None, hint: str | None = None
 ) -> Constraints:
     """The constraints of a rig below those that were asked for.
@@ -82,7 +82,7 @@ def _placed(asked: Mapping[str, Any]) -> bool:
 def _check_places(rig: DesignSpec, space: DesignSpace, placed: Sequence[bool], hint: str | None) -> None:
     """Refuse a rig whose sensors stand where the design space has no place, of those that the user puts nowhere."""
     boxes = {sensor.name: _box(sensor) for sensor, own in zip(rig.sensors, placed, strict=False) if not own}
-    beyond = {name: axes for name, box in boxes.items() if (axes := misses(*box, space))}
+    beyond = {name: axes for name, box in boxes.items() if (axes := axes_outside(*box, space))}
     if not beyond:
         return
     name = next(iter(beyond))
@@ -111,7 +111,7 @@ def _of_sensor(sensor: Sensor, space: DesignSpace) -> dict[str, Any]:
 def _place(sensor: Sensor, space: DesignSpace) -> dict[str, Any]:
     """Where a sensor is: a point, or the box of its origins, open along conditions."""
     low, high = _box(sensor)
-    place = settled_place(sensor.origin_m, space)
+    place = snap_place_to_space(sensor.origin_m, space)
     moving = [axis for axis in range(3) if DIMENSIONS[axis] in space.condition]
     if not moving and (low == high).all():
         return {"fixed_m": place}
@@ -131,7 +131,7 @@ def moved_notes(rig: DesignSpec, space: DesignSpace, constraints: Constraints) -
     """Which sensors of a rig are taken to stand where the space fixes their place, as they stand next to it."""
     moved = []
     for sensor, one in zip(rig.sensors, constraints.each, strict=False):
-        place = settled_place(sensor.origin_m, space)
+        place = snap_place_to_space(sensor.origin_m, space)
         off = float(np.abs(np.subtract(place, sensor.origin_m)).max())
         # what is said of other places, or of conditions, is no move
         if off > SLACK and one.origin.fixed_m == place:
@@ -142,7 +142,7 @@ def moved_notes(rig: DesignSpec, space: DesignSpace, constraints: Constraints) -
     return [f"{names}: {max(off for _, off in moved):.2g} mm from where the run's sensors stand: taken to stand there"]
 
 
-def taken_over(rig: DesignSpec, constraints: Constraints, asked: Constraints) -> list[str]:
+def rig_notes(rig: DesignSpec, constraints: Constraints, asked: Constraints) -> list[str]:
     """What a rig's likeness says, one line each, for people."""
     sensors, own = len(rig.sensors), asked.as_document()
     said = [f"{sensors} sensor" + "s" * (sensors > 1)]

@@ -23,7 +23,7 @@ FULL_TURN_DEG = 360.0
 
 
 @dataclass(frozen=True)
-class Tightness:
+class ConstraintSlack:
     """One bound, over all sensors that it holds for.
 
     Arguments:
@@ -55,7 +55,7 @@ class Tightness:
         return "broken" if self.broken else "at the bound" if self.tight else "kept"
 
 
-def tightness(checks: Iterable[ConstraintCheck], sensors: Sequence[str]) -> list[Tightness]:
+def constraint_slack(checks: Iterable[ConstraintCheck], sensors: Sequence[str]) -> list[ConstraintSlack]:
     """How tight each bound is, in the order in which the checker comes to them.
 
     Arguments:
@@ -127,7 +127,7 @@ def _numbers(value: Any) -> list[float]:
     return [float(one) for one in values] if plain and all(math.isfinite(one) for one in values) else []
 
 
-def _told(key: str, group: Sequence[tuple[str, ConstraintCheck]]) -> Tightness:
+def _told(key: str, group: Sequence[tuple[str, ConstraintCheck]]) -> ConstraintSlack:
     rooms = [room_of(check) for _, check in group]
 
     def closeness(index: int) -> tuple[bool, float]:
@@ -139,7 +139,7 @@ def _told(key: str, group: Sequence[tuple[str, ConstraintCheck]]) -> Tightness:
     room, share = rooms[first]
     tight = [one for one, (_, kept) in zip(rooms, group, strict=True) if kept.satisfied and _is_tight(*one)]
     broken = sum(not kept.satisfied for _, kept in group)
-    return Tightness(key, check.bound, check.value, owner, room, share, len(group), len(tight), broken)
+    return ConstraintSlack(key, check.bound, check.value, owner, room, share, len(group), len(tight), broken)
 
 
 def _is_tight(room: float | None, share: float | None) -> bool:

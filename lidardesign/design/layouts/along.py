@@ -28,7 +28,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidardesign.design.layouts.quantise import lloyd
-from lidardesign.design.mixture.features import Axes, Features, looks
+from lidardesign.design.mixture.features import Axes, Features, ray_features
 from lidardesign.numerics import ROUNDING, SLACK, effective_count
 from lidardesign.space import AZIMUTH, ELEVATION, DesignSpace, angles
 
@@ -97,7 +97,7 @@ class Along:
 def aimed_rays(along: Along, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """What the rays aim at, relative to the sensor, at the knots (P, N, 3), and the ray of each sample (M,)."""
     features = Features.of(along.points, along.weights, Axes.of(along.space), along.space)
-    surface = looks(features) - along.points[:, :3]
+    surface = ray_features(features) - along.points[:, :3]
     power = (AZIMUTH in along.space.free) + (ELEVATION in along.space.free)
     mass = along.weights * np.linalg.norm(surface, axis=1) ** power
     weighted = replace(along, weights=mass / mass.sum())

@@ -38,16 +38,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri, ndtri
 
-from lidardesign.design.constraints.bounds import Bounds
 from lidardesign.design.constraints.document import Constraints, SensorConstraints
-from lidardesign.design.constraints.rules import bounds_of
+from lidardesign.design.constraints.origins import box_around, free_boxes, inside_excluded, origin_box
 from lidardesign.design.layouts.gates import SMALLEST_CELL, central_intervals, kept_gates
 from lidardesign.design.layouts.grid import field_on_sphere, low_discrepancy
 from lidardesign.design.layouts.quantise import lloyd, samples_for
 from lidardesign.design.layouts.shared_fields import FIELD_ROUNDING_RAD, SMALLEST_ANGLE_RAD, SMALLEST_LENGTH
+from lidardesign.design.mixture.bounds import Bounds, bounds_of
 from lidardesign.design.mixture.coupling import conditional_means, conditional_spreads, relative
-from lidardesign.design.mixture.features import Axes, Features, looks
-from lidardesign.design.mixture.origins import box_around, free_boxes, inside_excluded, origin_box
+from lidardesign.design.mixture.features import Axes, Features, ray_features
 from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor, tangent_directions
 from lidardesign.numerics import ROUNDING, SLACK, angle_over_sine, systematic_draw
 from lidardesign.samples import Samples
@@ -284,7 +283,7 @@ def _thinned(weights: np.ndarray, count: int, generator: np.random.Generator) ->
 
 def _picked(part: Features, log_target: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
     """The samples whose rays are fired, `count` distinct ones ordered by direction and origin."""
-    views = looks(part)
+    views = ray_features(part)
     centres, labels = lloyd(views, part.weights, count, generator, iterations=LLOYD_ITERATIONS)
     away = np.square(views - centres[labels]).sum(axis=1)
     picked = _best_near(labels, away, log_target, NEAR_SHARE)

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.constraints.bounds import Bounds
-from lidardesign.design.mixture.mstep import fit_gate
+from lidardesign.design.mixture.bounds import Bounds
+from lidardesign.design.mixture.m_step import fit_gate
 from lidardesign.design.sensor import Sensor
 from lidardesign.numerics import TINY
 

@@ -17,13 +17,13 @@ from scipy.spatial import cKDTree
 
 from lidardesign.design.catalog.part import thinned
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.rules import bounds_of, groups
 from lidardesign.design.layouts.distributed import distributed_beams
 from lidardesign.design.layouts.gates import SMALLEST_CELL, central_intervals, kept_gates
 from lidardesign.design.layouts.grid import field_on_sphere, grid_tangent
 from lidardesign.design.layouts.quantise import lloyd, samples_for
 from lidardesign.design.layouts.shared_fields import Members, members, narrowed, shared_rays
 from lidardesign.design.layouts.track import moved, placed
+from lidardesign.design.mixture.bounds import bounds_of, groups
 from lidardesign.design.mixture.conditions import conditioned
 from lidardesign.design.mixture.support import Retarget
 from lidardesign.design.sensor import (

@@ -21,15 +21,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidardesign.design.constraints.bounds import Bounds
-from lidardesign.design.constraints.budget import ReadOut, within_budget
+from lidardesign.design.constraints.budget import BandwidthBudget, fit_within_budget
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.rules import Group, bounds_of
 from lidardesign.design.layouts.gates import admissible_gates, central_intervals
 from lidardesign.design.layouts.quantise import lloyd
-from lidardesign.design.mixture.em import Trace, from_labels
-from lidardesign.design.mixture.ensemble import Ensemble, Part, sensors_of
-from lidardesign.design.mixture.features import Features, looks
+from lidardesign.design.mixture.bounds import Bounds, Group, bounds_of
+from lidardesign.design.mixture.em import EMResult, from_labels
+from lidardesign.design.mixture.ensemble import Ensemble, GroupSamples, sensors_of
+from lidardesign.design.mixture.features import Features, ray_features
 from lidardesign.design.mixture.mixture import Mixture, log_density
 from lidardesign.design.sensor import Sensor, interval_factor
 from lidardesign.errors import ConfigError
@@ -49,7 +48,7 @@ def fit_scan(
     space: DesignSpace,
     constraints: Constraints,
     group: Group,
-    read_out: ReadOut,
+    read_out: BandwidthBudget,
     level: float,
     seed: int,
 ) -> tuple[tuple[Sensor, ...], Ensemble]:
@@ -78,17 +77,17 @@ def fit_scan(
     everyone = Group(group.pins, tuple(range(count)))
     bounds = bounds_of(constraints, space, everyone.sensors, interval_factor(level))
     generator = random_generator(seed, "scan")
-    _, labels = lloyd(looks(features), features.weights, count, generator, iterations=LLOYD_ITERATIONS)
-    part = Part(everyone, 1.0, features, bounds)
+    _, labels = lloyd(ray_features(features), features.weights, count, generator, iterations=LLOYD_ITERATIONS)
+    part = GroupSamples(everyone, 1.0, features, bounds)
 
     def scan(limits: Bounds) -> Ensemble:
         mixture = from_labels(features, labels, limits).with_weights(np.full(count, 1.0 / count))
         mixture = _with_gates(mixture, features, labels, limits, level)
         values = log_density(mixture, features)
         score = float(features.weights @ values)
-        return Ensemble((part,), (Trace(mixture, score, (score,), values=values),))
+        return Ensemble((part,), (EMResult(mixture, score, (score,), values=values),))
 
-    fitted, _ = within_budget(
+    fitted, _ = fit_within_budget(
         scan(bounds),
         lambda _, width_m: scan(bounds.narrowed(width_m)),
         lambda e: (e.widths_m, e.weights),
@@ -100,7 +99,7 @@ def fit_scan(
     return named, fitted
 
 
-def rays_of(read_out: ReadOut) -> int:
+def rays_of(read_out: BandwidthBudget) -> int:
     """The number of rays of a scan, which nothing else can tell.
 
     Raises:

@@ -20,9 +20,9 @@ from scipy.special import ndtri
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.rules import bounds_of
 from lidardesign.design.layouts.gates import Heard, gates_within
 from lidardesign.design.layouts.quantise import lloyd, samples_for
+from lidardesign.design.mixture.bounds import bounds_of
 from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor, tangent_coordinates, tangent_directions
 from lidardesign.numerics import ROUNDING, angle_over_sine, systematic_draw, unit_vectors
 from lidardesign.samples import Samples

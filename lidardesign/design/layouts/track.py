@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidardesign.design.constraints.rules import mean_azimuth
+from lidardesign.design.mixture.bounds import mean_azimuth
 from lidardesign.design.mixture.conditions import shown
 from lidardesign.design.sensor import DesignSpec, RayTable, Sensor, Track, interval_factor
 from lidardesign.errors import ConfigError

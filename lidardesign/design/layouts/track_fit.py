@@ -17,19 +17,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidardesign.design.constraints.bounds import Bounds
-from lidardesign.design.constraints.budget import ReadOut, within_budget
+from lidardesign.design.constraints.budget import BandwidthBudget, fit_within_budget
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.rules import Group, bounds_of
+from lidardesign.design.constraints.origins import free_boxes, origin_box
 from lidardesign.design.layouts.along import Along, aimed_rays
 from lidardesign.design.layouts.gates import admissible_gates, central_intervals
 from lidardesign.design.layouts.track import TRAVELLED, boresight_azimuth, interpolated
+from lidardesign.design.mixture.bounds import Bounds, Group, bounds_of
 from lidardesign.design.mixture.conditions import fixed_conditions
 from lidardesign.design.mixture.em import from_labels
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.mixture import Mixture, log_density
-from lidardesign.design.mixture.origins import free_boxes, origin_box
-from lidardesign.design.mixture.support import Support, check_support, restricted
+from lidardesign.design.mixture.support import Support, check_support, restrict_samples
 from lidardesign.design.sensor import DEFAULT_LEVEL, DesignSpec, Sensor, Track, interval_factor
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.numerics import SLACK
@@ -94,12 +93,12 @@ def fit_track(
     """
     constraints = Constraints() if constraints is None else constraints
     dimension = _travelled(samples.space)
-    read_out = ReadOut.of(constraints, rays)
+    read_out = BandwidthBudget.of(constraints, rays)
     if read_out.rays is None:
         raise ConfigError("a track needs its number of rays per position", where="--layout scan", hint="give --rays N")
     group = Group((None, None, None), tuple(range(read_out.rays)))
     ends = _ends(samples.space, constraints, dimension, level)
-    support = restricted(samples, constraints, group)
+    support = restrict_samples(samples, constraints, group)
     support = replace(support, mass=support.total)
     check_support(support, group, mass=support.total, several=False)
     places = _knots(*ends, support.effective, read_out.rays, knots)
@@ -230,7 +229,7 @@ def _with_gates(
     elevation: np.ndarray,
     bounds: Bounds,
     level: float,
-    read_out: ReadOut,
+    read_out: BandwidthBudget,
 ) -> Track:
     """The track with gates that hold the level of what each ray sees, inside bounds and within the bandwidth.
 
@@ -252,7 +251,7 @@ def _with_gates(
         return Track(DIMENSIONS[along.dimension], along.knots, azimuth, elevation, gate, np.arange(count))
 
     even = np.full(count, 1.0 / count)
-    fitted, _ = within_budget(
+    fitted, _ = fit_within_budget(
         track(bounds),
         lambda _, width_m: track(bounds.narrowed(width_m)),
         lambda t: (_worst_widths(t, read_out), even),
@@ -261,7 +260,7 @@ def _with_gates(
     return fitted
 
 
-def _worst_widths(track: Track, read_out: ReadOut) -> np.ndarray:
+def _worst_widths(track: Track, read_out: BandwidthBudget) -> np.ndarray:
     """Gate widths that cost at least what any position does: the wider of two neighbouring knots, ray by ray."""
     width = np.diff(track.gate_m, axis=2)[:, :, 0]
     wider = np.maximum(width[:-1], width[1:])

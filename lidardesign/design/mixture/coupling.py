@@ -25,7 +25,7 @@ LEAST_EFFECTIVE_SAMPLES = 30.0
 SMALLEST_VARIANCE_SHARE = SLACK
 
 
-def couplings(ensemble: Ensemble, sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
+def add_couplings(ensemble: Ensemble, sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
     """The sensors of an ensemble, in its own order of sensors, with their couplings."""
     coupled = list(sensors)
     for part, trace in zip(ensemble.parts, ensemble.traces, strict=True):

@@ -7,9 +7,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lidardesign.design.constraints.bounds import Bounds, Floors, clip_azimuth
+from lidardesign.design.constraints.origins import nearest_admitted
 from lidardesign.design.layouts.quantise import lloyd
+from lidardesign.design.mixture.bounds import Bounds, Floors, clip_azimuth
 from lidardesign.design.mixture.features import Features
+from lidardesign.design.mixture.m_step import SMALLEST_MASS, maximise
 from lidardesign.design.mixture.mixture import (
     Mixture,
     Statistics,
@@ -18,8 +20,6 @@ from lidardesign.design.mixture.mixture import (
     mean_directions,
     responsibilities,
 )
-from lidardesign.design.mixture.mstep import SMALLEST_MASS, maximise
-from lidardesign.design.mixture.origins import nearest_admitted
 from lidardesign.errors import NumericalError
 from lidardesign.numerics import ROUNDING, TINY, effective_count, wrap_angle
 
@@ -46,7 +46,7 @@ SMALLEST_CELL = TINY
 
 
 @dataclass(frozen=True, eq=False)
-class Trace:
+class EMResult:
     """What one run of the loop did.
 
     Arguments:
@@ -64,14 +64,14 @@ class Trace:
     values: np.ndarray | None = None
 
 
-def climb(
+def run_em(
     mixture: Mixture,
     features: Features,
     bounds: Bounds,
     *,
     iterations: int = MOST_ITERATIONS,
     tolerance_nats: float = CONVERGENCE_NATS,
-) -> Trace:
+) -> EMResult:
     """Iterate from admissible parameters; a step that would lower the log-likelihood is replaced.
 
     The replacement keeps the boresights, for which the M-step is exact and so cannot lose; the share of the
@@ -98,7 +98,7 @@ def climb(
         # a shortened boresight step may gain little and the next one more
         if gain < tolerance_nats and (step >= 1.0 or step < SMALLEST_STEP):
             break
-    return Trace(mixture, history[-1], tuple(history))
+    return EMResult(mixture, history[-1], tuple(history))
 
 
 def _finite(statistics: Statistics) -> float:
@@ -140,7 +140,7 @@ def from_labels(features: Features, labels: np.ndarray, bounds: Bounds) -> Mixtu
     return placed
 
 
-def seed(features: Features, bounds: Bounds, generator: np.random.Generator) -> Mixture:
+def seed_mixture(features: Features, bounds: Bounds, generator: np.random.Generator) -> Mixture:
     """k-means++ seeds, a few Lloyd steps, and components from the cells, each where its bounds admit it."""
     chosen = generator.choice(len(features), min(SEED_SAMPLES, len(features)), replace=False)
     part = features.subset(np.sort(chosen)) if len(chosen) < len(features) else features
@@ -190,7 +190,7 @@ def fit_mixture(
     *,
     restarts: int = 12,
     start: Mixture | None = None,
-) -> Trace:
+) -> EMResult:
     """The best of several short runs, continued until it converges.
 
     Arguments:
@@ -202,7 +202,7 @@ def fit_mixture(
     """
     if start is None:
         start = _best_seed(features, bounds, generator, 1 if len(bounds) == 1 else max(restarts, 1))
-    trace = _revived(climb(start, features, bounds), features, bounds, generator)
+    trace = _revived(run_em(start, features, bounds), features, bounds, generator)
     return replace(trace, notes=(*_shared_notes(features, len(bounds)), *trace.notes))
 
 
@@ -217,15 +217,15 @@ def _shared_notes(features: Features, count: int) -> tuple[str, ...]:
 
 def _best_seed(features: Features, bounds: Bounds, generator: np.random.Generator, restarts: int) -> Mixture:
     """The most promising of several seeds: short runs on a part of the samples, then of a few on all."""
-    seeds = [seed(features, bounds, generator) for _ in range(restarts)]
+    seeds = [seed_mixture(features, bounds, generator) for _ in range(restarts)]
     if restarts == 1:
         return seeds[0]
     part = features
     if len(features) > SCREEN_SAMPLES:
         part = features.subset(np.sort(generator.choice(len(features), SCREEN_SAMPLES, replace=False)))
-    runs = [climb(one, part, bounds, iterations=RESTART_ITERATIONS) for one in seeds]
+    runs = [run_em(one, part, bounds, iterations=RESTART_ITERATIONS) for one in seeds]
     runs.sort(key=lambda run: -run.log_likelihood)
-    best = [climb(run.mixture, features, bounds, iterations=RESTART_ITERATIONS) for run in runs[:FINALISTS]]
+    best = [run_em(run.mixture, features, bounds, iterations=RESTART_ITERATIONS) for run in runs[:FINALISTS]]
     return max(best, key=lambda run: run.log_likelihood).mixture
 
 
@@ -234,7 +234,7 @@ def dead_components(mixture: Mixture, features: Features) -> np.ndarray:
     return mixture.weights * effective_count(features.weights) < min(DEAD_SAMPLES, len(features) / len(mixture))
 
 
-def _revived(trace: Trace, features: Features, bounds: Bounds, generator: np.random.Generator) -> Trace:
+def _revived(trace: EMResult, features: Features, bounds: Bounds, generator: np.random.Generator) -> EMResult:
     """Give dead components half of the heaviest one's samples and go on, where the likelihood gains."""
     notes: list[str] = []
     for _ in range(MOST_REVIVALS):
@@ -247,7 +247,7 @@ def _revived(trace: Trace, features: Features, bounds: Bounds, generator: np.ran
             part = features.subset(inside)
             _, halves = lloyd(np.ascontiguousarray(part.embedding), part.weights, 2, generator, iterations=2)
             labels[inside[halves == 1]] = component
-        again = climb(from_labels(features, labels, bounds), features, bounds)
+        again = run_em(from_labels(features, labels, bounds), features, bounds)
         if again.log_likelihood < trace.log_likelihood:
             notes.append(f"{len(dead)} of {len(bounds)} sensors explain almost no samples")
             break

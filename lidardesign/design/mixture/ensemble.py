@@ -16,15 +16,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidardesign.design.constraints.bounds import Bounds, Floors
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.mounts import Mount, fixed_at, matched, mounts_of
-from lidardesign.design.constraints.rules import Group, mean_azimuth, pins_of
-from lidardesign.design.mixture.em import Trace, climb, fit_mixture
+from lidardesign.design.constraints.origins import Mount, fix_origins, mounts_of, mounts_suffice
+from lidardesign.design.mixture.bounds import Bounds, Floors, Group, mean_azimuth, pins_of
+from lidardesign.design.mixture.em import EMResult, fit_mixture, run_em
 from lidardesign.design.mixture.features import Axes, Features
+from lidardesign.design.mixture.m_step import maximise
 from lidardesign.design.mixture.mixture import Mixture, expect, log_density
-from lidardesign.design.mixture.mstep import maximise
-from lidardesign.design.mixture.support import Retarget, re_aimed
+from lidardesign.design.mixture.support import Retarget, reaim_samples
 from lidardesign.design.sensor import Sensor
 from lidardesign.errors import InfeasibleError
 from lidardesign.numerics import systematic_draw
@@ -35,7 +34,7 @@ from lidardesign.task import random_generator
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class GroupSamples:
     """One group of sensors with its samples and bounds.
 
     Arguments:
@@ -60,8 +59,8 @@ class Ensemble:
         traces: One per part.
     """
 
-    parts: tuple[Part, ...]
-    traces: tuple[Trace, ...]
+    parts: tuple[GroupSamples, ...]
+    traces: tuple[EMResult, ...]
 
     @property
     def log_likelihood(self) -> float:
@@ -101,11 +100,11 @@ class Ensemble:
         traces = []
         for part, trace in zip(self.parts, self.traces, strict=True):
             bounds = part.bounds.narrowed(width_m)
-            start = admitted(trace.mixture, part.features, bounds)
-            traces.append(replace(climb(start, part.features, bounds), notes=trace.notes))
+            start = admitted_mixture(trace.mixture, part.features, bounds)
+            traces.append(replace(run_em(start, part.features, bounds), notes=trace.notes))
         return Ensemble(self.parts, tuple(traces))
 
-    def held_out(self, parts: Sequence[Part]) -> tuple[float, float]:
+    def held_out(self, parts: Sequence[GroupSamples]) -> tuple[float, float]:
         """Mean log density of other samples of the same groups, and its standard error [nats]."""
         mean, variance = 0.0, 0.0
         for part, trace in zip(parts, self.traces, strict=True):
@@ -117,7 +116,7 @@ class Ensemble:
 
 
 @phase("mixture")
-def fit_parts(parts: Sequence[Part], seed: int, restarts: int) -> Ensemble:
+def fit_parts(parts: Sequence[GroupSamples], seed: int, restarts: int) -> Ensemble:
     """Fit every group."""
     traces = [
         fit_mixture(part.features, part.bounds, random_generator(seed, "sensors", index), restarts=restarts)
@@ -126,7 +125,7 @@ def fit_parts(parts: Sequence[Part], seed: int, restarts: int) -> Ensemble:
     return Ensemble(tuple(parts), tuple(traces))
 
 
-def admitted(mixture: Mixture, features: Features, bounds: Bounds) -> Mixture:
+def admitted_mixture(mixture: Mixture, features: Features, bounds: Bounds) -> Mixture:
     """The nearest parameters of a fit inside other bounds: one M-step from its own statistics."""
     return maximise(mixture, expect(mixture, features), features, bounds, Floors.of(features), 0.0)
 
@@ -152,7 +151,7 @@ def _named(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
     return tuple(replace(sensor, name=f"s{index}") for index, sensor in enumerate(sensors))
 
 
-def _sensor(part: Part, mixture: Mixture, row: int, space: DesignSpace, level: float) -> Sensor:
+def _sensor(part: GroupSamples, mixture: Mixture, row: int, space: DesignSpace, level: float) -> Sensor:
     axes: Axes = part.features.axes
     origin = np.array(space.low[:3], dtype=np.float64)
     for axis, pin in enumerate(part.group.pins):
@@ -185,7 +184,7 @@ MOUNT_SAMPLES = 4000
 ENOUGH_SHARE = 0.95
 
 
-def at_mounts(
+def choose_mounts(
     constraints: Constraints, samples: Samples, counts: list[int], retarget: Retarget | None, seed: int
 ) -> tuple[Constraints, list[int]]:
     """The constraints with every mounted sensor fixed at the mount chosen for it, and the counts that are left.
@@ -215,7 +214,7 @@ def at_mounts(
             seen = {n: _greedy(views, options[:n]) for n in counts}
             count = min(n for n in counts if seen[n][1] >= ENOUGH_SHARE * together)
             chosen = seen[count][0]
-    fixed = fixed_at(constraints, [chosen.get(sensor) for sensor in range(count)])
+    fixed = fix_origins(constraints, [chosen.get(sensor) for sensor in range(count)])
     return fixed, [count] if mounts_of(constraints, len(constraints.each)) else counts
 
 
@@ -259,9 +258,9 @@ def _view(
     retarget: Retarget | None,
 ) -> np.ndarray:
     places: list[Mount | None] = [None] * sensor
-    fixed = fixed_at(constraints, [*places, mount])
+    fixed = fix_origins(constraints, [*places, mount])
     pins = pins_of(fixed.of_sensor(sensor), samples.space)
-    return re_aimed(samples, chosen, fixed, Group(pins, (sensor,)), retarget)[1]
+    return reaim_samples(samples, chosen, fixed, Group(pins, (sensor,)), retarget)[1]
 
 
 def _greedy(
@@ -276,7 +275,7 @@ def _greedy(
             (sensor, mount): float(np.maximum(seen, views[sensor, mount]).sum())
             for sensor, mounts in left.items()
             for mount in mounts
-            if matched([[m for m in others if m != mount] for other, others in left.items() if other != sensor])
+            if mounts_suffice([[m for m in others if m != mount] for other, others in left.items() if other != sensor])
         }
         sensor, mount = max(gains, key=lambda pair: gains[pair])
         chosen[sensor] = mount

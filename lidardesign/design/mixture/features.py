@@ -160,7 +160,7 @@ NEIGHBOURS = 16
 NEIGHBOUR_POOL = 5000
 
 
-def looks(features: Features) -> np.ndarray:
+def ray_features(features: Features) -> np.ndarray:
     """Directions where origins are given, else points of the mean surface, shape (N, F)."""
     aiming = features.embedding
     if features.axes.range:

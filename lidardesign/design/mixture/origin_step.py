@@ -38,7 +38,7 @@ FORCE_ROUNDS = 6
 SMALLEST_WIDTH_M = SQUARABLE
 
 
-class Box(NamedTuple):
+class IntervalBoxes(NamedTuple):
     """Bounds on J origins along n free axes.
 
     Arguments:
@@ -82,7 +82,7 @@ def variances(covariance: np.ndarray) -> np.ndarray:
 
 
 def improved(
-    mean: np.ndarray, scatter: np.ndarray, box: Box, point: np.ndarray, covariance: np.ndarray
+    mean: np.ndarray, scatter: np.ndarray, box: IntervalBoxes, point: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Means (J, n) and covariances (J, n, n) whose intervals lie in their boxes, better than those they start from.
 
@@ -105,7 +105,7 @@ def improved(
     return point, covariance
 
 
-def projected(mean: np.ndarray, scatter: np.ndarray, box: Box) -> tuple[np.ndarray, np.ndarray]:
+def projected(mean: np.ndarray, scatter: np.ndarray, box: IntervalBoxes) -> tuple[np.ndarray, np.ndarray]:
     """The samples' own moments with one axis after the other moved to its best inside the box, the worst first.
 
     The other axes keep their regressions on it.
@@ -123,7 +123,7 @@ def projected(mean: np.ndarray, scatter: np.ndarray, box: Box) -> tuple[np.ndarr
     return point, covariance
 
 
-def independent_axes(mean: np.ndarray, variance: np.ndarray, box: Box) -> tuple[np.ndarray, np.ndarray]:
+def independent_axes(mean: np.ndarray, variance: np.ndarray, box: IntervalBoxes) -> tuple[np.ndarray, np.ndarray]:
     """Inverse standard deviations p, and p times the shift from the mean, of axes as if independent, (J, n) each."""
     zero, one = np.zeros_like(variance), np.ones_like(variance)
     return _best_axis((variance, one, zero, zero), mean, box.sides, box)
@@ -164,7 +164,7 @@ def _narrowed(covariance: np.ndarray, most: np.ndarray) -> np.ndarray:
 
 
 def _scaled(
-    mean: np.ndarray, scatter: np.ndarray, box: Box, point: np.ndarray, covariance: np.ndarray
+    mean: np.ndarray, scatter: np.ndarray, box: IntervalBoxes, point: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The best means and standard deviations inside the box, with the correlations of a covariance."""
     deviations = np.sqrt(variances(covariance))
@@ -188,7 +188,7 @@ def _best_axis(
     form: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
     mean: np.ndarray,
     sides: tuple[np.ndarray, ...],
-    box: Box,
+    box: IntervalBoxes,
 ) -> tuple[np.ndarray, np.ndarray]:
     r"""The p and e that minimise $-2 \log p + a p^2 + 2 b p + q e^2 + 2 c e$ inside the bounds, of one shape.
 
@@ -226,7 +226,7 @@ def _best_axis(
     return np.take_along_axis(precision, best, axis=0)[0], np.take_along_axis(shift, best, axis=0)[0]
 
 
-def _least_precision(slopes: np.ndarray, box: Box) -> np.ndarray:
+def _least_precision(slopes: np.ndarray, box: IntervalBoxes) -> np.ndarray:
     """The smallest p that the largest variance admits and at which the lower lines lie below the upper ones."""
     widths = np.maximum(slopes[[0, 0, 1]] + slopes[[2, 3, 2]], SMALLEST_WIDTH_M)
     factors = box.interval * np.reshape([2.0, 1.0, 1.0], (3, *[1] * (slopes.ndim - 1)))
@@ -249,7 +249,7 @@ BOXES_SCORED = 8
 # Parameters keep bounds up to this share of a standard deviation, by rounding.
 
 
-class Limits(NamedTuple):
+class OriginLimits(NamedTuple):
     """Bounds on N origins along n free axes.
 
     Arguments:
@@ -269,24 +269,24 @@ class Limits(NamedTuple):
     most: np.ndarray
     thinnest: np.ndarray
 
-    def take(self, rows: np.ndarray) -> Limits:
+    def take(self, rows: np.ndarray) -> OriginLimits:
         """The limits of some origins."""
-        return Limits(*(value if isinstance(value, float) else value[rows] for value in self))
+        return OriginLimits(*(value if isinstance(value, float) else value[rows] for value in self))
 
-    def inside(self, boxes: np.ndarray) -> Box:
+    def inside(self, boxes: np.ndarray) -> IntervalBoxes:
         """One row per origin and box of `boxes` (N, B), origin by origin."""
         rows = np.repeat(np.arange(len(boxes)), boxes.shape[1])
         free_low, free_high = (side[rows, boxes.ravel()] for side in (self.free_low, self.free_high))
         low = np.maximum(self.low[rows], free_low)
         high = np.maximum(np.minimum(self.high[rows], free_high), low)
         bounds = self.least[rows], self.most[rows], self.thinnest[rows]
-        return Box(low, high, free_low, free_high, self.interval, *bounds)
+        return IntervalBoxes(low, high, free_low, free_high, self.interval, *bounds)
 
 
 def best_origins(
     mean: np.ndarray,
     scatter: np.ndarray,
-    limits: Limits,
+    limits: OriginLimits,
     old_mean: np.ndarray,
     old_covariance: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -307,7 +307,7 @@ def best_origins(
     return point, covariance
 
 
-def _anywhere(mean: np.ndarray, scatter: np.ndarray, limits: Limits) -> tuple[np.ndarray, np.ndarray]:
+def _anywhere(mean: np.ndarray, scatter: np.ndarray, limits: OriginLimits) -> tuple[np.ndarray, np.ndarray]:
     """The best mean in its box and covariance between its bounds, wherever its interval lies."""
     bounds = limits.least, limits.most, limits.thinnest
     covariance = clipped_eigenvalues(scatter, *bounds)
@@ -320,7 +320,7 @@ def _anywhere(mean: np.ndarray, scatter: np.ndarray, limits: Limits) -> tuple[np
     return point, covariance
 
 
-def _holding(point: np.ndarray, covariance: np.ndarray, limits: Limits) -> np.ndarray:
+def _holding(point: np.ndarray, covariance: np.ndarray, limits: OriginLimits) -> np.ndarray:
     """Which boxes hold which intervals, shape (N, M) bool."""
     reach = limits.interval * np.sqrt(np.maximum(variances(covariance), 0.0))
     low, high = (point - reach)[:, None], (point + reach)[:, None]
@@ -329,7 +329,7 @@ def _holding(point: np.ndarray, covariance: np.ndarray, limits: Limits) -> np.nd
 
 
 def _between_boxes(
-    mean: np.ndarray, scatter: np.ndarray, limits: Limits, old_mean: np.ndarray, old_covariance: np.ndarray
+    mean: np.ndarray, scatter: np.ndarray, limits: OriginLimits, old_mean: np.ndarray, old_covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Parameters in the best of a few boxes for each origin, or better ones in the box of the old ones, or these."""
     floored = clipped_eigenvalues(scatter, limits.least)
@@ -350,7 +350,7 @@ def _between_boxes(
     return point, covariance
 
 
-def _usable(point: np.ndarray, covariance: np.ndarray, limits: Limits) -> tuple[np.ndarray, np.ndarray]:
+def _usable(point: np.ndarray, covariance: np.ndarray, limits: OriginLimits) -> tuple[np.ndarray, np.ndarray]:
     """Which parameters keep all bounds, shape (N,) bool, and the first box that holds them, or any, shape (N,)."""
     holding = _holding(point, covariance, limits)
     values = np.linalg.eigvalsh(covariance)
@@ -361,7 +361,7 @@ def _usable(point: np.ndarray, covariance: np.ndarray, limits: Limits) -> tuple[
     return kept, holding.argmax(axis=1)
 
 
-def _promising(mean: np.ndarray, scatter: np.ndarray, limits: Limits) -> np.ndarray:
+def _promising(mean: np.ndarray, scatter: np.ndarray, limits: OriginLimits) -> np.ndarray:
     """A few boxes for each origin, those in which its axes lose least, one by one: shape (N, B)."""
     count, many = limits.free_low.shape[:2]
     boxes = np.broadcast_to(np.arange(many), (count, many))
@@ -381,7 +381,7 @@ def _lowest(losses: np.ndarray, wanted: int) -> np.ndarray:
     return np.argsort(losses, axis=1, kind="stable")[:, :wanted]
 
 
-def _rough_losses(mean: np.ndarray, variance: np.ndarray, limits: Limits) -> np.ndarray:
+def _rough_losses(mean: np.ndarray, variance: np.ndarray, limits: OriginLimits) -> np.ndarray:
     """About what each box costs: the shift that makes room for a spread that fits, (N, n) to (N, M)."""
     centre, own = mean[:, None], variance[:, None]
     widest = (limits.free_high - limits.free_low) / (2 * limits.interval)

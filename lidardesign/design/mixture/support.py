@@ -20,8 +20,8 @@ import numpy as np
 
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.constraints.feasibility import azimuth_interval
-from lidardesign.design.constraints.rules import Group, Pins
-from lidardesign.design.mixture.origins import inside_excluded, origin_box
+from lidardesign.design.constraints.origins import inside_excluded, origin_box
+from lidardesign.design.mixture.bounds import Group, Pins
 from lidardesign.errors import ConfigError, InfeasibleError, NumericalError
 from lidardesign.numerics import SLACK, effective_count, systematic_draw, wrap_angle
 from lidardesign.samples import Samples
@@ -92,14 +92,14 @@ def _in_sight(points: np.ndarray, one: object, space: DesignSpace) -> np.ndarray
     return np.einsum("ni,ni->n", nearest, ray) >= math.cos(min(reach, math.pi))
 
 
-def restricted(samples: Samples, constraints: Constraints, group: Group) -> Support:
+def restrict_samples(samples: Samples, constraints: Constraints, group: Group) -> Support:
     """The samples of p inside the admissible set of a group without pins; `total` is the admissible mass."""
     keep = admissible(samples.points, constraints, samples.space, group)
     weights = samples.weights[keep]
     return Support(samples.points[keep], weights, float(weights.sum()), effective_count(weights))
 
 
-def pinned(
+def pin_samples(
     samples: Samples,
     constraints: Constraints,
     group: Group,
@@ -121,12 +121,12 @@ def pinned(
         ConfigError: No way to evaluate the target density was given.
     """
     chosen = systematic_draw(samples.weights, count, generator)
-    aimed, weights = re_aimed(samples, chosen, constraints, group, retarget)
+    aimed, weights = reaim_samples(samples, chosen, constraints, group, retarget)
     used = weights > 0
     return Support(aimed[used], weights[used], float(weights.sum()) / count, effective_count(weights))
 
 
-def re_aimed(
+def reaim_samples(
     samples: Samples, chosen: np.ndarray, constraints: Constraints, group: Group, retarget: Retarget | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Chosen samples aimed from the pins at what they observed, (N, 6), and their new weights, (N,); 0 where unseen.

@@ -10,22 +10,22 @@ from typing import Any
 import numpy as np
 
 from lidardesign.design.catalog.placing import Pose, interleaved, part_sensor
-from lidardesign.design.constraints.budget import ReadOut
+from lidardesign.design.constraints.budget import BandwidthBudget
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.mounts import fixed_at
+from lidardesign.design.constraints.origins import fix_origins
 from lidardesign.design.files import MOST_TABLE_RAYS
 from lidardesign.design.layouts.rays import split_budget
 from lidardesign.design.mixture.ensemble import Ensemble, sensors_of
 from lidardesign.design.mixture.features import Features
 from lidardesign.design.sensor import DesignSpec, RayTable, Sensor, interval_factor
-from lidardesign.design.snap.parts import Choice, Options, nearest_parts, options_of, with_parts
+from lidardesign.design.snap.parts import PartChoice, PartOptions, fit_part_poses, nearest_parts, part_options
 from lidardesign.design.snap.rays import affordable, counts_of, fired, gate_widths, useful_rays, useful_split
 from lidardesign.errors import ConfigError
 from lidardesign.space import DesignSpace, angles
 
 
 @dataclass(frozen=True, eq=False)
-class Snapped:
+class SnappedDesign:
     """A design of parts.
 
     Arguments:
@@ -47,12 +47,12 @@ class _Placed:
 
     fitted: Sensor
     sensor: Sensor
-    choice: Choice
+    choice: PartChoice
     pose: Pose | None
     seen: Features
 
 
-def at_one_place(constraints: Constraints, sensors: Sequence[Sensor]) -> Constraints | None:
+def fix_part_origins(constraints: Constraints, sensors: Sequence[Sensor]) -> Constraints | None:
     """The constraints with sensors that become parts fixed at their mean origins; None where they are already."""
     spread = [
         bool(np.any(sensor.origin_covariance_m2)) and constraints.of_sensor(index).snap is not None
@@ -64,19 +64,19 @@ def at_one_place(constraints: Constraints, sensors: Sequence[Sensor]) -> Constra
         (float(x), float(y), float(z)) if moves else None
         for (x, y, z), moves in zip((sensor.origin_m for sensor in sensors), spread, strict=True)
     ]
-    return fixed_at(constraints, places)
+    return fix_origins(constraints, places)
 
 
-def snapped(
+def snap_design(
     ensemble: Ensemble,
     constraints: Constraints,
     space: DesignSpace,
-    read_out: ReadOut,
+    read_out: BandwidthBudget,
     *,
     level: float,
     seed: int,
     name: str,
-) -> Snapped:
+) -> SnappedDesign:
     """The sensors of an ensemble replaced by parts of the catalogue.
 
     Arguments:
@@ -93,14 +93,14 @@ def snapped(
         ConfigError: A part that is not there; more rays than a design file holds.
     """
     before = sensors_of(ensemble, space, level)
-    options = options_of(constraints, space, [sensor.range_m for sensor in before])
+    options = part_options(constraints, space, [sensor.range_m for sensor in before])
     if (read_out.rays or 0) > MOST_TABLE_RAYS:
         raise ConfigError(f"{read_out.rays} rays of parts", where="--rays", allowed=f"at most {MOST_TABLE_RAYS}")
     choices = nearest_parts(ensemble, options, read_out.rays, seed)
     fitted_widths = np.array([sensor.gate_m[1] - sensor.gate_m[0] for sensor in before])
     choices = affordable(choices, options, ensemble.weights, fitted_widths, read_out)
     held = [(one := constraints.of_sensor(i).snap) is not None and one.pose == "fitted" for i in range(len(before))]
-    refitted = with_parts(ensemble, choices, held)
+    refitted = fit_part_poses(ensemble, choices, held)
     placed = _placed(before, sensors_of(refitted, space, level), choices, ensemble)
     if not constraints.each:
         order = sorted(range(len(placed)), key=lambda i: -round(placed[i].sensor.weight, 9))
@@ -113,11 +113,11 @@ def snapped(
         "log_likelihood": {"fitted": ensemble.log_likelihood, "parts": refitted.log_likelihood},
         "sensors": _rows(placed, options, counts, read_out),
     }
-    return Snapped(design, refitted, report, _notes(design, options))
+    return SnappedDesign(design, refitted, report, _notes(design, options))
 
 
 def _placed(
-    before: Sequence[Sensor], after: Sequence[Sensor], choices: Sequence[Choice], ensemble: Ensemble
+    before: Sequence[Sensor], after: Sequence[Sensor], choices: Sequence[PartChoice], ensemble: Ensemble
 ) -> list[_Placed]:
     """Every sensor with its part at the pose that its component has."""
     features = {sensor: part.features for part in ensemble.parts for sensor in part.group.sensors}
@@ -189,7 +189,7 @@ def _renamed(one: _Placed, name: str) -> _Placed:
     return replace(one, sensor=replace(one.sensor, name=name))
 
 
-def _counts(placed: Sequence[_Placed], read_out: ReadOut) -> np.ndarray:
+def _counts(placed: Sequence[_Placed], read_out: BandwidthBudget) -> np.ndarray:
     """Rays of every sensor, shape (G,)."""
     weights = np.array([one.sensor.weight for one in placed])
     choices = [one.choice for one in placed]
@@ -235,7 +235,7 @@ def _design(
 
 
 def _rows(
-    placed: Sequence[_Placed], options: Sequence[Options], counts: np.ndarray, read_out: ReadOut
+    placed: Sequence[_Placed], options: Sequence[PartOptions], counts: np.ndarray, read_out: BandwidthBudget
 ) -> list[dict[str, Any]]:
     """What every sensor was, what it became, and what that costs alone; in the order of the design."""
     weights = np.array([one.fitted.weight for one in placed])
@@ -272,7 +272,7 @@ def _field(sensor: Sensor) -> list[float]:
     return [float(angle) for angle in sensor.field_of_view_rad]
 
 
-def _notes(design: DesignSpec, options: Sequence[Options]) -> tuple[str, ...]:
+def _notes(design: DesignSpec, options: Sequence[PartOptions]) -> tuple[str, ...]:
     notes = []
     for sensor, option in zip(design.sensors, options, strict=True):
         if option.lacking:

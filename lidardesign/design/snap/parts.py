@@ -30,15 +30,15 @@ import numpy as np
 
 from lidardesign.design.catalog.library import SUFFIX, Library, load_library
 from lidardesign.design.catalog.part import Part
-from lidardesign.design.constraints.bounds import Bounds, Floors
 from lidardesign.design.constraints.document import Constraints, SensorConstraints, Snap
-from lidardesign.design.mixture.em import CONVERGENCE_NATS, Trace
+from lidardesign.design.mixture.bounds import Bounds, Floors
+from lidardesign.design.mixture.em import CONVERGENCE_NATS, EMResult
 from lidardesign.design.mixture.ensemble import Ensemble
-from lidardesign.design.mixture.ensemble import Part as Group
+from lidardesign.design.mixture.ensemble import GroupSamples as Group
 from lidardesign.design.mixture.features import Features
+from lidardesign.design.mixture.m_step import maximise
 from lidardesign.design.mixture.mixture import Mixture, expect, log_density
-from lidardesign.design.mixture.mstep import maximise
-from lidardesign.design.snap.shapes import Shape, shaped_bounds, shaped_mixture, shapes_of
+from lidardesign.design.snap.shapes import PartShape, shaped_bounds, shaped_mixture, shapes_of
 from lidardesign.errors import InfeasibleError
 from lidardesign.numerics import SLACK, systematic_draw
 from lidardesign.run.clock import phase
@@ -50,7 +50,7 @@ BOUNDED = ("field_of_view.horizontal_deg", "field_of_view.vertical_deg", "gate.s
 
 
 @dataclass(frozen=True, eq=False)
-class Options:
+class PartOptions:
     """The parts that a sensor may become.
 
     Arguments:
@@ -59,7 +59,7 @@ class Options:
         lacking: Names of a smallest set of constraints that no part keeps together; empty where some do.
     """
 
-    shapes: list[Shape]
+    shapes: list[PartShape]
     snapped: bool
     lacking: tuple[str, ...] = ()
 
@@ -69,7 +69,7 @@ def wants_parts(constraints: Constraints) -> bool:
     return any(constraints.of_sensor(index).snap is not None for index in range(len(constraints.each) + 1))
 
 
-def options_of(constraints: Constraints, space: DesignSpace, middles_m: Sequence[float]) -> list[Options]:
+def part_options(constraints: Constraints, space: DesignSpace, middles_m: Sequence[float]) -> list[PartOptions]:
     """What each of some sensors may become.
 
     Arguments:
@@ -154,23 +154,23 @@ def _modes(library: Library, part: Part) -> list[Part]:
 
 def _options(
     constraints: Constraints, index: int, space: DesignSpace, middle_m: float, parts: Sequence[Part]
-) -> Options:
+) -> PartOptions:
     one = constraints.of_sensor(index)
     if one.snap is None:
-        return Options([], snapped=False)
+        return PartOptions([], snapped=False)
     every = [shapes_of(part, space) for part in parts]
     heard = [shapes for shapes in every if shapes and shapes[0].gate_m[0] <= middle_m <= shapes[0].gate_m[1]]
     broken = [_broken(shapes[0], one) for shapes in heard]
     kept = [shape for shapes, found in zip(heard, broken, strict=True) if not found for shape in shapes]
     if kept:
-        return Options(kept, snapped=True)
+        return PartOptions(kept, snapped=True)
     lacking = _smallest_lacking(broken) if broken else ()
-    return Options(
+    return PartOptions(
         [], snapped=False, lacking=tuple(constraints.name_of(index, key) for key in lacking) or (SPACE_RANGE,)
     )
 
 
-def _broken(shape: Shape, one: SensorConstraints) -> set[str]:
+def _broken(shape: PartShape, one: SensorConstraints) -> set[str]:
     """Keys of the constraints that a part does not keep."""
     horizontal, vertical = (math.degrees(angle) for angle in shape.part.field_of_view_rad)
     start, end = shape.gate_m
@@ -205,7 +205,7 @@ EQUAL_NATS = SLACK
 
 
 @dataclass(frozen=True, eq=False)
-class Choice:
+class PartChoice:
     """The part of one sensor, and what the other parts would have been worth in its place.
 
     Arguments:
@@ -213,12 +213,12 @@ class Choice:
         losses: What each of its options loses beside the sensor as fitted [nats], in the order of the options.
     """
 
-    shape: Shape | None
+    shape: PartShape | None
     losses: tuple[float, ...] = ()
 
 
 @phase("parts")
-def nearest_parts(ensemble: Ensemble, options: Sequence[Options], rays: int | None, seed: int) -> list[Choice]:
+def nearest_parts(ensemble: Ensemble, options: Sequence[PartOptions], rays: int | None, seed: int) -> list[PartChoice]:
     """The part that every sensor of an ensemble becomes, in the order of the sensors.
 
     Arguments:
@@ -228,7 +228,7 @@ def nearest_parts(ensemble: Ensemble, options: Sequence[Options], rays: int | No
         seed: Root of the draw of samples.
     """
     rays = USUAL_RAYS * len(options) if rays is None else rays
-    found: dict[int, Choice] = {}
+    found: dict[int, PartChoice] = {}
     for index, (group, trace) in enumerate(zip(ensemble.parts, ensemble.traces, strict=True)):
         features = _thinned(group.features, random_generator(seed, "parts", index))
         own = [options[sensor] for sensor in group.group.sensors]
@@ -244,9 +244,11 @@ def _thinned(features: Features, generator: np.random.Generator) -> Features:
     return replace(features.subset(drawn), weights=times / times.sum())
 
 
-def _nearest(mixture: Mixture, features: Features, options: list[Options], group: Group, rays: float) -> list[Choice]:
+def _nearest(
+    mixture: Mixture, features: Features, options: list[PartOptions], group: Group, rays: float
+) -> list[PartChoice]:
     """Coordinate ascent over the shapes of a group's components, the heaviest first."""
-    chosen: list[Shape | None] = [None] * len(mixture)
+    chosen: list[PartShape | None] = [None] * len(mixture)
     losses: list[tuple[float, ...]] = [()] * len(mixture)
     own = np.stack([_log_joint(mixture, row, features) for row in range(len(mixture))])
     rows = [int(row) for row in np.argsort(-mixture.weights, kind="stable") if options[row].shapes]
@@ -265,11 +267,11 @@ def _nearest(mixture: Mixture, features: Features, options: list[Options], group
             chosen[row], own[row] = options[row].shapes[best], as_parts[row][best]
         if chosen == before:
             break
-    return [Choice(shape, loss) for shape, loss in zip(chosen, losses, strict=True)]
+    return [PartChoice(shape, loss) for shape, loss in zip(chosen, losses, strict=True)]
 
 
 def _as_parts(
-    mixture: Mixture, row: int, shapes: Sequence[Shape], features: Features, group: Group, rays: float
+    mixture: Mixture, row: int, shapes: Sequence[PartShape], features: Features, group: Group, rays: float
 ) -> list[np.ndarray]:
     """A component's share times its density at every sample, in log, were it each of some parts: (N,) each."""
     known: dict[tuple[float, ...], np.ndarray] = {}
@@ -283,8 +285,8 @@ def _as_parts(
     return found
 
 
-def _only(row: int, shape: Shape, count: int) -> list[Shape | None]:
-    shapes: list[Shape | None] = [None] * count
+def _only(row: int, shape: PartShape, count: int) -> list[PartShape | None]:
+    shapes: list[PartShape | None] = [None] * count
     shapes[row] = shape
     return shapes
 
@@ -294,14 +296,14 @@ def _log_joint(mixture: Mixture, row: int, features: Features) -> np.ndarray:
     return float(np.log(mixture.weights[row])) + log_density(mixture.take(np.array([row])), features)
 
 
-def _first_of_best(worth: np.ndarray, shapes: Sequence[Shape]) -> int:
+def _first_of_best(worth: np.ndarray, shapes: Sequence[PartShape]) -> int:
     """The most likely shape; of equally likely ones that of the part with most rays, then the first by name."""
     near = np.flatnonzero(worth >= worth.max() - EQUAL_NATS)
     return int(min(near, key=lambda index: (-shapes[index].part.rays, shapes[index].part.name, shapes[index].turned)))
 
 
 @phase("parts")
-def with_parts(ensemble: Ensemble, choices: Sequence[Choice], held: Sequence[bool]) -> Ensemble:
+def fit_part_poses(ensemble: Ensemble, choices: Sequence[PartChoice], held: Sequence[bool]) -> Ensemble:
     """The ensemble with its components in the shapes of parts, their poses refitted.
 
     The shares of the rays stay those of the sensors: wide parts that see the same would divide them at random.
@@ -318,7 +320,7 @@ def with_parts(ensemble: Ensemble, choices: Sequence[Choice], held: Sequence[boo
         mixture = shaped_mixture(trace.mixture, shapes, group.bounds.interval, group.features.axes)
         bounds = _held(shaped_bounds(group.bounds, shapes, group.features.axes), mixture, still)
         found, history = _turned(mixture, group.features, bounds, still)
-        traces.append(Trace(found, history[-1], history, trace.notes))
+        traces.append(EMResult(found, history[-1], history, trace.notes))
     return Ensemble(ensemble.parts, tuple(traces))
 
 

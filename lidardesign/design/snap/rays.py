@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from lidardesign.design.catalog.placing import Pose, part_rays
-from lidardesign.design.constraints.budget import ReadOut
+from lidardesign.design.constraints.budget import BandwidthBudget
 from lidardesign.design.files import MOST_TABLE_RAYS
 from lidardesign.design.layouts.grid import field_on_sphere, grid_tangent
 from lidardesign.design.layouts.rays import split_budget
 from lidardesign.design.mixture.features import Features
 from lidardesign.design.sensor import Sensor, tangent_directions
-from lidardesign.design.snap.parts import Choice, Options
+from lidardesign.design.snap.parts import PartChoice, PartOptions
 from lidardesign.design.snap.shapes import worth_firing
 from lidardesign.errors import InfeasibleError
 
@@ -61,8 +61,12 @@ def useful_split(weights: np.ndarray, count: int, useful: np.ndarray, most: np.n
 
 
 def affordable(
-    choices: Sequence[Choice], options: Sequence[Options], weights: np.ndarray, widths_m: np.ndarray, read_out: ReadOut
-) -> list[Choice]:
+    choices: Sequence[PartChoice],
+    options: Sequence[PartOptions],
+    weights: np.ndarray,
+    widths_m: np.ndarray,
+    read_out: BandwidthBudget,
+) -> list[PartChoice]:
     """Choices whose parts have the rays that are asked for, inside the bandwidth that there is.
 
     Sensors change to parts that help, each time the one that loses least per ray or per bin gained.
@@ -93,7 +97,9 @@ def affordable(
     return chosen
 
 
-def _lack(chosen: Sequence[Choice], weights: np.ndarray, widths_m: np.ndarray, read_out: ReadOut) -> tuple[int, int]:
+def _lack(
+    chosen: Sequence[PartChoice], weights: np.ndarray, widths_m: np.ndarray, read_out: BandwidthBudget
+) -> tuple[int, int]:
     """Rays that the parts lack, and bins that they need beyond the bandwidth."""
     most = np.array([ANY if one.shape is None else one.shape.part.rays for one in chosen])
     if read_out.rays is not None and np.minimum(most, read_out.rays).sum() < read_out.rays:
@@ -108,7 +114,7 @@ def _lack(chosen: Sequence[Choice], weights: np.ndarray, widths_m: np.ndarray, r
     return 0, max(int(counts @ bins) - allowed, 0)
 
 
-def gate_widths(chosen: Sequence[Choice], widths_m: np.ndarray) -> list[float]:
+def gate_widths(chosen: Sequence[PartChoice], widths_m: np.ndarray) -> list[float]:
     """Gate widths of the parts, and of the sensors that stay as they are [m]."""
     return [
         float(width) if one.shape is None else one.shape.gate_m[1] - one.shape.gate_m[0]
@@ -116,7 +122,7 @@ def gate_widths(chosen: Sequence[Choice], widths_m: np.ndarray) -> list[float]:
     ]
 
 
-def _refused(chosen: Sequence[Choice], lack: tuple[int, int], read_out: ReadOut) -> InfeasibleError:
+def _refused(chosen: Sequence[PartChoice], lack: tuple[int, int], read_out: BandwidthBudget) -> InfeasibleError:
     name = "budget.rays" if "budget.rays" in read_out.names else "--rays"
     if lack[0]:
         return InfeasibleError(
@@ -134,7 +140,7 @@ def _refused(chosen: Sequence[Choice], lack: tuple[int, int], read_out: ReadOut)
     )
 
 
-def fired(shape_pose: tuple[Choice, Pose | None], sensor: Sensor, count: int, seen: Features) -> np.ndarray:
+def fired(shape_pose: tuple[PartChoice, Pose | None], sensor: Sensor, count: int, seen: Features) -> np.ndarray:
     """The unit vectors that a sensor fires: of its part's pattern, or of its own even grid, shape (count, 3)."""
     choice, pose = shape_pose
     if choice.shape is None or pose is None:
@@ -144,7 +150,7 @@ def fired(shape_pose: tuple[Choice, Pose | None], sensor: Sensor, count: int, se
     return part_rays(part, pose, count, wanted=wanted).direction
 
 
-def useful_rays(choice: Choice, pose: Pose, seen: Features) -> int:
+def useful_rays(choice: PartChoice, pose: Pose, seen: Features) -> int:
     """How many rays of a part look at some of the density; at least one."""
     if choice.shape is None:
         return 0
@@ -153,7 +159,7 @@ def useful_rays(choice: Choice, pose: Pose, seen: Features) -> int:
     return max(int(wanted.sum()), 1)
 
 
-def counts_of(useful: np.ndarray, weights: np.ndarray, widths_m: np.ndarray, read_out: ReadOut) -> np.ndarray:
+def counts_of(useful: np.ndarray, weights: np.ndarray, widths_m: np.ndarray, read_out: BandwidthBudget) -> np.ndarray:
     """Rays of every sensor where none are asked for: what parts have to tell, as far as the bandwidth pays for it.
 
     Arguments:

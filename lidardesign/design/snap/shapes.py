@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from lidardesign.design.catalog.part import Part, to_angles, to_directions
 from lidardesign.design.catalog.placing import Pose, boresight_of
-from lidardesign.design.constraints.bounds import Bounds
+from lidardesign.design.mixture.bounds import Bounds
 from lidardesign.design.mixture.features import Axes
 from lidardesign.design.mixture.mixture import Mixture
 from lidardesign.design.sensor import boresight_frame
@@ -28,7 +28,7 @@ LEAST_FIELD_RAD = math.radians(1.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
+class PartShape:
     """A part in one of its two ways to be mounted.
 
     Arguments:
@@ -85,16 +85,16 @@ def gate_inside(part: Part, space: DesignSpace) -> tuple[float, float] | None:
     return (start, end) if start < end else None
 
 
-def shapes_of(part: Part, space: DesignSpace) -> list[Shape]:
+def shapes_of(part: Part, space: DesignSpace) -> list[PartShape]:
     """The ways to mount a part: none where it measures nothing inside the space, one where both angles are equal."""
     gate = gate_inside(part, space)
     if gate is None:
         return []
     horizontal, vertical = part.field_of_view_rad
-    return [Shape(part, turned, gate) for turned in ((False, True) if horizontal != vertical else (False,))]
+    return [PartShape(part, turned, gate) for turned in ((False, True) if horizontal != vertical else (False,))]
 
 
-def shaped_bounds(bounds: Bounds, shapes: Sequence[Shape | None], axes: Axes) -> Bounds:
+def shaped_bounds(bounds: Bounds, shapes: Sequence[PartShape | None], axes: Axes) -> Bounds:
     """Bounds whose components have the shapes of parts and nothing else; None leaves one as it was."""
     spread = [np.array(bounds.spread_low, dtype=np.float64), np.array(bounds.spread_high, dtype=np.float64)]
     gates = {name: np.array(getattr(bounds, name), dtype=np.float64) for name in GATE_BOUNDS}
@@ -109,7 +109,7 @@ def shaped_bounds(bounds: Bounds, shapes: Sequence[Shape | None], axes: Axes) ->
     return replace(bounds, spread_low=spread[0], spread_high=spread[1], **gates)
 
 
-def shaped_mixture(mixture: Mixture, shapes: Sequence[Shape | None], interval: float, axes: Axes) -> Mixture:
+def shaped_mixture(mixture: Mixture, shapes: Sequence[PartShape | None], interval: float, axes: Axes) -> Mixture:
     """Components that stand where they stood, with the shapes of parts; None leaves one as it was."""
     spread, middle, depth = mixture.spread_rad.copy(), mixture.range_m.copy(), mixture.spread_range_m.copy()
     for row, shape in enumerate(shapes):

@@ -16,10 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from lidardesign.config import FILE_NAME as CONFIG_FILE
-from lidardesign.design.constraints.bounds import Bounds
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.rules import bounds_of, groups
 from lidardesign.design.fit import EM_SAMPLES, HELD_OUT_SHARE, RESTARTS
+from lidardesign.design.mixture.bounds import Bounds, bounds_of, groups
 from lidardesign.design.mixture.conditions import MOVED_SAMPLES, at_condition, shown
 from lidardesign.design.mixture.em import fit_mixture
 from lidardesign.design.mixture.features import Axes, Features

@@ -21,13 +21,13 @@ import numpy as np
 from lidardesign.design.catalog.part import Part
 from lidardesign.design.catalog.placing import Pose, interleaved
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.rules import bounds_of
 from lidardesign.design.layouts.grid import low_discrepancy
+from lidardesign.design.mixture.bounds import bounds_of
 from lidardesign.design.mixture.em import fit_mixture
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.mixture import Mixture
 from lidardesign.design.sensor import DEFAULT_LEVEL, interval_factor
-from lidardesign.design.snap.shapes import Shape, in_view, shaped_bounds, shapes_of
+from lidardesign.design.snap.shapes import PartShape, in_view, shaped_bounds, shapes_of
 from lidardesign.numerics import effective_count
 from lidardesign.run.clock import phase
 from lidardesign.space import AZIMUTH, DIMENSIONS, RANGE, DesignSpace, aim, observed_point
@@ -252,7 +252,7 @@ def fitted_poses(
 
 
 def _fit(
-    features: Features, space: DesignSpace, shape: Shape, number: int, generator: np.random.Generator
+    features: Features, space: DesignSpace, shape: PartShape, number: int, generator: np.random.Generator
 ) -> tuple[Mixture, float]:
     free = bounds_of(Constraints(), space, tuple(range(number)), interval_factor(DEFAULT_LEVEL))
     bounds = shaped_bounds(free, [shape] * number, features.axes)
@@ -260,7 +260,7 @@ def _fit(
     return trace.mixture, trace.log_likelihood
 
 
-def _pose(shape: Shape, mixture: Mixture, row: int, origin_m: np.ndarray, axes: Axes) -> Pose:
+def _pose(shape: PartShape, mixture: Mixture, row: int, origin_m: np.ndarray, axes: Axes) -> Pose:
     azimuth = float(mixture.azimuth_rad[row]) if axes.horizontal else axes.azimuth_rad
     elevation = float(mixture.elevation_rad[row]) if axes.vertical else axes.elevation_rad
     return shape.pose(origin_m, azimuth, elevation, float(mixture.roll_rad[row]), axes)

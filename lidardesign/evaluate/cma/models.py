@@ -21,7 +21,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.constraints.budget import BIN_MARGIN, ReadOut
+from lidardesign.design.constraints.budget import BIN_MARGIN, BandwidthBudget
 from lidardesign.design.layouts.rays import lay_out, split_budget
 from lidardesign.design.sensor import MOST_RAYS, DesignSpec, Sensor, interval_factor
 from lidardesign.evaluate.baselines.candidates import Positions, mean_mbps
@@ -203,14 +203,14 @@ class Amount:
     def __init__(self, count: int | None, limit_mbps: float | None = None, bandwidth: Bandwidth | None = None) -> None:
         self.count, self.limit_mbps, self.bandwidth = count, limit_mbps, bandwidth or Bandwidth()
 
-    def read_outs(self, setting: Setting) -> list[ReadOut]:
+    def read_outs(self, setting: Setting) -> list[BandwidthBudget]:
         """The bandwidth budgets that hold: the constraints' own, and that of the comparison."""
         found = []
-        own = ReadOut.of(setting.constraints, self.count)
+        own = BandwidthBudget.of(setting.constraints, self.count)
         if own.limit_mbps is not None:
             found.append(own)
         if self.limit_mbps is not None:
-            found.append(ReadOut(self.bandwidth, self.limit_mbps, self.count))
+            found.append(BandwidthBudget(self.bandwidth, self.limit_mbps, self.count))
         return found
 
 
@@ -237,7 +237,7 @@ class Model(Protocol):
         ...
 
 
-def widest_bins(fits: Callable[[float], bool], widths_m: np.ndarray, read_out: ReadOut) -> float:
+def widest_bins(fits: Callable[[float], bool], widths_m: np.ndarray, read_out: BandwidthBudget) -> float:
     """The largest common cap of gates [m] that keeps a budget; infinite where none is needed, 0 where none does."""
     if fits(math.inf):
         return math.inf
@@ -341,7 +341,7 @@ class SensorModel:
         affordable = [one.affordable_rays(widths, weights) for one in amount.read_outs(self.setting)]
         return min(*affordable, MOST_RAYS)
 
-    def _afforded(self, vector: np.ndarray, figures: Figures, count: int, read_out: ReadOut) -> Figures:
+    def _afforded(self, vector: np.ndarray, figures: Figures, count: int, read_out: BandwidthBudget) -> Figures:
         """The numbers with gates no wider than a common cap that keeps the budget."""
 
         def narrowed(width_m: float) -> Figures:
@@ -350,7 +350,7 @@ class SensorModel:
         cap = widest_bins(lambda width: self._fits(narrowed(width), count, read_out), _widths(figures), read_out)
         return narrowed(cap) if cap > 0 else figures
 
-    def _fits(self, figures: Figures, count: int, read_out: ReadOut) -> bool:
+    def _fits(self, figures: Figures, count: int, read_out: BandwidthBudget) -> bool:
         if self.setting.layout == "scan":
             shares = np.full(len(figures), int(count > 0))
             return read_out.model.mbps_of_widths(_widths(figures), shares) <= (read_out.limit_mbps or math.inf)

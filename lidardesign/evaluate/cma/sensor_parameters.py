@@ -15,13 +15,11 @@ from functools import cached_property
 
 import numpy as np
 
-from lidardesign.design.constraints.bounds import Bounds, clip_azimuth
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.mounts import Mount, mounts_of
-from lidardesign.design.constraints.rules import bounds_of
+from lidardesign.design.constraints.origins import Boxes, Mount, box_around, mounts_of, nearest_admitted
 from lidardesign.design.layouts.gates import admissible_gates
+from lidardesign.design.mixture.bounds import Bounds, bounds_of, clip_azimuth
 from lidardesign.design.mixture.features import Axes
-from lidardesign.design.mixture.origins import Boxes, box_around, nearest_admitted
 from lidardesign.design.sensor import Coupling, Sensor, boresight_frame, interval_factor
 from lidardesign.numerics import ROUNDING, SLACK, TINY, clipped_eigenvalues, safe_divide
 from lidardesign.space import DesignSpace, angles, direction

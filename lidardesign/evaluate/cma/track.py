@@ -13,11 +13,11 @@ from functools import partial
 
 import numpy as np
 
-from lidardesign.design.constraints.bounds import Bounds
-from lidardesign.design.constraints.budget import ReadOut
+from lidardesign.design.constraints.budget import BandwidthBudget
 from lidardesign.design.layouts.gates import admissible_gates
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.layouts.track import boresight_azimuth
+from lidardesign.design.mixture.bounds import Bounds
 from lidardesign.design.sensor import DesignSpec, Sensor, Track
 from lidardesign.evaluate.baselines.candidates import Positions
 from lidardesign.evaluate.cma.models import GATE_SHARE, LOG_WIDTH, Amount, widest_bins
@@ -114,7 +114,7 @@ class TrackModel:
         design = self.design(vector, amount)
         return tuple(lay_out(design, design.rays, None, at=condition) for condition in self.conditions)
 
-    def _fits(self, vector: np.ndarray, read_out: ReadOut, width_m: float) -> bool:
+    def _fits(self, vector: np.ndarray, read_out: BandwidthBudget, width_m: float) -> bool:
         return read_out.model.mbps_of_widths(_widths(self.figures(vector, width_m))) <= (read_out.limit_mbps or 0.0)
 
     def _units(self) -> tuple[np.ndarray, np.ndarray]:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.design.constraints.slack import SPACE_MARK, Tightness
+from lidardesign.design.constraints.slack import SPACE_MARK, ConstraintSlack
 from lidardesign.evaluate.figures.canvas import (
     INK,
     PAGE_INCHES,
@@ -37,7 +37,7 @@ ON, OFF = "#0072B2", "#6b7280"
 LEAST_SHARE = 1e-4
 
 
-def constraints_picture(tightness: Mapping[str, Sequence[Tightness]]) -> Figure | None:
+def constraints_picture(tightness: Mapping[str, Sequence[ConstraintSlack]]) -> Figure | None:
     """The room that designs leave under each bound, a page wide; None where nothing was asked for.
 
     Arguments:
@@ -71,11 +71,11 @@ def constraints_picture(tightness: Mapping[str, Sequence[Tightness]]) -> Figure 
     return figure
 
 
-def _of_space(row: Tightness) -> bool:
+def _of_space(row: ConstraintSlack) -> bool:
     return row.name.startswith(SPACE_MARK)
 
 
-def bound_label(row: Tightness) -> str:
+def bound_label(row: ConstraintSlack) -> str:
     """A bound as its key and what was asked for."""
     return plain_label(f"{row.name}: {short_value(row.bound)}", longest=40)
 
@@ -92,7 +92,7 @@ def short_value(value: Any) -> str:
 
 
 def _draw_room(
-    axes: Axes, rows: Sequence[Tightness], labels: Sequence[str], number: int, count: int, name: str
+    axes: Axes, rows: Sequence[ConstraintSlack], labels: Sequence[str], number: int, count: int, name: str
 ) -> None:
     offset = (number - (count - 1) / 2) * 0.7 / count
     colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
@@ -118,7 +118,7 @@ def _draw_room(
         )
 
 
-def _place_of(row: Tightness) -> float:
+def _place_of(row: ConstraintSlack) -> float:
     """Where a bound stands on the axis: its share of room; what has no distance at the end of its side."""
     if row.share is not None:
         return PERCENT * row.share

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from lidardesign.design.constraints.check import check_design
-from lidardesign.design.constraints.slack import SPACE_MARK, Tightness, tightness
+from lidardesign.design.constraints.slack import SPACE_MARK, ConstraintSlack, constraint_slack
 from lidardesign.design.files import design_document
 from lidardesign.design.layouts.track import placed
 from lidardesign.design.sensor import DesignSpec
@@ -32,7 +32,7 @@ class Pictured:
 
     shown: Shown | None = None
     density: DensityView | None = None
-    tightness: Mapping[str, Sequence[Tightness]] = field(default_factory=dict)
+    tightness: Mapping[str, Sequence[ConstraintSlack]] = field(default_factory=dict)
     times: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
 
@@ -74,8 +74,8 @@ def density_of(request: EvaluationRequest) -> DensityView | None:
     return None if density is None else density_view(density.samples, request.test[0], request.designs)
 
 
-def tightness_of(design: DesignSpec, space: DesignSpace) -> list[Tightness]:
+def tightness_of(design: DesignSpec, space: DesignSpace) -> list[ConstraintSlack]:
     """How tight each constraint of a design is, by the independent checker; the bounds of its space last."""
     checks = check_design(design_document(design), design.constraints, space)
-    found = tightness(checks, [sensor.name for sensor in design.sensors])
+    found = constraint_slack(checks, [sensor.name for sensor in design.sensors])
     return sorted(found, key=lambda one: one.name.startswith(SPACE_MARK))

@@ -13,9 +13,9 @@ import numpy as np
 from scipy.special import ndtri
 
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.rules import bounds_of
 from lidardesign.design.layouts.gates import Heard, gates_within
 from lidardesign.design.layouts.shared_fields import bandwidth_limit
+from lidardesign.design.mixture.bounds import bounds_of
 from lidardesign.design.sensor import DesignSpec, RayTable, Sensor, interval_factor
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Rays

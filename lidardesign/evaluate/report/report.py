@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidardesign.design.constraints.slack import Tightness
+from lidardesign.design.constraints.slack import ConstraintSlack
 from lidardesign.evaluate.accuracy.settings import Ladder
 from lidardesign.evaluate.figures.curves import DASHES, Series, series
 from lidardesign.evaluate.figures.density_views import DensityView
@@ -74,7 +74,7 @@ class Report:
     title: str
     density: DensityView | None = None
     density_m: np.ndarray | None = None
-    constraints: Mapping[str, Sequence[Tightness]] = field(default_factory=dict)
+    constraints: Mapping[str, Sequence[ConstraintSlack]] = field(default_factory=dict)
     times: Sequence[CommandTimes] = ()
     reproduce: Reproduction = field(default_factory=Reproduction)
 
@@ -178,7 +178,7 @@ def _density(view: DensityView, looks: Mapping[str, Series]) -> str:
     )
 
 
-def _constraints(found: Mapping[str, Sequence[Tightness]]) -> str:
+def _constraints(found: Mapping[str, Sequence[ConstraintSlack]]) -> str:
     return "".join(constraints_table(name, bounds) for name, bounds in found.items())
 
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from lidardesign.design.constraints.slack import Tightness
+from lidardesign.design.constraints.slack import ConstraintSlack
 from lidardesign.evaluate.report.markup import definitions
 from lidardesign.evaluate.results import Audit, AuditRow, EffectSummary, Evaluation
 from lidardesign.evaluate.verdicts import TINY, figure, plain, table
@@ -61,7 +61,7 @@ class Reproduction:
     config: str = ""
 
 
-def constraints_table(name: str, found: Sequence[Tightness]) -> str:
+def constraints_table(name: str, found: Sequence[ConstraintSlack]) -> str:
     """One row per bound of a design, the tightest sensor, what room it leaves and how much of the bound is used."""
     if not found:
         return f"<p>{html.escape(name)} has no constraints.</p>"
@@ -72,7 +72,7 @@ def constraints_table(name: str, found: Sequence[Tightness]) -> str:
     return _scrolled(head, rows, caption)
 
 
-def _constraint_row(one: Tightness) -> str:
+def _constraint_row(one: ConstraintSlack) -> str:
     owner = f"{html.escape(one.sensor)}: " if one.sensor else ""
     how = {"broken": "worse", "at the bound": "open", "kept": "better"}[one.word]
     verdict = one.word
@@ -92,7 +92,7 @@ def _room(room: float, bound: Any) -> str:
     return "0" if abs(room) < TINY * size else number(room)
 
 
-def _used(one: Tightness) -> str:
+def _used(one: ConstraintSlack) -> str:
     """A bar that is full where a design is at its bound; in words for who cannot see it."""
     if one.share is None:
         return "-"

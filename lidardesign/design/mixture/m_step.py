@@ -13,10 +13,10 @@ import math
 
 import numpy as np
 
-from lidardesign.design.constraints.bounds import Bounds, Floors, clip_azimuth
+from lidardesign.design.mixture.bounds import Bounds, Floors, clip_azimuth
 from lidardesign.design.mixture.features import Features
 from lidardesign.design.mixture.mixture import SMALLEST_WEIGHT, Mixture, Statistics, frames
-from lidardesign.design.mixture.origin_step import Limits, best_origins
+from lidardesign.design.mixture.origin_step import OriginLimits, best_origins
 from lidardesign.numerics import COARSE_SLACK, SLACK, box_quadratic_minimum, sphere_exp, sphere_log, wrap_angle
 
 # A component with less than this share of the samples keeps its parameters: its moments are rounding noise.
@@ -78,7 +78,7 @@ def _origin(
         scatter[:, i, j] = scatter[:, j, i] = value
     # a floor above the largest admitted spread yields to it
     most = np.square(bounds.origin_spread)
-    limits = Limits(
+    limits = OriginLimits(
         low=bounds.origin_low[:, axes],
         high=bounds.origin_high[:, axes],
         free_low=bounds.free_low[:, :, axes],

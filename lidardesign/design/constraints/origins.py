@@ -1,0 +1,270 @@
+"""Where a sensor's origin may be: its box, minus the boxes that constraints exclude.
+
+What is left is not convex, so it is described by its maximal boxes: a box avoids the interiors of all excluded boxes
+just where it lies in one of the maximal boxes between them. So an interval of origins, which is a box of its own, is
+kept out of all excluded boxes by keeping it in one maximal box, and nothing is lost.
+
+Excluded boxes that take part of the origin box divide what is left of it, and an interval keeps to one of its parts:
+it would otherwise balance on an edge of the origin box, half of it outside, to cover other parts. Where none does,
+the mean alone keeps to the origin box, and its interval, which may be longer, has the excluded boxes beyond to avoid.
+Along axes on which the origin box is thin there is no freedom: an excluded box that does not hold the coordinate there
+is not in the way.
+
+Mounting points in a constraint file: which sensors have them, and whether there are enough for all.
+
+Where sensors are asked to stand and where a design space lets them: two numbers for one place are one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidardesign.design.constraints.document import Constraints, SensorConstraints
+from lidardesign.numerics import HALF_DIGITS, SLACK
+from lidardesign.space import DIMENSIONS, DesignSpace
+
+# Origin boxes thinner than this along an axis pin it [m].
+PINNED_BOX_M = SLACK
+# Gaps between excluded boxes narrower than this, in metres and relative to coordinates, leave no place.
+SMALLEST_GAP = HALF_DIGITS
+
+
+class Boxes(NamedTuple):
+    """Boxes with their sides along the axes.
+
+    Arguments:
+        low_m: Lower corners, shape (M, 3); may be -inf.
+        high_m: Upper corners, shape (M, 3); may be inf.
+    """
+
+    low_m: np.ndarray
+    high_m: np.ndarray
+
+
+def origin_box(one: SensorConstraints, space: DesignSpace) -> tuple[np.ndarray, np.ndarray]:
+    """The box of a sensor's mean origin inside the design space, (3,) each [m]; a point where it is fixed."""
+    low, high = (np.array(bound[:3], dtype=np.float64) for bound in (space.low, space.high))
+    if one.origin.low_m is not None:
+        low = np.maximum(low, one.origin.low_m)
+    if one.origin.high_m is not None:
+        high = np.minimum(high, one.origin.high_m)
+    if one.origin.fixed_m is not None:
+        fixed = np.array(one.origin.fixed_m)
+        free = np.isin(np.arange(3), space.free)
+        low = high = np.where(free, fixed, np.array(space.low[:3]))
+    return low, np.maximum(low, high)
+
+
+def excluded(one: SensorConstraints) -> Boxes:
+    """The boxes that a sensor's constraints exclude, flat ones included."""
+    boxes = one.origin.exclude or []
+    low, high = ([getattr(box, key) for box in boxes] for key in ("low_m", "high_m"))
+    return Boxes(np.array(low, dtype=np.float64).reshape(-1, 3), np.array(high, dtype=np.float64).reshape(-1, 3))
+
+
+def inside_excluded(origins_m: np.ndarray, one: SensorConstraints) -> np.ndarray:
+    """Which origins (N, 3) lie in the interior of an excluded box, shape (N,) bool."""
+    inside = np.zeros(len(origins_m), dtype=bool)
+    for low, high in zip(*excluded(one), strict=True):
+        inside |= ((origins_m > low) & (origins_m < high)).all(axis=1)
+    return inside
+
+
+def free_boxes(one: SensorConstraints, space: DesignSpace) -> Boxes:
+    """The maximal boxes between the excluded ones that hold a sensor's intervals; none where all is excluded.
+
+    Where no excluded box meets the origin box they may reach beyond it; along axes without freedom they are the line.
+    """
+    low, high = origin_box(one, space)
+    fixed = high - low <= PINNED_BOX_M
+    middle = (low + high) / 2
+    bottoms, tops = excluded(one)
+    held = np.where(fixed, (bottoms < middle) & (middle < tops), bottoms < tops).all(axis=1)
+    bottoms, tops = bottoms[held], tops[held]
+    inside = (((bottoms < high) & (tops > low)) | fixed).all(axis=1).any()
+    kept = ~fixed & inside
+    free = Boxes(np.where(kept, low, -np.inf)[None], np.where(kept, high, np.inf)[None])
+    for bottom, top in zip(bottoms, tops, strict=True):
+        free = _without(free, bottom, top, low, high, ~fixed)
+    # in an order that is not that of the excluded boxes, for where two are equally good
+    corners = np.unique(np.concatenate(free, axis=1), axis=0)
+    return Boxes(corners[:, :3], corners[:, 3:])
+
+
+def _without(
+    boxes: Boxes, bottom: np.ndarray, top: np.ndarray, low: np.ndarray, high: np.ndarray, axes: np.ndarray
+) -> Boxes:
+    """The maximal boxes inside some others that avoid one more, cut along some axes, with room in [low, high]."""
+    met = ((boxes.low_m < top) & (boxes.high_m > bottom) | ~axes).all(axis=1)
+    lows, highs = [], []
+    for axis in np.flatnonzero(axes):
+        below, above = boxes.high_m[met].copy(), boxes.low_m[met].copy()
+        below[:, axis] = np.minimum(below[:, axis], bottom[axis])
+        above[:, axis] = np.maximum(above[:, axis], top[axis])
+        lows += [boxes.low_m[met], above]
+        highs += [below, boxes.high_m[met]]
+    old = np.concatenate([boxes.low_m, -boxes.high_m], axis=1)[~met]
+    if not lows:
+        return Boxes(old[:, :3], -old[:, 3:])
+    fresh = np.concatenate([np.concatenate(lows), -np.concatenate(highs)], axis=1)
+    fresh = fresh[_roomy(Boxes(fresh[:, :3], -fresh[:, 3:]), low, high, axes)]
+    # no old box lies in a fresh one, which is part of another old box
+    fresh = np.unique(fresh, axis=0)
+    holds = (np.concatenate([old, fresh])[None] <= fresh[:, None]).all(axis=2)
+    corners = np.concatenate([old, fresh[holds.sum(axis=1) == 1]])
+    return Boxes(corners[:, :3], -corners[:, 3:])
+
+
+def _roomy(boxes: Boxes, low: np.ndarray, high: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Which boxes leave room inside [low, high] along some axes, shape (M,) bool."""
+    size = np.maximum(np.maximum(np.abs(low), np.abs(high)), 1.0)
+    needed = np.minimum(SMALLEST_GAP * size, (high - low) / 2)
+    room = np.minimum(boxes.high_m, high) - np.maximum(boxes.low_m, low)
+    return (room > needed)[:, axes].all(axis=1)
+
+
+def box_around(mean_m: np.ndarray, reach_m: np.ndarray, boxes: Boxes) -> tuple[np.ndarray, np.ndarray]:
+    """The box that holds an interval, mean -+ reach (3,) each, or lacks least of it: low and high, (3,) each [m]."""
+    lacking = np.maximum(boxes.low_m - (mean_m - reach_m), 0.0) + np.maximum(mean_m + reach_m - boxes.high_m, 0.0)
+    best = int(np.square(lacking).sum(axis=1).argmin())
+    return boxes.low_m[best], boxes.high_m[best]
+
+
+def nearest_admitted(origins_m: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """The nearest point of any of M boxes, given by corners (M, 3), to each of some origins (N, 3): shape (N, 3)."""
+    clipped = np.clip(origins_m[:, None], low, high)
+    away = np.square(clipped - origins_m[:, None]).sum(axis=2)
+    return np.take_along_axis(clipped, away.argmin(axis=1)[:, None, None], axis=1)[:, 0]
+
+
+Mount = tuple[float, float, float]
+
+
+def mounts_of(constraints: Constraints, sensor: int) -> list[Mount]:
+    """The mounts that one sensor may take, those in an excluded box left out; none where it is not mounted."""
+    one = constraints.of_sensor(sensor)
+    listed = [(x, y, z) for x, y, z in one.origin.mounts_m or []]
+    dropped = inside_excluded(np.array(listed, dtype=np.float64).reshape(-1, 3), one)
+    return [mount for mount, inside in zip(listed, dropped, strict=True) if not inside]
+
+
+def is_mounted(constraints: Constraints) -> bool:
+    """Whether any sensor sits at a mount."""
+    return any(mounts_of(constraints, sensor) for sensor in range(len(constraints.each) + 1))
+
+
+def most_mounted(constraints: Constraints) -> int | None:
+    """The largest number of sensors that all find a mount; None where the number is not limited.
+
+    Sensors beyond the entries of `each` share the common list.
+    """
+    common = mounts_of(constraints, len(constraints.each))
+    count = len(constraints.each) + len(common)
+    options = [mounts_of(constraints, sensor) for sensor in range(count)]
+    while not mounts_suffice([mounts for mounts in options[:count] if mounts]):
+        count -= 1
+    return None if not common and count == len(constraints.each) else count
+
+
+def mounts_suffice(options: Sequence[Sequence[Mount]]) -> bool:
+    """Whether each of some mounted sensors can have a mount of its own; one without any left cannot."""
+    if not options or not all(options):
+        return not options
+    # loaded here because few constraint files have mounts
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import maximum_bipartite_matching
+
+    places = sorted({mount for mounts in options for mount in mounts})
+    admitted = np.array([[mount in mounts for mount in places] for mounts in options], dtype=np.int8)
+    return bool((maximum_bipartite_matching(csr_array(admitted), perm_type="column") >= 0).all())
+
+
+def fix_origins(constraints: Constraints, places: Sequence[Mount | None]) -> Constraints:
+    """The constraints with sensor i fixed at the i-th place, and no mounts left to choose."""
+    each = []
+    for sensor, place in enumerate(places):
+        one = constraints.of_sensor(sensor)
+        if place is not None:
+            origin = one.origin.model_copy(update={"mounts_m": None, "fixed_m": list(place)})
+            one = one.model_copy(update={"origin": origin})
+        each.append(one)
+    common = constraints.origin.model_copy(update={"mounts_m": None})
+    return constraints.model_copy(update={"origin": common, "each": each})
+
+
+def placement_notes(constraints: Constraints) -> tuple[str, ...]:
+    """What the constraints say without effect: mounts in excluded boxes, and excluded boxes without volume."""
+    notes = []
+    for index in range(len(constraints.each) + 1):
+        one = constraints.of_sensor(index)
+        left, listed = mounts_of(constraints, index), one.origin.mounts_m or []
+        name = constraints.name_of(index, "origin.exclude")
+        if len(left) < len(listed):
+            mounts = constraints.name_of(index, "origin.mounts_m")
+            places = ", ".join(str(mount) for mount in listed if tuple(mount) not in left)
+            notes.append(f"{len(listed) - len(left)} of {len(listed)} {mounts} left out, inside {name}: {places}")
+        for number, box in enumerate(one.origin.exclude or []):
+            if not all(low < high for low, high in zip(box.low_m, box.high_m, strict=True)):
+                notes.append(f"{name}[{number}] has no volume and excludes nothing")
+    return tuple(dict.fromkeys(notes))
+
+
+# An origin that is pinned no further than this from where the space fixes it is meant to be there [m]: tables, robot
+# models and drawings say places to the millimetre, and no sensor is mounted more exactly.
+SAME_PLACE_M = 1e-3
+
+
+def fixed_axes(space: DesignSpace) -> list[int]:
+    """The axes of origins on which the design space leaves one place."""
+    return [axis for axis in range(3) if axis not in space.free]
+
+
+def snap_place_to_space(origin_m: Sequence[float], space: DesignSpace) -> list[float]:
+    """An origin (3,) [m], with those coordinates of the space that it differs from by less than anyone mounts."""
+    place = [float(value) for value in origin_m]
+    for axis in fixed_axes(space):
+        if abs(place[axis] - space.low[axis]) <= SAME_PLACE_M:
+            place[axis] = float(space.low[axis])
+    return place
+
+
+def snap_to_space(constraints: Constraints, space: DesignSpace) -> tuple[Constraints, list[str]]:
+    """Constraints whose pinned origins are where the space fixes them, and a note for each that was moved there.
+
+    The same object where nothing moves.
+    """
+    document: dict[str, Any] = constraints.as_document()
+    notes, changed = [], False
+    for name, one in (("", document), *((f"each[{i}].", one) for i, one in enumerate(document.get("each", [])))):
+        given = (one.get("origin") or {}).get("fixed_m")
+        place = given if given is None else snap_place_to_space(given, space)
+        if given is not None and place != list(given):
+            one["origin"], changed = {**one["origin"], "fixed_m": place}, True
+            off = float(np.abs(np.subtract(place, given)).max())
+            if off > SLACK:
+                stand = "from where the run's sensors stand: taken to be there"
+                notes.append(f"{name}origin.fixed_m is {1e3 * off:.2g} mm {stand}")
+    return (Constraints.from_mapping(document) if changed else constraints), notes
+
+
+def axes_outside(low_m: Sequence[float], high_m: Sequence[float], space: DesignSpace) -> list[int]:
+    """The axes on which a box of origins lies outside the design space, but for conditions, along which it moves."""
+    return [
+        axis
+        for axis in range(3)
+        if DIMENSIONS[axis] not in space.condition
+        and (low_m[axis] > space.high[axis] + SAME_PLACE_M or high_m[axis] < space.low[axis] - SAME_PLACE_M)
+    ]
+
+
+def place_text(low_m: Sequence[float], high_m: Sequence[float]) -> str:
+    """A box of origins for people, as `x 0.451, y -1 to 1, z 0 m`."""
+    ends = [tuple(f"{round(end, 6) + 0.0:.7g}" for end in pair) for pair in zip(low_m, high_m, strict=True)]
+    told = [
+        f"{name} {low}" if low == high else f"{name} {low} to {high}"
+        for name, (low, high) in zip("xyz", ends, strict=True)
+    ]
+    return f"{', '.join(told)} m"
