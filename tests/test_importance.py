@@ -9,6 +9,7 @@ import pytest
 import torch
 import trimesh
 from lidardesign_tasks.face import FaceConfig, FaceTask
+from small_runs import shifted
 
 from lidardesign.config import DensitySettings, LearningSettings, RunConfig
 from lidardesign.density.fields.grids import grid_around
@@ -399,7 +400,7 @@ def learned(tmp_path_factory):
         coverage_proposals=2048,
     )  # fmt: skip
     config = RunConfig(
-        task_name="patches", seed=1, preset="draft", task=TaskConfig(), space=PATCHES,
+        task_name="patches", seed=shifted(1), preset="draft", task=TaskConfig(), space=PATCHES,
         density=DensitySettings(sigma_m=0.03, field_resolution=48), learning=settings,
     )  # fmt: skip
     return learn(PatchesTask(), config, run), load_samples(run), config

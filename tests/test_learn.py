@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from small_runs import shifted
 
 from lidardesign.config import DensitySettings, LearningSettings, RunConfig
 from lidardesign.density import learn as learning
@@ -52,7 +53,7 @@ class BallTask:
 
 def config_of(space=SPACE, seed=3, **settings):
     return RunConfig(
-        task_name="ball", seed=seed, preset="draft", task=TaskConfig(), space=space,
+        task_name="ball", seed=shifted(seed), preset="draft", task=TaskConfig(), space=space,
         density=DensitySettings(sigma_m=0.05), learning=LearningSettings(**{**SMALL, **settings}),
     )  # fmt: skip
 

@@ -23,6 +23,7 @@ from command_line import caller, files_under, make_run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from small_runs import shifted
 from test_hard_learning import interrupt_after_a_checkpoint
 from test_registry import BROKEN, GOOD
 
@@ -50,9 +51,10 @@ from lidardesign.space import DesignSpace
 from lidardesign.task import Score
 
 FLATLAND = (
-    "learn", "flatland", "--preset", "draft", "--seed", "3",
+    "learn", "flatland", "--preset", "draft", "--seed", str(shifted(3)),
     *(word for setting in (
-        "train=3", "test=2", "learning.steps=40", "learning.batch=64", "learning.layers=1", "learning.hidden=16",
+        "train=3", "test=2", "density.sigma_m=0.06",
+        "learning.steps=40", "learning.batch=64", "learning.layers=1", "learning.hidden=16",
         "learning.samples=2000", "learning.balance_proposals=512", "learning.coverage_proposals=256",
         "learning.checkpoint_seconds=0.001",
     ) for word in ("--set", setting)),
