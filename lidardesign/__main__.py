@@ -1,4 +1,4 @@
-"""`python -m lidardesign` and `torchrun -m lidardesign`: the program."""
+"""`python -m lidardesign`: the program."""
 
 from lidardesign.cli.main import run
 

@@ -109,12 +109,6 @@ class DivergenceError(NumericalError):
     """Learning that diverged; the message names the last good checkpoint (exit 5)."""
 
 
-class LostRankError(LidardesignError):
-    """Another of the processes that learn together ended or cannot be reached (exit 3)."""
-
-    exit_code, kind = 3, "system"
-
-
 class PluginError(LidardesignError):
     """A task plugin that failed to load or broke its contract (exit 6)."""
 

@@ -21,7 +21,7 @@ HEADINGS = (
     ("Design space and density", range(1, 11)),
     ("Fields and meshes", range(11, 17)),
     ("Rays and simulation", range(17, 23)),
-    ("Learning the flow", range(23, 29)),
+    ("Learning the flow", range(23, 28)),
     ("Mixtures, constraints, designs", range(29, 36)),
     ("Files, plugins, processes", range(36, 41)),
 )

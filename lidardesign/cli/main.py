@@ -25,7 +25,6 @@ from lidardesign.cli.environment import make_streams_tolerant, set_cache_default
 from lidardesign.cli.manual import PAGES, add_manuals
 from lidardesign.cli.mistakes import hint_of
 from lidardesign.cli.output import EXIT_BROKEN_PIPE, Console, forget_stdout, print_json, report_error, tell
-from lidardesign.cli.ranks import refuse_ranks
 from lidardesign.cli.stdout_guard import print_aside_from_now_on
 
 EXIT_USAGE = 2
@@ -58,14 +57,11 @@ def _print_version(wanted: bool) -> None:
 
 @app.callback()
 def program(
-    context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """Declare the options of the program itself; the typer object carries its help."""
-    if context.invoked_subcommand != "learn":
-        refuse_ranks(context.invoked_subcommand or "this")
 
 
 def run(arguments: list[str] | None = None) -> None:

@@ -118,7 +118,6 @@ PAGES: dict[str, Manual] = {
             "lidardesign learn face --time-budget 60 --out runs/minute": "as well as a minute allows",
             "lidardesign learn face --out runs/face --resume": "go on after Ctrl-C, to the same bytes",
             "lidardesign learn face --out runs/face --dry-run": "what would be learned, and where to",
-            "torchrun --nproc-per-node 2 -m lidardesign learn face --out runs/face": "two processes learn together",
         },
         about="Learns which rays are worth firing. All that follows (fit, constrain, evaluate, export) works on the "
         "run folder that this makes, and learns nothing again.",
@@ -127,7 +126,7 @@ PAGES: dict[str, Manual] = {
             "RUN/: config.yaml, manifest.json, flow.safetensors, samples.npz, checkpoint.safetensors, progress.jsonl",
         ),
         exits={1: "--tolerance was not reached", 5: "learning diverged", 6: "the task's plugin failed"},
-        see=("run-folder.md", "accuracy.md", "cluster.md"),
+        see=("run-folder.md", "accuracy.md"),
     ),
     "fit": Manual(
         {

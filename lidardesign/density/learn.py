@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -13,7 +12,6 @@ import torch
 from lidardesign.config import LearningSettings, RunConfig
 from lidardesign.density.flow.flow import DesignFlow
 from lidardesign.density.flow.objective import Coordinates
-from lidardesign.density.ranks import ALONE, Ranks
 from lidardesign.density.target.device import on_device, stays_on
 from lidardesign.density.training.checkpoint import clear_snapshots, save_arrays
 from lidardesign.density.training.quality import Measured, draw_probes, measure
@@ -22,7 +20,7 @@ from lidardesign.density.training.training_data import Ground, prepare_ground
 from lidardesign.errors import ConfigError
 from lidardesign.estimates import Estimate
 from lidardesign.run.clock import phase, running
-from lidardesign.run.manifest import note, record, versions
+from lidardesign.run.manifest import note, record
 from lidardesign.samples import Samples, save_samples
 from lidardesign.scene import Scene
 from lidardesign.space import AZIMUTH
@@ -72,7 +70,6 @@ def learn(
     device: str = "auto",
     progress: Callable[[LearnProgress], None] | None = None,
     ground: Ground | None = None,
-    ranks: Ranks = ALONE,
     replan: Callable[[Trainer], LearningSettings] | None = None,
 ) -> LearnResult:
     """Learn the density of a task into a run folder.
@@ -85,27 +82,28 @@ def learn(
         device: auto, cpu or cuda: where the flow lives, and what of the target can (`device_target`).
         progress: Called about every tenth step.
         ground: What `prepare_ground` made of the same task and configuration, to be learned on again.
-        ranks: Who learns together; see `parallel_learn`. The first one alone writes.
         replan: Asked for the settings anew when balancing begins; see `Trainer`.
 
     Raises:
         ConfigError, DataError: Unusable settings or scenes.
         DivergenceError: Learning stayed non-finite; the last good checkpoint is kept.
     """
-    place = own_device(choose_device(device), ranks)
+    place = choose_device(device)
     with running() as clock:
-        ground = prepare_ground(task, config, ranks) if ground is None else ground
-        ranks.announce({"job": "learn", "config": config.as_document(), "device": device, "resume": resume})
+        ground = prepare_ground(task, config) if ground is None else ground
         trainer = make_trainer(ground, config, run, place)
         trainer.replan = replan
-        _start(trainer, config, resume)
+        if resume:
+            trainer.resume()
+        else:
+            (run / PROGRESS).unlink(missing_ok=True)
+            clear_snapshots(run)
         with phase("learning"):
             trainer.train(progress)
         # float32 steps train as well and cost less; samples and their densities are worth float64
         trainer.flow.double()
         measured = _measured(trainer, ground.scenes, config)
-        if ranks.first:
-            _store(trainer, measured.samples, config, run)
+        _store(trainer, measured.samples, config, run)
     result = LearnResult(
         run=str(run),
         task=config.task_name,
@@ -116,9 +114,8 @@ def learn(
         error_estimates=measured.estimates,
         **{name: estimate.value for name, estimate in measured.estimates.items()},
     )
-    if ranks.first:
-        found = {"visibility": ground.target.visibility.name, "round_trip_nats": measured.round_trip_nats}
-        note(run, learn=result.as_dict(), ranks=ranks.size, **found)
+    found = {"visibility": ground.target.visibility.name, "round_trip_nats": measured.round_trip_nats}
+    note(run, learn=result.as_dict(), ranks=1, **found)
     return result
 
 
@@ -130,19 +127,6 @@ def _notes(trainer: Trainer, place: torch.device) -> list[str]:
     if trainer.doubled_at is not None:
         notes.append(f"float32 could not invert the flow's splines: from step {trainer.doubled_at} on float64")
     return notes
-
-
-def _start(trainer: Trainer, config: RunConfig, resume: bool) -> None:
-    """Take the run's checkpoint or clear what an earlier start left, on ranks that have all in common."""
-    ranks, run = trainer.target.ranks, trainer.run
-    document = {"config": config.as_document(), "versions": versions(), "columns": trainer.target.columns}
-    weights = [value.detach().cpu().numpy().tobytes() for value in trainer.flow.state_dict().values()]
-    ranks.agree("scenes, settings or versions", json.dumps(document, sort_keys=True).encode() + b"".join(weights))
-    if resume:
-        trainer.resume()
-    elif ranks.first:
-        (run / PROGRESS).unlink(missing_ok=True)
-        clear_snapshots(run)
 
 
 def choose_device(name: str) -> torch.device:
@@ -158,23 +142,6 @@ def choose_device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise ConfigError("no CUDA device is available", where="--device", allowed="auto, cpu")
     return torch.device(name)
-
-
-def own_device(device: torch.device, ranks: Ranks) -> torch.device:
-    """The GPU of a rank; the CPU is everyone's.
-
-    Raises:
-        ConfigError: There are more ranks than GPUs on this computer.
-    """
-    if device.type != "cuda" or ranks.size == 1:
-        return device
-    if ranks.local_rank >= torch.cuda.device_count():
-        raise ConfigError(
-            f"rank {ranks.rank} has no GPU of its own",
-            where="--device",
-            allowed=f"at most {torch.cuda.device_count()} ranks on this computer, or --device cpu",
-        )
-    return torch.device("cuda", ranks.local_rank)
 
 
 @phase("flow")

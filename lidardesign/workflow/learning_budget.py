@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     from lidardesign.config import RunConfig
     from lidardesign.density.learn import LearnProgress, LearnResult
-    from lidardesign.density.ranks import Ranks
     from lidardesign.density.training.schedule import ToleranceGoal
     from lidardesign.task import Task
 
@@ -83,15 +82,12 @@ class Goal:
         return {"time_budget_s": self.time_budget_s}
 
 
-def checked_goal(
-    tolerance: float | None, time_budget_s: float | None, given: Mapping[str, Any], ranks: Ranks
-) -> Goal:
+def checked_goal(tolerance: float | None, time_budget_s: float | None, given: Mapping[str, Any]) -> Goal:
     """The goal of the two options.
 
     Arguments:
         tolerance, time_budget_s: The options.
         given: The other options of the configuration.
-        ranks: Who learns together.
 
     Raises:
         ConfigError: Both, a value that is none, or a number of steps beside a time.
@@ -109,8 +105,6 @@ def checked_goal(
         raise ConfigError(f"the time decides {STEPS_KEY}", where=TIME_BUDGET, hint=f"leave out --set {STEPS_KEY}")
     if given["config_file"] is not None:
         _refuse_steps_in(given["config_file"])
-    if ranks.size > 1:
-        raise ConfigError("plans steps for one rank", where=TIME_BUDGET, hint=f"--set {STEPS_KEY}=N, or {TOLERANCE}")
     return Goal(None, time_budget_s)
 
 
@@ -157,7 +151,6 @@ class Learner:
         run: The folder.
         device: auto, cpu or cuda.
         progress: Called about every tenth step.
-        ranks: Who learns together.
         console: Whose clock the time budget is measured by.
     """
 
@@ -165,7 +158,6 @@ class Learner:
     run: Path
     device: str
     progress: Callable[[LearnProgress], None]
-    ranks: Ranks
     console: Console
 
     def learn(self, config: RunConfig, goal: Goal, *, resume: bool) -> LearnResult:
@@ -174,7 +166,7 @@ class Learner:
             from lidardesign.density.learn import learn as learn_density
             from lidardesign.run.manifest import read_manifest
 
-        options: dict[str, Any] = {"device": self.device, "progress": self.progress, "ranks": self.ranks}
+        options: dict[str, Any] = {"device": self.device, "progress": self.progress}
         if goal.tolerance is not None:
             return self._to_tolerance(config, goal, resume, options)
         if goal.time_budget_s is not None and not resume:
@@ -190,7 +182,7 @@ class Learner:
         begun, note = goal_of(self.run), ""
         if begun is None:
             config, begun, note = self._begun(config, goal)
-        ground = prepare_ground(self.task, config, self.ranks)
+        ground = prepare_ground(self.task, config)
 
         def once(staged: RunConfig, going_on: bool) -> LearnResult:
             return learn_density(self.task, staged, self.run, resume=going_on, ground=ground, **options)
@@ -224,8 +216,6 @@ class Learner:
         from lidardesign.density.training.schedule import Timekeeper
         from lidardesign.density.training.training_data import prepare_ground
 
-        if self.ranks.size > 1:  # also where a run is started anew whose goal is in its manifest
-            raise ConfigError("plans steps for one rank", where=TIME_BUDGET, hint="resume the run on one rank")
         place = choose_device(self.device)
         clock, age = self.console.clock, _age_s()
         startup = STARTUP_S if age is None or age - clock.seconds > MOST_STARTUP_S else age - clock.seconds

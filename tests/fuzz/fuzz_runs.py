@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 from command_line import make_run
 from fuzz_kinds import Read, of_file
@@ -106,14 +105,12 @@ def _trainer(run: Path) -> object:
 
     from lidardesign.density.flow.objective import Coordinates
     from lidardesign.density.learn import make_flow
-    from lidardesign.density.ranks import ALONE
     from lidardesign.density.training.training import Trainer
 
     config = small_config()
     generator = torch.Generator().manual_seed(0)
-    target = SimpleNamespace(ranks=ALONE)
     flow, coordinates = make_flow(config, generator), Coordinates(config.space)
-    trainer = Trainer(flow, target, coordinates, config.learning, run, generator, None)
+    trainer = Trainer(flow, None, coordinates, config.learning, run, generator, None)
     for parameter in trainer.flow.parameters():
         parameter.grad = torch.zeros_like(parameter)
     trainer.optimiser.step()

@@ -318,18 +318,14 @@ class TestCheckpoints:
 
 def fresh_trainer(run, hidden):
     """A trainer of a small flow at its first step, with nothing to train on."""
-    from types import SimpleNamespace
-
     import torch
 
     from lidardesign.density.flow.objective import Coordinates
     from lidardesign.density.learn import make_flow
-    from lidardesign.density.ranks import ALONE
     from lidardesign.density.training.training import Trainer
 
     small = [f"learning.hidden={hidden}", "learning.layers=1", "learning.bins=4"]
     config = resolve(load_task("flatland"), preset="draft", overrides=small)
     generator = torch.Generator().manual_seed(0)
     flow, coordinates = make_flow(config, generator), Coordinates(config.space)
-    target = SimpleNamespace(ranks=ALONE)
-    return Trainer(flow, target, coordinates, config.learning, run, generator, None)
+    return Trainer(flow, None, coordinates, config.learning, run, generator, None)

@@ -13,9 +13,8 @@ import typer
 from lidardesign.cli import options
 from lidardesign.cli.dry_run import DryRun, tell_plan
 from lidardesign.cli.output import Console, command
-from lidardesign.cli.ranks import joined_ranks
 from lidardesign.cli.tables.times import keep_times
-from lidardesign.errors import DataError, LostRankError
+from lidardesign.errors import DataError
 from lidardesign.run.clock import WAIT_S, phase
 from lidardesign.workflow.learning_budget import Learner, TimeBudget, Tolerance, check_met, checked_goal
 from lidardesign.workflow.run_lifecycle import (
@@ -35,7 +34,6 @@ if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
     from lidardesign.density.learn import LearnProgress, LearnResult
-    from lidardesign.density.ranks import Ranks
 
 DEVICES = ("auto", "cpu", "cuda")
 # Below these a density is too rough for figures that are meant seriously.
@@ -70,10 +68,10 @@ def learn(
     debug: options.Debug = False,
 ) -> None:
     """Learn where rays are worth firing for TASK, into a run folder."""
-    with command(json=json, quiet=quiet, debug=debug) as console, joined_ranks(console) as ranks:
+    with command(json=json, quiet=quiet, debug=debug) as console:
         check_choice(device, "--device", DEVICES)
         choices = {"preset": preset, "config_file": config, "overrides": overrides or (), "seed": seed}
-        goal = checked_goal(tolerance, time_budget, choices, ranks)
+        goal = checked_goal(tolerance, time_budget, choices)
         with phase("libraries"):
             import lidardesign.config  # noqa: F401
             from lidardesign.registry import load_task
@@ -87,7 +85,7 @@ def learn(
 
             tell_plan(learn_plan(job, device, config), console)
             return
-        result = _learn_in_folder(job, device, console, ranks)
+        result = _learn_in_folder(job, device, console)
         keep_times(run, "learn", console, wait_s=WAIT_S)
         result = replace(result, notes=(*result.notes, *_advice(result)))
         untold = [] if console.quiet else [note for note in result.notes if note not in told]
@@ -107,7 +105,7 @@ def _tell_task_notes(job: Job, console: Console) -> list[str]:
     return found
 
 
-def _learn_in_folder(job: Job, device: str, console: Console, ranks: Ranks) -> LearnResult:
+def _learn_in_folder(job: Job, device: str, console: Console) -> LearnResult:
     from lidardesign.run.lock import run_lock
 
     task, run = job.task.name, job.run
@@ -119,15 +117,15 @@ def _learn_in_folder(job: Job, device: str, console: Console, ranks: Ranks) -> L
                 begin(job)
             console.when_interrupted = lambda: _interruption(task, run)
             with _progress(console) as progress:
-                learner = Learner(job.task, run, device, progress, ranks, console)
+                learner = Learner(job.task, run, device, progress, console)
                 try:
                     return learner.learn(job.settings, job.goal, resume=job.has_checkpoint)
-                except (LostRankError, DataError) as error:
-                    # of errors about data, those that only ended the writing: a full disk
-                    if isinstance(error, DataError) and not isinstance(error.__cause__, OSError):
+                except DataError as error:
+                    # only what ended the writing, as a full disk does
+                    if not isinstance(error.__cause__, OSError):
                         raise
                     hint = f"{error.hint}; {_interruption(task, run)}"
-                    raise type(error)(error.message, where=error.where, hint=hint) from error.__cause__
+                    raise DataError(error.message, where=error.where, hint=hint) from error.__cause__
 
 
 def _interruption(task: str, run: Path) -> str | None:

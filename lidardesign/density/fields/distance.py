@@ -164,9 +164,8 @@ def scene_columns(scenes: Sequence[Scene]) -> list[tuple[int, int]]:
 
 
 def build_field(
-    scenes: Sequence[Scene], chosen: Callable[[Body], bool], *, resolution: int, padding_m: float,
-    around: Sequence[Scene] | None = None,
-) -> Field:  # fmt: skip
+    scenes: Sequence[Scene], chosen: Callable[[Body], bool], *, resolution: int, padding_m: float
+) -> Field:
     """The distances of the chosen bodies of all scenes.
 
     Arguments:
@@ -174,7 +173,6 @@ def build_field(
         chosen: Which bodies count, as `lambda body: body.is_target`.
         resolution: Grid points along the longest side of a mesh field.
         padding_m: How far grids reach beyond their meshes [m].
-        around: Scenes whose meshes the shared table's grid must hold; these by default.
     """
     columns = scene_columns(scenes)
     at_rest: list[tuple[int, Body]] = []
@@ -187,22 +185,11 @@ def build_field(
                 others.append((column, body, frame))
     fields: list[Field] = []
     if at_rest:
-        grid = _table_grid(scenes if around is None else around, chosen, resolution, padding_m)
-        fields.append(_table_field(at_rest, len(columns), grid))
+        fields.append(_table_field(at_rest, len(columns), resolution, padding_m))
     if others or not at_rest:
         build = partial(own_grid, resolution=resolution, padding_m=padding_m)
         fields.append(BodyField(place_bodies(others, len(columns), build)))
     return fields[0] if len(fields) == 1 else UnionField(*fields)
-
-
-def _table_grid(
-    scenes: Sequence[Scene], chosen: Callable[[Body], bool], resolution: int, padding_m: float
-) -> Grid:
-    """The grid around the chosen meshes at rest of all scenes."""
-    bodies = [body for scene in scenes if scene.frames == 1 for body in filter(chosen, scene.bodies)]
-    meshes = [body.shape.transformed(body.pose()) for body in bodies if isinstance(body.shape, Mesh)]
-    corners = np.concatenate([mesh.bounds_m for mesh in meshes])
-    return grid_around(np.stack([corners.min(axis=0), corners.max(axis=0)]), resolution, padding_m)
 
 
 def check_table(grid: Grid, columns: int, tables: int = 1) -> None:
@@ -221,8 +208,12 @@ def check_table(grid: Grid, columns: int, tables: int = 1) -> None:
         )
 
 
-def _table_field(bodies: list[tuple[int, Body]], columns: int, grid: Grid) -> TableField:
+def _table_field(
+    bodies: list[tuple[int, Body]], columns: int, resolution: int, padding_m: float
+) -> TableField:
     meshes = [body.shape.transformed(body.pose()) for _, body in bodies]
+    corners = np.concatenate([mesh.bounds_m for mesh in meshes])
+    grid = grid_around(np.stack([corners.min(axis=0), corners.max(axis=0)]), resolution, padding_m)
     check_table(grid, columns)
     table = np.full((grid.size, columns), FAR_M, dtype=np.float32)
     shell_m = np.zeros(columns)

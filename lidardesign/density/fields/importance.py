@@ -286,15 +286,14 @@ def weigh(bodies: Bodies, entries: Sequence[Body]) -> Bodies:
     return replace(bodies, log_weight=log_weight, grids=replace(grids, log_weights=np.concatenate(values)))
 
 
-def build_log_weights(scenes: Sequence[Scene], field: Field, *, around: Sequence[Scene]) -> LogWeights | None:
-    """The importance of the targets of scenes; None where all count 1, in all of `around`.
+def build_log_weights(scenes: Sequence[Scene], field: Field) -> LogWeights | None:
+    """The importance of the targets of scenes; None where all count 1.
 
     Arguments:
         scenes: One column per scene and frame.
         field: The distances of their targets, as `fields.build_field` gives them.
-        around: The scenes of all ranks, which must agree on whether there are weights.
     """
-    if not is_weighted(around):
+    if not is_weighted(scenes):
         return None
     columns = scene_columns(scenes)
     at_rest, others = [], []

@@ -142,9 +142,9 @@ class _Table:
 def on_device(target: Target, device: torch.device) -> Target:
     """The target for a flow on a device: on it where it can be, else as it is.
 
-    It can where it is made of tables, is seen directly or by quadrature over tables, and no rank shares it.
+    It can where it is made of tables and is seen directly or by quadrature over tables.
     """
-    if type(target) is not Target or target.ranks.size > 1 or not isinstance(target.field, TableField):
+    if type(target) is not Target or not isinstance(target.field, TableField):
         return target
     visibility = target.visibility
     tables = isinstance(visibility, Quadrature) and isinstance(visibility.field, TableField)

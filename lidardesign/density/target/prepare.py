@@ -6,11 +6,9 @@ from collections.abc import Sequence
 
 from lidardesign.config import RunConfig
 from lidardesign.density.fields.importance import importance_notes
-from lidardesign.density.ranks import ALONE, Ranks
-from lidardesign.density.target.ranks import SharedTarget, build_shared_target
 from lidardesign.density.target.refinement import refine_quadrature
 from lidardesign.density.target.resolution import flatness_notes, resolution_notes
-from lidardesign.density.target.target import Target
+from lidardesign.density.target.target import Target, build_target
 from lidardesign.density.training.proposals import occluded_share, propose
 from lidardesign.density.visibility.quadrature import Optics
 from lidardesign.run.clock import phase
@@ -29,7 +27,6 @@ def prepare_target(
     *,
     visibility: str | None = None,
     compiled: bool = True,
-    ranks: Ranks = ALONE,
 ) -> tuple[Target, list[str]]:
     """The target of training scenes, and notes on what was decided or is doubtful.
 
@@ -38,7 +35,6 @@ def prepare_target(
         config: The run's configuration; visibility `auto` is decided here by a probe.
         visibility: What an earlier probe of the same run decided, to take instead.
         compiled: See `build_target`.
-        ranks: Who shares the scenes.
 
     Raises:
         ConfigError: Sigma is finer than distances are known; see `build_target` too.
@@ -48,7 +44,7 @@ def prepare_target(
     if visibility == "auto":
         visibility, reason = _choose_visibility(scenes, config)
         notes.append(reason)
-    target = build_shared_target(scenes, config.space, settings, visibility, ranks, compiled=compiled)
+    target = build_target(scenes, config.space, settings, visibility, compiled=compiled)
     if visibility == "quadrature":
         target, refined = _refine_quadrature(target, scenes, config)
         notes.extend(refined)
@@ -80,6 +76,4 @@ def _choose_visibility(scenes: Sequence[Scene], config: RunConfig) -> tuple[str,
 def _refine_quadrature(target: Target, scenes: Sequence[Scene], config: RunConfig) -> tuple[Target, list[str]]:
     generator = random_generator(config.seed, "quadrature")
     proposals = propose(scenes, config.space, PROBES, config.density.sigma_m, generator)
-    if isinstance(target, SharedTarget):
-        return target.refined(proposals.points)
     return refine_quadrature(target, scenes, proposals.points)

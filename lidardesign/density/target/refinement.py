@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,15 +19,10 @@ MISSED_SHARE_TO_CARE = 0.005
 OPAQUE, TRANSPARENT = 0.01, 0.1
 
 
-def _mean(values: np.ndarray) -> float:
-    return float(values.mean()) if values.size else 0.0
-
-
 def refine_quadrature(
     target: Target,
     scenes: Sequence[Scene],
     probes: np.ndarray,
-    mean: Callable[[np.ndarray], float] = _mean,
 ) -> tuple[Target, list[str]]:
     """The target with enough midpoints that probes hidden by an occluder are hidden, and notes about it.
 
@@ -35,7 +30,6 @@ def refine_quadrature(
         target: The target of the scenes.
         scenes: One or more columns each.
         probes: Design points, shape (N, 6).
-        mean: Of the probes' values; over all ranks, where each has scenes of its own.
     """
     rays = RayBatch.of(probes)
     active = np.ones((len(probes), target.field.columns), dtype=bool)
@@ -43,7 +37,7 @@ def refine_quadrature(
     hidden = exact < np.log(OPAQUE)
     heard = target.visibility if isinstance(target.visibility, HeardVisibility) else None
     visibility, reach = heard.one_way if heard else target.visibility, float(probes[:, RANGE].max(initial=0.0))
-    if not mean(hidden):
+    if not hidden.any():
         return target, []
     first, passed = visibility.points, _passed(visibility, rays, hidden, target)
     while visibility.points < MAXIMUM_POINTS:
@@ -51,10 +45,10 @@ def refine_quadrature(
         passed_finer = _passed(finer, rays, hidden, target)
         # seen through, or not opaque only because midpoints are too few
         coarse = (passed > TRANSPARENT) | ((passed > OPAQUE) & (passed_finer <= OPAQUE))
-        if mean(coarse) <= MISSED_SHARE_TO_CARE:
+        if coarse.mean() <= MISSED_SHARE_TO_CARE:
             break
         visibility, passed = finer, passed_finer
-    missed = mean(passed > TRANSPARENT)
+    missed = float((passed > TRANSPARENT).mean())
     notes = []
     if visibility.points != first:
         notes.append(f"visibility quadrature refined from {first} to {visibility.points} points")

@@ -12,7 +12,6 @@ import numpy as np
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields.bodies import Bodies
 from lidardesign.density.fields.distance import BodyField, Field, TableField, UnionField
-from lidardesign.density.target.ranks import GatheredField
 from lidardesign.density.target.target import Target
 from lidardesign.errors import ConfigError
 from lidardesign.space import RANGE, DesignSpace, observed_point
@@ -97,7 +96,5 @@ def _grid_steps_m(field: Field | Bodies) -> np.ndarray:
         return np.array([field.grid.step])
     if isinstance(field, UnionField):
         return np.concatenate([_grid_steps_m(field.first), _grid_steps_m(field.second)])
-    if isinstance(field, GatheredField):
-        return _grid_steps_m(field.own)
     bodies = field.bodies if isinstance(field, BodyField) else field
     return 1.0 / bodies.grids.inverse_steps[1:] if isinstance(bodies, Bodies) else np.zeros(0)

@@ -15,14 +15,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields.distance import Field, TableField, build_field, scene_columns
 from lidardesign.density.fields.importance import LogWeights, build_log_weights
-from lidardesign.density.ranks import ALONE, Ranks
 from lidardesign.density.visibility.quadrature import (
     NoVisibility,
     Optics,
@@ -87,7 +85,6 @@ class Target:
     space: DesignSpace
     surface_tolerance_nats: float = 16.0
     importance: LogWeights | None = None
-    ranks: ClassVar[Ranks] = ALONE  # who shares the columns
 
     @property
     def columns(self) -> int:
@@ -153,7 +150,7 @@ class Target:
         observed = rays.observed
         distances = self.field.distances(observed).astype(np.float64)
         surface = self.surface_terms(observed, distances, optics.sigma_m)
-        active = surface >= self._best(surface) - self.surface_tolerance_nats
+        active = surface >= surface.max(axis=1, keepdims=True, initial=-np.inf) - self.surface_tolerance_nats
         passed = self.visibility.transmittance(rays, active, optics, differentiable=gradient)
         terms = np.where(active, surface + passed.log_values, -np.inf)
         values, shares = self._log_sums(terms)
@@ -170,10 +167,6 @@ class Target:
         """log w - distance^2 / (2 sigma^2) at scene points (N, 3), shape (N, columns)."""
         terms = self.log_column_weights - np.square(distances / sigma_m) / 2
         return terms if self.importance is None else terms + self.importance.values(observed)
-
-    def _best(self, surface: np.ndarray) -> np.ndarray:
-        """The largest surface term of each point, (N, columns) to (N, 1)."""
-        return surface.max(axis=1, keepdims=True, initial=-np.inf)
 
     def _log_sums(self, terms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """log of the sum of exp(terms) of each point (N,), and the share of each term in it (N, columns)."""
@@ -209,9 +202,8 @@ def unusable(points: np.ndarray) -> str | None:
 
 
 def build_target(
-    scenes: Sequence[Scene], space: DesignSpace, settings: DensitySettings, visibility: str, *,
-    compiled: bool = True, around: Sequence[Scene] | None = None,
-) -> Target:  # fmt: skip
+    scenes: Sequence[Scene], space: DesignSpace, settings: DensitySettings, visibility: str, *, compiled: bool = True
+) -> Target:
     """The target of scenes.
 
     Arguments:
@@ -220,7 +212,6 @@ def build_target(
         settings: Its numbers.
         visibility: raycast, quadrature or off; `prepare_target` decides auto.
         compiled: False for a few evaluations without gradient, which are not worth loading the kernels.
-        around: Scenes that one grid of distances must hold, more than these where other ranks have the others.
 
     Raises:
         ConfigError: A quadrature over too many moving bodies, or scenes with different receivers.
@@ -235,13 +226,12 @@ def build_target(
         from lidardesign.density.target.frames import build_frames_target
 
         return build_frames_target(scenes, space, settings, visibility, log_column_weights, **fields)
-    around = around or scenes
-    check_quadrature(around, visibility)
-    field = build_field(scenes, lambda body: body.is_target, around=around, **fields)
+    check_quadrature(scenes, visibility)
+    field = build_field(scenes, lambda body: body.is_target, **fields)
     if isinstance(field, TableField):
         field = replace(field, compiled=compiled)
-    importance = build_log_weights(scenes, field, around=around)
-    way = _build_visibility(scenes, settings, visibility, field, {**fields, "around": around})
+    importance = build_log_weights(scenes, field)
+    way = _build_visibility(scenes, settings, visibility, field, fields)
     return Target(
         field=field,
         visibility=way if receiver is None else HeardVisibility(way, receiver),
@@ -286,6 +276,6 @@ def _build_visibility(
         return NoVisibility()
     if visibility == "raycast":
         return Raycast(scenes)
-    same = all(body.role == "both" for scene in fields["around"] for body in scene.bodies)
+    same = all(body.role == "both" for scene in scenes for body in scene.bodies)
     occluders = field if same else build_field(scenes, lambda body: body.is_occluder, **fields)
     return Quadrature(occluders, settings.quadrature_points)

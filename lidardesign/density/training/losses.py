@@ -29,7 +29,6 @@ from torch import Tensor
 
 from lidardesign.density.flow.flow import DesignFlow
 from lidardesign.density.flow.objective import Coordinates, log_target, log_target_values
-from lidardesign.density.ranks import Ranks
 from lidardesign.density.target.target import Target
 from lidardesign.numerics import effective_sample_size, logsumexp
 
@@ -64,22 +63,13 @@ def pathwise_loss(
     eta: float,
     generator: torch.Generator,
 ) -> tuple[Tensor, float, float]:
-    """mean of (1 + eta) log p(d) - log p*(d) over flow samples; also its value for reports and the batch's ESS.
-
-    Over several ranks each gets its own samples' part of the loss; the value and the ESS are of the whole batch.
-    """
-    ranks = target.ranks
-    conditions = _part(draw_conditions(flow, count, generator), ranks)
-    learned, log_prob = flow(ranks.part(flow.draw_base(count, generator)), conditions)
+    """mean of (1 + eta) log p(d) - log p*(d) over flow samples; also its value for reports and the batch's ESS."""
+    conditions = draw_conditions(flow, count, generator)
+    learned, log_prob = flow(flow.draw_base(count, generator), conditions)
     log_p_star = log_target(coordinates.join(learned, conditions), target, coordinates, sigma_m)
     loss = ((1 + eta) * log_prob - log_p_star).sum() / count
-    every = ranks.gather(torch.stack([log_prob, log_p_star], dim=1).detach(), of=count)
-    value = ((1 + eta) * every[:, 0] - every[:, 1]).mean()
-    return loss, float(value), effective_share(every[:, 1] - every[:, 0])
-
-
-def _part(rows: Tensor | None, ranks: Ranks) -> Tensor | None:
-    return None if rows is None else ranks.part(rows)
+    log_prob, log_p_star = log_prob.detach(), log_p_star.detach()
+    return loss, float(((1 + eta) * log_prob - log_p_star).mean()), effective_share(log_p_star - log_prob)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,31 +108,27 @@ class Pool:
 def balancing_loss(
     flow: DesignFlow, target: Target, coordinates: Coordinates, count: int, pool: Pool, generator: torch.Generator
 ) -> tuple[Tensor, float, float]:
-    """A loss whose gradient balances mass by values of p*; also the reverse KL loss and the batch's ESS.
-
-    Over several ranks each gets its own samples' part of the loss; the other two are of the whole batch.
-    """
-    ranks = target.ranks
-    conditions = _part(draw_conditions(flow, count, generator), ranks)
-    base = ranks.part(flow.draw_base(count, generator))
+    """A loss whose gradient balances mass by values of p*; also the reverse KL loss and the batch's ESS."""
+    conditions = draw_conditions(flow, count, generator)
+    base = flow.draw_base(count, generator)
     with torch.no_grad():
         learned, log_prob = flow(base, conditions)
     unit = coordinates.join(learned, conditions)
     log_p_star = log_target_values(unit, target, coordinates)
-    log_weights = ranks.gather(log_p_star - log_prob, of=count)
+    log_weights = log_p_star - log_prob
     log_z = logsumexp(log_weights) - np.log(count)
     centred = log_weights - log_z
     pull = centred.clamp(-LARGEST_PULL_NATS, LARGEST_PULL_NATS)
     pull = pull - pull.mean()
-    proposed, proposed_target = map(ranks.part, pool.draw(count, generator, learned))
+    proposed, proposed_target = pool.draw(count, generator, learned)
     foreign = proposed[:, coordinates.learned]
     contexts = None if conditions is None else torch.cat([conditions, proposed[:, coordinates.conditions]])
     both = flow.log_prob(torch.cat([learned, foreign]), contexts)
     own, others = both[: len(learned)], both[len(learned) :]
     starved = (proposed_target - others.detach() - log_z).clamp(max=np.log(LARGEST_EMPHASIS)).exp()
-    loss = -(ranks.part(pull) * own).sum() / count - FORWARD_SHARE * (starved * others).sum() / count
-    leaked = ranks.part(centred) < -LARGEST_PULL_NATS
-    if (centred < -LARGEST_PULL_NATS).any():
+    loss = -(pull * own).sum() / count - FORWARD_SHARE * (starved * others).sum() / count
+    leaked = centred < -LARGEST_PULL_NATS
+    if leaked.any():
         cost = _leak_cost(flow, target, coordinates, base[leaked], None if conditions is None else conditions[leaked])
         loss = loss + LEAK_WEIGHT * cost / count
     return loss, float(-log_weights.mean()), effective_share(log_weights)

@@ -300,9 +300,8 @@ class Measured:
 
 def draw_probes(target: Target, scenes: Sequence[Scene], count: int, generator: np.random.Generator) -> Probes:
     """At most `count` probes of a target; none where no ray of the space comes near a surface."""
-    ranks = target.ranks
-    points, log_proposal = map(ranks.of_first, independent_points(target, scenes, count, generator))
-    log_target = ranks.spread(target.log_density, points) if len(points) else log_proposal
+    points, log_proposal = independent_points(target, scenes, count, generator)
+    log_target = target.log_density(points) if len(points) else log_proposal
     return Probes(points, log_proposal, log_target)
 
 
@@ -342,28 +341,23 @@ def measure(learned: Learned, probes: Probes, count: int) -> Measured:
 def draw_samples(learned: Learned, count: int) -> Samples:
     """Fresh samples of the flow with their log density and log target, in chunks."""
     points, log_prob = [], []
-    flow, coordinates, ranks = learned.flow, learned.coordinates, learned.target.ranks
+    flow, coordinates = learned.flow, learned.coordinates
     with torch.no_grad():
         for start in range(0, count, SAMPLE_CHUNK):
             size = min(SAMPLE_CHUNK, count - start)
             conditions = draw_conditions(flow, size, learned.generator)
-            conditions = None if conditions is None else ranks.part(conditions)
-            values, log_density = flow(ranks.part(flow.draw_base(size, learned.generator)), conditions)
+            values, log_density = flow(flow.draw_base(size, learned.generator), conditions)
             unit = coordinates.join(values, conditions)
-            points.append(ranks.gather(coordinates.space.from_unit(unit.cpu().double().numpy()), of=size))
-            log_prob.append(ranks.gather(log_density.cpu().double().numpy(), of=size))
+            points.append(coordinates.space.from_unit(unit.cpu().double().numpy()))
+            log_prob.append(log_density.cpu().double().numpy())
     points = np.concatenate(points)
     offset = coordinates.log_condition_density - coordinates.log_unit_volume
-    log_target = ranks.spread(learned.target.log_density, points)
+    log_target = learned.target.log_density(points)
     return Samples(points, np.concatenate(log_prob) + offset, log_target, coordinates.space)
 
 
 def log_density_of(learned: Learned, points: np.ndarray) -> np.ndarray:
     """The flow's log density per chart volume at any design points, (N, 6) to (N,); -inf outside the space."""
-    return learned.target.ranks.spread(lambda rows: _log_density_of(learned, rows), points)
-
-
-def _log_density_of(learned: Learned, points: np.ndarray) -> np.ndarray:
     flow, coordinates = learned.flow, learned.coordinates
     like = next(flow.parameters())
     # points on the space's faces may leave it by rounding

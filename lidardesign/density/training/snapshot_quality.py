@@ -22,7 +22,6 @@ from lidardesign.config import LearningSettings, RunConfig
 from lidardesign.density.flow.flow import DesignFlow
 from lidardesign.density.flow.objective import Coordinates
 from lidardesign.density.learn import FLOW, make_flow
-from lidardesign.density.ranks import ALONE, Ranks
 from lidardesign.density.target.target import Target
 from lidardesign.density.training.checkpoint import kept_snapshots, load_arrays, rung_steps, twin_step
 from lidardesign.density.training.losses import Pool, balancing_loss, draw_conditions, pathwise_loss
@@ -158,7 +157,6 @@ class FlatTarget:
 
     optics: Optics
     space: DesignSpace
-    ranks: Ranks = ALONE
 
     def log_density(self, points: np.ndarray) -> np.ndarray:
         """See `Target`."""

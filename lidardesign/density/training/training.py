@@ -42,7 +42,7 @@ from lidardesign.density.training.checkpoint import (
     snapshot_steps,
 )
 from lidardesign.density.training.losses import TOLERANCE_NATS, Pool, balancing_loss, pathwise_loss, round_trip_nats
-from lidardesign.errors import DataError, DivergenceError, LostRankError, NumericalError
+from lidardesign.errors import DataError, DivergenceError, NumericalError
 from lidardesign.numerics import HALF_DIGITS
 from lidardesign.run.clock import phase
 from lidardesign.run.files import append_line, write_atomic
@@ -201,19 +201,11 @@ class Trainer:
         """Run the remaining steps, with checkpoints, one of them when it is interrupted; raises DivergenceError."""
         try:
             self._run_steps(progress)
-        except (KeyboardInterrupt, LostRankError):
-            self._save_last()
+        except KeyboardInterrupt:
+            if self._snapshot is not None:
+                self._save(self._snapshot)
             raise
         self._save(self._taken())
-
-    def _save_last(self) -> None:
-        if self._snapshot is None:
-            return
-        try:
-            self._save(self._snapshot)
-        except KeyboardInterrupt:  # a launcher ends the ranks that are left while this one saves what they did
-            self._save(self._snapshot)
-            raise
 
     def _run_steps(self, progress: Callable[[LearnProgress], None] | None) -> None:
         checkpointed = time.perf_counter()
@@ -229,7 +221,7 @@ class Trainer:
                 self.settings, self.replan = self.replan(self), None
             loss, ess = self._advance()
             if self.step in snapshot_steps(self.settings):
-                self._keep()
+                save_snapshot(self.flow, self.run, self.step)
             if self.step % PROGRESS_STEPS == 0 or self.step == self.settings.steps:
                 self._report(loss, ess, progress)
 
@@ -252,7 +244,6 @@ class Trainer:
         if torch.isfinite(loss):
             with phase("gradient"):
                 loss.backward()
-        self.target.ranks.sum_gradients(self.flow.parameters(), valid=bool(torch.isfinite(loss)))
         return loss, torch.nn.utils.clip_grad_norm_(self.flow.parameters(), self.settings.clip_norm), value, ess
 
     def _loss(self) -> tuple[torch.Tensor, float, float]:
@@ -271,7 +262,7 @@ class Trainer:
         if self.step < self.pathwise_steps or next(self.flow.parameters()).dtype == torch.float64:
             return
         off = round_trip_nats(self.flow, ROUND_TRIPS, torch.Generator().manual_seed(self.step))
-        if self.target.ranks.max(np.array([off]))[0] > TOLERANCE_NATS:
+        if off > TOLERANCE_NATS:
             self._double(self.step)
 
     def _double(self, step: int) -> None:
@@ -308,8 +299,6 @@ class Trainer:
         self._restore_arrays(self._snapshot.arrays)
 
     def _report(self, loss: float, ess: float, progress: Callable[[LearnProgress], None] | None) -> None:
-        if not self.target.ranks.first:
-            return
         seconds = self.seconds
         left = seconds / self.step * (self.settings.steps - self.step)
         row = {
@@ -358,20 +347,13 @@ class Trainer:
         return _Snapshot(self._state_arrays(), {**counters, "seconds": self.seconds})
 
     def _save(self, snapshot: _Snapshot) -> None:
-        if not self.target.ranks.first:
-            return
         save_arrays(self.run, CHECKPOINT, snapshot.arrays, snapshot.state)
         if (self.run / PROGRESS).exists():
             record(self.run, [PROGRESS])
 
-    def _keep(self) -> None:
-        if self.target.ranks.first:
-            save_snapshot(self.flow, self.run, self.step)
-
     def resume(self) -> None:
         """Take the state of the run's checkpoint; progress.jsonl and snapshots are cut back to it."""
-        ranks = self.target.ranks
-        arrays, state = ranks.state_of_first(lambda: load_arrays(self.run, CHECKPOINT))
+        arrays, state = load_arrays(self.run, CHECKPOINT)
         check_resumable(arrays, state, self.flow, self.generator, self.run / CHECKPOINT)
         if state.get("doubled_at") is not None:  # older checkpoints have no such entry
             self._double(state["doubled_at"])
@@ -379,8 +361,6 @@ class Trainer:
         self.step, self.skipped = state["step"], state["skipped"]
         self.skipped_in_a_row, self.halvings = state["skipped_in_a_row"], state["halvings"]
         self.seconds_before, self._started = state["seconds"], time.perf_counter()
-        if not ranks.first:
-            return
         clear_snapshots(self.run, beyond=self.step)
         path = self.run / PROGRESS
         if path.exists():

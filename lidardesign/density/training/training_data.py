@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidardesign.config import RunConfig
-from lidardesign.density.ranks import ALONE, Ranks
 from lidardesign.density.target.prepare import prepare_target
 from lidardesign.density.target.target import Target
 from lidardesign.density.training.independent import independent_points
@@ -33,13 +32,12 @@ class Ground:
     pool: Pool
 
 
-def prepare_ground(task: Task, config: RunConfig, ranks: Ranks = ALONE) -> Ground:
+def prepare_ground(task: Task, config: RunConfig) -> Ground:
     """The ground of a task; it does not depend on the steps, the flow or its optimiser.
 
     Arguments:
         task: The plugin.
         config: The resolved configuration.
-        ranks: Who shares the scenes; `parallel_learn.follow` prepares the others' parts.
 
     Raises:
         ConfigError, DataError: Unusable settings or scenes.
@@ -51,11 +49,10 @@ def prepare_ground(task: Task, config: RunConfig, ranks: Ranks = ALONE) -> Groun
             where="space",
             hint="free at least one, or write the point as a design file",
         )
-    ranks.announce({"job": "ground", "config": config.as_document()})
     with plugin_guard(config.task_name):
         told = notes_of(task, config.task, config.space)
     scenes = training_scenes(task, config)
-    target, notes = prepare_target(scenes, config, ranks=ranks)
+    target, notes = prepare_target(scenes, config)
     return Ground(scenes, target, (*told, *notes), _pool(target, scenes, config))
 
 
@@ -79,7 +76,7 @@ def _pool(target: Target, scenes: Sequence[Scene], config: RunConfig) -> Pool:
     """Proposals for balancing, independent of those that coverage is measured on."""
     count = config.learning.balance_proposals
     generator = random_generator(config.seed, "balancing")
-    points, log_density = map(target.ranks.of_first, independent_points(target, scenes, count, generator))
+    points, log_density = independent_points(target, scenes, count, generator)
     if not len(points):
         raise DataError(
             "no ray of the design space reaches a target surface in any training scene",
@@ -87,7 +84,7 @@ def _pool(target: Target, scenes: Sequence[Scene], config: RunConfig) -> Pool:
             hint="widen the angles or the range, move the origin, or raise density.sigma_m",
         )
     refuse_blind_receiver(scenes, points)
-    log_target = target.ranks.spread(target.log_density, points)
+    log_target = target.log_density(points)
     # points on the space's faces may leave it by rounding
     return Pool.of(config.space.to_unit(points).clip(-1.0, 1.0), log_target, log_density)
 

@@ -246,7 +246,7 @@ class Case:
             optics=Optics.of(settings),
             space=space,
             surface_tolerance_nats=settings.surface_tolerance_nats,
-            importance=build_log_weights(few, field, around=scenes),
+            importance=build_log_weights(few, field),
         )
         probes = draw_probes(target, few, PROBES, seed, "fields", widening=WIDENING)
         if not len(probes.points):
