@@ -12,10 +12,9 @@ from lidardesign_tasks.flatland import FlatlandTask
 from scipy.spatial.transform import Rotation
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.layouts.rays import fire_times
 from lidardesign.evaluate.baselines.candidates import even_placement, rays_at
 from lidardesign.evaluate.results import Audit, AuditRow
-from lidardesign.geometry.rays import Rays
+from lidardesign.geometry.rays import Rays, fire_times
 from lidardesign.scene import Body, Box, rigid
 from lidardesign.simulate.detector.detector import Detector
 from lidardesign.simulate.detector.files import load_detector

@@ -9,10 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import Coupling, DesignSpec, RayTable, Sensor
+from lidardesign.design.sensor import Coupling, DesignSpec, Sensor
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.evaluate.entries import entries_of, middle_condition
 from lidardesign.evaluate.score import EvaluationRequest, evaluate
+from lidardesign.geometry.rays import Rays
 from lidardesign.samples import Samples
 from lidardesign.scene import Body, Box, Capsule, Scene, Sphere, rigid
 from lidardesign.simulate.simulate import simulate
@@ -233,13 +234,13 @@ def turned_sensor(sensor):
 
 
 def turned_table(table):
-    return replace(table, origin_m=table.origin_m @ QUARTER.T, azimuth_rad=table.azimuth_rad + math.pi / 2)
+    return Rays.from_angles(
+        table.origin_m @ QUARTER.T, table.azimuth_rad + math.pi / 2, table.elevation_rad, table.gate_m, table.sensor
+    )
 
 
 def explicit(design, count):
-    rays = lay_out(design, count)
-    azimuth, elevation = angles(rays.direction)
-    return replace(design, rays=count, ray_table=RayTable(rays.origin_m, azimuth, elevation, rays.gate_m, rays.sensor))
+    return replace(design, rays=count, ray_table=lay_out(design, count).as_angles())
 
 
 def test_turning_sensors_and_world_by_a_quarter_changes_no_score():

@@ -19,8 +19,9 @@ from lidardesign.design.files import (
     save_design,
 )
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import Coupling, DesignSpec, RayTable, Sensor, interval_factor
+from lidardesign.design.sensor import Coupling, DesignSpec, Sensor, interval_factor
 from lidardesign.errors import ConfigError, DataError, NumericalError
+from lidardesign.geometry.rays import Rays
 from lidardesign.run.yaml import dump_yaml, parse_yaml
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "hand_written_design.yaml"
@@ -67,7 +68,7 @@ def ray_tables(draw, sensor_count):
     count = draw(st.integers(0, 12))
     column = lambda values: np.array(draw(st.lists(values, min_size=count, max_size=count)), dtype=np.float64)  # noqa: E731
     start = column(length)
-    return RayTable(
+    return Rays.from_angles(
         origin_m=np.stack([column(finite) for _ in range(3)], axis=1),
         azimuth_rad=column(st.floats(-10, 10)),
         elevation_rad=column(st.floats(-math.pi / 2, math.pi / 2)),
@@ -386,7 +387,7 @@ def test_the_file_has_one_level_and_the_sensors_keep_their_spreads():
 def test_more_explicit_rays_than_can_be_read_back_are_not_written(tmp_path):
     design, count = load_design(EXAMPLE), 60_001
     flat = np.zeros(count)
-    table = RayTable(np.zeros((count, 3)), flat, flat, np.tile([0.0, 1.0], (count, 1)), flat.astype(np.int64))
+    table = Rays.from_angles(np.zeros((count, 3)), flat, flat, np.tile([0.0, 1.0], (count, 1)), flat.astype(np.int64))
     with pytest.raises(ConfigError, match="60001 explicit rays"):
         save_design(replace(design, layout="density", rays=count, ray_table=table), tmp_path / "x.yaml")
     assert not list(tmp_path.iterdir())

@@ -19,10 +19,10 @@ from lidardesign.cli.output import Console, describe_error
 from lidardesign.density.fields.grids import _digest, _load
 from lidardesign.density.training.snapshot_quality import seconds_at
 from lidardesign.density.training.training import _step_of
+from lidardesign.design.bandwidth import split_budget
 from lidardesign.design.constraints.document import MOST_FITTED, Constraints
 from lidardesign.design.files import load_design
 from lidardesign.design.fit import fit
-from lidardesign.design.layouts.rays import split_budget
 from lidardesign.design.sensor import MOST_RAYS, interval_factor
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.evaluate.captures.capture import load_capture

@@ -18,7 +18,6 @@ from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.rigs.rig import aim_of
 from lidardesign.design.sensor import (
     DesignSpec,
-    RayTable,
     Sensor,
     boresight_frame,
     interval_factor,
@@ -26,6 +25,7 @@ from lidardesign.design.sensor import (
 )
 from lidardesign.errors import DataError, LidardesignError
 from lidardesign.export.registry import EXPORTERS
+from lidardesign.geometry.rays import Rays
 from lidardesign.geometry.rotation import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.run.xml import _Builder
 from lidardesign.space import DesignSpace, angles, direction
@@ -41,7 +41,7 @@ def rig(seed=0, counts=(7, 1, 4), names=NASTY):
     sensor = generator.permutation(np.repeat(np.arange(len(counts)), counts))
     origins = generator.normal(size=(len(counts), 3))
     start = generator.uniform(0, 1, total)
-    table = RayTable(
+    table = Rays.from_angles(
         origins[sensor],
         generator.uniform(0, 2 * math.pi, total),
         generator.uniform(-1.5, 1.5, total),

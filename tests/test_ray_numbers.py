@@ -10,9 +10,10 @@ import pytest
 from command_line import caller, make_run
 
 from lidardesign.design.files import save_design
-from lidardesign.design.sensor import DesignSpec, RayTable, Sensor
+from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.request import fired_numbers, left_out, usual_numbers
+from lidardesign.geometry.rays import Rays
 
 FAR_M = 0.9
 
@@ -22,7 +23,7 @@ def pattern(name, count, layout="fixed"):
     sensor = Sensor("fan", 1.0, np.array([0.5, 0, 0]), np.zeros((3, 3)), 1.5, 0.0, 0.0, 0.3, 0.0, FAR_M / 2, FAR_M / 4)
     azimuth, zeros = np.linspace(1.0, 2.0, count), np.zeros(count)
     gates = np.tile([0.0, FAR_M], (count, 1))
-    table = RayTable(np.tile([0.5, 0, 0], (count, 1)), azimuth, zeros, gates, zeros.astype(int))
+    table = Rays.from_angles(np.tile([0.5, 0, 0], (count, 1)), azimuth, zeros, gates, zeros.astype(int))
     return DesignSpec(
         name, (sensor,), layout=layout, ray_table=table if layout == "fixed" else None, provenance={"run": ".."}
     )

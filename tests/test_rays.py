@@ -8,16 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lidardesign.design.bandwidth import split_budget
 from lidardesign.design.layouts.grid import grid_rows, grid_tangent
-from lidardesign.design.layouts.rays import (
-    gates_of,
-    lay_out,
-    make_ray_table,
-    own_count,
-    own_gates,
-    refitted,
-    split_budget,
-)
+from lidardesign.design.layouts.rays import gates_of, lay_out, make_ray_table, own_count, own_gates, refitted
 from lidardesign.design.layouts.shared_fields import log_density, members, seen_from
 from lidardesign.design.sensor import (
     MOST_RAYS,

@@ -13,8 +13,9 @@ from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import DesignSpec, RayTable, Sensor, interval_factor
+from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor
 from lidardesign.evaluate.refinement.regating import Gating, has_ray_gates
+from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.simulate.simulate import build_casters, simulate
 from lidardesign.space import DesignSpace
@@ -51,7 +52,7 @@ def scan(gates, constraints=None):
 
 def table(gates, constraints=None):
     sensor = Sensor("s0", 1.0, np.zeros(3), np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.2, 0.1, 2.0, 1.0, rays=15)
-    rays = RayTable(np.zeros((15, 3)), ANGLES, np.zeros(15), np.asarray(gates, float), np.zeros(15, dtype=int))
+    rays = Rays.from_angles(np.zeros((15, 3)), ANGLES, np.zeros(15), np.asarray(gates, float), np.zeros(15, dtype=int))
     return DesignSpec("d", (sensor,), "density", rays=15, ray_table=rays, constraints=constraints or {})
 
 

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.bandwidth import Bandwidth, split_budget
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document
 from lidardesign.design.fit import fit
-from lidardesign.design.layouts.rays import lay_out, split_budget
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.layouts.shared_fields import bandwidth_limit, shared_rays
 from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor, tangent_coordinates
 from lidardesign.samples import Samples

@@ -1,4 +1,4 @@
-"""What a design costs to read out: range bins, bits and frames per second (paper, section 6).
+"""How rays are shared out, and what a design costs to read out: bins, bits and frames per second (paper, section 6).
 
 A gate of width w listens for the round-trip time 2 w / c, cut into bins of one fixed duration. Every bin
 of every ray is read out once per frame, so the bandwidth is sum(bins) * bits * rate.
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import SLACK
@@ -23,6 +24,8 @@ BITS_PER_MEGABIT = 1e6
 BIN_ROUNDING = SLACK
 # More are counted as so many, which no read-out takes: whole numbers stay exact.
 MOST_BINS = 1e15
+# Shares of a ray closer than this are the same share: weights that were normalised differ by a few ulp.
+REMAINDER_DECIMALS = 9
 
 
 @dataclass(frozen=True)
@@ -77,3 +80,29 @@ class Bandwidth:
         """Bandwidth of `counts` rays for each gate width: (G,) [m], (G,) to Mbit/s."""
         total = int(np.sum(self.bins(widths_m) * np.asarray(counts)))
         return total * self.bits_per_bin * self.rate_hz / BITS_PER_MEGABIT
+
+
+def split_budget(weights: np.ndarray, count: int) -> np.ndarray:
+    """Whole numbers of rays in proportion to weights: (G,) to int64 (G,) with the sum `count` exactly.
+
+    Largest remainder (Hamilton): every sensor gets the whole part of its quota, the rays left over go to the
+    largest fractional parts, the lower index first where they tie. Too few rays leave some sensors without.
+
+    Raises:
+        ConfigError: Weights that are negative, not finite or all zero; a negative count.
+    """
+    weights = np.asarray(weights, dtype=np.float64)
+    if weights.ndim != 1 or not len(weights):
+        raise ConfigError(f"weights of shape {weights.shape}", where="budget", allowed="one per sensor")
+    if not (np.isfinite(weights).all() and (weights >= 0).all() and weights.max() > 0):
+        raise ConfigError(
+            "weights are negative, not finite or all zero", where="budget", allowed="0 or more, one above 0"
+        )
+    if not 0 <= count <= MOST_RAYS or count != int(count):
+        raise ConfigError(f"{count} rays", where="budget", allowed=f"a whole number from 0 to {MOST_RAYS}")
+    scaled = weights / weights.max()
+    quotas = scaled / scaled.sum() * count
+    shares = np.floor(quotas).astype(np.int64)
+    order = np.argsort(-np.round(quotas - shares, REMAINDER_DECIMALS), kind="stable")
+    shares[order[: int(count) - int(shares.sum())]] += 1
+    return shares

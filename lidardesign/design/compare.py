@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.layouts.rays import split_budget
+from lidardesign.design.bandwidth import Bandwidth, split_budget
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.space import RANGE, DesignSpace
 

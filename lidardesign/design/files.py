@@ -29,12 +29,12 @@ from lidardesign.design.sensor import (
     MOST_RAYS,
     Coupling,
     DesignSpec,
-    RayTable,
     Sensor,
     Track,
     interval_factor,
 )
 from lidardesign.errors import ConfigError, DataError
+from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import COARSE_SLACK, SLACK
 from lidardesign.run.clock import phase
 from lidardesign.run.files import write_atomic
@@ -171,7 +171,7 @@ def _count(rays: int | None) -> int | None:
     return None if rays is None else int(rays)
 
 
-def _table_document(table: RayTable) -> dict[str, list[float] | list[int]]:
+def _table_document(table: Rays) -> dict[str, list[float] | list[int]]:
     origin, gate = np.asarray(table.origin_m, np.float64), np.asarray(table.gate_m, np.float64)
     angles = (np.asarray(table.azimuth_rad, np.float64), np.asarray(table.elevation_rad, np.float64))
     columns = (*origin.T, *angles, *gate.T, np.asarray(table.sensor, np.int64))
@@ -472,7 +472,7 @@ def _agree(node: Node, expected: float, unit: str, level: float, scale: float = 
         )
 
 
-def _ray_table(node: Node, sensors: int) -> RayTable:
+def _ray_table(node: Node, sensors: int) -> Rays:
     keys = node.mapping(TABLE_KEYS)
     count = len(keys["sensor"].items())
     column = {key: keys[key].numbers(count) for key in TABLE_KEYS[:3]}
@@ -483,7 +483,7 @@ def _ray_table(node: Node, sensors: int) -> RayTable:
         bad = int(np.argmax(end < start))
         raise keys["gate_end_m"].child(bad).error(f"is {end[bad]}, before the gate's start {start[bad]}")
     indices = [item.integer(0, sensors - 1) for item in keys["sensor"].items()]
-    return RayTable(
+    return Rays.from_angles(
         origin_m=np.stack([column[key] for key in TABLE_KEYS[:3]], axis=1),
         azimuth_rad=column["azimuth_rad"],
         elevation_rad=column["elevation_rad"],
@@ -496,7 +496,7 @@ def _check_rays(
     keys: dict[str, Node],
     sensors: tuple[Sensor, ...],
     rays: int | None,
-    table: RayTable | None,
+    table: Rays | None,
     track: Track | None,
 ) -> None:
     """The places that may count rays must agree, and one of them says where rays go."""

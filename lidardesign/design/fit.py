@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from lidardesign.design.bandwidth import split_budget
 from lidardesign.design.constraints.budget import BandwidthBudget, fit_within_budget
 from lidardesign.design.constraints.check import ConstraintCheck, check_design
 from lidardesign.design.constraints.document import MOST_FITTED, Constraints
@@ -16,7 +17,7 @@ from lidardesign.design.constraints.feasibility import check_feasible, most_rays
 from lidardesign.design.constraints.origins import is_mounted, most_mounted, placement_notes, snap_to_space
 from lidardesign.design.fit_result import FitResult, fit_estimates, likelihood_error
 from lidardesign.design.layouts.quantise import SAMPLES_PER_RAY
-from lidardesign.design.layouts.rays import Gates, make_ray_table, own_gates, split_budget
+from lidardesign.design.layouts.rays import Gates, make_ray_table, own_gates
 from lidardesign.design.layouts.scan import fit_scan, rays_of
 from lidardesign.design.layouts.track_fit import fit_track
 from lidardesign.design.mixture.bounds import bounds_of, groups

@@ -18,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.special import ndtri
 
+from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import sphere_exp, sphere_log
 from lidardesign.space import direction
 
@@ -198,24 +199,6 @@ class Sensor:
 
 
 @dataclass(frozen=True, eq=False)
-class RayTable:
-    """Explicit rays of a `density` or `scan` layout, as they stand in a design file.
-
-    Arguments:
-        origin_m: Shape (N, 3).
-        azimuth_rad, elevation_rad: Shape (N,).
-        gate_m: Shape (N, 2).
-        sensor: Index of the sensor that fires each ray, shape (N,).
-    """
-
-    origin_m: np.ndarray
-    azimuth_rad: np.ndarray
-    elevation_rad: np.ndarray
-    gate_m: np.ndarray
-    sensor: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class Track:
     """Rays that vary smoothly along one condition, as a robot's position: given at knots, linear in between.
 
@@ -258,7 +241,7 @@ class DesignSpec:
     sensors: tuple[Sensor, ...]
     layout: Layout = "grid"
     rays: int | None = None
-    ray_table: RayTable | None = None
+    ray_table: Rays | None = None
     constraints: dict[str, Any] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
     level: float = DEFAULT_LEVEL

@@ -32,13 +32,12 @@ from lidardesign.design.galvo import (
     scan_angles_deg,
     scan_directions,
 )
-from lidardesign.design.layouts.rays import fire_times
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.columns import losses
 from lidardesign.export.common.read_back import rays_rounding
-from lidardesign.geometry.rays import Rays
+from lidardesign.geometry.rays import Rays, fire_times
 from lidardesign.numerics import ROUNDING, SLACK, TINY
 from lidardesign.run.files import write_atomic
 

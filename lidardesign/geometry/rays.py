@@ -1,7 +1,4 @@
-"""Rays that a design fires and the returns that its receiver reports.
-
-What rays meet: the first hit of each, or all surfaces along them.
-"""
+"""Rays that a design fires, what they meet, and the returns that its receiver reports."""
 
 from __future__ import annotations
 
@@ -13,6 +10,15 @@ import numpy as np
 
 from lidardesign.errors import ConfigError
 from lidardesign.numerics import COARSE_SLACK
+from lidardesign.space import angles, direction
+
+# Frames per second where nothing else is said.
+DEFAULT_RATE_HZ = 10.0
+
+
+def fire_times(count: int, rate_hz: float) -> np.ndarray:
+    """When each ray fires in its frame, i / (n * rate), shape (n,) [s]."""
+    return np.arange(count) / (max(count, 1) * rate_hz)
 
 
 class Outcome(IntEnum):
@@ -35,6 +41,8 @@ class Rays:
         gate_m: Start and end of the interval each ray listens in [m], shape (N, 2).
         sensor: The index of the sensor that fires it, shape (N,).
         time_s: When it fires within the frame [s], shape (N,).
+        angles_rad: The azimuths and elevations that directions were made from, shape (N, 2); None where they follow
+            from the directions. Files hold angles: reading and writing them again changes no digit.
 
     Raises:
         ConfigError: Non-finite values, directions that are not unit vectors, reversed or negative gates.
@@ -45,6 +53,7 @@ class Rays:
     gate_m: np.ndarray
     sensor: np.ndarray
     time_s: np.ndarray
+    angles_rad: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         count = len(self.origin_m)
@@ -54,6 +63,7 @@ class Rays:
             ("gate_m", (2,), np.float64),
             ("sensor", (), np.int64),
             ("time_s", (), np.float64),
+            *([] if self.angles_rad is None else [("angles_rad", (2,), np.float64)]),
         ):
             values = np.ascontiguousarray(getattr(self, name), dtype=dtype)
             if values.shape != (count, *tail):
@@ -67,12 +77,41 @@ class Rays:
         if count and (self.gate_m[:, 0].min() < 0 or (self.gate_m[:, 1] < self.gate_m[:, 0]).any()):
             raise ConfigError("a gate is negative or ends before it starts", where="rays.gate_m")
 
+    @classmethod
+    def from_angles(
+        cls,
+        origin_m: np.ndarray,
+        azimuth_rad: np.ndarray,
+        elevation_rad: np.ndarray,
+        gate_m: np.ndarray,
+        sensor: np.ndarray,
+    ) -> Rays:
+        """Rays whose angles (N,) keep every digit, evenly over a frame at the default rate."""
+        looking = direction(azimuth_rad, elevation_rad)
+        both = np.stack([azimuth_rad, elevation_rad], axis=1)
+        return cls(origin_m, looking, gate_m, sensor, fire_times(len(looking), DEFAULT_RATE_HZ), both)
+
+    @property
+    def azimuth_rad(self) -> np.ndarray:
+        """Shape (N,)."""
+        return angles(self.direction)[0] if self.angles_rad is None else self.angles_rad[:, 0]
+
+    @property
+    def elevation_rad(self) -> np.ndarray:
+        """Shape (N,)."""
+        return angles(self.direction)[1] if self.angles_rad is None else self.angles_rad[:, 1]
+
+    def as_angles(self) -> Rays:
+        """These rays as a file holds them: directions are those of their own angles, and may differ by rounding."""
+        return Rays.from_angles(self.origin_m, *angles(self.direction), self.gate_m, self.sensor)
+
     def __len__(self) -> int:
         return len(self.origin_m)
 
     def subset(self, keep: np.ndarray) -> Rays:
         """The rays at an index or mask."""
-        return Rays(self.origin_m[keep], self.direction[keep], self.gate_m[keep], self.sensor[keep], self.time_s[keep])
+        columns = (self.origin_m, self.direction, self.gate_m, self.sensor, self.time_s, self.angles_rad)
+        return Rays(*(None if column is None else column[keep] for column in columns))  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,10 +20,11 @@ from lidardesign.config import resolve
 from lidardesign.design.files import design_document
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.rigs.sensor_csv import QUERY_COLUMN, write_sensor_csv
-from lidardesign.design.sensor import Coupling, DesignSpec, RayTable, Sensor, Track
+from lidardesign.design.sensor import Coupling, DesignSpec, Sensor, Track
 from lidardesign.export import csv as csv_format
 from lidardesign.export import galvo
 from lidardesign.export import npz as npz_format
+from lidardesign.geometry.rays import Rays
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import note, read_manifest
 from lidardesign.run.yaml import dump_yaml
@@ -63,7 +64,7 @@ def sensor(index: int = 0, *, spread_m: float = 0.0, coupled: bool = False) -> S
 def sample_designs() -> list[DesignSpec]:
     """A grid, explicit rays, a scan along a track, and a distributed design with couplings."""
     pair = (sensor(0), sensor(1))
-    table = RayTable(
+    table = Rays.from_angles(
         np.zeros((4, 3)), np.linspace(3, 3.3, 4), np.zeros(4), np.tile([0.2, 0.5], (4, 1)), np.array([0, 0, 1, 1])
     )
     knots = np.array([0.0, 0.5, 1.0])

@@ -20,19 +20,20 @@ from test_fit import FREE, MOVING, log_target
 from test_rays import drawn_from, three_sensors
 
 import lidardesign.design.constraints.check as checker
+from lidardesign.design.bandwidth import split_budget
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.constraints.feasibility import check_feasible
 from lidardesign.design.files import design_document, design_from_document
 from lidardesign.design.fit import fit
-from lidardesign.design.layouts.rays import MOST_RAYS, lay_out, split_budget
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.mixture.bounds import Bounds
 from lidardesign.design.mixture.em import fit_mixture
 from lidardesign.design.mixture.ensemble import admitted_mixture
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.mixture import log_density
 from lidardesign.design.mixture.support import LEAST_MASS
-from lidardesign.design.sensor import DesignSpec, interval_factor
+from lidardesign.design.sensor import MOST_RAYS, DesignSpec, interval_factor
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.evaluate.metrics import DRAW_ROUNDS
 from lidardesign.samples import Samples

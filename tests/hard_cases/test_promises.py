@@ -32,11 +32,11 @@ from lidardesign.config import DensitySettings, LearningSettings
 from lidardesign.density.target.target import build_target
 from lidardesign.density.training.checkpoint import load_arrays, save_arrays
 from lidardesign.density.training.quality import coverage, quality
+from lidardesign.design.bandwidth import split_budget
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts.quantise import lloyd
-from lidardesign.design.layouts.rays import split_budget
 from lidardesign.errors import DataError, LidardesignError
 from lidardesign.evaluate.scene_scores import checked_score
 from lidardesign.evaluate.statistics import bootstrap_interval

@@ -18,7 +18,6 @@ from lidardesign.design.sensor import (
     DEFAULT_LEVEL,
     MOST_RAYS,
     DesignSpec,
-    RayTable,
     Sensor,
     boresight_frame,
     interval_factor,
@@ -192,7 +191,6 @@ def part_design(
     """
     poses = [poses] if isinstance(poses, Pose) else list(poses)
     rays = part_rays(part, poses, count, wanted=wanted)
-    azimuth, elevation = angles(rays.direction)
     shares = np.bincount(rays.sensor, minlength=len(poses))
     sensors = tuple(
         part_sensor(part, pose, name=f"s{index}", weight=1 / len(poses), rays=int(shares[index]), level=level)
@@ -203,7 +201,7 @@ def part_design(
         sensors=sensors,
         layout="fixed",
         rays=len(rays),
-        ray_table=RayTable(rays.origin_m, azimuth, elevation, rays.gate_m, rays.sensor),
+        ray_table=rays.as_angles(),
         provenance={"catalog": part.name, "product": part.product, "rate_hz": part.rate_hz},
         level=level,
     )

@@ -8,10 +8,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.bandwidth import Bandwidth, split_budget
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.constraints.feasibility import least_width
-from lidardesign.design.layouts.rays import split_budget
 from lidardesign.errors import InfeasibleError
 from lidardesign.numerics import COARSE_SLACK
 

@@ -15,6 +15,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from scipy.spatial import cKDTree
 
+from lidardesign.design.bandwidth import split_budget
 from lidardesign.design.catalog.part import thinned
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.layouts.distributed import distributed_beams
@@ -27,57 +28,26 @@ from lidardesign.design.mixture.bounds import bounds_of, groups
 from lidardesign.design.mixture.conditions import conditioned
 from lidardesign.design.mixture.support import Retarget
 from lidardesign.design.sensor import (
-    MOST_RAYS,
     DesignSpec,
     Layout,
-    RayTable,
     Sensor,
     interval_factor,
     tangent_directions,
 )
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.rays import Rays
+from lidardesign.geometry.rays import DEFAULT_RATE_HZ, Rays, fire_times
 from lidardesign.numerics import sphere_exp, sphere_log, systematic_draw, unit_vectors
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
-from lidardesign.space import DesignSpace, angles, direction
+from lidardesign.space import DesignSpace
 from lidardesign.task import random_generator
 
 Gates = Literal["sensor", "ray"]
-DEFAULT_RATE_HZ = 10.0
-# Shares of a ray closer than this are the same share: weights that were normalised differ by a few ulp.
-REMAINDER_DECIMALS = 9
 
 # A design is asked for at many places of a track; the samples and the design decide what a refit finds.
 _REFITS: WeakKeyDictionary[Samples, WeakKeyDictionary[DesignSpec, dict[tuple[int, int], DesignSpec]]] = (
     WeakKeyDictionary()
 )
-
-
-def split_budget(weights: np.ndarray, count: int) -> np.ndarray:
-    """Whole numbers of rays in proportion to weights: (G,) to int64 (G,) with the sum `count` exactly.
-
-    Largest remainder (Hamilton): every sensor gets the whole part of its quota, the rays left over go to the
-    largest fractional parts, the lower index first where they tie. Too few rays leave some sensors without.
-
-    Raises:
-        ConfigError: Weights that are negative, not finite or all zero; a negative count.
-    """
-    weights = np.asarray(weights, dtype=np.float64)
-    if weights.ndim != 1 or not len(weights):
-        raise ConfigError(f"weights of shape {weights.shape}", where="budget", allowed="one per sensor")
-    if not (np.isfinite(weights).all() and (weights >= 0).all() and weights.max() > 0):
-        raise ConfigError(
-            "weights are negative, not finite or all zero", where="budget", allowed="0 or more, one above 0"
-        )
-    if not 0 <= count <= MOST_RAYS or count != int(count):
-        raise ConfigError(f"{count} rays", where="budget", allowed=f"a whole number from 0 to {MOST_RAYS}")
-    scaled = weights / weights.max()
-    quotas = scaled / scaled.sum() * count
-    shares = np.floor(quotas).astype(np.int64)
-    order = np.argsort(-np.round(quotas - shares, REMAINDER_DECIMALS), kind="stable")
-    shares[order[: int(count) - int(shares.sum())]] += 1
-    return shares
 
 
 def lay_out(
@@ -225,11 +195,10 @@ def _distributed_rays(
 @phase("rays")
 def make_ray_table(
     design: DesignSpec, count: int, samples: Samples | None = None, gates: Gates | None = None, *, seed: int = 0
-) -> RayTable:
+) -> Rays:
     """The explicit rays of a design's layout, laid out anew, as they are kept in its file."""
     rays = lay_out(replace(design, ray_table=None), count, samples, gates=gates, seed=seed)
-    azimuth, elevation = angles(rays.direction)
-    return RayTable(rays.origin_m, azimuth, elevation, rays.gate_m, rays.sensor)
+    return rays.as_angles()
 
 
 def own_count(design: DesignSpec) -> int:
@@ -247,11 +216,6 @@ def own_count(design: DesignSpec) -> int:
     if design.layout == "scan":
         return len(design.sensors)
     raise ConfigError("the design names no number of rays", where=design.name, hint="give --rays N")
-
-
-def fire_times(count: int, rate_hz: float) -> np.ndarray:
-    """When each ray fires in its frame, i / (n * rate), shape (n,) [s]."""
-    return np.arange(count) / (max(count, 1) * rate_hz)
 
 
 def _shares(design: DesignSpec, total: int) -> np.ndarray:
@@ -321,7 +285,7 @@ def _needs_samples(design: DesignSpec, total: int, gates: Gates) -> ConfigError:
     )
 
 
-def _fewer(design: DesignSpec, total: int) -> RayTable:
+def _fewer(design: DesignSpec, total: int) -> Rays:
     """An evenly spread subset of a fixed design's rays, each sensor's in proportion."""
     table = design.ray_table
     if table is None or total > len(table.sensor):
@@ -333,17 +297,14 @@ def _fewer(design: DesignSpec, total: int) -> RayTable:
         )
     own = np.bincount(table.sensor, minlength=len(design.sensors))
     shares = split_budget(own, total)
-    looking = direction(table.azimuth_rad, table.elevation_rad)
     of_sensor = [np.flatnonzero(table.sensor == index) for index in range(len(own))]
-    kept = [rows[thinned(looking[rows], int(share))] for rows, share in zip(of_sensor, shares, strict=True)]
+    kept = [rows[thinned(table.direction[rows], int(share))] for rows, share in zip(of_sensor, shares, strict=True)]
     chosen = np.sort(np.concatenate(kept))
-    columns = (table.origin_m, table.azimuth_rad, table.elevation_rad, table.gate_m, table.sensor)
-    return RayTable(*(column[chosen] for column in columns))
+    return table.subset(chosen)
 
 
-def _table_rays(table: RayTable, rate_hz: float) -> Rays:
-    looking = direction(table.azimuth_rad, table.elevation_rad)
-    return Rays(table.origin_m, looking, table.gate_m, table.sensor, fire_times(len(table.sensor), rate_hz))
+def _table_rays(table: Rays, rate_hz: float) -> Rays:
+    return replace(table, time_s=fire_times(len(table), rate_hz))
 
 
 def _tangent(layout: str, sensor: Sensor, count: int, seen: Members | None, seed: int) -> np.ndarray:

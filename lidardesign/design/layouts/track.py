@@ -14,7 +14,7 @@ import numpy as np
 
 from lidardesign.design.mixture.bounds import mean_azimuth
 from lidardesign.design.mixture.conditions import shown
-from lidardesign.design.sensor import DesignSpec, RayTable, Sensor, Track, interval_factor
+from lidardesign.design.sensor import DesignSpec, Sensor, Track, interval_factor
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Rays
 from lidardesign.space import DIMENSIONS
@@ -111,7 +111,7 @@ def _on_track(design: DesignSpec, track: Track, at: Mapping[str, float]) -> Desi
         )
     value = float(at[track.dimension])
     azimuth, elevation, gate = interpolated(track, value)
-    table = RayTable(_origins(track, design, value), azimuth, elevation, gate, track.sensor)
+    table = Rays.from_angles(_origins(track, design, value), azimuth, elevation, gate, track.sensor)
     sensors = tuple(
         _turned(sensor, track, value, np.flatnonzero(track.sensor == index), (azimuth, elevation, gate))
         for index, sensor in enumerate(design.sensors)

@@ -17,7 +17,6 @@ from lidardesign.design.sensor import (
     DEFAULT_LEVEL,
     MOST_RAYS,
     DesignSpec,
-    RayTable,
     Sensor,
     boresight_frame,
     interval_factor,
@@ -25,6 +24,7 @@ from lidardesign.design.sensor import (
     tangent_directions,
 )
 from lidardesign.errors import DataError
+from lidardesign.geometry.rays import Rays
 from lidardesign.run.validation import is_name
 from lidardesign.space import FARTHEST_M, FULL_TURN, angles, direction
 
@@ -160,7 +160,7 @@ def _unique(names: Sequence[str]) -> list[str]:
     return unique
 
 
-def _table(sensors: Sequence[RigSensor]) -> RayTable:
+def _table(sensors: Sequence[RigSensor]) -> Rays:
     counts = [len(one.azimuth_rad) for one in sensors]
     before = np.concatenate([[0], np.cumsum(counts)[:-1]])
     places = [
@@ -170,7 +170,7 @@ def _table(sensors: Sequence[RigSensor]) -> RayTable:
     order = np.argsort(np.concatenate(places), kind="stable")
     columns = ("origin_m", "azimuth_rad", "elevation_rad", "gate_m")
     ordered = (np.concatenate([getattr(one, name) for one in sensors])[order] for name in columns)
-    return RayTable(*ordered, sensor=np.repeat(np.arange(len(sensors)), counts)[order])
+    return Rays.from_angles(*ordered, sensor=np.repeat(np.arange(len(sensors)), counts)[order])
 
 
 def _sensor(one: RigSensor, name: str, total: int) -> Sensor:

@@ -9,18 +9,19 @@ from typing import Any
 
 import numpy as np
 
+from lidardesign.design.bandwidth import split_budget
 from lidardesign.design.catalog.placing import Pose, interleaved, part_sensor
 from lidardesign.design.constraints.budget import BandwidthBudget
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.constraints.origins import fix_origins
 from lidardesign.design.files import MOST_TABLE_RAYS
-from lidardesign.design.layouts.rays import split_budget
 from lidardesign.design.mixture.ensemble import Ensemble, sensors_of
 from lidardesign.design.mixture.features import Features
-from lidardesign.design.sensor import DesignSpec, RayTable, Sensor, interval_factor
+from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor
 from lidardesign.design.snap.parts import PartChoice, PartOptions, fit_part_poses, nearest_parts, part_options
 from lidardesign.design.snap.rays import affordable, counts_of, fired, gate_widths, useful_rays, useful_split
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.rays import Rays
 from lidardesign.space import DesignSpace, angles
 
 
@@ -228,7 +229,7 @@ def _design(
         sensors=sensors,
         layout="fixed",
         rays=total,
-        ray_table=RayTable(origins[owner], azimuth, elevation, np.array(gates)[owner], owner),
+        ray_table=Rays.from_angles(origins[owner], azimuth, elevation, np.array(gates)[owner], owner),
         constraints=constraints.as_document(),
         level=level,
     )

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from lidardesign.design.bandwidth import split_budget
 from lidardesign.design.catalog.placing import Pose, part_rays
 from lidardesign.design.constraints.budget import BandwidthBudget
 from lidardesign.design.files import MOST_TABLE_RAYS
 from lidardesign.design.layouts.grid import field_on_sphere, grid_tangent
-from lidardesign.design.layouts.rays import split_budget
 from lidardesign.design.mixture.features import Features
 from lidardesign.design.sensor import Sensor, tangent_directions
 from lidardesign.design.snap.parts import PartChoice, PartOptions

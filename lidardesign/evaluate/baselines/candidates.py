@@ -17,10 +17,9 @@ import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.layouts.grid import grid_tangent, low_discrepancy
-from lidardesign.design.layouts.rays import fire_times
 from lidardesign.design.sensor import MOST_RAYS
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.rays import Rays
+from lidardesign.geometry.rays import Rays, fire_times
 from lidardesign.numerics import EPSILON
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 

@@ -20,9 +20,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.bandwidth import Bandwidth, split_budget
 from lidardesign.design.constraints.budget import BIN_MARGIN, BandwidthBudget
-from lidardesign.design.layouts.rays import lay_out, split_budget
+from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import MOST_RAYS, DesignSpec, Sensor, interval_factor
 from lidardesign.evaluate.baselines.candidates import Positions, mean_mbps
 from lidardesign.evaluate.cma.sensor_parameters import (

@@ -16,7 +16,7 @@ from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.layouts.gates import Heard, gates_within
 from lidardesign.design.layouts.shared_fields import bandwidth_limit
 from lidardesign.design.mixture.bounds import bounds_of
-from lidardesign.design.sensor import DesignSpec, RayTable, Sensor, interval_factor
+from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
@@ -109,7 +109,7 @@ def has_ray_gates(design: DesignSpec) -> bool:
 def _with_gates(design: DesignSpec, gates: np.ndarray) -> DesignSpec:
     if design.layout != "scan":
         table = design.ray_table
-        assert isinstance(table, RayTable)
+        assert table is not None
         return replace(design, ray_table=replace(table, gate_m=gates))
     factor = interval_factor(design.level)
     sensors = [_gated(sensor, gate, factor) for sensor, gate in zip(design.sensors, gates, strict=True)]

@@ -15,13 +15,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidardesign.design.layouts.rays import DEFAULT_RATE_HZ
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import DataError
 from lidardesign.estimates import ROUNDING, Estimate
 from lidardesign.export.common.names import identifiers
 from lidardesign.export.common.read_back import angles_between
-from lidardesign.geometry.rays import Rays
+from lidardesign.geometry.rays import DEFAULT_RATE_HZ, Rays
 from lidardesign.numerics import SLACK
 from lidardesign.space import angles
 
