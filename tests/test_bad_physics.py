@@ -12,7 +12,7 @@ from lidardesign_tasks.emitter import winding_number
 from lidardesign_tasks.flatland import FlatlandTask
 from test_bad_input import GARBAGE, GOOD, check_one_clear_message
 
-from lidardesign.cli.output import EXIT_INTERRUPTED, Console, describe_error
+from lidardesign.cli.output import EXIT_INTERRUPTED, Output, describe_error
 from lidardesign.errors import PluginError
 from lidardesign.registry import plugin_guard
 from lidardesign.scene import Ambient, Body, Medium, Mesh, Receiver, Scene, Sphere
@@ -260,5 +260,5 @@ def test_an_interruption_inside_a_compiled_kernel_is_an_interruption():
     with pytest.raises(PluginError) as blamed, plugin_guard("flatland"):
         interrupted_kernel()
     for error in (raised.value, blamed.value):
-        document, code, text = describe_error(error, Console())
+        document, code, text = describe_error(error, Output())
         assert (document["kind"], code, text) == ("interrupted", EXIT_INTERRUPTED, "interrupted")

@@ -14,7 +14,7 @@ from command_line import caller, files_under, make_run
 
 from lidardesign import __version__
 from lidardesign.cli import output as console_module
-from lidardesign.cli.output import Console, command, plain_json
+from lidardesign.cli.output import Output, command, plain_json
 from lidardesign.errors import InfeasibleError
 from lidardesign.run.yaml import load_yaml
 from lidardesign.samples import Samples, load_samples, save_samples
@@ -351,8 +351,8 @@ def test_numbers_that_json_lacks_become_null():
 
 
 def test_quiet_says_nothing_by_the_way(capsys):
-    Console(quiet=True).note("something")
-    Console().note("something else")
+    Output(quiet=True).note("something")
+    Output().note("something else")
     assert capsys.readouterr().err == "something else\n"
 
 

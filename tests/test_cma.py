@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from command_line import caller
 
-from lidardesign.cli.output import Console
+from lidardesign.cli.output import Output
 from lidardesign.cli.searches import check_cma_seconds, told
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.check import check_design
@@ -558,7 +558,7 @@ class Bar:
 
 def test_each_search_has_a_line_that_shows_how_far_it_is_and_its_best_score():
     bar = Bar()
-    settings = told(CmaSettings(FAST), MissTask.metric, Console(), bar)
+    settings = told(CmaSettings(FAST), MissTask.metric, Output(), bar)
     candidate_of("grid", settings).positions([], 12)
     candidate_of("grid", settings).positions([], 13)
     assert bar.lines == ["cma, 12 rays", "cma, 13 rays"]
@@ -569,7 +569,7 @@ def test_each_search_has_a_line_that_shows_how_far_it_is_and_its_best_score():
 
 
 def test_without_a_terminal_a_search_is_announced_once(capsys):
-    settings = told(CmaSettings(FAST), MissTask.metric, Console(), None)
+    settings = told(CmaSettings(FAST), MissTask.metric, Output(), None)
     candidate_of("grid", settings).positions([], 12)
     said = capsys.readouterr().err
     assert said.count("cma, 12 rays: searching") == 1

@@ -15,7 +15,7 @@ from command_line import caller, make_run
 from lidardesign_tasks.arm_robot import load_robot
 from lidardesign_tasks.basel import load_model
 
-from lidardesign.cli.output import Console, describe_error
+from lidardesign.cli.output import Output, describe_error
 from lidardesign.density.fields.grids import _digest, _load
 from lidardesign.density.training.snapshot_quality import seconds_at
 from lidardesign.density.training.training import _step_of
@@ -324,6 +324,6 @@ def test_memory_that_torch_does_not_get_is_no_fault_of_the_program():
 
     with pytest.raises(RuntimeError) as refused:
         torch.empty(1 << 60, dtype=torch.uint8)
-    document, _, text = describe_error(refused.value, Console())
+    document, _, text = describe_error(refused.value, Output())
     assert document["kind"] == "memory"
     assert "fault" not in text

@@ -13,7 +13,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +21,8 @@ import trimesh
 import typer
 from command_line import caller, files_under, make_run, program
 
-from lidardesign.cli import deprecations
-from lidardesign.cli.deprecations import RENAMED, RenamedOption, deprecations_told, with_new_names
 from lidardesign.cli.main import app
 from lidardesign.cli.manual import MANUALS
-from lidardesign.deprecation import DeprecatedUse, announce
 from lidardesign.run.files import STDIO, is_input, offered_input
 from lidardesign.run.yaml import load_yaml
 
@@ -327,65 +323,6 @@ def test_every_exit_code_that_a_manual_names_is_explained_in_one_place():
     explained = {int(code) for code in re.findall(r"^\| (\d+) \|", page, re.MULTILINE)}
     named = {code for manual in MANUALS.values() for code in manual.exits or ()}
     assert named | {0, 2, 3, 70, 130, 141, 143} <= explained
-
-
-def test_a_deprecated_use_is_told_once_also_where_nothing_else_is(capsys):
-    with deprecations_told():
-        for _ in range(3):
-            announce("--old", instead="--new", removed_in="0.3.0")
-        announce("--other", instead="--new", removed_in="0.3.0")
-        with warnings.catch_warnings(record=True) as others:
-            warnings.simplefilter("always")
-            warnings.warn("something else", stacklevel=1)
-    assert capsys.readouterr().err.splitlines() == [
-        "deprecated: --old is deprecated and goes in 0.3.0; use --new",
-        "deprecated: --other is deprecated and goes in 0.3.0; use --new",
-    ]
-    assert len(others) == 1
-
-
-def test_other_warnings_are_not_taken_for_deprecations():
-    with pytest.warns(UserWarning, match="something else"), deprecations_told():
-        warnings.warn("something else", stacklevel=1)
-
-
-def test_python_callers_meet_a_warning_at_their_own_line():
-    def renamed():
-        announce("renamed()", instead="new()", removed_in="0.3.0")
-
-    with pytest.warns(DeprecatedUse) as caught:
-        renamed()
-    assert caught[0].filename == __file__
-    assert caught[0].message.as_dict() == {"what": "renamed()", "instead": "new()", "removed_in": "0.3.0"}
-
-
-def test_an_option_by_its_old_name_does_what_the_new_one_does(lidardesign, flat, monkeypatch):
-    old = RenamedOption("show", "--condition", "--at", "0.3.0")
-    monkeypatch.setattr(deprecations, "RENAMED", (old,))
-    design = flat / "designs" / "fit.yaml"
-    for given in (("--condition", "x_m=1"), ("--condition=x_m=1",)):
-        result = lidardesign("show", design, *given, "--quiet", "--json")
-        assert result.json["at"] == {"x_m": 1.0}
-        assert result.err == "deprecated: show --condition is deprecated and goes in 0.3.0; use --at\n"
-    assert lidardesign("show", design, "--at", "x_m=1", "--quiet").err == ""
-
-
-def test_only_options_of_the_command_are_renamed():
-    table = (RenamedOption("catalog show", "--old", "--new", "1.0.0"),)
-    with pytest.warns(DeprecatedUse):
-        assert with_new_names(["catalog", "show", "a", "--old=3", "--", "--old"], table) == [
-            "catalog", "show", "a", "--new=3", "--", "--old"
-        ]  # fmt: skip
-    for words in (["catalog", "list", "--old"], ["show", "--old"], [], ["catalog"]):
-        assert with_new_names(words, table) == words
-
-
-def test_what_is_renamed_has_a_name_that_there_is():
-    parsed = dict(commands())
-    for entry in RENAMED:
-        names = {name for parameter in parsed[entry.command].params for name in parameter.opts}
-        assert entry.new in names
-        assert entry.old not in names
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import trimesh
 from command_line import caller, make_run
 from lidardesign_tasks.units import doubtful_meshes, doubtful_motion
 
-from lidardesign.cli.output import Console
+from lidardesign.cli.output import Output
 from lidardesign.config import load_run_config
 from lidardesign.density.target.resolution import resolution_notes
 from lidardesign.design.compare import outside_notes
@@ -169,8 +169,8 @@ def test_a_rig_in_millimetres_is_told_wherever_it_meets_a_run(capsys, monkeypatc
 
 def test_a_rig_that_hears_only_far_beyond_the_space_is_told(flat):
     space = load_run_config(flat)[1].space
-    near = read_design(rig(flat, "near.csv", 1), Console())
-    far = read_design(rig(flat, "far.csv", 1, start=500.0), Console())
+    near = read_design(rig(flat, "near.csv", 1), Output())
+    far = read_design(rig(flat, "far.csv", 1, start=500.0), Output())
     assert outside_notes(near, space) == []
     assert "hears from 500 m on" in outside_notes(far, space)[0]
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
     from rich.console import Console as RichConsole
 
-    from lidardesign.cli.output import Console
+    from lidardesign.cli.output import Output
     from lidardesign.design.constraints.document import Constraints
     from lidardesign.design.sensor import DesignSpec
     from lidardesign.workflow.learning_budget import Goal
@@ -90,7 +90,7 @@ class Plan:
         }
 
 
-def tell_plan(plan: Plan, console: Console) -> None:
+def tell_plan(plan: Plan, console: Output) -> None:
     """Give a plan as the result of its command.
 
     Raises:

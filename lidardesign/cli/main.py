@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
+import shlex
 import sys
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
@@ -20,18 +23,27 @@ from lidardesign.cli.commands.fit import fit
 from lidardesign.cli.commands.learn import learn
 from lidardesign.cli.commands.show import show
 from lidardesign.cli.commands.tasks import tasks_app
-from lidardesign.cli.deprecations import deprecations_told, with_new_names
 from lidardesign.cli.environment import make_streams_tolerant, set_cache_default, set_thread_defaults, terminate_cleanly
 from lidardesign.cli.manual import PAGES, add_manuals
-from lidardesign.cli.mistakes import hint_of
-from lidardesign.cli.output import EXIT_BROKEN_PIPE, Console, forget_stdout, print_json, report_error, tell
-from lidardesign.cli.stdout_guard import print_aside_from_now_on
+from lidardesign.cli.output import (
+    EXIT_BROKEN_PIPE,
+    Output,
+    close_stdout_guard,
+    forget_stdout,
+    print_json,
+    print_message,
+    report_error,
+)
 
+PROGRAM = "lidardesign"
 EXIT_USAGE = 2
+HELP_WORDS = ("help", "man", "usage")
+# Options that belong to commands, and are often written before them.
+COMMON_OPTIONS = ("--json", "--quiet", "-q", "--debug", "--seed")
 SETTINGS = {"help_option_names": ["-h", "--help"]}
 
 app = typer.Typer(
-    name="lidardesign",
+    name=PROGRAM,
     help="Design LiDARs: learn which rays are worth firing, fit sensors, prove what they are worth.",
     epilog="Exit codes: 0 ok, 1 threshold missed, 2 usage or config, 3 bad input data, "
     "4 infeasible constraints, 5 numerical failure, 6 plugin failure, 70 internal error, 130 interrupted, "
@@ -74,29 +86,28 @@ def run(arguments: list[str] | None = None) -> None:
     terminate_cleanly()
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
-        with deprecations_told():
-            code = _invoke(with_new_names(arguments))
+        code = _invoke(arguments)
         sys.stdout.flush()
         if "--json" in arguments:
-            print_aside_from_now_on()
+            close_stdout_guard()
     except BrokenPipeError:
         forget_stdout()
         code = EXIT_BROKEN_PIPE
     except OSError as error:
         forget_stdout()
-        code = report_error(error, Console())
+        code = report_error(error, Output())
     sys.exit(code)
 
 
 def _invoke(arguments: list[str]) -> int:
     """Run typer without letting it print or exit for errors."""
-    console = Console(json="--json" in arguments, debug="--debug" in arguments)
+    output = Output(json="--json" in arguments, debug="--debug" in arguments)
     try:
-        code: Any = app(arguments, prog_name="lidardesign", standalone_mode=False)
+        code: Any = app(arguments, prog_name=PROGRAM, standalone_mode=False)
     except typer.Exit as error:
         code = error.exit_code
     except typer.Abort:
-        return report_error(KeyboardInterrupt(), console)
+        return report_error(KeyboardInterrupt(), output)
     except SystemExit as error:
         # neither typer nor rich exits by itself here but for a closed pipe
         raise BrokenPipeError from error
@@ -104,21 +115,55 @@ def _invoke(arguments: list[str]) -> int:
         raise
     except Exception as error:
         if not hasattr(error, "format_message"):
-            return report_error(error, console)
-        return _report_usage(error, console, arguments)
+            return report_error(error, output)
+        return _report_usage(error, output, arguments)
     return code if isinstance(code, int) else 0
 
 
-def _report_usage(error: Any, console: Console, arguments: list[str]) -> int:
+def _report_usage(error: Any, output: Output, arguments: list[str]) -> int:
     """One message for what typer finds wrong with the command line."""
     context = getattr(error, "ctx", None)
-    path = context.command_path if context else "lidardesign"
-    message, hint = error.format_message().rstrip(), hint_of(arguments, error, typer.main.get_command(app))
+    path = context.command_path if context else PROGRAM
+    message = error.format_message().rstrip()
+    hint = _similar_line(arguments, typer.main.get_command(app)) or f"{path} --help"
     if type(error).__name__ == "NoArgsIsHelpError":
-        tell(message)
+        print_message(message)
         message = "no command was given"
-    if console.json:
+    if output.json:
         document = {"kind": "usage", "message": message, "where": path, "hint": hint}
         print_json({"error": document, "exit_code": EXIT_USAGE})
-    tell(f"usage error: {path}: {message}\n  try: {hint}")
+    print_message(f"usage error: {path}: {message}\n  try: {hint}")
     return EXIT_USAGE
+
+
+def _similar_line(words: Sequence[str], root: Any) -> str | None:
+    """A command line close to the given one that would be understood, if there is one."""
+    commands = root.commands
+    first, *rest = words or [""]
+    split = first.split()
+    similar: list[str] | None = None
+    if len(split) > 1 and split[0] in commands:
+        similar = [*split, *rest]
+    elif first in HELP_WORDS:
+        named = [word for word in rest if not word.startswith("-")][:1]
+        similar = [*named, "--help"] if not named or named[0] in commands else ["--help"]
+    elif first in COMMON_OPTIONS:  # they belong behind the command
+        options, behind = [], list(words)
+        while behind and behind[0] in COMMON_OPTIONS:
+            count = 2 if behind[0] == "--seed" else 1
+            options, behind = options + behind[:count], behind[count:]
+        similar = [*behind, *options] if behind and behind[0] in commands else None
+    elif first in commands:
+        similar = _with_known_command(words, 1, getattr(commands[first], "commands", None))
+    elif first and not first.startswith("-"):
+        similar = _with_known_command(words, 0, commands)
+    return None if similar is None else shlex.join([PROGRAM, *similar])
+
+
+def _with_known_command(words: Sequence[str], index: int, commands: Any) -> list[str] | None:
+    """A command line with the word at a place replaced by the command that it is most like."""
+    if not commands or len(words) <= index or words[index] in commands:
+        return None
+    names = [name for name, command in commands.items() if not command.hidden]
+    close = difflib.get_close_matches(words[index], names, n=1)
+    return [*words[:index], close[0], *words[index + 1 :]] if close else None

@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING, Any, TextIO
 import typer
 
 from lidardesign.cli.environment import TerminatedError
-from lidardesign.cli.stdout_guard import printing_aside
 from lidardesign.cli.tables.times import show_times
-from lidardesign.errors import LidardesignError
-from lidardesign.run.clock import Clock, peak_memory_bytes, running
+from lidardesign.errors import ConfigError, DataError, LidardesignError
+from lidardesign.run.clock import Clock, keep_timings, peak_memory_bytes, running
 from lidardesign.run.files import offered_input
 
 if TYPE_CHECKING:
@@ -37,6 +36,9 @@ PLAIN_WIDTH = 120
 NUMBA_CACHE = "numba/core/caching.py"
 NO_MEMORY = "can't allocate memory"
 DISK_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
+STDOUT, STDERR = 1, 2
+# Commands that only read a run wait for its writer no longer than this.
+SHORT_WAIT_S = 0.5
 
 
 def plain_json(value: Any) -> Any:
@@ -55,15 +57,15 @@ def plain_json(value: Any) -> Any:
 
 
 @dataclass
-class Console:
+class Output:
     """Where a command's output goes.
 
     Arguments:
         json: Print one JSON document on stdout and nothing else there.
         quiet: No progress and no notes.
         debug: Show tracebacks.
-        output: Where the result goes: the program's stdout.
-        when_interrupted: What to tell the user after Ctrl-C or SIGTERM.
+        stream: Where the result goes: the program's stdout.
+        when_interrupted: What to say to the user after Ctrl-C or SIGTERM.
         answered: Whether the one JSON document was printed; an error after it adds none.
         clock: Where the command's time goes.
     """
@@ -71,7 +73,7 @@ class Console:
     json: bool = False
     quiet: bool = False
     debug: bool = False
-    output: TextIO = field(default_factory=lambda: sys.stdout)
+    stream: TextIO = field(default_factory=lambda: sys.stdout)
     when_interrupted: Callable[[], str | None] = field(default=lambda: None)
     answered: bool = False
     clock: Clock = field(default_factory=Clock)
@@ -80,14 +82,14 @@ class Console:
         """A rich console; it honours NO_COLOR and prints plain text where there is no terminal."""
         from rich.console import Console as RichConsole
 
-        file = sys.stderr if stderr else self.output
+        file = sys.stderr if stderr else self.stream
         width = None if file.isatty() or "COLUMNS" in os.environ else PLAIN_WIDTH
         return RichConsole(file=file, highlight=False, width=width)
 
     def note(self, text: str) -> None:
-        """Tell something by the way, on stderr."""
+        """Print a note on stderr, unless --quiet."""
         if not self.quiet:
-            tell(text)
+            print_message(text)
 
     def result(
         self, document: dict[str, Any], show: Callable[[RichConsole], None], *, show_costs: bool = True
@@ -102,7 +104,7 @@ class Console:
         timings = self.clock.timings()
         if self.json:
             self.answered = True
-            print_json({**document, "timings": timings, "peak_memory_bytes": peak_memory_bytes()}, self.output)
+            print_json({**document, "timings": timings, "peak_memory_bytes": peak_memory_bytes()}, self.stream)
             return
         rich = self.rich()
         show(rich)
@@ -123,7 +125,7 @@ class Console:
             yield bar
 
 
-def tell(text: str) -> None:
+def print_message(text: str) -> None:
     """Print on stderr; where nobody listens there any more, that is no reason to stop working."""
     try:
         print(text, file=sys.stderr, flush=True)
@@ -138,34 +140,64 @@ def print_json(document: dict[str, Any], output: TextIO | None = None) -> None:
 
 
 @contextlib.contextmanager
-def command(*, json: bool, quiet: bool, debug: bool) -> Iterator[Console]:
+def command(*, json: bool, quiet: bool, debug: bool) -> Iterator[Output]:
     """Run a command's body: its errors become one message and an exit code.
 
     With `--json`, whatever plugins and libraries print meanwhile goes to stderr, also by processes of their own.
     """
-    console = Console(json=json, quiet=quiet, debug=debug, output=sys.stdout)
+    output = Output(json=json, quiet=quiet, debug=debug, stream=sys.stdout)
     try:
-        aside = printing_aside(console) if json else contextlib.nullcontext()
-        with aside, running(console.clock), offered_input():
-            yield console
-        console.output.flush()
+        guard = _guarded_stdout(output) if json else contextlib.nullcontext()
+        with guard, running(output.clock), offered_input():
+            yield output
+        output.stream.flush()
     except typer.Exit:
         raise
     except BrokenPipeError:
         forget_stdout()
         raise typer.Exit(EXIT_BROKEN_PIPE) from None
     except (Exception, KeyboardInterrupt) as error:
-        code = report_error(error, console)
-        _drop_unwritable(console.output)
+        code = report_error(error, output)
+        try:
+            output.stream.flush()
+        except OSError:  # a full disk, which was reported: the last flush would fail once more
+            forget_stdout()
         raise typer.Exit(code) from None
 
 
-def _drop_unwritable(output: TextIO) -> None:
-    """Forget what a full disk did not take: it was reported, and the last flush would fail once more."""
+@contextlib.contextmanager
+def _guarded_stdout(output: Output) -> Iterator[None]:
+    """Keep standard output for the one document; plugins, compiled code and their processes print on stderr."""
+    stdout = output.stream
+    with contextlib.redirect_stdout(sys.stderr):
+        if not _is_of_process(stdout):
+            yield
+            return
+        stdout.flush()
+        copy = os.dup(STDOUT)
+        os.dup2(STDERR, STDOUT)
+        try:
+            with open(os.dup(copy), "w", encoding=stdout.encoding, errors=stdout.errors) as output.stream:
+                yield
+        finally:
+            output.stream = stdout
+            os.dup2(copy, STDOUT)
+            os.close(copy)
+
+
+def close_stdout_guard() -> None:
+    """Send what threads and exit handlers of plugins still print to stderr, once the program has answered."""
+    if _is_of_process(sys.stdout):
+        sys.stdout.flush()
+        os.dup2(STDERR, STDOUT)
+
+
+def _is_of_process(stream: TextIO) -> bool:
+    """Whether a stream is the standard output that other processes and compiled code print on, too."""
     try:
-        output.flush()
-    except OSError:
-        forget_stdout()
+        return stream.fileno() == STDOUT
+    except (AttributeError, OSError, ValueError):
+        return False
 
 
 def forget_stdout() -> None:
@@ -173,26 +205,31 @@ def forget_stdout() -> None:
     sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - lives as long as the process
 
 
-def report_error(error: BaseException, console: Console) -> int:
+def report_error(error: BaseException, output: Output) -> int:
     """Print what went wrong, once, and return the exit code."""
-    document, code, text = describe_error(error, console)
-    if console.json and not console.answered:
-        print_json({"error": document, "exit_code": code}, console.output)
-    tell(text)
-    if console.debug:
+    document, code, text = describe_error(error, output)
+    if output.json and not output.answered:
+        print_json({"error": document, "exit_code": code}, output.stream)
+    print_message(text)
+    if output.debug:
         traceback.print_exception(error)
     return code
 
 
-def describe_error(error: BaseException, console: Console) -> tuple[dict[str, Any], int, str]:
+def describe_error(error: BaseException, output: Output) -> tuple[dict[str, Any], int, str]:
     """The JSON form of an error, its exit code, and its text for people."""
-    error = _interruption(error) or error
+    cause: BaseException | None = error
+    while cause is not None:  # compiled kernels that return into an interruption make it a SystemError
+        if isinstance(cause, KeyboardInterrupt):
+            error = cause
+            break
+        cause = cause.__cause__
     if isinstance(error, LidardesignError):
         return error.as_dict(), error.exit_code, f"{error.kind} error: {error}"
     if isinstance(error, KeyboardInterrupt):
         terminated = isinstance(error, TerminatedError)
         kind, code = ("terminated", EXIT_TERMINATED) if terminated else ("interrupted", EXIT_INTERRUPTED)
-        further = console.when_interrupted()
+        further = output.when_interrupted()
         text = f"{kind}: {further}" if further else kind
         return {"kind": kind, "message": text}, code, text
     # torch says so by a name or by words of its own
@@ -200,29 +237,20 @@ def describe_error(error: BaseException, console: Console) -> tuple[dict[str, An
         text = "the computer has no memory left; a smaller batch, field_resolution or preset needs less"
         return {"kind": "memory", "message": text}, EXIT_INTERNAL, f"memory error: {text}"
     if isinstance(error, OSError):
-        return _describe_system_error(error)
-    folder = _damaged_cache(error)
-    if folder is not None:
-        text, hint = f"{folder}: the cache of compiled code is damaged", "remove its files *.nbi and *.nbc"
-        document = {"kind": "system", "message": text, "hint": hint}
-        return document, EXIT_SYSTEM, f"system error: {text}\n  try: {hint}"
-    text = f"{type(error).__name__}: {' '.join(str(error).split())}"
-    hint = "this is a fault of lidardesign; --debug shows where, please report it"
-    return (
-        {"kind": "internal", "message": text, "hint": hint},
-        EXIT_INTERNAL,
-        f"internal error: {text}\n  {hint}",
-    )
-
-
-def _interruption(error: BaseException) -> KeyboardInterrupt | None:
-    """The interruption that an error came of: compiled kernels that return into one make it a SystemError."""
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, KeyboardInterrupt):
-            return cause
-        cause = cause.__cause__
-    return None
+        name = f"{error.filename}: " if error.filename else ""
+        document = {"kind": "system", "message": f"{name}{error.strerror or error}"}
+        if error.errno in DISK_FULL and not error.filename:
+            document["hint"] = "make room where the output, the temporary files or numba's cache (NUMBA_CACHE_DIR) go"
+    elif folder := _damaged_cache(error):
+        message = f"{folder}: the cache of compiled code is damaged"
+        document = {"kind": "system", "message": message, "hint": "remove its files *.nbi and *.nbc"}
+    else:
+        text = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        hint = "this is a fault of lidardesign; --debug shows where, please report it"
+        document = {"kind": "internal", "message": text, "hint": hint}
+        return document, EXIT_INTERNAL, f"internal error: {text}\n  {hint}"
+    attempt = f"\n  try: {document['hint']}" if "hint" in document else ""
+    return document, EXIT_SYSTEM, f"system error: {document['message']}{attempt}"
 
 
 def _damaged_cache(error: BaseException) -> str | None:
@@ -238,11 +266,13 @@ def _damaged_cache(error: BaseException) -> str | None:
     return None
 
 
-def _describe_system_error(error: OSError) -> tuple[dict[str, Any], int, str]:
-    name = f"{error.filename}: " if error.filename else ""
-    document = {"kind": "system", "message": f"{name}{error.strerror or error}"}
-    text = f"system error: {document['message']}"
-    if error.errno in DISK_FULL and not error.filename:
-        document["hint"] = "make room where the output, the temporary files or numba's cache (NUMBA_CACHE_DIR) go"
-        text += f"\n  try: {document['hint']}"
-    return document, EXIT_SYSTEM, text
+def keep_times(run: Path, name: str, output: Output, *, wait_s: float = SHORT_WAIT_S) -> None:
+    """Enter the times of a command in the manifest of its run; where that cannot be, a note says so.
+
+    The work is done by then: that its times are not kept is no reason to fail.
+    """
+    try:
+        keep_timings(run, name, output.clock, wait_s=wait_s)
+    except (ConfigError, DataError, OSError) as error:
+        message = error.message if isinstance(error, ConfigError | DataError) else error.strerror or error
+        output.note(f"note: the times of {name} are not kept in {run}: {message}")

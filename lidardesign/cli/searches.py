@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress as RichProgress
     from rich.progress import TaskID
 
-    from lidardesign.cli.output import Console
+    from lidardesign.cli.output import Output
     from lidardesign.evaluate.cma.candidate import CmaSettings
     from lidardesign.evaluate.cma.search import Progress
     from lidardesign.task import Metric
@@ -57,7 +57,7 @@ def searching(seconds: float | None) -> CmaSettings:
     return CmaSettings(Budget(DEFAULT_SECONDS if seconds is None else seconds))
 
 
-def told(settings: CmaSettings, metric: Metric, console: Console, bar: RichProgress | None) -> CmaSettings:
+def told(settings: CmaSettings, metric: Metric, console: Output, bar: RichProgress | None) -> CmaSettings:
     """The same settings with searches that show their best score in a bar; without one, when they begin."""
     lines: dict[str, TaskID] = {}
     begun: set[str] = set()

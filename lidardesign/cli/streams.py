@@ -1,7 +1,4 @@
-"""`-` for a file: standard input as a file for who reads one, and files that go to standard output.
-
-Files that a command will write: what is wrong or new about their names, said before anything takes time.
-"""
+"""Files that a command will write: `-` for standard output, pages, and folders that are not there yet."""
 
 from __future__ import annotations
 
@@ -11,52 +8,19 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from lidardesign.errors import ConfigError, LidardesignError
-from lidardesign.run.files import STDIO, is_input, read_input
-
-if TYPE_CHECKING:
-    from lidardesign.cli.output import Console
+from lidardesign.cli.output import Output
+from lidardesign.errors import ConfigError
+from lidardesign.run.files import STDIO
 
 
-# A design from standard input has no file that it could be called by.
-NAME = "stdin"
-MAX_BYTES = 64_000_000
-
-
-@contextlib.contextmanager
-def readable(path: Path, kind: str = "a design") -> Iterator[Path]:
-    """The file to read for a path: of standard input, a copy for as long as it is read.
-
-    Errors inside name standard input, not the copy.
-
-    Raises:
-        ConfigError: Standard input is too large, or was read as something else.
-    """
-    if not is_input(path):
-        yield path
-        return
-    content = read_input(kind, MAX_BYTES)
-    with tempfile.TemporaryDirectory(prefix="lidardesign-") as folder:
-        copy = Path(folder) / NAME
-        copy.write_bytes(content)
-        try:
-            yield copy
-        except LidardesignError as error:
-            error.where = (error.where or STDIO).replace(str(copy), STDIO)
-            error.message = error.message.replace(str(copy), STDIO)
-            error.args = (error.render(),)
-            raise
-
-
-def claim_stdout(console: Console, *, dry_run: bool = False, **files: Path | None) -> None:
-    """Give standard output to the file that is `-`, if one is; what people are told then goes to stderr, or
-    nowhere with --quiet.
+def claim_stdout(output: Output, *, dry_run: bool = False, **files: Path | None) -> None:
+    """Give standard output to the file that is `-`, if one is; people then read all else on stderr, or nowhere with
+    --quiet.
 
     Arguments:
-        console: The command's.
-        dry_run: Whether the files are only spoken of, so that standard output stays with what is told.
+        output: The command's.
+        dry_run: Whether the files are only spoken of, so that standard output stays with the result.
         files: What would be written, by the option that says so, with _ for -.
 
     Raises:
@@ -65,14 +29,13 @@ def claim_stdout(console: Console, *, dry_run: bool = False, **files: Path | Non
     asking = ["--" + name.replace("_", "-") for name, path in files.items() if path is not None and str(path) == STDIO]
     if not asking:
         return
-    if console.json:
+    if output.json:
         asking.append("--json")
     if len(asking) > 1:
         hint = f"give {asking[0]} a file"
         raise ConfigError(f"{' and '.join(asking)} both write to standard output", where=asking[0], hint=hint)
     if not dry_run:
-        # who is to be told nothing by the way gets the file alone
-        console.output = io.StringIO() if console.quiet else sys.stderr
+        output.stream = io.StringIO() if output.quiet else sys.stderr
 
 
 def is_output(path: Path | None) -> bool:
@@ -118,7 +81,7 @@ PAGE_SUFFIXES = (".html", ".htm")
 
 
 def claim_outputs(
-    console: Console,
+    output: Output,
     *,
     dry_run: bool = False,
     csv: Path | None = None,
@@ -130,9 +93,9 @@ def claim_outputs(
     Raises:
         ConfigError: As of `claim_stdout` and `check_page`.
     """
-    claim_stdout(console, dry_run=dry_run, csv=csv, report=report)
+    claim_stdout(output, dry_run=dry_run, csv=csv, report=report)
     check_page(report)
-    tell_new_folders([path for path in (csv, report, plots) if path is not None], console)
+    note_new_folders([path for path in (csv, report, plots) if path is not None], output)
 
 
 def check_page(report: Path | None) -> None:
@@ -153,7 +116,7 @@ def check_page(report: Path | None) -> None:
     )
 
 
-def tell_new_folders(paths: Iterable[Path], console: Console) -> None:
+def note_new_folders(paths: Iterable[Path], output: Output) -> None:
     """Say which folders are made for files, so that a misspelt one is seen; each once, by its topmost new part."""
     new: dict[Path, Path] = {}
     for path in paths:
@@ -161,4 +124,4 @@ def tell_new_folders(paths: Iterable[Path], console: Console) -> None:
         if missing:
             new.setdefault(missing[-1], path)
     for folder, path in new.items():
-        console.note(f"note: there is no folder {folder} yet; it is made for {path}")
+        output.note(f"note: there is no folder {folder} yet; it is made for {path}")

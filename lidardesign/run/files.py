@@ -15,11 +15,12 @@ import re
 import secrets
 import socket
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextvars import ContextVar
 from pathlib import Path
 
-from lidardesign.errors import ConfigError, DataError
+from lidardesign.errors import ConfigError, DataError, LidardesignError
 
 HOST_DIGITS = 8
 
@@ -187,6 +188,8 @@ def sha256_file(path: Path) -> str:
 
 # What stands for standard input where a file is read, and for standard output where one is written.
 STDIO = "-"
+# What a design may have that is read from standard input.
+MOST_INPUT_BYTES = 64_000_000
 HINT = "give one of them as a file; a file that is called - is given by its whole path"
 
 
@@ -252,3 +255,28 @@ def read_input(kind: str, most_bytes: int) -> bytes:
     if offered is None:
         raise ConfigError("stands for standard input in commands only", where=STDIO, hint="give a file")
     return offered.read(kind, most_bytes)
+
+
+@contextlib.contextmanager
+def readable(path: Path, kind: str = "a design") -> Iterator[Path]:
+    """The file to read for a path: of standard input, a copy for as long as it is read.
+
+    Errors inside name standard input, not the copy.
+
+    Raises:
+        ConfigError: Standard input is too large, or was read as something else.
+    """
+    if not is_input(path):
+        yield path
+        return
+    content = read_input(kind, MOST_INPUT_BYTES)
+    with tempfile.TemporaryDirectory(prefix="lidardesign-") as folder:
+        copy = Path(folder) / "stdin"
+        copy.write_bytes(content)
+        try:
+            yield copy
+        except LidardesignError as error:
+            error.where = (error.where or STDIO).replace(str(copy), STDIO)
+            error.message = error.message.replace(str(copy), STDIO)
+            error.args = (error.render(),)
+            raise

@@ -13,7 +13,7 @@ from lidardesign.run.files import is_there
 from lidardesign.workflow.runs import open_run, reach_beside, read_design, run_of
 
 if TYPE_CHECKING:
-    from lidardesign.cli.output import Console
+    from lidardesign.cli.output import Output
     from lidardesign.design.sensor import DesignSpec
     from lidardesign.evaluate.score import EvaluationRequest
     from lidardesign.workflow.runs import Run
@@ -31,7 +31,7 @@ class JudgedDesign:
 
 
 @phase("designs")
-def collect(targets: list[Path], console: Console) -> tuple[list[JudgedDesign], list[Run]]:
+def collect(targets: list[Path], console: Output) -> tuple[list[JudgedDesign], list[Run]]:
     """The designs that were named, and the runs: of folders all designs, of files the file."""
     entries: list[JudgedDesign] = []
     opened = {target: open_run(target) for target in targets if target.is_dir()}

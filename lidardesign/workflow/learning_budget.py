@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidardesign.cli.output import Console
+from lidardesign.cli.output import Output
 from lidardesign.errors import ConfigError, DataError, ThresholdError
 from lidardesign.run.clock import phase
 
@@ -158,7 +158,7 @@ class Learner:
     run: Path
     device: str
     progress: Callable[[LearnProgress], None]
-    console: Console
+    console: Output
 
     def learn(self, config: RunConfig, goal: Goal, *, resume: bool) -> LearnResult:
         """Learn a configuration, or to a goal, or go on with it."""

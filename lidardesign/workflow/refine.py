@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
     from rich.console import Console as RichConsole
 
-    from lidardesign.cli.output import Console
+    from lidardesign.cli.output import Output
     from lidardesign.design.constraints.document import Constraints
     from lidardesign.design.fit import FitResult
     from lidardesign.evaluate.refinement.attention import Attention
@@ -72,7 +72,7 @@ class Fitter:
         DataError: The density is too rough, with or without the settings.
     """
 
-    def __init__(self, order: FitOrder, weighting: Weighting, console: Console) -> None:
+    def __init__(self, order: FitOrder, weighting: Weighting, console: Output) -> None:
         self.order, self.console = order, console
         settings_alone = replace(weighting, reweighting=None, range_spread_m=0.0)
         self.target = RunTarget(order.run, weighting=settings_alone)
@@ -162,14 +162,14 @@ class Fitter:
         return not is_mounted(constraints) and all(pin is None for group in members for pin in group.pins)
 
 
-def fitted(order: FitOrder, weighting: Weighting, console: Console) -> tuple[FitResult, Weighting]:
+def fitted(order: FitOrder, weighting: Weighting, console: Output) -> tuple[FitResult, Weighting]:
     """A design as it was ordered."""
     fitter = Fitter(order, weighting, console)
     return fitter.fit(weighting, fitter.samples(weighting)), weighting
 
 
 def refined(
-    order: FitOrder, weighting: Weighting, rounds: int, console: Console
+    order: FitOrder, weighting: Weighting, rounds: int, console: Output
 ) -> tuple[tuple[FitResult, Weighting], dict[str, Any]]:
     """A design that was refined, how its samples are weighted, and how it went, for the document.
 
@@ -193,7 +193,7 @@ def refined(
     return (found.trial.result, used), {"refinement": _document(found, run.task.metric.unit)}
 
 
-def _refine(fitter: Fitter, weighting: Weighting, rounds: int, console: Console) -> Refinement:
+def _refine(fitter: Fitter, weighting: Weighting, rounds: int, console: Output) -> Refinement:
     from lidardesign.evaluate.refinement.refinement import Refiner, Shape
 
     order, start = fitter.order, weighting.reweighting

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, TypeVar
 from lidardesign.errors import ConfigError
 
 if TYPE_CHECKING:
-    from lidardesign.cli.output import Console
+    from lidardesign.cli.output import Output
     from lidardesign.design.constraints.document import Constraints
     from lidardesign.space import DesignSpace
     from lidardesign.workflow.runs import Run
@@ -21,7 +21,7 @@ PLACE_KEYS = ("origin_m", "origin_box_m")
 
 
 def likeness(
-    like: Path | None, asked: Asked, layout: str | None, rays: int | None, run: Run, console: Console
+    like: Path | None, asked: Asked, layout: str | None, rays: int | None, run: Run, console: Output
 ) -> tuple[Constraints | Asked, str | None, tuple[str, ...]]:
     """The constraints with those of a rig below them, the layout, and its sensors' names; as they are without a rig.
 
@@ -55,7 +55,7 @@ def _hint(run: Run) -> str:
     return f"learn with {' / '.join(keys) or others} for the rig's places: lidardesign tasks show {run.task.name}"
 
 
-def _settled(constraints: Asked, space: DesignSpace, console: Console) -> Asked:
+def _settled(constraints: Asked, space: DesignSpace, console: Output) -> Asked:
     """The constraints with pinned origins where the space fixes them; says which were moved there."""
     from lidardesign.design.constraints.origins import snap_to_space
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.cli.output import Console
+from lidardesign.cli.output import Output
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.workflow.learning_budget import GOAL, Goal, resumed_goal
 
@@ -51,7 +51,7 @@ def started(task: Task, run: Path, goal: Goal, choices: dict[str, Any]) -> Job:
     return Job(task, run, resolve(task, **choices), goal)
 
 
-def resumed(task: Task, run: Path, goal: Goal, choices: dict[str, Any], console: Console) -> Job:
+def resumed(task: Task, run: Path, goal: Goal, choices: dict[str, Any], console: Output) -> Job:
     """A run that was interrupted, or killed before it had begun: that one is started anew."""
     from lidardesign.config import load_run_config
     from lidardesign.registry import load_task

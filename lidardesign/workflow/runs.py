@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 
 from lidardesign.errors import ConfigError, DataError, LidardesignError
 from lidardesign.run.clock import phase
-from lidardesign.run.files import is_input, is_there
+from lidardesign.run.files import is_input, is_there, readable
 
 if TYPE_CHECKING:
-    from lidardesign.cli.output import Console
+    from lidardesign.cli.output import Output
     from lidardesign.config import RunConfig
     from lidardesign.design.sensor import DesignSpec
     from lidardesign.scene import Scene
@@ -73,7 +73,7 @@ def open_run(folder: Path) -> Run:
     return Run(folder, task, config)
 
 
-def read_design(path: Path, console: Console, reach_m: float | None = None) -> DesignSpec:
+def read_design(path: Path, console: Output, reach_m: float | None = None) -> DesignSpec:
     """A design file or a rig of others, or standard input for `-`.
 
     One of a run that is not as it was written says so: it may be cut, or mended by hand. A rig says what its file
@@ -87,7 +87,6 @@ def read_design(path: Path, console: Console, reach_m: float | None = None) -> D
     Raises:
         ConfigError, DataError: It cannot be read.
     """
-    from lidardesign.cli.streams import readable
     from lidardesign.design.files import load_design
 
     difference = _difference(path)
@@ -118,7 +117,7 @@ def _difference(path: Path) -> str | None:
         return None
 
 
-def open_target(path: Path, console: Console) -> tuple[Run | None, DesignSpec | None]:
+def open_target(path: Path, console: Output) -> tuple[Run | None, DesignSpec | None]:
     """Open what a command was given: a run folder, or a design file and the run that it came from.
 
     Returns:
@@ -265,7 +264,7 @@ def reach_beside(files: Iterable[Path], runs: Sequence[Run]) -> float | None:
     return None
 
 
-def tell_notes(design: DesignSpec, shown: str, console: Console) -> None:
+def tell_notes(design: DesignSpec, shown: str, console: Output) -> None:
     """Say what the file of a rig did not: only what was read from others has such notes."""
     notes = design.provenance.get("notes")
     if "source" in design.provenance and isinstance(notes, list):
@@ -273,7 +272,7 @@ def tell_notes(design: DesignSpec, shown: str, console: Console) -> None:
             console.note(f"note: {shown}: {note}")
 
 
-def budgets_within(designs: Iterable[DesignSpec], budgets: Sequence[int], console: Console) -> list[int]:
+def budgets_within(designs: Iterable[DesignSpec], budgets: Sequence[int], console: Output) -> list[int]:
     """The numbers of rays to evaluate at where none is asked for: those that every fixed ray list has.
 
     Where a rig has fewer rays than the task's largest budget, its own number takes the place of those beyond it.

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Console, command
+from lidardesign.cli.output import Output, command, keep_times
 from lidardesign.cli.streams import claim_outputs, written_file
 from lidardesign.cli.tables.designs import number
 from lidardesign.cli.tables.grids import print_table
-from lidardesign.cli.tables.times import keep_times
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.clock import phase
 from lidardesign.run.files import is_input, is_there
@@ -148,7 +147,7 @@ def _settings(
     return CaptureSettings(Estimation(estimator, false_alarm), within, outlier_mm / 1000.0, reference)  # type: ignore[arg-type]
 
 
-def _rays(path: Path, count: int | None, at: dict[str, float], seed: int, console: Console) -> Rays:
+def _rays(path: Path, count: int | None, at: dict[str, float], seed: int, console: Output) -> Rays:
     """The rays of a design file, or of what was exported of it for a scanner, at least one."""
     rays = _listed_rays(path, count, at, seed, console)
     if not len(rays):
@@ -156,7 +155,7 @@ def _rays(path: Path, count: int | None, at: dict[str, float], seed: int, consol
     return rays
 
 
-def _listed_rays(path: Path, count: int | None, at: dict[str, float], seed: int, console: Console) -> Rays:
+def _listed_rays(path: Path, count: int | None, at: dict[str, float], seed: int, console: Output) -> Rays:
     from lidardesign.cli.commands.export import design_and_rays
     from lidardesign.export.galvo import is_galvo_file, read
 

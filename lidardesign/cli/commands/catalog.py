@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Console, command
+from lidardesign.cli.output import Output, command
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
 
@@ -203,7 +203,7 @@ def _refuse_without_out(given: dict[str, Any]) -> None:
             raise ConfigError("says how a design is made", where=option, hint="--out FILE.yaml writes one")
 
 
-def _design(part: Part, given: dict[str, Any], name: str, console: Console) -> DesignSpec:
+def _design(part: Part, given: dict[str, Any], name: str, console: Output) -> DesignSpec:
     """The design that the options ask for."""
     from lidardesign.design.catalog.placing import interleaved, part_design, parts_for, side_by_side
     from lidardesign.design.sensor import MOST_RAYS

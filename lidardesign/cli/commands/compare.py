@@ -18,7 +18,7 @@ from lidardesign.run.clock import phase
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
-    from lidardesign.cli.output import Console
+    from lidardesign.cli.output import Output
     from lidardesign.design.sensor import DesignSpec
     from lidardesign.evaluate.score import Evaluation, EvaluationRequest
     from lidardesign.workflow.evaluation_request import JudgedDesign
@@ -85,7 +85,7 @@ _NO_SCORES: dict[str, Any] = {"metric": None, "scenes": None, "rows": [], "paire
 
 
 @phase("designs")
-def _read(first: Path, second: Path, space_of: Path | None, console: Console) -> tuple[list[JudgedDesign], Run | None]:
+def _read(first: Path, second: Path, space_of: Path | None, console: Output) -> tuple[list[JudgedDesign], Run | None]:
     """Both designs under names that differ, and the run whose scenes they are scored in, if one is known."""
     from lidardesign.workflow.evaluation_request import JudgedDesign, common_run
     from lidardesign.workflow.runs import open_run, reach_beside, read_design, run_of
@@ -106,7 +106,7 @@ def _read(first: Path, second: Path, space_of: Path | None, console: Console) ->
 
 
 def _scores(
-    run: Run, entries: Sequence[JudgedDesign], rays: list[int] | None, seed: int | None, console: Console
+    run: Run, entries: Sequence[JudgedDesign], rays: list[int] | None, seed: int | None, console: Output
 ) -> dict[str, Any]:
     """Scores on held-out scenes and their paired differences, first minus second."""
     from lidardesign.workflow.evaluation_request import request_of
@@ -137,7 +137,7 @@ def _scores(
     }
 
 
-def _check_fired(designs: Sequence[DesignSpec], counts: Sequence[int], console: Console) -> None:
+def _check_fired(designs: Sequence[DesignSpec], counts: Sequence[int], console: Output) -> None:
     """Say where a design has no row; a design that has none at all is refused."""
     from lidardesign.evaluate.request import fired_numbers, left_out
 
@@ -158,7 +158,7 @@ def _own_count(design: DesignSpec) -> int | None:
     return readout_of(design).rays
 
 
-def _counts(designs: Sequence[DesignSpec], own: Sequence[int | None], run: Run, console: Console) -> list[int]:
+def _counts(designs: Sequence[DesignSpec], own: Sequence[int | None], run: Run, console: Output) -> list[int]:
     """Rays at which two designs are compared: what both were made for, else the budgets that both have."""
     from lidardesign.workflow.runs import budgets_within
 

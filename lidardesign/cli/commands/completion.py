@@ -108,7 +108,7 @@ def completion(
         check_choice(shell, "SHELL", tuple(SCRIPTS))
         script = SCRIPTS[shell]
         shown = {"shell": shell, "script": script}
-        console.result(shown, lambda rich: print(script, end="", file=console.output), show_costs=False)
+        console.result(shown, lambda rich: print(script, end="", file=console.stream), show_costs=False)
 
 
 def is_asked() -> bool:

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Console, command
-from lidardesign.cli.streams import is_output, put_on_stdout, tell_new_folders
+from lidardesign.cli.output import Output, command
+from lidardesign.cli.streams import is_output, note_new_folders, put_on_stdout
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
 from lidardesign.workflow.runs import check_choice
@@ -131,13 +131,13 @@ def _check_new(out: Path | None) -> None:
         raise ConfigError("is there already", where=f"--out {out}", hint="give another --out, or remove it")
 
 
-def _give(text: str, document: dict[str, Any], out: Path | None, console: Console) -> None:
+def _give(text: str, document: dict[str, Any], out: Path | None, console: Output) -> None:
     """Write a text, or print it where no file is named."""
     from lidardesign.run.files import write_atomic
 
     to_file = out is not None and not is_output(out)
     if to_file:
-        tell_new_folders([Path(str(out))], console)
+        note_new_folders([Path(str(out))], console)
         with phase("writing"):
             write_atomic(Path(str(out)), text)
     if console.json:

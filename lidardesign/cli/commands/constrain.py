@@ -23,7 +23,7 @@ from lidardesign.workflow.runs import check_name, need_run, open_target, parse_a
 from lidardesign.workflow.weighting import Weighting
 
 if TYPE_CHECKING:
-    from lidardesign.cli.output import Console
+    from lidardesign.cli.output import Output
     from lidardesign.design.constraints.document import Constraints
     from lidardesign.design.sensor import DesignSpec
     from lidardesign.run.yaml import KeyPath
@@ -106,7 +106,7 @@ def _usual(constraints: Constraints, design: DesignSpec | None, run: Run) -> str
     return fitted_layout(design.layout) if design else usual_layout(run)
 
 
-def _weighting(given: list[str] | None, design: DesignSpec | None, console: Console) -> Weighting:
+def _weighting(given: list[str] | None, design: DesignSpec | None, console: Output) -> Weighting:
     """How samples are weighted: by the options, else as they were for the design."""
     own = Weighting.of(design) if design else Weighting()
     if not given:
@@ -137,7 +137,7 @@ def check_parts(constraints: Constraints) -> None:
             parts_of(snap)
 
 
-def load_constraints(file: Path | None, overrides: list[str], console: Console | None = None) -> Constraints:
+def load_constraints(file: Path | None, overrides: list[str], console: Output | None = None) -> Constraints:
     """Constraints of a file with `--set` laid over it; the console is told where the file holds none.
 
     Raises:

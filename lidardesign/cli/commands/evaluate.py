@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,15 +12,15 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.dry_run import DryRun, tell_plan
-from lidardesign.cli.output import Console, command
+from lidardesign.cli.output import Output, command, keep_times
 from lidardesign.cli.physics import Detector, Effects, RangeTolerance, ReturnTolerance, planner_of
 from lidardesign.cli.searches import CmaSeconds, check_cma_seconds, searching, told
 from lidardesign.cli.streams import claim_outputs, is_output, written_file
 from lidardesign.cli.tables.designs import number
 from lidardesign.cli.tables.scores import show_evaluation
-from lidardesign.cli.tables.times import keep_times, times_so_far
 from lidardesign.errors import ConfigError, ThresholdError
 from lidardesign.run.clock import phase
+from lidardesign.workflow.evaluation_report import times_so_far
 from lidardesign.workflow.evaluation_request import ALWAYS, JudgedDesign, collect, common_run, named_apart, request_of
 
 if TYPE_CHECKING:
@@ -162,10 +163,10 @@ def evaluate(
         evaluation = _evaluate_with(wanted, replace(request, cma=searching(cma_seconds)), console)
         # accuracy takes minutes: what was scored by then is written already
         early = (None if accuracy and is_output(path) else path for path in files)
-        written = _write_files(evaluation, request, learned, times_so_far(run.folder, "evaluate", console), *early)
+        written = _write_files(evaluation, request, learned, times_so_far(run.folder, console.clock), *early)
         if accuracy:
             evaluation = _with_accuracy(evaluation, request, learned, console)
-            written = _write_files(evaluation, request, learned, times_so_far(run.folder, "evaluate", console), *files)
+            written = _write_files(evaluation, request, learned, times_so_far(run.folder, console.clock), *files)
         document = {**evaluation.as_dict(), "set": overrides or [], "files": [str(path) for path in written]}
         keep_times(run.folder, "evaluate", console)
         shown = {**document, "notes": []} if console.quiet else document
@@ -176,7 +177,7 @@ def evaluate(
 
 def _show(evaluation: Evaluation, document: dict[str, Any], written: list[Path], rich: RichConsole) -> None:
     if evaluation.accuracy is not None:
-        from lidardesign.cli.tables.accuracy import show_accuracy
+        from lidardesign.cli.tables.times import show_accuracy
 
         show_accuracy(evaluation.accuracy, rich)
     show_evaluation(document, written, rich)
@@ -223,7 +224,7 @@ def _plan(
     )
 
 
-def _evaluate_with(wanted: int | str, request: EvaluationRequest, console: Console) -> Evaluation:
+def _evaluate_with(wanted: int | str, request: EvaluationRequest, console: Output) -> Evaluation:
     """The evaluation, its scenes scored by the workers that were asked for."""
     from lidardesign.evaluate.workers.pool import workers_of
 
@@ -234,7 +235,7 @@ def _evaluate_with(wanted: int | str, request: EvaluationRequest, console: Conso
         return _evaluate(replace(request, scorer=scorer), console)
 
 
-def _evaluate(request: EvaluationRequest, console: Console) -> Evaluation:
+def _evaluate(request: EvaluationRequest, console: Output) -> Evaluation:
     from lidardesign.evaluate.score import evaluate as score
 
     with console.progress("row") as bar:
@@ -255,7 +256,7 @@ def _check_measurable(run: Run) -> None:
     check_kept(run.folder)
 
 
-def _with_accuracy(evaluation: Evaluation, request: EvaluationRequest, run: Run, console: Console) -> Evaluation:
+def _with_accuracy(evaluation: Evaluation, request: EvaluationRequest, run: Run, console: Output) -> Evaluation:
     """The evaluation with the ladders of the run, whose density is that of its own scenes, whatever it is judged by."""
     if (request.config, request.seed) != (run.config.task, run.config.seed):
         request = replace(request, train=run.scenes("train", run.config.seed))
@@ -312,10 +313,12 @@ def _write_drawn(
 
         written += write_plots(evaluation, plots, pictured)
     if report is not None:
-        from lidardesign.cli.pages import write_page
+        from lidardesign.evaluate.report.report import write_report
+        from lidardesign.workflow.evaluation_report import evaluation_report
 
+        command_line = ["lidardesign", *sys.argv[1:]]
         with written_file(report) as file:
-            write_page(evaluation, request, run, pictured, file)
+            write_report(evaluation_report(evaluation, request, run, pictured, command_line), file)
         written.append(report)
     return written
 

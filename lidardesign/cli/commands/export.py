@@ -12,9 +12,8 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.dry_run import DryRun, tell_plan
-from lidardesign.cli.output import Console, command
-from lidardesign.cli.streams import claim_stdout, is_output, tell_new_folders, written_file
-from lidardesign.cli.tables.times import keep_times
+from lidardesign.cli.output import Output, command, keep_times
+from lidardesign.cli.streams import claim_stdout, is_output, note_new_folders, written_file
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
 from lidardesign.run.files import is_input
@@ -91,7 +90,7 @@ def export(
             _export(design, format_, out, _Asked(rays, parse_at(at), rate_hz, seed or 0), console, dry_run=dry_run)
 
 
-def _list(console: Console) -> None:
+def _list(console: Output) -> None:
     from lidardesign.export.registry import EXPORTERS
 
     formats = [
@@ -123,7 +122,7 @@ def _export(
     name: str | None,
     out: Path | None,
     asked: _Asked,
-    console: Console,
+    console: Output,
     *,
     dry_run: bool,
 ) -> None:
@@ -140,7 +139,7 @@ def _export(
     exporter.check_rate(asked.rate_hz)
     target = _target(path, out, exporter)
     folder = folder_of(design, path)
-    tell_new_folders([target], console)
+    note_new_folders([target], console)
     if dry_run:
         return tell_plan(_plan(design, path, target, exporter, asked), console)
     design, laid_out = design_and_rays(design, path, exporter.name, asked.rays, asked.at, asked.seed, console)
@@ -257,7 +256,7 @@ def _shown_rounding(rounding: Mapping[str, Estimate]) -> str:
 
 @phase("rays")
 def design_and_rays(
-    design: DesignSpec, path: Path, name: str, count: int | None, at: Mapping[str, float], seed: int, console: Console
+    design: DesignSpec, path: Path, name: str, count: int | None, at: Mapping[str, float], seed: int, console: Output
 ) -> tuple[DesignSpec, Rays]:
     """A design and its explicit rays at a condition; another number of rays may need the samples of its run.
 

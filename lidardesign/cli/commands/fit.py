@@ -11,8 +11,7 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.dry_run import DryRun, tell_plan
-from lidardesign.cli.output import Console, command
-from lidardesign.cli.tables.times import keep_times
+from lidardesign.cli.output import Output, command, keep_times
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import WAIT_S, phase
 from lidardesign.workflow.rig_constraints import likeness
@@ -140,7 +139,7 @@ def usual_layout(run: Run) -> str:
 
 def fit_and_write(
     run: Run,
-    console: Console,
+    console: Output,
     *,
     command_name: str,
     name: str,

@@ -12,8 +12,7 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.dry_run import DryRun, tell_plan
-from lidardesign.cli.output import Console, command
-from lidardesign.cli.tables.times import keep_times
+from lidardesign.cli.output import Output, command, keep_times
 from lidardesign.errors import DataError
 from lidardesign.run.clock import WAIT_S, phase
 from lidardesign.workflow.learning_budget import Learner, TimeBudget, Tolerance, check_met, checked_goal
@@ -93,7 +92,7 @@ def learn(
         check_met(result, goal)
 
 
-def _tell_task_notes(job: Job, console: Console) -> list[str]:
+def _tell_task_notes(job: Job, console: Output) -> list[str]:
     """Say what the task has to say of its configuration before anything takes time; returns what was said."""
     from lidardesign.registry import plugin_guard
     from lidardesign.task import notes_of
@@ -105,7 +104,7 @@ def _tell_task_notes(job: Job, console: Console) -> list[str]:
     return found
 
 
-def _learn_in_folder(job: Job, device: str, console: Console) -> LearnResult:
+def _learn_in_folder(job: Job, device: str, console: Output) -> LearnResult:
     from lidardesign.run.lock import run_lock
 
     task, run = job.task.name, job.run
@@ -140,7 +139,7 @@ def _interruption(task: str, run: Path) -> str | None:
 
 
 @contextlib.contextmanager
-def _progress(console: Console) -> Iterator[Callable[[LearnProgress], None]]:
+def _progress(console: Output) -> Iterator[Callable[[LearnProgress], None]]:
     """A function that shows the progress: a bar on a terminal, else one note per phase."""
     with console.progress("loss", "ess", "left") as bar:
         line = bar.add_task("learning", total=None, loss="", ess="", left="") if bar else None

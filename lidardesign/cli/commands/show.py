@@ -14,7 +14,7 @@ from lidardesign.run.clock import phase
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
-    from lidardesign.cli.output import Console
+    from lidardesign.cli.output import Output
     from lidardesign.design.compare import Readout
     from lidardesign.design.constraints.check import ConstraintCheck
     from lidardesign.design.sensor import DesignSpec
@@ -67,7 +67,7 @@ def show(
         console.result(_document(loaded, design, checks, readout), print_all, show_costs=False)
 
 
-def _tell_outside(design: DesignSpec, path: Path, run: Run | None, console: Console) -> None:
+def _tell_outside(design: DesignSpec, path: Path, run: Run | None, console: Output) -> None:
     """Say where a design stands far outside the design space of the run that it is shown in, or came from."""
     from lidardesign.design.compare import outside_notes
     from lidardesign.errors import LidardesignError
@@ -102,7 +102,7 @@ def _document(loaded: DesignSpec, path: Path, checks: list[ConstraintCheck], rea
     }
 
 
-def _checks(design: DesignSpec, path: Path, run: Run | None, console: Console) -> list[ConstraintCheck]:
+def _checks(design: DesignSpec, path: Path, run: Run | None, console: Output) -> list[ConstraintCheck]:
     """Every constraint that the design was made under, checked anew; in its run's design space where that is there."""
     from lidardesign.design.constraints.check import check_design
     from lidardesign.design.files import design_document

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Console, command
+from lidardesign.cli.output import Output, command
 from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def check(
         refuse_broken(name, findings)
 
 
-def _followed(findings: Iterable[Finding], console: Console) -> list[Finding]:
+def _followed(findings: Iterable[Finding], console: Output) -> list[Finding]:
     """All findings, with the name of the last one shown as it comes."""
     from lidardesign.testing.contract import LAWS
 

@@ -1,4 +1,4 @@
-"""Where the time went, and how far results may be off, for people."""
+"""Where the time went, and how accurate results are at which cost, for people."""
 
 from __future__ import annotations
 
@@ -6,24 +6,19 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from lidardesign.cli.tables.grids import print_table
-from lidardesign.errors import ConfigError, DataError
-from lidardesign.run.clock import INSIDE, OTHER, keep_timings
+from lidardesign.run.clock import INSIDE, OTHER
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from rich.console import Console as RichConsole
 
-    from lidardesign.cli.output import Console
+    from lidardesign.evaluate.accuracy.settings import Ladder, Rung
+    from lidardesign.evaluate.accuracy.sweeps import Accuracy
 
 # Phases of a smaller share are left to --json; `other` shows what they took.
 LEAST_SHARE = 0.005
-INDENT = "  "
 MEBIBYTE = 1024**2
 # People are shown phases and those directly inside of them.
 DEEPEST = 2
-# Commands that only read a run wait for its writer no longer than this.
-SHORT_WAIT_S = 0.5
 
 
 def show_times(timings: Mapping[str, float], memory_bytes: int | None, rich: RichConsole) -> None:
@@ -32,40 +27,52 @@ def show_times(timings: Mapping[str, float], memory_bytes: int | None, rich: Ric
     total = sum(seconds for key, seconds in timings.items() if INSIDE not in key)
     if total <= 0:
         return
-    kept = {key: seconds for key, seconds in timings.items() if key != OTHER and seconds >= LEAST_SHARE * total}
-    kept[OTHER] = total - sum(seconds for key, seconds in kept.items() if INSIDE not in key)
-    lines = [_line(key, seconds, total) for key, seconds in kept.items()]
+    shown = {key: seconds for key, seconds in timings.items() if key != OTHER and seconds >= LEAST_SHARE * total}
+    shown[OTHER] = total - sum(seconds for key, seconds in shown.items() if INSIDE not in key)
+    lines = []
+    for key, seconds in shown.items():
+        *outside, name = key.split(INSIDE)
+        lines.append(("  " * len(outside) + name, f"{seconds:.2f}", f"{100 * seconds / total:.0f} %"))
     memory = "" if memory_bytes is None else f"; the most memory that it took: {memory_bytes / MEBIBYTE:.0f} MiB"
     print_table(f"where the time went{memory}", ("phase", "seconds", "share"), lines, rich, text=("phase",))
 
 
-def _line(key: str, seconds: float, total: float) -> tuple[str, str, str]:
-    *outside, name = key.split(INSIDE)
-    return f"{INDENT * len(outside)}{name}", f"{seconds:.2f}", f"{100 * seconds / total:.0f} %"
+def show_accuracy(accuracy: Accuracy, rich: RichConsole) -> None:
+    """Print every ladder, the roughest rung first, and the verdict on each."""
+    from rich.markup import escape
+
+    for ladder in accuracy.ladders:
+        _show_ladder(ladder, rich)
+    taken = sum(accuracy.seconds.values())
+    rich.print(f"accuracy measured in {taken:.0f} s; [bold]*[/bold] is what to choose, (run) what this run does")
+    off = [ladder for ladder in accuracy.ladders if ladder.default is not None and ladder.chosen is not ladder.default]
+    for ladder in off:
+        rich.print(f"note: {escape(ladder.knob)}: {escape(ladder.verdict)}")
 
 
-def times_so_far(run: Path, name: str, console: Console) -> dict[str, dict[str, float]]:
-    """Seconds by phase of each command on a run, in the order in which they first ran; of this one until now."""
-    from lidardesign.run.manifest import read_manifest
+def _show_ladder(ladder: Ladder, rich: RichConsole) -> None:
+    from rich.markup import escape
 
-    kept = read_manifest(run).get("timings", {})
-    phases = {command: dict(entry["phases"]) for command, entry in kept.items() if _has_phases(entry)}
-    return {**phases, name: console.clock.timings()}
+    unit = f" [{ladder.unit}]" if ladder.unit else ""
+    title = f"{ladder.knob}: {ladder.error_of}{unit}, against {ladder.against}; seconds of {ladder.work}"
+    further = list(dict.fromkeys(name for rung in ladder.rungs for name in rung.values))
+    lines = [(*_cells(rung, ladder), *(_figure(rung.values.get(name)) for name in further)) for rung in ladder.rungs]
+    # a sentence, which wraps like those below the table
+    rich.print(f"[italic]{escape(title)}[/italic]")
+    print_table(None, ("setting", "error", "+-", "seconds", "memory", *further), lines, rich, text=("setting",))
+    rich.print(f"{escape(ladder.verdict)}; tolerance {ladder.tolerance:.3g}{escape(unit)}: {escape(ladder.because)}")
+    if ladder.note:
+        rich.print(f"note: {escape(ladder.note)}")
+    rich.print()
 
 
-def _has_phases(entry: object) -> bool:
-    """Whether an entry of a manifest holds seconds by phase; those of older versions do not."""
-    phases = entry.get("phases") if isinstance(entry, dict) else None
-    return isinstance(phases, dict) and all(isinstance(seconds, int | float) for seconds in phases.values())
+def _cells(rung: Rung, ladder: Ladder) -> tuple[str, ...]:
+    marks = (" *" if rung is ladder.chosen else "") + (" (run)" if rung.default else "")
+    error = "reference" if rung.reference else _figure(rung.error)
+    spread = "" if rung.reference else _figure(rung.uncertainty)
+    memory = "" if rung.memory_bytes is None else f"{rung.memory_bytes / MEBIBYTE:.0f} MiB"
+    return rung.setting + marks, error, spread, _figure(rung.seconds), memory
 
 
-def keep_times(run: Path, name: str, console: Console, *, wait_s: float = SHORT_WAIT_S) -> None:
-    """Enter the times of a command in the manifest of its run; where that cannot be, a note says so.
-
-    The work is done by then: that its times are not kept is no reason to fail.
-    """
-    try:
-        keep_timings(run, name, console.clock, wait_s=wait_s)
-    except (ConfigError, DataError, OSError) as error:
-        message = error.message if isinstance(error, ConfigError | DataError) else error.strerror or error
-        console.note(f"note: the times of {name} are not kept in {run}: {message}")
+def _figure(value: float | None) -> str:
+    return "" if value is None else f"{value:.3g}"
