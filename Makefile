@@ -48,7 +48,7 @@ test: $(BIN)/.ready $(BIN)/.transport $(BIN)/.consumers
 test-arithmetic: $(BIN)/.ready
 	ATEN_CPU_CAPABILITY=default MKL_CBWR=COMPATIBLE \
 		NUMBA_CPU_NAME=generic NUMBA_CACHE_DIR=$(CURDIR)/build/numba-generic \
-		$(BIN)/python -m pytest tests/test_docs_run.py
+		$(BIN)/python -m pytest tests/docs/test_docs_run.py
 
 # The suite with every line and branch that it takes; what numba compiles, apart, in a run without the compiler
 KERNELS := NUMBA_DISABLE_JIT=1 $(BIN)/python -m coverage
@@ -58,7 +58,7 @@ coverage: $(BIN)/.ready
 	$(BIN)/python -m coverage combine
 	@mkdir -p build
 	$(KERNELS) run --rcfile=/dev/null --branch --source=lidardesign --data-file=build/kernels.coverage \
-		-m pytest -W ignore::RuntimeWarning tests/test_splines.py
+		-m pytest -W ignore::RuntimeWarning tests/density/test_splines.py
 	$(KERNELS) report --rcfile=/dev/null --data-file=build/kernels.coverage --include='*kernels.py'
 	$(BIN)/python -m coverage report --fail-under=90
 
@@ -70,7 +70,7 @@ lint: $(BIN)/.ready
 	$(BIN)/python -m ruff check .
 
 fuzz: $(BIN)/.ready
-	$(BIN)/python tests/fuzz/campaign.py --inputs 100000 --out docs/soak
+	PYTHONPATH=tests $(BIN)/python -m fuzz.campaign --inputs 100000 --out docs/soak
 
 # JOBS=N does so many runs at once
 JOBS ?= 2

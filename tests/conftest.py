@@ -32,7 +32,6 @@ LONGEST = (
     "test_hard_plugins.py",
     "test_cluster.py",
     "test_worker_processes.py",
-    "test_parallel.py",
 )
 
 

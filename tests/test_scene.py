@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 import pytest
-import references
 import trimesh
 from scipy.spatial.transform import Rotation
+from support import references
 
 from lidardesign.errors import DataError
 from lidardesign.geometry.surface import sample_body, sample_triangles, surface_area_m2

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 import pytest
-import references
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support import references
 
 from lidardesign.errors import ConfigError
 from lidardesign.space import AZIMUTH, ELEVATION, DesignSpace, aim, angles, direction, observed_point

@@ -28,10 +28,10 @@ ROOT = Path(__file__).resolve().parent.parent
 RECORDS = ROOT / "build" / "mutation"
 # The files that test each module. A change outside of functions meets the first one alone, whole.
 TESTS = {
-    "lidardesign/numerics.py": ("numerics",),
-    "lidardesign/design/mixture/mixture.py": ("mixture",),
-    "lidardesign/design/constraints/document.py": ("constraints", "check"),
-    "lidardesign/design/layouts/rays.py": ("rays",),
+    "lidardesign/numerics.py": ("test_numerics.py",),
+    "lidardesign/design/mixture/mixture.py": ("design/test_mixture.py",),
+    "lidardesign/design/constraints/document.py": ("design/test_constraints.py", "design/test_check.py"),
+    "lidardesign/design/layouts/rays.py": ("design/test_rays.py",),
 }
 # Packages and modules that a mutant is to meet anew; the tests are too.
 OURS = {"lidardesign", "lidardesign_tasks"}
@@ -87,14 +87,14 @@ def run_module(module: str, jobs: int, retry: bool, sample: int | None) -> int:
     With `retry` those that were killed before are not tested again.
     """
     path, name = ROOT / module, module.removesuffix(".py").replace("/", ".")
-    files = [str(ROOT / "tests" / f"test_{one}.py") for one in TESTS[module]]
+    files = [str(ROOT / "tests" / name) for name in TESTS[module]]
     found, record = mutants_of(path.read_text()), Record(module)
     found = found if sample is None else found[:: max(1, len(found) // sample)]
     keys = {key_of(mutant) for mutant in found}
     record.begin([one for one in record.read() if retry and one.outcome != "survived" and one.key in keys])
     known = {one.key for one in record.read()}
     waiting = [mutant for mutant in found if key_of(mutant) not in known]
-    ours = OURS | {one.stem for one in (ROOT / "tests").rglob("*.py")}
+    ours = OURS | {"tests", *(folder.name for folder in (ROOT / "tests").iterdir() if folder.is_dir())}
     return try_mutants(path, name, files, waiting, Children(jobs, record.tell), ours)
 
 
@@ -112,7 +112,7 @@ def report(results: dict[str, list[Outcome]], minutes: float, retry: bool) -> st
         "cosmic-ray, as `tools/mutants.py` chooses them; each meets only its module's own test files"
         + (", and those that died before in the same source are not tested again:" if retry else ":")
     )
-    tests = [f"- `{module}`: " + ", ".join(f"`test_{name}.py`" for name in TESTS[module]) for module in results]
+    tests = [f"- `{module}`: " + ", ".join(f"`tests/{name}`" for name in TESTS[module]) for module in results]
     return "\n".join(["# Mutation", "", about, "", *tests, "", *rows, "", *_survivors(results)]) + "\n"
 
 

@@ -28,7 +28,7 @@ HEADINGS = (
 
 
 def table(cases: Mapping[str, Any]) -> str:
-    """The tables of all layers as Markdown: cases by key, see tests/hard_cases/cases.py."""
+    """The tables of all layers as Markdown: cases by key, see tests/support/hard_cases.py."""
     parts = [_layer(heading, [cases[str(number)] for number in numbers]) for heading, numbers in HEADINGS]
     robots = [case for key, case in cases.items() if key.startswith("M")]
     promises = [case for key, case in cases.items() if key.startswith("P")]
@@ -51,17 +51,18 @@ def _cell(text: str) -> str:
 
 
 def _tests(case: Any) -> str:
-    return f"[`{case.tests.__name__}`](../tests/hard_cases/{case.tests.__module__}.py): {len(case.names)}"
+    file = case.tests.__module__.rpartition(".")[2]
+    return f"[`{case.tests.__name__}`](../tests/hard_cases/{file}.py): {len(case.names)}"
 
 
 def main() -> None:
     """Collect the cases and write the page."""
-    sys.path[:0] = [str(CASES_FOLDER), str(CASES_FOLDER.parent)]
+    sys.path[:0] = [str(ROOT), str(CASES_FOLDER.parent)]
     import conftest  # noqa: F401  one thread, as in the tests
 
-    cases = importlib.import_module("cases").CASES
+    cases = importlib.import_module("support.hard_cases").CASES
     for path in [*sorted(CASES_FOLDER.glob("test_cases_of_*.py")), CASES_FOLDER / "test_promises.py"]:
-        importlib.import_module(path.stem)
+        importlib.import_module(f"hard_cases.{path.stem}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the plain formulas overflow: that is what is shown
         written = table(cases)

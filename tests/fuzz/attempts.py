@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from fuzz_kinds import Read, Target
 
+from fuzz.fuzz_kinds import Read, Target
 from lidardesign.errors import LidardesignError
 
 EXECUTED = "EXECUTED"
@@ -139,7 +139,7 @@ class Fuzzer:
 
     def next(self) -> bytes:
         """The next damaged content; damage that a mutator cannot do to a damaged file is done to its bytes."""
-        from mutators import mutate_bytes
+        from fuzz.mutators import mutate_bytes
 
         content = self.source.choice(self._good if self.source.random() < GOOD_SHARE else self.seeds)
         try:

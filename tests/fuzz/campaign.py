@@ -1,6 +1,6 @@
 """The long run of the fuzzer: every target in processes of its own that may hang, crash or run out of memory.
 
-    python tests/fuzz/campaign.py --inputs 100000 --out docs/soak
+    PYTHONPATH=tests python -m fuzz.campaign --inputs 100000 --out docs/soak
 
 A target's inputs go through the program in batches, each in a fresh process with a memory limit. Which input is being
 read is on disk before it is read, so that one which ends or stops the process is known, and the batch goes on after it.
@@ -27,9 +27,8 @@ from datetime import datetime, timezone
 from importlib.metadata import version
 from pathlib import Path
 
-HERE = Path(__file__).parent
-ROOT = HERE.parents[1]
-WORKER = HERE / "fuzz_worker.py"
+ROOT = Path(__file__).parents[2]
+WORKER = Path(__file__).with_name("fuzz_worker.py")
 BATCH = 2500
 COMMAND_BATCH = 60
 # A process that reads one input for so long hangs: of processor time, as the machine may be busy with other things, or
@@ -79,8 +78,8 @@ class Found:
 
 def jobs(inputs: int, only: list[str], seed: int) -> Iterator[Job]:
     """Batches of all targets, inputs in the targets' shares."""
-    from commands import COMMANDS
-    from fuzz_targets import TARGETS
+    from fuzz.commands import COMMANDS
+    from fuzz.fuzz_targets import TARGETS
 
     chosen = [target for target in (*TARGETS, *COMMANDS) if not only or any(word in target.name for word in only)]
     shares = sum(target.share for target in (*TARGETS, *COMMANDS))
@@ -123,7 +122,7 @@ def _process(job: Job, first: int, folder: Path) -> str | None:
     """Run inputs from the first on; why the process ended before the last, or None."""
     arguments = [job.name, str(job.seed), str(first), str(job.inputs), str(folder)]
     # the program beside this file, wherever another is installed
-    places = (ROOT, ROOT / "tasks", ROOT / "tests", HERE)
+    places = (ROOT, ROOT / "tasks", ROOT / "tests")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, places))}
     with (folder / "output").open("wb") as output:
         process = subprocess.Popen(

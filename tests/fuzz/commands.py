@@ -9,14 +9,14 @@ import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import corpus
-from command_line import files_under, make_run
-from containers import mutate_glb, mutate_hdf5, mutate_npz, mutate_safetensors
-from fuzz_kinds import Read, Target
-from fuzz_runs import SMALL, checkpoints, rerecord, small_config
-from fuzz_targets import TEXTS
-from mutators import Mutator, mutate_bytes, mutate_yaml
+from support.command_line import files_under, make_run
 
+from fuzz import corpus
+from fuzz.containers import mutate_glb, mutate_hdf5, mutate_npz, mutate_safetensors
+from fuzz.fuzz_kinds import Read, Target
+from fuzz.fuzz_runs import SMALL, checkpoints, rerecord, small_config
+from fuzz.fuzz_targets import TEXTS
+from fuzz.mutators import Mutator, mutate_bytes, mutate_yaml
 from lidardesign.config import save_run_config
 from lidardesign.design.files import save_design
 from lidardesign.errors import LidardesignError

@@ -12,8 +12,9 @@ from collections.abc import Sequence
 
 import h5py
 import numpy as np
-from mutators import LARGEST_INPUT, mutate_bytes, mutate_tree
 from scipy.io import loadmat, savemat
+
+from fuzz.mutators import LARGEST_INPUT, mutate_bytes, mutate_tree
 
 KINDS = ("<f8", "<f4", "<f2", ">f8", "<i8", "<i4", "|i1", "|u1", "<u2", "<u8", "|b1", "<c16", "<U3", "|S4", "<M8[s]")
 NUMERIC_KINDS = ("<f8", "<f4", "<i8", "<i4", "|i1", "|u1", "<u2", "<u8")

@@ -12,9 +12,9 @@ import h5py
 import numpy as np
 import trimesh
 import yaml
-from captures import BIN_PS, BINS, make_capture
-from command_line import make_run
 from scipy.io import savemat
+from support.captures import BIN_PS, BINS, make_capture
+from support.command_line import make_run
 
 from lidardesign.config import resolve
 from lidardesign.design.files import design_document

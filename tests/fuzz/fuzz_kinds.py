@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from mutators import Mutator
+from fuzz.mutators import Mutator
 
 Read = Callable[[bytes], object]
 

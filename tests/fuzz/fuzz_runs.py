@@ -6,9 +6,9 @@ import hashlib
 import json
 from pathlib import Path
 
-from command_line import make_run
-from fuzz_kinds import Read, of_file
+from support.command_line import make_run
 
+from fuzz.fuzz_kinds import Read, of_file
 from lidardesign.config import RunConfig, resolve
 from lidardesign.registry import load_task
 

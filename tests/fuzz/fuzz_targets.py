@@ -8,8 +8,8 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
-import corpus
-from containers import (
+from fuzz import corpus
+from fuzz.containers import (
     mutate_glb,
     mutate_gltf,
     mutate_hdf5,
@@ -17,8 +17,8 @@ from containers import (
     mutate_npz,
     mutate_safetensors,
 )
-from fuzz_kinds import Read, Target, of_file
-from fuzz_runs import (
+from fuzz.fuzz_kinds import Read, Target, of_file
+from fuzz.fuzz_runs import (
     checkpoints,
     open_checkpoints,
     open_fields,
@@ -27,7 +27,7 @@ from fuzz_runs import (
     open_progress,
     open_samples,
 )
-from mutators import either, mutate_bytes, mutate_json, mutate_text, mutate_yaml
+from fuzz.mutators import either, mutate_bytes, mutate_json, mutate_text, mutate_yaml
 
 MOST_LAID_OUT = 5000
 

@@ -8,9 +8,9 @@ import resource
 import sys
 from pathlib import Path
 
-from attempts import Fuzzer
-from commands import COMMANDS
-from fuzz_targets import TARGETS
+from fuzz.attempts import Fuzzer
+from fuzz.commands import COMMANDS
+from fuzz.fuzz_targets import TARGETS
 
 MEMORY_BYTES = 2 << 30
 MOST_KEPT = 50

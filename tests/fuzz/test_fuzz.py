@@ -7,16 +7,16 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
-import campaign
 import numpy as np
 import pytest
-from attempts import Fuzzer, Tally, attempt, not_finite
-from campaign import Job, run_job, together
-from commands import COMMANDS
-from fuzz_kinds import Target
-from fuzz_targets import NAMES, TARGETS, target_of
-from mutators import mutate_bytes
 
+from fuzz import campaign
+from fuzz.attempts import Fuzzer, Tally, attempt, not_finite
+from fuzz.campaign import Job, run_job, together
+from fuzz.commands import COMMANDS
+from fuzz.fuzz_kinds import Target
+from fuzz.fuzz_targets import NAMES, TARGETS, target_of
+from fuzz.mutators import mutate_bytes
 from lidardesign.errors import ConfigError, DataError
 
 INPUTS = 40

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from cases import CASES, KEYS
+from support.hard_cases import CASES, KEYS
 
 FOLDER = Path(__file__).parent
 ROOT = FOLDER.parents[1]
@@ -19,7 +19,7 @@ MODULES = sorted(path.stem for path in FOLDER.glob("test_*.py") if path != Path(
 @pytest.fixture(scope="module", autouse=True)
 def every_case():
     for name in MODULES:
-        importlib.import_module(name)
+        importlib.import_module(f"hard_cases.{name}")
     return CASES
 
 

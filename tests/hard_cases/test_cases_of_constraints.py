@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from cases import hard_case
-from command_line import caller, files_under, make_run
+from design.test_constraints import CONTRADICTIONS, FACE, ROOM, SAMPLES
+from design.test_fit import FREE, MOVING, log_target
+from design.test_rays import drawn_from, three_sensors
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
-from test_constraints import CONTRADICTIONS, FACE, ROOM, SAMPLES
-from test_fit import FREE, MOVING, log_target
-from test_rays import drawn_from, three_sensors
+from support.command_line import caller, files_under, make_run
+from support.hard_cases import hard_case
 
 import lidardesign.design.constraints.check as checker
 from lidardesign.design.bandwidth import split_budget

@@ -8,16 +8,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import references
 import torch
 import trimesh
-from cases import hard_case
+from density.test_learn import SMALL, BallTask
+from density.test_visibility import along_axis, both_ways, config_of, plate, transmittance_on, wall
+from design.test_physical import from_the_ceiling
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from test_learn import SMALL, BallTask
-from test_physical import from_the_ceiling
-from test_visibility import along_axis, both_ways, config_of, plate, transmittance_on, wall
+from support import references
+from support.hard_cases import hard_case
 
 from lidardesign.config import (
     FASTEST_PER_M,

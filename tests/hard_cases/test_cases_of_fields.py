@@ -11,13 +11,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import references
 import trimesh
-from cases import hard_case
-from command_line import caller
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support import references
+from support.command_line import caller
+from support.hard_cases import hard_case
 from test_meshio import BOX_FACES, BOX_VERTICES, write_box
 
 from lidardesign.config import DensitySettings

@@ -10,9 +10,9 @@ import struct
 import numpy as np
 import pytest
 import yaml
-from cases import hard_case
 from hypothesis import given
 from hypothesis import strategies as st
+from support.hard_cases import hard_case
 
 from lidardesign.cli.commands.constrain import load_constraints
 from lidardesign.config import resolve

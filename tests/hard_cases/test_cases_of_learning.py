@@ -9,13 +9,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import references
 import torch
-from cases import hard_case
+from density.test_flow import FLOWS, draw, flow_of
+from density.test_learn import SPACE, BallTask, Interrupter, a_trainer, config_of, result_bytes
 from hypothesis import given
 from hypothesis import strategies as st
-from test_flow import FLOWS, draw, flow_of
-from test_learn import SPACE, BallTask, Interrupter, a_trainer, config_of, result_bytes
+from support import references
+from support.hard_cases import hard_case
 from zuko.distributions import BoxUniform
 from zuko.transforms import MonotonicRQSTransform
 

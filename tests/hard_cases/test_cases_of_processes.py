@@ -18,9 +18,9 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
-from cases import hard_case
-from command_line import caller, files_under, make_run, program
 from lidardesign_tasks.flatland import FlatlandTask
+from support.command_line import caller, files_under, make_run, program
+from support.hard_cases import hard_case
 
 from lidardesign import registry
 from lidardesign import registry as probe

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import references
 import trimesh
-from cases import hard_case
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support import references
+from support.hard_cases import hard_case
 
 from lidardesign.design.files import design_from_document
 from lidardesign.errors import ConfigError, LidardesignError

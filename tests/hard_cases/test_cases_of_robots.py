@@ -14,7 +14,6 @@ import mink
 import mujoco
 import numpy as np
 import pytest
-from cases import hard_case
 from lidardesign_tasks import arm_motion
 from lidardesign_tasks.arm import ArmTask
 from lidardesign_tasks.arm_engine import mujoco_warnings
@@ -22,7 +21,8 @@ from lidardesign_tasks.arm_files import MAX_INCLUDES, model_files
 from lidardesign_tasks.arm_links import BALL
 from lidardesign_tasks.arm_motion import PENETRATION_M, POSITION_RESIDUAL_M, TRIES, Arm, RejectedError, draw_waypoints
 from lidardesign_tasks.arm_robot import load_robot
-from test_arm_robot import TOOL_M, mjcf, written
+from support.hard_cases import hard_case
+from tasks.test_arm_robot import TOOL_M, mjcf, written
 
 from lidardesign.errors import DataError
 

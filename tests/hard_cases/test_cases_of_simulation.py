@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cases import hard_case
-from command_line import caller, make_run
+from evaluate.test_score import design, make_request, rows_by_key
 from hypothesis import given
 from hypothesis import strategies as st
 from lidardesign_tasks.arm import ArmTask
@@ -22,8 +21,9 @@ from lidardesign_tasks.face import FaceTask
 from lidardesign_tasks.flatland import FlatlandTask
 from lidardesign_tasks.meshes import MeshesTask
 from lidardesign_tasks.warehouse import WarehouseTask
-from test_called_for import EVERYTHING, face_rays, heads
-from test_score import design, make_request, rows_by_key
+from simulate.test_called_for import EVERYTHING, face_rays, heads
+from support.command_line import caller, make_run
+from support.hard_cases import hard_case
 
 from lidardesign.density.training.training_data import refuse_blind_receiver
 from lidardesign.errors import ConfigError, DataError

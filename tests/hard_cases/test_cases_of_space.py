@@ -7,12 +7,12 @@ import re
 
 import numpy as np
 import pytest
-import references
 import torch
-from cases import hard_case
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support import references
+from support.hard_cases import hard_case
 
 from lidardesign.config import DensitySettings, LearningSettings, RunConfig, resolve
 from lidardesign.density.flow.flow import DesignFlow

@@ -18,13 +18,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from cases import hard_case
-from command_line import caller, files_under, make_run
+from density.test_hard_learning import interrupt_after_a_checkpoint
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
-from small_runs import shifted
-from test_hard_learning import interrupt_after_a_checkpoint
+from support.command_line import caller, files_under, make_run
+from support.hard_cases import hard_case
+from support.small_runs import shifted
 from test_registry import BROKEN, GOOD
 
 from lidardesign.cli.main import run as run_program

@@ -1,0 +1,460 @@
+"""Everything that a user can get wrong: one clear message, the right exit code, and nothing half-written."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from support.command_line import caller, files_under, make_run, program
+
+from lidardesign.run.yaml import dump_yaml, load_yaml
+
+GARBAGE = bytes(range(256)) * 8
+CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+OPEN = CORNERS + "f 1 2 3\nf 1 2 4\n"
+EMPTY_PLY = (
+    b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+)
+
+# folder, file in it, its content
+MESHES = [
+    ("empty_obj", "a.obj", b""),
+    ("empty_stl", "a.stl", b""),
+    ("empty_ply", "a.ply", EMPTY_PLY),
+    ("only_points", "a.obj", CORNERS.encode()),
+    ("nan", "a.obj", OPEN.replace("v 1 0 0", "v nan 0 0").encode()),
+    ("infinite", "a.obj", OPEN.replace("v 1 0 0", "v inf 0 0").encode()),
+    ("missing_corner", "a.obj", (CORNERS + "f 1 2 9\n").encode()),
+    ("open", "a.obj", OPEN.encode()),
+    ("one_bad_of_two", "b.stl", GARBAGE),
+    ("one_bad_of_two", "a.obj", OPEN.encode()),
+    ("no_mesh", "a.txt", b"hello"),
+    *((f"garbage_{suffix}", f"a.{suffix}", GARBAGE) for suffix in ("stl", "obj", "ply", "glb", "gltf", "off")),
+]
+
+TEXTS = {
+    "typo.yaml": "density:\n  sigma_m: [0.01\n",
+    "tabs.yaml": "density:\n\tsigma_m: 0.01\n",
+    "unknown.yaml": "density:\n  sigma_mm: 0.1\n",
+    "section.yaml": "densty: {sigma_m: 0.1}\n",
+    "type.yaml": "density: {sigma_m: wide}\n",
+    "list.yaml": "- 1\n- 2\n",
+    "negative.yaml": "density: {sigma_m: -0.1}\n",
+    "nan.yaml": "density: {sigma_m: .nan}\n",
+    "infinite.yaml": "learning: {rate: .inf}\n",
+    "overflow.yaml": "density: {sigma_m: 1e999}\n",
+    "twice.yaml": "density: {sigma_m: 0.1, sigma_m: 0.2}\n",
+    "code.yaml": "density: !!python/object/apply:os.system ['touch owned']\n",
+    "other_task.yaml": "task_name: face\n",
+    "upside_down.yaml": "space: {range_m: [1.0, 0.5]}\n",
+    "garbage.yaml": "\x00\x01\x02",
+    "rows.csv": "a,b,c\n1,2,3\n",
+    "short.csv": "1,2,3\n",
+}
+
+CASES = [
+    # meshes
+    ("learn meshes --set folder=absent", 3, "absent"),
+    ("learn meshes --set folder=no_mesh", 3, "no_mesh"),
+    ("learn meshes --set folder=open --set sign=solid", 3, "a.obj"),
+    ("learn meshes --set folder=open --set sign=inside", 2, "--set sign=inside"),
+    ("learn meshes --set folder=open --set scale=0", 2, "--set scale=0"),
+    ("learn meshes --set folder=open --set scale=nan", 2, "--set scale=nan"),
+    ("learn meshes --set folder=open --set scale=1e400", 2, "--set scale=1e400"),
+    ("learn meshes --set folder=one_bad_of_two", 3, "b.stl"),
+    ("learn meshes --set folder=open --set occluders=garbage_stl", 3, "a.stl"),
+    *(
+        (f"learn meshes --set folder={name}", 3, file)
+        for name, file, _ in MESHES
+        if name not in ("open", "one_bad_of_two", "no_mesh")
+    ),
+    # configuration: file, line and column
+    ("learn flatland --config typo.yaml", 2, "typo.yaml:3:1"),
+    ("learn flatland --config tabs.yaml", 2, "tabs.yaml:2:1"),
+    ("learn flatland --config unknown.yaml", 2, "unknown.yaml:2:3: unknown key 'density.sigma_mm'"),
+    ("learn flatland --config section.yaml", 2, "did you mean 'density'"),
+    ("learn flatland --config type.yaml", 2, "type.yaml:1:20"),
+    ("learn flatland --config list.yaml", 2, "list.yaml"),
+    ("learn flatland --config negative.yaml", 2, "negative.yaml:1:20"),
+    ("learn flatland --config nan.yaml", 2, "nan.yaml:1:20"),
+    ("learn flatland --config infinite.yaml", 2, "infinite.yaml:1:18"),
+    ("learn flatland --config overflow.yaml", 2, "overflow.yaml:1:20"),
+    ("learn flatland --config twice.yaml", 2, "twice.yaml:1:"),
+    ("learn flatland --config code.yaml", 2, "code.yaml:1:"),
+    ("learn flatland --config other_task.yaml", 2, "other_task.yaml:1:"),
+    ("learn flatland --config upside_down.yaml", 2, "upside_down.yaml:1:"),
+    ("learn flatland --config garbage.yaml", 2, "garbage.yaml"),
+    ("learn flatland --config open", 2, "open"),
+    ("learn flatland --set density.sigma_m=-1", 2, "--set density.sigma_m=-1"),
+    ("learn flatland --set density.sigma_m=nan", 2, "--set density.sigma_m=nan"),
+    ("learn flatland --set learning.steps=1.5", 2, "--set learning.steps=1.5"),
+    ("learn flatland --set learning.steps=many", 2, "--set learning.steps=many"),
+    ("learn flatland --set learning.step=3", 2, "did you mean 'steps'"),
+    ("learn flatland --set train=0", 2, "--set train=0"),
+    ("learn flatland --set space.range_m=[2,1]", 2, "--set space.range_m=[2,1]"),
+    ("learn flatland --set space.range_m=[0,.inf]", 2, "--set space.range_m=[0,.inf]"),
+    ("learn flatland --preset quick", 2, "draft, standard, fine"),
+    ("learn flatlan", 2, "did you mean 'flatland'"),
+    ("learn flatland --device cuda:9", 2, "auto, cpu, cuda"),
+    # morphable models
+    ("learn face --set model=absent.h5", 3, "absent.h5"),
+    ("learn face --set model=text.h5", 3, "text.h5"),
+    ("learn face --set model=other.h5", 3, "other.h5"),
+    ("learn face --set model=truncated.h5", 3, "truncated.h5"),
+    ("learn face --set model=open", 3, "open"),
+    # runs
+    ("fit absent", 3, "no such run"),
+    ("fit open", 3, "no run folder"),
+    ("fit unfinished", 3, "--resume"),
+    ("evaluate unfinished", 3, "no designs yet"),
+    ("fit truncated", 3, "truncated"),
+    ("fit flipped", 3, "SHA-256"),
+    ("constrain flipped --set gate.width_m.max=0.3", 3, "SHA-256"),
+    ("fit edited", 3, "config.yaml"),
+    ("fit no_manifest", 3, "manifest.json"),
+    ("fit bad_manifest", 3, "manifest.json"),
+    ("fit newer", 3, "schema version"),
+    ("learn flatland --out run", 2, "not empty"),
+    ("learn flatland --resume --out absent", 3, "no run to resume"),
+    ("learn flatland --resume --out open", 3, "no run folder"),
+    ("learn flatland --resume --out locked", 2, "is writing this run"),
+    ("learn face --resume --out run", 2, "task"),
+    # options
+    ("fit run --rays 0", 2, "rays"),
+    ("fit run --rays -5", 2, "rays"),
+    ("fit run --sensors 0", 2, "from 1, or auto"),
+    ("fit run --sensors -2", 2, "from 1, or auto"),
+    ("fit run --sensors 2.5", 2, "from 1, or auto"),
+    ("fit run --sensors 5 --rays 3", 4, "3 rays for 5 sensors"),
+    ("constrain run --sensors 5 --set budget.rays=3", 4, "budget.rays"),
+    ("evaluate run --rays 0", 2, "rays"),
+    ("evaluate run --rays many", 2, "rays"),
+    ("evaluate run --fail-above inf", 2, "finite"),
+    ("export good.yaml --format csv --rays 0", 2, "rays"),
+    ("export good.yaml --format csv --out open", 3, "is a folder"),
+    ("export good.yaml --format csv --out good.yaml", 2, "overwrite the design"),
+    # constraints
+    ("constrain run --constraints typo.yaml", 2, "typo.yaml:3:1"),
+    ("constrain run --set gate.width_m.max=-1", 2, "--set gate.width_m.max=-1"),
+    ("constrain run --set gate.width_m.max=nan", 2, "--set gate.width_m.max=nan"),
+    ("constrain run --set gate.width.max=1", 2, "did you mean 'width_m'"),
+    ("constrain run --set rays=1", 2, "did you mean 'budget.rays'"),
+    ("constrain run --set mounts_m=[[0,0,1]]", 2, "did you mean 'origin.mounts_m'"),
+    ("constrain run --set field_of_view.horizontal_deg=20", 2, "--set field_of_view.horizontal_deg=20"),
+    ("constrain run --set gate.start_m.min=0.8 --set gate.end_m.max=0.5", 4, "gate.start_m.min"),
+    ("constrain run --set sensors.count=3 --sensors 2", 4, "sensors.count"),
+    ("constrain run --set gate.start_m.min=7", 4, "gate.start_m.min"),
+    ("constrain run --set origin.low_m=[5,0,0] --set origin.high_m=[6,0,0]", 4, "origin"),
+    ("constrain run --set budget.bandwidth_mbps=1e-9", 4, "bandwidth_mbps"),
+    ("constrain run --set gate.end_m.max=0.02", 4, "density"),
+    # designs
+    ("show rows.csv", 3, "rows.csv:1"),
+    ("show short.csv", 3, "short.csv:1"),
+    ("show garbage.yaml", 2, "garbage.yaml"),
+    ("evaluate run good.yaml --baseline best", 2, "uniform"),
+]
+
+
+def damaged_run(folder, name, change):
+    """A run with one of its files changed behind its back."""
+    path = make_run(folder, count=1000) / name
+    path.write_bytes(change(path.read_bytes()))
+
+
+def flipped(content):
+    middle = len(content) // 2
+    return content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+
+
+def make_runs(folder):
+    make_run(folder / "run", count=1000)
+    damaged_run(folder / "truncated", "samples.npz", lambda content: content[: len(content) // 2])
+    damaged_run(folder / "flipped", "samples.npz", flipped)
+    damaged_run(folder / "edited", "config.yaml", lambda content: content.replace(b"seed: 3", b"seed: 4"))
+    damaged_run(folder / "bad_manifest", "manifest.json", lambda content: content[:40])
+    damaged_run(folder / "newer", "manifest.json", lambda c: c.replace(b'"schema_version": 1', b'"schema_version": 2'))
+    make_run(folder / "no_manifest", count=1000)
+    (folder / "no_manifest" / "manifest.json").unlink()
+    make_run(folder / "locked", count=1000)
+    (folder / "locked" / ".lock").write_text(json.dumps({"pid": 1, "host": "elsewhere"}))
+    unfinished = make_run(folder / "unfinished", count=1000)
+    manifest = json.loads((unfinished / "manifest.json").read_text())
+    del manifest["files"]["samples.npz"]
+    (unfinished / "manifest.json").write_text(json.dumps(manifest))
+    (unfinished / "samples.npz").unlink()
+
+
+def make_models(folder):
+    (folder / "text.h5").write_text("not HDF5")
+    with h5py.File(folder / "other.h5", "w") as file:
+        file["temperature"] = np.arange(5)
+    content = (folder / "other.h5").read_bytes()
+    (folder / "truncated.h5").write_bytes(content[: len(content) // 2])
+
+
+GOOD = """\
+schema_version: 1
+layout: grid
+rays: 100
+sensors:
+- name: one
+  weight: 1.0
+  origin_m: {mean: [0.4, 0.0, 0.0]}
+  boresight: {azimuth_rad: 3.14, elevation_rad: 0.0}
+  field_of_view_rad: {horizontal: 0.2, vertical: 0.25}
+  gate_m: {start: 0.25, end: 0.4}
+"""
+
+
+@pytest.fixture(scope="module")
+def mistakes(tmp_path_factory):
+    """A folder with everything that can be got wrong in it."""
+    folder = tmp_path_factory.mktemp("mistakes") / "with spaces ü"
+    folder.mkdir()
+    for name, file, content in MESHES:
+        (folder / name).mkdir(exist_ok=True)
+        (folder / name / file).write_bytes(content)
+    for name, text in TEXTS.items():
+        (folder / name).write_text(text)
+    (folder / "good.yaml").write_text(GOOD)
+    make_models(folder)
+    make_runs(folder)
+    return folder
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+def check_one_clear_message(result, code, words):
+    """The message is short, says what it must, is the same in JSON, and the exit code is right."""
+    assert result.code == code, result.err
+    document = result.json
+    assert document["schema_version"] == 1
+    assert document["exit_code"] == code
+    assert document["error"]["message"]
+    assert words in result.err
+    assert "Traceback" not in result.err
+    assert len(result.err.strip().splitlines()) <= 5, result.err
+
+
+@pytest.mark.parametrize(("arguments", "code", "words"), CASES, ids=[case[0] for case in CASES])
+def test_bad_input_gets_one_message_its_exit_code_and_writes_nothing(
+    mistakes, lidardesign, monkeypatch, arguments, code, words
+):
+    monkeypatch.chdir(mistakes)
+    before = files_under(mistakes)
+    check_one_clear_message(lidardesign(*arguments.split(), "--json"), code, words)
+    assert files_under(mistakes) == before
+    assert not (mistakes / "runs").exists()
+
+
+# where in a valid design, what stands there instead, words of the message
+DESIGNS = [
+    (("schema_version",), 2, "schema"),
+    (("layout",), "spiral", "layout"),
+    (("rays",), -1, "rays"),
+    (("rays",), "many", "rays"),
+    (("sensors",), [], "sensors"),
+    (("sensors", 0, "name"), "", "name"),
+    (("sensors", 0, "weight"), -1.0, "weight"),
+    (("sensors", 0, "weight"), "heavy", "weight"),
+    (("sensors", 0, "gain"), 2, "gain"),
+    (("sensors", 0, "origin_m", "mean"), [0.0, 0.0], "mean"),
+    (("sensors", 0, "origin_m", "covariance"), [[-1, 0, 0], [0, 1, 0], [0, 0, 1]], "covariance"),
+    (("sensors", 0, "boresight", "elevation_rad"), 2.0, "elevation_rad"),
+    (("sensors", 0, "field_of_view_rad", "horizontal"), -0.1, "horizontal"),
+    (("sensors", 0, "gate_m", "end"), 0.1, "gate_m"),
+    (("sensors", 0, "gate_m"), None, "gate_m"),
+]
+
+
+@pytest.mark.parametrize("command", ["show", "evaluate run", "export --format csv"])
+@pytest.mark.parametrize(
+    ("path", "value", "words"), DESIGNS, ids=[f"{'.'.join(map(str, d[0]))}={d[1]}" for d in DESIGNS]
+)
+def test_a_mistake_in_a_design_is_found_with_its_line(mistakes, lidardesign, monkeypatch, path, value, words, command):
+    monkeypatch.chdir(mistakes)
+    document = load_yaml(mistakes / "good.yaml").value
+    node = document
+    for key in path[:-1]:
+        node = node[key]
+    node[path[-1]] = value
+    wrong = mistakes / "wrong.yaml"
+    wrong.write_text(dump_yaml(document))
+    first, *options = command.split()
+    result = lidardesign(first, *options, wrong, "--json")
+    check_one_clear_message(result, 2, words)
+    assert "wrong.yaml:" in result.err
+
+
+def test_a_design_whose_numbers_are_not_finite_is_refused(mistakes, lidardesign, monkeypatch):
+    monkeypatch.chdir(mistakes)
+    for number in (".nan", ".inf", "1e999"):
+        (mistakes / "wrong.yaml").write_text(GOOD.replace("weight: 1.0", f"weight: {number}"))
+        check_one_clear_message(lidardesign("show", "wrong.yaml", "--json"), 2, "wrong.yaml:6:11")
+
+
+def test_constraints_that_hold_almost_nothing_say_how_much(mistakes, lidardesign, monkeypatch):
+    monkeypatch.chdir(mistakes)
+    error = lidardesign("constrain", "run", "--set", "gate.end_m.max=0.02", "--json").json["error"]
+    assert error["kind"] == "infeasible"
+    assert 0 <= error["admissible_mass"] < 0.01
+    assert f"{error['admissible_mass']:.3g} of the density" in error["message"]
+
+
+def test_contradictory_constraints_name_both_sides(mistakes, lidardesign, monkeypatch):
+    monkeypatch.chdir(mistakes)
+    arguments = ("--set", "gate.start_m.min=0.8", "--set", "gate.end_m.max=0.5", "--json")
+    error = lidardesign("constrain", "run", *arguments).json["error"]
+    assert {"gate.start_m.min", "gate.end_m.max"} <= set(error["conflicts"])
+
+
+COMMANDS = {
+    "fit": ("fit", "run", "--sensors", "1"),
+    "constrain": ("constrain", "run", "--set", "budget.rays=20"),
+    "export": ("export", "good.yaml", "--format", "npz", "--out", "rays.npz"),
+    "learn": ("learn", "flatland", "--preset", "draft", "--out", "new/run"),
+}
+
+
+@pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EROFS, errno.EACCES])
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_disk_that_takes_nothing_leaves_the_old_files(lidardesign, tmp_path, monkeypatch, command, reason):
+    make_run(tmp_path / "run", count=1000)
+    (tmp_path / "good.yaml").write_text(GOOD)
+    before = files_under(tmp_path)
+
+    def refuse(source, target):
+        raise OSError(reason, os.strerror(reason), str(target))
+
+    monkeypatch.setattr("lidardesign.run.files.os.replace", refuse)
+    result = lidardesign(*COMMANDS[command], "--json")
+    check_one_clear_message(result, 3, os.strerror(reason))
+    assert files_under(tmp_path) == before
+    assert not (tmp_path / "new").exists()
+
+
+def test_evaluate_says_when_a_file_cannot_be_written(lidardesign, tmp_path):
+    make_run(tmp_path / "run", count=1000)
+    (tmp_path / "taken").write_text("a file")
+    lidardesign("fit", "run", "--sensors", "1")
+    for option, place in (("--csv", "taken/rows.csv"), ("--plots", "taken"), ("--report", "taken/report.html")):
+        result = lidardesign("evaluate", "run", "--rays", "16", option, place, "--json")
+        check_one_clear_message(result, 3, "taken")
+    assert (tmp_path / "taken").read_text() == "a file"
+
+
+SMALL = ["learning.steps=200", "learning.batch=64", "learning.samples=1000", "learning.coverage_proposals=256"]
+FREQUENT = ["learning.balance_proposals=256", "learning.checkpoint_seconds=0.05", "train=3"]
+RESULTS = ("flow.safetensors", "samples.npz")
+# a process whose files may not grow beyond a size behaves like one on a disk that becomes full
+# Python writes byte code in part without noticing where the disk is full, and would leave it broken for all others
+SMALL_DISK = (
+    "import resource, sys; sys.dont_write_bytecode = True; "
+    "resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))"
+)
+# what a process has imported in the end
+TELLING = (
+    "import atexit, sys; "
+    "atexit.register(lambda: print(*(f'{name} is imported' for name in sys.modules), sep='\\n', file=sys.stderr))"
+)
+
+
+def settings_of(*settings):
+    return [word for setting in settings for word in ("--set", setting)]
+
+
+def finish(process):
+    out, err = process.communicate(timeout=240)
+    return process.returncode, out.decode(), err.decode()
+
+
+@pytest.mark.slow
+def test_a_disk_that_fills_during_learning_is_one_message_and_a_folder_that_says_what_it_is(tmp_path):
+    settings = settings_of(*SMALL, *FREQUENT)
+    arguments = ["learn", "flatland", "--preset", "draft", "--out", "run", *settings]
+    code, out, err = finish(program(*arguments, "--json", cwd=tmp_path, before=SMALL_DISK))
+    assert code == 3, err
+    assert "File too large" in json.loads(out)["error"]["message"]
+    assert "Traceback" not in err
+    left = files_under(tmp_path)
+    assert not [name for name in left if name.endswith((".tmp", ".lock", *RESULTS))]
+    if left:
+        code, out, err = finish(program("fit", "run", cwd=tmp_path))
+        assert code == 3
+        assert "--resume" in err
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_is_resumed_to_the_bytes_of_a_straight_one(lidardesign, tmp_path):
+    settings = settings_of(*SMALL, *FREQUENT)
+    arguments = ["learn", "flatland", "--preset", "draft", *settings]
+    code, out, err = finish(program(*arguments, "--out", "straight", "--json", cwd=tmp_path, before=TELLING))
+    assert code == 0, err
+    assert "torch is imported" in err
+    assert "torch._dynamo is imported" not in err  # as long to import as torch itself, and never used
+    assert {"run", "task", "seconds", "steps", "ess", "kl_nats", "log_z", "coverage"} <= set(json.loads(out))
+    interrupted = program(*arguments, "--out", "stopped", "--json", cwd=tmp_path)
+    deadline = time.monotonic() + 120
+    while not (tmp_path / "stopped" / "checkpoint.safetensors").exists() and time.monotonic() < deadline:
+        time.sleep(0.005)
+    interrupted.send_signal(signal.SIGINT)
+    code, out, err = finish(interrupted)
+    assert code == 130, err
+    assert json.loads(out)["error"]["kind"] == "interrupted"
+    assert not (tmp_path / "stopped" / "samples.npz").exists()
+    refused = lidardesign("fit", "stopped")
+    assert refused.code == 3
+    assert "--resume" in refused.err
+    resumed = [*arguments, "--out", "stopped", "--resume", "--json"]
+    checkpoint = tmp_path / "stopped" / "checkpoint.safetensors"
+    content = checkpoint.read_bytes()
+    for damaged, words in ((content[:-50], "truncated"), (flipped(content), "SHA-256")):
+        checkpoint.write_bytes(damaged)
+        refused = lidardesign(*resumed)
+        assert (refused.code, refused.json["exit_code"]) == (3, 3), refused.err
+        assert words in refused.err
+    checkpoint.write_bytes(content)
+    code, _, err = finish(program(*resumed, cwd=tmp_path))
+    assert code == 0, err
+    for name in RESULTS:
+        assert (tmp_path / "stopped" / name).read_bytes() == (tmp_path / "straight" / name).read_bytes()
+
+
+@pytest.mark.slow
+def test_two_processes_never_learn_into_one_folder(tmp_path):
+    arguments = ["learn", "flatland", "--preset", "draft", "--out", "run", *settings_of("learning.steps=100000")]
+    first = program(*arguments, "--json", cwd=tmp_path)
+    deadline = time.monotonic() + 120
+    while not (tmp_path / "run" / "config.yaml").exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    before = (tmp_path / "run" / "config.yaml").read_bytes()
+    for further, words in (((), "not empty"), (("--resume",), "is writing this run")):
+        code, _, err = finish(program(*arguments, *further, cwd=tmp_path))
+        assert code == 2
+        assert words in err
+    assert first.poll() is None
+    assert (tmp_path / "run" / "config.yaml").read_bytes() == before
+    first.send_signal(signal.SIGTERM)
+    assert finish(first)[0] == 143
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs the device /dev/full")
+def test_an_export_to_a_full_device_says_so(tmp_path):
+    (tmp_path / "good.yaml").write_text(GOOD)
+    arguments = ("export", "good.yaml", "--format", "csv", "--out", "/dev/full")
+    code, out, err = finish(program(*arguments, cwd=tmp_path))
+    assert (code, out) == (3, "")
+    assert "No space left on device" in err
+    with contextlib.suppress(FileNotFoundError):
+        assert not list(tmp_path.glob("*.tmp"))

@@ -1,0 +1,499 @@
+"""The command line: one clear message and the right exit code for each mistake, and nothing half-written."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.command_line import caller, files_under, make_run
+
+from lidardesign import __version__
+from lidardesign.cli import output as console_module
+from lidardesign.cli.output import Output, command, plain_json
+from lidardesign.errors import InfeasibleError
+from lidardesign.run.yaml import load_yaml
+from lidardesign.samples import Samples, load_samples, save_samples
+
+COMMANDS = ["learn", "fit", "constrain", "evaluate", "export", "show", "tasks", "tasks list", "tasks show"]
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    """Run the program in this process, in an empty folder."""
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def finished_run(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("runs") / "flat land ü")
+
+
+@pytest.fixture
+def flat(tmp_path):
+    return make_run(tmp_path / "run")
+
+
+BAD_YAML = {
+    "typo.yaml": "density\n  sigma_m: 1\n",
+    "unknown.yaml": "density: {sigma: 0.1}\n",
+    "negative.yaml": "density: {sigma_m: -0.1}\n",
+    "design.yaml": "schema_version: 1\nsensors: 3\n",
+    "gate.yaml": "gate: {width_m: {max: -1}}\n",
+    "gates.yaml": "gates: {width_m: {max: 1}}\n",
+    "contradiction.yaml": "gate: {start_m: {min: 0.8}, end_m: {max: 0.5}}\n",
+    "empty.yaml": "",
+    "notes.txt": "not a design at all",
+}
+
+CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
+MESHES = {
+    "empty": "",
+    "nan": CORNERS.replace("v 1 0 0", "v nan 0 0") + "f 1 2 3\nf 1 2 4\n",
+    "open": CORNERS + "f 1 2 3\nf 1 2 4\n",
+}
+
+MISTAKES = [
+    ("learn nothing", 2, "unknown task 'nothing'"),
+    ("learn flatlnd", 2, "did you mean 'flatland'"),
+    ("learn", 2, "TASK"),
+    ("learn flatland --preset quick", 2, "draft, standard, fine"),
+    ("learn flatland --device tpu", 2, "auto, cpu, cuda"),
+    ("learn flatland --seed -1", 2, "seed"),
+    ("learn flatland --seed x", 2, "seed"),
+    ("learn flatland --config absent.yaml", 2, "absent.yaml: cannot be read: No such file"),
+    ("learn flatland --config typo.yaml", 2, "typo.yaml:2:"),
+    ("learn flatland --config unknown.yaml", 2, "unknown.yaml:1:11: unknown key 'density.sigma'"),
+    ("learn flatland --config negative.yaml", 2, "negative.yaml:1:20"),
+    ("learn flatland --set density.sigma_m=-1", 2, "--set density.sigma_m=-1"),
+    ("learn flatland --set sigma", 2, "KEY=VALUE"),
+    ("learn flatland --out taken", 2, "not empty"),
+    ("learn flatland --out notes.txt", 2, "is a file"),
+    ("learn flatland --out notes.txt/run", 3, "cannot be made"),
+    ("learn flatland --resume --out absent", 3, "no run to resume"),
+    ("learn flatland --unknown", 2, "unknown"),
+    ("learn face --set model=absent.h5", 3, "absent.h5"),
+    ("learn face --set model=notes.txt", 3, "notes.txt"),
+    ("learn meshes --set folder=absent", 3, "absent"),
+    ("learn meshes", 2, "--set folder=PATH"),
+    ("learn meshes --set folder=nothing", 3, "nothing"),
+    ("learn meshes --set folder=empty", 3, "empty.obj"),
+    ("learn meshes --set folder=nan", 3, "nan.obj"),
+    ("learn meshes --set folder=open --set sign=solid", 3, "open.obj"),
+    ("fit absent", 3, "no such run"),
+    ("fit taken", 3, "no run folder"),
+    ("fit run --sensors 0", 2, "from 1, or auto"),
+    ("fit run --sensors many", 2, "from 1, or auto"),
+    ("fit run --layout spiral", 2, "grid, density, scan"),
+    ("fit run --gates one", 2, "sensor, ray"),
+    ("fit run --rays 0", 2, "rays"),
+    ("fit run --name ../elsewhere", 2, "no name for a design"),
+    ("constrain run --constraints absent.yaml", 2, "absent.yaml"),
+    ("constrain run --constraints gate.yaml", 2, "gate.yaml:1:23"),
+    ("constrain run --constraints gates.yaml", 2, "did you mean 'gate'"),
+    ("constrain run --constraints contradiction.yaml", 4, "gate."),
+    ("constrain run --set gate.width_m.max=wide", 2, "--set gate.width_m.max=wide"),
+    ("constrain run --set gate.width_m.most=1", 2, "--set gate.width_m.most=1"),
+    ("constrain absent.yaml", 3, "absent.yaml"),
+    ("evaluate absent", 3, "absent"),
+    ("evaluate run", 3, "no designs yet"),
+    ("evaluate run --baseline best", 2, "uniform"),
+    ("evaluate run --rays 0", 2, "rays"),
+    ("evaluate run --fail-above nan", 2, "finite"),
+    ("evaluate design.yaml", 2, "design.yaml:2:10"),
+    ("export", 2, "no design"),
+    ("export absent.yaml --format csv", 3, "absent.yaml"),
+    ("export design.yaml --format csv", 2, "design.yaml"),
+    ("export design.yaml --format jpeg", 2, "csv"),
+    ("export design.yaml", 2, "no format"),
+    ("export empty.yaml --format csv", 2, "empty.yaml"),
+    ("show notes.txt", 2, "notes.txt"),
+    ("show absent.yaml", 3, "absent.yaml"),
+    ("tasks show nothing", 2, "unknown task"),
+    ("tasks remove", 2, "remove"),
+    ("fly", 2, "fly"),
+]
+
+
+@pytest.fixture
+def mistakes(tmp_path, lidardesign):
+    """A folder with everything that can be got wrong in it."""
+    make_run(tmp_path / "run", count=1000)
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "letter.txt").write_text("keep me")
+    for name, text in MESHES.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / f"{name}.obj").write_text(text)
+    (tmp_path / "nothing").mkdir()
+    for name, text in BAD_YAML.items():
+        (tmp_path / name).write_text(text)
+    return lidardesign
+
+
+@pytest.mark.parametrize(("arguments", "code", "words"), MISTAKES, ids=[entry[0] for entry in MISTAKES])
+def test_a_mistake_gets_one_message_its_exit_code_and_writes_nothing(mistakes, tmp_path, arguments, code, words):
+    before = files_under(tmp_path)
+    result = mistakes(*arguments.split(), "--json")
+    assert result.code == code, result.err
+    document = result.json
+    assert document["schema_version"] == 1
+    assert document["exit_code"] == code
+    assert words in f"{document['error'].get('where')}: {document['error']}" or words in result.err
+    assert words in result.err
+    assert "Traceback" not in result.err
+    assert len(result.err.strip().splitlines()) <= 4
+    assert files_under(tmp_path) == before
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_explains_itself_and_has_the_common_options(lidardesign, name):
+    result = lidardesign(*name.split(), "--help")
+    assert result.code == 0
+    for option in ("--json", "--seed", "--quiet", "--debug"):
+        assert option in result.out
+
+
+def test_the_version_is_printed(lidardesign):
+    assert lidardesign("--version").out == f"lidardesign {__version__}\n"
+
+
+def test_tasks_alone_lists_them_and_json_is_one_document(lidardesign):
+    assert "flatland" in lidardesign("tasks").out
+    listed = lidardesign("tasks", "list", "--json").json["tasks"]
+    assert {"face", "flatland", "meshes"} <= {entry["name"] for entry in listed}
+    assert lidardesign("tasks", "--json").json["tasks"] == listed
+
+
+def test_a_task_shows_its_keys_and_its_space(lidardesign):
+    document = lidardesign("tasks", "show", "flatland", "--json").json
+    assert document["metric"]["unit"] == "mm"
+    assert document["space"]["range_m"][0] >= 0
+    assert all(entry["description"] for entry in document["config"])
+    assert "design space" in lidardesign("tasks", "show", "flatland").out
+
+
+def test_a_task_shows_what_is_designed_what_is_given_and_how_it_is_fitted(lidardesign):
+    arm = lidardesign("tasks", "show", "arm")
+    assert "4 sensors, layout distributed, level 0.99, evaluated at 400, 1000, 1200 rays" in arm.out
+    assert lidardesign("tasks", "show", "arm", "--json").json["defaults"]["layout"] == "distributed"
+    shelves = lidardesign("tasks", "show", "warehouse").out
+    kinds = {row.split()[1]: row for row in shelves.splitlines() if row.startswith("│")}
+    assert "a condition (--at)" in kinds["x_m"]
+    assert "fixed" in kinds["azimuth_rad"]
+    assert "designed" in kinds["elevation_rad"]
+    assert "layout scan, level" in shelves
+
+
+def test_the_chain_works_from_a_run_to_exported_rays(lidardesign, flat, tmp_path):
+    fitted = lidardesign("fit", flat, "--sensors", 2, "--json").json
+    assert {
+        "design",
+        "sensors",
+        "log_likelihood",
+        "admissible_mass",
+        "ess",
+        "satisfied",
+        "constraints",
+        "seconds",
+    } <= {*fitted}
+    assert Path(fitted["design"]) == flat / "designs" / "fit.yaml"
+    assert len(fitted["sensors"]) == 2
+    arguments = ("--set", "gate.width_m.max=0.3", "--set", "budget.rays=40", "--name", "tight")
+    tight = lidardesign("constrain", flat / "designs" / "fit.yaml", *arguments, "--json").json
+    assert tight["satisfied"] is True
+    assert {"name", "bound", "value", "satisfied"} == {*tight["constraints"][0]}
+    written = load_yaml(Path(tight["design"])).value
+    assert all(sensor["gate_m"]["end"] - sensor["gate_m"]["start"] <= 0.3 for sensor in written["sensors"])
+    assert (flat / "designs" / written["provenance"]["run"]).resolve() == flat.resolve()
+    exported = lidardesign("export", tight["design"], "--format", "csv", "--json").json
+    assert exported["rays"] == 40
+    assert Path(exported["out"]).is_file()
+    assert "tight" in lidardesign("show", tight["design"]).out
+
+
+def test_evaluate_scores_designs_and_baselines_and_holds_a_threshold(lidardesign, flat):
+    lidardesign("fit", flat, "--sensors", 2)
+    arguments = ("evaluate", flat, "--rays", 16, "--csv", "rows.csv", "--json")
+    result = lidardesign(*arguments, "--fail-above", 1e-9)
+    assert result.code == 1
+    assert "fail-above" in result.err
+    rows = result.json["rows"]
+    assert {"fit", "uniform", "random", "bounding"} <= {row["design"] for row in rows}
+    assert Path("rows.csv").is_file()
+    assert lidardesign(*arguments, "--fail-above", 1e9).code == 0
+    assert "held-out" in lidardesign("evaluate", flat, "--rays", 16).out
+
+
+def test_further_baselines_are_built_where_they_are_asked_for(lidardesign, flat):
+    lidardesign("fit", flat, "--sensors", 2)
+    asked = ("--baseline", "occupancy", "--baseline", "no-visibility")
+    result = lidardesign("evaluate", flat, "--rays", 12, *asked, "--report", "page.html", "--json").json
+    names = ["fit", "uniform", "random", "bounding", "occupancy", "no-visibility"]
+    assert [row["design"] for row in result["rows"]] == names
+    assert all(row["rays"] == 12 for row in result["rows"])
+    assert {row["design"] for row in result["equal_bandwidth"]} == {*names[1:]}
+    assert Path("page.html").is_file()
+
+
+def test_no_visibility_needs_a_design_whose_run_is_there(lidardesign, flat):
+    lidardesign("fit", flat, "--sensors", 2)
+    away = Path("away.yaml")
+    away.write_text((flat / "designs" / "fit.yaml").read_text())
+    (flat / "designs" / "fit.yaml").unlink()
+    result = lidardesign("evaluate", flat, away, "--rays", 12, "--baseline", "no-visibility")
+    assert result.code == 2
+    assert "no design to fit anew" in result.err
+
+
+def test_the_same_seed_writes_the_same_design(lidardesign, flat):
+    texts = []
+    for seed in (1, 1):
+        lidardesign("fit", flat, "--sensors", 2, "--seed", seed)
+        texts.append((flat / "designs" / "fit.yaml").read_text())
+    assert texts[0] == texts[1]
+
+
+def test_a_damaged_run_is_noticed_before_anything_is_written(lidardesign, flat):
+    samples = flat / "samples.npz"
+    samples.write_bytes(samples.read_bytes()[:-100])
+    result = lidardesign("fit", flat)
+    assert result.code == 3
+    assert "truncated" in result.err
+    assert not (flat / "designs").exists()
+
+
+def test_a_design_that_breaks_a_constraint_is_never_written(lidardesign, flat, monkeypatch):
+    from lidardesign.cli.commands import fit as fit_module
+
+    def refuse(design, constraints, space):
+        raise InfeasibleError("broken", conflicts=["gate.width_m.max"])
+
+    monkeypatch.setattr(fit_module, "check_written", refuse)
+    result = lidardesign("constrain", flat, "--set", "gate.width_m.max=0.3", "--json")
+    assert result.code == 4
+    assert result.json["error"]["conflicts"] == ["gate.width_m.max"]
+    assert not (flat / "designs").exists()
+
+
+def test_a_run_that_is_being_written_is_left_alone(lidardesign, flat, monkeypatch):
+    monkeypatch.setattr("lidardesign.cli.tables.designs.WAIT_S", 0.1)
+    (flat / ".lock").write_text(json.dumps({"pid": 1, "host": "elsewhere"}))
+    result = lidardesign("fit", flat)
+    assert result.code == 2
+    assert "is writing this run" in result.err
+
+
+def test_names_with_spaces_and_letters_of_all_kinds_work(lidardesign, finished_run):
+    assert lidardesign("fit", finished_run, "--sensors", 1, "--name", "größe-1").code == 0
+    assert (finished_run / "designs" / "größe-1.yaml").is_file()
+
+
+def test_an_unexpected_error_is_one_line_with_a_hint(capsys):
+    for debug in (False, True):
+        with pytest.raises(console_module.typer.Exit) as ended, command(json=True, quiet=False, debug=debug):
+            raise ZeroDivisionError("division by zero")
+        captured = capsys.readouterr()
+        assert ended.value.exit_code == 70
+        assert json.loads(captured.out)["error"]["kind"] == "internal"
+        assert "--debug" in captured.err
+        assert ("Traceback" in captured.err) == debug
+
+
+def test_a_damaged_cache_of_compiled_code_is_named_with_what_to_do(tmp_path, capsys):
+    from numba.core.caching import IndexDataCacheFile
+
+    (tmp_path / "kernel.nbi").write_bytes(b"\x80\x04 cut")
+    cache = IndexDataCacheFile(str(tmp_path), "kernel", "stamp")
+    with pytest.raises(console_module.typer.Exit) as ended, command(json=True, quiet=False, debug=False):
+        cache.load("overload")
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert (ended.value.exit_code, error["kind"]) == (3, "system")
+    assert str(tmp_path) in error["message"]
+    assert "*.nbi" in error["hint"]
+
+
+def test_what_libraries_print_does_not_spoil_the_document(capsys):
+    with command(json=True, quiet=False, debug=False) as console:
+        print("a library says hello")
+        console.result({"value": 1}, lambda rich: None)
+    captured = capsys.readouterr()
+    document = json.loads(captured.out)
+    assert set(document) == {"schema_version", "value", "timings", "peak_memory_bytes"}
+    assert document["value"] == 1
+    assert "hello" in captured.err
+
+
+def test_an_error_after_the_document_adds_no_second_one(capsys):
+    def body():
+        with command(json=True, quiet=False, debug=False) as console:
+            console.result({"value": 1}, lambda rich: None)
+            raise InfeasibleError("late")
+
+    with pytest.raises(console_module.typer.Exit):
+        body()
+    assert json.loads(capsys.readouterr().out)["value"] == 1
+
+
+def test_numbers_that_json_lacks_become_null():
+    values = {
+        "a": float("nan"),
+        "b": [np.inf, np.float64(1.5)],
+        "c": np.arange(2),
+        "d": Path("x"),
+        "e": (None, True),
+    }
+    assert plain_json(values) == {"a": None, "b": [None, 1.5], "c": [0, 1], "d": "x", "e": [None, True]}
+
+
+def test_quiet_says_nothing_by_the_way(capsys):
+    Output(quiet=True).note("something")
+    Output().note("something else")
+    assert capsys.readouterr().err == "something else\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs the device /dev/full")
+def test_a_full_disk_behind_stdout_is_one_message(tmp_path):
+    with open("/dev/full", "w") as full:
+        code = "from lidardesign.cli.main import run; run(['tasks', 'list'])"
+        result = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, check=False)
+    assert result.returncode == 3
+    assert result.stderr.splitlines()[0] == b"system error: No space left on device"
+    assert len(result.stderr.splitlines()) == 2
+
+
+def test_a_design_fits_a_terminal_of_80_columns(lidardesign, flat, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    design = Path(__file__).parents[2] / "examples" / "hand_written_design.yaml"
+    lines = lidardesign("show", design).out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert any("nose" in line and "0.250 - 0.400" in line for line in lines)
+    assert "all at 0.400 0.000 0.000 m" in "".join(lines)
+
+
+def test_a_task_lists_the_keys_of_every_section_in_words(lidardesign):
+    document = lidardesign("tasks", "show", "meshes", "--json").json
+    takes = {entry["key"]: entry["type"] for entry in document["config"]}
+    assert takes["folder"] == "path or null"
+    assert takes["origin_m"] == "3 numbers or null"
+    assert takes["up"] == "x or y or z"
+    assert {"sigma_m"} <= {entry["key"] for entry in document["density"]}
+    assert {"steps"} <= {entry["key"] for entry in document["learning"]}
+    text = lidardesign("tasks", "show", "meshes").out
+    assert "folder" in text
+    assert "sigma_m" in text
+
+
+def test_every_pinned_place_gets_a_sensor(lidardesign, flat):
+    each = "each=[{}, {}, {}, {}, {gate: {width_m: {max: 0.3}}}]"
+    made = lidardesign("constrain", flat, "--set", each, "--json").json
+    assert len(made["sensors"]) == 5
+
+
+def test_a_scan_exported_at_another_count_has_its_own_sensors(lidardesign, flat, tmp_path):
+    assert lidardesign("fit", flat, "--layout", "scan", "--rays", 12, "--name", "beams").code == 0
+    design = flat / "designs" / "beams.yaml"
+    lidardesign("export", design, "--format", "sensors-csv", "--rays", 20, "--out", "sensors.csv")
+    assert len((tmp_path / "sensors.csv").read_text().splitlines()) == 21
+    lidardesign("export", design, "--format", "npz", "--rays", 20, "--out", "rays.npz")
+    with np.load(tmp_path / "rays.npz") as arrays:
+        assert len(arrays["sensor_names"]) == 20
+        assert arrays["sensor"].max() == 19
+
+
+def test_help_gives_an_example_of_every_command(lidardesign):
+    for name in ("learn", "fit", "constrain", "evaluate", "export", "show"):
+        assert f"lidardesign {name} " in lidardesign(name, "--help").out.split(" Examples\n")[1]
+
+
+def test_a_design_that_was_copied_away_from_its_run_says_what_it_lacks(lidardesign, flat, tmp_path):
+    lidardesign("fit", flat, "--layout", "density", "--rays", 12, "--name", "beams")
+    copied = tmp_path / "elsewhere" / "deep" / "beams.yaml"
+    copied.parent.mkdir(parents=True)
+    copied.write_bytes((flat / "designs" / "beams.yaml").read_bytes())
+    assert lidardesign("export", copied, "--format", "csv").code == 0
+    for arguments, words in (
+        (("export", copied, "--format", "csv", "--rays", 20), "need samples of the learned density"),
+        (("evaluate", copied), "give the run folder too"),
+        (("constrain", copied), "the run of this design is not there"),
+    ):
+        result = lidardesign(*arguments)
+        assert result.code in (2, 3)
+        assert words in result.err
+    assert lidardesign("evaluate", flat, copied, "--rays", 12).code == 0
+
+
+@pytest.mark.parametrize("decided", ["raycast", "off", None])
+def test_a_pinned_origin_is_weighted_with_the_visibility_that_the_run_decided_on(flat, monkeypatch, decided):
+    from lidardesign.run.manifest import note
+    from lidardesign.workflow.layouts import RunTarget
+    from lidardesign.workflow.runs import open_run
+
+    asked = []
+
+    class Flat:
+        def log_density(self, points):
+            return np.zeros(len(points))
+
+    def prepare(scenes, config, *, visibility=None, compiled=True):
+        assert not compiled
+        asked.append((len(scenes), visibility))
+        return Flat(), []
+
+    monkeypatch.setattr("lidardesign.density.target.prepare.prepare_target", prepare)
+    if decided is not None:
+        note(flat, visibility=decided)
+    target = RunTarget(open_run(flat))
+    assert [target(np.zeros((3, 6))).shape for _ in range(2)] == [(3,), (3,)]
+    assert asked == [(20, decided)]
+
+
+def test_a_density_that_was_learned_badly_comes_with_advice():
+    from types import SimpleNamespace
+
+    from lidardesign.cli.commands.learn import _advice
+
+    assert _advice(SimpleNamespace(ess=0.6, coverage=0.98)) == []
+    assert len(_advice(SimpleNamespace(ess=0.01, coverage=0.1))) == 2
+
+
+def test_compiled_code_has_a_folder_where_nothing_else_can_be_written(monkeypatch):
+    from lidardesign.cli import environment
+
+    removed = []
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setattr(environment.atexit, "register", lambda call, folder, **_: removed.append(folder))
+    environment.set_cache_default()
+    assert not removed
+    assert "NUMBA_CACHE_DIR" not in os.environ
+    monkeypatch.setattr(environment, "_can_be_written", lambda folder: False)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "chosen")
+    environment.set_cache_default()
+    assert os.environ["NUMBA_CACHE_DIR"] == "chosen"
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    environment.set_cache_default()
+    assert [os.environ["NUMBA_CACHE_DIR"]] == removed
+    assert os.listdir(removed[0]) == []
+    os.rmdir(removed[0])
+
+
+def test_a_folder_that_cannot_be_made_cannot_be_written(tmp_path):
+    from lidardesign.cli.environment import _can_be_written
+
+    (tmp_path / "file").write_text("")
+    assert _can_be_written(tmp_path / "new" / "deep")
+    assert not _can_be_written(tmp_path / "file" / "below")
+
+
+def test_a_density_that_is_too_rough_is_no_fault_of_constraints(lidardesign, flat):
+    samples = load_samples(flat)
+    log_target = np.where(np.arange(len(samples)) < 3, 0.0, -1e3)
+    save_samples(Samples(samples.points, samples.log_prob, log_target, samples.space), flat)
+    result = lidardesign("fit", flat)
+    assert result.code == 3
+    assert "samples are worth 3" in result.err
+    assert "learn longer" in result.err

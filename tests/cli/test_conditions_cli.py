@@ -1,0 +1,293 @@
+"""Conditions on the command line: --at, tracks, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from support.command_line import caller, files_under, make_run
+
+from lidardesign.config import resolve, save_run_config
+from lidardesign.design.files import load_design
+from lidardesign.design.layouts.rays import lay_out
+from lidardesign.registry import load_task
+from lidardesign.run.manifest import start_manifest
+from lidardesign.samples import Samples, save_samples
+
+
+def log_target(points):
+    """A spot of flatland's line of sensors that every position sees under another azimuth."""
+    azimuth = np.pi / 2 + 0.4 * (0.5 - points[:, 0])
+    return -0.5 * (np.square((points[:, 3] - azimuth) / 0.1) + np.square((points[:, 5] - 0.6) / 0.05))
+
+
+def make_conditioned_run(folder, count=6000, condition="[x_m]"):
+    """A run of flatland, conditioned on where the sensor is, as `learn` leaves it."""
+    task = load_task("flatland")
+    config = resolve(task, preset="draft", seed=3, overrides=[f"space.condition={condition}"])
+    generator = np.random.default_rng(0)
+    points = config.space.sample(count, generator)
+    start_manifest(folder, command=["lidardesign", "learn"], seed=3)
+    save_run_config(config, folder)
+    log_prob = np.full(count, -config.space.log_volume)
+    save_samples(Samples(points, log_prob, log_target(points), config.space), folder)
+    return folder
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    """Run the program in this process; the target density is the planted one."""
+    monkeypatch.setattr("lidardesign.workflow.layouts.RunTarget.__call__", lambda self, points: log_target(points))
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+@pytest.fixture
+def run(tmp_path):
+    return make_conditioned_run(tmp_path / "run")
+
+
+@pytest.mark.parametrize("layout", ["grid", "density", "scan", "distributed"])
+def test_every_layout_can_be_fitted_at_a_value(lidardesign, run, layout):
+    sensors = () if layout == "scan" else ("--sensors", 2)
+    result = lidardesign(
+        "fit", run, "--at", "x_m=0.37", "--layout", layout, "--rays", 6, *sensors, "--name", "here", "--json"
+    )
+    assert result.code == 0, result.err
+    design = load_design(run / "designs" / "here.yaml")
+    assert dict(design.at) == {"x_m": 0.37}
+    assert design.track is None
+    assert {sensor.origin_m[0] for sensor in design.sensors} == {0.37}
+    rays = lay_out(design)
+    np.testing.assert_array_equal(rays.origin_m[:, 0], 0.37)
+    # from x = 0.37 the spot lies at 90 + 0.052 rad
+    assert abs(np.average(rays.direction[:, 0]) + 0.052) < 0.06
+    assert "ESS" in result.err
+    assert 0.01 < result.json["ess"] <= 1
+
+
+def test_a_scan_without_a_value_is_a_track_and_shown_as_one(lidardesign, run):
+    result = lidardesign("fit", run, "--layout", "scan", "--rays", 4)
+    assert result.code == 0, result.err
+    assert "4 rays at every x_m from 0 to 1" in result.out
+    path = run / "designs" / "fit.yaml"
+    shown = lidardesign("show", path)
+    assert "travel 1 m" in shown.out
+    assert "--at x_m=VALUE" in shown.out
+    document = lidardesign("show", path, "--json").json
+    assert document["track"]["dimension"] == "x_m"
+    assert len(document["track"]["azimuth_rad"][0]) == 4
+    here = lidardesign("show", path, "--at", "x_m=0.25", "--json").json
+    assert here["track"] is None
+    assert here["at"] == {"x_m": 0.25}
+    rays = lay_out(load_design(path), at={"x_m": 0.25})
+    assert [s["gate_m"]["start"] for s in here["sensors"]] == pytest.approx(rays.gate_m[:, 0])
+    assert "at x_m=0.25" in lidardesign("show", path, "--at", "x_m=0.25").out
+
+
+def test_a_scan_is_the_layout_where_the_task_says_so(lidardesign, run, monkeypatch):
+    from dataclasses import replace
+
+    task = type(load_task("flatland"))
+    monkeypatch.setattr(task, "defaults", replace(task.defaults, layout="scan", rays=(3, 5)))
+    assert lidardesign("fit", run).code == 0
+    design = load_design(run / "designs" / "fit.yaml")
+    assert design.track is not None
+    assert design.rays == 5
+
+
+def test_a_layout_that_a_task_invented_is_refused(lidardesign, run, monkeypatch):
+    from dataclasses import replace
+
+    task = type(load_task("flatland"))
+    monkeypatch.setattr(task, "defaults", replace(task.defaults, layout="spiral"))
+    for command in ("fit", "constrain"):
+        result = lidardesign(command, run)
+        assert result.code == 2
+        assert "task flatland" in result.err
+
+
+def test_constraints_hold_along_a_track_and_at_a_value(lidardesign, run):
+    lidardesign("fit", run, "--layout", "scan", "--rays", 4)
+    path = run / "designs" / "fit.yaml"
+    rules = ("--set", "gate.width_m.max=0.08", "--set", "budget.bandwidth_mbps=0.008")
+    along = lidardesign("constrain", path, *rules, "--name", "along", "--json")
+    assert along.code == 0, along.err
+    assert along.json["satisfied"] is True
+    track = load_design(run / "designs" / "along.yaml").track
+    assert np.diff(track.gate_m, axis=2).max() <= 0.08
+    here = lidardesign("constrain", path, *rules, "--at", "x_m=1", "--name", "here", "--json")
+    assert here.code == 0, here.err
+    design = load_design(run / "designs" / "here.yaml")
+    assert dict(design.at) == {"x_m": 1.0}
+    # a design for one value stays for that value unless another one is given
+    assert lidardesign("constrain", run / "designs" / "here.yaml", "--name", "again").code == 0
+    assert dict(load_design(run / "designs" / "again.yaml").at) == {"x_m": 1.0}
+    assert lidardesign("constrain", run / "designs" / "here.yaml", "--at", "x_m=0.5", "--name", "moved").code == 0
+    assert dict(load_design(run / "designs" / "moved.yaml").at) == {"x_m": 0.5}
+
+
+def test_a_track_is_exported_at_a_position(lidardesign, run, tmp_path):
+    lidardesign("fit", run, "--layout", "scan", "--rays", 4)
+    path = run / "designs" / "fit.yaml"
+    for count in (4, 6):
+        result = lidardesign("export", path, "--format", "npz", "--at", "x_m=0.25", "--rays", count, "--out", "r.npz")
+        assert result.code == 0, result.err
+        with np.load(tmp_path / "r.npz") as arrays:
+            assert len(arrays["sensor"]) == count
+            np.testing.assert_array_equal(arrays["origin_x_m"], 0.25)
+    assert lidardesign("export", path, "--format", "sensors-csv", "--at", "x_m=0.25", "--out", "s.csv").code == 0
+    assert len((tmp_path / "s.csv").read_text().splitlines()) == 5
+    refused = lidardesign("export", path, "--format", "csv")
+    assert refused.code == 2
+    assert "x_m from 0 to 1" in refused.err
+
+
+def test_a_design_for_one_value_is_exported_anew_from_samples_of_that_value(lidardesign, run, tmp_path):
+    lidardesign("fit", run, "--at", "x_m=0.37", "--layout", "scan", "--rays", 4, "--name", "here")
+    path = run / "designs" / "here.yaml"
+    for at, expected in ((("--at", "x_m=0.9"), 0.9), ((), 0.37)):
+        result = lidardesign("export", path, "--format", "npz", "--rays", 7, *at, "--out", "r.npz")
+        assert result.code == 0, result.err
+        with np.load(tmp_path / "r.npz") as arrays:
+            assert len(arrays["sensor"]) == 7
+            np.testing.assert_array_equal(arrays["origin_x_m"], expected)
+
+
+MISTAKES = [
+    ("fit run --at x_m", 2, "NAME=VALUE"),
+    ("fit run --at x_m=", 2, "NAME=VALUE"),
+    ("fit run --at =3", 2, "NAME=VALUE"),
+    ("fit run --at x_m=here", 2, "NAME=VALUE"),
+    ("fit run --at x_m=nan", 2, "finite"),
+    ("fit run --at x_m=inf", 2, "finite"),
+    ("fit run --at x_m=1_0", 2, "0 to 1"),
+    ("fit run --at x_m=0.1 --at x_m=0.2", 2, "twice"),
+    ("fit run --at x_m=1.01", 2, "0 to 1"),
+    ("fit run --at y_m=0", 2, "x_m"),
+    ("fit run --at speed=0", 2, "x_m"),
+    ("fit run", 2, "--layout scan, or --at x_m=VALUE"),
+    ("fit run --layout density --rays 4", 2, "--at x_m=VALUE"),
+    ("fit run --layout distributed --rays 4", 2, "--at x_m=VALUE"),
+    ("fit run --layout scan --rays 4 --sensors 2", 2, "--sensors"),
+    ("constrain run --layout scan --rays 4 --sensors auto", 2, "--sensors"),
+    ("constrain run", 2, "--at x_m=VALUE"),
+    ("constrain run --at x_m=-0.1", 2, "0 to 1"),
+    ("constrain run --layout scan --set origin.fixed_m=[0.5,0,0]", 4, "--at x_m=0.5"),
+    ("fit plain --at x_m=0.5", 2, "no conditions"),
+    ("constrain plain --at x_m=0.5", 2, "no conditions"),
+    ("fit two --layout scan --rays 4", 2, "--at x_m=VALUE --at azimuth_rad=VALUE"),
+    ("fit turning --layout scan --rays 4", 2, "coordinate of the origin"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "code", "words"), MISTAKES, ids=[entry[0] for entry in MISTAKES])
+def test_a_mistake_gets_one_message_its_exit_code_and_writes_nothing(lidardesign, tmp_path, arguments, code, words):
+    kinds = {"run": "[x_m]", "two": "[x_m,azimuth_rad]", "turning": "[azimuth_rad]"}
+    name = arguments.split()[1]
+    if name == "plain":
+        make_run(tmp_path / name, count=1000)
+    else:
+        make_conditioned_run(tmp_path / name, 4000, kinds[name])
+    before = files_under(tmp_path)
+    result = lidardesign(*arguments.split())
+    assert result.code == code, result.err
+    assert words in result.err
+    assert result.out == ""
+    assert result.err.count("error") == 1
+    assert files_under(tmp_path) == before
+
+
+def test_several_conditions_are_given_at_once(lidardesign, tmp_path):
+    run = make_conditioned_run(tmp_path / "two", 20_000, "[x_m,azimuth_rad]")
+    result = lidardesign("fit", run, "--at", "x_m=0.5", "--at", "azimuth_rad=1.6", "--sensors", 1, "--json")
+    assert result.code == 0, result.err
+    (sensor,) = json.loads(result.out)["sensors"]
+    assert sensor["boresight"]["azimuth_rad"] == pytest.approx(1.6)
+    assert sensor["field_of_view_rad"]["horizontal"] == 0
+    assert np.mean(list(sensor["gate_m"].values())) == pytest.approx(0.6, abs=0.02)
+
+
+OPEN = """
+schema_version: 1
+layout: {layout}
+sensors:
+- name: a
+  origin_m: {{mean: [0.5, 0, 0], covariance: [[0.04, 0, 0], [0, 0, 0], [0, 0, 0]]}}
+  boresight: {{azimuth_rad: 1.6, elevation_rad: 0.0}}
+  field_of_view_rad: {{horizontal: 0.3, vertical: 0.0}}
+  gate_m: {{start: 0.4, end: 1.0}}
+"""
+
+
+def test_a_design_by_hand_without_a_number_of_rays_is_exported_at_the_one_that_is_asked_for(lidardesign, tmp_path):
+    (tmp_path / "hand.yaml").write_text(OPEN.format(layout="distributed"))
+    result = lidardesign("export", "hand.yaml", "--format", "npz", "--rays", 20, "--out", "r.npz")
+    assert result.code == 0, result.err
+    with np.load(tmp_path / "r.npz") as arrays:
+        assert len(np.unique(arrays["origin_x_m"])) == 20
+    (tmp_path / "hand.yaml").write_text(OPEN.format(layout="density"))
+    refused = lidardesign("export", "hand.yaml", "--format", "npz", "--rays", 20, "--out", "r.npz")
+    assert refused.code == 2
+    assert "need samples of the learned density" in refused.err
+
+
+def test_a_design_is_exported_with_the_rays_that_it_is_evaluated_with(lidardesign, run, tmp_path):
+    from lidardesign.samples import load_samples
+    from lidardesign.workflow.layouts import Layouts
+
+    for layout, gates in (("grid", "ray"), ("density", "ray"), ("distributed", "sensor"), ("distributed", "ray")):
+        name = f"{layout}-{gates}"
+        made = ("--at", "x_m=0.37", "--layout", layout, "--rays", 8, "--sensors", 2, "--gates", gates)
+        assert lidardesign("fit", run, *made, "--name", name).code == 0
+        path = run / "designs" / f"{name}.yaml"
+        assert lidardesign("export", path, "--format", "npz", "--rays", 12, "--out", "r.npz").code == 0
+        evaluated = Layouts({name: log_target})(load_design(path), 12, load_samples(run))
+        with np.load(tmp_path / "r.npz") as arrays:
+            np.testing.assert_array_equal(arrays["gate_start_m"], evaluated.gate_m[:, 0])
+            np.testing.assert_array_equal(arrays["gate_end_m"], evaluated.gate_m[:, 1])
+            np.testing.assert_array_equal(arrays["azimuth_rad"], np.arctan2(*evaluated.direction[:, 1::-1].T))
+        own = [np.ptp(evaluated.gate_m[evaluated.sensor == index, 1]) > 0 for index in (0, 1)]
+        assert any(own) == (gates == "ray")
+
+
+def test_a_scan_for_one_value_is_fitted_anew_once_for_all_places(lidardesign, run, monkeypatch):
+    from lidardesign.design.layouts import rays as rays_module
+    from lidardesign.samples import load_samples
+
+    assert lidardesign("fit", run, "--at", "x_m=0.37", "--layout", "scan", "--rays", 4, "--name", "here").code == 0
+    design, samples, fits = load_design(run / "designs" / "here.yaml"), load_samples(run), []
+    refit = rays_module._refit
+    monkeypatch.setattr(rays_module, "_refit", lambda *arguments: fits.append(1) or refit(*arguments))
+    first, *others = (lay_out(design, 7, samples, at={"x_m": x}, retarget=log_target) for x in (0.0, 0.37, 1.0))
+    assert len(fits) == 1
+    for other, x in zip(others, (0.37, 1.0), strict=True):
+        np.testing.assert_array_equal(other.direction, first.direction)
+        np.testing.assert_array_equal(other.origin_m[:, 0], x)
+
+
+def test_a_distributed_design_by_hand_is_evaluated_with_the_gates_of_its_layout(tmp_path):
+    from lidardesign.workflow.layouts import Layouts
+
+    (tmp_path / "hand.yaml").write_text(OPEN.format(layout="distributed"))
+    design = load_design(tmp_path / "hand.yaml")
+    expected = lay_out(design, 20)
+    found = Layouts({})(design, 20, None)
+    np.testing.assert_array_equal(found.gate_m, expected.gate_m)
+    np.testing.assert_array_equal(found.origin_m, expected.origin_m)
+
+
+def test_the_seed_of_an_export_draws_its_layout(lidardesign, run, tmp_path):
+    from lidardesign.samples import load_samples
+
+    made = ("--at", "x_m=0.37", "--layout", "density", "--rays", 8, "--sensors", 1)
+    assert lidardesign("fit", run, *made).code == 0
+    path, found = run / "designs" / "fit.yaml", []
+    for seed in (0, 5):
+        result = lidardesign("export", path, "--format", "npz", "--rays", 30, "--seed", seed, "--out", "r.npz")
+        assert result.code == 0, result.err
+        with np.load(tmp_path / "r.npz") as arrays:
+            found.append(arrays["azimuth_rad"].copy())
+        expected = lay_out(load_design(path), 30, load_samples(run), seed=seed, retarget=log_target)
+        np.testing.assert_allclose(np.cos(found[-1]), expected.direction[:, 0], atol=1e-12)
+    assert not np.array_equal(*found)

@@ -1,0 +1,293 @@
+"""`config init` writes what changes nothing until it is edited; `config schema` agrees with what the program reads."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import jsonschema
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.command_line import caller, make_run
+
+from lidardesign.cli.commands.config import Chosen, config_text, default_document, schema_of, uncommented
+from lidardesign.config import PRESETS, DensitySettings, LearningSettings, resolve
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.errors import ConfigError
+from lidardesign.registry import list_tasks, load_task
+from lidardesign.run.yaml import dump_yaml, parse_yaml
+from lidardesign.task import Metric, TaskConfig
+
+TASKS = [item.name for item in list_tasks() if item.error is None and item.distribution.startswith("lidardesign ")]
+# They need a folder, so that no configuration follows from the defaults alone.
+WITHOUT_DEFAULTS = ("meshes",)
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+def written(task, tmp_path, preset="standard", **chosen):
+    document = default_document(task, preset) if task.name in WITHOUT_DEFAULTS else resolve(task, preset=preset)
+    document = document if isinstance(document, dict) else document.as_document()
+    path = tmp_path / "config.yaml"
+    path.write_text(config_text(task, document, Chosen(preset, **chosen)))
+    return path
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_file_to_begin_with_changes_nothing(name, tmp_path):
+    task = load_task(name)
+    needed = ("folder=.",) if name in WITHOUT_DEFAULTS else ()
+    path = written(task, tmp_path)
+    if needed:
+        with pytest.raises(ConfigError, match="folder"):
+            resolve(task, config_file=path)
+        return
+    for preset in PRESETS:
+        assert resolve(task, preset=preset, config_file=path) == resolve(task, preset=preset)
+
+
+@pytest.mark.parametrize("name", [name for name in TASKS if name not in WITHOUT_DEFAULTS])
+@pytest.mark.parametrize("preset", PRESETS)
+def test_all_of_its_defaults_are_the_ones_that_hold(name, preset, tmp_path):
+    task = load_task(name)
+    path = written(task, tmp_path, preset)
+    path.write_text(uncommented(path.read_text()))
+    assert resolve(task, config_file=path).as_document() == resolve(task, preset=preset).as_document()
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_every_key_is_there_with_what_it_is(name, tmp_path):
+    task = load_task(name)
+    text = written(task, tmp_path).read_text()
+    for model in (task.Config, DensitySettings, LearningSettings):
+        for key, info in model.model_fields.items():
+            assert f"\n  #{key}: " in text
+            assert " ".join((info.description or "").split())[:40] in text
+    assert max(map(len, text.splitlines())) <= 120
+
+
+def test_what_is_chosen_is_set_and_all_else_is_not(lidardesign, tmp_path):
+    chosen = ("--preset", "draft", "--set", "density.sigma_m=0.01", "--set", "variation=2", "--seed", 7)
+    result = lidardesign("config", "init", "flatland", *chosen)
+    path = tmp_path / "flat.yaml"
+    path.write_text(result.out)
+    assert parse_yaml(result.out, where="text").value == {
+        "schema_version": 1,
+        "task_name": "flatland",
+        "seed": 7,
+        "preset": "draft",
+        "task": {"variation": 2.0},
+        "space": None,
+        "density": {"sigma_m": 0.01},
+        "learning": None,
+    }
+    assert resolve(load_task("flatland"), config_file=path).density.sigma_m == 0.01
+
+
+def test_a_file_is_written_once_and_kept(lidardesign, tmp_path):
+    assert lidardesign("config", "init", "face", "--out", "face.yaml").code == 0
+    before = (tmp_path / "face.yaml").read_text()
+    result = lidardesign("config", "init", "flatland", "--out", "face.yaml")
+    assert result.code == 2
+    assert "is there already" in result.err
+    assert (tmp_path / "face.yaml").read_text() == before == lidardesign("config", "init", "face").out
+    assert lidardesign("config", "init", "face", "--json").json["text"] == before
+
+
+@given(st.text(), st.text(), st.text())
+def test_no_word_of_a_task_leaves_its_comment(summary, description, unit):
+    config = type(
+        "Config",
+        (TaskConfig,),
+        {"__annotations__": {"width": str}, "width": description},
+    )
+    config.model_fields["width"].description = description
+    task = SimpleNamespace(
+        name="odd",
+        summary=summary,
+        Config=config,
+        metric=Metric("name", unit, "lower", 1.0, 0.1),
+        defaults=SimpleNamespace(density={}, learning={}),
+    )
+    text = config_text(task, default_document(task, "draft"), Chosen("draft"))
+    assert parse_yaml(text, where="text").value == {
+        "schema_version": 1, "task_name": "odd", "task": None, "space": None, "density": None, "learning": None
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("config init nothing", "unknown task"),
+        ("config init flatland --preset quick", "draft, standard, fine"),
+        ("config init flatland --set colour=red", "colour"),
+        ("config schema recipe", "config, constraints, design, evaluate"),
+        ("config schema design --task face", "--task"),
+        ("config schema config --task nothing", "unknown task"),
+        ("config", "no command"),
+    ],
+)
+def test_mistakes_are_told(lidardesign, arguments, words):
+    result = lidardesign(*arguments.split())
+    assert result.code == 2
+    assert words in result.err
+    assert "Traceback" not in result.err
+
+
+def accepts(schema, value):
+    return jsonschema.Draft202012Validator(schema).is_valid(value)
+
+
+@pytest.mark.parametrize("kind", ["config", "constraints", "design", "evaluate"])
+def test_schemas_are_schemas_and_are_printed_as_such(lidardesign, kind):
+    printed = json.loads(lidardesign("config", "schema", kind).out)
+    jsonschema.Draft202012Validator.check_schema(printed)
+    assert printed["$id"].startswith(f"urn:lidardesign:{kind}:")
+    assert lidardesign("config", "schema", kind, "--json").json["schema"] == printed
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_configuration_that_is_resolved_is_valid(name, tmp_path):
+    task = load_task(name)
+    document = parse_yaml(uncommented(written(task, tmp_path).read_text()), where="text").value
+    document["space"] = None if name in WITHOUT_DEFAULTS else document["space"]
+    assert accepts(schema_of("config", task), document)
+    assert accepts(schema_of("config"), document)
+
+
+CONFIGURATIONS = [
+    {},
+    {"density": None},
+    {"density": {"sigma_m": 0.01}},
+    {"density": {"sigma_m": -1}},
+    {"density": {"sigma": 0.01}},
+    {"density": {"visibility": "maybe"}},
+    {"density": {"margin_m": None}},
+    {"learning": {"steps": 0}},
+    {"learning": {"steps": 1.5}},
+    {"learning": {"dtype": "float16"}},
+    {"space": {"x_m": [0, 1]}},
+    {"space": {"x_m": 0.5}},
+    {"space": {"x_m": [0, 1, 2]}},
+    {"space": {"w_m": 0.5}},
+    {"task": {"variation": 1}},
+    {"task": {"variation": 3}},
+    {"task": {"scene": "moon"}},
+    {"task": {"scene": "discs"}},
+    {"task_name": "face"},
+    {"preset": "draft"},
+    {"preset": "quick"},
+    {"preset": None},
+    {"seed": -1},
+    {"seed": 1},
+    {"more": 1},
+    {"schema_version": 2},
+]
+
+
+@pytest.mark.parametrize("values", CONFIGURATIONS, ids=str)
+def test_the_schema_of_a_configuration_takes_what_the_program_takes(values, tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text(dump_yaml(values))
+    task = load_task("flatland")
+    try:
+        resolve(task, config_file=path)
+        taken = True
+    except ConfigError:
+        taken = False
+    assert accepts(schema_of("config", task), values) == taken
+
+
+CONSTRAINTS = [
+    {},
+    {"gate": {"width_m": {"max": 0.1}}},
+    {"gate": {"width_m": {"max": 0}}},
+    {"gate": {"width_m": {"most": 1}}},
+    {"gate": None},
+    {"gate": {"width_m": None}},
+    {"gate": 3},
+    {"sensors": {"count": 4}},
+    {"sensors": {"count": 0}},
+    {"sensors": {"count": "4"}},
+    {"snap": "catalog"},
+    {"snap": "shop"},
+    {"snap": {"parts": ["vl53l5cx"]}},
+    {"snap": {"parts": []}},
+    {"each": [{"gate": {"width_m": {"max": 0.05}}}]},
+    {"each": [{"sensors": {"count": 1}}]},
+    {"origin": {"fixed_m": [0, 0, 1]}},
+    {"origin": {"fixed_m": [0, 0]}},
+    {"origin": {"exclude": [{"low_m": [0, 0, 0], "high_m": [1, 1, 1]}]}},
+    {"origin": {"exclude": [{"low_m": [0, 0, 0]}]}},
+    {"budget": {"rays": 576, "bandwidth_mbps": 2.0}},
+    {"budget": {"rays": 0}},
+    {"boresight": {"elevation_deg": {"max": 91}}},
+    {"field_of_view": {"horizontal_deg": {"max": 20}}},
+]
+
+
+@pytest.mark.parametrize("values", CONSTRAINTS, ids=str)
+def test_the_schema_of_constraints_takes_what_the_program_takes(values):
+    try:
+        Constraints.from_mapping(values)
+        taken = True
+    except ConfigError:
+        taken = False
+    assert accepts(schema_of("constraints"), values) == taken
+
+
+@pytest.fixture(scope="module")
+def evaluation(tmp_path_factory):
+    """What `evaluate --json` prints, with nearly all that adds to it."""
+    import contextlib
+
+    from lidardesign.cli.main import run
+
+    flat = make_run(tmp_path_factory.mktemp("runs") / "flat", count=1000)
+
+    def printed(*arguments):
+        out = io.StringIO()
+        with contextlib.redirect_stdout(out), pytest.raises(SystemExit) as ended:
+            run([str(argument) for argument in arguments])
+        assert not ended.value.code
+        return json.loads(out.getvalue())
+
+    printed("fit", flat, "--sensors", 1, "--json")
+    search = ("--baseline", "cma", "--cma-seconds", 0.1, "--set", "test=2")
+    audited = ("--effects", "audit")
+    return printed("evaluate", flat, "--rays", 9, *search, *audited, "--json", "--quiet")
+
+
+def test_what_evaluate_prints_is_valid_and_complete(evaluation):
+    schema = schema_of("evaluate")
+    jsonschema.Draft202012Validator(schema).validate(evaluation)
+    for name in ("rows", "paired", "equal_bandwidth", "effects", "cma", "error_estimates", "audit"):
+        assert evaluation[name]
+    assert set(evaluation) == set(schema["properties"])
+    for name in evaluation:
+        rest = {key: value for key, value in evaluation.items() if key != name}
+        assert accepts(schema, rest) == (name not in schema["required"])
+    assert not accepts(schema, {**evaluation, "more": 1})
+    assert not accepts(schema, {**evaluation, "rows": [{**evaluation["rows"][0], "value": "good"}]})
+
+
+def test_the_rungs_of_accuracy_are_those_of_the_schema():
+    from lidardesign.evaluate.accuracy.settings import Ladder, Rung
+
+    rungs = [Rung("4", 0.1, 0.01, 2.0, values={"gap_mm": 1.0}), Rung("8", 0.0, 0.0, 4.0, 5, True, True)]
+    ladder = Ladder("knob", "gap", "mm", "the finest", 0.5, "it is small", "work", rungs)
+    schema = schema_of("evaluate")
+    one = {"$ref": "#/$defs/rung", "$defs": schema["$defs"]}
+    for row in ladder.as_rows():
+        jsonschema.Draft202012Validator(one).validate(row)
+
+
+def test_the_files_of_the_schemas_are_packaged():
+    root = Path(__file__).parents[2] / "lidardesign"
+    assert {path.name for path in root.rglob("*.schema.json")} >= {"design.schema.json", "evaluate.schema.json"}

@@ -1,0 +1,196 @@
+"""Every command says where its time went and how far its figures may be off: in tables, in JSON, in the manifest."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from support.command_line import caller, files_under, make_run
+
+from lidardesign.cli.tables.times import show_times
+from lidardesign.run.lock import run_lock
+from lidardesign.run.manifest import read_manifest
+
+TITLE = "where the time went"
+LEARN = (
+    "learn flatland --preset draft --set learning.steps=20 --set learning.samples=1000 --set learning.batch=64 "
+    "--set learning.layers=1 --set learning.hidden=12 --set train=2 --set learning.coverage_proposals=256"
+)
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    """Run the program in this process, in an empty folder."""
+    program = caller(capsys, tmp_path, monkeypatch)
+    return lambda line, *more: program(*line.split(), *more)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("made") / "run")
+
+
+@pytest.fixture
+def flat(made, tmp_path):
+    return shutil.copytree(made, tmp_path / "run")
+
+
+def adds_up(document):
+    """Whether the outer phases of a document make a plausible whole."""
+    timings = document["timings"]
+    assert list(timings)[-1] == "other"
+    assert all(seconds >= 0 for seconds in timings.values())
+    for name in timings:
+        inside = sum(seconds for key, seconds in timings.items() if key.rpartition("/")[0] == name)
+        # each is rounded to a millisecond
+        assert inside <= timings[name] + 0.0005 * (1 + len(timings))
+    return sum(seconds for name, seconds in timings.items() if "/" not in name)
+
+
+def test_learning_says_what_it_cost_and_how_far_its_figures_may_be_off(lidardesign, tmp_path):
+    done = lidardesign(LEARN, "--out", tmp_path / "run", "--json", "--quiet")
+    assert done.code == 0, done.err
+    document = done.json
+    assert adds_up(document) >= document["seconds"] - 0.01
+    assert {"libraries", "scenes", "fields", "proposals", "learning", "learning/target", "measuring", "writing"} <= set(
+        document["timings"]
+    )
+    for name in ("ess", "kl_nats", "log_z", "coverage"):
+        estimate = document["error_estimates"][name]
+        assert estimate["value"] == document[name]
+        assert estimate["error"] >= 0
+        assert estimate["kind"] == "standard error"
+    kept = read_manifest(tmp_path / "run")["timings"]["learn"]
+    assert set(kept) == {"when", "seconds", "phases", "peak_memory_bytes"}
+    # numpy and torch alone take some 100 MB
+    assert 5e7 < kept["peak_memory_bytes"] <= document["peak_memory_bytes"] < 1e11
+    assert kept["phases"]["learning"] == document["timings"]["learning"]
+
+
+def test_fits_say_what_they_cost_and_write_the_same_bytes_whatever_the_time(lidardesign, flat):
+    designs = []
+    for name in ("one", "one"):
+        done = lidardesign(f"fit {flat} --rays 30 --name {name} --json")
+        designs.append((flat / "designs" / "one.yaml").read_bytes())
+        document = done.json
+        assert adds_up(document) >= document["seconds"] - 0.01
+        assert {"samples", "fitting", "fitting/mixture", "writing"} <= set(document["timings"])
+    assert designs[0] == designs[1]
+    assert b"seconds" not in designs[0]
+    estimates = document["error_estimates"]
+    for name in ("log_likelihood", "ess", "admissible_mass"):
+        assert estimates[name]["value"] == pytest.approx(document[name])
+    assert estimates["rays"]["kind"] == "rounding"
+    lidardesign(f"constrain {flat} --set gate.width_m.max=0.4 --name two")
+    assert set(read_manifest(flat)["timings"]) == {"fit", "constrain"}
+
+
+def test_reading_commands_keep_their_times_in_the_run_and_change_nothing_else_there(lidardesign, flat, tmp_path):
+    lidardesign(f"fit {flat} --sensors 2 --rays 20 --name one")
+    before = files_under(flat)
+    evaluated = lidardesign(f"evaluate {flat} --rays 20 --set test=3 --json").json
+    adds_up(evaluated)
+    assert {"designs", "scenes", "rays", "held-out scenes", "held-out scenes/metric"} <= set(evaluated["timings"])
+    exported = lidardesign(f"export {flat}/designs/one.yaml --format npz --out {tmp_path}/rays.npz --json").json
+    adds_up(exported)
+    shown = lidardesign(f"show {flat}/designs/one.yaml --json").json
+    adds_up(shown)
+    after = files_under(flat)
+    assert {name for name in after if after[name] != before.get(name)} == {"manifest.json"}
+    assert set(read_manifest(flat)["timings"]) == {"fit", "evaluate", "export"}
+    old, new = (json.loads(files["manifest.json"]) for files in (before, after))
+    assert {**new, "timings": None} == {**old, "timings": None}
+
+
+def test_a_run_that_cannot_be_written_is_still_read(lidardesign, flat, tmp_path):
+    lidardesign(f"fit {flat} --sensors 2 --rays 20 --name one")
+    with run_lock(flat):
+        done = lidardesign(f"export {flat}/designs/one.yaml --format csv --out {tmp_path}/rays.csv")
+    assert done.code == 0
+    assert "the times of export are not kept" in done.err
+    assert "writing this run" in done.err
+    assert (tmp_path / "rays.csv").is_file()
+
+
+def test_evaluations_give_half_of_every_interval(lidardesign, flat):
+    lidardesign(f"fit {flat} --sensors 2 --rays 20 --name one")
+    document = lidardesign(f"evaluate {flat} --rays 20 --set test=4 --json").json
+    for entry in document["rows"] + document["paired"]:
+        assert entry["half_width"] == pytest.approx((entry["ci_high"] - entry["ci_low"]) / 2)
+    estimates = document["error_estimates"]
+    assert estimates["one at 20 rays"]["error"] == document["rows"][0]["half_width"]
+    assert estimates["one at 20 rays"]["unit"] == document["metric"]["unit"]
+    assert "one - bounding at 20 rays" in estimates
+
+
+def test_exports_say_what_their_numbers_lose(lidardesign, flat, tmp_path):
+    lidardesign(f"fit {flat} --sensors 2 --rays 20 --name one")
+    design = flat / "designs" / "one.yaml"
+    exact = lidardesign(f"export {design} --format csv --out {tmp_path}/rays.csv")
+    assert "read back: exact" in exact.out
+    found = lidardesign(f"export {design} --format csv --out {tmp_path}/rays.csv --json").json["error_estimates"]
+    assert {name: one["error"] for name, one in found.items()} == dict.fromkeys(
+        ("origin_m", "direction_rad", "gate_m", "time_s"), 0.0
+    )
+
+
+def test_tables_are_for_people_who_did_not_ask_for_quiet(lidardesign, flat):
+    loud = lidardesign(f"fit {flat} --sensors 2 --name one")
+    assert TITLE in loud.out
+    assert "fitting" in loud.out
+    assert "log-likelihood" in loud.out
+    assert "+-" in loud.out
+    assert TITLE not in lidardesign(f"fit {flat} --sensors 2 --name one --quiet").out
+    # what only looks something up does not tell people how long that took
+    assert TITLE not in lidardesign(f"show {flat}/designs/one.yaml").out
+    assert TITLE not in lidardesign("tasks list").out
+    assert TITLE not in lidardesign("export --list").out
+
+
+class Page:
+    """What was printed."""
+
+    width = 80
+
+    def __init__(self):
+        self.printed = []
+
+    def __getattr__(self, name):
+        from rich.console import Console
+
+        return getattr(Console(width=self.width), name)
+
+    def print(self, what, **options):
+        self.printed.append(what)
+
+
+def rows_of(timings):
+    page = Page()
+    show_times(timings, None, page)
+    if not page.printed:
+        return []
+    table = page.printed[-1]
+    return list(zip(*(column._cells for column in table.columns), strict=True))
+
+
+def test_the_table_of_times_indents_what_is_inside_and_leaves_out_what_is_next_to_nothing():
+    timings = {"learning": 8.0, "learning/target": 6.0, "writing": 0.01, "other": 1.99}
+    assert rows_of(timings) == [
+        ("learning", "8.00", "80 %"),
+        ("  target", "6.00", "60 %"),
+        ("other", "2.00", "20 %"),
+    ]
+    assert rows_of({"other": 0.0}) == []
+
+
+def test_every_phase_is_explained():
+    root = Path(__file__).parents[2]
+    page = (root / "docs" / "costs.md").read_text(encoding="utf-8")
+    explained = set(re.findall(r"`([a-z -]+)`", "".join(re.findall(r"^\| (.*?) \|", page, re.MULTILINE))))
+    sources = [path.read_text(encoding="utf-8") for path in (root / "lidardesign").rglob("*.py")]
+    used = {name for text in sources for name in re.findall(r'phase\("([^"]+)"\)', text)}
+    assert used <= explained, f"docs/costs.md does not explain {used - explained}"
+    assert explained - used <= {"learn", "fit", "constrain", "evaluate", "export"}, explained - used

@@ -1,0 +1,201 @@
+"""`--dry-run` writes nothing, refuses what the command would refuse, and says what the command then does."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from support.command_line import caller, files_under, make_run
+
+from lidardesign.run.manifest import read_manifest, write_manifest
+
+TINY = ("steps=2", "batch=64", "samples=1000", "balance_proposals=256", "coverage_proposals=256", "hidden=4")
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+@pytest.fixture
+def flat(tmp_path):
+    return make_run(tmp_path / "run")
+
+
+@pytest.fixture
+def given_files(lidardesign, flat, tmp_path):
+    """A design of two sensors, constraints and a configuration."""
+    lidardesign("fit", flat, "--sensors", 2)
+    (tmp_path / "few.yaml").write_text("budget: {rays: 40}\n")
+    (tmp_path / "flat.yaml").write_text("task: {variation: 0.5}\n")
+
+
+def dry(lidardesign, tmp_path, *arguments):
+    """The plan of a command, which must leave everything as it is."""
+    before = files_under(tmp_path)
+    plan = lidardesign(*arguments, "--dry-run", "--json")
+    assert plan.code == 0, plan.err
+    assert files_under(tmp_path) == before
+    return plan.json
+
+
+def changed(before, tmp_path):
+    """The files that are new or have another content."""
+    return {name for name, content in files_under(tmp_path).items() if before.get(name) != content}
+
+
+def announced(plan, tmp_path):
+    return {str(Path(entry["path"]).absolute().relative_to(tmp_path)) for entry in plan["writes"]}
+
+
+COMMANDS = [
+    ("fit run --sensors 2 --name two", None),
+    ("constrain run --set gate.width_m.max=0.3 --name tight", None),
+    ("evaluate run --rays 9 --csv rows.csv", "fit run --sensors 1"),
+    ("export run/designs/fit.yaml --format csv --rays 9", "fit run --sensors 1"),
+    ("export run/designs/fit.yaml --format sensors-csv --out out/table.csv", "fit run --sensors 1"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "first"), COMMANDS, ids=[one[0] for one in COMMANDS])
+def test_what_would_be_written_is_what_is_written_then(lidardesign, flat, tmp_path, arguments, first):
+    if first:
+        lidardesign(*first.split())
+    before = files_under(tmp_path)
+    plan = dry(lidardesign, tmp_path, *arguments.split())
+    assert lidardesign(*arguments.split()).code == 0
+    written = changed(before, tmp_path)
+    # an export keeps its times in the run too
+    kept = {"run/manifest.json"} if arguments.startswith("export") else set()
+    assert written - kept == announced(plan, tmp_path) - kept
+    for entry in plan["reads"]:
+        assert entry["bytes"] == len(before[str(Path(entry["path"]).absolute().relative_to(tmp_path))])
+
+
+def test_learning_writes_what_was_said(lidardesign, tmp_path):
+    settings = [word for value in TINY for word in ("--set", f"learning.{value}")]
+    arguments = ("learn", "flatland", "--set", "train=1", *settings, "--out", "new/run")
+    plan = dry(lidardesign, tmp_path, *arguments)
+    assert plan["settings"]["learning"]["steps"] == 2
+    assert "2 steps of 64 points" in plan["steps"]
+    assert lidardesign(*arguments).code == 0
+    folders = [name for name in announced(plan, tmp_path) if (tmp_path / name).is_dir()]
+    for name in files_under(tmp_path):
+        held = name in announced(plan, tmp_path) or any(name.startswith(f"{folder}/") for folder in folders)
+        assert held or name.endswith(".lock"), name
+    for name in announced(plan, tmp_path):
+        assert (tmp_path / name).exists(), name
+    # the same once more knows how long it takes
+    again = dry(lidardesign, tmp_path, *arguments[:-1], "new/other")
+    assert again["before"]["seconds"] == read_manifest(tmp_path / "new/run")["timings"]["learn"]["seconds"]
+    assert "run" in again["before"]["of"]
+    longer = dry(lidardesign, tmp_path, *arguments[:-1], "new/longer", "--set", "learning.steps=3")
+    assert longer["before"] is None
+
+
+REFUSED = [
+    ("learn nothing", 2),
+    ("learn flatland --out run", 2),
+    ("learn flatland --out notes.txt/run", 3),
+    ("learn flatland --set density.sigma_m=-1", 2),
+    ("learn flatland --tolerance 2", 2),
+    ("learn flatland --resume --out absent", 3),
+    ("fit absent", 3),
+    ("fit run --layout spiral", 2),
+    ("fit run --name ../elsewhere", 2),
+    ("constrain run --set gate.width_m.most=1", 2),
+    ("constrain run --set gate.start_m.min=0.8 --set gate.end_m.max=0.5", 4),
+    ("evaluate run", 3),
+    ("evaluate run --baseline best", 2),
+    ("evaluate fitted --set range=1", 2),
+    ("evaluate fitted --csv notes.txt/rows.csv", 3),
+    ("evaluate fitted --report fitted", 3),
+    ("export absent.yaml --format csv", 3),
+    ("export fitted/designs/fit.yaml --format jpeg", 2),
+    ("export fitted/designs/fit.yaml --format csv --at hue=1", 2),
+    ("export fitted/designs/fit.yaml --format csv --out fitted/designs/fit.yaml", 2),
+]
+
+
+@pytest.fixture(scope="module")
+def refusing(tmp_path_factory):
+    """A folder with a run without designs, one with a design, and a file."""
+    folder = tmp_path_factory.mktemp("refusing")
+    make_run(folder / "run", count=1000)
+    make_run(folder / "fitted", count=1000)
+    (folder / "notes.txt").write_text("keep me")
+    return folder
+
+
+@pytest.mark.parametrize(("arguments", "code"), REFUSED, ids=[one[0] for one in REFUSED])
+def test_what_the_command_would_refuse_is_refused(capsys, monkeypatch, refusing, arguments, code):
+    call = caller(capsys, refusing, monkeypatch)
+    if not (refusing / "fitted" / "designs").exists():
+        call("fit", "fitted", "--sensors", 1)
+    before = files_under(refusing)
+    result = call(*arguments.split(), "--dry-run", "--json")
+    assert result.code == code, result.out + result.err
+    assert result.json["exit_code"] == code
+    assert files_under(refusing) == before
+
+
+def test_samples_that_were_changed_are_refused_before_anything_is_fitted(lidardesign, flat, tmp_path):
+    samples = flat / "samples.npz"
+    samples.write_bytes(samples.read_bytes()[:-10])
+    result = lidardesign("fit", flat, "--dry-run")
+    assert result.code == 3
+    assert "truncated" in result.err
+
+
+def test_people_are_told_in_words(lidardesign, flat, tmp_path):
+    lidardesign("fit", flat, "--sensors", 2)
+    result = lidardesign("fit", flat, "--sensors", 2, "--refine", 3, "--weight", "variation=1.5", "--dry-run")
+    lines = result.out.splitlines()
+    assert lines[0] == "fit would"
+    assert "  fit 2 sensors, layout grid, rays left open, level 0.95, seed 3" in lines
+    assert "  weigh the density with variation=1.5" in lines
+    assert "  refine it in up to 3 rounds on training scenes of task flatland" in lines
+    assert f"write  {flat}/designs/fit.yaml (replaced)" in lines
+    assert any(line.startswith(f"time   the last fit of {flat} took") for line in lines)
+    assert lines[-1] == "nothing was done: leave out --dry-run to do it"
+    told = lidardesign("evaluate", flat, "--rays", 9, "--rays", 16, "--baseline", "occupancy", "--dry-run").out
+    assert "beside uniform, random, bounding, occupancy: 10 rows at equal rays, up to 8 at equal bandwidth" in told
+
+
+def test_a_manifest_without_times_or_with_odd_ones_promises_nothing(lidardesign, flat, tmp_path):
+    for times in ({}, {"fit": {"seconds": "long"}}, {"fit": 3}):
+        write_manifest(flat, {**read_manifest(flat), "timings": times})
+        assert dry(lidardesign, tmp_path, "fit", flat)["before"] is None
+
+
+def test_another_run_whose_files_are_damaged_is_no_example(lidardesign, tmp_path):
+    broken = tmp_path / "runs" / "broken"
+    broken.mkdir(parents=True)
+    (broken / "manifest.json").write_text(json.dumps([]))
+    (broken / "config.yaml").write_text("{")
+    assert dry(lidardesign, tmp_path, "learn", "flatland")["before"] is None
+
+
+def test_files_that_were_given_are_among_those_that_are_read(lidardesign, given_files, tmp_path):
+    plan = dry(lidardesign, tmp_path, "constrain", "run/designs/fit.yaml", "--constraints", "few.yaml")
+    assert [entry["path"] for entry in plan["reads"]][:2] == ["run/designs/fit.yaml", "few.yaml"]
+    plan = dry(lidardesign, tmp_path, "learn", "flatland", "--config", "flat.yaml")
+    assert [entry["path"] for entry in plan["reads"]] == ["flat.yaml"]
+    plan = dry(lidardesign, tmp_path, "fit", "run", "--like", "run/designs/fit.yaml")
+    assert plan["reads"][0]["path"] == "run/designs/fit.yaml"
+    assert plan["settings"]["sensors"] == 2
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("evaluate flat --plots flat/config.yaml", "run/config.yaml: is a file"),
+        ("export flat/designs/fit.yaml --format csv --rate-hz 5", "csv holds no frame rate"),
+        ("fit flat --at y_m=1", "--at"),
+    ],
+)
+def test_what_would_be_refused_is_refused_at_once(lidardesign, flat, given_files, line, words):
+    result = lidardesign(*line.replace("flat/", f"{flat}/").replace("flat ", f"{flat} ").split(), "--dry-run")
+    assert result.code in (2, 3), result.out
+    assert words in result.err

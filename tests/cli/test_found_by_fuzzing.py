@@ -1,0 +1,329 @@
+"""What damaged files once did to the program: each ends in words now."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+import zipfile
+
+import h5py
+import numpy as np
+import pytest
+from lidardesign_tasks.arm_robot import load_robot
+from lidardesign_tasks.basel import load_model
+from support.captures import make_capture
+from support.command_line import caller, make_run
+
+from lidardesign.cli.output import Output, describe_error
+from lidardesign.density.fields.grids import _digest, _load
+from lidardesign.density.training.snapshot_quality import seconds_at
+from lidardesign.density.training.training import _step_of
+from lidardesign.design.bandwidth import split_budget
+from lidardesign.design.constraints.document import MOST_FITTED, Constraints
+from lidardesign.design.files import load_design
+from lidardesign.design.fit import fit
+from lidardesign.design.sensor import MOST_RAYS, interval_factor
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.evaluate.captures.capture import load_capture
+from lidardesign.export import csv as csv_format
+from lidardesign.export import npz as npz_format
+from lidardesign.meshio import check_mesh, load_mesh
+from lidardesign.run.manifest import record
+from lidardesign.samples import Samples, load_samples
+from lidardesign.space import FARTHEST_M, DesignSpace
+
+SPACE = DesignSpace((0.0, 0, 0, 2, 0, 0), (1.0, 0, 0, 4, 0, 1))
+CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+# --- samples of a run
+
+
+def good_arrays():
+    space = np.frombuffer(json.dumps(SPACE.as_dict()).encode(), dtype=np.uint8)
+    return {"points": np.ones((9, 6)), "log_prob": np.zeros(9), "log_target": np.zeros(9), "space": space}
+
+
+BAD_SAMPLES = {
+    "no archive": (b"words", "no .npz file"),
+    "cut short": (lambda content: content[:-30], "no .npz file"),
+    "a wrong checksum": (lambda content: content.replace(struct.pack("<d", 1.0), struct.pack("<d", 2.0), 1), "CRC"),
+    "one array missing": ({"log_target": None}, "has no log_target"),
+    "another type": ({"log_prob": np.array(["a"] * 9)}, "of type <U1"),
+    "whole numbers": ({"log_prob": np.zeros(9, np.int64)}, "int64 of shape"),
+    "another shape": ({"points": np.ones((9, 5))}, "shape \\(9, 5\\)"),
+    "another length": ({"log_prob": np.zeros(8)}, "shape \\(8,\\)"),
+    "no sample": ({"points": np.ones((0, 6)), "log_prob": np.zeros(0), "log_target": np.zeros(0)}, "shape \\(0, 6\\)"),
+    "a number alone": ({"points": np.array(1.0)}, "shape \\(\\)"),
+    "infinite targets": ({"log_target": np.full(9, np.inf)}, "not finite"),
+    "no space": ({"space": np.frombuffer(b"[1, 2]", np.uint8)}, "TypeError"),
+    "a space of words": ({"space": np.frombuffer(b"{", np.uint8)}, "JSONDecodeError"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_SAMPLES)
+def test_samples_that_are_none_are_refused_although_their_hash_is_right(tmp_path, case):
+    run = make_run(tmp_path / "run", count=20)
+    change, words = BAD_SAMPLES[case]
+    arrays = {**good_arrays(), **(change if isinstance(change, dict) else {})}
+    np.savez(run / "samples.npz", **{name: array for name, array in arrays.items() if array is not None})
+    if not isinstance(change, dict):
+        content = change if isinstance(change, bytes) else change((run / "samples.npz").read_bytes())
+        (run / "samples.npz").write_bytes(content)
+    record(run, ["samples.npz"])
+    with pytest.raises(DataError, match=words) as refused:
+        load_samples(run)
+    assert "samples.npz" in str(refused.value)
+
+
+def test_good_samples_with_targets_of_nothing_are_read(tmp_path):
+    run = make_run(tmp_path / "run", count=20)
+    np.savez(run / "samples.npz", **{**good_arrays(), "log_target": np.where(np.arange(9) < 3, -np.inf, 0.0)})
+    record(run, ["samples.npz"])
+    assert np.isfinite(load_samples(run).weights).all()
+
+
+@pytest.mark.parametrize("shape", ["(1000000000000,)", "(4294967296, 4294967296)"])
+def test_no_room_is_made_for_what_a_header_only_promises(tmp_path, shape):
+    """numpy would ask for 8 TB before it finds that there is nothing."""
+    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    with zipfile.ZipFile(tmp_path / "rays.npz", "w") as archive:
+        archive.writestr("points.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + bytes(80))
+    for read in (npz_format.read, load_capture):
+        with pytest.raises(DataError, match="80 bytes of data"):
+            read(tmp_path / "rays.npz")
+
+
+BAD_PROGRESS = {
+    "an infinite step": '{"step": 1e400, "seconds": 1}',
+    "a step of many digits": '{"step": 1' + "0" * 400 + ', "seconds": 1}',
+    "no time": '{"step": 20, "seconds": NaN}',
+    "a step of text": '{"step": "x", "seconds": 1}',
+    "a list": "[20, 1]",
+    "a step backwards": '{"step": 5, "seconds": 1}',
+    "bytes": "\ufffd",
+    "nesting": "[" * 100_000,
+}
+
+
+@pytest.mark.parametrize("case", BAD_PROGRESS)
+def test_progress_that_is_none_is_refused_and_cut_back_at_resume(tmp_path, case):
+    run = make_run(tmp_path / "run", count=20)
+    good = '{"step": 10, "seconds": 0.5}'
+    (run / "progress.jsonl").write_text(f"{good}\n{BAD_PROGRESS[case]}\n")
+    record(run, ["progress.jsonl"])
+    with pytest.raises(DataError, match="no progress of learning"):
+        seconds_at(run, [10])
+    assert _step_of(good) == 10
+    assert _step_of(BAD_PROGRESS[case]) in (20, 5, math.inf)
+
+
+@pytest.mark.parametrize("header", [b"{" * 300, b"(", b"{'descr': '<f8', 'fortran_order': False, 'shape': (1", b""])
+def test_a_cached_field_with_a_damaged_header_is_built_again(tmp_path, header):
+    content = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
+    (tmp_path / "field.npy").write_bytes(content + _digest(content))
+    assert _load(tmp_path / "field.npy", 8) is None
+
+
+RAY_COLUMNS = (
+    "origin_x_m,origin_y_m,origin_z_m,direction_x,direction_y,direction_z,azimuth_rad,elevation_rad,gate_start_m,"
+    "gate_end_m,sensor,time_s"
+)
+RAY_ROW = ["0", "0", "0", "1", "0", "0", "0", "0", "1", "2", "3", "0.1"]
+
+
+@pytest.mark.parametrize(
+    ("column", "text"),
+    [(0, "1e300"), (3, "1e200"), (3, "nan"), (9, "inf"), (10, "1e30"), (10, "0.5"), (10, "-1"), (11, "nan")],
+)
+def test_numbers_of_rays_that_cannot_be_are_refused_without_a_warning(tmp_path, column, text):
+    path = tmp_path / "rays.csv"
+    path.write_text(f"{RAY_COLUMNS}\n{','.join(RAY_ROW)}\n")
+    assert csv_format.read(path).sensor[0] == 3
+    path.write_text(f"{RAY_COLUMNS}\n{','.join([*RAY_ROW[:column], text, *RAY_ROW[column + 1 :]])}\n")
+    with pytest.raises(DataError, match="holds no ray list"):
+        csv_format.read(path)
+
+
+# --- geometry
+
+
+@pytest.mark.parametrize("scale", [1e154, 1e300, 2 * FARTHEST_M])
+def test_a_mesh_beyond_all_distances_is_refused_without_a_warning(scale):
+    with pytest.raises(DataError, match="reaches"):
+        check_mesh(CORNERS * scale, FACES)
+    assert len(check_mesh(CORNERS * FARTHEST_M, FACES).faces) == 4
+
+
+def test_a_scale_that_overflows_is_refused_without_a_warning(tmp_path):
+    (tmp_path / "m.obj").write_text("v 1e300 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\n")
+    with pytest.raises(DataError, match="infinite"):
+        load_mesh(tmp_path / "m.obj", scale=1e10)
+
+
+@pytest.mark.parametrize("dataset", ["shape/model/mean", "shape/model/pcaVariance", "shape/representer/cells"])
+def test_a_dataset_without_values_is_refused_by_name(tmp_path, dataset):
+    values = {
+        "shape/model/mean": np.arange(9.0),
+        "shape/model/pcaVariance": np.ones(1),
+        "shape/model/pcaBasis": np.full((9, 1), 1 / 3),
+        "shape/representer/cells": np.array([[0], [1], [2]]),
+    }
+    with h5py.File(tmp_path / "m.h5", "w") as file:
+        for name, array in values.items():
+            file[name] = h5py.Empty("f8") if name == dataset else array
+    with pytest.raises(DataError, match="not an array of numbers") as refused:
+        load_model(tmp_path / "m.h5", unit="mm")
+    assert dataset in str(refused.value)
+
+
+@pytest.mark.parametrize("dataset", ["model/mean", "model/pcaVariance", "model/pcaBasis"])
+def test_a_face_beyond_all_sizes_is_refused_without_a_warning(tmp_path, dataset):
+    values = {"model/mean": np.arange(9.0), "model/pcaVariance": np.ones(1), "model/pcaBasis": np.full((9, 1), 1 / 3)}
+    with h5py.File(tmp_path / "m.h5", "w") as file:
+        for name, array in values.items():
+            file[name] = array * (1e300 if name == dataset else 1.0)
+        file["representer/cells"] = np.array([[0], [1], [2]])
+    with pytest.raises(DataError, match="reaches") as refused:
+        load_model(tmp_path / "m.h5", unit="mm")
+    assert dataset in str(refused.value)
+
+
+def test_a_length_unit_without_a_value_is_refused(tmp_path):
+    with h5py.File(tmp_path / "m.h5", "w") as file:
+        file["model/mean"], file["model/pcaVariance"] = np.arange(9.0), np.ones(1)
+        file["model/pcaBasis"], file["representer/cells"] = np.full((9, 1), 1 / 3), np.array([[0], [1], [2]])
+        file["representer/length-unit"] = np.zeros(0)
+    with pytest.raises(DataError, match="length-unit"):
+        load_model(tmp_path / "m.h5")
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32])
+def test_counts_of_half_precision_are_counted_without_a_warning(tmp_path, kind):
+    arrays = make_capture(3)
+    np.savez(tmp_path / "s.npz", **{**arrays, "counts": arrays["counts"].astype(kind)})
+    assert load_capture(tmp_path / "s.npz").counts.dtype == kind
+
+
+def test_directions_whose_length_overflows_are_refused_without_a_warning(tmp_path):
+    arrays = {name: value for name, value in make_capture(3).items() if not name.endswith("_deg")}
+    np.savez(tmp_path / "s.npz", **{**arrays, "direction": np.full((3, 3, 3), 1e200)})
+    with pytest.raises(DataError, match="length inf"):
+        load_capture(tmp_path / "s.npz")
+
+
+def test_what_mujoco_warns_of_becomes_a_note_of_the_robot(tmp_path):
+    piece = '<body pos="0 0 .1"><joint axis="0 0 1"/>{}'
+    geom = '<geom type="capsule" size=".03" fromto="0 0 0 0 0 .18" density="{}"/>'
+    links = [piece.format(geom.format("1e-12" if link == 6 else "1e12")) for link in range(7)]
+    (tmp_path / "arm.xml").write_text(f"<mujoco><worldbody>{''.join(links)}{'</body>' * 7}</worldbody></mujoco>")
+    assert all("\n" not in note for note in load_robot(tmp_path / "arm.xml", 0.15).notes)
+
+
+@pytest.mark.parametrize(("length", "fits"), [(1.0, True), (1e-300, True), (1e308, True), (0.0, False)])
+def test_a_direction_of_travel_may_have_any_length_but_none(tmp_path, length, fits):
+    text = design_text().replace(
+        "{mean: [0, 0, 0]}", "{mean: [0, 0, 0], covariance: [[4, 0, 0], [0, 1, 0], [0, 0, 1]]}"
+    )
+    travel = 2 * 2 * interval_factor(0.95)
+    (tmp_path / "d.yaml").write_text(f"{text}  travel_m: {{length: {travel!r}, direction: [{length!r}, 0, 0]}}\n")
+    if fits:
+        assert load_design(tmp_path / "d.yaml").sensors[0].travel_m[0] == pytest.approx(travel)
+    else:
+        with pytest.raises(ConfigError, match="longest"):
+            load_design(tmp_path / "d.yaml")
+
+
+@pytest.mark.parametrize("key", ["bin_ps", "bits_per_bin", "rate_hz"])
+@pytest.mark.parametrize("value", [5e-324, 1e-300, 1e300])
+def test_a_read_out_that_no_detector_has_is_refused_without_a_warning(key, value):
+    with pytest.raises(ConfigError, match=key):
+        Constraints.from_mapping({"budget": {key: value, "rays": 10, "bandwidth_mbps": 5.0}})
+
+
+# --- numbers that no computer bears
+
+
+def design_text(rays="100", own="null"):
+    return f"""\
+schema_version: 1
+rays: {rays}
+sensors:
+- origin_m: {{mean: [0, 0, 0]}}
+  boresight: {{azimuth_rad: 0, elevation_rad: 0}}
+  field_of_view_rad: {{horizontal: 0.2, vertical: 0.2}}
+  gate_m: {{start: 1, end: 2}}
+  rays: {own}
+"""
+
+
+@pytest.mark.parametrize("rays", [MOST_RAYS + 1, 10**12, 10**30])
+def test_more_rays_than_any_computer_bears_are_refused_in_a_design(tmp_path, rays):
+    for text in (design_text(rays=rays), design_text(rays="null", own=rays)):
+        (tmp_path / "d.yaml").write_text(text)
+        with pytest.raises(ConfigError, match=f"from 0 to {MOST_RAYS}"):
+            load_design(tmp_path / "d.yaml")
+    with pytest.raises(ConfigError, match="rays"):
+        split_budget(np.ones(2), rays)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "fit run --rays 1000000000000",
+        "fit run --rays 1000000000000 --layout density",
+        "fit run --sensors 1000000000",
+        "constrain run --set sensors.count=1000000000",
+        "constrain run --set sensors.max=1000000000",
+        "constrain run --set budget.rays=1000000000000000000000000",
+        "evaluate run --rays 1000000000000",
+        "learn flatland --out out --set learning.batch=1000000000000",
+        "learn flatland --out out --set learning.hidden=10000000",
+        "learn flatland --out out --set learning.bins=100000000",
+        "learn flatland --out out --set learning.samples=1000000000000",
+        "learn flatland --out out --set learning.coverage_proposals=1000000000000",
+        "learn flatland --out out --set learning.balance_proposals=1000000000000",
+    ],
+)
+def test_commands_refuse_numbers_that_no_computer_bears(lidardesign, tmp_path, arguments):
+    make_run(tmp_path / "run", count=2000)
+    result = lidardesign(*arguments.split())
+    assert result.code == 2, result.err
+    assert "1000" in result.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_more_sensors_than_a_mixture_may_have_are_refused_before_anything_is_computed():
+    samples = Samples(np.full((50, 6), 0.5), np.zeros(50), np.zeros(50), SPACE)
+    with pytest.raises(ConfigError, match=f"1 to {MOST_FITTED}"):
+        fit(samples, sensors=10**9)
+    with pytest.raises(ConfigError, match="1000"):
+        Constraints.from_mapping({"sensors": {"min": MOST_FITTED + 1}})
+
+
+@pytest.mark.parametrize("reader", ["--set", "key", "name"])
+def test_a_message_does_not_repeat_whole_pages_of_its_input(lidardesign, tmp_path, reader):
+    page = "long" * 20_000
+    (tmp_path / "c.yaml").write_text(f"{page}: 1\n" if reader == "key" else f"gate: {page}\n")
+    (tmp_path / "run").mkdir()
+    extra = ["--set", f"gate={page}"] if reader == "--set" else ["--constraints", "c.yaml"]
+    result = lidardesign("constrain", "run", *extra)
+    assert result.code == 2
+    assert 20 < len(result.err) < 5000
+
+
+def test_memory_that_torch_does_not_get_is_no_fault_of_the_program():
+    import torch
+
+    with pytest.raises(RuntimeError) as refused:
+        torch.empty(1 << 60, dtype=torch.uint8)
+    document, _, text = describe_error(refused.value, Output())
+    assert document["kind"] == "memory"
+    assert "fault" not in text

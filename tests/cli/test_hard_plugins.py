@@ -1,0 +1,68 @@
+"""Tasks that break the contract while they are evaluated: one message that names them, and exit 6."""
+
+from __future__ import annotations
+
+import pytest
+from cli.test_conditions_cli import make_conditioned_run
+from lidardesign_tasks.flatland import FlatlandTask
+from support.command_line import caller, make_run
+
+from lidardesign.errors import PluginError
+from lidardesign.space import DesignSpace
+from lidardesign.task import Score, scenes_of
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+def broken():
+    raise RuntimeError("the map is lost")
+
+
+# what `conditions` gives, exit code, words of the message
+CONDITIONS = {
+    "raises": (broken, 6, "the map is lost"),
+    "none": (lambda: None, 6, "task flatland"),
+    "a number": (lambda: 5, 6, "task flatland"),
+    "numbers": (lambda: [1.0], 6, "task flatland"),
+    "text": (lambda: [{"x_m": "far"}], 6, "far"),
+    "nothing": (list, 6, "no condition value"),
+    "open": (lambda: [{}], 6, "x_m open"),
+    "outside": (lambda: [{"x_m": 99.0}], 2, "task flatland, conditions: x_m=99 is outside"),
+    "nan": (lambda: [{"x_m": float("nan")}], 2, "task flatland, conditions: x_m=nan is outside"),
+    "another dimension": (lambda: [{"x_m": 0.5, "z_m": 0.0}], 2, "'z_m' is no condition"),
+}
+
+
+@pytest.mark.parametrize("given", CONDITIONS)
+def test_conditions_that_are_none_are_the_tasks_fault_and_no_traceback(lidardesign, tmp_path, monkeypatch, given):
+    answer, code, words = CONDITIONS[given]
+    run = make_conditioned_run(tmp_path / "run", count=3000)
+    assert lidardesign("fit", run, "--layout", "scan", "--rays", 3).code == 0
+    monkeypatch.setattr(FlatlandTask, "conditions", lambda self, config: answer(), raising=False)
+    result = lidardesign("evaluate", run, "--rays", 3, "--json")
+    assert result.code == code, result.err
+    assert words in result.err
+    assert "internal error" not in result.err
+
+
+DETAILS = {"nothing": None, "a list": [1.0], "unnamed": {3: 1.0}, "text": {"seen": "some"}}
+
+
+@pytest.mark.parametrize("given", DETAILS)
+def test_details_of_a_score_that_are_no_numbers_by_name_are_the_tasks_fault(lidardesign, tmp_path, monkeypatch, given):
+    run = make_run(tmp_path / "run", count=1000)
+    assert lidardesign("fit", run, "--sensors", 1).code == 0
+    monkeypatch.setattr(FlatlandTask, "score", lambda *_: Score(1.0, details=DETAILS[given]))
+    result = lidardesign("evaluate", run, "--rays", 4, "--json")
+    assert result.code == 6, result.err
+    assert "score returned the detail" in result.err
+
+
+def test_scenes_that_are_none_are_the_tasks_fault():
+    task = FlatlandTask()
+    task.scenes = lambda config, split, seed: [{"bodies": []}]
+    with pytest.raises(PluginError, match="scenes gave one dict"):
+        scenes_of(task, None, "train", 0, DesignSpace((0.0,) * 6, (1.0,) * 6))

@@ -1,0 +1,183 @@
+"""Lengths in another unit, and splits that share a mesh, are told before anything takes time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from lidardesign_tasks.units import doubtful_meshes, doubtful_motion
+from support.command_line import caller, make_run
+
+from lidardesign.cli.output import Output
+from lidardesign.config import load_run_config
+from lidardesign.density.target.resolution import resolution_notes
+from lidardesign.design.compare import outside_notes
+from lidardesign.errors import ConfigError, PluginError
+from lidardesign.registry import load_task
+from lidardesign.space import DesignSpace
+from lidardesign.task import notes_of
+from lidardesign.workflow.runs import read_design
+
+SPACE = DesignSpace(low=(1.0, 0, 0, 2.8, -0.4, 0.5), high=(1.0, 0, 0, 3.5, 0.4, 1.5))
+QUICK = [word for key in ("poses=1", "truth_points=100", "density.field_resolution=8", "density.visibility=off")
+         for word in ("--set", key)]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory):
+    """Three parts as a drawing program writes them, in millimetres."""
+    folder = tmp_path_factory.mktemp("work") / "parts"
+    folder.mkdir()
+    for index, size in enumerate((120, 160, 211)):
+        trimesh.creation.box((size, 60, 40)).export(folder / f"part_{index}.stl")
+    return folder
+
+
+@pytest.fixture
+def call(capsys, parts, monkeypatch):
+    return caller(capsys, parts.parent, monkeypatch)
+
+
+def test_a_dry_run_says_once_for_all_parts_that_they_look_like_millimetres(call):
+    result = call("learn", "meshes", "--set", "folder=parts", *QUICK, "--dry-run")
+    assert result.code == 0, result.err
+    (note,) = [line for line in result.err.splitlines() if "millimetres" in line]
+    assert note.startswith("note: 3 of 3 meshes")
+    assert "part_2.stl with 211 m" in note
+    assert "scale=0.001" in note
+    scaled = call("learn", "meshes", "--set", "folder=parts", "--set", "scale=0.001", *QUICK, "--dry-run")
+    assert "millimetres" not in scaled.err + scaled.out
+
+
+def test_the_error_about_sigma_names_the_likely_cause_after_a_note_before_learning(call):
+    result = call("learn", "meshes", "--set", "folder=parts", *QUICK, "--out", "run")
+    assert result.code == 2
+    before, error = result.err.split("config error")
+    assert "3 of 3 meshes" in before
+    assert "below the grid step" in error
+    assert "scale=0.001" in error
+    assert "density.field_resolution" in error
+
+
+def test_the_error_about_sigma_leaves_units_alone_where_scenes_are_small(monkeypatch):
+    found = {}
+    for step in (0.9, 3.6):
+        steps = "lidardesign.density.target.resolution._grid_steps_m"
+        monkeypatch.setattr(steps, lambda field, step=step: np.array([step]))
+        settings = type("Settings", (), {"sigma_m": 0.002, "field_resolution": 16})
+        with pytest.raises(ConfigError) as refused:
+            resolution_notes(type("Target", (), {"space": SPACE, "field": None}), settings)
+        found[step] = refused.value.hint
+    assert found[0.9] == "raise density.field_resolution, or sigma"
+    assert "about 58 m across" in found[3.6]
+
+
+def test_large_meshes_are_doubted_only_where_no_unit_was_given():
+    assert doubtful_meshes({"a.stl": 19.9}, 1.0) == doubtful_meshes({"a.stl": 300.0}, 0.01) == []
+    assert doubtful_meshes({"a.stl": 300.0}, 1.0)[0].startswith("a.stl: is 300 m long")
+    assert doubtful_meshes({"a.stl": 300.0, "b.stl": 0.1}, 1.0)[0].startswith("1 of 2 meshes")
+
+
+@pytest.mark.parametrize("way_m", [0.6, 12.0, 600.0])
+@pytest.mark.parametrize("reach_m", [1.5, 2000.0])
+def test_a_way_is_doubted_where_it_dwarfs_what_goes_it(way_m, reach_m):
+    space = DesignSpace(low=SPACE.low, high=(*SPACE.high[:5], reach_m))
+    box = {"ball": np.array([[-0.1, -way_m / 2, -0.1], [0.1, way_m / 2, 0.1]])}
+    assert [line for line in doubtful_motion(box, 0.2, space) if "millimetres" in line] == doubtful_motion(
+        box, 0.2, space
+    )
+    assert bool(doubtful_motion(box, 0.2, space)) == (way_m > 100)
+
+
+def test_a_way_that_no_sensor_reaches_is_told_with_its_distance():
+    box = {"ball": np.array([[-0.1, 300.0, -0.1], [0.1, 303.0, 0.1]])}
+    (note,) = doubtful_motion(box, 0.2, SPACE)
+    assert "no nearer than 300 m" in note
+    assert "reach 1.5 m" in note
+    assert doubtful_motion({}, 0.2, SPACE) == []
+
+
+def test_a_motion_in_millimetres_is_told_before_learning(call, parts):
+    (parts.parent / "way.csv").write_text("time_s,body,x_m,y_m,z_m\n0,*,0,-300,0\n1,*,0,300,0\n")
+    settings = ("--set", "folder=parts", "--set", "scale=0.001", "--set", "motion=way.csv")
+    result = call("learn", "meshes", *settings, "--set", "frame_rate_hz=1", *QUICK, "--dry-run")
+    assert "is the CSV in millimetres?" in result.err
+    here = ("--set", "origin_m=[1, 0, 0]", "--set", "space.range_m=[0.5, 1.5]")
+    (parts.parent / "way.csv").write_text("time_s,body,x_m,y_m,z_m\n0,*,0,300,0\n1,*,0,301,0\n")
+    result = call("learn", "meshes", *settings, "--set", "frame_rate_hz=1", *here, *QUICK, "--dry-run")
+    assert "where sensors may be" in result.err, result.err
+
+
+def test_one_mesh_is_told_to_be_both_trained_on_and_held_out(tmp_path):
+    task = load_task("meshes")
+    for count in (1, 2):
+        trimesh.creation.box((0.1 * count, 0.1, 0.1)).export(tmp_path / f"part{count}.stl")
+        config = task.Config(folder=tmp_path)
+        notes = notes_of(task, config, task.space(config))
+        assert len(notes) == 2 - count
+        assert all(note.startswith("part1.stl is the only mesh: training and held-out scenes") for note in notes)
+
+
+def test_a_task_without_notes_has_none_and_one_with_anything_else_is_refused():
+    assert notes_of(load_task("flatland"), None, SPACE) == []
+    for found in ("one line", [3], [None]):
+        task = type("Loud", (), {"name": "loud", "notes": lambda self, config, space, found=found: found})()
+        with pytest.raises(PluginError, match="loud"):
+            notes_of(task, None, SPACE)
+
+
+# ------------------------------------------------------------------- designs
+
+
+RAYS = "origin_x_m,origin_y_m,origin_z_m,azimuth_rad,elevation_rad,gate_start_m,gate_end_m\n"
+
+
+@pytest.fixture(scope="module")
+def flat(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("flat") / "run", count=1000)
+
+
+def rig(run, name, factor, start=0.3):
+    """A rig at the corner of the run's design space, its lengths multiplied by a factor."""
+    space = load_run_config(run)[1].space
+    rows = [
+        ",".join(f"{value:.6f}" for value in (*(factor * (1 + np.array(space.low[:3]))), 0.1 * index, 0.0,
+                                              factor * start, factor * (start + 0.3)))
+        for index in range(9)
+    ]  # fmt: skip
+    path = run.parent / name
+    path.write_text(RAYS + "\n".join(rows) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("factor", [1, 1000])
+def test_a_rig_in_millimetres_is_told_wherever_it_meets_a_run(capsys, monkeypatch, flat, factor):
+    call = caller(capsys, flat.parent, monkeypatch)
+    name = rig(flat, f"rig{factor}.csv", factor).name
+    commands = (
+        ("show", name, "--in", flat),
+        ("compare", name, name, "--in", flat, "--rays", 9),
+        ("evaluate", flat, name, "--rays", 9),
+        ("evaluate", flat, name, "--rays", 9, "--dry-run"),
+    )
+    for arguments in commands:
+        result = call(*arguments)
+        assert result.code == 0, result.err
+        said = " ".join((result.out + result.err).split())
+        assert ("m outside the run's design space; are its lengths in millimetres?" in said) == (factor > 1), arguments
+
+
+def test_a_rig_that_hears_only_far_beyond_the_space_is_told(flat):
+    space = load_run_config(flat)[1].space
+    near = read_design(rig(flat, "near.csv", 1), Output())
+    far = read_design(rig(flat, "far.csv", 1, start=500.0), Output())
+    assert outside_notes(near, space) == []
+    assert "hears from 500 m on" in outside_notes(far, space)[0]
+
+
+def test_an_evaluation_says_what_its_task_says_of_the_configuration(capsys, monkeypatch, flat):
+    call = caller(capsys, flat.parent, monkeypatch)
+    name = rig(flat, "other.csv", 1).name
+    kind = type(load_task("flatland"))
+    monkeypatch.setattr(kind, "notes", lambda self, config, space: ["one mesh is all there is"], raising=False)
+    assert "one mesh is all there is" in call("evaluate", flat, name, "--rays", 9, "--json").json["notes"]

@@ -1,0 +1,131 @@
+"""Effective sample size, KL, log Z and coverage against closed forms of Gaussians."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from support import references
+
+from lidardesign.density.training.quality import coverage, quality
+from lidardesign.errors import NumericalError
+from lidardesign.estimates import Estimate
+
+COUNT = 200_000
+LOG_Z = 3.7
+
+
+def gaussian(x, mean, spread):
+    return -np.square((x - mean) / spread) / 2 - math.log(spread * math.sqrt(2 * math.pi))
+
+
+def test_a_shifted_gaussian_has_its_closed_form_figures():
+    shift = 0.5
+    x = np.random.default_rng(0).normal(size=COUNT)
+    found = quality(gaussian(x, 0, 1), gaussian(x, shift, 1) + LOG_Z)
+    # E[w] = Z, E[w^2] = Z^2 exp(shift^2), KL = shift^2 / 2
+    error = references.STANDARD_ERRORS / math.sqrt(COUNT)
+    assert found.log_z == pytest.approx(LOG_Z, abs=error * math.sqrt(math.expm1(shift**2)))
+    assert found.kl_nats == pytest.approx(shift**2 / 2, abs=error)
+    assert found.ess == pytest.approx(math.exp(-(shift**2)), abs=0.02)
+
+
+def test_the_target_itself_is_perfect():
+    x = np.random.default_rng(1).normal(size=1000)
+    found = quality(gaussian(x, 0, 1), gaussian(x, 0, 1) + LOG_Z)
+    assert (found.ess, found.kl_nats, found.log_z) == pytest.approx((1.0, 0.0, LOG_Z))
+
+
+@pytest.mark.parametrize("offset", [-1e6, 1e6])
+def test_figures_are_computed_in_log_space(offset):
+    x = np.random.default_rng(2).normal(size=1000)
+    near = quality(gaussian(x, 0, 1), gaussian(x, 0.3, 1))
+    far = quality(gaussian(x, 0, 1), gaussian(x, 0.3, 1) + offset)
+    assert far.ess == pytest.approx(near.ess, rel=1e-6)
+    assert far.kl_nats == pytest.approx(near.kl_nats, abs=1e-6)
+    assert far.log_z - offset == pytest.approx(near.log_z, abs=1e-6)
+
+
+def test_one_outlying_weight_lowers_the_ess_to_its_closed_form():
+    log_target = np.zeros(1000)
+    log_target[0] = math.log(1001.0)
+    assert quality(np.zeros(1000), log_target).ess == pytest.approx(2000**2 / (1000 * (999 + 1001**2)))
+
+
+def test_groups_are_judged_by_themselves_and_averaged():
+    log_target = np.concatenate([np.zeros(500), np.full(500, 4.0)])
+    groups = np.repeat([0, 1], 500)
+    found = quality(np.zeros(1000), log_target, groups)
+    assert (found.ess, found.kl_nats, found.log_z) == pytest.approx((1.0, 0.0, 2.0))
+    assert quality(np.zeros(1000), log_target).ess < 0.6
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_weights_that_are_no_numbers_are_an_error_and_no_figure(bad):
+    log_target = np.zeros(10)
+    log_target[3] = bad
+    with pytest.raises(NumericalError, match="1 of 10"):
+        quality(np.zeros(10), log_target)
+
+
+def two_modes(x):
+    return np.logaddexp(gaussian(x, -5, 1) + math.log(0.7), gaussian(x, 5, 1) + math.log(0.3)) + LOG_Z
+
+
+def test_coverage_sees_a_dropped_mode_that_the_ess_cannot():
+    generator = np.random.default_rng(3)
+    x = generator.normal(-5, 1, COUNT)
+    only_one = gaussian(x, -5, 1)
+    found = quality(only_one, two_modes(x))
+    assert found.ess > 0.99
+    proposed = generator.uniform(-12, 12, 50_000)
+    covered = coverage(gaussian(proposed, -5, 1), two_modes(proposed), np.zeros(50_000), LOG_Z)
+    assert covered.value == pytest.approx(0.7, abs=4 * covered.error)
+    assert 0 < covered.error < 0.01
+    whole = coverage(two_modes(proposed) - LOG_Z, two_modes(proposed), np.zeros(50_000), LOG_Z)
+    assert whole.value == 1.0
+    assert whole.error == pytest.approx(0.0, abs=1e-12)
+
+
+def test_coverage_takes_a_log_z_per_proposal_and_nothing_covers_nothing():
+    log_target = np.array([0.0, 10.0])
+    assert coverage(np.zeros(2), log_target, log_target, np.array([0.0, 10.0])).value == 1.0
+    assert coverage(np.zeros(2), log_target, log_target, 0.0).value == 0.5
+    assert coverage(np.zeros(0), np.zeros(0), np.zeros(0), 0.0) == Estimate(0.0, None)
+
+
+def test_standard_errors_are_the_spread_over_other_samples():
+    # log weights of a normal distribution with variance 1/4: all moments of the weights are finite
+    generator = np.random.default_rng(5)
+    found = [quality(np.zeros(2000), generator.normal(0, 0.5, 2000)) for _ in range(400)]
+    for figure, error in (("ess", "ess_error"), ("kl_nats", "kl_error_nats"), ("log_z", "log_z_error")):
+        spread = np.std([getattr(one, figure) for one in found])
+        stated = np.mean([getattr(one, error) for one in found])
+        # a standard deviation of 400 values is known to 3.5 %
+        assert stated == pytest.approx(spread, rel=4 * 0.035), figure
+
+
+def test_standard_errors_of_groups_are_those_of_their_mean():
+    generator = np.random.default_rng(6)
+    log_weights = generator.normal(0, 0.5, 4000)
+    alone = quality(np.zeros(4000), log_weights)
+    groups = np.arange(4000) % 4
+    grouped = quality(np.zeros(4000), log_weights, groups)
+    assert grouped.log_z_error == pytest.approx(alone.log_z_error, rel=0.05)
+    assert grouped.ess_error == pytest.approx(alone.ess_error, rel=0.05)
+    # four groups of the same samples know nothing more of each other
+    same = quality(np.zeros(4000), np.tile(log_weights[:1000], 4), np.repeat(np.arange(4), 1000))
+    one = quality(np.zeros(1000), log_weights[:1000])
+    assert same.kl_error_nats == pytest.approx(one.kl_error_nats / 2)
+
+
+def test_the_error_of_coverage_is_its_spread_over_other_proposals():
+    generator = np.random.default_rng(7)
+    found = []
+    for _ in range(300):
+        x = generator.uniform(-12, 12, 2000)
+        found.append(coverage(gaussian(x, -5, 1), two_modes(x), np.zeros(2000), LOG_Z))
+    assert np.mean([one.error for one in found]) == pytest.approx(
+        np.std([one.value for one in found]), rel=4 * 0.041
+    )

@@ -1,0 +1,155 @@
+"""The flow: a bijection of the box with an honest density, continuous around the circle, finite at every edge."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from support import references
+
+from lidardesign.density.flow.flow import DesignFlow
+from lidardesign.density.flow.objective import Coordinates
+from lidardesign.space import DesignSpace
+
+# name -> (blocks, context, periodic): adding a flow to every law below is adding a line
+FLOWS = {
+    "one dimension": ([[0]], 0, [False]),
+    "one on a circle": ([[0]], 0, [True]),
+    "a block of two": ([[0, 1]], 0, [False, False]),
+    "circle, then two blocks": ([[0], [1], [2]], 0, [True, False, False]),
+    "all six": ([[0, 1, 2], [3], [4], [5]], 0, [False, False, False, True, False, False]),
+    "one, given one": ([[0]], 1, [False]),
+    "chain, given two": ([[0, 1], [2]], 2, [False, False, False]),
+}
+
+
+def flow_of(name, layers=3, scale=3.0, seed=0):
+    """A flow away from the identity: its last layers are scaled up."""
+    blocks, context, periodic = FLOWS[name]
+    generator = torch.Generator().manual_seed(seed)
+    flow = DesignFlow(
+        blocks, context, layers=layers, hidden=16, bins=6, periodic=periodic, generator=generator
+    ).double()
+    with torch.no_grad():
+        for parameter in flow.parameters():
+            parameter.mul_(scale)
+    return flow
+
+
+def draw(flow, count, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+    base = flow.draw_base(count, generator)
+    context = None
+    if flow.context:
+        context = 2 * torch.rand(count, flow.context, generator=generator, dtype=torch.float64) - 1
+    return base, context
+
+
+@pytest.mark.parametrize("name", FLOWS)
+def test_samples_have_the_density_that_foreign_points_there_have(name):
+    flow = flow_of(name)
+    base, context = draw(flow, 300)
+    with torch.no_grad():
+        values, log_prob = flow(base, context)
+        again = flow.log_prob(values, context)
+    assert values.abs().max() <= 1
+    np.testing.assert_allclose(again.numpy(), log_prob.numpy(), atol=references.FLOW_ROUND_TRIP_NATS)
+
+
+@pytest.mark.parametrize("name", FLOWS)
+def test_the_density_is_the_jacobian_of_sampling(name):
+    flow = flow_of(name)
+    base, context = draw(flow, 10)
+    _, log_prob = flow(base, context)
+    for row in range(10):
+        given = None if context is None else context[[row]]
+        jacobian = torch.autograd.functional.jacobian(lambda u, c=given: flow(u[None], c)[0][0], base[row])
+        expected = flow.log_base - torch.linalg.slogdet(jacobian).logabsdet
+        assert float(log_prob[row].detach()) == pytest.approx(float(expected.detach()), abs=1e-8)
+
+
+@pytest.mark.parametrize(("name", "dimensions"), [("one dimension", 1), ("one on a circle", 1), ("a block of two", 2)])
+def test_the_density_integrates_to_one(name, dimensions):
+    flow = flow_of(name, scale=1.5)
+    count = 20_000 if dimensions == 1 else 160
+    axis = (torch.arange(count, dtype=torch.float64) + 0.5) / count * 2 - 1
+    points = torch.cartesian_prod(*[axis] * dimensions).reshape(-1, dimensions)
+    with torch.no_grad():
+        total = flow.log_prob(points).exp().mean() * 2**dimensions
+    assert float(total) == pytest.approx(1.0, abs=5e-3)  # midpoints of a density with kinks at the knots
+
+
+def test_a_conditional_density_integrates_to_one_for_every_condition_and_depends_on_it():
+    flow = flow_of("one, given one", scale=1.5)
+    axis = ((torch.arange(5000, dtype=torch.float64) + 0.5) / 5000 * 2 - 1)[:, None]
+    curves = []
+    with torch.no_grad():
+        for value in (-1.0, 0.0, 1.0):
+            curves.append(flow.log_prob(axis, torch.full_like(axis, value)).exp())
+    for curve in curves:
+        assert float(curve.mean() * 2) == pytest.approx(1.0, abs=2e-3)
+    assert (curves[0] - curves[2]).abs().max() > 0.05
+
+
+@pytest.mark.parametrize("name", FLOWS)
+def test_every_parameter_gets_a_finite_gradient(name):
+    flow = flow_of(name, scale=1.0)
+    base, context = draw(flow, 64)
+    values, log_prob = flow(base, context)
+    (log_prob.mean() + values.square().mean()).backward()
+    for label, parameter in flow.named_parameters():
+        assert parameter.grad is not None, label
+        assert torch.isfinite(parameter.grad).all(), label
+    last = [parameter for label, parameter in flow.named_parameters() if label.endswith("bias")]
+    assert all((parameter.grad != 0).any() for parameter in last)
+
+
+@pytest.mark.parametrize("name", ["one on a circle", "circle, then two blocks"])
+def test_the_density_is_continuous_around_the_circle(name):
+    flow = flow_of(name)
+    features = flow.features
+    others = draw(flow, 40)[0][:, 1:]
+    near = 1e-6
+
+    def at(azimuth):
+        points = torch.cat([torch.full((40, 1), azimuth, dtype=torch.float64), others[:, : features - 1]], dim=1)
+        with torch.no_grad():
+            return flow.log_prob(points).numpy()
+
+    np.testing.assert_allclose(at(1 - near), at(near - 1), atol=1e-2)
+    # nowhere else is it cut open either: where it changes most it changes smoothly
+    grid = np.linspace(-0.99, 0.99, 100)
+    jumps = [np.abs(at(float(b)) - at(float(a))).max() for a, b in pairwise(grid)]
+    fine = [np.abs(at(float(a + near)) - at(float(a - near))).max() for a in grid[np.argsort(jumps)[-5:]]]
+    assert max(fine) < 1e-2
+
+
+def test_an_azimuth_on_a_circle_is_a_block_of_its_own_and_an_arc_is_not():
+    low, high = (0, 0, 0, 0, -1, 0), (1, 1, 0, 2 * math.pi, 1, 3)
+    assert Coordinates(DesignSpace(low, high)).blocks == [[0, 1], [2], [3], [4]]
+    arc = (1, 1, 0, 2.0, 1, 3)
+    assert Coordinates(DesignSpace(low, arc)).blocks == [[0, 1], [2, 3], [4]]
+    assert Coordinates(DesignSpace(low, arc, condition=("x_m",))).blocks == [[0], [1, 2], [3]]
+
+
+def test_a_fresh_flow_is_near_the_identity_and_its_seed_is_all_that_matters():
+    blocks, context, periodic = FLOWS["all six"]
+    options = {"layers": 2, "hidden": 16, "bins": 6, "periodic": periodic}
+    first, second = (
+        DesignFlow(blocks, context, **options, generator=torch.Generator().manual_seed(5)) for _ in range(2)
+    )
+    for a, b in zip(first.parameters(), second.parameters(), strict=True):
+        assert torch.equal(a, b)
+    base, _ = draw(first.double(), 200)
+    with torch.no_grad():
+        _, log_prob = first(base)
+    assert (log_prob - first.log_base).abs().max() < 2.0
+
+
+def test_building_a_flow_leaves_the_global_random_state_alone():
+    before = torch.get_rng_state()
+    flow_of("all six")
+    assert torch.equal(torch.get_rng_state(), before)

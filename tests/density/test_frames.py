@@ -1,0 +1,216 @@
+"""The target over many moving frames against the full sum over all of them, and the points drawn near its surfaces."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import trimesh
+from scipy import integrate, stats
+from support import references
+
+from lidardesign.config import DensitySettings
+from lidardesign.density.fields.bodies import collect_bodies, occluding_bodies
+from lidardesign.density.fields.distance import BodyField
+from lidardesign.density.target.frames import FramesTarget
+from lidardesign.density.target.target import build_target
+from lidardesign.density.training.independent import draw_near_surfaces, independent_points
+from lidardesign.density.visibility.occlusion import BodyRaycast, Pairs
+from lidardesign.density.visibility.quadrature import RayBatch
+from lidardesign.errors import ConfigError
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.space import AZIMUTH, ELEVATION, DesignSpace, direction, observed_point
+
+CEILING = DesignSpace((-0.6, -0.6, 1.0, 0.0, -math.pi / 2, 0.1), (0.6, 0.6, 1.0, 2 * math.pi, -math.pi / 4, 1.5))
+SETTINGS = DensitySettings(sigma_m=0.03, attenuation_per_m=40.0, margin_m=0.03)
+ALL = SETTINGS.model_copy(update={"surface_tolerance_nats": 1e6})
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("LIDARDESIGN_CACHE", str(tmp_path / "cache"))
+
+
+def turned(generator):
+    """A random rotation, shape (3, 3)."""
+    q, r = np.linalg.qr(generator.normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q if np.linalg.det(q) > 0 else -q
+
+
+def tracks(generator, frames):
+    """Poses that wander through the space below the ceiling, (frames, 4, 4)."""
+    ends = generator.uniform([-0.4, -0.4, 0.1], [0.4, 0.4, 0.5], (2, 3))
+    share = np.linspace(0, 1, frames)[:, None]
+    rotation = turned(generator)
+    return np.stack([rigid(rotation, place) for place in (1 - share) * ends[0] + share * ends[1]])
+
+
+def cube(generator):
+    mesh = trimesh.creation.box((0.1, 0.14, 0.2))
+    return Mesh(mesh.vertices, mesh.faces)
+
+
+def moving_scenes(seed=0, scenes=3, frames=7, with_mesh=True):
+    """Balls carried under links of every kind."""
+    generator = np.random.default_rng(seed)
+    mesh = cube(generator)
+    result = []
+    for index in range(scenes):
+        path = tracks(generator, frames)
+        above = path.copy()
+        above[:, 2, 3] += 0.2
+        shapes = [Capsule(0.05, 0.1), Box((0.05, 0.1, 0.08)), *([mesh] if with_mesh else [])]
+        links = [Body(shape, f"link {n}", "occluder", tracks(generator, frames)) for n, shape in enumerate(shapes)]
+        hand = Body(Capsule(0.03, 0.05), "hand", "occluder", above)
+        floor = Body(Plane(), "floor", "occluder", rigid(translation_m=(0, 0, -0.2)))
+        result.append(Scene((Body(Sphere(0.03), "ball", "target", path), hand, floor, *links), f"scene {index}"))
+    return result
+
+
+def near_points(target, scenes, count=300, seed=1):
+    points, _ = independent_points(target, scenes, count, np.random.default_rng(seed))
+    return points
+
+
+def full_sum(scenes, points, optics):
+    """log p* of points as it is defined: every frame of every scene, cast by itself. The naive twin."""
+    rays = direction(points[:, AZIMUTH], points[:, ELEVATION])
+    observed, total = observed_point(points), np.zeros(len(points))
+    for scene in scenes:
+        ball = scene.bodies[0]
+        for frame in range(scene.frames):
+            distance = np.linalg.norm(observed - ball.pose(frame)[:3, 3], axis=1) - ball.shape.radius_m
+            hits = SceneCaster(scene, frame, only="occluders").first_hit(points[:, :3], rays)
+            hidden = np.maximum(points[:, 5] - optics.margin_m - hits.range_m, 0.0)
+            surface = np.exp(-np.square(distance / optics.sigma_m) / 2)
+            total += surface * np.exp(-optics.attenuation_per_m * hidden) / scene.frames
+    return total
+
+
+def test_the_target_equals_the_full_sum_over_all_frames():
+    scenes = moving_scenes()
+    target = build_target(scenes, CEILING, ALL, "raycast")
+    assert isinstance(target, FramesTarget)
+    points = near_points(target, scenes)
+    expected = full_sum(scenes, points, target.optics)
+    # embree casts in float32: 1e-6 m times the attenuation of 40 / m
+    np.testing.assert_allclose(np.exp(target.log_density(points)), expected, rtol=2e-4, atol=1e-12)
+    assert (expected < 0.5 * np.exp(target.log_proximity(points))).mean() > 0.1  # occlusion matters here
+
+
+@pytest.mark.parametrize("tolerance", [2.0, 6.0, 16.0])
+def test_leaving_out_frames_costs_no_more_than_stated(tolerance):
+    scenes = moving_scenes(frames=20)
+    exact = build_target(scenes, CEILING, ALL, "raycast")
+    quick = build_target(scenes, CEILING, SETTINGS.model_copy(update={"surface_tolerance_nats": tolerance}), "raycast")
+    points = near_points(exact, scenes, 600)
+    columns = exact.field.columns
+    observed = observed_point(points)
+    balls = np.concatenate([scene.bodies[0].poses[:, :3, 3] for scene in scenes])
+    distances = np.linalg.norm(observed[:, None] - balls, axis=2) - 0.03
+    largest = np.exp(-np.square(distances / SETTINGS.sigma_m).min(axis=1) / 2) / 20
+    error = np.exp(exact.log_density(points)) - np.exp(quick.log_density(points))
+    assert (error >= -1e-12).all()
+    assert (error <= columns * math.exp(-tolerance) * largest + 1e-12).all()
+    if tolerance < 3:
+        assert error.max() > 0
+
+
+def test_gradients_match_differences_of_the_values():
+    scenes = moving_scenes(with_mesh=False)
+    target = build_target(scenes, CEILING, ALL, "raycast")
+    points = near_points(target, scenes, 200)
+    points = points[points[:, ELEVATION] > -1.4]
+    _, gradient = target.log_density_and_gradient(points)
+    numerical = references.numerical_gradient(
+        lambda chart: target.log_density(CEILING.from_chart(chart)), CEILING.to_chart(points), 1e-6
+    )
+    error = np.abs(gradient - numerical) / (1 + np.abs(numerical))
+    # silhouettes and the ends of margins are kinks
+    assert np.quantile(error, 0.9) < 1e-3
+
+
+def test_parts_of_all_frames_average_to_the_whole():
+    scenes = moving_scenes(with_mesh=False)
+    target = build_target(scenes, CEILING, ALL, "raycast")
+    points = near_points(target, scenes)
+    order = np.random.default_rng(3).permutation(target.field.columns)
+    parts = [target.drawn(np.sort(part)).log_density(points) for part in np.split(order, 3)]
+    np.testing.assert_allclose(np.exp(parts).mean(axis=0), np.exp(target.log_density(points)), rtol=1e-9)
+
+
+def test_bodies_are_found_by_their_boxes_as_by_looking_at_all():
+    scenes = moving_scenes(frames=4)
+    bodies = collect_bodies(scenes, lambda body: not isinstance(body.shape, Plane), resolution=24, padding_m=0.1)
+    points = np.random.default_rng(5).uniform(-0.6, 0.8, (400, 3))
+    everything = BodyField(bodies).distances(points)
+    from lidardesign.density.target.frames import near_pairs
+
+    pairs = near_pairs(bodies, points, np.zeros(bodies.columns), 0.05, 1e9)
+    np.testing.assert_array_equal(pairs.columns, np.tile(np.arange(bodies.columns), len(points)))
+    np.testing.assert_allclose(pairs.distances, everything.ravel(), atol=1e-12)
+
+
+@pytest.mark.parametrize("with_mesh", [False, True], ids=["primitives", "meshes"])
+def test_first_hits_of_pairs_are_those_of_the_scene(with_mesh):
+    scenes = moving_scenes(frames=3, with_mesh=with_mesh)
+    visibility = BodyRaycast(occluding_bodies(scenes))
+    generator = np.random.default_rng(7)
+    points = CEILING.sample(400, generator)
+    rays = RayBatch(points[:, :3].copy(), direction(points[:, AZIMUTH], points[:, ELEVATION]), points[:, 5].copy())
+    columns = 9
+    pairs = Pairs(np.arange(401) * columns, np.tile(np.arange(columns), 400), np.zeros(3600), np.zeros(3600, int))
+    limit = np.full(400, 1.4)
+    hits, normals = visibility.first_hits(rays, pairs, limit)
+    hits, normals = hits.reshape(400, columns), normals.reshape(400, columns, 3)
+    for column in range(columns):
+        one = SceneCaster(scenes[column // 3], column % 3, only="occluders").trace(rays.origins, rays.directions, limit)
+        np.testing.assert_allclose(hits[:, column], one.range_m, rtol=1e-5)
+        # embree's normals near an edge of the cube may be of either face
+        same = np.einsum("nk,nk->n", normals[:, column], one.normal) > 0.999
+        assert same[np.isfinite(one.range_m)].mean() > 0.98
+
+
+def test_points_near_a_ball_follow_its_surface_term():
+    scenes = [Scene((Body(Sphere(0.1), "ball", "target", rigid(translation_m=(0.2, 0, 0.3))),))]
+    target = build_target(scenes, CEILING, DensitySettings(sigma_m=0.05), "off")
+    points = draw_near_surfaces(target, 20_000, np.random.default_rng(0))
+    radius = np.linalg.norm(points - (0.2, 0, 0.3), axis=1)
+
+    def density(r):
+        return r**2 * math.exp(-(((r - 0.1) / 0.05) ** 2) / 2)
+
+    whole = integrate.quad(density, 0, 0.6)[0]
+    cumulated = np.vectorize(lambda r: integrate.quad(density, 0, r)[0] / whole)
+    assert stats.kstest(radius[:4000], cumulated).pvalue > 1e-3
+
+
+def test_independent_points_weighted_by_their_density_integrate_the_target():
+    scenes = moving_scenes(with_mesh=False)
+    target = build_target(scenes, CEILING, SETTINGS.model_copy(update={"sigma_m": 0.1}), "raycast")
+    points, log_density = independent_points(target, scenes, 40_000, np.random.default_rng(0))
+    weights = np.exp(target.log_density(points) - log_density)
+    uniform = CEILING.sample(40_000, np.random.default_rng(1))
+    values = np.exp(target.log_density(uniform))
+    for axis in (0, 1, 5):
+        ours = np.average(points[:, axis], weights=weights)
+        naive = np.average(uniform[:, axis], weights=values)
+        effective = values.sum() ** 2 / np.square(values).sum()
+        spread = math.sqrt(np.average(np.square(uniform[:, axis] - naive), weights=values))
+        assert abs(ours - naive) < 5 * spread / math.sqrt(effective)
+
+
+def test_a_quadrature_over_thousands_of_bodies_is_refused():
+    with pytest.raises(ConfigError, match="raycast"):
+        build_target(moving_scenes(frames=300), CEILING, SETTINGS, "quadrature")
+
+
+def test_a_frame_costs_a_pose_and_no_grid_even_where_scenes_have_copies_of_a_mesh():
+    generator = np.random.default_rng(0)
+    scenes = [Scene((Body(cube(generator), "part", "target", tracks(generator, 250)),)) for _ in range(2)]
+    bodies = collect_bodies(scenes, lambda body: True, resolution=16, padding_m=0.05)
+    assert bodies.columns == 500
+    assert len(bodies.grids.meshes) == 1

@@ -1,0 +1,91 @@
+"""Learning from moving scenes: frames drawn at random in every step leave the bytes of a run repeatable."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+from support.command_line import caller
+
+import lidardesign.density.learn as density_learn
+from lidardesign.density.training import quality as measure
+from lidardesign.density.training import training
+
+SETTINGS = (
+    "size=small", "train=2", "test=1", "frames=6", "learning.steps=40", "learning.batch=64", "learning.samples=1000",
+    "learning.coverage_proposals=256", "learning.balance_proposals=256", "learning.checkpoint_seconds=0.001",
+    "learning.frames=3",
+)  # fmt: skip
+RESULTS = ("flow.safetensors", "samples.npz")
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+def learn(lidardesign, out, *further):
+    options = [word for setting in SETTINGS for word in ("--set", setting)]
+    return lidardesign("learn", "arm", "--preset", "draft", "--out", out, *options, *further, "--json")
+
+
+def interrupt_after_a_checkpoint(monkeypatch, folder):
+    """Make learning stop as Ctrl-C does, once the folder has a checkpoint and more steps were made."""
+    learn_density, seen = density_learn.learn, SimpleNamespace(step=None)
+
+    def interrupted(*arguments, progress, **options):
+        def stop(now):
+            progress(now)
+            if (folder / "checkpoint.safetensors").exists():
+                seen.step = now.step if seen.step is None else seen.step
+                if now.step > seen.step:
+                    raise KeyboardInterrupt
+
+        return learn_density(*arguments, progress=stop, **options)
+
+    monkeypatch.setattr(density_learn, "learn", interrupted)
+    monkeypatch.setattr(training, "SNAPSHOT_STEPS", 7)
+    monkeypatch.setattr(training, "PROGRESS_STEPS", 2)
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_over_moving_frames_is_resumed_to_the_bytes_of_a_straight_one(
+    lidardesign, tmp_path, monkeypatch
+):
+    assert learn(lidardesign, "straight").code == 0
+    with monkeypatch.context() as patched:
+        interrupt_after_a_checkpoint(patched, tmp_path / "stopped")
+        assert learn(lidardesign, "stopped").code == 130
+    assert not (tmp_path / "stopped" / "samples.npz").exists()
+    assert learn(lidardesign, "stopped", "--resume").code == 0
+    for name in RESULTS:
+        assert (tmp_path / "stopped" / name).read_bytes() == (tmp_path / "straight" / name).read_bytes()
+    assert not list(tmp_path.rglob("MUJOCO_LOG*"))
+
+
+@pytest.mark.slow
+def test_one_frame_per_step_is_enough_to_learn_something_finite(lidardesign):
+    result = learn(lidardesign, "one", "--set", "learning.frames=1", "--set", "learning.dtype=float64")
+    assert result.code == 0, result.err
+    assert 0 < result.json["ess"] <= 1
+
+
+def test_a_space_too_narrow_for_any_ray_is_refused_before_learning(lidardesign):
+    done = learn(lidardesign, "run", "--set", "elevation_max_deg=-89.9")
+    assert done.code == 3
+    assert "no ray of the design space" in done.json["error"]["message"]
+
+
+def test_coverage_that_cannot_be_measured_counts_as_none_and_is_said(lidardesign, monkeypatch):
+    draw = measure.independent_points
+
+    def none_is_drawn(*arguments):
+        points, log_density = draw(*arguments)
+        return points[:0], log_density[:0]
+
+    monkeypatch.setattr(measure, "independent_points", none_is_drawn)
+    done = learn(lidardesign, "run", "--set", "learning.steps=3")
+    assert done.code == 0
+    assert done.json["coverage"] == 0
+    (said,) = [note for note in done.json["notes"] if "coverage could not be measured" in note]
+    assert "misplaced leaves out what the density dropped" in said

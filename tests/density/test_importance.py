@@ -1,0 +1,458 @@
+"""Parts of a surface that count more get more of the density, by exactly as much as they count."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from lidardesign_tasks.face import FaceConfig, FaceTask
+from support.small_runs import shifted
+
+from lidardesign.config import DensitySettings, LearningSettings, RunConfig
+from lidardesign.density.fields.grids import grid_around
+from lidardesign.density.fields.importance import (
+    BodyWeights,
+    TableWeights,
+    UnionWeights,
+    barycentric,
+    is_weighted,
+    log_weight_grid,
+)
+from lidardesign.density.flow.objective import Coordinates, log_target
+from lidardesign.density.learn import learn
+from lidardesign.density.target.device import DeviceTarget, on_device
+from lidardesign.density.target.prepare import prepare_target
+from lidardesign.density.target.target import build_target
+from lidardesign.density.training.independent import independent_points
+from lidardesign.errors import DataError
+from lidardesign.numerics import logsumexp
+from lidardesign.samples import load_samples
+from lidardesign.scene import LARGEST_WEIGHT, Body, Box, Capsule, Mesh, Receiver, Scene, Sphere, rigid
+from lidardesign.space import DesignSpace, observed_point
+from lidardesign.task import Defaults, Metric, TaskConfig, judged_by_keys
+
+SPACE = DesignSpace((0, -0.1, -0.1, -0.5, -0.4, 0.3), (0, 0.1, 0.1, 0.5, 0.4, 2.2))
+SETTINGS = DensitySettings(sigma_m=0.05, field_resolution=24, quadrature_points=24)
+SCREEN = Body(Box((0.02, 0.2, 0.2)), "screen", "occluder", rigid(translation_m=(0.7, 0.25, 0)))
+RECEIVER = Receiver((0.0, 0.3, 0.0), 0.0, 0.0, 1.5, 1.5, (0.1, 3.0))
+
+
+def ball(weights=None, radius=0.3):
+    """A ball as a mesh; weights is a function of its vertices."""
+    made = trimesh.creation.icosphere(subdivisions=2, radius=radius)
+    vertices = np.asarray(made.vertices)
+    return Mesh(vertices, made.faces, importance=None if weights is None else weights(vertices))
+
+
+def sideways(vertices):
+    """Weights that grow twentyfold from right to left, 1 in the middle."""
+    return np.exp(5.0 * vertices[:, 1])
+
+
+def places(count):
+    return [np.array([1.3 + 0.1 * i, 0.15 * (i - 1), 0.05 * i]) for i in range(count)]
+
+
+def at_rest(shape, factor=1.0, count=3, receiver=None):
+    body = Body(shape, importance=factor)
+    return [
+        Scene((replace(body, poses=rigid(translation_m=p)), SCREEN), f"scene {i}", receiver=receiver)
+        for i, p in enumerate(places(count))
+    ]
+
+
+def moving(shape, factor=1.0, count=3):
+    """Each scene has one frame more than the one before."""
+    made = []
+    for i, place in enumerate(places(count)):
+        poses = np.stack([rigid(translation_m=place + np.array([0, 0.03 * k, 0])) for k in range(i + 2)])
+        made.append(Scene((Body(shape, poses=poses, importance=factor), SCREEN)))
+    return made
+
+
+def mixed(shape, factor=1.0, count=3):
+    """A mesh beside a primitive, both targets at rest."""
+    post = Body(Capsule(0.1, 0.4), "post", importance=factor)
+    return [
+        Scene(
+            (
+                Body(shape, poses=rigid(translation_m=p), importance=factor),
+                replace(post, poses=rigid(translation_m=p + np.array([0.1, -0.4, 0]))),
+                SCREEN,
+            )
+        )
+        for p in places(count)
+    ]
+
+
+def heard(shape, factor=1.0, count=3):
+    return at_rest(shape, factor, count, RECEIVER)
+
+
+CASES = {
+    "meshes, off": (at_rest, "off", TableWeights),
+    "meshes, raycast": (at_rest, "raycast", TableWeights),
+    "meshes, quadrature": (at_rest, "quadrature", TableWeights),
+    "meshes, fixed receiver": (heard, "raycast", TableWeights),
+    "moving meshes, off": (moving, "off", BodyWeights),
+    "moving meshes, raycast": (moving, "raycast", BodyWeights),
+    "moving meshes, quadrature": (moving, "quadrature", BodyWeights),
+    "mesh beside a primitive": (mixed, "raycast", UnionWeights),
+}
+
+
+def built(make, visibility, shape, factor=1.0):
+    return build_target(make(shape, factor), SPACE, SETTINGS, visibility)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_no_weights_and_weights_of_one_are_the_same_target_to_the_bit(case):
+    make, visibility, _ = CASES[case]
+    points = SPACE.sample(300, np.random.default_rng(1))
+    plain = built(make, visibility, ball())
+    ones = built(make, visibility, ball(lambda vertices: np.ones(len(vertices))))
+    assert plain.importance is None
+    assert ones.importance is None
+    for found, expected in zip(
+        ones.log_density_and_gradient(points), plain.log_density_and_gradient(points), strict=True
+    ):
+        assert np.array_equal(found, expected)
+
+
+# a primitive has no vertices
+CONSTANTS = [(case, of) for case in CASES for of in ("vertices", "body") if of == "body" or CASES[case][0] is not mixed]
+
+
+@pytest.mark.parametrize(("case", "of"), CONSTANTS)
+def test_a_constant_weight_moves_log_density_by_its_log_and_nothing_else(case, of):
+    make, visibility, kind = CASES[case]
+    points = SPACE.sample(300, np.random.default_rng(1))
+    plain = built(make, visibility, ball())
+    if of == "body":
+        weighted = built(make, visibility, ball(), factor=7.0)
+    else:
+        weighted = built(make, visibility, ball(lambda vertices: np.full(len(vertices), 7.0)))
+    assert isinstance(weighted.importance, kind)
+    value, gradient = weighted.log_density_and_gradient(points, 0.1)
+    expected, slope = plain.log_density_and_gradient(points, 0.1)
+    assert np.allclose(value - expected, np.log(7.0), atol=1e-6)
+    assert np.allclose(gradient, slope, rtol=1e-5, atol=1e-5 * np.abs(slope).max())
+    assert np.allclose(weighted.log_proximity(points) - plain.log_proximity(points), np.log(7.0), atol=1e-6)
+    assert weighted.log_peak - plain.log_peak == pytest.approx(np.log(7.0), abs=1e-6)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_gradient_is_that_of_finite_differences(case):
+    make, visibility, _ = CASES[case]
+    target = built(make, visibility, ball(sideways))
+    assert is_weighted(make(ball(sideways)))
+    points = SPACE.sample(400, np.random.default_rng(2))
+    points = points[target.log_density(points, 0.1) > -30]
+    _, gradient = target.log_density_and_gradient(points, 0.1)
+    unweighted = replace(target, importance=None)
+    _, plain = unweighted.log_density_and_gradient(points, 0.1)
+    step = 1e-4
+    for dimension in (1, 3, 5):  # the elevation is in the chart as its sine
+        moved = np.zeros(6)
+        moved[dimension] = step
+        sides = [t.log_density(points + sign * moved, 0.1) for sign in (1, -1) for t in (target, unweighted)]
+        # of the weights alone: silhouettes, which visibility's gradient leaves out, are in both
+        slope = (sides[0] - sides[2]) / (2 * step) - (sides[1] - sides[3]) / (2 * step)
+        apart = np.abs(slope - (gradient - plain)[:, dimension])
+        assert np.median(apart) < 0.02
+        assert np.quantile(apart, 0.9) < 0.15  # kinks between cells
+
+
+@pytest.mark.parametrize("visibility", ["off", "raycast", "quadrature"])
+def test_where_one_scene_is_all_there_is_the_density_grows_by_the_weight_of_the_nearest_point(visibility):
+    # linear on a flat plate, so trilinear values are exact
+    plate = trimesh.creation.box((0.1, 1.0, 1.0)).subdivide_loop(0)
+    vertices = np.asarray(plate.vertices)
+    weights = np.exp(2.0 * vertices[:, 1] - vertices[:, 2])
+    pose = rigid(translation_m=(1.5, 0, 0))
+    scenes = [Scene((Body(Mesh(vertices, plate.faces, importance=w), poses=pose),)) for w in (None, weights)]
+    plain, weighted = (build_target([scene], SPACE, SETTINGS, visibility) for scene in scenes)
+    points = SPACE.sample(2000, np.random.default_rng(3))
+    observed = observed_point(points)
+    in_front = (np.abs(observed[:, 1:]) < 0.4).all(axis=1) & (observed[:, 0] > 1.2) & (observed[:, 0] < 1.45)
+    assert in_front.sum() > 50
+    found = (weighted.log_density(points) - plain.log_density(points))[in_front]
+    assert np.allclose(found, 2.0 * observed[in_front, 1] - observed[in_front, 2], atol=1e-5)
+
+
+def test_where_one_scene_dominates_the_density_grows_by_its_weight_alone():
+    near, far = (Body(Sphere(0.2), poses=rigid(translation_m=(1.2, y, 0))) for y in (-0.3, 0.3))
+    plain = build_target([Scene((near,)), Scene((far,))], SPACE, SETTINGS, "off")
+    weighted = build_target([Scene((replace(near, importance=5.0),)), Scene((far,))], SPACE, SETTINGS, "off")
+    points = SPACE.sample(4000, np.random.default_rng(4))
+    change = weighted.log_density(points) - plain.log_density(points)
+    share = np.exp(
+        build_target([Scene((near,))], SPACE, SETTINGS, "off").log_density(points) - plain.log_density(points)
+    )
+    # log(1 + 4 share), whatever the share
+    assert np.allclose(change, np.log1p(4 * np.minimum(share, 1.0)), atol=1e-5)
+    assert (change > np.log(5.0) - 0.001).sum() > 100
+    assert (change < 0.001).sum() > 100
+
+
+def test_moving_frames_count_as_a_naive_sum_over_all_of_them_does():
+    scenes = moving(ball(sideways), count=4)
+    target = build_target(scenes, SPACE, SETTINGS, "off")
+    points = SPACE.sample(300, np.random.default_rng(5))
+    terms = []
+    for scene in scenes:
+        for frame in range(scene.frames):
+            alone = Scene((replace(scene.bodies[0], poses=scene.bodies[0].pose(frame)[None].repeat(2, axis=0)),))
+            one = build_target([alone], SPACE, SETTINGS, "off")
+            assert one.columns == 2
+            terms.append(one.log_density(points) - np.log(scene.frames))
+    naive = logsumexp(np.stack(terms, axis=1), axis=1)
+    near = naive > -12
+    assert near.sum() > 50
+    assert np.allclose(target.log_density(points)[near], naive[near], atol=1e-5)
+
+
+def test_a_scene_far_off_that_counts_a_million_times_is_not_left_out():
+    near = Scene((Body(Sphere(0.2), poses=rigid(translation_m=(1.0, 0, 0)), importance=1 / LARGEST_WEIGHT),))
+    far = Scene((Body(Sphere(0.2), poses=rigid(translation_m=(1.4, 0, 0)), importance=LARGEST_WEIGHT),))
+    both = build_target([near, far], SPACE, SETTINGS, "off")
+    parts = [build_target([scene], SPACE, SETTINGS, "off") for scene in (near, far)]
+    points = SPACE.sample(2000, np.random.default_rng(6))
+    naive = np.logaddexp(*(part.log_density(points) for part in parts))
+    assert np.allclose(both.log_density(points), naive, atol=1e-6)
+    assert (naive > parts[0].log_density(points) + 5).sum() > 100
+
+
+@pytest.mark.parametrize("visibility", ["off", "quadrature"])
+def test_the_target_on_a_device_counts_the_same(visibility):
+    scenes = at_rest(ball(sideways))
+    scenes = [replace(s, bodies=(s.bodies[0], replace(s.bodies[0], role="occluder"))) for s in scenes]
+    host = replace(build_target(scenes, SPACE, SETTINGS, visibility), surface_tolerance_nats=300.0)
+    device = on_device(host, torch.device("cpu"))
+    assert isinstance(device, DeviceTarget)
+    coordinates = Coordinates(SPACE)
+    unit = 2 * torch.rand(300, len(SPACE.free), generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 1
+    for few in (False, True):
+        found = []
+        for target in (host, device):
+            target = target.drawn(np.array([0, 2])) if few else target
+            leaf = unit.clone().requires_grad_(True)
+            values = log_target(leaf, target, coordinates, 0.1)
+            values.sum().backward()
+            found.append((values.detach().numpy(), leaf.grad.numpy()))
+        assert np.allclose(found[0][0], found[1][0], atol=1e-4)
+        assert np.allclose(found[0][1], found[1][1], atol=1e-3 * np.abs(found[0][1]).max())
+
+
+@pytest.mark.parametrize("make", [at_rest, moving])
+def test_a_few_drawn_columns_estimate_the_weighted_density(make):
+    target = built(make, "off", ball(sideways))
+    points = SPACE.sample(300, np.random.default_rng(7))
+    every = np.arange(target.columns)
+    assert np.allclose(target.drawn(every).log_density(points), target.log_density(points), atol=1e-9)
+    singles = np.stack([target.drawn(every[[c]]).log_density(points) for c in every], axis=1)
+    naive = logsumexp(singles - np.log(len(every)), axis=1)
+    assert np.allclose(naive, target.log_density(points), atol=1e-5)
+
+
+def test_plain_interpolation_and_compiled_loops_give_the_same_weights():
+    scenes = at_rest(ball(sideways))
+    compiled, plain = (build_target(scenes, SPACE, SETTINGS, "off", compiled=c).importance for c in (True, False))
+    points = np.random.default_rng(8).uniform(-1, 3, (500, 3))
+    assert np.allclose(compiled.values(points), plain.values(points), atol=1e-5)
+
+
+def test_weights_beyond_their_grid_are_those_at_its_faces_and_have_no_slope_across():
+    weights = build_target(at_rest(ball(sideways), count=1), SPACE, SETTINGS, "off").importance
+    high = weights.grid.low + weights.grid.step * (weights.grid.counts - 1)
+    inside = np.array([[high[0], 0.1, 0.1]])
+    beyond = inside + np.array([5.0, 0, 0])
+    assert np.array_equal(weights.values(inside), weights.values(beyond))
+    assert weights.gradient(beyond, np.ones((1, 1)))[0, 0] == 0.0
+
+
+def test_grids_of_weights_are_those_of_the_nearest_point_of_the_surface():
+    mesh = ball(sideways)
+    grid = grid_around(mesh.bounds_m, 12, 0.05)
+    found, points = log_weight_grid(mesh, grid), grid.points()
+    triangles = mesh.vertices[mesh.faces]
+    pairs = np.repeat(triangles[None], len(points), axis=0).reshape(-1, 3, 3), np.repeat(points, len(triangles), axis=0)
+    closest = trimesh.triangles.closest_point(*pairs).reshape(len(points), -1, 3)
+    every = np.linalg.norm(closest - points[:, None], axis=2)
+    face, rows = every.argmin(axis=1), np.arange(len(points))
+    closest, distance = closest[rows, face], every[rows, face]
+    # on a ball the nearest point of everything within the band is defined well but at its centre
+    near = distance < 2.5 * grid.step
+    shares = barycentric(closest, mesh.vertices[mesh.faces[face]])
+    exact = np.einsum("nk,nk->n", shares, np.log(mesh.importance)[mesh.faces[face]])
+    assert near.sum() > 200
+    assert np.allclose(found[near], exact[near], atol=1e-5)
+    assert np.abs(found - exact)[distance < 6 * grid.step].max() < 0.5  # filled beyond the band
+
+
+def test_two_weights_on_one_geometry_are_two_grids(tmp_path, monkeypatch):
+    monkeypatch.setenv("LIDARDESIGN_CACHE", str(tmp_path))
+    shapes = [ball(), ball(sideways), ball(lambda v: 2 * sideways(v))]
+    assert len({shape.content_hash for shape in shapes}) == 1
+    points = SPACE.sample(200, np.random.default_rng(9))
+    for make in (at_rest, moving):
+        first = [build_target(make(shape), SPACE, SETTINGS, "off").log_density(points) for shape in shapes]
+        again = [build_target(make(shape), SPACE, SETTINGS, "off").log_density(points) for shape in shapes]
+        assert np.array_equal(first, again)
+        assert np.allclose(first[2] - first[1], np.log(2), atol=1e-5)
+        assert np.abs(first[1] - first[0]).max() > 0.5
+        two = moving(shapes[1], count=1)[0].bodies[0], moving(shapes[2], count=1)[0].bodies[0]
+        both = build_target([Scene((two[0],)), Scene((two[1],))], SPACE, SETTINGS, "off").log_density(points)
+        alone = build_target([Scene((two[0],))], SPACE, SETTINGS, "off").log_density(points)
+        assert np.allclose(both - alone, np.log(3), atol=1e-5)
+
+
+@pytest.mark.parametrize("make", [at_rest, moving])
+@pytest.mark.parametrize("factor", [1e-5, 1e5])
+def test_independent_proposals_find_surfaces_however_little_they_count(make, factor):
+    space = DesignSpace((0, 0, 0, -0.5, 0, 0.3), (0, 0, 0, 0.5, 0, 2.2))
+    scenes = make(Sphere(0.3) if make is moving else ball(), factor)
+    target = build_target(scenes, space, SETTINGS, "off")
+    points, log_density = independent_points(target, scenes, 500, np.random.default_rng(10))
+    assert len(points) == 500
+    assert np.isfinite(log_density).all()
+
+
+@pytest.mark.parametrize("make", [at_rest, moving])
+def test_independent_proposals_measure_log_z_of_the_weighted_density(make):
+    factors = [3.0, 1.0, 0.2]
+    scenes = make(Sphere(0.3))
+    weighted = [
+        replace(s, bodies=(replace(s.bodies[0], importance=f), SCREEN)) for s, f in zip(scenes, factors, strict=True)
+    ]
+    log_z = []
+    for some in (scenes, weighted, *([s] for s in scenes)):
+        target = build_target(some, SPACE, SETTINGS, "off")
+        uniform = SPACE.sample(60_000, np.random.default_rng(11))
+        log_z.append(float(logsumexp(target.log_density(uniform))))
+    parts = np.array(log_z[2:])
+    assert log_z[0] == pytest.approx(float(logsumexp(parts)), abs=1e-6)
+    assert log_z[1] == pytest.approx(float(logsumexp(parts + np.log(factors))), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("weights", "words"),
+    [
+        (np.ones(5), "shape"),
+        (np.zeros(162), "importance is 0"),
+        (np.full(162, -1.0), "importance is -1"),
+        (np.full(162, np.nan), "importance is nan"),
+        (np.full(162, 1e9), "1e-06 to 1e"),
+    ],
+)
+def test_weights_that_are_none_are_refused_with_what_is_allowed(weights, words):
+    with pytest.raises(DataError) as refused:
+        ball(lambda _: weights)
+    assert words in str(refused.value)
+
+
+@pytest.mark.parametrize("importance", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_body_that_counts_nothing_is_refused(importance):
+    with pytest.raises(DataError, match="importance"):
+        Body(Sphere(1.0), importance=importance)
+
+
+def test_a_mesh_in_another_pose_counts_as_before():
+    mesh = ball(sideways)
+    moved = mesh.transformed(rigid(translation_m=(1, 2, 3)))
+    assert np.array_equal(moved.importance, mesh.importance)
+    assert moved.importance_hash == mesh.importance_hash != ball().importance_hash == ""
+
+
+PATCH = trimesh.creation.box((0.02, 0.3, 0.3))
+PATCHES = DesignSpace((0, 0, 0, -0.5, -0.2, 0.6), (0, 0, 0, 0.5, 0.2, 1.4))
+
+
+class PatchesTask:
+    """Two equal patches side by side, of which the left one counts three times as much."""
+
+    name, summary, api_version = "patches", "two patches", 1
+    Config = TaskConfig
+    metric = Metric("hits", "-", "higher", 0.0, 0.0)
+    defaults = Defaults()
+
+    def space(self, config):
+        return PATCHES
+
+    def scenes(self, config, split, seed):
+        mesh = Mesh(PATCH.vertices, PATCH.faces)
+        heavy = replace(mesh, importance=np.full(len(mesh.vertices), 3.0))
+        poses = [rigid(translation_m=(1.0, y, 0)) for y in (0.25, -0.25)]
+        return [Scene((Body(heavy, poses=poses[0]), Body(mesh, poses=poses[1])))]
+
+    def score(self, scene, returns):
+        raise NotImplementedError
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    run = tmp_path_factory.mktemp("patches")
+    settings = LearningSettings(
+        steps=300, batch=256, layers=2, hidden=24, bins=12, samples=20_000, balance_proposals=8192, balance=0.6,
+        coverage_proposals=2048,
+    )  # fmt: skip
+    config = RunConfig(
+        task_name="patches", seed=shifted(1), preset="draft", task=TaskConfig(), space=PATCHES,
+        density=DensitySettings(sigma_m=0.03, field_resolution=48), learning=settings,
+    )  # fmt: skip
+    return learn(PatchesTask(), config, run), load_samples(run), config
+
+
+def test_a_patch_that_counts_three_times_gets_three_times_the_mass(learned):
+    result, samples, _ = learned
+    left = samples.points[:, 3] > 0
+    weighted = float(samples.weights[left].sum())
+    error = float(np.sqrt(np.square(samples.weights * (left - weighted)).sum()))
+    assert abs(weighted - 0.75) < 4 * error
+    assert error < 0.01
+    # and the flow itself, by no more than it has in the wrong place
+    assert abs(left.mean() - 0.75) < result.misplaced + 4 * np.sqrt(0.75 * 0.25 / len(left))
+
+
+def test_what_a_density_is_worth_is_measured_against_the_weighted_target(learned):
+    result, samples, config = learned
+    scenes = PatchesTask().scenes(config.task, "train", 1)
+    target = prepare_target(scenes, config, visibility="off")[0]
+    uniform = PATCHES.sample(400_000, np.random.default_rng(12))
+    values = np.exp(target.log_density(uniform))
+    log_z = np.log(values.mean()) + PATCHES.log_volume
+    error = values.std() / values.mean() / np.sqrt(len(values)) + result.error_estimates["log_z"].error
+    assert abs(result.log_z - log_z) < 4 * error
+    plain = replace(target, importance=None).log_density(samples.points)
+    assert np.allclose(samples.log_target, target.log_density(samples.points), atol=1e-6)
+    # left of the middle all that is near the left patch counts three times
+    sure = np.abs(samples.points[:, 3]) > 0.1
+    grown = (samples.log_target - plain)[sure]
+    assert np.allclose(grown, np.where(samples.points[sure, 3] > 0, np.log(3.0), 0.0), atol=0.01)
+    assert result.ess > 0.8
+    assert result.coverage > 0.97
+
+
+def test_samples_of_the_plain_density_reweighted_are_those_of_the_weighted_one(learned):
+    _, samples, config = learned
+    scenes = PatchesTask().scenes(config.task, "train", 1)
+    target = prepare_target(scenes, config, visibility="off")[0]
+    factors = replace(target, importance=None).log_density(samples.points) - target.log_density(samples.points)
+    back = samples.reweighted(factors)
+    share = float(back.weights[back.points[:, 3] > 0].sum())
+    assert share == pytest.approx(0.5, abs=0.02)
+    # shares of 3/4 and 1/4 weighted to halves: ESS = 1 / sum (1/2)^2 / share
+    halves = np.array([0.75, 0.25])
+    expected = 1.0 / (np.square(0.5 / halves) * halves).sum()
+    assert back.effective_sample_size == pytest.approx(expected * samples.effective_sample_size, abs=0.06)
+
+
+def test_settings_that_only_weigh_do_not_keep_designs_from_being_judged_together():
+    task = FaceTask()
+    plain, weighed, elsewhere = (FaceConfig(**keys) for keys in ({}, {"area_exponent": 0.5}, {"distance_m": 0.5}))
+    assert judged_by_keys(task, plain) == judged_by_keys(task, weighed)
+    assert judged_by_keys(task, plain) != judged_by_keys(task, elsewhere)
+    assert set(task.weighing_keys) < set(FaceConfig.model_fields)

@@ -1,0 +1,293 @@
+"""Learning: the same bytes for the same seed, also after interruptions; divergence, damage and misuse end clearly."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from support.small_runs import shifted
+
+from lidardesign.config import DensitySettings, LearningSettings, RunConfig
+from lidardesign.density import learn as learning
+from lidardesign.density.learn import learn
+from lidardesign.density.target.prepare import prepare_target
+from lidardesign.density.training import training
+from lidardesign.density.training import training_data as ground
+from lidardesign.density.training.checkpoint import save_arrays
+from lidardesign.density.training.quality import log_density_of
+from lidardesign.density.training.training_data import prepare_ground
+from lidardesign.errors import ConfigError, DataError, PluginError
+from lidardesign.samples import load_samples
+from lidardesign.scene import Body, Scene, Sphere, rigid
+from lidardesign.space import DesignSpace
+from lidardesign.task import Defaults, Metric, TaskConfig
+
+SPACE = DesignSpace((0, 0, 0, -0.4, 0, 0.2), (0, 0, 0, 0.4, 0, 2.5))
+SMALL = {
+    "steps": 120, "batch": 48, "layers": 1, "hidden": 12, "bins": 8, "samples": 2000, "balance_proposals": 512,
+    "coverage_proposals": 512, "checkpoint_seconds": 1e-9,
+}  # fmt: skip
+
+
+class BallTask:
+    """One ball in front of the sensor."""
+
+    name, summary, api_version = "ball", "one ball", 1
+    Config = TaskConfig
+    metric = Metric("hits", "-", "higher", 0.0, 0.0)
+    defaults = Defaults()
+
+    def space(self, config):
+        return SPACE
+
+    def scenes(self, config, split, seed):
+        return [Scene((Body(Sphere(0.5), poses=rigid(translation_m=(1.5, 0, 0))),))]
+
+    def score(self, scene, returns):
+        raise NotImplementedError
+
+
+def config_of(space=SPACE, seed=3, **settings):
+    return RunConfig(
+        task_name="ball", seed=shifted(seed), preset="draft", task=TaskConfig(), space=space,
+        density=DensitySettings(sigma_m=0.05), learning=LearningSettings(**{**SMALL, **settings}),
+    )  # fmt: skip
+
+
+def result_bytes(run):
+    return (run / "flow.safetensors").read_bytes(), (run / "samples.npz").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    run = tmp_path_factory.mktemp("finished")
+    return run, learn(BallTask(), config_of(), run)
+
+
+class Interrupter:
+    """A progress callback that presses Ctrl-C at a step."""
+
+    def __init__(self, step):
+        self.step = step
+
+    def __call__(self, progress):
+        if progress.step == self.step:
+            raise KeyboardInterrupt
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(finished, tmp_path):
+    run, _ = finished
+    (tmp_path / "same").mkdir()
+    learn(BallTask(), config_of(), tmp_path / "same")
+    assert result_bytes(tmp_path / "same") == result_bytes(run)
+    (tmp_path / "other").mkdir()
+    learn(BallTask(), config_of(seed=4), tmp_path / "other")
+    assert result_bytes(tmp_path / "other")[0] != result_bytes(run)[0]
+
+
+@pytest.mark.parametrize("step", [10, 50, 90, 110])
+def test_a_resumed_run_is_an_uninterrupted_run_bit_for_bit(finished, tmp_path, step):
+    with pytest.raises(KeyboardInterrupt):
+        learn(BallTask(), config_of(), tmp_path, progress=Interrupter(step))
+    assert not (tmp_path / "flow.safetensors").exists()
+    result = learn(BallTask(), config_of(), tmp_path, resume=True)
+    assert result_bytes(tmp_path) == result_bytes(finished[0])
+    assert result.steps == 120
+    rows = [json.loads(line) for line in (tmp_path / "progress.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == list(range(10, 121, 10))
+
+
+def test_proposals_on_the_faces_of_the_space_are_inside_the_flows_box(monkeypatch):
+    # the space counts what is outside by rounding as inside; the flow's density would be 0 there
+    points = np.array([[0, 0, 0, 0.4 + 1e-10, 0, 1.0], [0, 0, 0, 0.1, 0, 0.2 - 1e-10]])
+    monkeypatch.setattr(ground, "independent_points", lambda *_: (points, np.zeros(2)))
+    pool = prepare_ground(BallTask(), config_of()).pool
+    assert SPACE.contains(points).all()
+    assert float(pool.unit.abs().max()) == 1.0
+
+
+def a_trainer(run):
+    config = config_of()
+    return learning.make_trainer(prepare_ground(BallTask(), config), config, run, torch.device("cpu"))
+
+
+def test_weights_taken_back_to_the_start_forget_the_moments_of_later_steps(tmp_path):
+    trainer = a_trainer(tmp_path)
+    start = trainer._state_arrays()
+    trainer._advance()
+    assert len(trainer._state_arrays()) > len(start)
+    trainer._restore_arrays(start, with_generator=True)
+    taken_back = trainer._state_arrays()
+    assert taken_back.keys() == start.keys()
+    for name, value in start.items():
+        np.testing.assert_array_equal(taken_back[name], value)
+
+
+@pytest.mark.filterwarnings("ignore:for .* copying from a non-meta parameter")
+def test_all_of_the_optimisers_state_comes_back_on_the_device_of_its_parameter(tmp_path):
+    trainer = a_trainer(tmp_path)
+    trainer._advance()
+    arrays = trainer._state_arrays()
+    # no values, but a device that is not the CPU on every computer
+    trainer.flow.to("meta")
+    trainer.optimiser.state.clear()
+    trainer._restore_arrays(arrays)
+    kept = [value for state in trainer.optimiser.state.values() for value in state.values()]
+    assert kept
+    assert {value.device.type for value in kept} == {"meta"}
+
+
+def test_resuming_a_finished_run_changes_nothing(finished, tmp_path):
+    learn(BallTask(), config_of(), tmp_path)
+    before = result_bytes(tmp_path)
+    learn(BallTask(), config_of(), tmp_path, resume=True)
+    assert result_bytes(tmp_path) == before
+
+
+def test_the_result_has_sensible_figures_and_files(finished):
+    run, result = finished
+    assert 0 < result.ess <= 1
+    assert result.kl_nats >= 0
+    assert 0 <= result.coverage <= 1
+    assert math.isfinite(result.log_z)
+    samples = load_samples(run)
+    assert len(samples) == 2000
+    assert SPACE.contains(samples.points).all()
+    assert samples.effective_sample_size == pytest.approx(result.ess, rel=1e-9)
+    assert samples.log_prob.dtype == samples.log_target.dtype == np.float64
+    assert (samples.points[:, [0, 1, 2, 4]] == 0).all()
+
+
+def test_progress_rows_are_valid_and_complete(finished):
+    rows = [json.loads(line) for line in (finished[0] / "progress.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == list(range(10, 121, 10))
+    for row in rows:
+        assert set(row) >= {"step", "loss", "ess", "sigma_m", "rate", "skipped", "seconds"}
+        assert 0 < row["ess"] <= 1
+    sigmas = [row["sigma_m"] for row in rows]
+    assert sigmas == sorted(sigmas, reverse=True)
+    assert sigmas[-1] == pytest.approx(0.05)
+
+
+def test_an_analytic_scene_is_learned_well(tmp_path):
+    settings = {"steps": 250, "batch": 256, "layers": 2, "hidden": 32, "samples": 10_000, "checkpoint_seconds": 100.0}
+    # the ball fills the space: with an angle fixed, no proposal meets the rim of a silhouette
+    space = replace(SPACE, low=(0, 0, 0, -0.25, 0, 0.2), high=(0, 0, 0, 0.25, 0, 2.5))
+    config = config_of(space, **settings)
+    result = learn(BallTask(), config, tmp_path)
+    assert result.ess > 0.4
+    assert result.kl_nats < 1.0  # leaked samples of so short a training make most of it
+    assert result.coverage > 0.9
+    # log Z by plain Monte Carlo over the box
+    points = space.sample(100_000, np.random.default_rng(0))
+    target, _ = prepare_target(BallTask().scenes(None, "train", 0), config)
+    plain = math.log(np.exp(target.log_density(points)).mean()) + space.log_volume
+    assert result.log_z == pytest.approx(plain, abs=0.1)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_samples_carry_the_density_that_the_flow_has_there(tmp_path, monkeypatch, dtype):
+    kept = {}
+    measure = learning.measure
+
+    def keep(trainer, *rest):
+        kept["trainer"] = trainer
+        return measure(trainer, *rest)
+
+    monkeypatch.setattr(learning, "measure", keep)
+    learn(BallTask(), config_of(dtype=dtype), tmp_path)
+    samples = load_samples(tmp_path).subset(np.arange(500))
+    again = log_density_of(kept["trainer"], samples.points)
+    np.testing.assert_allclose(again, samples.log_prob, atol=1e-6)
+    outside = samples.points + np.array([0, 0, 0, 0, 0, 5.0])
+    assert (log_density_of(kept["trainer"], outside) == -np.inf).all()
+
+
+def test_a_conditioned_dimension_stays_uniform(tmp_path):
+    space = DesignSpace((-0.3, 0, 0, -0.4, 0, 0.2), (0.3, 0, 0, 0.4, 0, 2.5), condition=("x_m",))
+    result = learn(BallTask(), config_of(space), tmp_path)
+    x = load_samples(tmp_path).points[:, 0]
+    counts = np.histogram(x, bins=10, range=(-0.3, 0.3))[0]
+    assert np.abs(counts - 200).max() < 4 * math.sqrt(200)
+    assert 0 < result.ess <= 1
+    assert result.coverage > 0
+
+
+def test_entropy_is_annealed_away_without_harm(tmp_path):
+    result = learn(BallTask(), config_of(entropy=0.5), tmp_path)
+    assert math.isfinite(result.kl_nats)
+
+
+def damage_truncate(path):
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def damage_flip(path):
+    content = bytearray(path.read_bytes())
+    content[-50] ^= 1
+    path.write_bytes(bytes(content))
+
+
+def damage_pickle(path):
+    path.write_bytes(b"\x80\x04\x95" + bytes(500))
+
+
+def damage_foreign(path):
+    save_arrays(path.parent, path.name, {"flow.other": np.zeros(3), "generator": np.zeros(8, np.uint8)}, {"step": 1})
+
+
+def damage_missing(path):
+    path.unlink()
+
+
+@pytest.mark.parametrize("damage", [damage_truncate, damage_flip, damage_pickle, damage_foreign, damage_missing])
+def test_a_damaged_checkpoint_is_a_data_error_that_names_it(tmp_path, damage):
+    with pytest.raises(KeyboardInterrupt):
+        learn(BallTask(), config_of(), tmp_path, progress=Interrupter(60))
+    damage(tmp_path / training.CHECKPOINT)
+    with pytest.raises(DataError, match="checkpoint") as caught:
+        learn(BallTask(), config_of(), tmp_path, resume=True)
+    assert caught.value.exit_code == 3
+
+
+def test_a_checkpoint_of_another_size_of_flow_is_a_data_error(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        learn(BallTask(), config_of(), tmp_path, progress=Interrupter(60))
+    with pytest.raises(DataError, match="another flow"):
+        learn(BallTask(), config_of(hidden=24), tmp_path, resume=True)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
+def test_cuda_where_there_is_none_and_unknown_devices_are_config_errors(tmp_path):
+    for device in ("cuda", "tpu"):
+        with pytest.raises(ConfigError, match="--device"):
+            learn(BallTask(), config_of(), tmp_path, device=device)
+
+
+def test_a_task_that_raises_is_a_plugin_error_and_one_without_scenes_a_data_error(tmp_path):
+    class Broken(BallTask):
+        def scenes(self, config, split, seed):
+            raise RuntimeError("no scenes today")
+
+    with pytest.raises(PluginError, match="no scenes today"):
+        learn(Broken(), config_of(), tmp_path)
+
+    class Empty(BallTask):
+        def scenes(self, config, split, seed):
+            return []
+
+    with pytest.raises(DataError, match="no training scenes"):
+        learn(Empty(), config_of(), tmp_path)
+
+
+def test_spaces_that_see_nothing_or_have_nothing_to_learn_are_refused(tmp_path):
+    away = replace(SPACE, low=(0, 0, 0, 2.0, 0, 0.2), high=(0, 0, 0, 3.0, 0, 2.5))
+    with pytest.raises(DataError, match="no ray of the design space reaches"):
+        learn(BallTask(), config_of(away), tmp_path)
+    fixed = replace(SPACE, low=(0, 0, 0, 0, 0, 1.0), high=(0, 0, 0, 0, 0, 1.0))
+    with pytest.raises(ConfigError, match="every dimension"):
+        learn(BallTask(), config_of(fixed), tmp_path)

@@ -1,0 +1,783 @@
+"""Real parts: what their files say, where their rays go, and how they stand in the design space."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.command_line import caller, make_run
+
+from lidardesign.design.catalog.library import FOLDER, find_part, load_library
+from lidardesign.design.catalog.part import Part, conditions_of, disagreements, thinned, to_angles, to_directions
+from lidardesign.design.catalog.placing import (
+    Pose,
+    boresight_of,
+    covered,
+    interleaved,
+    looking_at,
+    part_design,
+    part_rays,
+    part_sensor,
+    parts_for,
+    side_by_side,
+)
+from lidardesign.design.catalog.statements import FIELDS, PartFile, Statement
+from lidardesign.design.files import SCHEMA_FILE, design_document, design_from_document, load_design, save_design
+from lidardesign.design.layouts.grid import grid_rows
+from lidardesign.design.layouts.rays import lay_out
+from lidardesign.design.sensor import boresight_frame, fitted_layout
+from lidardesign.errors import ConfigError
+from lidardesign.run.validation import check_model
+from lidardesign.run.yaml import parse_yaml
+from lidardesign.space import angles, direction
+
+LIBRARY = load_library()
+PARTS = {part.name: part for part in LIBRARY.every_mode()}
+ZONES = ("vl53l5cx", "vl53l5cx:4x4", "vl53l7cx", "vl53l8cx", "tmf8820", "tmf8820:wide", "tmf8821:3x6", "tmf8828")
+SOME = ("vl53l8cx", "tmf8820:wide", "vlp-16", "hdl-64e", "tim781", "mid-40", "mid-360", "ml30s", "azure-kinect")
+ANGLE = st.floats(-math.pi, math.pi)
+ELEVATION = st.floats(-math.pi / 2, math.pi / 2)
+OWN = """
+schema_version: 1
+maker: Us
+product: Homemade
+kind: multi-zone
+summary: A ranger of our own.
+sources:
+  bench: {title: Our bench, kind: measurement}
+pattern:
+  - {kind: zones, columns: 3, rows: 2, source: bench}
+field_of_view_deg:
+  - {azimuth: [-15, 15], elevation: [-10, 10], source: bench}
+near_m:
+  - {value: 0.1, source: bench}
+far_m:
+  - {value: 2.5, source: bench, reflectance_percent: 50, illuminance_klux: 1}
+  - {value: 1.5, source: bench, reflectance_percent: 10, illuminance_klux: 1}
+rate_hz:
+  - {value: 20, source: bench}
+"""
+
+
+@pytest.fixture
+def own(tmp_path):
+    path = tmp_path / "homemade.yaml"
+    path.write_text(OWN)
+    return path
+
+
+@pytest.fixture
+def call(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+def some_pose(seed: int = 1) -> Pose:
+    values = np.random.default_rng(seed).uniform(-1, 1, 6)
+    return Pose(values[:3], *(values[3:] * [3, 1.4, 3]))
+
+
+# what the files say
+
+
+def test_more_than_twenty_parts_are_shipped_and_all_that_were_asked_for():
+    asked = {
+        "vl53l5cx", "vl53l7cx", "vl53l8cx", "vl53l1x", "tmf8820", "tmf8821", "tmf8828", "vlp-16", "hdl-64e", "os0-128",
+        "os1-128", "xt32", "mid-40", "tim781",
+    }  # fmt: skip
+    assert asked <= set(LIBRARY.names)
+    assert len(LIBRARY.names) >= 40
+
+
+@pytest.mark.parametrize("name", LIBRARY.names)
+def test_every_source_of_a_part_is_used_and_every_statement_has_one(name):
+    file = LIBRARY.files[name]
+    modes = list(file.modes) or [None]
+    used = {one.source for mode in modes for statements in file.figures(mode).values() for one in statements}
+    assert used == set(file.sources)
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_the_rays_of_a_part_are_unit_vectors_inside_its_field_and_as_many_as_it_says(name):
+    part = PARTS[name]
+    assert np.allclose(np.linalg.norm(part.directions, axis=1), 1, atol=1e-12)
+    assert part.inside(part.directions).all()
+    assert len(part.directions) == part.rays
+    assert len(np.unique(np.round(part.directions, 9), axis=0)) == part.rays
+    columns, rows = part.grid
+    assert columns * rows >= part.rays > (columns - 1) * (rows - 1)
+
+
+@pytest.mark.parametrize("name", [name for name, part in PARTS.items() if part.value("points_per_s")])
+def test_rays_and_frames_make_the_points_per_second_that_the_maker_states(name):
+    part = PARTS[name]
+    assert part.rays * part.rate_hz == pytest.approx(part.value("points_per_s"), rel=0.001)
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_a_part_fills_its_field_up_to_one_cell(name):
+    part = PARTS[name]
+    if part.rays == 1:
+        return
+    reached = np.degrees(np.ptp(to_angles(part.projection, part.directions), axis=0))
+    for width, found, cells in zip(np.degrees(part.field_of_view_rad), reached, part.grid, strict=True):
+        # rosettes and pixels are not even: their outermost cells are wider or reached only now and then
+        assert found <= width + 1e-9
+        assert found >= width * (1 - 2.5 / max(cells, 2.6)) - 1e-9
+
+
+def test_zones_stand_at_the_centres_of_their_cells_never_on_the_edge():
+    tangent = np.degrees(to_angles("tangent", PARTS["vl53l5cx"].directions))
+    assert tangent[:, 0].max() == pytest.approx(19.6875)
+    assert np.unique(np.round(np.diff(np.unique(np.round(tangent[:, 0], 9))), 6)) == pytest.approx([5.625])
+
+
+def test_beams_of_a_spinning_scanner_include_the_ends_and_its_columns_do_not_repeat():
+    azimuth, elevation = to_angles("sphere", PARTS["vlp-16"].directions).T
+    assert np.unique(np.round(np.degrees(elevation), 9)) == pytest.approx(np.arange(-15, 16, 2))
+    columns = np.unique(np.round(np.degrees(azimuth), 9))
+    assert len(columns) == 1800
+    assert np.ptp(np.diff(columns)) < 1e-6
+    assert columns[0] + 360 - columns[-1] == pytest.approx(0.2)
+
+
+def test_a_sweep_of_less_than_a_turn_has_its_ends():
+    azimuth = np.degrees(to_angles("sphere", PARTS["tim781"].directions)[:, 0])
+    assert (azimuth.min(), azimuth.max()) == pytest.approx((-135, 135))
+    assert np.diff(np.sort(azimuth)) == pytest.approx(1 / 3)
+
+
+def test_pixels_are_even_on_the_focal_plane():
+    forward, left, up = PARTS["azure-kinect"].directions.T
+    for across, count, half_deg in ((left / forward, 320, 37.5), (up / forward, 288, 32.5)):
+        steps = np.diff(np.unique(np.round(across, 9)))
+        assert len(steps) == count - 1
+        assert steps == pytest.approx(2 * math.tan(math.radians(half_deg)) / count, rel=1e-4)
+
+
+def test_a_rosette_is_the_sum_of_two_turning_deflections():
+    pattern = PARTS["mid-40"].pattern
+    points = np.degrees(to_angles("tangent", PARTS["mid-40"].directions))
+    first, second = pattern.deflection_deg
+    radius = np.linalg.norm(points, axis=1)
+    assert radius.max() == pytest.approx(first + second, rel=1e-3)
+    assert radius.min() == pytest.approx(abs(first - second), abs=0.1)
+    time_s = np.arange(len(points)) / pattern.points_per_s
+    turned = points[:, 0] + 1j * points[:, 1]
+    for hertz, deflection in zip(pattern.rotor_hz, pattern.deflection_deg, strict=True):
+        # as a naive Fourier coefficient at the rotor's frequency; the other one leaks by what 0.1 s cannot part
+        assert abs((turned * np.exp(-2j * np.pi * hertz * time_s)).mean()) == pytest.approx(deflection, rel=0.05)
+
+
+def test_a_pattern_that_is_not_published_is_even_per_solid_angle():
+    elevation = to_angles("sphere", PARTS["mid-360"].directions)[:, 1]
+    low, high = np.sin(np.radians([-7, 52]))
+    for split in (0.1, 0.5, 0.8):
+        share = (np.sin(elevation) < low + split * (high - low)).mean()
+        assert share == pytest.approx(split, abs=0.002)
+
+
+def test_an_unpublished_pattern_in_a_round_field_is_even_over_its_disc(own):
+    text = OWN.replace("kind: zones, columns: 3, rows: 2", "kind: even, rays: 3000")
+    own.write_text(text.replace("elevation: [-10, 10]", "elevation: [-10, 10], shape: ellipse"))
+    part = find_part(own)
+    across, up = np.degrees(to_angles(part.projection, part.directions)).T
+    radius = np.hypot(across / 15, up / 10)
+    assert radius.max() <= 1
+    for inner in (0.3, 0.5, 0.9):
+        assert (radius < inner).mean() == pytest.approx(inner**2, abs=0.01)
+    assert (across > 0).mean() == pytest.approx(0.5, abs=0.01)
+    assert (up > 0).mean() == pytest.approx(0.5, abs=0.01)
+
+
+@pytest.mark.parametrize("projection", ["tangent", "sphere", "plane"])
+def test_angles_and_directions_undo_each_other(projection):
+    angle = np.random.default_rng(0).uniform(-1.2, 1.2, (200, 2))
+    assert np.allclose(to_angles(projection, to_directions(projection, angle)), angle, atol=1e-12)
+
+
+def test_a_camera_does_not_see_what_is_behind_it():
+    assert not PARTS["azure-kinect"].inside(np.array([[-1.0, 0, 0], [0, 1, 0]])).any()
+
+
+def test_histograms_and_processed_results_cost_what_their_bits_make():
+    tmf, vl53 = PARTS["tmf8820"], PARTS["vl53l5cx"]
+    assert tmf.histogram_mbps == pytest.approx(128 * 24 * 10 * 30 / 1e6)
+    assert tmf.processed_mbps is None
+    assert vl53.processed_mbps == pytest.approx((256 + 64 + 256 + 256 + 128 + 128 + 64 + 64 + 140) * 8 * 15 / 1e6)
+    assert vl53.histogram_mbps is None
+    # rays that are read as histograms cost far more than results that the part makes itself
+    assert PARTS["tmf8828"].histogram_mbps > 15 * vl53.processed_mbps
+
+
+# conditions and contradictions
+
+
+def test_sources_that_disagree_stay_visible():
+    assert set(disagreements(PARTS["vlp-16"])) >= {"near_m", "far_m", "noise_m", "wavelength_nm"}
+    assert disagreements(PARTS["ml30s"]) == ["field_of_view_deg"]
+    assert disagreements(PARTS["vl53l5cx"]) == []
+    # other conditions are no contradiction
+    assert "far_m" not in disagreements(PARTS["mid-40"])
+
+
+def test_one_source_with_several_figures_does_not_disagree_with_itself(own):
+    own.write_text(OWN.replace("  - {value: 0.1, source: bench}", "  - {value: 0.1, source: bench}\n" * 2))
+    assert disagreements(find_part(own)) == []
+    twice = "  - {value: 0.1, source: bench}\n  - {value: 0.2, source: bench}"
+    own.write_text(OWN.replace("  - {value: 0.1, source: bench}", twice))
+    assert disagreements(find_part(own)) == []
+    other = OWN.replace("  bench: {", "  list: {title: A list, kind: list}\n  bench: {")
+    own.write_text(
+        other.replace("  - {value: 0.1, source: bench}", twice.replace("0.2, source: bench", "0.2, source: list"))
+    )
+    assert disagreements(find_part(own)) == ["near_m"]
+
+
+def test_the_range_under_conditions_is_the_farthest_that_a_source_vouches_for():
+    part = PARTS["vl53l5cx"]
+    assert part.under(reflectance_percent=88, illuminance_klux=0).range_m == (0.02, 3.5)
+    assert part.under(reflectance_percent=50, illuminance_klux=2).range_m == (0.02, 0.8)
+    assert part.under(illuminance_klux=5).range_m == (0.02, 1.1)
+    assert part.under(reflectance_percent=50, illuminance_klux=2).rays == 64
+    assert len(part.under(illuminance_klux=5).figures["far_m"]) == len(part.figures["far_m"])
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.sampled_from(sorted(PARTS)), st.floats(0.1, 100), st.floats(0, 120), st.floats(1, 10), st.floats(0, 1))
+def test_darker_targets_and_more_light_never_lengthen_a_range(name, reflectance, klux, brighter, dimmer):
+    part = PARTS[name]
+    try:
+        hard = part.under(reflectance_percent=reflectance, illuminance_klux=klux)
+    except ConfigError:
+        return
+    easy = part.under(reflectance_percent=min(reflectance * brighter, 100), illuminance_klux=klux * dimmer)
+    assert easy.range_m[1] >= hard.range_m[1]
+    assert hard.range_m[1] in [one.value for one in part.figures["far_m"]]
+
+
+def test_conditions_that_no_source_states_are_refused_with_those_that_are():
+    with pytest.raises(ConfigError, match="no source of vl53l5cx states a range at 5 % reflectance") as caught:
+        PARTS["vl53l5cx"].under(reflectance_percent=5)
+    assert "17 % reflectance, darkness" in str(caught.value)
+    assert conditions_of(PARTS["tfmini-i"].figures["far_m"][0]) == "90 % reflectance, 70 klux"
+
+
+# placing
+
+
+@given(ANGLE, ELEVATION, ANGLE)
+def test_a_frame_gives_back_its_boresight(azimuth, elevation, roll):
+    frame = boresight_frame(azimuth, elevation, roll)
+    assert np.allclose(boresight_frame(*boresight_of(frame)), frame, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ZONES)
+def test_zones_are_the_even_grid_of_their_field_where_that_has_their_rows(name):
+    part = PARTS[name]
+    design = part_design(part, some_pose())
+    even = lay_out(replace(design, layout="grid", ray_table=None), part.rays)
+    own_rays = lay_out(design)
+    assert np.allclose(own_rays.gate_m, even.gate_m, atol=1e-12)
+    if part.grid[1] == len(grid_rows(*part.field_of_view_rad, part.rays)):
+        assert np.allclose(own_rays.direction, even.direction, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", SOME)
+def test_a_pose_moves_a_part_as_a_rigid_body(name):
+    part, pose = PARTS[name], some_pose()
+    here = part_rays(part, Pose(), min(part.rays, 60))
+    there = part_rays(part, replace(pose, origin_m=pose.origin_m), min(part.rays, 60))
+    assert np.allclose(there.origin_m, pose.origin_m)
+    # the subset may differ between poses, but every ray is one of the part's own, turned
+    local = there.direction @ pose.frame.T
+    assert part.inside(local).all()
+    nearest = (local @ part.directions.T).max(axis=1)
+    assert nearest.min() > 1 - 1e-12
+    assert len(np.unique(np.round(local, 9), axis=0)) == len(there) == len(here)
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_the_sensor_of_a_part_has_its_field_its_range_and_looks_at_its_centre(name):
+    part, pose = PARTS[name], some_pose(3)
+    sensor = part_sensor(part, pose)
+    assert sensor.field_of_view_rad == pytest.approx(part.field_of_view_rad)
+    assert sensor.gate_m == pytest.approx(part.range_m)
+    centre = direction(*part.centre_rad) @ pose.frame
+    assert np.allclose(sensor.boresight, centre, atol=1e-9)
+    assert np.allclose(sensor.frame, boresight_frame(*part.centre_rad) @ pose.frame, atol=1e-9)
+    assert not sensor.origin_covariance_m2.any()
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.sampled_from(SOME), ANGLE, ELEVATION)
+def test_a_part_can_be_made_to_look_anywhere(name, azimuth, elevation):
+    pose = looking_at(PARTS[name], np.array([1.0, 2, 3]), azimuth, elevation)
+    assert np.allclose(part_sensor(PARTS[name], pose).boresight, direction(azimuth, elevation), atol=1e-9)
+    assert abs(pose.elevation_rad) <= math.pi / 2 + 1e-12
+
+
+@pytest.mark.parametrize("name", SOME)
+def test_a_part_covers_what_its_rays_see_within_its_range_and_nothing_else(name):
+    part, pose = PARTS[name], some_pose(5)
+    rays = part_rays(part, pose, min(part.rays, 200))
+    near, far = part.range_m
+    azimuth, elevation = angles(rays.direction)
+
+    def at(distance):
+        return np.column_stack([rays.origin_m, azimuth, elevation, np.full(len(rays), distance)])
+
+    assert covered(part, pose, at(0.5 * (near + far))).all()
+    assert not covered(part, pose, at(far * 1.01)).any()
+    assert not covered(part, pose, at(near * 0.9)).any() or near == 0
+    # the same scene points, told from elsewhere
+    seen = rays.origin_m + 0.5 * (near + far) * rays.direction
+    elsewhere = np.array([3.0, -2, 0.5])
+    offset = seen - elsewhere
+    told = np.column_stack([np.broadcast_to(elsewhere, seen.shape), *angles(offset), np.linalg.norm(offset, axis=1)])
+    assert covered(part, pose, told).all()
+    behind = at(0.5 * (near + far))
+    behind[:, 3] += math.pi
+    behind[:, 4] *= -1
+    if part.field_of_view_rad[0] < math.pi:
+        assert not covered(part, pose, behind).any()
+
+
+def test_rays_of_one_part_fire_over_its_own_frame():
+    rays = part_rays(PARTS["tim781"], Pose())
+    assert rays.time_s[0] == 0
+    assert rays.time_s[-1] == pytest.approx((1 - 1 / 811) / 15)
+
+
+# subsets and several parts
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 400), st.data())
+def test_a_subset_has_the_rays_asked_for_each_once(total, data):
+    count = data.draw(st.integers(0, total))
+    points = np.random.default_rng(total).normal(size=(total, 3))
+    kept = thinned(points, count)
+    assert len(np.unique(kept)) == len(kept) == count
+    assert np.array_equal(kept, np.sort(kept))
+    assert np.array_equal(kept, thinned(points, count))
+
+
+def test_a_quarter_of_the_zones_is_one_of_every_block_of_four():
+    kept = thinned(PARTS["vl53l5cx"].directions, 16)
+    blocks = {(index // 8 // 2, index % 8 // 2) for index in kept}
+    assert len(blocks) == 16
+
+
+def test_one_ray_of_each_quarter_stands_in_its_middle():
+    kept = thinned(PARTS["vl53l5cx"].directions, 4)
+    assert {(index // 8 // 4, index % 8 // 4) for index in kept} == {(0, 0), (0, 1), (1, 0), (1, 1)}
+    assert all(index // 8 % 4 in (1, 2) and index % 4 in (1, 2) for index in kept)
+
+
+def test_a_subset_leaves_smaller_gaps_than_one_drawn_at_random():
+    everything = PARTS["vlp-16"].directions
+    kept = everything[thinned(everything, 300)]
+    drawn = everything[np.random.default_rng(0).choice(len(everything), 300, replace=False)]
+
+    def gap(chosen):
+        return np.arccos(np.clip((everything[::7] @ chosen.T).max(axis=1), -1, 1)).max()
+
+    assert gap(kept) < 0.7 * gap(drawn)
+
+
+def test_more_than_there_are_cannot_be_chosen():
+    with pytest.raises(ConfigError, match="5 of 3 rays"):
+        thinned(np.eye(3), 5)
+
+
+def test_rays_that_are_worth_firing_are_taken_first_and_others_fill_up():
+    part = PARTS["vlp-16"]
+
+    def forward(directions):
+        return directions[:, 0] > math.cos(math.radians(10))
+
+    there = int(forward(part.directions).sum())
+    few = part_rays(part, Pose(), 100, wanted=forward)
+    assert forward(few.direction).all()
+    many = part_rays(part, Pose(), there + 50, wanted=forward)
+    assert forward(many.direction).sum() == there
+    assert len(many) == there + 50
+
+
+@pytest.mark.parametrize(("count", "parts", "shares"), [(64, 1, [64]), (65, 2, [33, 32]), (196, 4, [49, 49, 49, 49])])
+def test_more_rays_than_a_part_has_take_more_parts_that_share_them(count, parts, shares):
+    part = PARTS["vl53l8cx"]
+    assert parts_for(part, count) == parts
+    rays = part_rays(part, interleaved(part, Pose(), parts), count)
+    assert np.bincount(rays.sensor).tolist() == shares
+
+
+def test_parts_that_stand_nowhere_fire_nothing():
+    with pytest.raises(ConfigError, match="no pose for vl53l8cx"):
+        part_rays(PARTS["vl53l8cx"], [])
+
+
+def test_one_part_cannot_fire_more_rays_than_it_has():
+    with pytest.raises(ConfigError, match="65 rays of 1 x vl53l8cx") as caught:
+        part_rays(PARTS["vl53l8cx"], Pose(), 65)
+    assert "2 parts" in str(caught.value)
+
+
+def test_four_interleaved_parts_of_eight_by_eight_zones_have_sixteen_by_sixteen():
+    part = PARTS["vl53l8cx"]
+    rays = part_rays(part, interleaved(part, Pose(), 4))
+    found = np.degrees(to_angles("tangent", rays.direction))
+    wanted = (np.arange(16) + 0.5) * 45 / 16 - 22.5
+    distance = np.abs(found[:, :, None] - wanted).min(axis=2)
+    # turning a part about its own axes is not quite a shift in its tangent plane
+    assert distance.max() < 0.2
+    assert len(np.unique(np.abs(found[:, :, None] - wanted).argmin(axis=2), axis=0)) == 256
+
+
+def test_parts_beside_each_other_look_a_field_of_view_apart():
+    part = PARTS["vl53l8cx"]
+    poses = side_by_side(part, some_pose(), 2)
+    assert math.acos(poses[0].frame[0] @ poses[1].frame[0]) == pytest.approx(math.radians(45))
+    middle = poses[0].frame[0] + poses[1].frame[0]
+    assert np.allclose(middle / np.linalg.norm(middle), some_pose().frame[0])
+
+
+def test_spinning_scanners_stand_above_each_other_and_line_scanners_are_rolled():
+    above = side_by_side(PARTS["vlp-16"], Pose(), 2)
+    assert [pose.elevation_rad for pose in above] == pytest.approx([math.radians(-15), math.radians(15)])
+    rolled = side_by_side(PARTS["tim781"], Pose(), 3)
+    assert [pose.roll_rad for pose in rolled] == pytest.approx([0, math.pi / 3, 2 * math.pi / 3])
+
+
+# designs
+
+
+@pytest.mark.parametrize("name", ["vl53l8cx", "vlp-16", "mid-40", "tmf8821:3x6"])
+def test_a_design_of_a_part_is_read_back_bit_for_bit(name, tmp_path):
+    design = part_design(PARTS[name], some_pose(), min(PARTS[name].rays, 500))
+    path = tmp_path / "part.yaml"
+    save_design(design, path)
+    back = load_design(path)
+    assert back.layout == "fixed"
+    mine, theirs = lay_out(design), lay_out(back)
+    for column in ("origin_m", "direction", "gate_m", "sensor", "time_s"):
+        assert np.array_equal(getattr(mine, column), getattr(theirs, column))
+    jsonschema.validate(design_document(design), json.loads(SCHEMA_FILE.read_text(encoding="utf-8")))
+
+
+def test_a_fixed_design_at_fewer_rays_fires_a_subset_of_its_own_each_sensor_in_proportion():
+    part = PARTS["vl53l8cx"]
+    design = part_design(part, side_by_side(part, Pose(), 3))
+    everything, few = lay_out(design), lay_out(design, 60)
+    assert np.bincount(few.sensor).tolist() == [20, 20, 20]
+    mine = {tuple(row) for row in np.column_stack([everything.direction, everything.gate_m, everything.sensor])}
+    assert all(tuple(row) in mine for row in np.column_stack([few.direction, few.gate_m, few.sensor]))
+    assert len(lay_out(design, 0)) == 0
+
+
+def test_sensors_of_different_size_lose_rays_in_proportion():
+    part = PARTS["vl53l8cx"]
+    whole = part_design(part, side_by_side(part, Pose(), 2))
+    kept = np.flatnonzero((whole.ray_table.sensor == 0) | (np.arange(128) % 2 == 0))
+    sensors = tuple(replace(sensor, rays=None) for sensor in whole.sensors)
+    uneven = replace(whole, rays=96, ray_table=whole.ray_table.subset(kept), sensors=sensors)
+    assert np.bincount(lay_out(uneven, 48).sensor).tolist() == [32, 16]
+
+
+def test_a_fixed_design_has_no_more_rays_than_its_pattern():
+    with pytest.raises(ConfigError, match="65 rays, but the design's fixed pattern has 64"):
+        lay_out(part_design(PARTS["vl53l8cx"], Pose()), 65)
+
+
+def test_a_fixed_layout_needs_its_rays_and_is_fitted_anew_as_a_grid():
+    document = design_document(part_design(PARTS["vl53l8cx"], Pose()))
+    del document["ray_table"]
+    with pytest.raises(ConfigError, match="is fixed, but there is no ray_table"):
+        design_from_document(document)
+    assert fitted_layout("fixed") == "grid"
+    assert fitted_layout("scan") == "scan"
+
+
+def test_a_part_in_a_run_is_constrained_as_a_grid_of_its_sensors_and_cannot_be_fitted(call, tmp_path):
+    run = make_run(tmp_path / "run")
+    design = run / "designs" / "bought.yaml"
+    design.parent.mkdir()
+    save_design(replace(part_design(PARTS["vl53l8cx"], Pose()), provenance={"run": ".."}), design)
+    result = call("constrain", design, "--name", "like", "--json")
+    assert result.code == 0, result.err
+    assert load_design(run / "designs" / "like.yaml").layout == "grid"
+    refused = call("fit", run, "--layout", "fixed")
+    assert refused.code == 2
+
+
+# the library
+
+
+def test_an_own_part_is_found_by_its_path_its_folder_and_its_name(own, tmp_path):
+    assert find_part(own).product == "Us Homemade"
+    assert find_part(str(own)).range_m == (0.1, 2.5)
+    library = load_library([tmp_path])
+    assert "homemade" in library.names
+    assert library.part("homemade").origin == str(own)
+    assert len(library.names) == len(LIBRARY.names) + 1
+
+
+def test_an_own_part_stands_in_for_a_shipped_one_of_its_name(tmp_path):
+    path = tmp_path / "vlp-16.yaml"
+    path.write_text(OWN)
+    assert load_library([path]).part("vlp-16").product == "Us Homemade"
+    assert LIBRARY.part("vlp-16").product == "Velodyne VLP-16"
+
+
+def test_a_mode_is_named_behind_a_name_or_a_path(tmp_path):
+    path = tmp_path / "copy.yaml"
+    path.write_text((FOLDER / "vl53l5cx.yaml").read_text())
+    assert find_part(f"{path}:4x4").rays == find_part("vl53l5cx:4x4").rays == 16
+    assert find_part("vl53l5cx:8x8").name == "vl53l5cx"
+
+
+def test_two_own_parts_of_one_name_are_refused(tmp_path):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "same.yaml").write_text(OWN)
+    with pytest.raises(ConfigError, match="is a second part 'same'"):
+        load_library([tmp_path / "a", tmp_path / "b"])
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("vlp16", "there is no part 'vlp16'"),
+        ("vlp-16:4x4", "vlp-16 has no mode '4x4'"),
+        ("vl53l5cx:9x9", "vl53l5cx has no mode '9x9'"),
+        ("vl53l5cx:", "vl53l5cx has no mode ''"),
+        ("", "there is no part ''"),
+        ("nowhere/part.yaml", "cannot be read"),
+        ("no such.yaml", "'no such' is no name of a part"),
+    ],
+)
+def test_names_that_lead_nowhere_are_refused(name, message):
+    with pytest.raises(ConfigError, match=message):
+        find_part(name)
+
+
+def test_an_empty_folder_holds_no_parts(tmp_path):
+    with pytest.raises(ConfigError, match="holds no file"):
+        load_library([tmp_path])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("kind: multi-zone", "kind: sonar", r"homemade.yaml:5:7: kind: found 'sonar'"),
+        ("rows: 2", "rows: 0", r"rows"),
+        ("rows: 2", "rows: two", r"rows"),
+        ("rows: 2, source: bench", "rows: 2, source: nobody", "names the source 'nobody', known are bench"),
+        ("[-15, 15]", "[15, -15]", "azimuth runs from 15 down to -15"),
+        ("[-15, 15]", "[-15, 200]", "azimuth"),
+        ("value: 0.1,", "value: 3,", "near_m is not below far_m"),
+        ("value: 0.1,", "value: -1,", "near_m"),
+        ("value: 20,", "value: 0,", "rate_hz"),
+        ("rate_hz:\n  - {value: 20, source: bench}\n", "", "rate_hz is missing"),
+        ("reflectance_percent: 50", "reflectance_percent: 150", "reflectance_percent"),
+        ("reflectance_percent: 50", "reflectance: 50", r"homemade.yaml:16:\d+: unknown key"),
+        ("far_m:", "far:", r"unknown key 'far'"),
+        ("schema_version: 1", "schema_version: 2", "schema_version"),
+        ("kind: zones", "kind: spiral", "pattern"),
+        ("{kind: zones, columns: 3, rows: 2,", "{kind: rings, columns: 3,", "give either rings or elevations_deg"),
+        ("{kind: zones, columns: 3, rows: 2,", "{kind: zones, columns: 3000, rows: 3000,", "9000000 rays a frame"),
+        (
+            "{kind: zones, columns: 3, rows: 2,",
+            "{kind: rings, columns: 3, elevations_deg: [0, 11],",
+            "a beam at 11 deg",
+        ),
+        ("elevation: [-10, 10]", "elevation: [0, 0]", "2 rays across an elevation without width"),
+        ("azimuth: [-15, 15]", "azimuth: [-180, 180]", "beyond 180 degrees from the forward axis"),
+        ("elevation: [-10, 10]", "elevation: [-10, 10], shape: ellipse", "its pattern has corners"),
+        ("product: Homemade", 'product: "\\x1b[2J"', "product"),
+    ],
+)
+def test_a_part_file_that_cannot_be_is_refused_where_it_is_wrong(own, old, new, message):
+    assert old in OWN
+    own.write_text(OWN.replace(old, new, 1))
+    with pytest.raises(ConfigError, match=message):
+        assert find_part(own).directions.size < 0
+
+
+@pytest.mark.parametrize("text", ["", "[]", "just words", "{}", "a: *b", "far_m: 3", "modes: {x: 3}", "pattern: [[]]"])
+def test_files_that_are_no_parts_are_refused(own, text):
+    own.write_text(text)
+    with pytest.raises(ConfigError):
+        find_part(own)
+
+
+LEAVES = st.one_of(
+    st.none(), st.booleans(), st.integers(-3, 3), st.integers(10**5, 10**9), st.floats(), st.text(max_size=5),
+    st.just([]), st.just({}), st.lists(st.floats(-400, 400), max_size=3),
+)  # fmt: skip
+
+
+def leaves(value, path=()):
+    yield path
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, inside in items:
+        yield from leaves(inside, (*path, key))
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.data())
+def test_a_part_file_with_anything_in_any_place_is_a_part_or_refused(data):
+    document = parse_yaml(OWN, where="own").value
+    path = data.draw(st.sampled_from([one for one in leaves(document) if one]))
+    target = document
+    for key in path[:-1]:
+        target = target[key]
+    target[path[-1]] = data.draw(LEAVES)
+    try:
+        part = Part.of_file("own", check_model(PartFile, document, lambda where, *, key=False: "own"), None, "own")
+        rays = part_rays(part, Pose())
+    except ConfigError:
+        return
+    assert len(rays) == part.rays >= 1
+    assert part.inside(part.directions).all()
+    design_from_document(design_document(part_design(part, Pose(), min(part.rays, 50))))
+
+
+# the commands
+
+
+def test_the_list_has_every_part_in_every_mode(call):
+    document = call("catalog", "list", "--json").json
+    assert document["schema_version"] == 1
+    assert [entry["name"] for entry in document["parts"]] == list(PARTS)
+    assert call("catalog", "--json").json["parts"] == document["parts"]
+    shown = call("catalog", "list")
+    assert all(name.partition(":")[0] in shown.out for name in PARTS)
+
+
+def test_the_list_under_conditions_leaves_out_what_no_source_vouches_for(call):
+    result = call("catalog", "list", "--reflectance", "10", "--klux", "100", "--json")
+    names = [entry["name"] for entry in result.json["parts"]]
+    assert "mid-40" in names
+    assert "vl53l5cx" not in names
+    assert result.json["left_out"] == len(PARTS) - len(names)
+    assert "have no range stated" in result.err
+
+
+def test_a_part_is_shown_with_every_source_and_what_they_disagree_about(call):
+    shown = call("catalog", "show", "vlp-16").out
+    for text in ("velodyne_description", "HELIOS++", "0.09144", "sources disagree about", "28800 rays"):
+        assert text in shown
+    document = call("catalog", "show", "vlp-16", "--json").json
+    assert [one["value"] for one in document["figures"]["far_m"]] == [100, 100, 130]
+    assert document["disagreements"] == disagreements(PARTS["vlp-16"])
+
+
+def test_own_parts_are_listed_and_shown(call, own):
+    entries = call("catalog", "list", "--catalog", own, "--json").json["parts"]
+    assert next(entry["origin"] for entry in entries if entry["name"] == "homemade") == str(own)
+    assert call("catalog", "show", "homemade", "--catalog", own.parent, "--json").json["rays"] == 6
+    assert call("catalog", "show", own, "--json").json["rays"] == 6
+
+
+def test_a_part_is_written_as_a_design_that_other_commands_read(call, tmp_path):
+    result = call(
+        "catalog", "show", "vl53l8cx", "--out", "bought.yaml", "--rays", "196", "--at-origin", "-1,0,0.5",
+        "--azimuth-deg", "-20", "--elevation-deg", "10", "--json",
+    )  # fmt: skip
+    assert result.json["design_rays"] == 196
+    assert result.json["sensors"] == 4
+    design = load_design(tmp_path / "bought.yaml")
+    part = PARTS["vl53l8cx"]
+    pose = Pose(np.array([-1, 0, 0.5]), math.radians(-20), math.radians(10))
+    wanted = part_rays(part, interleaved(part, pose, 4), 196)
+    assert np.allclose(lay_out(design).direction, wanted.direction, atol=1e-12)
+    beside = call("catalog", "show", "vl53l8cx", "--out", "wide.yaml", "--parts", "2", "--arrange", "beside")
+    assert beside.code == 0, beside.err
+    one, other = load_design(tmp_path / "wide.yaml").sensors
+    assert math.acos(one.boresight @ other.boresight) == pytest.approx(math.radians(45))
+    assert call("export", "bought.yaml", "--format", "csv", "--rays", "100").code == 0
+    assert len(Path("bought.csv").read_text().splitlines()) >= 100
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--rays", "10"), "says how a design is made"),
+        (("--at-origin", "0,0,0"), "says how a design is made"),
+        (("--out", "o.yaml", "--at-origin", "1,2"), "three numbers"),
+        (("--out", "o.yaml", "--at-origin", "1,2,nan"), "three numbers"),
+        (("--out", "o.yaml", "--elevation-deg", "91"), "-90 to 90"),
+        (("--out", "o.yaml", "--azimuth-deg", "nan"), "-360 to 360"),
+        (("--out", "o.yaml", "--arrange", "beside"), "is for several parts"),
+        (("--out", "o.yaml", "--arrange", "stacked", "--parts", "2"), "interleaved"),
+        (("--out", "o.yaml", "--parts", "2", "--rays", "129"), "129 rays of 2 x vl53l8cx"),
+        (("--reflectance", "0"), "--reflectance"),
+        (("--klux", "-1"), "--klux"),
+        (("--klux", "nan"), "--klux"),
+        (("--reflectance", "5"), "no source of vl53l8cx states a range"),
+    ],
+)
+def test_what_cannot_be_asked_of_a_part_is_refused_and_nothing_is_written(call, options, message):
+    result = call("catalog", "show", "vl53l8cx", *options)
+    assert result.code == 2
+    assert message in result.err
+    assert not Path("o.yaml").exists()
+
+
+def test_a_part_of_more_rays_than_a_file_takes_says_what_to_do(call):
+    result = call("catalog", "show", "os1-128", "--out", "o.yaml")
+    assert result.code == 2
+    assert "--rays N takes an evenly spread subset" in result.err
+    assert call("catalog", "show", "os1-128", "--out", "o.yaml", "--rays", "1000", "--json").json["sensors"] == 1
+
+
+# the guide
+
+GUIDE = (Path(__file__).parents[2] / "docs" / "catalog.md").read_text(encoding="utf-8")
+
+
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", GUIDE, re.DOTALL)
+
+
+def test_the_part_file_of_the_guide_is_one(tmp_path):
+    (text,) = blocks("yaml")
+    path = tmp_path / "ranger.yaml"
+    path.write_text(text)
+    fine, fast = find_part(path), find_part(f"{path}:fast")
+    assert (fine.rays, fast.rays) == (6, 3)
+    assert fine.histogram_mbps == pytest.approx(6 * 64 * 16 * 20 / 1e6)
+    assert fine.under(reflectance_percent=50, illuminance_klux=1).range_m == (0.05, 0.9)
+
+
+def test_the_guide_names_every_key_and_every_kind_of_pattern():
+    keys = set(re.findall(r"`([a-z_]+)`", GUIDE))
+    patterns = {part.pattern.kind for part in PARTS.values()} | {"raster"}
+    assert {*FIELDS, *Statement.model_fields, *patterns} - {"value"} <= keys
+
+
+def test_the_ranges_of_the_guide_are_the_parts(call):
+    rows = re.findall(r"\| `vl53l5cx( --[^`]*)`? ?\| ([\d.]+) - ([\d.]+) m", GUIDE)
+    assert len(rows) == 2
+    for options, start, end in rows:
+        shown = call("catalog", "show", "vl53l5cx", *options.split(), "--json").json
+        assert shown["range_m"] == {"near": float(start), "far": float(end)}
+    assert PARTS["vl53l5cx"].range_m == (0.02, 3.5)
+
+
+def test_the_program_of_the_guide_runs():
+    (text,) = blocks("python")
+    made = {}
+    exec(text, made)  # the guide's own text
+    assert len(made["rays"]) == 64
+    assert len(made["design"].sensors) == 4
+    assert np.allclose(made["sensor"].boresight, [-1, 0, 0])

@@ -1,0 +1,169 @@
+"""Two designs beside each other: sensor by sensor, and by their scores in the same scenes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.command_line import caller, make_run
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.compare import angle_between, paired_sensors, readout_of
+from lidardesign.design.files import load_design, save_design
+from lidardesign.design.layouts.rays import lay_out
+from lidardesign.design.sensor import DesignSpec, Sensor
+from lidardesign.space import direction
+
+
+def sensors(seed, count, named="s"):
+    generator = np.random.default_rng(seed)
+    return tuple(
+        Sensor(
+            f"{named}{index}", 1 / count, generator.normal(size=3), np.zeros((3, 3)), *generator.uniform(-1, 1, 3),
+            *generator.uniform(0.01, 0.4, 2), *generator.uniform(0.5, 2, 2),
+        )
+        for index in range(count)
+    )  # fmt: skip
+
+
+def test_a_design_does_not_differ_from_itself_however_its_sensors_are_ordered_and_named():
+    own = sensors(0, 6)
+    generator = np.random.default_rng(1)
+    for _ in range(5):
+        order = generator.permutation(6)
+        other = tuple(replace(own[index], name=f"other{place}") for place, index in enumerate(order))
+        pairs = paired_sensors(DesignSpec("a", own), DesignSpec("b", other))
+        assert [pair.first.name for pair in pairs] == [sensor.name for sensor in own]
+        for pair in pairs:
+            assert all(value in (0, None) for value in pair.as_dict()["difference"].values())
+
+
+def test_sensors_of_the_same_names_are_compared_by_name():
+    own = sensors(0, 3)
+    swapped = tuple(replace(sensor, name=own[index].name) for index, sensor in enumerate(own[::-1]))
+    pairs = paired_sensors(DesignSpec("a", own), DesignSpec("b", swapped[::-1]))
+    assert [(pair.first.name, pair.second.name) for pair in pairs] == [("s0", "s0"), ("s1", "s1"), ("s2", "s2")]
+
+
+def test_differences_turn_their_sign_with_the_order_and_sensors_left_over_are_named():
+    first, second = DesignSpec("a", sensors(2, 2)), DesignSpec("b", sensors(3, 4, "t"))
+    there = [pair.as_dict() for pair in paired_sensors(first, second)]
+    back = {pair.as_dict()["b"]: pair.as_dict() for pair in paired_sensors(second, first)}
+    assert sorted(pair["b"] for pair in there) == ["t0", "t1", "t2", "t3"]
+    assert [pair["a"] for pair in there[2:]] == [None, None]
+    for pair in there[:2]:
+        other = back[pair["a"]]["difference"]
+        for key, value in pair["difference"].items():
+            if value is not None:
+                sign = 1 if key in ("place_m", "boresight_deg") else -1
+                assert other[key] == pytest.approx(sign * value)
+
+
+def test_an_angle_is_exact_for_the_smallest_and_the_largest():
+    for angle in (0.0, 1e-9, 1e-4, 1.0, math.pi - 1e-9, math.pi):
+        found = angle_between(direction(0.0, 0.0), direction(angle, 0.0))
+        assert found == pytest.approx(angle, rel=1e-7, abs=1e-15)
+
+
+def test_what_a_design_costs_is_what_its_rays_cost():
+    for seed in range(5):
+        design = DesignSpec("d", sensors(seed, 4), rays=101)
+        assert readout_of(design).high_mbps == pytest.approx(Bandwidth().mbps(lay_out(design)))
+        slow = replace(design, constraints={"budget": {"rate_hz": 2.0, "bin_ps": 250.0}})
+        model = Bandwidth(bin_ps=250.0, rate_hz=2.0)
+        assert readout_of(slow).high_mbps == pytest.approx(model.mbps(lay_out(design)))
+        many = 4_000
+        open_cost = readout_of(replace(design, rays=None))
+        assert open_cost.rays is None
+        assert many * open_cost.low_mbps == pytest.approx(Bandwidth().mbps(lay_out(design, many)), rel=1e-9)
+
+
+# ------------------------------------------------------------------- commands
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = make_run(tmp_path_factory.mktemp("runs") / "flat", count=2000)
+    from lidardesign.cli.main import run as program
+
+    for name, rays in (("few", 8), ("more", 12)):
+        with pytest.raises(SystemExit) as ended:
+            program(["fit", str(folder), "--sensors", "2", "--rays", str(rays), "--name", name, "--quiet"])
+        assert not ended.value.code
+    return folder
+
+
+@pytest.fixture
+def call(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+def test_scores_of_two_designs_pair_as_evaluate_pairs_them(call, run):
+    few, more = (run / "designs" / f"{name}.yaml" for name in ("few", "more"))
+    found = call("compare", few, more, "--rays", "16", "--json").json
+    expected = call("evaluate", few, more, "--rays", "16", "--json").json
+    paired = [pair for pair in expected["paired"] if (pair["a"], pair["b"]) == ("few", "more")]
+    assert found["paired"] == paired
+    values = {row["design"]: row["value"] for row in expected["rows"]}
+    assert {row["design"]: row["value"] for row in found["rows"]} == {name: values[name] for name in ("few", "more")}
+
+
+def test_designs_of_other_numbers_of_rays_are_also_compared_as_they_are(call, run):
+    few, more = (run / "designs" / f"{name}.yaml" for name in ("few", "more"))
+    found = call("compare", few, more, "--json").json
+    first = found["paired"][0]
+    assert (first["rays"], first["rays_b"]) == (8, 12)
+    rows = {(row["design"], row["rays"]): row["value"] for row in found["rows"]}
+    assert first["difference"] == pytest.approx(rows["few", 8] - rows["more", 12])
+    text = call("compare", few, more).out
+    assert "few minus more" in text
+    assert "second minus first" in text
+    itself = call("compare", few, few, "--json").json
+    assert [design["name"] for design in itself["designs"]] == ["few (first)", "few (second)"]
+    assert itself["paired"][0]["difference"] == 0
+
+
+def test_what_rounding_leaves_of_no_difference_is_shown_as_none(call, run, tmp_path):
+    """A direction goes through its unit vector, and comes back to the last digit but one."""
+    rows = "".join(f"{angle / 7},{angle / 9},2\n" for angle in range(3))
+    (tmp_path / "rays.csv").write_text("azimuth_rad,elevation_rad,gate_end_m\n" + rows)
+    assert call("export", "rays.csv", "--format", "mjcf", "--out", "rays.xml").code == 0
+    result = call("compare", "rays.csv", "rays.xml")
+    assert result.code == 0, result.err
+    assert "e-" not in result.out
+
+
+def test_without_a_run_there_are_no_scores_and_with_one_there_are(call, run, tmp_path):
+    for name in ("one", "two"):
+        save_design(replace(load_design(run / "designs" / "few.yaml"), provenance={}), tmp_path / f"{name}.yaml")
+    bare = call("compare", "one.yaml", "two.yaml", "--json")
+    assert bare.json["rows"] == []
+    assert "--in RUN" in bare.err
+    assert call("compare", "one.yaml", "two.yaml", "--rays", "8").code == 2
+    found = call("compare", "one.yaml", "two.yaml", "--in", run, "--json").json
+    assert [row["rays"] for row in found["rows"]] == [8, 8]
+    assert "no difference is shown" in call("compare", "one.yaml", "two.yaml", "--in", run).out
+
+
+def test_a_shown_design_says_how_tight_its_constraints_are(call, run):
+    result = call(
+        "constrain", run, "--set", "gate.width_m.max=0.2", "--set", "budget.bandwidth_mbps=900", "--rays", "8"
+    )
+    assert result.code == 0, result.err
+    path = run / "designs" / "constrained.yaml"
+    shown = call("show", path, "--json").json
+    checks = {check["name"]: check for check in shown["checks"]}
+    budget = checks["budget.bandwidth_mbps"]
+    assert budget["room"] == pytest.approx(900 - shown["bandwidth"]["high_mbps"])
+    assert not budget["tight"]
+    widths = [check for name, check in checks.items() if name.endswith("gate.width_m.max")]
+    assert any(check["tight"] for check in widths)
+    assert all(check["satisfied"] for check in checks.values())
+    # the run's design space is checked too, where it is there
+    assert any(".space." in name for name in checks)
+    text = call("show", path).out
+    assert "yes, tight" in text
+    assert "Mbit/s for 8 rays per frame" in text
+    assert call("show", run / "designs" / "few.yaml", "--json").json["checks"] == []

@@ -1,0 +1,147 @@
+"""Rigs' files with small faults: what is wrong is said, as of a bad file and not of a bad command line."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.command_line import caller, make_run
+
+from lidardesign.design.files import load_design, save_design
+from lidardesign.design.sensor import DesignSpec, Sensor
+from lidardesign.errors import DataError
+from lidardesign.run.xml import read_xml
+
+HEADER = "origin_x_m,origin_y_m,origin_z_m,azimuth_deg,elevation_deg,gate_start_m,gate_end_m"
+ROWS = ["0.5,0,0,60,0,0.1,0.9", "0.5,0,0,90,0,0.1,0.9", "0.5,0,0,120,0,0.1,0.9"]
+GOOD = "\n".join([HEADER, *ROWS]) + "\n"
+SDF = """<sdf version="1.9"><model name="m"><link name="l"><sensor name="fan" type="gpu_lidar">
+<pose>0.5 0 0 0 0 1.5708</pose><lidar><scan><horizontal><samples>3</samples>
+<min_angle>-0.5</min_angle><max_angle>0.5</max_angle></horizontal></scan>
+<range><min>0.1</min><max>0.9</max></range></lidar></sensor></link></model></sdf>
+"""
+
+
+@pytest.fixture
+def call(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+def semicolons(text):
+    return text.replace(",", ";").replace(".", ",")
+
+
+def archive():
+    buffer = io.BytesIO()
+    np.savez(buffer, azimuth_deg=np.zeros(3))
+    return buffer.getvalue()
+
+
+def noise():
+    return np.random.default_rng(5).bytes(3000)
+
+
+FAULTS = {
+    "empty csv": ("rig.csv", b"", "is empty"),
+    "empty sdf": ("rig.sdf", b"\n", "is empty"),
+    "empty npz": ("rig.npz", b"", "is empty"),
+    "empty xml": ("rig.xml", b"", "is empty"),
+    "semicolons": ("rig.csv", semicolons(GOOD).encode(), "columns are separated by ; (a semicolon)"),
+    "semicolons with commas first": ("rig.csv", semicolons("\n".join(ROWS)).encode(), "columns are separated by ;"),
+    "tabs": ("rig.csv", GOOD.replace(",", "\t").encode(), "columns are separated by tabs"),
+    "comment": ("rig.csv", f"# made by hand\n{GOOD}".encode(), "begins with a comment"),
+    "no header": ("rig.csv", "\n".join(ROWS).encode(), "line 1 has numbers and no names of columns"),
+    "no header, names": ("rig.csv", b"left,0.5,0,0,60,0\nleft,0.5,0,0,90,0\n", "line 1 has numbers and no names"),
+    "noise csv": ("rig.csv", noise(), "is no CSV"),
+    "noise sdf": ("rig.sdf", noise(), "is no XML"),
+    "noise npz": ("rig.npz", noise(), "is no NPZ archive"),
+    "cut npz": ("rig.npz", archive()[:-30], "is no .npz file, or one cut short"),
+    "beheaded npz": ("rig.npz", archive()[8:], "is no NPZ archive"),
+    "text npz": ("rig.npz", b"hello\n", "is no NPZ archive"),
+    "text sdf": ("rig.sdf", b"hello\n", "is no XML"),
+    "Latin-1": ("rig.csv", GOOD.replace("origin_x_m", "l\u00e4nge").encode("latin-1"), "is not UTF-8 text"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_faulty_file_is_refused_for_what_is_wrong_with_it(call, tmp_path, fault):
+    name, content, found = FAULTS[fault]
+    (tmp_path / name).write_bytes(content)
+    result = call("show", name)
+    assert found in " ".join(result.err.split())
+    assert name in result.err
+    assert result.code == 3
+
+
+def test_good_files_are_read_as_before_whatever_they_are_called(tmp_path):
+    (tmp_path / "rig.csv").write_text(GOOD)
+    rig = load_design(tmp_path / "rig.csv")
+    save_design(rig, tmp_path / "design.yaml")
+    for name, source in (("rig.txt", "rig.csv"), ("rig.sdf", "rig.csv"), ("design.csv", "design.yaml")):
+        (tmp_path / name).write_bytes((tmp_path / source).read_bytes())
+        assert len(load_design(tmp_path / name).ray_table.sensor) == 3
+
+
+def test_xml_that_stops_anywhere_is_said_to_end_early(tmp_path):
+    path = tmp_path / "rig.sdf"
+    for end in range(1, SDF.rindex("</sdf>") + 5, 7):
+        path.write_text(SDF[:end])
+        with pytest.raises(DataError, match="ends early"):
+            read_xml(path, "XML")
+    path.write_text(SDF[: SDF.index("<range>")])
+    with pytest.raises(DataError, match="ends early: <lidar> of line 2 is not closed"):
+        read_xml(path, "XML")
+
+
+def test_a_file_that_may_not_be_read_is_a_bad_file_like_one_that_is_not_there(call, tmp_path, monkeypatch):
+    (tmp_path / "rig.csv").write_text(GOOD)
+    plain = Path.open
+
+    def refused(self, *arguments, **options):
+        if self.name == "rig.csv":
+            raise PermissionError(13, "Permission denied")
+        return plain(self, *arguments, **options)
+
+    monkeypatch.setattr(Path, "open", refused)
+    # whoever runs the tests may read everything: what asks the system first is told that it may not
+    monkeypatch.setattr("os.access", lambda path, *_, **__: Path(str(path)).name != "rig.csv")
+    run = make_run(tmp_path / "run", count=100)
+    for arguments in (
+        ["show", "rig.csv"],
+        ["export", "rig.csv", "--format", "npz", "--out", "o"],
+        ["evaluate", "rig.csv"],
+        ["compare", "rig.csv", "rig.csv"],
+        ["constrain", "rig.csv"],
+        ["fit", run, "--like", "rig.csv"],
+    ):
+        result = call(*arguments)
+        assert result.code == 3, arguments
+        assert "Permission denied" in result.err
+    assert call("show", "none.csv").code == 3
+
+
+def test_files_that_only_their_endings_tell_apart_are_called_by_them(call, tmp_path):
+    run = make_run(tmp_path / "run", count=300)
+    (tmp_path / "rig.csv").write_text(GOOD)
+    (tmp_path / "rig.sdf").write_text(SDF)
+    planned = call("evaluate", run, "rig.csv", "rig.sdf", "--rays", 2, "--dry-run", "--json")
+    assert planned.code == 0, planned.err
+    assert planned.json["settings"]["designs"] == ["rig.csv", "rig.sdf"]
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "rig.csv").write_text(GOOD)
+    planned = call("evaluate", run, "rig.csv", "rig.sdf", "other/rig.csv", "--rays", 2, "--dry-run", "--json")
+    names = planned.json["settings"]["designs"]
+    assert len(set(names)) == 3
+    assert names[2] == "other/rig"
+
+
+def test_a_sensor_table_of_the_research_code_may_still_lack_its_header(tmp_path):
+    from lidardesign.design.rigs.sensor_csv import write_sensor_csv
+
+    sensor = Sensor("s", 1.0, np.zeros(3), np.zeros((3, 3)), 1.0, 0.0, 0.0, 0.1, 0.1, 0.5, 0.1)
+    write_sensor_csv(DesignSpec("d", (sensor,)), tmp_path / "table.csv")
+    lines = (tmp_path / "table.csv").read_text().splitlines()
+    (tmp_path / "bare.csv").write_text(lines[1] + "\n")
+    assert load_design(tmp_path / "bare.csv").sensors[0].azimuth_rad == 1.0

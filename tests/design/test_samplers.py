@@ -1,0 +1,554 @@
+"""Every sampler draws from the density that it claims: Pearson's test on grids, as renderers do."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from density.test_flow import FLOWS, draw, flow_of
+from design.test_mixture import POINT, features_of, random_mixture
+from design.test_mixture import drawn as drawn_from_mixture
+from design.test_rays import sensor
+from scipy.stats import chi2, norm
+from support.chi_square import UNLIKELY, counts_of_cells, mass_of_cells, p_value, pooled
+
+from lidardesign.density.flow.objective import Coordinates
+from lidardesign.density.training.losses import Pool, draw_conditions
+from lidardesign.density.training.quality import draw_samples, log_density_of
+from lidardesign.density.training.snapshot_quality import FlatTarget
+from lidardesign.density.visibility.quadrature import Optics
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.fit import fit
+from lidardesign.design.layouts.grid import low_discrepancy
+from lidardesign.design.layouts.rays import lay_out
+from lidardesign.design.mixture.bounds import groups
+from lidardesign.design.mixture.mixture import log_density
+from lidardesign.design.mixture.support import pin_samples, restrict_samples
+from lidardesign.design.sensor import DesignSpec, tangent_coordinates, tangent_directions
+from lidardesign.evaluate.baselines.occupancy import OccupancyGrid
+from lidardesign.evaluate.baselines.simple import build_baseline
+from lidardesign.geometry.surface import sample_body
+from lidardesign.numerics import systematic_draw
+from lidardesign.samples import Samples
+from lidardesign.scene import Body, Box, Capsule, Mesh, Scene, Sphere
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, angles, direction
+
+DRAWS = 20_000
+
+
+def edges_of(*sizes, low=-1.0, high=1.0):
+    return [np.linspace(low, high, size + 1) for size in sizes]
+
+
+# --- the test itself
+
+
+def test_the_test_accepts_right_draws_as_often_as_it_says_and_refuses_wrong_ones():
+    generator = np.random.default_rng(0)
+    edges = edges_of(12, 12, low=-4.0, high=4.0)
+    right = mass_of_cells(lambda x: np.exp(-np.square(x).sum(axis=1) / 2) / (2 * math.pi), edges, 8)
+    values = [
+        p_value(
+            counts_of_cells(np.clip(generator.standard_normal((2000, 2)), -4, 4), edges), 2000 * right / right.sum()
+        )
+        for _ in range(200)
+    ]
+    assert abs(np.mean(np.array(values) < 0.5) - 0.5) < 4 * 0.5 / math.sqrt(200)
+    wider = np.clip(1.1 * generator.standard_normal((2000, 2)), -4, 4)
+    assert p_value(counts_of_cells(wider, edges), 2000 * right / right.sum()) < UNLIKELY
+    assert p_value([1, 99], [0.0, 100.0]) == 0.0
+
+
+def test_pools_expect_enough_draws_and_lose_none():
+    generator = np.random.default_rng(1)
+    expected = generator.exponential(2.0, 500) ** 2
+    observed = generator.poisson(expected)
+    counts, means = pooled(observed, expected)
+    assert means.min() >= 5.0
+    assert counts.sum() == observed.sum()
+    assert means.sum() == pytest.approx(expected.sum())
+    assert len(means) > 100
+
+
+# --- the flow
+
+# cells per axis, midpoints per cell and axis, and how far the flow's weights are scaled up: densities vary by factors
+# of 30 to 300, and by so little within a midpoint's part that its error is far below the draws' noise
+GRIDS = {
+    "one dimension": ([60], 64, 5.0),
+    "one on a circle": ([60], 64, 5.0),
+    "a block of two": ([16, 16], 12, 5.0),
+    "circle, then two blocks": ([8, 8, 8], 6, 3.0),
+    "one, given one": ([60], 64, 4.0),
+    "chain, given two": ([8, 8, 8], 6, 3.0),
+}
+
+
+def of_flow(flow, context):
+    def density(points):
+        given = None if context is None else context.expand(len(points), -1)
+        with torch.no_grad():
+            return flow.log_prob(torch.as_tensor(points), given).exp().numpy()
+
+    return density
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("name", GRIDS)
+def test_samples_of_a_flow_have_its_integrated_density(name, dtype):
+    sizes, inside, scale = GRIDS[name]
+    flow = flow_of(name, layers=2, scale=scale)
+    context = torch.tensor([[0.3, -0.8][: flow.context]], dtype=torch.float64) if flow.context else None
+    edges = edges_of(*sizes)
+    mass = mass_of_cells(of_flow(flow, context), edges, inside)
+    assert mass.sum() == pytest.approx(1.0, abs=5e-3)
+    base = flow.draw_base(DRAWS, torch.Generator().manual_seed(2)).to(dtype)
+    with torch.no_grad():
+        values, _ = flow.to(dtype)(base, None if context is None else context.to(dtype).expand(DRAWS, -1))
+    assert p_value(counts_of_cells(values.double().numpy(), edges), DRAWS * mass / mass.sum()) > UNLIKELY
+
+
+def test_a_sampler_that_is_a_little_wrong_is_found_out():
+    flow = flow_of("a block of two", layers=2, scale=5.0)
+    edges = edges_of(16, 16)
+    mass = mass_of_cells(of_flow(flow, None), edges, 12)
+    with torch.no_grad():
+        values, _ = flow(flow.draw_base(DRAWS, torch.Generator().manual_seed(2)))
+    shifted = np.clip(values.numpy() + 0.02, -1, 1)
+    assert p_value(counts_of_cells(shifted, edges), DRAWS * mass / mass.sum()) < UNLIKELY
+
+
+@pytest.mark.parametrize("name", FLOWS)
+def test_samples_weighted_by_their_inverse_density_measure_the_volume_of_every_part_of_the_box(name):
+    # in all dimensions together, where no grid reaches: the mean of 1 / p over samples inside a part is its volume
+    flow = flow_of(name, layers=2, scale=1.0)
+    base, context = draw(flow, DRAWS, seed=3)
+    with torch.no_grad():
+        values, log_prob = flow(base, context)
+        foreign = flow.log_prob(values, context)
+    part = (values > 0).long() @ (2 ** torch.arange(flow.features))
+    for density in (log_prob, foreign):
+        volume = torch.exp(-density).numpy()
+        for index in range(2**flow.features):
+            shares = np.where(part.numpy() == index, volume, 0.0)
+            assert abs(shares.mean() - 1.0) < 4.5 * shares.std() / math.sqrt(DRAWS), index
+
+
+def learned_in(space, seed=4):
+    flow = flow_of("circle, then two blocks", layers=2, scale=3.0)
+    target = FlatTarget(Optics(0.1, 1e3, 1e3, 0.1), space)
+    return SimpleNamespace(
+        flow=flow, target=target, coordinates=Coordinates(space), generator=torch.Generator().manual_seed(seed)
+    )
+
+
+@pytest.mark.parametrize("measure", ["solid_angle", "angles"])
+def test_samples_of_a_run_have_the_density_per_chart_volume_that_is_stored_with_them(measure):
+    space = DesignSpace((0, 0, 0, 1.0, -0.9, 0.5), (0, 0, 0, 1.0 + 2 * math.pi, 1.2, 3.0), measure=measure)
+    learned = learned_in(space)
+    samples = draw_samples(learned, DRAWS)
+    np.testing.assert_allclose(log_density_of(learned, samples.points), samples.log_prob, atol=1e-6)
+    low, high = space.chart_low[3:], space.chart_high[3:]
+    edges = [np.linspace(a, b, 9) for a, b in zip(low, high, strict=True)]
+
+    def density(chart):
+        points = space.from_chart(np.column_stack([np.zeros((len(chart), 3)), chart]))
+        return np.exp(log_density_of(learned, points))
+
+    mass = mass_of_cells(density, edges, 6)
+    assert mass.sum() == pytest.approx(1.0, abs=5e-3)
+    drawn = np.clip(space.to_chart(samples.points)[:, 3:], low, high)
+    assert p_value(counts_of_cells(drawn, edges), DRAWS * mass / mass.sum()) > UNLIKELY
+
+
+def test_conditions_and_proposals_are_drawn_as_they_say():
+    generator = torch.Generator().manual_seed(5)
+    conditions = draw_conditions(flow_of("chain, given two"), DRAWS, generator).numpy()
+    edges = edges_of(10, 10)
+    assert p_value(counts_of_cells(conditions, edges), np.full(100, DRAWS / 100)) > UNLIKELY
+    log_weights = np.random.default_rng(6).normal(0, 2, 400)
+    pool = Pool.of(np.arange(400.0)[:, None], log_weights, np.zeros(400))
+    unit, values = pool.draw(DRAWS, generator, torch.zeros(1, dtype=torch.float64))
+    chosen = unit[:, 0].long().numpy()
+    np.testing.assert_array_equal(values.numpy(), log_weights[chosen])
+    share = np.exp(log_weights) / np.exp(log_weights).sum()
+    assert p_value(np.bincount(chosen, minlength=400), DRAWS * share) > UNLIKELY
+
+
+# --- mixtures and single sensors
+
+
+def of_directions(density_of_points, origin=(0.0, 0.0, 0.0)):
+    """A density over (azimuth, sin elevation, range) of one over design points."""
+    return lambda chart: density_of_points(
+        np.column_stack([np.tile(origin, (len(chart), 1)), chart[:, 0], np.arcsin(chart[:, 1]), chart[:, 2]])
+    )
+
+
+# of standard deviations of up to 0.7 rad: t / sin t, the tangent plane's own share, is then up to 1.5 and more
+SPHERE_EDGES = [np.linspace(0, 2 * math.pi, 17), np.linspace(-1, 1, 13), np.linspace(0, 9, 7)]
+
+
+def test_draws_of_a_mixture_over_the_sphere_have_its_density_per_solid_angle():
+    generator = np.random.default_rng(7)
+    mixture = random_mixture(generator, 3, width=0.8)
+    points = drawn_from_mixture(mixture, DRAWS, generator, POINT)
+    mass = mass_of_cells(of_directions(lambda p: np.exp(log_density(mixture, features_of(p, POINT)))), SPHERE_EDGES, 8)
+    assert mass.sum() == pytest.approx(1.0, abs=5e-3)
+    chart = np.column_stack([points[:, AZIMUTH], np.sin(points[:, ELEVATION]), points[:, RANGE]])
+    assert p_value(counts_of_cells(chart, SPHERE_EDGES), DRAWS * mass / mass.sum()) > UNLIKELY
+
+
+def test_without_the_share_of_the_tangent_plane_the_same_draws_would_be_refused():
+    generator = np.random.default_rng(7)
+    mixture = random_mixture(generator, 3, width=0.8)
+    points = drawn_from_mixture(mixture, DRAWS, generator, POINT)
+
+    def flat(points):
+        looking, total = direction(points[:, AZIMUTH], points[:, ELEVATION]), np.zeros(len(points))
+        for k in range(3):
+            tangent = tangent_coordinates(mixture.frames[k], looking)
+            total += (
+                mixture.weights[k]
+                * np.prod(norm.pdf(tangent, 0, mixture.spread_rad[k]), axis=1)
+                * norm.pdf(points[:, RANGE], mixture.range_m[k], mixture.spread_range_m[k])
+            )
+        return total
+
+    mass = mass_of_cells(of_directions(flat), SPHERE_EDGES, 4)
+    chart = np.column_stack([points[:, AZIMUTH], np.sin(points[:, ELEVATION]), points[:, RANGE]])
+    assert p_value(counts_of_cells(chart, SPHERE_EDGES), DRAWS * mass / mass.sum()) < UNLIKELY
+
+
+def test_draws_of_origins_have_the_mixtures_density_with_its_full_covariance():
+    space = DesignSpace((-9, -9, -9, 0.3, 0.1, 2.0), (9, 9, 9, 0.3, 0.1, 2.0))
+    generator = np.random.default_rng(8)
+    mixture = random_mixture(generator, 3)
+    points = drawn_from_mixture(mixture, DRAWS, generator, space)[:, :3]
+    edges = edges_of(14, 14, 14, low=-4.0, high=4.0)
+
+    def density(origins):
+        rays = np.column_stack([origins, np.tile([0.3, 0.1, 2.0], (len(origins), 1))])
+        return np.exp(log_density(mixture, features_of(rays, space)))
+
+    mass = mass_of_cells(density, edges, 6)
+    assert mass.sum() == pytest.approx(1.0, abs=5e-3)
+    assert p_value(counts_of_cells(points, edges), DRAWS * mass / mass.sum()) > UNLIKELY
+
+
+# --- truncated sampling
+
+BOX = DesignSpace((-0.5, -0.4, 0, -1.5, -0.9, 0.2), (0.5, 0.4, 0, 1.5, 0.9, 3.0))
+
+
+def samples_of(log_p_star, space=BOX, count=400_000, seed=9):
+    """Uniform samples weighted to p*: many more than are drawn of them, so that their own noise is little."""
+    points = space.sample(count, np.random.default_rng(seed))
+    return Samples(points, np.full(count, -space.log_volume), log_p_star(points), space)
+
+
+def bump(points):
+    """log p* of a tilted hill in origin, direction and range."""
+    x, y = points[:, 0], points[:, 1]
+    azimuth, elevation, distance = points[:, AZIMUTH], points[:, ELEVATION], points[:, RANGE]
+    return -np.square(x - 0.3 * azimuth) - y - np.square(azimuth - 0.2) - np.square(distance - 1 - elevation) + x * y
+
+
+def restricted_draws(document, space=BOX, log_p_star=bump, count=8000):
+    samples, constraints = samples_of(log_p_star, space), Constraints.from_mapping(document)
+    (group,) = groups(constraints, space, 1)
+    support = restrict_samples(samples, constraints, group)
+    drawn = support.points[systematic_draw(support.weights, count, np.random.default_rng(10))]
+    return support, drawn
+
+
+def axis_mass(axes, edges, within, log_p_star=bump, space=BOX, count=400_000):
+    """The renormalised density of p* in a region over the cells of some chart axes; a lattice sums over the others."""
+    unit = np.mod(0.5 + np.arange(1, count + 1)[:, None] * _LATTICE[: len(space.free)], 1.0)
+    points = space.from_unit(2 * unit - 1)
+    chart = space.to_chart(points)
+    share = np.where(within(points), np.exp(log_p_star(points)), 0.0)
+    mass = np.histogramdd(chart[:, axes], edges, weights=share)[0].ravel()
+    return mass / mass.sum(), share.mean() / np.exp(log_p_star(points)).mean()
+
+
+# generators of a lattice in five dimensions: powers of the root of r^6 = r + 1, inverted (Roberts 2018)
+_LATTICE = 1.1347241384015194 ** -np.arange(1.0, 6.0)
+
+
+def test_draws_inside_a_gate_have_the_density_renormalised_there():
+    support, drawn = restricted_draws({"gate": {"start_m": {"min": 0.8}, "end_m": {"max": 1.9}}})
+    assert drawn[:, RANGE].min() >= 0.8
+    assert drawn[:, RANGE].max() <= 1.9
+    edges = [np.linspace(-1.5, 1.5, 9), np.linspace(0.8, 1.9, 12)]
+    mass, share = axis_mass([AZIMUTH, RANGE], edges, lambda p: (p[:, RANGE] >= 0.8) & (p[:, RANGE] <= 1.9))
+    assert support.total == pytest.approx(share, rel=0.01)
+    assert p_value(counts_of_cells(drawn[:, [AZIMUTH, RANGE]], edges), len(drawn) * mass) > UNLIKELY
+
+
+def test_draws_inside_an_origin_box_without_an_excluded_one_have_the_density_renormalised_there():
+    support, drawn = restricted_draws(
+        {
+            "origin": {
+                "low_m": [-0.4, -0.2, 0.0],
+                "high_m": [0.4, 0.4, 0.0],
+                "exclude": [{"low_m": [0.0, 0.0, -1.0], "high_m": [0.2, 0.2, 1.0]}],
+            }
+        }
+    )
+    x, y = drawn[:, 0], drawn[:, 1]
+    assert not ((x > 0) & (x < 0.2) & (y > 0) & (y < 0.2)).any()
+    edges = [np.linspace(-0.4, 0.4, 9), np.linspace(-0.2, 0.4, 7)]
+
+    def within(points):
+        x, y = points[:, 0], points[:, 1]
+        hole = (x > 0) & (x < 0.2) & (y > 0) & (y < 0.2)
+        return (np.abs(x) <= 0.4) & (y >= -0.2) & (y <= 0.4) & ~hole
+
+    mass, share = axis_mass([0, 1], edges, within)
+    assert support.total == pytest.approx(share, rel=0.01)
+    assert p_value(counts_of_cells(drawn[:, :2], edges), len(drawn) * mass) > UNLIKELY
+
+
+def test_draws_inside_a_field_of_view_fill_its_cap_of_the_sphere_evenly():
+    # p* is flat and the boresight given: what is left is the cap around it, half a diagonal of the field wide
+    _, drawn = restricted_draws(
+        {
+            "boresight": {"azimuth_deg": {"min": 20, "max": 20}, "elevation_deg": {"min": 10, "max": 10}},
+            "field_of_view": {"horizontal_deg": {"max": 40}, "vertical_deg": {"max": 30}},
+        },
+        log_p_star=lambda points: np.zeros(len(points)),
+    )
+    axis = direction(math.radians(20), math.radians(10))
+    cosine = direction(drawn[:, AZIMUTH], drawn[:, ELEVATION]) @ axis
+    reach = math.cos(math.radians(math.hypot(40, 30) / 2))
+    frame = np.stack([axis, direction(math.radians(110), 0.0), direction(math.radians(20), math.radians(100))])
+    local = direction(drawn[:, AZIMUTH], drawn[:, ELEVATION]) @ frame.T
+    edges = [np.linspace(reach, 1, 11), np.linspace(-math.pi, math.pi, 13)]
+    found = counts_of_cells(np.column_stack([cosine, np.arctan2(local[:, 2], local[:, 1])]), edges)
+    assert p_value(found, np.full(120, len(drawn) / 120)) > UNLIKELY
+
+
+def test_draws_from_a_pinned_origin_have_the_density_at_that_origin():
+    space = DesignSpace((-0.05, 0, 0, -0.8, -0.7, 0.5), (0.05, 0, 0, 0.8, 0.7, 2.0))
+
+    # a hill so far inside the space that what is seen of it from one origin is seen from all
+    def log_p_star(points):
+        x, azimuth, elevation, distance = points[:, 0], points[:, AZIMUTH], points[:, ELEVATION], points[:, RANGE]
+        return -np.square((azimuth - x) / 0.2) - np.square((elevation + x) / 0.2) - np.square((distance - 1.2) / 0.15)
+
+    samples = samples_of(log_p_star, space)
+    constraints = Constraints.from_mapping({"origin": {"fixed_m": [0.04, 0, 0]}})
+    (group,) = groups(constraints, space, 1)
+    support = pin_samples(samples, constraints, group, log_p_star, 60_000, np.random.default_rng(11))
+    drawn = support.points[systematic_draw(support.weights, 4000, np.random.default_rng(12))]
+    assert (drawn[:, 0] == 0.04).all()
+    edges = [np.linspace(-0.8, 0.8, 15), np.linspace(-0.7, 0.7, 13), np.linspace(0.5, 2.0, 13)]
+    chart = np.column_stack([drawn[:, AZIMUTH], np.sin(drawn[:, ELEVATION]), drawn[:, RANGE]])
+    mass = mass_of_cells(of_directions(lambda p: np.exp(log_p_star(p)), (0.04, 0, 0)), edges, 8)
+    assert p_value(counts_of_cells(chart, edges), len(drawn) * mass / mass.sum()) > UNLIKELY
+
+
+# --- layouts of rays
+
+
+def one_sensor(layout, rays, **changes):
+    return DesignSpec(name="d", sensors=(sensor(**changes),), layout=layout, rays=rays)
+
+
+def field_mass(one, edges, density):
+    """The mass over (azimuth, sin elevation) of a density over one sensor's tangent plane, inside its field."""
+    half = np.array(one.field_of_view_rad) / 2
+
+    def on_sphere(chart):
+        tangent = tangent_coordinates(one.frame, direction(chart[:, 0], np.arcsin(chart[:, 1])))
+        angle = np.hypot(*tangent.T)
+        inside = (np.abs(tangent) <= half).all(axis=1)
+        return np.where(inside, density(tangent) / np.sinc(angle / math.pi), 0.0)
+
+    mass = mass_of_cells(on_sphere, edges, 12)
+    return mass / mass.sum()
+
+
+def on_chart(rays):
+    azimuth, elevation = angles(rays.direction)
+    return np.column_stack([azimuth, np.sin(elevation)])
+
+
+CHART_EDGES = [np.linspace(0, 2 * math.pi, 33), np.linspace(-1, 1, 17)]
+
+
+def test_a_grid_is_even_over_a_wide_field_of_view_on_the_sphere():
+    design = one_sensor("grid", DRAWS, spread_horizontal_rad=0.5, spread_vertical_rad=0.3, azimuth_rad=2.0)
+    (one,) = design.sensors
+    mass = field_mass(one, CHART_EDGES, lambda tangent: np.ones(len(tangent)))
+    counts = counts_of_cells(on_chart(lay_out(design)), CHART_EDGES)
+    # the field's edge cuts cells, which midpoints know to a part in a few hundred
+    filled = DRAWS * mass > 5
+    assert p_value(counts[filled], counts[filled].sum() * mass[filled] / mass[filled].sum()) > UNLIKELY
+    # a grid in azimuth and elevation instead is found out
+    wide = np.random.default_rng(13).uniform(-0.5, 0.5, (DRAWS, 2)) * one.field_of_view_rad
+    crooked = np.column_stack([wide[:, 0] + one.azimuth_rad, np.sin(wide[:, 1] + one.elevation_rad)])
+    assert p_value(counts_of_cells(crooked, CHART_EDGES), np.maximum(DRAWS * mass, 1e-3)) < UNLIKELY
+
+
+RAYS = 1000
+
+
+def hill(tangent):
+    """A steep density over a tangent plane."""
+    return np.exp(-np.square(tangent / [0.10, 0.07]).sum(axis=1) / 2)
+
+
+def samples_of_hill(one, count=60_000, seed=14):
+    generator = np.random.default_rng(seed)
+    tangent = generator.uniform(-0.5, 0.5, (count, 2)) * one.field_of_view_rad
+    azimuth, elevation = angles(tangent_directions(one.frame, tangent))
+    reach = generator.normal(1.0, 0.02, count)
+    points = np.column_stack([np.tile(one.origin_m, (count, 1)), azimuth, elevation, reach])
+    angle = np.hypot(*tangent.T)
+    low, high = (*one.origin_m, 0, -math.pi / 2, 0.0), (*one.origin_m, 2 * math.pi, math.pi / 2, 9.0)
+    log_prob = -np.log(np.sinc(angle / math.pi))
+    return Samples(points, log_prob, np.log(hill(tangent)) + log_prob, DesignSpace(low, high))
+
+
+@pytest.mark.parametrize("layout", ["density", "scan"])
+def test_rays_by_the_density_follow_its_square_root(layout):
+    # centres of optimal cells in two dimensions (Zador 1982)
+    design = one_sensor(layout, RAYS, origin_m=np.zeros(3))
+    (one,) = design.sensors
+    samples = samples_of_hill(one)
+    if layout == "scan":
+        rays = lay_out(fit(samples, layout="scan", rays=RAYS).design)
+    else:
+        rays = lay_out(design, RAYS, samples)
+    tangent = tangent_coordinates(one.frame, rays.direction)
+    half = np.array(one.field_of_view_rad) / 2
+    edges = [np.linspace(-h, h, 9) for h in half]
+    counts = counts_of_cells(np.clip(tangent, -half, half), edges)
+    root = mass_of_cells(lambda u: np.sqrt(hill(u)), edges, 8)
+    whole = mass_of_cells(hill, edges, 8)
+    assert p_value(counts, RAYS * root / root.sum()) > UNLIKELY
+    assert p_value(counts, RAYS * whole / whole.sum()) < UNLIKELY
+
+
+def test_distributed_rays_without_samples_fill_their_sensors_own_gaussian():
+    covariance = np.array([[0.04, 0.01, 0], [0.01, 0.09, 0.0], [0, 0, 0.01]])
+    design = one_sensor("distributed", DRAWS, origin_covariance_m2=covariance, origin_m=np.zeros(3))
+    rays = lay_out(design)
+    (one,) = design.sensors
+    away = rays.origin_m @ np.linalg.cholesky(np.linalg.inv(covariance))
+    squares = np.square(away).sum(axis=1)
+    inside = chi2.cdf(squares, 3) / one.level
+    assert inside.max() <= 1 + 1e-9
+    height = away[:, 2] / np.sqrt(squares)
+    spread = np.array([one.spread_horizontal_rad, one.spread_vertical_rad])
+    tangent = tangent_coordinates(one.frame, rays.direction)
+    across = (norm.cdf(tangent / spread) - (1 - one.level) / 2) / one.level
+    unit = np.clip(np.column_stack([inside, (height + 1) / 2, across]), 0, 1)
+    for first in range(4):
+        for second in range(first):
+            edges = edges_of(20, 20, low=0.0)
+            assert p_value(counts_of_cells(unit[:, [second, first]], edges), np.full(400, DRAWS / 400)) > UNLIKELY
+
+
+@pytest.mark.parametrize("measure", ["solid_angle", "angles"])
+@pytest.mark.parametrize("name", ["random", "uniform"])
+def test_rays_of_the_plain_baselines_are_uniform_in_what_they_say(name, measure):
+    space = DesignSpace((-1, 0, 0, 0.5, -1.2, 0.5), (1, 0, 0, 2.5, 1.4, 3.0), measure=measure)
+    rays = build_baseline(name, space, (), 4000, 3)
+    azimuth, elevation = angles(rays.direction)
+    # even placements divide the angles; random ones are uniform in the space's own measure
+    by_area = measure == "solid_angle" and name == "random"
+    low, high = np.array([-1, 0.5, -1.2]), np.array([1, 2.5, 1.4])
+    if by_area:
+        low[2], high[2] = np.sin(low[2]), np.sin(high[2])
+    edges = [np.linspace(*ends, 8) for ends in zip(low, high, strict=True)]
+    chart = np.column_stack([rays.origin_m[:, 0], azimuth, np.sin(elevation) if by_area else elevation])
+    assert p_value(counts_of_cells(np.clip(chart, low, high), edges), np.full(343, 4000 / 343)) > UNLIKELY
+
+
+def test_points_of_an_occupancy_grid_are_drawn_by_its_probabilities():
+    probability = np.random.default_rng(15).uniform(0, 1, (4, 3, 5)) ** 2
+    grid = OccupancyGrid(np.array([1.0, -2.0, 0.5]), 0.25, probability)
+    points = grid.draw(DRAWS, np.random.default_rng(16))
+    edges = [low + 0.25 * np.arange(n + 1) for low, n in zip(grid.low_m, probability.shape, strict=True)]
+    expected = DRAWS * probability.ravel() / probability.sum()
+    assert p_value(counts_of_cells(points, edges), expected) > UNLIKELY
+
+
+@pytest.mark.parametrize("count", [400, 1000, 20_000])
+@pytest.mark.parametrize("axes", [2, 3, 4, 5, 6])
+def test_even_points_are_more_even_than_draws_in_every_pair_of_their_axes(axes, count):
+    points = low_discrepancy(count, axes)
+    edges = edges_of(10, 10, low=0.0)
+    for first in range(axes):
+        for second in range(first):
+            counts = counts_of_cells(points[:, [second, first]], edges)
+            # Pearson's statistic of independent draws falls below this once in a hundred times
+            assert np.sum(np.square(counts - count / 100)) / (count / 100) < chi2.ppf(0.01, 99), (second, first)
+
+
+# --- surfaces: the share of each body's area between two heights, in closed form
+
+
+def of_sphere(height):
+    return np.clip((height + 0.5) / 1.0, 0, 1)
+
+
+def of_capsule(height):
+    # half a sphere at each end of a cylinder; all bands of one height have one area
+    return np.clip((height + 0.7) / 1.4, 0, 1)
+
+
+def of_box(height):
+    side, lid = 2 * 2 * (0.5 + 0.3), 4 * 0.5 * 0.3
+    total = side * 0.4 + 2 * lid
+    below = np.where(height >= -0.2, lid, 0.0) + side * np.clip(height + 0.2, 0, 0.4)
+    return (below + np.where(height >= 0.2, lid, 0.0)) / total
+
+
+def of_tetrahedron(height):
+    # three sides and a floor of equal area; a side's share below a height is 1 - (1 - z)^2
+    return (np.where(height >= 0, 1.0, 0.0) + 3 * (1 - np.square(1 - np.clip(height, 0, 1)))) / 4
+
+
+def tetrahedron():
+    radius = 1 / math.sqrt(2)  # of the floor's corners, for the height 1
+    turn = 2 * math.pi * np.arange(3) / 3
+    corners = np.column_stack([radius * np.cos(turn), radius * np.sin(turn), np.zeros(3)])
+    return Mesh(np.vstack([corners, [0, 0, 1.0]]), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]))
+
+
+SHAPES = {
+    "sphere": (Sphere(0.5), of_sphere, -0.5, 0.5),
+    "capsule": (Capsule(0.3, 0.4), of_capsule, -0.7, 0.7),
+    "box": (Box((0.5, 0.3, 0.2)), of_box, -0.2, 0.2),
+    "mesh": (tetrahedron(), of_tetrahedron, 0.0, 1.0),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_points_on_a_surface_are_uniform_in_its_area(name):
+    shape, below, low, high = SHAPES[name]
+    points = sample_body([Body(shape)], BOX, DRAWS, np.random.default_rng(17)).points
+    edges = np.linspace(low, high, 21)
+    edges[0], edges[-1] = low - 1e-9, high + 1e-9
+    turn = np.arctan2(points[:, 1], points[:, 0])
+    counts = np.histogram(points[:, 2], edges)[0]
+    assert p_value(counts, DRAWS * np.diff(below(edges))) > UNLIKELY
+    if name in ("sphere", "capsule"):
+        both = [edges, np.linspace(-math.pi, math.pi, 13)]
+        expected = np.multiply.outer(np.diff(below(edges)), np.full(12, 1 / 12)).ravel()
+        assert p_value(counts_of_cells(np.column_stack([points[:, 2], turn]), both), DRAWS * expected) > UNLIKELY
+
+
+def test_points_on_several_bodies_share_themselves_by_area():
+    scene = Scene((Body(Sphere(0.5)), Body(Box((0.5, 0.3, 0.2)))))
+    points = sample_body(scene.bodies, BOX, DRAWS, np.random.default_rng(18)).points
+    on_sphere = int((np.abs(np.linalg.norm(points, axis=1) - 0.5) < 1e-9).sum())
+    areas = np.array([math.pi, 8 * (0.15 + 0.06 + 0.1)])
+    assert p_value([on_sphere, DRAWS - on_sphere], DRAWS * areas / areas.sum()) > UNLIKELY

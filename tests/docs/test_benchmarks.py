@@ -1,0 +1,457 @@
+"""The scripts of benchmarks/ start and say what they do; their helpers and the example's pictures work."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from support.small_runs import shifting_environment
+
+from lidardesign.scene import Mesh
+
+ROOT = Path(__file__).parents[2]
+SCRIPTS = sorted(path for path in (ROOT / "benchmarks").glob("*.py") if path.stem != "common")
+
+
+@pytest.fixture(scope="module")
+def common():
+    spec = importlib.util.spec_from_file_location("benchmarks_common", ROOT / "benchmarks" / "common.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules[spec.name]
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_a_benchmark_imports_and_explains_itself(script):
+    if script.stem == "em":
+        pytest.importorskip("sklearn")
+    done = subprocess.run([sys.executable, script, "--help"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("usage:")
+    assert f"benchmarks/{script.name}" in done.stdout
+
+
+def test_every_benchmark_is_documented():
+    text = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    for script in SCRIPTS:
+        assert f"python benchmarks/{script.name}" in text
+
+
+def test_a_command_is_measured_from_outside(common):
+    words = [sys.executable, "-c", "import sys; x = bytearray(2 ** 25); print('{\"a\": 1}')"]
+    result = common.run_process(words)
+    assert result.document() == {"a": 1}
+    assert result.peak_mib > 32
+    assert result.wall > 0
+
+
+def test_a_command_that_fails_ends_the_benchmark_with_its_message(common):
+    result = common.run_process([sys.executable, "-c", "import sys; sys.exit('what went wrong')"])
+    with pytest.raises(SystemExit, match="what went wrong"):
+        result.document()
+
+
+def test_contestants_take_turns_after_one_round_that_is_not_counted(common):
+    calls = []
+    measured = common.interleaved({name: lambda name=name: calls.append(name) for name in "ab"}, rounds=2)
+    assert calls == list("ababab")
+    assert all(len(timing.wall) == len(timing.cpu) == 2 for timing in measured.values())
+
+
+def test_ratios_are_taken_round_by_round(common):
+    assert common.median_ratio([1.0, 10.0, 100.0], [2.0, 20.0, 50.0]) == 0.5
+
+
+@pytest.fixture
+def script(monkeypatch):
+    """A benchmark script as a module, by its name."""
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    before = set(sys.modules)
+    yield lambda name: importlib.import_module(name)
+    for name in {"common", *(path.stem for path in SCRIPTS)} & (set(sys.modules) - before):
+        del sys.modules[name]
+
+
+def test_a_claim_is_said_to_hold_or_where_it_does_not(common):
+    assert common.verdict("lower", {"a": True, "b": True}) == "holds: lower (2 of 2)"
+    assert common.verdict("lower", {"a": True, "b": False}) == "does not hold: lower (1 of 2; not for b)"
+
+
+def test_a_run_is_taken_as_it_is(common, tmp_path):
+    options = common.parser(None)
+    common.run_options(options)
+    assert common.learned("arm", tmp_path, options.parse_args(["--run", "here"]), {}) == Path("here")
+    with pytest.raises(SystemExit, match="as it is"):
+        common.learned("arm", tmp_path, options.parse_args(["--run", "here", "--preset", "draft"]), {})
+    with pytest.raises(SystemExit, match="as it is"):
+        common.learned("arm", tmp_path, options.parse_args(["--run", "here"]), {"robot": "other.xml"})
+
+
+def test_a_benchmark_that_is_refused_says_why_without_a_traceback(common):
+    from lidardesign.errors import ConfigError
+
+    def refused():
+        raise ConfigError("5 m", where="--at", allowed="0 to 4 m")
+
+    with pytest.raises(SystemExit, match="--at: 5 m"):
+        common.without_traceback(refused)
+
+
+def test_the_rays_that_a_distance_takes_are_exact_on_a_power_law(script):
+    rays = (100, 200, 400, 1600)
+    distances = [3 * count**-0.7 for count in rays]
+    needed = script("occlusion").rays_needed
+    for wanted in (130.0, 200.0, 399.0, 1000.0):
+        found = needed(rays, distances, 3 * wanted**-0.7)
+        assert found.rays == pytest.approx(wanted)
+        assert not found.bound
+
+
+def test_the_rays_that_a_distance_takes_are_bounded_beyond_the_curve(script):
+    needed = script("occlusion").rays_needed
+    assert needed((100, 200), (0.4, 0.2), 0.5).text() == "<= 100"
+    assert needed((100, 200), (0.4, 0.2), 0.1).text() == "> 200"
+
+
+def test_a_curve_that_rises_again_counts_where_it_first_comes_down(script):
+    needed = script("occlusion").rays_needed
+    assert needed((100, 200, 400, 800), (0.4, 0.2, 0.3, 0.1), 0.2).rays == pytest.approx(200)
+
+
+def test_bounds_only_count_towards_a_factor_that_they_support(script):
+    occlusion = script("occlusion")
+    factors = [occlusion.Needed(3.0, "<="), occlusion.Needed(3.0, ">"), occlusion.Needed(1.9)]
+    assert occlusion.layout_line("density", (100, 200, 300), factors).endswith("at least 2 times at 200")
+
+
+def rows_of(**values):
+    """Rows of an evaluation from name = (value, bandwidth), at 10 rays."""
+    return {
+        "rows": [
+            {"design": name.replace("_", "-"), "rays": 10, "value": value, "bandwidth_mbps": spent}
+            for name, (value, spent) in values.items()
+        ]
+    }
+
+
+@pytest.mark.parametrize(("spent", "value", "holds"), [(1.0, 0.1, True), (1.01, 0.1, False), (0.5, 0.5, False)])
+def test_the_arm_must_be_better_at_half_the_bandwidth(script, spent, value, holds):
+    others = {"uniform": (0.5, 2.0), "random": (0.6, 2.0), "bounding": (0.4, 2.0)}
+    others |= {"occupancy": (0.4, 2.0), "no_visibility": (0.4, 2.0)}
+    first = script("arm").verdicts(rows_of(mine=(value, spent), **others))[0]
+    assert first.startswith("holds") == holds
+
+
+@pytest.mark.parametrize(
+    ("mine", "theirs", "holds"), [(9.0, 10.0, True), (10.0, 10.0, False), (2.0, 2.0, True), (2.1, 2.0, False)]
+)
+def test_the_warehouse_must_beat_bounding_where_that_misses_much(script, mine, theirs, holds):
+    others = {"uniform": (50.0, 8.0), "random": (50.0, 8.0), "bounding": (theirs, 2.0)}
+    sparse, bounded = script("warehouse").verdicts(rows_of(mine=(mine, 1.0), **others))
+    assert sparse.startswith("holds")
+    assert bounded.startswith("holds") == holds
+
+
+def test_a_warehouse_without_an_eighth_of_the_bandwidth_falls_short(script):
+    others = {"uniform": (50.0, 7.9), "random": (50.0, 8.0), "bounding": (10.0, 2.0)}
+    sparse = script("warehouse").verdicts(rows_of(mine=(9.0, 1.0), **others))[0]
+    assert sparse.startswith("does not hold")
+    assert "uniform" in sparse
+
+
+def test_positions_between_are_held_against_the_worst_of_the_papers(script):
+    paper = [[0.0, 0.5, 2.0, 0.8, 20.0], [1.2, 0.5, 3.0, 0.7, 10.0]]
+    said = script("warehouse").position_verdict
+    assert said([*paper, [0.37, 0.5, 0.1, 0.8, 20.0]]).startswith("holds")
+    assert said([*paper, [0.37, 0.5, 2.0, 0.81, 20.0]]).startswith("does not hold")
+    assert said([*paper, [0.37, 0.5, 2.0, math.nan, 20.0]]).startswith("does not hold")
+
+
+def test_the_exponent_of_a_power_law_is_its_power(script):
+    sizes = (10, 30, 100, 1000)
+    first, *others = script("growth").exponents(sizes, [5 * size**1.5 for size in sizes])
+    assert math.isnan(first)
+    assert others == pytest.approx([1.5, 1.5, 1.5])
+
+
+def test_the_reference_of_ray_casting_meets_a_box_where_planes_do(script):
+    corners = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    box = Mesh(corners, np.array([face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))]))
+    generator = np.random.default_rng(0)
+    origins = np.column_stack([np.full(200, 3.0), generator.uniform(-2, 2, (200, 2))])
+    targets = np.column_stack([np.full(200, 1.0), generator.uniform(-2, 2, (200, 2))])
+    directions = (targets - origins) / np.linalg.norm(targets - origins, axis=1, keepdims=True)
+    with np.errstate(divide="ignore"):
+        low, high = ((side - origins) / directions for side in (-1.0, 1.0))
+    enters, leaves = np.minimum(low, high).max(axis=1), np.maximum(low, high).min(axis=1)
+    expected = np.where((enters <= leaves) & (enters > 0), enters, np.inf)
+    found = script("raycasting").reference(box, origins, directions)
+    assert 50 < np.isfinite(expected).sum() < 150
+    assert found == pytest.approx(expected, abs=1e-12)
+
+
+def test_the_log_density_of_every_flow_that_is_compared_is_that_of_its_jacobian(script):
+    flow = script("flow")
+    sizes = flow.Sizes(batch=8, layers=2, bins=4, hidden=8, dtype=torch.float64)
+    base = 1.9 * torch.rand(8, flow.FEATURES, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 0.95
+    for name, contestant in flow.contestants(sizes, compiled=False).items():
+        assert flow.jacobian_error(contestant, base) < 1e-9, name
+
+
+def rival_documents(difference=-0.5, low=-0.9, high=-0.1):
+    """What `evaluate` prints about `refined` against one rival, at one number of rays."""
+    row = {"rays": 10, "ci_low": 0.0, "ci_high": 9.0, "bandwidth_mbps": 2.0}
+    pair = {"a": "refined", "b": "cma", "rays": 10, "difference": difference, "ci_low": low, "ci_high": high}
+    document = {
+        "metric": {"name": "error", "unit": "mm", "better": "lower"},
+        "scenes": 3,
+        "rows": [{**row, "design": "refined", "value": 4.5}, {**row, "design": "cma", "value": 5.0}],
+        "paired": [pair],
+        "equal_bandwidth": [{**row, "design": "cma", "value": 5.0, "matched_to": "refined", "matched_rays": 10}],
+        "paired_equal_bandwidth": [{**pair, "rays_b": 8}],
+        "cma": [],
+    }
+    return {"rays": {10: document}, "seconds": 100.0, "times": {"learning": 90.0, "change": 1.0, "refined": 9.0}}
+
+
+def test_a_rival_is_beaten_where_the_interval_says_so(script):
+    rivals = script("rivals")
+    for numbers, word in (((-0.5, -0.9, -0.1), "better"), ((0.5, 0.1, 0.9), "worse"), ((-0.1, -0.5, 0.4), "not told")):
+        found = rival_documents(*numbers)
+        (row,) = [row for row in rivals.equal_rays(found) if row[1] == "cma"]
+        assert word in row[-1]
+        assert row[-1].startswith(f"{100 * numbers[0] / 5:+.1f} (")
+        (matched,) = rivals.equal_bandwidth(found)
+        assert word in matched[-1]
+        assert all(line.startswith("holds") == (word == "better") for line in rivals.verdicts(found)[:2])
+
+
+def test_where_higher_is_better_a_positive_difference_is(script):
+    pair = {"difference": 0.5, "ci_low": 0.1, "ci_high": 0.9}
+    assert script("rivals").standing(pair, "higher") == "better"
+    assert script("rivals").standing(pair, "lower") == "worse"
+
+
+def test_a_search_has_the_time_of_learning_ten_changes_and_a_refinement(script):
+    rivals = script("rivals")
+    assert rivals.Times(90.0, 1.0, 9.0).ours == 90 + 10 * 1 + 9
+    assert rivals.verdicts(rival_documents())[-1].startswith("holds: at least 50 times faster")
+
+
+def test_longer_searches_stand_beside_the_others(script):
+    rivals = script("rivals")
+    document = rival_documents()["rays"][10]
+    merged = rivals.joined(document, rival_documents(-0.4)["rays"][10])
+    assert [row["design"] for row in merged["rows"]] == ["refined", "cma", rivals.LONG_NAME]
+    assert [pair["b"] for pair in merged["paired"]] == ["cma", rivals.LONG_NAME]
+    assert merged["paired"][1]["difference"] == -0.4
+    assert len(document["rows"]) == 2
+
+
+def test_designs_are_named_by_what_they_are(script):
+    text = {"rows": [{"design": "refined-361"}, {"design": "scan-361"}, {"design": "bounding"}]}
+    named = script("rivals").named(text, 361)
+    assert [row["design"] for row in named["rows"]] == ["refined", "scan", "bounding"]
+
+
+def test_what_was_measured_is_not_measured_again(script, tmp_path):
+    calls = []
+    for _ in range(2):
+        found = script("rivals").kept(tmp_path / "x.json", lambda: calls.append(1) or {"a": 1})
+    assert found == {"a": 1}
+    assert calls == [1]
+
+
+def test_rays_are_counted_over_designs_budgets_and_scenes(script):
+    found = {"scenes": 3, "rows": [{"rays": 10}, {"rays": 20}], "equal_bandwidth": [{"rays": 5}]}
+    assert script("evaluate").rays_scored(found) == 3 * 35
+
+
+@pytest.fixture
+def fill_benchmarks():
+    spec = importlib.util.spec_from_file_location("fill_benchmarks", ROOT / "tools" / "fill_benchmarks.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    yield module
+    sys.modules.pop(module.SHARED, None)
+
+
+def test_figures_replace_what_stood_between_the_marks_and_nothing_else(fill_benchmarks):
+    page = "before\n\n<!-- flow -->\n\nold\n\n<!-- flow -->\n\nafter\n"
+    once = fill_benchmarks.filled(page, "flow", "new")
+    assert once == page.replace("old", "new")
+    assert fill_benchmarks.filled(once, "flow", "new") == once
+    with pytest.raises(SystemExit, match=r"em.* 0 times"):
+        fill_benchmarks.filled(page, "em", "new")
+
+
+def test_figures_name_their_date_their_machine_and_their_tables(fill_benchmarks):
+    machine = {"processor": "one", "cores": 2, "threads": 1, "python": "3.11", "load_at_start": 0.1}
+    tables = {"First": [{"a": 1, "b": 0.12345}], "Second": [{"c": "x"}]}
+    document = {"title": "Flow", "machine": machine, "tables": tables, "conclusions": ["that is so"]}
+    text = fill_benchmarks.markdown(document, "2026-01-02", ["First"])
+    assert "2026-01-02" in text
+    assert "2 cores, 1 thread," in text
+    assert "| 1 | 0.123 |" in text
+    assert "Second" not in text
+    assert text.endswith("- that is so")
+    with pytest.raises(SystemExit, match="there are: First; Second"):
+        fill_benchmarks.markdown(document, "2026-01-02", ["Third"])
+
+
+def run_script(name, tmp_path, *words):
+    """What a script writes as JSON."""
+    file = tmp_path / "found.json"
+    command = [sys.executable, ROOT / "benchmarks" / f"{name}.py", "--rounds", "1", "--json", file, *words]
+    done = subprocess.run(
+        [*map(str, command)], capture_output=True, text=True, check=False, env=shifting_environment()
+    )
+    assert done.returncode == 0, done.stderr
+    assert "| ---" in done.stdout
+    return json.loads(file.read_text(encoding="utf-8"))
+
+
+def settings(*pairs):
+    """Words that make `learn` small; a blurred density is learned well enough on any processor: see `small_runs`."""
+    learning = ("steps=80", "samples=4000", "balance_proposals=2048", "coverage_proposals=512")
+    return [word for pair in (*(f"learning.{one}" for one in learning), *pairs) for word in ("--set", pair)]
+
+
+SMALL_ARM = settings("size=small", "train=2", "test=2", "density.sigma_m=0.2")
+SMALL_WAREHOUSE = settings("size=small", "train=3", "test=2", "positions=1", "density.sigma_m=0.25")
+
+
+@pytest.mark.slow
+def test_frames_are_measured_and_culling_keeps_its_bound(tmp_path):
+    words = ["--trajectories", "2", "--frames", "12", "--points", "64", "--casters", "6", "--growth", "24"]
+    found = run_script("frames", tmp_path, "--robot", "embedded", *words)
+    errors = next(rows for caption, rows in found["tables"].items() if caption.startswith("Culled"))
+    assert all(0 <= row["error, max"] <= row["bound"] for row in errors)
+    assert {row["way"] for row in found["tables"]["Time per evaluation"]} >= {"full sum", "caster per frame"}
+
+
+@pytest.mark.slow
+def test_growth_is_measured(tmp_path):
+    words = ["--of", "rays", "--of", "sensors", "--of", "dimensions", "--rays", "100", "200", "--sensors", "1", "2"]
+    found = run_script(
+        "growth", tmp_path, "--model", "embedded", *words, "--samples", "2000", "--heads", "2", "--batch", "64"
+    )
+    assert [len(rows) for rows in found["tables"].values()] == [2, 2, 6]
+
+
+@pytest.mark.slow
+def test_ray_casting_is_measured_and_stays_exact_far_from_the_origin(tmp_path):
+    found = run_script("raycasting", tmp_path, "--model", "embedded", "--rays", "2000", "--checked", "100")
+    ours = [row for row in found["tables"]["100 rays against float64"] if row["way"] == "lidardesign"]
+    assert {row["offset m"] for row in ours} == {0.0, 1000.0}
+    assert all(row["hit or miss differs"] == 0 and row["99 % um"] < 1 for row in ours)
+
+
+@pytest.mark.slow
+def test_a_field_is_measured_and_exact_near_its_surface(tmp_path):
+    words = ["--scenes", "2", "--resolution", "24", "--trimesh-points", "50"]
+    found = run_script("fields", tmp_path, "--model", "embedded", *words)
+    ours = list(found["tables"].values())[1][0]
+    assert ours["error near mm"] < 1e-4
+
+
+@pytest.mark.slow
+def test_learning_is_measured_with_fields_built_and_cached_and_up_to_a_divergence(tmp_path):
+    words = ["--model", "embedded", "--preset", "draft", *settings("train=3", "density.sigma_m=0.04")]
+    words += ["--steps", "40", "--kl", "1000"]
+    found = run_script("learn", tmp_path, *words)
+    presets, steps = found["tables"].values()
+    assert [row["fields"] for row in presets] == ["built", "in the cache"]
+    assert [row["steps"] for row in steps] == [40]
+    assert presets[0]["KL nats"] == presets[1]["KL nats"]
+    assert any("the paper's code" in line for line in found["conclusions"])
+
+
+@pytest.mark.slow
+def test_constraining_is_measured_against_learning_again(tmp_path):
+    words = ["--model", "embedded", *settings("train=3", "density.sigma_m=0.04"), "--only", "none"]
+    found = run_script("constrain", tmp_path, *words)
+    (rows,) = found["tables"].values()
+    assert [row["constraints"] for row in rows] == ["none", "learn again", "fit"]
+
+
+@pytest.mark.slow
+def test_the_flow_is_measured_beside_what_is_installed(tmp_path):
+    found = run_script("flow", tmp_path, "--batch", "64", "--layers", "2", "--bins", "4", "--hidden", "8")
+    (rows,) = found["tables"].values()
+    assert all(row["log q error, nats"] < 1e-9 for row in rows if not row["flow"].startswith("floor"))
+
+
+@pytest.mark.slow
+def test_the_target_is_measured_and_agrees_with_the_plain_way(tmp_path):
+    words = ["--model", "embedded", "--scenes", "2", "--batch", "128", "--points", "8", "--resolution", "24"]
+    agreement = list(run_script("target", tmp_path, *words)["tables"].values())[1]
+    assert all(row["value, max nats"] < 1e-4 for row in agreement)
+
+
+@pytest.mark.slow
+def test_the_arm_is_measured(tmp_path):
+    found = run_script("arm", tmp_path, "--preset", "draft", *SMALL_ARM, "--sensors", "2", "--rays", "40")
+    rows = next(rows for caption, rows in found["tables"].items() if caption.startswith("Scores"))
+    assert {row["design"] for row in rows} == {
+        "benchmark-2", "uniform", "random", "bounding", "occupancy", "no-visibility",
+    }  # fmt: skip
+    assert len(found["conclusions"]) == 4
+
+
+@pytest.mark.slow
+def test_the_worth_of_knowing_about_occlusion_is_measured(tmp_path):
+    words = ["--preset", "draft", "--rays", "40", "80", "--further-rays", "120", "--layout", "density"]
+    found = run_script("occlusion", tmp_path, *SMALL_ARM, *words)
+    (rows,) = found["tables"].values()
+    assert [row["rays"] for row in rows] == [40, 80]
+
+
+@pytest.mark.slow
+def test_the_warehouse_is_measured(tmp_path):
+    words = ["--preset", "draft", *SMALL_WAREHOUSE, "--rays", "4", "--fit-rays", "4", "--at", "0", "0.37"]
+    found = run_script("warehouse", tmp_path, *words)
+    rows = next(rows for caption, rows in found["tables"].items() if caption.startswith("Fits"))
+    assert [row["x m"] for row in rows] == [0.0, 0.37]
+    assert any("exit code 2" in line for line in found["conclusions"])
+
+
+@pytest.mark.slow
+def test_rivals_are_measured_drawn_and_put_on_their_page(tmp_path):
+    page, picture = tmp_path / "page.md", tmp_path / "picture.png"
+    page.write_text("before\n\n<!-- warehouse -->\n\n<!-- warehouse -->\n\nafter\n")
+    words = ["--folder", tmp_path / "kept", "--task", "warehouse", "--preset", "draft", *SMALL_WAREHOUSE]
+    words += ["--set", "learning.steps=200", "--set", "learning.samples=20000"]
+    words += ["--rays", "4", "--cma-seconds", "1", "--page", page, "--picture", picture]
+    found = run_script("rivals", tmp_path, *words)
+    rows = next(rows for caption, rows in found["tables"].items() if "equal rays" in caption)
+    assert [row["design"] for row in rows][:2] == ["refined", "plain"]
+    assert "cma" in {row["design"] for row in rows}
+    assert picture.stat().st_size > 10_000
+    text = page.read_text()
+    assert "| refined " in text
+    assert text.startswith("before")
+    assert text.endswith("after\n")
+
+
+@pytest.mark.slow
+def test_the_flatland_pictures_are_drawn(tmp_path):
+    settings = ["learning.steps=3", "learning.samples=1000", "learning.balance_proposals=256", "train=3"]
+    words = [word for setting in settings for word in ("--set", setting)]
+    script = ROOT / "examples" / "flatland_figures.py"
+    done = subprocess.run(
+        [sys.executable, script, "--out", tmp_path, *words], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["density.png", "existing_lidars.png", "scene_point.png"]

@@ -1,0 +1,215 @@
+"""What the README shows is true."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+import typer
+
+from lidardesign import registry
+from lidardesign.cli.main import app
+from lidardesign.config import resolve
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.errors import LidardesignError
+from lidardesign.evaluate.scene_scores import checked_residuals
+from lidardesign.geometry.rays import Rays
+from lidardesign.registry import load_task
+from lidardesign.run.yaml import parse_yaml
+from lidardesign.scene import Scene
+from lidardesign.simulate.simulate import simulate
+from lidardesign.task import Task, conditions_of
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+CONSTRAINTS = (ROOT / "docs" / "constraints.md").read_text(encoding="utf-8")
+SHELL = (ROOT / "docs" / "shell.md").read_text(encoding="utf-8")
+WRITING_TASKS = (ROOT / "docs" / "writing-tasks.md").read_text(encoding="utf-8")
+# The README's pictures are downloaded by everyone who clones it.
+LARGEST_PICTURE_BYTES = 250_000
+
+
+def blocks(language: str, text: str = README) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
+
+
+def yaml_of(page: str, name: str) -> str:
+    """The file that a page shows under a name."""
+    return next(block for block in blocks("yaml", page) if block.startswith(f"# {name}"))
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/constraints.md"])
+def test_the_constraint_file_is_accepted(page):
+    text = yaml_of((ROOT / page).read_text(encoding="utf-8"), "buyable.yaml")
+    constraints = Constraints.from_mapping(parse_yaml(text, where=page).value)
+    assert constraints.budget.rays == 576
+
+
+@pytest.mark.parametrize("page", ["arm.md", "constraints.md"])
+def test_the_mounts_of_the_ceiling_are_accepted(page):
+    text = yaml_of((ROOT / "docs" / page).read_text(encoding="utf-8"), "ceiling.yaml")
+    constraints = Constraints.from_mapping(parse_yaml(text, where=page).value)
+    assert len(constraints.origin.mounts_m or ()) == 9
+    assert constraints.sensors.count == 4
+
+
+def test_the_mounts_that_a_comment_shows_are_accepted():
+    (shown,) = re.findall(r"# (mounts_m: \[.*?\]\])", CONSTRAINTS)
+    origin = parse_yaml(shown, where="constraints.md").value
+    assert len(Constraints.from_mapping({"origin": origin}).origin.mounts_m or ()) == 2
+
+
+def leaves_of(model, path=()):
+    """The paths of all keys of a model, as `gate.width_m.max`."""
+    for name, field in model.model_fields.items():
+        kinds = (field.annotation, *get_args(field.annotation))
+        inner = next((kind for kind in kinds if hasattr(kind, "model_fields")), None)
+        if inner is None or name == "snap":
+            yield (*path, name)
+        else:
+            yield from leaves_of(inner, (*path, name))
+
+
+def test_every_constraint_key_that_is_shown_is_accepted_and_none_is_left_out():
+    text = yaml_of(CONSTRAINTS, "every_key.yaml")
+    shown = parse_yaml(text, where="constraints.md").value
+    Constraints.from_mapping(shown)
+    table = CONSTRAINTS.partition("| key | what it bounds |")[2]
+    for path in leaves_of(Constraints):
+        assert path[0] in shown
+        # bounds of one quantity share a row and an example
+        named = [part for part in path if part not in ("min", "max")]
+        assert all(part in text for part in named), path
+        assert ".".join(named) in table or named[-1] in table, path
+
+
+def test_the_configuration_file_is_accepted(tmp_path):
+    path = tmp_path / "scans.yaml"
+    path.write_text(yaml_of((ROOT / "docs" / "run-folder.md").read_text(encoding="utf-8"), "scans.yaml"))
+    with pytest.raises(LidardesignError, match=r"scans: is not a folder") as caught:
+        resolve(load_task("meshes"), config_file=path)
+    assert caught.value.exit_code == 3
+
+
+def test_every_exit_code_of_the_error_tree_is_listed():
+    def codes(kind):
+        yield kind.exit_code
+        for child in kind.__subclasses__():
+            yield from codes(child)
+
+    listed = {int(number) for row in re.findall(r"^\| ([\d, ]+) \|", SHELL, re.MULTILINE) for number in row.split(",")}
+    assert {0, 70, 130, 141, 143} | set(codes(LidardesignError)) == listed
+
+
+def test_every_command_is_shown():
+    shown = README + (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    for command in app.registered_commands:
+        assert f"lidardesign {command.name or command.callback.__name__}" in shown
+
+
+def test_every_page_is_in_the_index():
+    index = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
+    for page in (ROOT / "docs").glob("*.md"):
+        assert page.name == "README.md" or f"({page.name})" in index, page.name
+
+
+def test_the_example_task_keeps_the_contract_and_scores_a_ray():
+    namespace: dict[str, object] = {}
+    exec(blocks("python")[0], namespace)  # the README's own text
+    task = namespace["RoverTask"]()
+    registry.check_interface("rover", task)
+    assert isinstance(task, Task)
+    config = task.Config()
+    scene = task.scenes(config, "test", 0)[0]
+    assert isinstance(scene, Scene)
+    origin = np.array([[0.0, 0.0, 0.3]])
+    offset = scene.bodies[0].pose()[:3, 3] - origin
+    rays = Rays(origin, offset / np.linalg.norm(offset), np.array([[0.1, 5.0]]), np.zeros(1), np.zeros(1))
+    assert task.score(scene, simulate(scene, rays)).value == 0.0
+    away = Rays(origin, -rays.direction, rays.gate_m, rays.sensor, rays.time_s)
+    assert task.score(scene, simulate(scene, away)).value == 100.0
+    assert resolve(task).space == task.space(config)
+
+
+def moving_scene_of(name: str, block: int):
+    """A task of docs/writing-tasks.md, held to the contract, and its first held-out scene."""
+    namespace: dict[str, object] = {}
+    exec(blocks("python", WRITING_TASKS)[block], namespace)  # the page's own text
+    task = namespace[name]()
+    registry.check_interface(task.name, task)
+    config = task.Config()
+    first, again = (task.scenes(config, "test", 0)[0] for _ in range(2))
+    for one, other in zip(first.bodies, again.bodies, strict=True):
+        assert np.array_equal(one.poses, other.poses)
+    return task, config, first
+
+
+def rays_at(points: np.ndarray, origin: np.ndarray) -> Rays:
+    """One ray from an origin (3,) to each point (N, 3), listening all the way."""
+    offset = points - origin
+    directions = offset / np.linalg.norm(offset, axis=1, keepdims=True)
+    count = len(points)
+    origins = np.broadcast_to(origin, points.shape)
+    return Rays(origins, directions, np.tile([0.1, 9.0], (count, 1)), np.zeros(count), np.zeros(count))
+
+
+def test_the_moving_ball_of_the_guide_is_scored_over_its_frames():
+    task, config, scene = moving_scene_of("PassingTask", 0)
+    assert resolve(task).space == task.space(config)
+    origin, ball = np.array([0.0, 0.0, 0.3]), scene.bodies[0]
+    assert scene.frames == config.frames
+    seen_at_the_ends = rays_at(ball.poses[[0, -1], :3, 3], origin)
+    assert 0.0 < task.score(scene, simulate(scene, seen_at_the_ends)).value < 100.0
+    everywhere = rays_at(ball.poses[:, :3, 3], origin)
+    assert task.score(scene, simulate(scene, everywhere)).value < task.score(
+        scene, simulate(scene, seen_at_the_ends)
+    ).value
+
+
+def test_the_residuals_of_the_guide_are_the_frames_without_the_ball():
+    task, _, scene = moving_scene_of("PassingTask", 0)
+    ball = scene.bodies[0].poses[:, :3, 3]
+    returns = simulate(scene, rays_at(ball[[0]], np.array([0.0, 0.0, 0.3])))
+    found = checked_residuals(task, scene, returns)
+    assert np.array_equal(found.points_m, ball)
+    assert found.values[0] == 0.0 < found.values[-1]
+    assert found.values.sum() == pytest.approx(task.score(scene, returns).value)
+
+
+def test_the_drive_of_the_guide_is_scored_over_its_positions():
+    task, config, scene = moving_scene_of("DriveTask", 1)
+    space = resolve(task).space
+    assert space.condition == ("x_m",)
+    places = conditions_of(task, config, space)
+    assert len(places) == 4
+    sign = scene.bodies[0].pose()[:3, 3]
+    rays = [rays_at(sign[None], np.array([place["x_m"], 0.0, 0.0])) for place in places]
+    returns = [frame for one in rays for frame in simulate(scene, one)]
+    assert task.score(scene, returns).value == 0.0
+    away = Rays(rays[0].origin_m, -rays[0].direction, rays[0].gate_m, rays[0].sensor, rays[0].time_s)
+    assert task.score(scene, [*simulate(scene, away), *returns[1:]]).value == 25.0
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))], ids=lambda p: p.name)
+def test_links_lead_somewhere_and_pictures_are_small(page):
+    targets = re.findall(r"\]\(([^)#:]+)\)", page.read_text(encoding="utf-8"))
+    for target in targets:
+        found = page.parent / target
+        assert found.exists(), target
+        assert found.suffix != ".png" or found.stat().st_size < LARGEST_PICTURE_BYTES
+
+
+def test_every_option_that_a_console_shows_exists():
+    known = {
+        name
+        for command in typer.main.get_command(app).commands.values()
+        for part in (command, *getattr(command, "commands", {}).values())
+        for parameter in part.params
+        for name in parameter.opts
+    }
+    consoles = "\n".join(blocks("console"))
+    shown = {word for line in consoles.splitlines() if "lidardesign" in line for word in re.findall(r"--[\w-]+", line)}
+    assert shown <= known

@@ -1,0 +1,260 @@
+"""`evaluate --effects audit`: all effects against the planned ones, row by row; and what `evaluate` says of effects."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from evaluate.test_score import MissTask, design, make_request, scenes
+from simulate.test_plan import SINGLE
+from support.command_line import caller, make_run
+
+from lidardesign.errors import PluginError
+from lidardesign.evaluate.report.tables import audit_section, effects_section
+from lidardesign.evaluate.results import Audit, AuditRow, effect_notes, summaries
+from lidardesign.evaluate.score import evaluate
+from lidardesign.scene import Ambient, Scene
+from lidardesign.simulate import plan as plan_module
+from lidardesign.simulate.detector.detector import IDEAL, Detector
+from lidardesign.simulate.physics import EFFECTS
+from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
+
+EFFECT_KEYS = {"name", "on", "bound", "tolerance", "unit", "reason", "lost", "lost_tolerance", "scenes_on", "seconds"}
+JITTERY = Detector("jittery", jitter_sigma_s=1e-9)
+
+
+@pytest.fixture(autouse=True)
+def without_light_transport(monkeypatch):
+    """The same on every machine: late light is rendered by another program, which some do not have."""
+    monkeypatch.setattr(plan_module, "_missing", lambda name: "not here" if name == "multipath" else None)
+
+
+class RangeTask(MissTask):
+    """Mean range [mm]."""
+
+    def __init__(self, tolerance=0.001):
+        self.metric = replace(MissTask.metric, worst=1e4, tolerance=tolerance)
+
+    def score(self, scene, returns):
+        score, found = super().score(scene, returns), np.concatenate([one.range_m[one.returned] for one in returns])
+        return replace(score, value=1000 * float(found.mean())) if len(found) else score
+
+
+def sunny(count=2, lux=1e5):
+    return [Scene(scene.bodies, scene.name, ambient=Ambient(lux)) for scene in scenes(2, count)]
+
+
+def sunlit(**changes):
+    """Two scenes in the sun, seen by the single-photon detector, at 9 rays."""
+    return evaluate(make_request(**{"test": sunny(), "train": (), "planner": Planner(SINGLE), "rays": (9,), **changes}))
+
+
+def values(evaluation):
+    return {(row.design, row.rays, row.matched_to): list(row.per_scene) for row in evaluation.rows}
+
+
+def test_geometry_alone_is_what_it_was_with_any_choice_for_an_ideal_detector():
+    plain = evaluate(make_request())
+    assert [effect.name for effect in plain.effects] == list(EFFECTS)
+    assert not any(effect.on for effect in plain.effects)
+    for choice in ("none", "all"):
+        other = evaluate(make_request(planner=Planner(IDEAL, choice)))
+        for key, scores in values(plain).items():
+            assert values(other)[key] == pytest.approx(scores, abs=1e-9)
+
+
+def test_rows_meet_the_effects_that_their_scenes_call_for():
+    calm, noisy = evaluate(make_request(test=scenes(2, 2))), sunlit()
+    effects = {effect.name: effect for effect in noisy.effects}
+    assert effects["ambient"].on
+    assert effects["ambient"].scenes_on == 1.0
+    assert values(noisy) != values(calm)
+    assert noisy.detector == "single-photon"
+    mixed = evaluate(make_request(test=[*sunny(1), *scenes(3, 3)], planner=Planner(replace(SINGLE, photons=quiet()))))
+    assert {effect.name: effect.scenes_on for effect in mixed.effects}["ambient"] == 0.25
+
+
+def quiet():
+    return replace(SINGLE.photons, dark_hz=0.0)
+
+
+def test_the_same_seed_gives_the_same_scores_and_another_seed_others():
+    first, again, other = (sunlit(task=RangeTask(), seed=seed) for seed in (3, 3, 4))
+    assert values(first) == values(again)
+    assert values(first)["aimed", 9, None] != values(other)["aimed", 9, None]
+
+
+def test_an_audit_pairs_every_row_and_passes_where_nothing_that_matters_is_skipped():
+    evaluation = sunlit(audit=True)
+    audit, rows = evaluation.audit, [*evaluation.rows, *evaluation.equal_bandwidth]
+    expected = [(row.design, row.rays, row.value, row.matched_to) for row in rows]
+    assert sorted(expected, key=str) == sorted(
+        ((row.design, row.rays, row.planned, row.matched_to) for row in audit.rows), key=str
+    )
+    assert not audit.failed
+    assert audit.unavailable == ["multipath"]
+    for row in audit.rows:
+        assert row.difference == pytest.approx(row.planned - row.everything)
+        assert row.ci_low <= row.difference <= row.ci_high
+        assert row.seconds_everything > 0
+
+
+def test_an_audit_fails_where_something_that_matters_is_skipped():
+    planner = Planner(JITTERY, parse_effects("footprint"))
+    evaluation = evaluate(make_request(task=RangeTask(), planner=planner, audit=True))
+    assert evaluation.audit.failed
+    assert "jitter" in evaluation.audit.skipped
+    assert evaluation.audit.worst > 0.001
+    assert any("not simulated, as asked, though beyond the tolerance: jitter" in note for note in evaluation.notes)
+    tolerant = evaluate(make_request(task=RangeTask(1e4), planner=planner, audit=True))
+    assert not tolerant.audit.failed
+
+
+def test_both_sides_of_an_audit_draw_the_same_random_numbers():
+    """With everything on in both, not a bit differs."""
+    planner = Planner(SINGLE, frozenset(EFFECTS) - {"multipath"})
+    audit = sunlit(planner=planner, audit=True).audit
+    assert audit.worst == 0
+    assert audit.skipped == []
+
+
+def test_progress_of_an_audit_counts_both_passes():
+    told = []
+    evaluate(make_request(test=scenes(2, 3), audit=True), progress=lambda done, total, name: told.append((done, total)))
+    assert told == [(0, 6), (1, 6), (2, 6), (3, 6), (3, 6), (4, 6), (5, 6), (6, 6)]
+
+
+def test_what_cannot_be_simulated_is_noted_where_it_may_matter():
+    decision = Planner(SINGLE).plan(sunny(1)[0], [make_request().lay_out(design(), 9, None)])
+    found = [
+        replace(effect, range_m=0.5, missing="not installed: mitsuba") if effect.name == "multipath" else effect
+        for effect in summaries([decision])
+    ]
+    notes = effect_notes(found, "auto")
+    expected = "multipath is not simulated (not installed: mitsuba): it may move ranges by up to 500 mm and change 0"
+    assert any(note.startswith(expected) for note in notes)
+    assert not effect_notes(summaries([decision]), "auto")
+
+
+def test_documents_hold_effects_and_audits_as_plain_json():
+    document = sunlit(audit=True).as_dict()
+    assert json.loads(json.dumps(document, allow_nan=False)) == document
+    assert [effect["name"] for effect in document["effects"]] == list(EFFECTS)
+    for effect in document["effects"]:
+        assert set(effect) == {*EFFECT_KEYS, "missing"}
+        assert (effect["unit"], effect["lost_tolerance"]) == ("m", 0.001)
+    audit = document["audit"]
+    assert audit["passed"] is True
+    assert audit["tolerance"] == MissTask.metric.tolerance
+    assert len(audit["rows"]) == len(document["rows"]) + len(document["equal_bandwidth"])
+    assert "audit" not in evaluate(make_request()).as_dict()
+
+
+def test_the_report_shows_effects_and_audit_and_escapes_names():
+    request = make_request(test=sunny(1), planner=Planner(replace(SINGLE, name="<b>x</b>")), audit=True, rays=(9,))
+    evaluation = evaluate(request)
+    page = effects_section(evaluation) + audit_section(evaluation, evaluation.audit)
+    assert "The audit passed." in page
+    assert "100,000 lux (sun)" in page
+    assert "<b>x</b>" not in page
+    calm = evaluate(make_request())
+    assert "No scene calls for any effect" in effects_section(calm)
+
+
+def test_failed_rows_are_those_beyond_the_tolerance_on_either_side():
+    rows = [AuditRow("a", 9, 0.0, 0.0, moved, -1.0, 1.0, 1.0, 2.0) for moved in (0.5, -0.5, 0.51, -0.6)]
+    audit = Audit(0.5, "mm", rows, [], [])
+    assert audit.failed == rows[2:]
+    assert (audit.worst, audit.seconds) == (0.6, (4.0, 8.0))
+
+
+class BrokenTask(MissTask):
+    def score(self, scene, returns):
+        raise ValueError("no such body: -1")
+
+
+def test_a_score_that_cannot_take_noisy_returns_is_named():
+    with pytest.raises(PluginError, match="no such body: -1"):
+        evaluate(make_request(task=BrokenTask(), test=sunny(1), planner=Planner(SINGLE)))
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("runs") / "flat")
+
+
+@pytest.fixture
+def fitted(lidardesign, run):
+    if not (run / "designs" / "fit.yaml").exists():
+        assert lidardesign("fit", run, "--sensors", 2).code == 0
+    return run
+
+
+def test_the_program_audits_and_exits_with_1_only_where_scores_move(lidardesign, fitted, tmp_path):
+    (tmp_path / "timed.yaml").write_text("pulse_fwhm_ps: 10\njitter_fwhm_ps: 2000\n")
+    rough = ("--detector", "timed.yaml", "--effects", "audit", "--rays", 8)
+    passed = lidardesign("evaluate", fitted, *rough, "--json")
+    assert passed.code == 0
+    assert passed.json["audit"]["passed"]
+    assert {effect["name"] for effect in passed.json["effects"] if effect["on"]} == {"jitter"}
+    failed = lidardesign("evaluate", fitted, *rough, "--range-tolerance-mm", 1e4)
+    assert failed.code == 1
+    assert "audit failed" in failed.out
+    assert "skipped effects move fit with 8 rays" in failed.err
+    document = lidardesign("evaluate", fitted, *rough, "--range-tolerance-mm", 1e4, "--json")
+    assert document.code == 1
+    assert not document.json["audit"]["passed"]
+
+
+def test_the_program_shows_effects_with_their_reasons(lidardesign, fitted):
+    plain = lidardesign("evaluate", fitted, "--rays", 8)
+    assert "none called for with the detector ideal" in plain.out
+    noisy = lidardesign("evaluate", fitted, "--rays", 8, "--detector", "single-photon", "--return-tolerance", 0.002)
+    assert "0.12 mm and 0.002 of returns together" in noisy.out
+    assert "bins are 1.2 mm wide" in noisy.out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--effects ambint", "unknown effect 'ambint'"),
+        ("--effects jitter,audit", "'audit' stands among effects"),
+        ("--detector nothing", "there is no detector 'nothing'"),
+        ("--detector broken.yaml", "broken.yaml:1"),
+        ("--range-tolerance-mm 0", "--range-tolerance-mm: 0"),
+        ("--range-tolerance-mm nan", "--range-tolerance-mm: nan"),
+        ("--return-tolerance -0.1", "--return-tolerance: -0.1"),
+        ("--return-tolerance inf", "--return-tolerance: inf"),
+    ],
+)
+def test_mistakes_are_named_before_anything_is_scored(lidardesign, run, tmp_path, options, message):
+    (tmp_path / "broken.yaml").write_text("pulse_fwhm_mm: 3\n")
+    result = lidardesign("evaluate", run, *options.split())
+    assert result.code == 2
+    assert message in result.err
+    assert not result.out
+
+
+def test_tolerances_are_those_that_are_asked_for():
+    planner = Planner(SINGLE, tolerance=Tolerance(0.002, 0.05))
+    assert evaluate(make_request(test=sunny(1), planner=planner)).effects[0].tolerance == Tolerance(0.002, 0.05)
+
+
+def test_the_program_judges_by_other_surroundings_than_were_learned(lidardesign, fitted):
+    options = ("evaluate", fitted, "--rays", 8, "--detector", "single-photon", "--effects", "auto")
+    room = lidardesign(*options, "--json").json
+    sunny = lidardesign(*options, "--set", "illuminance_lux=100000", "--set", "light=sun")
+    assert sunny.code == 0
+    assert "illuminance_lux=100000, light=sun" in sunny.out
+    assert "100,000 lux (sun)" in sunny.out
+    assert room["set"] == []
+    assert "300 lux (indoor)" in next(one["reason"] for one in room["effects"] if one["name"] == "ambient")
+    other = lidardesign("evaluate", fitted, "--rays", 8, "--set", "density.sigma_m=1")
+    assert (other.code, "what was learned cannot be changed" in other.err) == (2, True)

@@ -1,0 +1,377 @@
+"""Captures are read from every kind of file alike, and nothing wrong in one gets past the reader."""
+
+import contextlib
+import io
+import pickle
+import struct
+import zipfile
+
+import h5py
+import numpy as np
+import pytest
+from scipy.io import savemat
+from support.captures import BINS, make_capture
+
+from lidardesign.errors import DataError
+from lidardesign.evaluate.captures.arrays import read_arrays, read_matlab
+from lidardesign.evaluate.captures.capture import load_capture
+from lidardesign.run import arrays as npz
+
+
+def save_npz(path, arrays):
+    np.savez_compressed(path, **arrays)
+
+
+def save_matlab_5(path, arrays):
+    savemat(path, arrays, do_compression=True)
+
+
+def save_matlab_73(path, arrays):
+    """What MATLAB writes by save('-v7.3'): HDF5 behind 512 bytes of text, all axes in reverse."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, array in arrays.items():
+            array = np.atleast_2d(array)
+            stored = file.create_dataset(name, data=array.T, compression="gzip")
+            kind = {"f": "double", "u": "uint16", "i": "int64"}[array.dtype.kind]
+            stored.attrs["MATLAB_class"] = np.bytes_(kind)
+    with open(path, "r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512))
+
+
+FORMATS = {"npz": save_npz, "mat 5": save_matlab_5, "mat 7.3": save_matlab_73}
+
+
+def path_of(folder, kind):
+    return folder / f"scan.{kind.split()[0]}"
+
+
+@pytest.mark.parametrize("images", [True, False])
+@pytest.mark.parametrize("kind", FORMATS)
+def test_a_capture_is_the_same_from_every_kind_of_file(tmp_path, kind, images):
+    arrays = make_capture(9, images=images)
+    FORMATS[kind](path_of(tmp_path, kind), arrays)
+    found = load_capture(path_of(tmp_path, kind))
+    np.testing.assert_array_equal(found.counts, arrays["counts"].reshape(-1, BINS))
+    np.testing.assert_array_equal(found.true_range_m, arrays["true_range_m"].reshape(-1))
+    np.testing.assert_allclose(np.linalg.norm(found.direction, axis=1), 1.0, atol=1e-15)
+    assert (found.bin_ps, found.pulse_fwhm_ps) == (20.0, 60.0)
+    np.testing.assert_array_equal(found.start_ps, np.full(81, 2000.0))
+    assert found.window_m == pytest.approx((0.29979, 2.09855), abs=1e-5)
+    assert np.degrees(found.spacing_rad) == pytest.approx(30 / 8, rel=0.01)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_directions_and_scan_angles_say_the_same(tmp_path, kind):
+    arrays = make_capture(5)
+    FORMATS[kind](path_of(tmp_path, kind), arrays)
+    by_angles = load_capture(path_of(tmp_path, kind))
+    for name in ("x_deg", "y_deg", "boresight_azimuth_deg", "boresight_elevation_deg"):
+        del arrays[name]
+    arrays["direction"] = by_angles.direction.reshape(5, 5, 3)
+    FORMATS[kind](path_of(tmp_path, kind), arrays)
+    np.testing.assert_allclose(load_capture(path_of(tmp_path, kind)).direction, by_angles.direction, atol=1e-15)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_counts_keep_their_small_type(tmp_path, kind):
+    FORMATS[kind](path_of(tmp_path, kind), make_capture(4))
+    assert load_capture(path_of(tmp_path, kind)).counts.dtype == np.uint16
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_every_pixel_may_have_a_start_of_its_own(tmp_path, kind):
+    starts = 2000.0 + np.arange(25.0).reshape(5, 5)
+    FORMATS[kind](path_of(tmp_path, kind), {**make_capture(5), "start_ps": starts})
+    np.testing.assert_array_equal(load_capture(path_of(tmp_path, kind)).start_ps, starts.ravel())
+
+
+def changed(**values):
+    def change(arrays):
+        for name, value in values.items():
+            if value is None:
+                del arrays[name]
+            else:
+                arrays[name] = value(arrays[name]) if callable(value) else value
+        return arrays
+
+    return change
+
+
+def at(index, value):
+    def put(array):
+        array = array.astype(np.float64)
+        array[index] = value
+        return array
+
+    return put
+
+
+def renamed(old, new):
+    return lambda arrays: {new if name == old else name: value for name, value in arrays.items()}
+
+
+WRONG = {
+    "no counts": (changed(counts=None), "has no counts"),
+    "no time of the first bin": (changed(start_ps=None), "has no start_ps"),
+    "no directions": (changed(x_deg=None, y_deg=None), "boresight_azimuth_deg.*\n.*direction, or all of"),
+    "directions twice": (changed(direction=np.ones((5, 5, 3)) / 3**0.5), "direction, x_deg"),
+    "half the angles": (changed(y_deg=None), "x_deg, boresight"),
+    "bins in ns": (
+        renamed("bin_width_ps", "bin_width_ns"),
+        "unknown key 'bin_width_ns'(.|\n)*'bin_width_ps' in another",
+    ),
+    "ranges in mm": (renamed("true_range_m", "true_range_mm"), "'true_range_m' in another unit"),
+    "a key of its own": (changed(operator=np.ones(3)), "unknown key 'operator'"),
+    "bins of a row too few": (changed(x_deg=lambda x: x[:-1]), r"x_deg has the shape \(4, 5\)"),
+    "flat counts": (changed(counts=lambda c: c.reshape(-1)), "counts has the shape"),
+    "no pixels": (changed(counts=lambda c: c[:0]), "counts has the shape"),
+    "NaN counts": (changed(counts=at((1, 2, 3), np.nan)), "nan in pixel 7, bin 3"),
+    "infinite counts": (changed(counts=at((1, 2, 3), np.inf)), "inf in pixel 7, bin 3"),
+    "negative counts": (changed(counts=at((0, 4, 599), -1)), "-1.0 in pixel 4, bin 599"),
+    "counts beyond counting": (changed(counts=at((0, 0, 0), 1e300)), "1e.300 in pixel 0, bin 0"),
+    "averaged counts": (changed(counts=lambda c: c / 10), "whole numbers"),
+    "no photons": (changed(counts=lambda c: 0 * c), "no photon"),
+    "complex counts": (changed(counts=lambda c: c * 1j), "complex"),
+    "several bin widths": (changed(bin_width_ps=np.ones(3)), "one number"),
+    "NaN bin width": (changed(bin_width_ps=np.nan), "bin_width_ps has values that are NaN"),
+    "no bin width": (changed(bin_width_ps=0.0), "bin_width_ps is 0"),
+    "bin width in s": (changed(bin_width_ps=2e-11), "bin_width_ps is 2e-11"),
+    "bin width below zero": (changed(bin_width_ps=-20.0), "bin_width_ps is -20"),
+    "histograms before the pulse": (changed(start_ps=-1e9), "an end after the pulse"),
+    "a first bin after a minute": (changed(start_ps=6e13), "an end after the pulse"),
+    "pulse in s": (changed(pulse_fwhm_ps=5e-11), "pulse_fwhm_ps is 5e-11"),
+    "too few starts": (changed(start_ps=np.ones(3)), "start_ps has the shape"),
+    "one NaN start": (
+        changed(start_ps=lambda s: np.where(np.arange(25).reshape(5, 5) == 7, np.nan, s)),
+        "start_ps has values",
+    ),
+    "one late start": (changed(start_ps=lambda s: np.where(np.arange(25).reshape(5, 5) == 7, 1e13, s)), "an end after"),
+    "flat origin": (changed(origin_m=np.zeros(2)), r"origin_m has the shape \(2,\)"),
+    "NaN origin": (changed(origin_m=np.full(3, np.nan)), "origin_m has values that are NaN"),
+    "angles beyond a right angle": (changed(x_deg=lambda x: x * 10), "beyond 90 degrees"),
+    "NaN angles": (changed(y_deg=at((0, 0), np.nan)), "y_deg has values that are NaN"),
+    "negative true ranges": (changed(true_range_m=at((0, 0), -0.1)), "negative"),
+    "true ranges elsewhere": (changed(true_range_m=lambda r: r * 1000), "one-way, in metres"),
+    "no true range at all": (changed(true_range_m=lambda r: r * np.nan), "no true range"),
+}
+
+
+# MATLAB has no lists: flat counts would be one pixel of many bins there, and the angles of another shape.
+ONLY_NUMPY = {"flat counts"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [(kind, name) for kind in ("npz", "mat 5") for name in WRONG if kind == "npz" or name not in ONLY_NUMPY],
+)
+def test_what_cannot_be_is_refused(tmp_path, kind, name):
+    change, message = WRONG[name]
+    path = path_of(tmp_path, kind)
+    FORMATS[kind](path, change(make_capture(5)))
+    # MATLAB knows no list of three, only a row
+    with pytest.raises(DataError, match=message.replace(r"\(2,\)", r"\((1, )?2,?\)")) as caught:
+        load_capture(path)
+    assert str(path) in str(caught.value)
+
+
+def test_directions_that_are_no_unit_vectors_are_refused(tmp_path):
+    arrays = make_capture(3)
+    for name in ("x_deg", "y_deg", "boresight_azimuth_deg", "boresight_elevation_deg"):
+        del arrays[name]
+    for vectors, message in (
+        (np.ones((3, 3, 3)), "length 1.732"),
+        (np.ones((9, 3)), "shape"),
+        (np.zeros((3, 3, 3)), "length 0"),
+    ):
+        save_npz(tmp_path / "s.npz", {**arrays, "direction": vectors})
+        with pytest.raises(DataError, match=message):
+            load_capture(tmp_path / "s.npz")
+
+
+# --- files
+
+
+class Bomb:
+    def __reduce__(self):
+        return (open, ("owned", "w"))
+
+
+def test_pickled_objects_are_refused_and_never_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    np.savez("s.npz", **{**make_capture(3), "origin_m": np.array([Bomb()], dtype=object)}, allow_pickle=True)
+    with pytest.raises(DataError, match="Python objects"):
+        load_capture(tmp_path / "s.npz")
+    (tmp_path / "raw.npz").write_bytes(pickle.dumps(Bomb()))
+    with pytest.raises(DataError):
+        load_capture(tmp_path / "raw.npz")
+    assert not (tmp_path / "owned").exists()
+
+
+MATLAB_OBJECTS = {"cell": np.array([[1], "x"], dtype=object), "struct": {"a": 1.0}, "char": "text"}
+
+
+@pytest.mark.parametrize("kind", MATLAB_OBJECTS)
+def test_matlab_structures_are_refused(tmp_path, kind):
+    savemat(tmp_path / "s.mat", {**make_capture(3), "start_ps": MATLAB_OBJECTS[kind]})
+    with pytest.raises(DataError, match=f"'start_ps' is a MATLAB {kind}"):
+        load_capture(tmp_path / "s.mat")
+
+
+NUMBERS = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "?")
+SHAPES = ((1, 1), (1, 3), (4, 1), (2, 3), (3, 2, 4), (0, 3), (0, 0))
+
+
+@pytest.mark.parametrize("kind", NUMBERS)
+@pytest.mark.parametrize("packed", [True, False])
+def test_every_type_and_shape_of_matlab_5_comes_through(kind, packed):
+    generator = np.random.default_rng(0)
+    arrays = {f"a{n}": (100 * generator.random(shape)).astype(kind) for n, shape in enumerate(SHAPES)}
+    content = io.BytesIO()
+    savemat(content, arrays, do_compression=packed)
+    found = read_matlab(content.getvalue(), "s.mat")
+    assert list(found) == list(arrays)
+    for name, array in arrays.items():
+        # SciPy writes booleans as bytes with a flag, as MATLAB does
+        assert found[name].dtype == array.dtype
+        np.testing.assert_array_equal(found[name], array)
+
+
+@pytest.mark.parametrize("kind", ["f8", "f4", "i4", "i2", "u1"])
+def test_matrices_of_matlab_4_come_through(kind):
+    arrays = {"first": np.arange(12).reshape(3, 4).astype(kind), "b": np.ones((1, 1), kind)}
+    content = io.BytesIO()
+    savemat(content, arrays, format="4")
+    found = read_matlab(content.getvalue(), "s.mat")
+    assert list(found) == list(arrays)
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(found[name], array)
+    for other in ({"a": "text"}, {"a": np.array([[1j]])}):
+        content = io.BytesIO()
+        savemat(content, other, format="4")
+        with pytest.raises(DataError, match=r"'a' is a MATLAB (char|complex)"):
+            read_matlab(content.getvalue(), "s.mat")
+
+
+def test_numbers_that_matlab_stored_in_less_space_and_in_the_other_byte_order_come_through():
+    """Doubles that are whole and small are stored as bytes; files of some computers begin with the high byte."""
+    for order, mark in (("<", b"IM"), (">", b"MI")):
+        flags = struct.pack(order + "IIII", 6, 8, 6, 0)
+        shape = struct.pack(order + "IIii", 5, 8, 1, 3)
+        name = struct.pack(order + "I", 1 << 16 | 1) + b"a\x00\x00\x00"
+        values = struct.pack(order + "I", 3 << 16 | 2) + bytes([7, 8, 9, 0])
+        body = flags + shape + name + values
+        content = bytes(124) + struct.pack(order + "H", 0x0100) + mark + struct.pack(order + "II", 14, len(body)) + body
+        found = read_matlab(content, "s.mat")["a"]
+        assert found.dtype == np.float64
+        np.testing.assert_array_equal(found, [[7.0, 8.0, 9.0]])
+
+
+def test_matlab_7_structures_and_foreign_hdf5_are_refused(tmp_path):
+    path = tmp_path / "s.mat"
+    save_matlab_73(path, make_capture(3))
+    with h5py.File(path, "a") as file:
+        file.create_group("scanner")
+    with pytest.raises(DataError, match="'scanner' is a MATLAB structure"):
+        load_capture(path)
+    with h5py.File(path, "w") as file:
+        file["counts"] = np.ones((3, 3, 5))
+    with pytest.raises(DataError, match="not written by MATLAB"):
+        load_capture(path)
+    with h5py.File(path, "w") as file:
+        file["counts"] = h5py.ExternalLink("other.h5", "/counts")
+    with pytest.raises(DataError, match="link"):
+        load_capture(path)
+    with h5py.File(path, "w") as file:
+        stored = file.create_dataset("counts", (4,), "u1", external=[(str(tmp_path / "other.bin"), 0, 4)])
+        stored.attrs["MATLAB_class"] = np.bytes_("uint8")
+    with pytest.raises(DataError, match="another file"):
+        load_capture(path)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.999])
+def test_a_file_that_was_cut_short_is_refused(tmp_path, kind, share):
+    path = path_of(tmp_path, kind)
+    FORMATS[kind](path, make_capture(5))
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(DataError, match="scan"):
+        load_capture(path)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_flipped_bytes_end_in_a_clear_error_or_in_a_checked_capture(tmp_path, kind):
+    path = path_of(tmp_path, kind)
+    FORMATS[kind](path, make_capture(3))
+    content = path.read_bytes()
+    generator = np.random.default_rng(1)
+    for _ in range(60):
+        damaged = bytearray(content)
+        for place in generator.integers(0, len(content), 3):
+            damaged[place] = int(generator.integers(0, 256))
+        path.write_bytes(bytes(damaged))
+        with contextlib.suppress(DataError):
+            assert np.isfinite(load_capture(path).direction).all()
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".mat"])
+def test_garbage_a_folder_and_nothing_are_refused(tmp_path, suffix):
+    path = tmp_path / f"s{suffix}"
+    with pytest.raises(DataError, match="no such file"):
+        load_capture(path)
+    path.write_bytes(bytes(range(256)) * 16)
+    with pytest.raises(DataError):
+        load_capture(path)
+    folder = tmp_path / f"folder{suffix}"
+    folder.mkdir()
+    with pytest.raises(DataError, match="no such file"):
+        load_capture(folder)
+    with pytest.raises(DataError, match=r"suffix '.csv'.*\n.*\.npz, \.mat"):
+        load_capture(tmp_path / "s.csv")
+
+
+def test_files_above_the_stated_size_are_refused_before_they_are_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(npz, "LARGEST_BYTES", 100_000)
+    zeros = {**make_capture(3), "counts": np.zeros((3, 3, 100_000), np.uint8)}
+    for kind, save in FORMATS.items():
+        path = path_of(tmp_path, kind)
+        save(path, zeros)
+        assert path.stat().st_size < 100_000, "packed, it is small"
+        with pytest.raises(DataError, match="GiB"):
+            load_capture(path)
+    (tmp_path / "big.npz").write_bytes(bytes(100_001))
+    with pytest.raises(DataError, match="the file takes"):
+        load_capture(tmp_path / "big.npz")
+
+
+def npz_with(header, data, path):
+    content = io.BytesIO()
+    np.lib.format.write_array_header_1_0(content, header)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("counts.npy", content.getvalue() + data)
+
+
+def test_a_header_that_promises_more_than_there_is_is_refused(tmp_path):
+    path = tmp_path / "s.npz"
+    npz_with({"shape": (10**6, 10**6), "fortran_order": False, "descr": "<f8"}, bytes(80), path)
+    with pytest.raises(DataError, match="80 bytes of data"):
+        read_arrays(path)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("notes.txt", "hello")
+    with pytest.raises(DataError, match=r"notes\.txt"):
+        read_arrays(path)
+
+
+def test_a_full_capture_is_read_in_bounded_memory(tmp_path):
+    import tracemalloc
+
+    counts = np.zeros((576, 4096), np.uint16)
+    counts[:, 100] = 3
+    looking = np.tile([1.0, 0.0, 0.0], (576, 1))
+    values = {"counts": counts, "bin_width_ps": 8.0, "start_ps": 0.0, "origin_m": np.zeros(3), "direction": looking}
+    np.savez(tmp_path / "s.npz", **values)
+    tracemalloc.start()
+    load_capture(tmp_path / "s.npz")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 6 * counts.nbytes

@@ -1,0 +1,181 @@
+"""Held-out scenes scored by the workers of a dask scheduler: the same rows, also when a worker is lost."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+import warnings
+from dataclasses import replace
+
+import pytest
+from evaluate.test_workers import make_request, results
+
+from lidardesign.errors import ConfigError
+from lidardesign.evaluate.score import evaluate
+from lidardesign.evaluate.workers import cluster as worker_cluster
+from lidardesign.evaluate.workers import worker as messages
+from lidardesign.evaluate.workers.pool import WorkerScorer, workers_of
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
+
+pytestmark = [
+    # what dask.distributed leaves to be collected at the end of a test is not ours to close
+    pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning:(distributed|tornado|dask).*"),
+]
+PATIENCE_S = 60.0
+
+
+class LocalScheduler:
+    """A scheduler and workers in processes of their own, as the documentation starts them."""
+
+    def __init__(self, folder):
+        self._folder, self._started = folder, []
+        known = folder / "scheduler.json"
+        self.scheduler = self._start("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", known)
+        end = time.monotonic() + PATIENCE_S
+        while not known.exists() and time.monotonic() < end:
+            time.sleep(0.05)
+        self.address = json.loads(known.read_text())["address"]
+
+    def add_worker(self):
+        return self._start(
+            "worker", self.address, "--nthreads", "1", "--no-nanny", "--local-directory", self._folder / "scratch"
+        )
+
+    def _start(self, kind, *arguments):
+        command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", "--no-dashboard", *map(str, arguments)]
+        log = open(self._folder / f"{kind}{len(self._started)}.log", "w")  # noqa: SIM115 (closed with the process)
+        popen = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
+        self._started.append((popen, log))
+        return popen
+
+    def close(self):
+        for popen, log in reversed(self._started):
+            popen.kill()
+            popen.wait()
+            log.close()
+
+
+@pytest.fixture
+def scheduler(tmp_path):
+    started = LocalScheduler(tmp_path)
+    yield started
+    started.close()
+
+
+def test_a_cluster_scores_as_this_process_does_though_a_worker_is_lost(scheduler):
+    request = make_request()
+    expected = results(evaluate(request))
+    lost = scheduler.add_worker()
+    scheduler.add_worker()
+    with workers_of(scheduler.address, 1) as scorer:
+        scorer.prepare(request)
+
+        def kill_once(done, total, name):
+            if done == 1:
+                lost.send_signal(signal.SIGKILL)
+
+        assert results(evaluate(replace(request, scorer=scorer), progress=kill_once)) == expected
+        assert lost.wait(PATIENCE_S) == -signal.SIGKILL
+        assert results(evaluate(replace(request, scorer=scorer))) == expected
+
+
+def test_a_scheduler_that_is_lost_ends_the_evaluation_with_its_address(scheduler):
+    request = make_request()
+    scheduler.add_worker()
+    with workers_of(scheduler.address, 1) as scorer:
+
+        def kill(done, total, name):
+            if done == 1:
+                scheduler.scheduler.kill()
+
+        with pytest.raises(ConfigError, match=f"the scheduler at {scheduler.address} was lost"):
+            evaluate(replace(request, scorer=scorer), progress=kill)
+
+
+def test_a_scheduler_without_workers_is_refused(scheduler, monkeypatch):
+    monkeypatch.setattr(worker_cluster, "WORKER_SECONDS", 0.5)
+    with pytest.raises(ConfigError, match=f"the scheduler at {scheduler.address} had no worker"):
+        WorkerScorer(worker_cluster.Cluster(scheduler.address))
+
+
+def test_an_address_where_nothing_answers_is_refused(monkeypatch):
+    monkeypatch.setattr(worker_cluster, "SCHEDULER_SECONDS", 0.5)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    with pytest.raises(ConfigError, match=f"no scheduler answers at {address}"):
+        worker_cluster.Cluster(address)
+
+
+def test_an_address_where_something_else_listens_is_refused(monkeypatch):
+    monkeypatch.setattr(worker_cluster, "SCHEDULER_SECONDS", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        with pytest.raises(ConfigError, match="does not speak as a scheduler"):
+            worker_cluster.Cluster(address)
+
+
+def test_without_dask_the_message_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ConfigError, match=r"lidardesign\[cluster\]"):
+        worker_cluster.Cluster("tcp://127.0.0.1:1")
+
+
+def test_a_cluster_without_this_program_or_with_another_version_is_refused(scheduler, monkeypatch):
+    scheduler.add_worker()
+    monkeypatch.setattr(worker_cluster, "__version__", "9.9")
+    with pytest.raises(ConfigError, match=r"the scheduler has version .* of it, not 9\.9"):
+        worker_cluster.Cluster(scheduler.address)
+
+
+def test_a_cluster_that_lost_its_last_worker_is_given_up(scheduler, monkeypatch):
+    monkeypatch.setattr(worker_cluster, "LOOK_SECONDS", 0.1)
+    request = make_request()
+    only = scheduler.add_worker()
+    with workers_of(scheduler.address, 1) as scorer:
+        monkeypatch.setattr(worker_cluster, "WORKER_SECONDS", 1.0)
+
+        def kill(done, total, name):
+            if done == 1:
+                only.kill()
+
+        with pytest.raises(ConfigError, match="has had no worker for 1 s"):
+            evaluate(replace(request, scorer=scorer), progress=kill)
+
+
+def test_a_worker_that_dies_between_its_answer_and_its_delivery_is_not_waited_for_in_vain(scheduler, monkeypatch):
+    monkeypatch.setattr(worker_cluster, "LOOK_SECONDS", 0.1)
+    only = scheduler.add_worker()
+    cluster, wait = worker_cluster.Cluster(scheduler.address), worker_cluster.Cluster._next
+    monkeypatch.setattr(worker_cluster, "WORKER_SECONDS", 1.0)
+
+    def next_of_a_dying_worker(self, done):
+        future = wait(self, done)
+        only.kill()
+        only.wait()
+        return future
+
+    monkeypatch.setattr(worker_cluster.Cluster, "_next", next_of_a_dying_worker)
+    try:
+        with pytest.raises(ConfigError, match="has had no worker for 1 s"):
+            list(cluster.answers([b""]))
+    finally:
+        cluster.close()
+
+
+def test_long_messages_are_sent_and_nonsense_is_answered(scheduler):
+    scheduler.add_worker()
+    cluster = worker_cluster.Cluster(scheduler.address)
+    try:
+        answers = dict(cluster.answers([bytes(12_000_000), b""]))
+    finally:
+        cluster.close()
+    for reply in answers.values():
+        assert "error" in messages.unpack(reply)[0]

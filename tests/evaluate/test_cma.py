@@ -1,0 +1,588 @@
+"""Direct optimisation as a rival: its vectors keep every constraint, its searches never lose what they started with."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.command_line import caller
+
+from lidardesign.cli.output import Output
+from lidardesign.cli.searches import check_cma_seconds, told
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.files import design_document
+from lidardesign.design.sensor import DesignSpec, Sensor, Track, tangent_coordinates
+from lidardesign.errors import ConfigError
+from lidardesign.evaluate.baselines.candidates import mean_mbps, whole_range
+from lidardesign.evaluate.baselines.observed import TrainingViews, dense_points
+from lidardesign.evaluate.cma.candidate import CmaCandidate, CmaSettings
+from lidardesign.evaluate.cma.models import Amount, SensorModel, widest_bins
+from lidardesign.evaluate.cma.objective import OutOfTimeError, TrainingObjective
+from lidardesign.evaluate.cma.search import Budget, Search
+from lidardesign.evaluate.cma.sensor_parameters import Setting, exp_matrix, log_matrix
+from lidardesign.evaluate.cma.starts import starts, tiles
+from lidardesign.evaluate.cma.track import TrackFigures, TrackModel, Way
+from lidardesign.evaluate.score import EvaluationRequest, evaluate
+from lidardesign.scene import Body, Scene, Sphere, rigid
+from lidardesign.simulate.plan import Planner
+from lidardesign.space import AZIMUTH, ELEVATION, DesignSpace
+from lidardesign.task import Defaults, Metric, Score, TaskConfig
+
+FIXED = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))
+FREE = DesignSpace((-0.2, -0.2, -0.2, -0.6, -0.5, 0.05), (0.2, 0.2, 0.2, 0.6, 0.5, 4.0))
+CEILING = DesignSpace((-1, -1, 1, 0, -math.pi / 2, 0.1), (1, 1, 1, 2 * math.pi, -0.8, 2.0))
+FLAT = DesignSpace((0, 0, 0, math.pi / 4, 0, 0), (1, 0, 0, 3 * math.pi / 4, 0, 1.2))
+AISLE = DesignSpace(
+    (0.0, 0, 0, 0.0, -0.5, 0.05), (1.0, 0, 0, 0.0, 0.5, 4.0), condition=("x_m",), measure="angles"
+)  # fmt: skip
+FAST = Budget(math.inf, evaluations=300)
+
+
+def balls(centre, radius=0.4, jitter=0.05, count=3):
+    generator = np.random.default_rng(8)
+    shifts = generator.normal(0, jitter, (count, 3))
+    return [
+        Scene((Body(Sphere(radius), "ball", "both", rigid(translation_m=centre + shift)),), f"ball {index}")
+        for index, shift in enumerate(shifts)
+    ]
+
+
+AHEAD, BELOW = balls(np.array([3.0, 0, 0])), balls(np.array([0.3, 0.2, 0.0]), 0.3)
+RULES = {
+    "none": {},
+    "gate": {"gate": {"start_m": {"min": 0.5}, "end_m": {"max": 2.9}, "width_m": {"min": 0.1, "max": 0.3}}},
+    "field": {"field_of_view": {"horizontal_deg": {"min": 4, "max": 9}, "vertical_deg": {"max": 6}}},
+    "boresight": {"boresight": {"azimuth_deg": {"min": -8, "max": 4}, "elevation_deg": {"min": -50, "max": -2}}},
+    "read-out": {"budget": {"bandwidth_mbps": 0.2}},
+    "each": {"each": [{"gate": {"end_m": {"max": 2.0}}}, {"field_of_view": {"vertical_deg": {"max": 2}}}]},
+}
+PLACES = {
+    "box": {"origin": {"low_m": [-0.1, -0.05, -0.2], "high_m": [0.2, 0.05, 1.0], "spread_m": {"max": 0.04}}},
+    "thin": {"origin": {"thickness_m": {"max": 0.01}}},
+    "point": {"origin": {"fixed_m": [0.1, 0.0, 0.1]}},
+    "mounts": {"origin": {"mounts_m": [[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0.1], [-0.1, 0.1, 0]]}},
+    "exclude": {"origin": {"exclude": [{"low_m": [-0.1, -1, -1], "high_m": [0.1, 0.1, 2]}]}},
+}
+CEILING_PLACES = {
+    "mounts": {"origin": {"mounts_m": [[0, 0, 1], [0.5, 0, 1], [0, 0.5, 1], [-0.5, 0.5, 1]]}},
+    "point": {"origin": {"fixed_m": [0.1, 0.0, 1.0]}},
+}
+CASES = [
+    *((FIXED, AHEAD, "grid", rules) for rules in RULES.values()),
+    *((FIXED, AHEAD, "scan", rules) for name, rules in RULES.items() if name != "each"),
+    *((FREE, AHEAD, "grid", rules) for rules in (RULES | PLACES).values()),
+    *((FREE, AHEAD, "distributed", rules) for name, rules in (RULES | PLACES).items() if name != "point"),
+    *((CEILING, BELOW, "distributed", rules) for name, rules in (PLACES | CEILING_PLACES).items() if name != "point"),
+    (FLAT, balls(np.array([0.5, 0.8, 0.0]), 0.15, 0.0), "grid", RULES["gate"]),
+]
+
+
+def named(case):
+    space, _, layout, rules = case
+    place = next(name for name, value in globals().items() if value is space)
+    return f"{place.lower()} {layout} {json.dumps(rules)[:60]}"
+
+
+def setting_of(space, layout, rules, gates=True):
+    return Setting(space, Constraints.from_mapping(rules), 0.95, layout, {}, gates)
+
+
+def models_of(space, train, layout, rules, count=3):
+    setting = setting_of(space, layout, rules)
+    found = starts(setting, TrainingViews(space, train), count)
+    return [SensorModel(setting, start, [{}], rules) for start in found]
+
+
+@pytest.mark.parametrize("case", CASES, ids=named)
+def test_every_vector_however_far_stands_for_a_design_that_keeps_its_constraints(case):
+    space, train, layout, rules = case
+    generator = np.random.default_rng(5)
+    for model in models_of(space, train, layout, rules)[::7]:
+        for step in (0.0, 0.5, 4.0, 40.0):
+            design = model.design(step * generator.standard_normal(model.size), Amount(12 if layout != "scan" else 3))
+            checks = check_design(design_document(design), rules, space)
+            assert not [check for check in checks if not check.satisfied]
+            assert design.rays in (0, 12, 3)
+            rays = model.laid_out(design)[0]
+            assert len(rays) == design.rays
+
+
+@pytest.mark.parametrize("case", CASES, ids=named)
+def test_projecting_twice_is_projecting_once(case):
+    generator = np.random.default_rng(6)
+    for model in models_of(*case)[::7]:
+        for step in (0.5, 4.0):
+            vector = step * generator.standard_normal(model.size)
+            designs = [model.design(one, Amount(12)) for one in (vector, model.projected(vector))]
+            for one, other in zip(*(design.sensors for design in designs), strict=True):
+                for name in ("origin_m", "origin_covariance_m2", "frame", "field_of_view_rad", "gate_m", "weight"):
+                    found, expected = getattr(one, name), getattr(other, name)
+                    np.testing.assert_allclose(found, expected, atol=1e-6, err_msg=name)
+
+
+def test_a_vector_that_breaks_nothing_is_its_own_projection():
+    sensors = [
+        Sensor(f"s{i}", 1 / 3, np.zeros(3), np.diag([4e-4, 9e-4, 1e-4]), 0.1 * i, -0.05 * i, 0.3, 0.05, 0.03, 1.5, 0.1)
+        for i in range(3)
+    ]
+    for layout, size in (("grid", 11), ("distributed", 20)):
+        model = SensorModel(setting_of(FREE, layout, {}), sensors, [{}], {})
+        assert model.size == 3 * size
+        vector = 0.5 * np.random.default_rng(1).standard_normal(model.size)
+        back = model.projected(vector)
+        # a common factor of all weights says nothing, and shares are at most 1
+        rows, found = vector.reshape(3, -1), back.reshape(3, -1)
+        kept = np.ones(rows.shape[1], dtype=bool)
+        kept[10] = False
+        kept[19:] = False
+        np.testing.assert_allclose(found[:, kept], rows[:, kept], atol=1e-6)
+        np.testing.assert_allclose(np.ptp(found[:, 10] - rows[:, 10]), 0.0, atol=1e-9)
+
+
+def test_the_vector_zero_is_the_start():
+    sensors = [
+        Sensor(f"s{i}", 0.2 + 0.3 * i, [0.1, 0, 0], np.zeros((3, 3)), 0.1 * i, -0.1, 0.4 * i, 0.04, 0.02, 1.5, 0.1)
+        for i in range(2)
+    ]
+    model = SensorModel(setting_of(FREE, "grid", {}), sensors, [{}], {})
+    for one, other in zip(model.design(model.zero, Amount(10)).sensors, sensors, strict=True):
+        np.testing.assert_allclose(one.frame, other.frame, atol=1e-9)
+        assert one.gate_m == pytest.approx(other.gate_m)
+        assert one.field_of_view_rad == pytest.approx(other.field_of_view_rad)
+        assert one.weight == pytest.approx(other.weight / 0.7)
+
+
+@pytest.mark.parametrize("focus", [0.0, 1.0])
+def test_rays_of_spread_sensors_are_parallel_or_meet_in_one_point(focus):
+    setting = setting_of(FREE, "distributed", {})
+    start = next(
+        one
+        for one in starts(setting, TrainingViews(FREE, AHEAD), 1)
+        if np.allclose(-one[0].range_m * one[0].coupling.direction_per_m[0] @ one[0].frame[1], focus, atol=1e-9)
+    )
+    narrow = replace(start[0], coupling=replace(start[0].coupling, spread_rad=np.full(2, 1e-4)))
+    model = SensorModel(setting, [narrow], [{}], {})
+    (rays,) = model.positions(model.zero, Amount(50))
+    # what lies along the boresight is no matter of directions
+    met = rays.origin_m + (narrow.range_m if focus else 1e6) * rays.direction
+    spread = np.linalg.norm(np.ptp(met @ narrow.frame[1:].T, axis=0)) / (1.0 if focus else 1e6)
+    assert np.linalg.norm(np.ptp(rays.origin_m, axis=0)) > 0.2
+    # to first order in where a ray starts
+    assert spread < (0.05 if focus else 0.01)
+
+
+@pytest.mark.parametrize(("count", "rows"), [(n, r) for n in (1, 2, 5, 10) for r in range(1, n + 1)])
+def test_tiles_are_equal_and_fill_their_rectangle(count, rows):
+    low, high = np.array([-1.0, 2.0]), np.array([3.0, 2.5])
+    found = tiles(low, high, count, rows)
+    assert len(found) == count
+    areas = [np.prod(tile.high - tile.low) for tile in found]
+    np.testing.assert_allclose(areas, np.prod(high - low) / count)
+    for one, other in itertools.combinations(found, 2):
+        shared = np.minimum(one.high, other.high) - np.maximum(one.low, other.low)
+        assert shared.min() < 1e-12
+    assert len({tile.low[1] for tile in found}) == rows
+
+
+def test_matrix_logarithms_and_exponentials_undo_each_other():
+    generator = np.random.default_rng(0)
+    symmetric = generator.standard_normal((5, 3, 3))
+    symmetric = symmetric + np.swapaxes(symmetric, 1, 2)
+    np.testing.assert_allclose(log_matrix(exp_matrix(symmetric)), symmetric, atol=1e-9)
+
+
+def test_the_widest_cap_keeps_a_budget_that_one_bin_more_breaks():
+    amount = Amount(None, 1.0)
+    read_out = amount.read_outs(setting_of(FIXED, "grid", {}))[0]
+    widths = np.array([0.5, 1.5])
+    for most in range(1, 101):
+        cap = widest_bins(lambda width, most=most: width <= most * read_out.model.bin_m, widths, read_out)
+        assert read_out.model.bins(cap) == most
+    assert widest_bins(lambda width: True, widths, read_out) == math.inf
+
+
+@pytest.mark.parametrize("layout", ["grid", "distributed"])
+@pytest.mark.parametrize("limit", [0.004, 0.3, 2.0])
+def test_rays_within_a_bandwidth_cost_no_more_and_hardly_less(layout, limit):
+    space = FREE if layout == "distributed" else FIXED
+    generator = np.random.default_rng(2)
+    for model in models_of(space, AHEAD, layout, {})[::6]:
+        for step in (0.0, 1.0):
+            amount = Amount(None, limit)
+            positions = model.positions(step * generator.standard_normal(model.size), amount)
+            spent = mean_mbps(positions, Bandwidth())
+            assert spent <= limit * (1 + 1e-12)
+            if limit > 0.2 and layout == "grid":
+                assert spent > 0.7 * limit
+
+
+class Bowl:
+    """A model whose rays are its vectors, for searches of a function."""
+
+    size = 4
+
+    def __init__(self, start):
+        self.zero = np.array(start, dtype=np.float64)
+
+    def projected(self, vector):
+        return np.clip(vector, -1.0, None)
+
+    def positions(self, vector, amount):
+        return vector
+
+
+class Distance:
+    """The squared distance from the scene's point; vectors below -1 are never asked for."""
+
+    sign = 1.0
+
+    def __init__(self, points):
+        self.scenes = [np.asarray(point, dtype=np.float64) for point in points]
+        self.asked = 0
+
+    def values(self, lists, scenes, stop=lambda: False):
+        found = np.empty((len(lists), len(scenes)))
+        for column, number in enumerate(scenes):
+            assert min(vector.min() for vector in lists) >= -1.0
+            found[:, column] = [np.square(vector - self.scenes[number]).sum() for vector in lists]
+            self.asked += len(lists)
+            if column + 1 < len(scenes) and stop():
+                raise OutOfTimeError
+        return found
+
+
+def search(objective, starts, evaluations=1500, seed=0, **options):
+    budget = Budget(math.inf, evaluations)
+    return Search(starts, Amount(1), objective, budget, np.random.default_rng(seed), **options).run()
+
+
+def test_a_search_finds_the_lowest_point_inside_the_constraints():
+    objective = Distance([[0.5, 1.5, -3.0, 0.0]])
+    found = search(objective, [Bowl([3.0, 3, 3, 3]), Bowl([0.0, 0, 0, 0])])
+    np.testing.assert_allclose(found.vector, [0.5, 1.5, -1.0, 0.0], atol=0.01)
+    assert found.value == pytest.approx(4.0, abs=0.01)
+    assert found.start_value == pytest.approx(11.5)
+
+
+def test_a_search_begins_at_the_best_start_and_ends_no_worse():
+    points = np.random.default_rng(4).normal(0, 2, (20, 4))
+    for evaluations in (1, 40, 200, 1500):
+        found = search(Distance(points), [Bowl([9.0] * 4), Bowl([1.0] * 4), Bowl([5.0] * 4)], evaluations)
+        assert found.value <= found.start_value
+        if evaluations >= 40:
+            expected = np.square(points[: found.scenes] - 1.0).sum(axis=1).mean()
+            assert found.start_value == pytest.approx(expected)
+
+
+def test_a_search_asks_the_evaluations_that_it_counts_and_keeps_to_its_budget():
+    objective = Distance(np.random.default_rng(1).normal(0, 1, (30, 4)))
+    found = search(objective, [Bowl([2.0] * 4)], 3000)
+    assert objective.asked == found.evaluations
+    # one population may be on its way when the budget ends
+    assert found.evaluations <= 3000 + 8 * 16
+    assert found.scenes == 30
+
+
+def test_the_curve_falls_as_long_as_the_scenes_are_the_same():
+    shown = []
+    found = search(Distance(np.random.default_rng(1).normal(0, 1, (30, 4))), [Bowl([2.0] * 4)], 3000, show=shown.append)
+    assert {scenes for _, _, scenes, _ in found.curve} == {8, 16, 30}
+    for (_, before, scenes, value), (_, after, then, later) in itertools.pairwise(found.curve):
+        assert before <= after
+        assert scenes <= then
+        if (scenes, before) != (then, after) and scenes == then and after < found.evaluations:
+            assert later <= value
+    assert all(0 <= one.share <= 1 for one in shown)
+    assert shown[-1].evaluations <= found.evaluations
+
+
+def test_the_same_seed_finds_the_same_and_another_one_another():
+    points = np.random.default_rng(1).normal(0, 1, (9, 4))
+    first, again, other = (search(Distance(points), [Bowl([2.0] * 4)], 900, seed) for seed in (1, 1, 2))
+    assert first.vector.tobytes() == again.vector.tobytes()
+    assert first.vector.tobytes() != other.vector.tobytes()
+
+
+def test_a_search_ends_when_its_time_is_up_by_its_own_clock():
+    now = itertools.count()
+    objective = Distance(np.zeros((40, 4)))
+    budget = Budget(200.0, clock=lambda: float(next(now)))
+    found = Search([Bowl([2.0] * 4)], Amount(1), objective, budget, np.random.default_rng(0)).run()
+    assert 100 < found.seconds <= 220
+
+
+def test_a_search_that_has_converged_begins_anew():
+    found = search(Distance([[0.2] * 4]), [Bowl([0.0] * 4)], 6000)
+    assert found.restarts >= 1
+    assert found.value < 1e-9
+
+
+class MissTask:
+    """Percent of rays without a return."""
+
+    name = "miss"
+    summary = "rays without a return"
+    api_version = 1
+    Config = TaskConfig
+    metric = Metric("misses", "%", "lower", worst=150.0, tolerance=1.0)
+    defaults = Defaults()
+
+    def score(self, scene, returns):
+        total = sum(len(frame.outcome) for frame in returns)
+        if not total:
+            return Score(self.metric.worst, failed=True)
+        return Score(100.0 * (1 - sum(int(frame.returned.sum()) for frame in returns) / total))
+
+
+class HitTask(MissTask):
+    """Percent of rays with a return: higher is better."""
+
+    metric = Metric("hits", "%", "higher", worst=-50.0, tolerance=1.0)
+
+    def score(self, scene, returns):
+        found = super().score(scene, returns)
+        return Score(100.0 - found.value, failed=found.failed)
+
+
+def sensors(count, space=FIXED):
+    origin = np.array(space.low[:3])
+    return tuple(
+        Sensor(f"s{i}", 1 / count, origin, np.zeros((3, 3)), 0.3, 0.3, 0.0, 0.1, 0.1, 2.0, 0.3) for i in range(count)
+    )
+
+
+def track(count=3):
+    knots = np.array([0.0, 0.5, 1.0])
+    aimed = np.tile(np.linspace(-0.2, 0.2, count), (3, 1))
+    gate = np.tile([2.0, 3.5], (3, count, 1))
+    followed = Track("x_m", knots, np.zeros((3, count)), aimed, gate, np.arange(count))
+    return DesignSpec("mine", sensors(count), layout="scan", rays=count, track=followed)
+
+
+FOLLOWED = {
+    "grid": (DesignSpec("mine", sensors(2)), FIXED, AHEAD),
+    "density": (DesignSpec("mine", sensors(2), layout="density"), FIXED, AHEAD),
+    "scan": (DesignSpec("mine", sensors(6), layout="scan", rays=6), FIXED, AHEAD),
+    "distributed": (DesignSpec("mine", sensors(2, CEILING), layout="distributed"), CEILING, BELOW),
+    "track": (track(), AISLE, balls(np.array([3.0, 0, 0.1]), 0.3)),
+    "bounded": (DesignSpec("mine", sensors(2), constraints=RULES["gate"] | {"budget": {"rays": 9}}), FIXED, AHEAD),
+}
+
+
+def request_of(name, task=None, **changes):
+    design, space, train = FOLLOWED[name]
+    values = {
+        "task": task or MissTask(),
+        "config": TaskConfig(),
+        "space": space,
+        "seed": 3,
+        "designs": [design],
+        "rays": [design.rays or 12],
+        "baselines": ("bounding", "cma"),
+        "train": train,
+        "test": train,
+        "equal_bandwidth": False,
+        "cma": CmaSettings(FAST),
+    }
+    return EvaluationRequest(**{**values, **changes})
+
+
+@pytest.mark.parametrize("name", [name for name in FOLLOWED if name != "density"])
+def test_every_kind_of_design_is_followed_and_what_is_found_keeps_its_constraints(name):
+    # rays of a density at another number follow from samples, which cma does without
+    evaluation = evaluate(request_of(name))
+    (record,) = evaluation.searches
+    row = next(row for row in evaluation.rows if row.design == "cma")
+    assert row.rays == record.rays == evaluation.rows[0].rays
+    assert not record.broken
+    assert len(record.design.sensors) == len(FOLLOWED[name][0].sensors)
+    assert record.found.value <= record.found.start_value
+    found = evaluation.as_dict()["cma"][0]
+    assert found["evaluations"] <= 300 + 30
+    assert found["satisfied"]
+    assert found["curve"][-1]["value"] == pytest.approx(found["value"])
+    assert any(note.startswith(f"cma at {row.rays} rays") for note in evaluation.notes)
+    json.dumps(evaluation.as_dict()["cma"], allow_nan=False)
+
+
+@pytest.mark.parametrize("task", [MissTask(), HitTask()])
+def test_the_search_gains_in_the_direction_of_the_metric_and_no_less_than_bounding(task):
+    evaluation = evaluate(request_of("grid", task, cma=CmaSettings(Budget(math.inf, 1500))))
+    value = {row.design: row.value for row in evaluation.rows}
+    sign = 1.0 if task.metric.better == "lower" else -1.0
+    assert sign * value["cma"] < sign * value["bounding"]
+    (record,) = evaluation.searches
+    assert sign * record.found.value < sign * record.found.start_value
+
+
+def candidate_of(name, settings=None):
+    design, space, train = FOLLOWED[name]
+    conditions = [{"x_m": 0.25}, {"x_m": 0.75}] if name == "track" else [{}]
+    objective = TrainingObjective(MissTask(), train, Planner(), 0)
+    return CmaCandidate(
+        design, space, conditions, TrainingViews(space, train), objective, settings or CmaSettings(FAST), 0
+    )
+
+
+@pytest.mark.parametrize("name", list(FOLLOWED))
+def test_what_is_found_within_a_bandwidth_stays_within_it(name):
+    source = candidate_of(name, CmaSettings(Budget(math.inf, 60)))
+    for limit in (0.02, 0.5):
+        positions = source.positions_within([], limit, Bandwidth())
+        assert mean_mbps(positions, Bandwidth()) <= limit * (1 + 1e-12)
+        record = source.record_of(positions)
+        assert record.limit_mbps == limit
+        assert record.rays == len(positions[0])
+        assert not record.broken
+
+
+def test_every_number_of_rays_is_searched_once():
+    begun = []
+    settings = CmaSettings(FAST, lambda label, progress: begun.append(label))
+    source = candidate_of("grid", settings)
+    first = source.positions([], 12)
+    count = len(begun)
+    assert source.positions([], 12) is first
+    assert len(begun) == count
+    assert set(begun) == {"cma, 12 rays"}
+
+
+def test_the_same_seed_fires_the_same_rays():
+    first, again = (
+        candidate_of("distributed", CmaSettings(Budget(math.inf, 150))).positions([], 20)[0] for _ in range(2)
+    )
+    for name in ("origin_m", "direction", "gate_m"):
+        assert getattr(first, name).tobytes() == getattr(again, name).tobytes()
+
+
+def test_gates_that_cost_nothing_end_where_the_returns_do():
+    source = candidate_of("grid")
+    positions = source.positions([], 12)
+    sensor, range_m = source.objective.returned(positions, range(3))
+    gate = {index: positions[0].gate_m[positions[0].sensor == index][0] for index in np.unique(sensor)}
+    for index, (start, end) in gate.items():
+        own = range_m[sensor == index]
+        assert start == pytest.approx(own.min(), rel=1e-5)
+        assert end == pytest.approx(own.max(), rel=1e-5)
+    assert np.ptp(whole_range(FIXED)) > 3 * max(end - start for start, end in gate.values())
+
+
+def test_a_track_keeps_its_constraints_at_every_place():
+    rules = {
+        "gate": {"start_m": {"min": 1.0}, "width_m": {"min": 0.05, "max": 0.2}},
+        "boresight": {"elevation_deg": {"min": -10, "max": 20}},
+        "budget": {"bandwidth_mbps": 0.015},
+    }
+    places, count = np.array([0.0, 1.0]), 4
+    start = TrackFigures(
+        np.zeros((2, count)), np.tile(np.linspace(-0.3, 0.3, count), (2, 1)), np.tile([0.5, 3.0], (2, count, 1))
+    )
+    model = TrackModel(setting_of(AISLE, "scan", rules), Way(0, places), start, [{"x_m": 0.3}], rules)
+    generator = np.random.default_rng(0)
+    for step in (0.0, 1.0, 10.0):
+        vector = step * generator.standard_normal(model.size)
+        design = model.design(vector, Amount(count))
+        checks = check_design(design_document(design), rules, AISLE)
+        assert not [check for check in checks if not check.satisfied]
+        once = model.projected(vector)
+        np.testing.assert_allclose(model.projected(once), once, atol=1e-6 * max(1.0, np.abs(once).max()))
+
+
+def test_starts_on_returns_see_them_and_stay_in_the_space():
+    setting = setting_of(FIXED, "grid", {}, gates=False)
+    for start in starts(setting, TrainingViews(FIXED, AHEAD), 4):
+        assert sum(sensor.weight for sensor in start) == pytest.approx(1.0)
+        for sensor in start:
+            assert sensor.gate_m == pytest.approx(tuple(whole_range(FIXED)))
+            azimuth = (sensor.azimuth_rad + math.pi) % (2 * math.pi) - math.pi
+            assert FIXED.low[AZIMUTH] <= azimuth <= FIXED.high[AZIMUTH]
+            assert FIXED.low[ELEVATION] <= sensor.elevation_rad <= FIXED.high[ELEVATION]
+
+
+def test_without_a_design_there_is_nothing_to_vary():
+    with pytest.raises(ConfigError, match="no design"):
+        evaluate(request_of("grid", designs=[], rays=[9]))
+
+
+@pytest.mark.parametrize(
+    ("seconds", "names"), [(0.0, ["cma"]), (math.nan, ["cma"]), (-1.0, ["cma"]), (5.0, ["occupancy"])]
+)
+def test_a_time_that_is_none_or_that_nothing_takes_is_refused(seconds, names):
+    with pytest.raises(ConfigError, match="--cma-seconds"):
+        check_cma_seconds(seconds, names)
+
+
+def test_a_time_is_taken_where_it_is_asked_for_or_left_out():
+    check_cma_seconds(5.0, ["cma"])
+    check_cma_seconds(None, [])
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--cma-seconds", "5"], "nothing is searched for"),
+        (["--cma-seconds", "0", "--baseline", "cma"], "--cma-seconds"),
+        (["--baseline", "cma:5"], "takes nothing after its name"),
+    ],
+)
+def test_the_command_refuses_it_before_anything_is_read(lidardesign, words, message):
+    result = lidardesign("evaluate", "nowhere", *words)
+    assert result.code == 2
+    assert message in result.err
+
+
+class Bar:
+    """A progress bar that remembers what it was told."""
+
+    def __init__(self):
+        self.lines, self.updates = [], []
+
+    def add_task(self, label, **fields):
+        self.lines.append(label)
+        return len(self.lines) - 1
+
+    def update(self, line, **fields):
+        self.updates.append((self.lines[line], fields))
+
+
+def test_each_search_has_a_line_that_shows_how_far_it_is_and_its_best_score():
+    bar = Bar()
+    settings = told(CmaSettings(FAST), MissTask.metric, Output(), bar)
+    candidate_of("grid", settings).positions([], 12)
+    candidate_of("grid", settings).positions([], 13)
+    assert bar.lines == ["cma, 12 rays", "cma, 13 rays"]
+    shares = [fields["completed"] for label, fields in bar.updates if label == "cma, 12 rays"]
+    assert shares == sorted(shares)
+    assert bar.updates[-1][1]["row"].startswith("best ")
+    assert bar.updates[-1][1]["row"].endswith(" %")
+
+
+def test_without_a_terminal_a_search_is_announced_once(capsys):
+    settings = told(CmaSettings(FAST), MissTask.metric, Output(), None)
+    candidate_of("grid", settings).positions([], 12)
+    said = capsys.readouterr().err
+    assert said.count("cma, 12 rays: searching") == 1
+
+
+def test_from_several_places_every_sensor_may_look_at_all_returns():
+    setting = setting_of(CEILING, "distributed", CEILING_PLACES["mounts"])
+    views = TrainingViews(CEILING, BELOW)
+    hits = views.hits(dense_points(CEILING)).hits_m
+    first = starts(setting, views, 3)[0]
+    assert len({tuple(sensor.origin_m) for sensor in first}) == 3
+    for sensor in first:
+        away = hits - sensor.origin_m
+        tangent = tangent_coordinates(sensor.frame, away / np.linalg.norm(away, axis=1, keepdims=True))
+        assert (np.abs(tangent) <= np.array(sensor.field_of_view_rad) / 2 * 1.2).all(axis=1).mean() > 0.95
+        assert sensor.weight == pytest.approx(1 / 3)

@@ -1,0 +1,496 @@
+"""The ladders of a density: errors against closed forms and exact references, falling rung by rung."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.stats import norm
+from support.references import shape_distance
+
+from lidardesign.config import DensitySettings, LearningSettings, resolve, save_run_config
+from lidardesign.density.fields.distance import TableField, build_field
+from lidardesign.density.fields.grids import Grid
+from lidardesign.density.flow.flow import DesignFlow
+from lidardesign.density.flow.objective import Coordinates
+from lidardesign.density.learn import learn
+from lidardesign.density.target.target import build_target
+from lidardesign.density.training.losses import Pool
+from lidardesign.density.training.quality import misplaced_share
+from lidardesign.density.training.snapshot_quality import (
+    Drawn,
+    Steps,
+    beside_noise,
+    each_beside_noise,
+    gradient,
+    in_arithmetic,
+)
+from lidardesign.errors import NumericalError
+from lidardesign.evaluate.accuracy import fields, precision, scenes, visibility
+from lidardesign.evaluate.accuracy.fields import ExactField, InterpolatedField, fresh_table
+from lidardesign.evaluate.accuracy.probes import draw_probes, few_columns, with_frames
+from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
+from lidardesign.evaluate.accuracy.visibility import LOG_OPAQUE, opaque_target
+from lidardesign.evaluate.request import EvaluationRequest
+from lidardesign.registry import load_task
+from lidardesign.run.manifest import start_manifest
+from lidardesign.scene import Body, Box, Mesh, Receiver, Scene, Sphere, rigid
+from lidardesign.space import DesignSpace
+from lidardesign.task import scenes_of
+
+SPACE = DesignSpace((0, 0, 0, -0.35, -0.35, 0.5), (0, 0, 0, 0.35, 0.35, 3.5))
+SETTINGS = DensitySettings(sigma_m=0.02)
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("LIDARDESIGN_CACHE", str(tmp_path / "cache"))
+
+
+def box_mesh(*half):
+    made = trimesh.creation.box(extents=2 * np.array(half))
+    return Mesh(made.vertices, made.faces)
+
+
+def ball_mesh(radius):
+    made = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    return Mesh(made.vertices, made.faces)
+
+
+def hidden_wall(place, kind=Box):
+    """A wall behind a plate of 5 mm that hides a part of it."""
+    make = Box if kind is Box else lambda half: box_mesh(*half)
+    wall = Body(make((0.05, 1.5, 1.5)), "wall", "both", rigid(translation_m=(3.05, 0, 0)))
+    plate = Body(make((0.0025, 0.25, 0.25)), "plate", "occluder", rigid(translation_m=place))
+    return Scene((wall, plate))
+
+
+def balls(count, seed=0):
+    places = np.random.default_rng(seed).uniform((1.9, -0.2, -0.2), (2.1, 0.2, 0.2), (count, 3))
+    return [Scene((Body(ball_mesh(0.3), "ball", "both", rigid(translation_m=place)),)) for place in places]
+
+
+def moving_ball(frames):
+    poses = np.stack([rigid(translation_m=(2.0, y, 0.0)) for y in np.linspace(-0.3, 0.3, frames)])
+    return Scene((Body(Sphere(0.2), "ball", "both", poses),))
+
+
+class TestMisplacedShare:
+    def gaussians(self, apart, count=20_000, seed=0):
+        points = np.random.default_rng(seed).normal(scale=2.0, size=count)
+        return norm.logpdf(points), norm.logpdf(points - apart) + 3.0, norm.logpdf(points / 2.0)
+
+    @pytest.mark.parametrize("apart", [0.01, 0.1, 1.0, 3.0])
+    def test_is_the_total_variation_of_two_normal_densities(self, apart):
+        share, error = misplaced_share(*self.gaussians(apart))
+        assert abs(share - (2 * norm.cdf(apart / 2) - 1)) < 4 * error
+        assert error < 0.05 * share + 1e-3
+
+    def test_its_standard_error_is_the_spread_over_seeds(self):
+        found = np.array([misplaced_share(*self.gaussians(0.5, 2000, seed)) for seed in range(200)])
+        # the relative error of a standard deviation from 200 values is 5 %
+        assert found[:, 0].std() == pytest.approx(found[:, 1].mean(), rel=0.2)
+
+    def test_the_same_density_at_any_scale_is_nowhere_apart(self):
+        log_first, _, log_proposal = self.gaussians(0.5)
+        share, error = misplaced_share(log_first, log_first + 7.0, log_proposal)
+        assert share == pytest.approx(0, abs=1e-12)
+        assert error == pytest.approx(0, abs=1e-12)
+
+    def test_is_symmetric_and_at_most_one(self):
+        first, second, proposal = self.gaussians(0.5)
+        assert misplaced_share(first, second, proposal) == pytest.approx(misplaced_share(second, first, proposal))
+        left, right = np.array([0.0, -np.inf]), np.array([-np.inf, 0.0])
+        assert misplaced_share(left, right, np.zeros(2))[0] == 1.0
+
+    def test_points_drawn_twice_count_as_one_of_twice_the_weight(self):
+        first, second, proposal = (values[:50] for values in self.gaussians(0.5))
+        twice = misplaced_share(*(np.repeat(values, 2) for values in (first, second, proposal)))
+        once = misplaced_share(first, second, proposal - math.log(2))
+        assert twice[0] == pytest.approx(once[0])
+
+    @pytest.mark.parametrize("bad", [np.nan, np.inf])
+    def test_what_is_no_density_is_refused(self, bad):
+        with pytest.raises(NumericalError, match="no finite mass"):
+            misplaced_share(np.array([0.0, bad]), np.zeros(2), np.zeros(2))
+        with pytest.raises(NumericalError, match="no finite mass"):
+            misplaced_share(np.full(2, -np.inf), np.zeros(2), np.zeros(2))
+
+
+class TestProbes:
+    def test_points_are_distinct_and_stand_for_all_draws(self):
+        scene, space = Scene((Body(Sphere(0.3), poses=rigid(translation_m=(2, 0, 0))),)), SPACE
+        space = DesignSpace((0, 0, 0, 0, -0.35, 0.5), (0, 0, 0, 0, 0.35, 3.5))
+        target = build_target([scene], space, SETTINGS, "raycast")
+        probes = draw_probes(target, [scene], 5000, 0, "test")
+        assert len(np.unique(probes.points, axis=0)) == len(probes.points) < 5000
+        # uniform points resampled by surface proximity: what repeated points lack in number they have in weight
+        log_times = target.log_proximity(probes.points) - probes.log_proposal
+        assert np.exp(log_times).round(9).sum() == 5000
+
+    def test_few_columns_keep_some_frames_of_some_scenes(self):
+        every = [moving_ball(50) for _ in range(10)]
+        few = few_columns(every, 12)
+        assert [scene.frames for scene in few] == [4, 4, 4]
+        assert few_columns(every[:1], 64) == every[:1]
+        assert with_frames(every[0], 2).bodies[0].poses.shape == (2, 4, 4)
+        assert np.array_equal(with_frames(every[0], 2).bodies[0].poses[-1], every[0].bodies[0].poses[-1])
+
+
+class TestOpaque:
+    @pytest.mark.parametrize("kind", [Box, Mesh])
+    def test_a_point_is_hidden_or_seen(self, kind):
+        scene = hidden_wall((1.5, 0.0, 0.0), kind)
+        target = opaque_target(build_target([scene], SPACE, SETTINGS, "raycast"), [scene])
+        points = np.array([[0, 0, 0, 0.0, 0, 3.0], [0, 0, 0, 0.3, 0, 3.0 / math.cos(0.3)]])
+        assert target.log_density(points) == pytest.approx([LOG_OPAQUE, 0.0], abs=1e-2)
+
+    @pytest.mark.parametrize("kind", [Box, Mesh])
+    def test_is_what_ray_casting_becomes_as_surfaces_get_harder(self, kind):
+        scene = hidden_wall((1.5, 0.1, 0.0), kind)
+        errors = []
+        for attenuation in (1e2, 1e3, 1e4):
+            settings = SETTINGS.model_copy(update={"attenuation_per_m": attenuation})
+            target = build_target([scene], SPACE, settings, "raycast")
+            probes = draw_probes(target, [scene], 4096, 0, "test")
+            exact = opaque_target(target, [scene]).log_density(probes.points)
+            errors.append(probes.misplaced(target.log_density(probes.points), exact)[0])
+        assert errors[0] > 3 * errors[1] > 9 * errors[2]
+
+    def test_a_receiver_sees_past_nothing_either(self):
+        receiver = Receiver((0.0, 1.0, 0.0), -0.3, 0.0, 1.5, 1.5, (0.1, 5.0))
+        scene = Scene(hidden_wall((1.5, 0.5, 0.0), Mesh).bodies, receiver=receiver)
+        target = opaque_target(build_target([scene], SPACE, SETTINGS, "raycast"), [scene])
+        # the plate lies between the wall's middle and the receiver, not before the ray
+        assert target.log_density(np.array([[0, 0, 0, 0.0, 0, 3.0]]))[0] == pytest.approx(LOG_OPAQUE, rel=1e-3)
+
+
+class TestVisibilityLadder:
+    @pytest.fixture(scope="class")
+    @staticmethod
+    def cases():
+        places = [(1.2, 0.1, 0.0), (1.8, -0.1, 0.1)]
+        made = {}
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(visibility, "PROBES", 4096)
+            patch.setattr(visibility, "TABLE_PROBES", 1024)
+            for kind in (Box, Mesh):
+                few = [hidden_wall(place, kind) for place in places]
+                made[kind] = visibility.Case.of(few, SPACE, SETTINGS, seed=0, batch=64)
+        return made
+
+    @pytest.mark.parametrize("kind", [Box, Mesh])
+    def test_ray_casting_is_chosen_where_thin_plates_hide_things(self, cases, kind):
+        ladder = visibility.visibility_ladder(cases[kind], 64, "raycast")
+        off, quadrature, cast = ladder.rungs
+        assert ladder.falls
+        assert ladder.chosen is cast is ladder.default
+        assert off.error > 0.05 > quadrature.error or off.error > quadrature.error > cast.error
+        assert cast.error < 0.02
+
+    @pytest.mark.parametrize("kind", [Box, Mesh])
+    def test_midpoints_fall_towards_the_integral(self, cases, kind):
+        ladder = visibility.points_ladder(cases[kind], 64)
+        assert ladder.falls
+        assert [rung.setting for rung in ladder.rungs] == ["16", "32", "64", "128", "256"]
+        assert ladder.default.setting == "64"
+        assert ladder.rungs[-1].error < ladder.rungs[0].error / 2
+
+    def test_the_points_of_a_refined_quadrature_are_a_rung(self, cases):
+        ladder = visibility.points_ladder(cases[Mesh], 100)
+        assert ladder.default.setting == "100"
+
+    def test_where_nothing_is_seen_there_is_nothing_to_choose(self, monkeypatch):
+        monkeypatch.setattr(visibility, "PROBES", 512)
+        wall, _ = hidden_wall((1.5, 0, 0)).bodies
+        screen = Body(Box((0.01, 5.0, 5.0)), "screen", "occluder", rigid(translation_m=(1.0, 0, 0)))
+        assert visibility.Case.of([Scene((wall, screen))], SPACE, SETTINGS, 0).is_blind
+        assert not visibility.Case.of([hidden_wall((1.5, 0, 0))], SPACE, SETTINGS, 0).is_blind
+
+    def test_bodies_one_by_one_are_measured_on_few_scenes(self):
+        every = [hidden_wall((1.5, 0, 0)) for _ in range(100)]
+        assert len(visibility.affordable_scenes(every)) == visibility.MOST_BODIES // 2
+        meshes = [hidden_wall((1.5, 0, 0), Mesh) for _ in range(100)]
+        assert visibility.affordable_scenes(meshes) is meshes
+
+
+class TestComparedFields:
+    POINTS = np.random.default_rng(0).uniform(-1, 1, (300, 3))
+
+    def test_exact_distances_of_a_mesh_are_those_of_its_box(self):
+        pose = rigid(trimesh.transformations.rotation_matrix(0.7, (1, 2, 3))[:3, :3], (0.1, 0.2, -0.1))
+        half = (0.3, 0.4, 0.5)
+        scene = Scene((Body(box_mesh(*half), poses=pose),))
+        found = ExactField([scene], lambda body: body.is_target).distances(self.POINTS)[:, 0]
+        local = (self.POINTS - pose[:3, 3]) @ pose[:3, :3]
+        assert found == pytest.approx(shape_distance(Box(half))(local), abs=1e-12)
+
+    def test_exact_distances_mix_meshes_and_primitives_and_follow_motion(self):
+        poses = np.stack([rigid(translation_m=(x, 0, 0)) for x in (-0.5, 0.5)])
+        scene = Scene((Body(box_mesh(0.1, 0.1, 0.1), poses=poses), Body(Sphere(0.2))))
+        found = ExactField([scene], lambda body: body.is_target).distances(self.POINTS)
+        for frame, x in enumerate((-0.5, 0.5)):
+            box = shape_distance(Box((0.1, 0.1, 0.1)))(self.POINTS - (x, 0, 0))
+            assert found[:, frame] == pytest.approx(np.minimum(box, shape_distance(Sphere(0.2))(self.POINTS)))
+
+    def test_an_open_mesh_has_no_inside(self):
+        sheet = Mesh(np.array([[0.0, -9, -9], [0, 9, -9], [0, 0, 9]]), np.array([[0, 1, 2]]), "unsigned")
+        found = ExactField([Scene((Body(sheet),))], lambda body: True).distances(self.POINTS)[:, 0]
+        assert found == pytest.approx(np.abs(self.POINTS[:, 0]))
+
+    def test_a_fresh_table_is_the_table_of_learning(self):
+        every = balls(3)
+        cached = build_field(every, lambda body: body.is_target, resolution=16, padding_m=0.1)
+        fresh = fresh_table(every[:2], every, 16, 0.1)
+        assert np.array_equal(fresh.table, cached.table[:, :2])
+        assert np.array_equal(fresh.grid.low, cached.grid.low)
+
+    def linear_table(self):
+        grid = Grid(np.full(3, -0.8), 0.1, np.array([17, 17, 17]))
+        slopes = np.array([[1.0, -0.5], [0.2, 0.3], [-0.1, 0.7]])
+        return TableField((grid.points() @ slopes).astype(np.float32), grid, np.zeros(2)), slopes
+
+    @pytest.mark.parametrize("order", [1, 3])
+    def test_a_linear_function_is_read_exactly(self, order):
+        table, slopes = self.linear_table()
+        # the spline's ends are mirrored: a few cells from them a linear function is one again
+        inside = self.POINTS[(np.abs(self.POINTS) < 0.3).all(axis=1)]
+        found = InterpolatedField.of(table, order).distances(inside)
+        assert found == pytest.approx(inside @ slopes, abs=1e-3)
+
+    def test_the_first_order_is_that_of_learning_inside_and_outside(self):
+        table = fresh_table(balls(2), balls(2), 16, 0.1)
+        points = self.POINTS + np.array([2.0, 0, 0])
+        assert InterpolatedField.of(table, 1).distances(points) == pytest.approx(table.distances(points), abs=1e-6)
+
+    def test_the_nearest_grid_point_is_read_as_it_is(self):
+        table, _ = self.linear_table()
+        inner = np.flatnonzero((np.abs(table.grid.points()) < 0.75).all(axis=1))[::97]
+        found = InterpolatedField.of(table, 0).distances(table.grid.points()[inner] + 0.03)
+        assert np.array_equal(found, table.table[inner])
+
+
+class TestFieldLadders:
+    @pytest.fixture(scope="class")
+    @staticmethod
+    def case():
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(fields, "PROBES", 4096)
+            patch.setattr(fields, "COLUMNS", 2)
+            settings = DensitySettings(sigma_m=0.02, field_resolution=24)
+            return fields.Case.of(balls(3), SPACE, settings, 0, "raycast")
+
+    def test_errors_fall_with_resolution(self, case, monkeypatch):
+        monkeypatch.setattr(fields, "RESOLUTIONS", (12, 24, 48))
+        ladder = fields.resolution_ladder(case)
+        assert ladder.falls
+        errors = [rung.values["distance_error_mm"] for rung in ladder.rungs]
+        # trilinear interpolation errs with the square of the step
+        assert errors[0] > 2.5 * errors[1] > 6 * errors[2]
+        assert ladder.rungs[0].error > ladder.rungs[2].error
+        assert ladder.default.setting == "24"
+        assert ladder.rungs[1].memory_bytes == case.target.field.table.nbytes // 2 * 3
+
+    def test_resolutions_that_take_long_are_left_out_beyond_the_runs_own(self, case, monkeypatch):
+        monkeypatch.setattr(fields, "RESOLUTIONS", (8, 12, 48))
+        monkeypatch.setattr(fields, "LONGEST_SECONDS", 0.0)
+        ladder = fields.resolution_ladder(case)
+        assert [rung.setting for rung in ladder.rungs] == ["8", "12", "24"]
+        assert "48 and more points would take long" in ladder.note
+
+    def test_splines_err_less_than_lines_and_lines_less_than_steps(self, case):
+        ladder = fields.interpolation_ladder(case)
+        nearest, trilinear, tricubic, exact = ladder.rungs
+        assert nearest.error > trilinear.error > tricubic.error > exact.error == 0
+        assert trilinear.default
+        assert exact.reference
+
+    def test_meshes_that_move_have_a_grid_in_their_own_frame(self, monkeypatch):
+        monkeypatch.setattr(fields, "PROBES", 512)
+        monkeypatch.setattr(fields, "RESOLUTIONS", (12, 48))
+        poses = np.stack([rigid(translation_m=(2.0, y, 0)) for y in (-0.1, 0.0, 0.1)])
+        scene = Scene((Body(ball_mesh(0.3), poses=poses),))
+        case = fields.Case.of([scene], SPACE, DensitySettings(sigma_m=0.02, field_resolution=48), 0, "off")
+        ladder = fields.resolution_ladder(case)
+        assert ladder.rungs[0].error > ladder.rungs[1].error
+        assert ladder.rungs[1].memory_bytes == case.target.field.bodies.grids.values.nbytes
+
+    def test_primitives_need_no_field(self):
+        request = SimpleNamespace(config=None, request=SimpleNamespace(train=[hidden_wall((1.5, 0, 0))]))
+        assert fields.ladders(request) == []
+
+
+class TestDrawnScenes:
+    def test_the_mean_over_all_choices_is_the_density_of_all(self):
+        every = balls(4)
+        target = build_target(every, SPACE, SETTINGS, "raycast")
+        points = draw_probes(target, every, 200, 0, "test").points
+        # culled by other best terms, scenes that are left out add less than exp(-16) of the largest term
+        means = [
+            np.exp(target.drawn(np.array(chosen)).log_density(points)) for chosen in itertools.combinations(range(4), 2)
+        ]
+        assert np.mean(means, axis=0) == pytest.approx(np.exp(target.log_density(points)), rel=1e-5, abs=1e-7)
+
+    def test_scenes_that_were_not_drawn_are_not_looked_at(self):
+        every = balls(3)
+        target = build_target(every, SPACE, SETTINGS, "raycast")
+        seen = []
+        way = target.visibility.transmittance
+
+        def watched(rays, active, *args, **options):
+            seen.append(active)
+            return way(rays, active, *args, **options)
+
+        target.visibility.transmittance = watched
+        points = draw_probes(target, every, 100, 0, "test").points
+        values, slopes = target.drawn(np.array([1])).log_density_and_gradient(points)
+        assert np.isfinite(values).all()
+        assert np.isfinite(slopes).all()
+        assert not seen[0][:, [0, 2]].any()
+        assert seen[0][:, 1].all()
+
+
+@pytest.fixture(scope="module")
+def steps(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LIDARDESIGN_CACHE", str(tmp_path_factory.mktemp("cache")))
+        every = balls(6)
+        target = build_target(every, SPACE, SETTINGS, "raycast")
+    probes = draw_probes(target, every, 512, 0, "test")
+    coordinates = Coordinates(SPACE)
+    flow = DesignFlow(
+        coordinates.blocks, 0, layers=1, hidden=8, bins=4, generator=torch.Generator().manual_seed(0)
+    ).double()
+    pool = Pool.of(SPACE.to_unit(probes.points), target.log_density(probes.points), probes.log_proposal)
+    return Steps(flow, target, LearningSettings(batch=64, layers=1, hidden=8, bins=4, frames=2), pool)
+
+
+class TestGradients:
+    def test_errors_are_shares_of_the_noise(self):
+        generator = np.random.default_rng(0)
+        exact = generator.normal(size=(200, 50)) + 5.0
+        found = exact + 0.1 * generator.normal(size=exact.shape)
+        share, error = beside_noise(found, exact)
+        assert abs(share - 0.1) < 4 * error + 1e-3
+        assert each_beside_noise(found, exact) == pytest.approx(0.1, rel=0.5)
+        assert beside_noise(exact, exact) == (0.0, 0.0)
+
+    def test_several_draws_for_each_batch_count_with_their_mean_square(self):
+        generator = np.random.default_rng(1)
+        exact = generator.normal(size=(10, 30))
+        apart = generator.normal(size=(10, 30))
+        once, _ = beside_noise(exact + apart, exact)
+        twice, _ = beside_noise(np.stack([exact + apart, exact - apart], axis=1), exact)
+        assert once == pytest.approx(twice)
+
+    def test_the_standard_error_is_the_spread_over_repetitions(self):
+        generator = np.random.default_rng(2)
+        found = []
+        for _ in range(200):
+            exact = generator.normal(size=(12, 20))
+            found.append(beside_noise(exact + 0.3 * generator.normal(size=exact.shape), exact))
+        values, errors = np.array(found).T
+        assert values.std() == pytest.approx(errors.mean(), rel=0.25)
+
+    @pytest.mark.parametrize("kind", ["pathwise", "balancing"])
+    def test_one_seed_gives_one_batch_in_any_arithmetic(self, steps, kind):
+        loss = getattr(steps, kind)()
+        exact = gradient(steps.flow, loss, 3, 1e9)
+        rough = gradient(in_arithmetic(steps.flow, "float32"), loss, 3, 1e9)
+        assert np.linalg.norm(rough - exact) < 1e-2 * np.linalg.norm(exact)
+        assert np.array_equal(exact, gradient(steps.flow, loss, 3, 1e9))
+
+    def test_gradients_are_clipped_as_steps_are(self, steps):
+        assert np.linalg.norm(gradient(steps.flow, steps.pathwise(), 0, 1e-3)) == pytest.approx(1e-3)
+
+    def test_what_is_not_finite_moves_nothing(self, steps):
+        found = gradient(steps.flow, lambda flow, generator: next(flow.parameters()).sum() * math.nan, 0, 1.0)
+        assert not found.any()
+
+    def test_the_flow_alone_takes_no_target(self, steps):
+        loss = steps.without_target().pathwise()
+        assert np.isfinite(gradient(steps.flow, loss, 0, 1.0)).all()
+
+
+class TestPrecisionLadder:
+    def test_a_float64_flow_finds_its_samples_densities_again(self, steps):
+        drawn = Drawn.of(steps.flow, 500, 0)
+        assert drawn.log_densities(steps.flow) == pytest.approx(drawn.log_prob, abs=1e-8)
+        assert drawn.round_trip_nats(steps.flow) < 1e-8
+
+    def test_rounding_is_far_below_the_noise_of_a_batch(self, steps, monkeypatch):
+        monkeypatch.setattr(precision, "BATCHES", 4)
+        monkeypatch.setattr(precision, "SAMPLES", 500)
+        ladder = precision.steps_ladder(steps, 0)
+        rough, exact = ladder.rungs
+        assert (rough.setting, exact.setting) == ("float32", "float64")
+        assert rough.default
+        assert exact.reference
+        assert 0 < rough.error < ladder.tolerance
+        assert 0 < rough.values["densities_misplaced"] < 1e-3
+        assert exact.values["densities_misplaced"] < 1e-9
+
+
+class TestScenesLadder:
+    def test_more_scenes_err_less(self, steps, monkeypatch):
+        monkeypatch.setattr(scenes, "POWERS", (1, 4))
+        monkeypatch.setattr(scenes, "BATCHES", 8)
+        ladder = scenes.scenes_ladder(steps, 0)
+        assert [rung.setting for rung in ladder.rungs] == ["1", "2", "4", "6"]
+        assert ladder.falls
+        assert ladder.rungs[0].error > ladder.rungs[2].error > ladder.rungs[3].error == 0
+        assert ladder.default.setting == "2"
+        assert ladder.rungs[3].reference
+
+    def test_settings_beyond_all_scenes_are_all_scenes(self):
+        assert scenes.counts(50, 50) == [4, 16, 50]
+        assert scenes.counts(2000, 256) == [4, 16, 64, 256, 2000]
+
+
+class TestRuns:
+    """The ladders of a run from its folder, as `evaluate --accuracy` asks for them."""
+
+    SMALL = (
+        "learning.steps=4", "learning.batch=32", "learning.layers=1", "learning.hidden=8", "learning.bins=4",
+        "learning.samples=1000", "learning.balance_proposals=256", "learning.coverage_proposals=256", "train=6",
+    )  # fmt: skip
+
+    @pytest.fixture(scope="class")
+    @staticmethod
+    def request_of(tmp_path_factory):
+        place = tmp_path_factory.mktemp("run") / "flatland"
+        task = load_task("flatland")
+        config = resolve(task, preset="draft", overrides=TestRuns.SMALL, seed=1)
+        place.mkdir()
+        start_manifest(place, command=[], seed=1)
+        save_run_config(config, place)
+        learn(task, config, place)
+        train = list(scenes_of(task, config.task, "train", config.seed, config.space))
+        asked = EvaluationRequest(task, config.task, config.space, config.seed, (), [12], train=train)
+        return AccuracyRequest(config, place, asked, None)
+
+    @pytest.mark.parametrize("module", [visibility, fields, precision, scenes])
+    def test_have_ladders_whose_errors_fall(self, request_of, module, monkeypatch):
+        monkeypatch.setattr(visibility, "PROBES", 2048)
+        monkeypatch.setattr(visibility, "BODY_PROBES", 256)
+        monkeypatch.setattr(visibility, "REFERENCE_POINTS", 128)
+        monkeypatch.setattr(visibility, "POINTS", (16, 32))
+        for number in (precision, scenes):
+            monkeypatch.setattr(number, "BATCHES", 4)
+        found = module.ladders(request_of)
+        assert len(found) == {visibility: 2, fields: 0, precision: 1, scenes: 1}[module]
+        for ladder in found:
+            assert ladder.falls
+            assert all(rung.seconds > 0 and rung.uncertainty >= 0 for rung in ladder.rungs)
+            assert ladder.as_rows()
+
+    def test_the_same_run_gives_the_same_errors(self, request_of, monkeypatch):
+        monkeypatch.setattr(precision, "BATCHES", 3)
+        again = AccuracyRequest(request_of.config, request_of.run, request_of.request, None)
+        first, second = (precision.ladders(request)[0] for request in (request_of, again))
+        assert [rung.error for rung in first.rungs] == [rung.error for rung in second.rungs]

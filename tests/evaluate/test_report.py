@@ -1,0 +1,409 @@
+"""The report is one page that works offline, and no name in it can become markup or script."""
+
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import plotly.graph_objects as go
+import pytest
+from support.report_pages import (
+    FRAMES,
+    NASTY,
+    PLACES,
+    make_evaluation,
+    make_rays,
+    make_report,
+    make_scene,
+    make_sensor,
+    make_shown,
+    ray_segments,
+)
+
+from lidardesign.design.sensor import DesignSpec
+from lidardesign.evaluate.figures.curves import series
+from lidardesign.evaluate.figures.drawing import (
+    FEWEST_STEPS,
+    MOST_FACES,
+    STEPS,
+    body_triangles,
+    drawn_share,
+    frustum_lines,
+    gate_shell,
+    origin_lines,
+    round_steps,
+    thinned,
+)
+from lidardesign.evaluate.figures.scene_figure import MOST_RAY_STEPS, MOST_STEPS, Shown
+from lidardesign.evaluate.report.figures import curve_figure, marginal_figure, plane_figure
+from lidardesign.evaluate.report.markup import asset, script_safe
+from lidardesign.evaluate.report.report import report_html, write_report
+from lidardesign.evaluate.report.tables import CommandTimes, constraints_table, number, times_tables
+from lidardesign.evaluate.report.view import (
+    MOST_BODIES,
+    MOST_SENSORS,
+    OUTCOMES,
+    drawn_bodies,
+    told,
+    view_bounds,
+    view_document,
+)
+from lidardesign.evaluate.results import Evaluation, leading_detail
+from lidardesign.evaluate.verdicts import figure, rows_table, summary_sentences, table, verdict
+from lidardesign.geometry.rays import Outcome
+from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.task import Metric
+
+
+class Collector(HTMLParser):
+    """Tags with their attributes, as a browser would read them."""
+
+    def __init__(self):
+        super().__init__()
+        self.tags = []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+
+@pytest.fixture(scope="module")
+def nasty():
+    return report_html(make_report(NASTY))
+
+
+def parsed(text):
+    collector = Collector()
+    collector.feed(text)
+    return collector.tags
+
+
+def test_nothing_in_the_page_is_fetched_from_elsewhere(nasty):
+    for tag, attributes in parsed(nasty):
+        assert tag not in ("link", "iframe", "object", "embed", "base", "form")
+        assert "src" not in attributes
+        assert attributes.get("href", "#").startswith("#")
+    policies = [a["content"] for t, a in parsed(nasty) if t == "meta" and "http-equiv" in a]
+    assert len(policies) == 1
+    assert "default-src 'none'" in policies[0]
+    assert not re.search(r"https?:|connect-src|\*", policies[0])
+    style = asset("report.css")
+    assert f"<style>{style}</style>" in nasty
+    assert "url(" not in style
+    assert "@import" not in style
+
+
+def test_a_nasty_name_adds_no_tag_and_ends_no_script(nasty):
+    harmless = [tag for tag, _ in parsed(report_html(make_report("plain")))]
+    assert [tag for tag, _ in parsed(nasty)] == harmless
+    assert "<script>alert" not in nasty
+    assert not any(key.startswith("on") for _, attributes in parsed(nasty) for key in attributes)
+
+
+def test_embedded_text_is_the_same_after_reading_and_ends_no_script():
+    wild = {"name": f"{NASTY} \u2028\u2029 <!--"}
+    text = script_safe(json.dumps(wild, ensure_ascii=False))
+    assert not set("<>&\u2028\u2029") & set(text)
+    assert json.loads(text) == wild
+
+
+def test_the_page_repeats_byte_for_byte_and_every_link_has_its_place():
+    first = report_html(make_report())
+    assert first == report_html(make_report())
+    tags = parsed(first)
+    identifiers = [attributes["id"] for _, attributes in tags if "id" in attributes]
+    assert len(identifiers) == len(set(identifiers))
+    links = [attributes["href"][1:] for _, attributes in tags if "href" in attributes]
+    assert len(links) > 8
+    assert set(links) <= set(identifiers)
+    figures = [attributes["data-figure"] for _, attributes in tags if "data-figure" in attributes]
+    assert len(figures) >= 2 + len(make_report().density.marginals)
+    assert {"view-scene", *figures} <= set(identifiers)
+
+
+def test_every_switch_has_a_label_and_every_table_a_caption_and_scopes():
+    text = report_html(make_report())
+    body = text[text.index("<body>") : text.index("<script>")]
+    boxes = body.count('type="checkbox"')
+    assert boxes > 15
+    assert boxes == len(re.findall(r'<label class="switch"><input type="checkbox"', body))
+    for slider in re.findall(r'<input type="range" id="([^"]+)"', body):
+        assert f'<label for="{slider}">' in body
+    assert body.count("<table>") == body.count("<caption>") > 4
+    assert not re.search(r"<th(?![^>]*scope)[ >]", body)
+
+
+def test_the_page_holds_tables_verdicts_times_and_how_to_reproduce(tmp_path):
+    write_report(make_report("mine"), tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    for expected in ("config: mine", "note mine", 'class="better"', "not clear", "viewport", "gate.width_m.max"):
+        assert expected in text
+    assert "learn mine: 10.00 s, at most 1 MiB of memory (now)" in text
+
+
+def test_what_is_not_there_has_no_section():
+    report = make_report()
+    bare = replace(
+        report, density=None, density_m=None, constraints={}, times=(), evaluation=make_evaluation("plain", "plain 1")
+    )
+    places = {attributes["id"] for tag, attributes in parsed(report_html(bare)) if tag == "section"}
+    assert {"density", "constraints", "time", "physics", "audit"}.isdisjoint(places)
+    assert "It was not measured" in report_html(bare)
+
+
+def test_plotly_accepts_every_figure():
+    report = make_report()
+    looks = {curve.name: curve for curve in series(report.evaluation)}
+    figures = [curve_figure(report.evaluation, against) for against in ("rays", "bandwidth")]
+    figures += [marginal_figure(one, looks) for one in report.density.marginals]
+    figures += [plane_figure(one) for one in report.density.planes]
+    assert all(go.Figure(one).data for one in figures)
+
+
+def test_a_table_says_what_it_shows_and_names_its_rows():
+    text = table(["a & b", "c"], [(["<x>", "1"], "", False)], text_columns=1, caption="all > one")
+    assert "<caption><span>all &gt; one</span></caption>" in text
+    assert '<th scope="row" class="name">&lt;x&gt;</th><td>1</td>' in text
+    assert 'tabindex="0" role="region" aria-label="all &gt; one"' in text
+
+
+def test_bars_of_constraints_are_full_at_the_bound_and_half_in_the_middle():
+    report = make_report()
+    (tight,) = report.constraints["plain"]
+    text = constraints_table(
+        "d", [replace(tight, room=0.0, share=0.0, tight=2), replace(tight, room=0.4, share=0.5, tight=0)]
+    )
+    assert 'class="room full" role="img" aria-label="100 % used"' in text
+    assert 'aria-label="50 % used"' in text
+    assert "at the bound (2 of 2)" in text
+    assert "has no constraints" in constraints_table("<d>", [])
+
+
+def test_phases_add_up_and_small_ones_count_as_other():
+    phases = {"learning": 60.0, "learning/target": 40.0, "tiny": 0.1, "writing": 39.0, "other": 0.9}
+    one = CommandTimes("learn", "", phases)
+    assert one.seconds == pytest.approx(100.0)
+    text = times_tables([one, CommandTimes("nothing", "", {})])
+    shown = [float(value) for value in re.findall(r"</th><td>([0-9.]+)</td>", text)]
+    assert shown == [60.0, 40.0, 39.0, 1.0]
+    assert "tiny" not in text
+    assert "nothing" not in text
+
+
+def test_figures_of_any_kind_are_told():
+    assert number([0.5, -0.0]) == "0.5, 0"
+    assert number({"x": 1, "y": None}) == "x 1, y -"
+    assert number([[0.0, 1.0, 2.0]] * 3) == "3 places"
+
+
+def luminance(colour):
+    shares = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    linear = [value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4 for value in shares]
+    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+
+def test_text_is_dark_enough_on_its_ground():
+    style = asset("report.css")
+    named = dict(re.findall(r"--(\w+): (#[0-9a-f]{6});", style))
+    colours = {named.get(name, name) for name in re.findall(r"[ {;]color: (?:var\(--)?([#\w]+)\)?;", style)}
+    assert len(colours) >= 5
+    grounds = ["#ffffff", named["tint"], "#fff8e6"]
+    for colour in colours - {"inherit"}:
+        for ground in grounds:
+            assert (luminance(ground) + 0.05) / (luminance(colour) + 0.05) >= 4.5, (colour, ground)
+
+
+def test_outcomes_are_told_apart_without_their_colours():
+    assert len({(dash, symbol) for _, _, _, dash, symbol in OUTCOMES}) == len(OUTCOMES) == len(Outcome)
+    assert len({colour for _, _, colour, _, _ in OUTCOMES}) == len(OUTCOMES)
+
+
+def test_a_verdict_needs_an_interval_that_excludes_zero_and_the_metrics_direction():
+    lower = make_evaluation("d")
+    higher = Evaluation(Metric("share", "%", "higher", 0.0, 1.0), 1, lower.rows, lower.paired)
+    assert [verdict(lower, pair) for pair in lower.paired] == ["better", "open"]
+    assert [verdict(higher, pair) for pair in higher.paired] == ["worse", "open"]
+    assert "no clear difference from uniform" in summary_sentences(lower)[1]
+
+
+def test_figures_have_four_digits():
+    assert [figure(v) for v in (0.1152, 39.1, 1234.0, 0.0)] == ["0.1152", "39.10", "1234", "0.000"]
+
+
+@pytest.mark.parametrize(
+    ("shape", "distance"),
+    [
+        (Sphere(0.4), lambda p: np.linalg.norm(p, axis=1) - 0.4),
+        (Box((0.1, 0.2, 0.3)), lambda p: np.max(np.abs(p) - [0.1, 0.2, 0.3], axis=1)),
+        (
+            Capsule(0.1, 0.3),
+            lambda p: np.linalg.norm(p - np.clip(p, [0, 0, -0.3], [0, 0, 0.3]), axis=1) - 0.1,
+        ),
+        (Plane(), lambda p: p[:, 2]),
+    ],
+)
+def test_drawn_primitives_have_their_vertices_on_the_surface(shape, distance):
+    bounds = np.array([[-1.0, -1, -1], [1, 1, 1]])
+    vertices, faces = body_triangles(Body(shape), 0, bounds)
+    assert vertices.dtype == np.float32
+    assert faces.dtype == np.int32
+    assert faces.max() < len(vertices)
+    # float32 vertices near 1
+    assert np.abs(distance(vertices.astype(float))).max() < 1e-6
+
+
+def test_thinning_keeps_the_shape_and_respects_the_limit():
+    side = np.linspace(0, 1, 120)
+    x, y = np.meshgrid(side, side)
+    vertices = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    first = (np.arange(119)[:, None] * 120 + np.arange(119)).ravel()
+    faces = np.stack([first, first + 1, first + 120], axis=1)
+    mesh = Mesh(vertices, faces, "unsigned")
+    small, kept = thinned(mesh.vertices, mesh.faces, most=2000)
+    assert 200 < len(kept) <= 2000
+    assert kept.max() < len(small)
+    np.testing.assert_allclose(small.min(axis=0), 0.0, atol=0.05)
+    np.testing.assert_allclose(small.max(axis=0)[:2], 1.0, atol=0.05)
+
+
+def test_gates_are_drawn_as_shells_at_their_ranges():
+    sensor = make_sensor(azimuth=1.0, elevation=1.5)
+    vertices, _ = gate_shell(sensor)
+    radii = np.linalg.norm(vertices, axis=1)
+    # float32 coordinates of a few metres
+    np.testing.assert_allclose(np.unique(np.round(radii, 5)), np.round(sensor.gate_m, 5), atol=2e-5)
+    lines = frustum_lines(sensor)
+    reach = np.linalg.norm(lines[~np.isnan(lines[:, 0])], axis=1)
+    assert reach.max() == pytest.approx(sensor.gate_m[1], abs=1e-5)
+
+
+def test_rays_are_drawn_to_the_first_hit_or_the_end_of_the_gate():
+    segments = ray_segments(make_scene(), make_rays(101))
+    assert sum(len(lines) // 3 for lines in segments.values()) == 101
+    ends = {outcome: np.linalg.norm(lines[1::3], axis=1) for outcome, lines in segments.items()}
+    assert (ends[Outcome.OCCLUDED] < 2.0).all()
+    assert len(ends[Outcome.OCCLUDED]) > 0
+    assert ((ends[Outcome.RETURN] >= 2.0) & (ends[Outcome.RETURN] < 4.0)).all()
+    np.testing.assert_allclose(ends[Outcome.MISS], 4.0, atol=1e-5)
+
+
+def looks_of(shown):
+    return [curve for curve in series(make_evaluation(*(one.design.name for one in shown.designs)))][
+        : len(shown.designs)
+    ]
+
+
+def test_what_becomes_of_rays_is_known_at_every_position_and_frame():
+    shown = make_shown()
+    assert len(shown.frames) == FRAMES
+    for one in shown.designs:
+        assert one.outcome.shape == one.length_m.shape == (len(PLACES), FRAMES, 25)
+        for place, rays in enumerate(one.rays):
+            np.testing.assert_allclose(rays.origin_m[:, 1], PLACES[place]["y_m"])
+            for step, frame in enumerate(shown.frames):
+                expected = ray_segments(shown.scene, rays, frame)
+                counts = {code: int((one.outcome[place, step] == code).sum()) for code in Outcome}
+                assert counts == {code: len(lines) // 3 for code, lines in expected.items()}
+                ends = np.concatenate([lines[1::3] for lines in expected.values()])
+                order = np.lexsort(np.round(ends, 4).T), np.lexsort(np.round(one.ends_m[place, step], 4).T)
+                np.testing.assert_allclose(ends[order[0]], one.ends_m[place, step][order[1]], atol=1e-4)
+
+
+def test_long_scenes_and_many_rays_are_thinned_evenly_and_the_page_says_so():
+    poses = np.stack([rigid(translation_m=(3, 0.01 * frame, 0)) for frame in range(200)])
+    scene = Scene((Body(Sphere(0.4), "ball", "target", poses),), "long")
+    places = [{"y_m": value} for value in np.linspace(-1, 1, 60)]
+    shown = make_shown(designs=3, places=places, rays=600, scene=scene)
+    assert (len(shown.places), shown.all_places) == (MOST_STEPS, 60)
+    assert (shown.frames[0], shown.frames[-1]) == (0, 199)
+    assert sum(one.outcome.size for one in shown.designs) <= MOST_RAY_STEPS
+    text = " ".join(told(shown))
+    for part in (f"{len(shown.frames)} of 200 frames", "25 of 60 positions", "of 600 rays of plain are drawn"):
+        assert part in text
+
+
+def test_a_scan_of_hundreds_of_sensors_is_drawn_by_its_rays_alone():
+    design = DesignSpec("scan", tuple(make_sensor(f"s{i}") for i in range(MOST_SENSORS + 1)), layout="scan")
+    shown = make_shown(designs=1)
+    one = replace(shown.designs[0], design=design, placed=(design,) * len(PLACES))
+    document = view_document(replace(shown, designs=(one,)), looks_of(shown))
+    assert document["designs"][0]["sensors"] == 0
+    assert document["designs"][0]["cones"] == ""
+
+
+def test_everything_that_is_drawn_lies_in_the_box_unless_it_goes_far():
+    shown = make_shown()
+    low, high = view_bounds(shown)
+    for one in shown.designs:
+        ends = one.ends_m.reshape(-1, 3)
+        assert (ends >= low - 1e-6).all()
+        assert (ends <= high + 1e-6).all()
+    far = make_rays(25, 2)
+    far.gate_m[:, 1] = 1e4
+    from_afar = make_shown(rays=25)
+    lengths = np.full_like(from_afar.designs[0].length_m, 1e4)
+    one = replace(from_afar.designs[0], length_m=lengths)
+    size = float(np.ptp(view_bounds(replace(from_afar, designs=(one,))), axis=0).max())
+    assert size < 3.5 * float(np.ptp(np.stack([low, high]), axis=0).max())
+
+
+def test_very_many_bodies_are_drawn_coarser_and_the_largest_first():
+    balls = tuple(Body(Sphere(0.1 + 0.001 * i), f"b{i}", "both") for i in range(MOST_BODIES + 10))
+    scene = Scene(balls, "many")
+    assert round_steps(scene) == FEWEST_STEPS < round_steps(make_scene()) == STEPS
+    kept = drawn_bodies(Shown(scene, (0,), ({},), ()))
+    assert [body.name for body in kept] == [f"b{i}" for i in range(10, MOST_BODIES + 10)]
+    floor = Body(Plane(), "floor", "both")
+    assert drawn_bodies(Shown(Scene((*balls, floor), "more"), (0,), ({},), ()))[-1] is floor
+
+
+def test_a_page_of_twenty_designs_in_a_large_scene_stays_small():
+    side = np.linspace(0, 1, 160)
+    x, y = np.meshgrid(side, side)
+    first = (np.arange(159)[:, None] * 160 + np.arange(159)).ravel()
+    faces = np.stack([first, first + 1, first + 160], axis=1)
+    sheet = Mesh(np.stack([x.ravel(), y.ravel(), np.sin(7 * x.ravel())], axis=1), faces, "unsigned")
+    poses = np.stack([rigid(translation_m=(0, 0, frame)) for frame in range(40)])
+    scene = Scene((Body(sheet, "sheet", "both", poses),), "large")
+    report = make_report(designs=20, scene=scene, rays=2000, places=[{"y_m": 0.1 * i} for i in range(30)])
+    assert len(report_html(report)) < 8e6
+
+
+def test_the_share_of_a_scene_that_is_drawn_bounds_all_its_meshes_together():
+    side = np.linspace(0, 1, 150)
+    x, y = np.meshgrid(side, side)
+    vertices = np.stack([x.ravel(), y.ravel(), np.sin(7 * x.ravel())], axis=1)
+    first = (np.arange(149)[:, None] * 150 + np.arange(149)).ravel()
+    sheet = Mesh(vertices, np.stack([first, first + 1, first + 150], axis=1), "unsigned")
+    poses = np.stack([rigid(translation_m=(0, 0, frame)) for frame in range(3)])
+    scene = Scene(tuple(Body(sheet, f"sheet {i}", poses=poses) for i in range(5)), "sheets")
+    assert drawn_share(make_scene()) == 1.0
+    assert drawn_share(scene) == pytest.approx(MOST_FACES / (5 * len(sheet.faces)))
+    drawn = sum(len(body_triangles(body, 1, np.zeros((2, 3)), drawn_share(scene))[1]) for body in scene.bodies)
+    assert 0.1 * MOST_FACES < drawn <= MOST_FACES + 5
+    assert any("triangles of the meshes are drawn" in line for line in told(make_shown(scene=scene)))
+
+
+def test_where_rays_of_a_sensor_start_is_drawn_where_it_spreads():
+    sensor = make_sensor()
+    assert len(origin_lines(sensor, 0.95)) == 0
+    turn = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
+    spread = turn @ np.diag([0.04, 0.01, 0]) @ turn.T
+    flat = replace(sensor, origin_m=np.array([1.0, 2, 3]), origin_covariance_m2=spread)
+    lines = origin_lines(flat, 0.95)
+    local = (lines[~np.isnan(lines[:, 0])] - flat.origin_m) @ turn
+    np.testing.assert_allclose(local[:, 2], 0.0, atol=1e-6)
+    np.testing.assert_allclose(np.hypot(local[:, 0] / 0.2, local[:, 1] / 0.1), 1.959964, atol=1e-4)
+    thick = replace(flat, origin_covariance_m2=np.diag([0.04, 0.01, 0.02]))
+    assert np.isnan(origin_lines(thick, 0.95)[:, 0]).sum() == 3
+
+
+def test_the_tasks_first_further_figure_stands_beside_the_score():
+    evaluation = make_evaluation("a")
+    assert leading_detail(evaluation.rows) is None
+    tracked = [replace(row, details={"tracked_share": 0.8125, "other": 3.0}) for row in evaluation.rows]
+    text = rows_table(replace(evaluation, rows=tracked))
+    assert "tracked share" in text
+    assert "0.8125" in text
+    assert "other" not in text
+    assert "tracked" not in rows_table(evaluation)

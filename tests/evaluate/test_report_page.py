@@ -1,0 +1,294 @@
+"""The report in a real browser: it asks nobody for anything, complains of nothing, draws, and answers its switches.
+
+One browser and one page for all tests; where there is no browser they are skipped.
+"""
+
+from __future__ import annotations
+
+import io
+import shutil
+
+import numpy as np
+import pytest
+from support.report_pages import FRAMES, NASTY, PLACES, make_report
+
+from lidardesign.evaluate.figures.drawing import body_triangles, frustum_lines, origin_lines, scene_bounds
+from lidardesign.evaluate.report.report import report_html
+from lidardesign.geometry.rays import Outcome
+
+FLAGS = [
+    *("--no-sandbox", "--no-first-run", "--disable-quic", "--disable-sync", "--disable-background-networking"),
+    *("--disable-component-update", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+]
+WAIT_MS = 120_000  # software that draws in 3D on a busy machine takes its time
+DRAWN = "document.documentElement.dataset.drawn === 'yes'"
+GREEN = (0, 158, 115)  # of rays that return
+
+
+@pytest.fixture(scope="module")
+def report():
+    return make_report(NASTY)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra: consumers)")
+    program = shutil.which("chromium") or shutil.which("chromium-browser")
+    if program is None:
+        pytest.skip("chromium is not installed (tools/install-consumers.sh)")
+    with api.sync_playwright() as player:
+        started = player.chromium.launch(executable_path=program, args=FLAGS)
+        yield started
+        started.close()
+
+
+@pytest.fixture(scope="module")
+def opened(browser, report, tmp_path_factory):
+    """The page, drawn, with what it said and asked for from the very beginning."""
+    path = tmp_path_factory.mktemp("page") / "report.html"
+    path.write_text(report_html(report), encoding="utf-8")
+    page = browser.new_page(viewport={"width": 480, "height": 360})
+    page.set_default_timeout(WAIT_MS)
+    heard = {"errors": [], "requests": [], "dialogs": []}
+    page.on("console", lambda message: message.type == "error" and heard["errors"].append(message.text))
+    page.on("pageerror", lambda error: heard["errors"].append(str(error)))
+    page.on("dialog", lambda dialog: (heard["dialogs"].append(dialog.message), dialog.dismiss()))
+    page.on("request", lambda request: heard["requests"].append(request.url))
+    page.goto(path.as_uri(), wait_until="commit")
+    page.wait_for_function(DRAWN, timeout=WAIT_MS)
+    yield page, heard, path
+    page.close()
+
+
+@pytest.fixture
+def page(opened):
+    return opened[0]
+
+
+def picture(page):
+    """What the 3D view shows, as an array of colours, shape (H, W, 3)."""
+    from PIL import Image
+
+    settle(page)
+    shot = page.locator("#view-scene").screenshot(timeout=WAIT_MS)
+    return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), dtype=int)
+
+
+def settle(page):
+    """Wait until what was asked for last is drawn."""
+    page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done())))")
+
+
+def close_to(shown, colour, within=40):
+    return int((np.abs(shown - np.array(colour)).max(axis=2) < within).sum())
+
+
+def counts(page):
+    settle(page)
+    script = "() => Object.fromEntries([...counts].map(([code, count]) => [code, count]))"
+    return {int(code): count for code, count in page.evaluate(script).items()}
+
+
+def expected_counts(report, place, frame, hidden=()):
+    one = report.shown.designs[0]
+    kept = ~np.isin(one.rays[place].sensor, hidden)
+    return {int(code): int((one.outcome[place, frame][kept] == code).sum()) for code in Outcome}
+
+
+def restored(page):
+    page.evaluate("""() => {
+      for (const box of all('input[type=checkbox]')) box.checked = box.defaultChecked;
+      for (const slider of all('input[type=range]')) slider.value = slider.defaultValue;
+      return drawScene();
+    }""")
+
+
+def test_the_page_asks_nobody_and_complains_of_nothing(opened):
+    page, heard, path = opened
+    assert heard["errors"] == []
+    assert heard["dialogs"] == []
+    assert [url for url in heard["requests"] if not url.startswith(("data:", "blob:"))] == [path.as_uri()]
+    assert page.title() == NASTY
+
+
+def test_the_view_draws_and_its_switches_change_what_is_drawn(page, report):
+    restored(page)
+    first = picture(page)
+    assert len(np.unique(first.reshape(-1, 3), axis=0)) > 100
+    assert close_to(first, GREEN) > 20
+    page.locator(f"[data-outcome='{int(Outcome.RETURN)}']").uncheck()
+    assert close_to(picture(page), GREEN) < 0.2 * close_to(first, GREEN)
+    page.locator("[data-layer='scene']").uncheck()
+    without = picture(page)
+    assert (np.abs(without - first).max(axis=2) > 20).sum() > 500
+    for layer in ("occluders", "fields", "gates", "starts"):
+        page.locator(f"[data-layer='{layer}']").uncheck()
+    page.locator("[data-design='0']").uncheck()
+    empty = picture(page)
+    page.locator("[data-layer='density']").check()
+    assert (np.abs(picture(page) - empty).max(axis=2) > 20).sum() > 100
+
+
+def test_switching_a_sensor_off_takes_its_rays_away(page, report):
+    restored(page)
+    place, frame = len(PLACES) // 2, FRAMES // 2
+    assert counts(page) == expected_counts(report, place, frame)
+    page.locator("[data-sensor='0.1']").uncheck()
+    assert counts(page) == expected_counts(report, place, frame, hidden=[1])
+    page.locator("[data-every='0'][data-to='off']").click()
+    assert sum(counts(page).values()) == 0
+    page.locator("[data-every='0'][data-to='on']").click()
+    page.locator("[data-design='1']").check()
+    both = {code: 2 * count for code, count in expected_counts(report, place, frame).items()}
+    assert counts(page) == both
+
+
+def test_sliders_go_through_positions_and_frames(page, report):
+    restored(page)
+    slider = page.locator("#view-place")
+    slider.focus()
+    slider.press("Home")
+    page.locator("#view-frame").focus()
+    page.locator("#view-frame").press("End")
+    assert counts(page) == expected_counts(report, 0, FRAMES - 1)
+    status = page.locator("#view-status").inner_text()
+    assert status.startswith(f"y_m = -0.3; frame {FRAMES} of {FRAMES}, 0.30 s;")
+    assert slider.get_attribute("aria-valuetext") == "y_m = -0.3"
+    page.locator("#view-frame").press("ArrowLeft")
+    assert counts(page) == expected_counts(report, 0, FRAMES - 2)
+
+
+def path_script(call):
+    return f"""() => {{
+      const path = new Path();
+      {call};
+      return ['x', 'y', 'z'].map(name => path[name].map(value => Number.isNaN(value) ? null : value));
+    }}"""
+
+
+def test_the_page_draws_the_same_frusta_and_origins_as_the_program(page, report):
+    shown = report.shown.designs[0]
+    sensor = shown.placed[2].sensors[1]
+    drawn = np.array(page.evaluate(path_script("frustumLines(coneOf(view.designs[0], 2, 1), path)")), dtype=float).T
+    np.testing.assert_allclose(drawn, frustum_lines(sensor), atol=1e-5)
+    page.evaluate("() => { view.designs[0].cones.set([0.5, 0, 0, 0, 0.2, 0, 0, 0, 0], 16); }")
+    starts = np.array(page.evaluate(path_script("originLines(coneOf(view.designs[0], 0, 0), path)")), dtype=float).T
+    page.evaluate("() => { view.designs[0].cones.fill(0, 16, 25); }")
+    assert len(starts) == 26  # one ellipse where an origin has no thickness
+    assert np.nanmax(np.abs(starts[:, 0] - shown.placed[0].sensors[0].origin_m[0])) == pytest.approx(0.5)
+    assert len(origin_lines(sensor, 0.95)) == 0
+
+
+@pytest.mark.parametrize("target", [True, False])
+def test_bodies_are_drawn_where_they_are_at_each_frame(page, report, target):
+    scene = report.shown.scene
+    script = """([target, frame]) => {
+      const columns = bodyColumns(view, target, frame);
+      return [...'xyzijk'].map(name => [...columns[name]]);
+    }"""
+    for step, frame in enumerate(report.shown.frames):
+        columns = page.evaluate(script, [target, step])
+        corners = np.array(columns[:3]).T[np.array(columns[3:]).T].reshape(-1, 9)
+        bounds = np.array(page.evaluate("view.bounds"))
+        pieces = [body_triangles(body, frame, bounds) for body in scene.bodies if body.is_target == target]
+        expected = np.concatenate([vertices[faces].reshape(-1, 9) for vertices, faces in pieces])
+        assert corners.shape == expected.shape
+        ours, theirs = (each[np.lexsort(np.round(each, 3).T)] for each in (corners, expected))
+        np.testing.assert_allclose(ours.mean(axis=0), theirs.mean(axis=0), atol=1e-5)
+        np.testing.assert_allclose(np.sort(ours, axis=0), np.sort(theirs, axis=0), atol=1e-5)
+        assert np.all(scene_bounds(scene, frame, [])[0] >= bounds[0] - 1e-6)
+
+
+def test_the_camera_turns_by_buttons_and_by_keys(page):
+    restored(page)
+    page.locator("[data-camera='reset']").click()
+    eye = "() => document.getElementById('view-scene').layout.scene.camera.eye"
+    first = page.evaluate(eye)
+    page.locator("[data-camera='left']").click()
+    turned = page.evaluate(eye)
+    assert turned["z"] == pytest.approx(first["z"])
+    assert np.hypot(turned["x"], turned["y"]) == pytest.approx(np.hypot(first["x"], first["y"]))
+    assert abs(turned["x"] - first["x"]) > 0.01
+    page.locator("#view-scene").focus()
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate(eye) == pytest.approx(first)
+    page.keyboard.press("+")
+    assert page.evaluate(eye)["x"] == pytest.approx(first["x"] / 1.2)
+    page.keyboard.press("Home")
+    assert page.evaluate(eye) == pytest.approx(first)
+    page.keyboard.press("-")
+    farther = page.evaluate(eye)
+    page.locator("[data-design='1']").check()
+    settle(page)
+    assert page.evaluate(eye) == pytest.approx(farther)
+
+
+def test_a_world_in_a_plane_turns_like_a_map(page):
+    camera = "() => document.getElementById('view-scene').layout.scene.camera"
+    page.evaluate("() => Plotly.relayout(SCENE, {'scene.camera': {eye: {x: 0, y: 0, z: 2}, up: {x: 0, y: 1, z: 0}}})")
+    page.evaluate("() => moveCamera('right')")
+    page.evaluate("() => moveCamera('closer')")
+    found = page.evaluate(camera)
+    assert found["eye"]["z"] == pytest.approx(2 / 1.2)
+    assert np.degrees(np.arctan2(found["up"]["y"], found["up"]["x"])) == pytest.approx(105)
+    page.locator("[data-camera='reset']").click()
+
+
+def test_the_keyboard_reaches_every_control_and_shows_where_it_is(page):
+    wanted = page.evaluate(
+        "() => { window.reached = new Set(); const seen = all('a[href], button, input, summary, [tabindex]')"
+        ".filter(one => one.checkVisibility()); seen[0].focus(); reached.add(seen[0]); return seen.length; }"
+    )
+    look = """() => {
+      const one = document.activeElement;
+      reached.add(one);
+      return [one.outerHTML.slice(0, 80), getComputedStyle(one).outlineStyle];
+    }"""
+    for _ in range(wanted - 1):
+        page.keyboard.press("Tab")
+        element, outline = page.evaluate(look)
+        assert outline == "solid", element
+    assert page.evaluate("() => reached.size") == wanted > 40
+
+
+def test_curves_are_switched_in_both_figures(page):
+    shown = "() => all('.curves').map(one => one._fullData.filter(trace => trace.visible === true).length)"
+    assert page.evaluate(shown) == [6, 6]
+    page.locator("[data-curve='2']").uncheck()
+    assert page.evaluate(shown) == [4, 4]
+    page.locator("[data-curve='2']").check()
+
+
+def test_the_view_prints_as_a_picture_and_nothing_is_cut(page):
+    restored(page)
+    page.evaluate("() => window.dispatchEvent(new Event('beforeprint'))")
+    page.emulate_media(media="print")
+    page.set_viewport_size({"width": 688, "height": 900})
+    printed = page.evaluate("""async () => {
+      const image = find('#view-printed');
+      await image.decode();
+      const canvas = Object.assign(document.createElement('canvas'), {width: 100, height: 60});
+      const pen = canvas.getContext('2d');
+      pen.drawImage(image, 0, 0, 100, 60);
+      const colours = new Set(new Uint32Array(pen.getImageData(0, 0, 100, 60).data.buffer));
+      return [image.checkVisibility(), colours.size, find('#view-scene').checkVisibility(),
+              all('details').every(fold => fold.open), document.documentElement.scrollWidth];
+    }""")
+    page.emulate_media(media="screen")
+    page.set_viewport_size({"width": 480, "height": 360})
+    page.evaluate("() => window.dispatchEvent(new Event('afterprint'))")
+    visible, colours, live, opened, width = printed
+    assert (visible, live, opened) == (True, False, True)
+    assert colours > 50
+    assert width <= 688
+    assert not page.evaluate("() => all('details').every(fold => fold.open)")
+
+
+def test_a_narrow_window_shows_everything_within_its_width(page):
+    page.set_viewport_size({"width": 390, "height": 700})
+    page.wait_for_function("document.documentElement.scrollWidth === 390", timeout=WAIT_MS)
+    outside = page.evaluate(
+        "() => all('h1, h2, p, button, .switch, figure, #view-scene').filter(one => one.checkVisibility() &&"
+        " !one.closest('.scroll') && one.getBoundingClientRect().right > 391).length"
+    )
+    assert outside == 0

@@ -1,0 +1,305 @@
+"""The ladder of training: what a run had reached at its snapshots, and what runs of other presets beside it reach."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.command_line import caller
+from support.small_runs import shifted
+
+from lidardesign.config import load_run_config, resolve, save_run_config
+from lidardesign.density import learn as learning
+from lidardesign.density.learn import learn
+from lidardesign.density.training import schedule as budget
+from lidardesign.density.training.checkpoint import save_arrays
+from lidardesign.density.training.quality import draw_probes
+from lidardesign.density.training.schedule import Stage, ToleranceGoal
+from lidardesign.density.training.snapshot_quality import load_flow, remeasured, seconds_at
+from lidardesign.density.training.training import Trainer
+from lidardesign.design.fit import fit
+from lidardesign.errors import DataError, NumericalError
+from lidardesign.evaluate import score
+from lidardesign.evaluate.accuracy import sweeps as accuracy
+from lidardesign.evaluate.accuracy import training
+from lidardesign.evaluate.accuracy.probes import run_target
+from lidardesign.evaluate.accuracy.sweeps import Accuracy, AccuracyRequest
+from lidardesign.evaluate.request import EvaluationRequest
+from lidardesign.registry import load_task
+from lidardesign.run.manifest import note, read_manifest, record, start_manifest
+from lidardesign.samples import load_samples
+from lidardesign.task import random_generator, scenes_of
+
+SMALL = (
+    "learning.batch=128", "learning.layers=1", "learning.hidden=16", "learning.bins=8", "learning.samples=2000",
+    "learning.balance_proposals=1024", "learning.coverage_proposals=512", "train=4", "test=3",
+    "density.sigma_m=0.06",
+)  # fmt: skip
+
+
+def learned(folder, preset, steps, *further):
+    task = load_task("flatland")
+    overrides = [*SMALL, f"learning.steps={steps}", *further]
+    config = resolve(task, preset=preset, overrides=overrides, seed=shifted(1))
+    folder.mkdir()
+    start_manifest(folder, command=[], seed=1)
+    save_run_config(config, folder)
+    learn(task, config, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    place = tmp_path_factory.mktemp("runs")
+    mine = learned(place / "mine", "draft", 64)
+    learned(place / "longer", "standard", 96)
+    learned(place / "other_density", "fine", 8, "density.sigma_m=0.08")
+    (place / "nothing").mkdir()
+    return mine
+
+
+def request_for(run, designs=()):
+    task, config = load_run_config(run)
+    train, test = (scenes_of(task, config.task, split, config.seed, config.space) for split in ("train", "test"))
+    asked = EvaluationRequest(
+        task=task, config=config.task, space=config.space, seed=config.seed, designs=designs, rays=[12],
+        train=list(train), test=list(test),
+    )  # fmt: skip
+    return AccuracyRequest(config, run, asked, None)
+
+
+@pytest.fixture(scope="module")
+def ladders(runs):
+    return training.ladders(request_for(runs, [fit(load_samples(runs), sensors=2, restarts=1).design]))
+
+
+def test_every_snapshot_and_the_flow_itself_are_rungs_with_errors_and_seconds(ladders):
+    steps = ladders[0]
+    assert steps.knob == "learning.steps"
+    assert [rung.setting for rung in steps.rungs] == ["32", "40", "48", "64"]
+    assert [rung.default for rung in steps.rungs] == [False] * 3 + [True]
+    assert all(0 < rung.error < 1 and 0 < rung.uncertainty < 0.1 for rung in steps.rungs)
+    seconds = [rung.seconds for rung in steps.rungs]
+    assert seconds == sorted(seconds)
+    assert steps.falls
+
+
+def test_rungs_carry_ess_kl_coverage_and_the_score_of_a_quick_fit(ladders):
+    values = ladders[0].rungs[-1].values
+    assert {"ess", "kl_nats", "coverage", "ess_error", "kl_nats_error"} <= values.keys()
+    assert any(name.startswith("score") for name in values)
+    differences = [v for name, v in values.items() if name.endswith("difference_error")]
+    assert differences == [0.0]
+    assert "quick fits" in ladders[0].note
+
+
+def test_runs_of_other_presets_are_rungs_and_runs_of_other_densities_are_not(ladders):
+    presets = ladders[1]
+    assert presets.knob == "preset"
+    assert [rung.setting for rung in presets.rungs] == ["draft", "standard"]
+    assert [rung.default for rung in presets.rungs] == [True, False]
+    assert presets.rungs[0].error == ladders[0].rungs[-1].error
+
+
+def test_errors_repeat_within_their_uncertainty_on_other_samples_and_probes(runs, ladders):
+    request = request_for(runs)
+    config, target = request.config, run_target(request)
+    probes = draw_probes(target, list(request.request.train), 8192, random_generator(99, "others"))
+    again = remeasured(runs, config, target, probes, count=8192, seed=99)
+    for rung, reached in zip(ladders[0].rungs, again, strict=True):
+        found = reached.misplaced
+        assert abs(found.value - rung.error) < 4 * np.hypot(found.error, rung.uncertainty)
+
+
+def test_a_snapshot_is_measured_as_the_flow_that_was_learned(runs):
+    request = request_for(runs)
+    flow = load_flow(runs, "flow.safetensors", request.config, run_target(request), 0)
+    assert next(flow.flow.parameters()).dtype.is_floating_point
+    wide = replace(request.config, learning=request.config.learning.model_copy(update={"hidden": 32}))
+    with pytest.raises(DataError, match="another flow"):
+        load_flow(runs, "flow.safetensors", wide, run_target(request), 0)
+
+
+def test_seconds_between_rows_of_the_progress_are_interpolated(runs):
+    seconds = seconds_at(runs, [20, 25, 30])
+    assert seconds[25] == pytest.approx((seconds[20] + seconds[30]) / 2)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"step": 1}', '{"step": null, "seconds": 1}'])
+def test_progress_that_is_none_is_told(runs, tmp_path, text):
+    shutil.copytree(runs, tmp_path / "run")
+    (tmp_path / "run" / "progress.jsonl").write_text(text)
+    record(tmp_path / "run", ["progress.jsonl"])
+    with pytest.raises(DataError, match=r"progress.jsonl: is no progress"):
+        seconds_at(tmp_path / "run", [20])
+
+
+def test_stages_of_a_tolerance_are_a_ladder_of_their_own(runs, tmp_path, ladders):
+    goal = ToleranceGoal(0.4, 64, (Stage(32, 0.6, 0.01, 1.0), Stage(64, 0.3, 0.01, 2.0)))
+    shutil.copytree(runs, tmp_path / "run")
+    request = request_for(tmp_path / "run")
+    note(tmp_path / "run", goal=goal.as_dict())
+    found = training._stages_ladder(request)
+    assert [(rung.setting, rung.error) for rung in found[0].rungs] == [("32", 0.6), ("64", 0.3)]
+    assert "tolerance of 0.4" in found[0].note
+
+
+def test_runs_beside_this_one_that_cannot_be_measured_are_left_out(runs, tmp_path, ladders):
+    place = tmp_path / "runs"
+    shutil.copytree(runs.parent, place)
+    manifest = read_manifest(place / "longer")
+    note(place / "longer", learn=None)
+    assert "preset" not in [ladder.knob for ladder in training.ladders(request_for(place / "mine"))]
+    note(place / "longer", learn=manifest["learn"])
+    weights = {"weights": np.zeros(3)}
+    save_arrays(place / "longer", "flow.safetensors", weights, {})
+    assert "preset" not in [ladder.knob for ladder in training.ladders(request_for(place / "mine"))]
+
+
+@pytest.fixture
+def fitted(runs, lidardesign, tmp_path):
+    """A copy of a run, with a design, in the current folder."""
+    shutil.copytree(runs, tmp_path / "run")
+    assert lidardesign("fit", "run", "--sensors", "1", "--name", "one").code == 0
+    return tmp_path / "run"
+
+
+@pytest.mark.parametrize("name", ["flow.safetensors", "progress.jsonl", "snapshots/step-000040.safetensors"])
+def test_accuracy_of_a_damaged_run_is_refused_before_anything_is_evaluated(fitted, lidardesign, name, monkeypatch):
+    monkeypatch.setattr(score, "evaluate", lambda *_, **__: pytest.fail("was evaluated"))
+    (fitted / name).write_bytes(b"{")
+    done = lidardesign("evaluate", "run", "--accuracy", "--json")
+    assert done.code == 3
+    assert name in done.json["error"]["where"]
+    (fitted / name).unlink()
+    assert "missing" in lidardesign("evaluate", "run", "--accuracy", "--json").json["error"]["message"]
+
+
+@pytest.mark.parametrize("judged", [("--seed", "7"), ("--set", "train=2")])
+def test_ladders_are_those_of_the_scenes_that_were_learned_whatever_designs_are_judged_by(
+    fitted, lidardesign, judged, monkeypatch
+):
+    asked = []
+    monkeypatch.setattr(accuracy, "measure_accuracy", lambda request, **_: asked.append(request) or Accuracy([], {}))
+    for options in ((), judged):
+        assert lidardesign("evaluate", "run", "--rays", "12", "--accuracy", *options).code == 0
+    own, other = asked
+    assert other.config == own.config
+    poses = [[body.poses.tolist() for scene in one.request.train for body in scene.bodies] for one in asked]
+    assert poses[0] == poses[1]
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+def flatland(lidardesign, out, *options):
+    small = [word for setting in SMALL for word in ("--set", setting)]
+    return lidardesign("learn", "flatland", "--preset", "draft", "--seed", shifted(), "--out", out, *small, *options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--tolerance", "0.1", "--time-budget", "60"), "both decide"),
+        (("--tolerance", "0"), "between 0 and 1"),
+        (("--tolerance", "nan"), "between 0 and 1"),
+        (("--time-budget", "-3"), "above 0"),
+        (("--time-budget", "inf"), "above 0"),
+        (("--time-budget", "1e300"), "a year at most"),
+        (("--time-budget", "60", "--set", "learning.steps=7"), "the time decides learning.steps"),
+    ],
+)
+def test_goals_that_make_no_sense_are_config_errors(lidardesign, tmp_path, options, message):
+    done = flatland(lidardesign, "run", *options)
+    assert done.code == 2
+    assert message in done.err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_file_that_sets_the_steps_beside_a_time_is_told_where(lidardesign, tmp_path):
+    (tmp_path / "other.yaml").write_text("learning:\n  steps: 30\n")
+    done = flatland(lidardesign, "run", "--time-budget", "60", "--config", "other.yaml")
+    assert done.code == 2
+    assert "other.yaml:2:10: the time decides learning.steps" in done.err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_tolerance_that_is_missed_exits_1_with_what_was_reached_and_a_usable_run(lidardesign, tmp_path):
+    done = flatland(lidardesign, "run", "--set", "learning.steps=8", "--tolerance", "1e-6", "--json")
+    assert done.code == 1
+    document = done.json
+    assert [stage["steps"] for stage in document["goal"]["stages"]][:4] == [1, 2, 4, 8]
+    assert not document["goal"]["met"]
+    assert f"{document['misplaced']:.3g}" in done.err
+    assert "--tolerance" in done.err
+    assert lidardesign("fit", "run", "--sensors", "2").code == 0
+    again = lidardesign("learn", "flatland", "--out", "run", "--resume", "--tolerance", "0.3")
+    assert again.code == 2
+    assert "started with tolerance = 1e-06" in again.err
+
+
+def test_a_tolerance_that_is_met_stops_there_and_resuming_changes_nothing(lidardesign, tmp_path):
+    done = flatland(lidardesign, "run", "--set", "learning.steps=64", "--tolerance", "0.95", "--json")
+    assert done.code == 0
+    assert done.json["goal"]["met"]
+    assert done.json["steps"] == done.json["goal"]["stages"][-1]["steps"] < 64
+    before = (tmp_path / "run" / "flow.safetensors").read_bytes()
+    assert lidardesign("learn", "flatland", "--out", "run", "--resume").code == 0
+    assert (tmp_path / "run" / "flow.safetensors").read_bytes() == before
+
+
+def test_an_interruption_between_stages_keeps_what_the_finished_ones_reached(lidardesign, tmp_path, monkeypatch):
+    made, make_trainer = [], learning.make_trainer
+
+    def interrupted(*arguments):
+        made.append(make_trainer(*arguments))
+        if len(made) == 2:
+            raise KeyboardInterrupt
+        return made[-1]
+
+    monkeypatch.setattr(learning, "make_trainer", interrupted)
+    done = flatland(lidardesign, "run", "--set", "learning.steps=16", "--tolerance", "1e-6")
+    assert done.code == 130
+    assert "keeps what the finished stages reached" in done.err
+    done = lidardesign("learn", "flatland", "--out", "run", "--resume", "--json")
+    assert [stage["steps"] for stage in done.json["goal"]["stages"]][:3] == [2, 4, 8]
+    assert len(made) == 1 + len(done.json["goal"]["stages"])
+
+
+def test_a_failure_before_the_first_checkpoint_leaves_nothing_behind(lidardesign, tmp_path, monkeypatch):
+    monkeypatch.setattr(Trainer, "_save", lambda *_: (tmp_path / "missing" / "file").read_text())
+    done = flatland(lidardesign, "run", "--set", "learning.steps=16")
+    assert done.code == 3
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_time_budget_writes_its_steps_into_the_configuration(lidardesign, tmp_path, monkeypatch):
+    # steps that pretend to be slow: the plan then depends on no machine
+    monkeypatch.setattr(budget, "_seconds_per_step", lambda *_: 600.0)
+    done = flatland(lidardesign, "run", "--time-budget", "100000", "--json")
+    assert done.code == 0
+    plan = done.json["goal"]
+    assert plan["pathwise_steps"] == pytest.approx(75, abs=1)
+    assert plan["balancing_steps"] == pytest.approx(149, abs=2)  # almost all of the time turned out to be left
+    assert done.json["steps"] == plan["pathwise_steps"] + plan["balancing_steps"]
+    assert load_run_config(tmp_path / "run")[1].learning.steps == done.json["steps"]
+    soon = flatland(lidardesign, "soon", "--time-budget", "0.01")
+    assert soon.code == 2
+    assert "at least" in soon.err
+    assert not (tmp_path / "soon").exists()
+
+
+def test_what_was_scored_is_written_before_accuracy_is_measured(fitted, lidardesign, monkeypatch):
+    def interrupted(*_, **__):
+        assert "one" in Path("rows.csv").read_text(encoding="utf-8")
+        raise NumericalError("interrupted", where="a ladder")
+
+    monkeypatch.setattr(accuracy, "measure_accuracy", interrupted)
+    done = lidardesign("evaluate", "run", "--rays", "8", "--accuracy", "--csv", "rows.csv", "--json")
+    assert done.code == 5
+    assert Path("rows.csv").exists()

@@ -1,0 +1,203 @@
+"""Workers that are processes of this machine: lost ones are replaced, and none outlives the program."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import pytest
+from evaluate.test_workers import make_request, results, without_times
+from support.command_line import caller, make_run, program
+
+from lidardesign.errors import ConfigError, NumericalError, PluginError
+from lidardesign.evaluate.score import evaluate
+from lidardesign.evaluate.workers import processes as worker_processes
+from lidardesign.evaluate.workers.pool import WorkerScorer
+from lidardesign.evaluate.workers.processes import MOST_TRIES, Processes
+from lidardesign.registry import load_task
+
+
+@pytest.fixture
+def pool():
+    """Starts worker processes; all are gone afterwards."""
+    started = []
+
+    def start(count):
+        started.append(Processes(count))
+        return started[-1]
+
+    yield start
+    for one in started:
+        known = [process._popen for process in one._running]
+        one.close()
+        assert all(popen.poll() is not None for popen in known)
+
+
+def test_processes_score_as_this_one_does_though_some_are_lost(pool):
+    request = make_request()
+    expected = results(evaluate(request))
+    engine = pool(2)
+    with WorkerScorer(engine) as scorer:
+        scorer.prepare(request)
+        assert results(evaluate(replace(request, scorer=scorer))) == expected
+        first = [process._popen for process in engine._running]
+        # one that is lost between two passes, and one in the middle of one
+        first[0].kill()
+
+        def kill_once(done, total, name):
+            if done == 2:
+                first[1].kill()
+
+        assert results(evaluate(replace(request, scorer=scorer), progress=kill_once)) == expected
+        assert not {popen.pid for popen in first} & {process._popen.pid for process in engine._running}
+
+
+def test_a_scene_that_kills_its_workers_is_named(pool, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    source = "import os, sys\ndef main():\n    sys.stdin.buffer.read(1)\n    os.kill(os.getpid(), 9)\n"
+    (tmp_path / "deadly.py").write_text(source)
+    monkeypatch.setattr("lidardesign.evaluate.workers.processes.WORKER", "deadly")
+    with pytest.raises(NumericalError, match=f"held-out scene 0 was ended by SIGKILL, {MOST_TRIES} times"):
+        list(pool(1).answers([b"one", b"two"]))
+
+
+def test_a_system_that_allows_fewer_processes_leaves_none(monkeypatch):
+    started = []
+
+    def limited(*arguments, **options):
+        if len(started) == 1:
+            raise BlockingIOError(11, "Resource temporarily unavailable")
+        started.append(subprocess.Popen(*arguments, **options))
+        return started[-1]
+
+    monkeypatch.setattr(worker_processes, "subprocess", Limited(limited))
+    with pytest.raises(ConfigError, match="only 1 of 3 processes could be started: Resource"):
+        Processes(3)
+    assert started[0].poll() is not None
+
+
+class Limited:
+    """The module `subprocess` with another `Popen`."""
+
+    def __init__(self, popen):
+        self.Popen = popen
+
+    def __getattr__(self, name):
+        return getattr(subprocess, name)
+
+
+BROKEN = """
+from lidardesign_tasks.flatland import FlatlandTask
+
+class BrokenTask(FlatlandTask):
+    name = "broken"
+
+    def score(self, scene, returns):
+        print("scored", scene.name)
+        if scene.name == "test 1":
+            raise RuntimeError("the map of test 1 is lost")
+        return super().score(scene, returns)
+"""
+
+
+@pytest.fixture
+def broken(tmp_path, monkeypatch):
+    """An installed task whose score fails in the second held-out scene."""
+    folder = tmp_path / "site"
+    (folder / "broken-1.0.dist-info").mkdir(parents=True)
+    (folder / "broken_task.py").write_text(BROKEN)
+    (folder / "broken-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
+    (folder / "broken-1.0.dist-info" / "entry_points.txt").write_text(
+        "[lidardesign.tasks]\nbroken = broken_task:BrokenTask\n"
+    )
+    monkeypatch.syspath_prepend(folder)
+    yield load_task("broken")
+    sys.modules.pop("broken_task", None)
+
+
+def test_what_a_plugin_prints_and_raises_in_a_worker_arrives_whole(broken, pool, capfd):
+    request = make_request(task=broken)
+    told = []
+    for scorer in (None, WorkerScorer(pool(2))):
+        judged = request if scorer is None else replace(request, scorer=scorer)
+        with pytest.raises(PluginError, match="the map of test 1 is lost") as raised:
+            evaluate(judged)
+        told.append(raised.value.as_dict())
+    assert told[0] == told[1]
+    assert "broken_task.py" in str(raised.value.__cause__)
+    captured = capfd.readouterr()
+    assert captured.out == ""
+    assert "scored test 1" in captured.err
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+@pytest.fixture
+def run(lidardesign, tmp_path):
+    folder = make_run(tmp_path / "run", count=1000)
+    assert lidardesign("fit", folder, "--sensors", 1).code == 0
+    return folder
+
+
+def test_the_command_gives_the_same_scores_with_workers(lidardesign, run):
+    one, two = (
+        lidardesign("evaluate", run, "--rays", 8, "--set", "test=3", "--workers", count, "--json") for count in (1, 2)
+    )
+    assert (one.code, two.code) == (0, 0), two.err
+    for name in ("metric", "scenes", "rows", "paired", "equal_bandwidth", "paired_equal_bandwidth", "effects"):
+        assert without_times(one.json[name]) == without_times(two.json[name])
+
+
+@pytest.mark.parametrize("value", ["0", "many", "tcp://nowhere", "http://host:1"])
+def test_the_command_refuses_workers_that_cannot_be(lidardesign, run, value):
+    result = lidardesign("evaluate", run, "--workers", value, "--json")
+    assert result.code == 2
+    assert result.json["error"]["where"] == "--workers"
+
+
+def children(pid):
+    """Processes that a process started and that run."""
+    listed = subprocess.run(["ps", "-A", "-o", "pid=,ppid=,stat="], capture_output=True, text=True, check=True).stdout
+    lines = [line.split() for line in listed.splitlines()]
+    return [int(child) for child, parent, state in lines if int(parent) == pid and not state.startswith("Z")]
+
+
+def runs(pid):
+    listed = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True, check=False)
+    return bool(listed.stdout.strip()) and not listed.stdout.strip().startswith("Z")
+
+
+def wait_until(condition, seconds=60.0):
+    """Poll; whether it became true in good time."""
+    end = time.monotonic() + seconds
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.05)
+    return condition()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_workers_end_with_the_program_however_it_ends(run, number):
+    ended = program("evaluate", run, "--rays", 20_000, "--set", "test=50", "--workers", 2, text=True)
+    try:
+        assert wait_until(lambda: len(children(ended.pid)) == 2 or ended.poll() is not None)
+        workers = children(ended.pid)
+        assert len(workers) == 2
+        # past the imports of the workers, in the middle of the scenes
+        time.sleep(2.0)
+        ended.send_signal(number)
+        _, err = ended.communicate(timeout=60)
+    finally:
+        ended.kill()
+    assert wait_until(lambda: not any(runs(pid) for pid in workers))
+    if number == signal.SIGINT:
+        assert ended.returncode == 130
+        assert err.strip() == "interrupted"

@@ -1,0 +1,253 @@
+"""Isaac Sim's profiles as JSON and USD, and CARLA's attributes: fields, types, lengths, and where rays go."""
+
+import json
+
+import numpy as np
+import pytest
+from jsonschema import Draft202012Validator
+from support.rigs import farthest_nearest, rig, spinning
+
+from lidardesign.errors import ConfigError
+from lidardesign.export.registry import EXPORTERS
+
+DESIGN, RAYS = rig()
+COUNTS = np.bincount(RAYS.sensor)
+
+NUMBER, COUNT = {"type": "number"}, {"type": "integer", "minimum": 1}
+PROFILE = {
+    "scanType": {"const": "solidState"},
+    "intensityProcessing": {"const": "normalization"},
+    "rotationDirection": {"enum": ["CW", "CCW"]},
+    "rayType": {"const": "IDEALIZED"},
+    "nearRangeM": NUMBER, "farRangeM": NUMBER, "minDistBetweenEchos": NUMBER, "rangeResolutionM": NUMBER,
+    "rangeAccuracyM": NUMBER, "effectiveApertureSize": NUMBER, "focusDistM": NUMBER, "avgPowerW": NUMBER,
+    "minReflectance": NUMBER, "minReflectanceRange": NUMBER, "wavelengthNm": NUMBER, "pulseTimeNs": NUMBER,
+    "maxReturns": COUNT, "scanRateBaseHz": NUMBER, "reportRateBaseHz": COUNT, "numberOfEmitters": COUNT,
+    "numberOfChannels": COUNT, "rangeCount": COUNT,
+    "ranges": {"type": "array", "minItems": 1, "items": {
+        "type": "object", "required": ["min", "max"], "additionalProperties": False,
+        "properties": {"min": NUMBER, "max": NUMBER}}},
+    "azimuthErrorMean": NUMBER, "azimuthErrorStd": NUMBER, "elevationErrorMean": NUMBER, "elevationErrorStd": NUMBER,
+    "stateResolutionStep": COUNT, "numLines": COUNT, "numRaysPerLine": {"type": "array", "items": COUNT},
+    "emitterStateCount": {"const": 1},
+    "emitterStates": {"type": "array", "minItems": 1, "maxItems": 1, "items": {
+        "type": "object", "additionalProperties": False,
+        "required": ["azimuthDeg", "elevationDeg", "fireTimeNs", "channelId", "rangeId", "bank"],
+        "properties": {
+            **{name: {"type": "array", "items": NUMBER} for name in ("azimuthDeg", "elevationDeg")},
+            **{name: {"type": "array", "items": {"type": "integer", "minimum": 0}}
+               for name in ("fireTimeNs", "channelId", "rangeId", "bank")},
+        }}},
+    "intensityMappingType": {"const": "LINEAR"},
+}  # fmt: skip
+SCHEMA = {
+    "type": "object",
+    "required": ["class", "type", "name", "driveWorksId", "profile"],
+    "additionalProperties": False,
+    "properties": {
+        "class": {"const": "sensor"},
+        "type": {"const": "lidar"},
+        "name": {"type": "string"},
+        "driveWorksId": {"const": "GENERIC"},
+        "profile": {
+            "type": "object", "properties": PROFILE, "required": list(PROFILE), "additionalProperties": False,
+        },
+    },
+}  # fmt: skip
+# Attributes of OmniSensorGenericLidarCoreAPI and its emitter states, with the types of USD.
+CORE_TYPES = {
+    **dict.fromkeys(("scanType", "rayType", "elementsCoordsType", "outputFrameOfReference"), "token"),
+    **dict.fromkeys(
+        ("scanRateBaseHz", "reportRateBaseHz", "patternFiringRateHz", "numberOfEmitters", "numberOfChannels",
+         "maxReturns", "numLines", "rangeCount"), "uint"),
+    **dict.fromkeys(
+        ("nearRangeM", "farRangeM", "minDistBetweenEchosM", "azimuthErrorMean", "azimuthErrorStd",
+         "elevationErrorMean", "elevationErrorStd", "rangeAccuracyM"), "float"),
+    **dict.fromkeys(("rangesMinM", "rangesMaxM"), "float[]"),
+    "numRaysPerLine": "uint[]",
+    **dict.fromkeys(("emitterState:s001:azimuthDeg", "emitterState:s001:elevationDeg"), "float[]"),
+    **{f"emitterState:s001:{name}": "uint[]" for name in ("fireTimeNs", "channelId", "rangeId", "bank")},
+}  # fmt: skip
+TOKENS = {
+    "scanType": "SOLID_STATE", "rayType": "IDEALIZED", "elementsCoordsType": "CARTESIAN",
+    "outputFrameOfReference": "SENSOR",
+}  # fmt: skip
+# What CARLA documents of sensor.lidar.ray_cast, with the types of its attributes.
+CARLA = {
+    "channels": int, "range": float, "points_per_second": int, "rotation_frequency": float, "upper_fov": float,
+    "lower_fov": float, "horizontal_fov": float, "atmosphere_attenuation_rate": float, "dropoff_general_rate": float,
+    "dropoff_intensity_limit": float, "dropoff_zero_intensity": float, "sensor_tick": float, "noise_stddev": float,
+    "role_name": str,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def profiles(tmp_path_factory):
+    path = tmp_path_factory.mktemp("isaac") / "rig.isaac"
+    EXPORTERS["isaac-json"].write(DESIGN, RAYS, path)
+    mounts = json.loads((path / "mounts.json").read_text())["sensors"]
+    return path, mounts, [json.loads((path / f"{one['config']}.json").read_text()) for one in mounts]
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory):
+    usd = pytest.importorskip("pxr.Usd", reason="needs usd-core: the extra `consumers`")
+    path = tmp_path_factory.mktemp("usd") / "rig.usda"
+    EXPORTERS["isaac-usd"].write(DESIGN, RAYS, path)
+    return usd.Stage.Open(str(path))
+
+
+def world(state, turn):
+    """Unit vectors in the world of emitters by degrees: x forward, y to the left at +90, z up."""
+    azimuth, elevation = (np.radians(np.array(state[key], dtype=np.float64)) for key in ("azimuthDeg", "elevationDeg"))
+    flat = np.cos(elevation)
+    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1) @ turn.T
+
+
+def turn_of(w, x, y, z):
+    """A rotation matrix of a unit quaternion, column by column: how it turns each axis."""
+    axis = np.array([x, y, z])
+    return np.stack([one + 2 * np.cross(axis, np.cross(axis, one) + w * one) for one in np.eye(3)], axis=1)
+
+
+def check_emitters(state, ranges, rays, turn):
+    """That emitters are a sensor's rays, one by one."""
+    np.testing.assert_allclose(world(state, turn), rays.direction, atol=2e-7)
+    np.testing.assert_allclose(np.array(ranges)[list(state["rangeId"])], rays.gate_m, atol=3e-7)
+    times = np.array(state["fireTimeNs"], dtype=np.int64)
+    assert (np.abs(times - rays.time_s * 1e9) <= 1).all()
+    assert times.max() < 100_000_000
+
+
+def test_profiles_have_the_fields_and_types_of_nvidias(profiles):
+    _, mounts, found = profiles
+    assert [one["name"] for one in mounts] == [one["name"] for one in found] == [one.name for one in DESIGN.sensors]
+    for profile, count in zip(found, COUNTS, strict=True):
+        assert list(Draft202012Validator(SCHEMA).iter_errors(profile)) == []
+        body = profile["profile"]
+        state = body["emitterStates"][0]
+        assert {len(values) for values in state.values()} == {count}
+        assert body["numberOfEmitters"] == body["numberOfChannels"] == sum(body["numRaysPerLine"]) == count
+        assert len(body["numRaysPerLine"]) == body["numLines"] == 1
+        assert sorted(state["channelId"]) == list(range(count))
+        assert len(body["ranges"]) == body["rangeCount"] == max(state["rangeId"]) + 1
+        assert body["minDistBetweenEchos"] <= body["nearRangeM"]
+
+
+def test_profiles_hold_every_ray_with_its_gate(profiles):
+    _, mounts, found = profiles
+    for index, (mount, profile) in enumerate(zip(mounts, found, strict=True)):
+        body, mine = profile["profile"], RAYS.subset(RAYS.sensor == index)
+        ranges = [(one["min"], one["max"]) for one in body["ranges"]]
+        check_emitters(body["emitterStates"][0], ranges, mine, turn_of(*mount["orientation_wxyz"]))
+        np.testing.assert_allclose(mount["translation_m"], mine.origin_m.mean(axis=0), atol=1e-12)
+        assert body["nearRangeM"] == mine.gate_m[:, 0].min()
+        assert body["farRangeM"] == mine.gate_m[:, 1].max()
+
+
+def test_a_folder_keeps_what_else_lies_there_and_says_so(profiles):
+    path, _, found = profiles
+    other = path / "Mine.json"
+    other.write_text("{}")
+    notes = EXPORTERS["isaac-json"].write(DESIGN, RAYS, path)
+    assert any("Mine.json" in note for note in notes)
+    assert other.read_text() == "{}"
+    assert len(list(path.iterdir())) == len(found) + 2
+
+
+def test_usd_has_an_omnilidar_per_sensor_with_the_schemas_types(stage):
+    assert str(stage.GetDefaultPrim().GetPath()) == "/Lidar"
+    assert stage.GetMetadata("upAxis") == "Z"
+    assert stage.GetMetadata("metersPerUnit") == 1
+    prims = stage.GetDefaultPrim().GetChildren()
+    assert [one.GetTypeName() for one in prims] == ["OmniLidar"] * len(DESIGN.sensors)
+    for prim, sensor, count in zip(prims, DESIGN.sensors, COUNTS, strict=True):
+        assert prim.GetDisplayName() == prim.GetAttribute("omni:sensor:marketName").Get() == sensor.name
+        schemas = prim.GetMetadata("apiSchemas").GetAddedOrExplicitItems()
+        assert schemas == ["OmniSensorGenericLidarCoreAPI", "OmniSensorGenericLidarCoreEmitterStateAPI:s001"]
+        core = {one.GetName().removeprefix("omni:sensor:Core:"): one for one in prim.GetAttributes()}
+        for name, kind in CORE_TYPES.items():
+            assert str(core[name].GetTypeName()) == kind, name
+            if kind.endswith("[]") and name.startswith("emitterState"):
+                assert len(core[name].Get()) == count
+        assert {name: core[name].Get() for name in TOKENS} == TOKENS
+        ours = {name for name in core if not name.startswith(("omni:", "xformOp"))}
+        assert ours == set(CORE_TYPES)
+        assert sum(core["numRaysPerLine"].Get()) == core["numberOfEmitters"].Get() == count
+        assert sorted(core["emitterState:s001:channelId"].Get()) == list(range(1, count + 1))
+        assert len(core["rangesMinM"].Get()) == len(core["rangesMaxM"].Get()) == core["rangeCount"].Get()
+        assert core["minDistBetweenEchosM"].Get() <= core["nearRangeM"].Get()
+
+
+def test_usd_places_every_ray_with_its_gate(stage):
+    for index, prim in enumerate(stage.GetDefaultPrim().GetChildren()):
+        mine = RAYS.subset(RAYS.sensor == index)
+        assert list(prim.GetAttribute("xformOpOrder").Get()) == ["xformOp:translate", "xformOp:orient"]
+        place = np.array(prim.GetAttribute("xformOp:translate").Get())
+        np.testing.assert_allclose(place, mine.origin_m.mean(axis=0), atol=1e-12)
+        orient = prim.GetAttribute("xformOp:orient").Get()
+        turn = turn_of(orient.GetReal(), *orient.GetImaginary())
+        core = {one.GetName().split(":")[-1]: one.Get() for one in prim.GetAttributes()}
+        ranges = np.stack([core["rangesMinM"], core["rangesMaxM"]], axis=1)
+        check_emitters(core, ranges, mine, turn)
+
+
+@pytest.mark.parametrize("name", ["isaac-json", "isaac-usd"])
+def test_frames_are_whole_numbers_per_second(tmp_path, name):
+    with pytest.raises(ConfigError, match=r"0\.3 frames per second"):
+        EXPORTERS[name].write(DESIGN, RAYS, tmp_path / "slow", 0.3)
+    assert list(tmp_path.iterdir()) == []
+    notes = EXPORTERS[name].write(DESIGN, RAYS, tmp_path / "out", 12.6)
+    assert any("12.6 Hz is 13 Hz" in note for note in notes)
+
+
+def swept(sensor, step_s):
+    """Unit vectors in our frame that CARLA fires in one frame: sweeps to the right, channels from above."""
+    attributes = {name: CARLA[name](value) for name, value in sensor["attributes"].items()}
+    channels, field = attributes["channels"], attributes["horizontal_fov"]
+    points = round(attributes["points_per_second"] * step_s / channels)
+    per_frame = attributes["rotation_frequency"] * field * step_s
+    fall = (attributes["upper_fov"] - attributes["lower_fov"]) / (channels - 1) if channels > 1 else 0.0
+    turn = {key: np.radians(value) for key, value in sensor["transform"]["rotation"].items()}
+    found = []
+    for channel in range(channels):
+        for point in range(points):
+            right = np.radians((per_frame / points * point) % field - field / 2)
+            up = np.radians(attributes["upper_fov"] - channel * fall)
+            x, y, z = np.cos(up) * np.cos(right), np.cos(up) * np.sin(right), np.sin(up)
+            # about x: the right side goes down
+            y, z = (
+                y * np.cos(turn["roll"]) + z * np.sin(turn["roll"]),
+                z * np.cos(turn["roll"]) - y * np.sin(turn["roll"]),
+            )
+            # about y: the front goes up
+            x, z = (
+                x * np.cos(turn["pitch"]) - z * np.sin(turn["pitch"]),
+                z * np.cos(turn["pitch"]) + x * np.sin(turn["pitch"]),
+            )
+            # about z: the front goes to the right
+            x, y = x * np.cos(turn["yaw"]) - y * np.sin(turn["yaw"]), y * np.cos(turn["yaw"]) + x * np.sin(turn["yaw"])
+            found.append((x, -y, z))
+    return np.array(found)
+
+
+@pytest.mark.parametrize(("design", "rays"), [(DESIGN, RAYS), spinning()])
+@pytest.mark.parametrize("rate_hz", [10.0, 12.5])
+def test_carla_sweeps_the_rays_that_are_on_even_grids(tmp_path, design, rays, rate_hz):
+    path = tmp_path / "rig.carla.json"
+    EXPORTERS["carla"].write(design, rays, path, rate_hz)
+    document = json.loads(path.read_text())
+    assert document["fixed_delta_seconds"] * rate_hz == pytest.approx(1)
+    assert [one["name"] for one in document["sensors"]] == [one.name for one in design.sensors]
+    for index, one in enumerate(document["sensors"]):
+        assert one["type"] == "sensor.lidar.ray_cast"
+        assert all(isinstance(value, str) for value in one["attributes"].values())
+        mine = rays.subset(rays.sensor == index)
+        place = [one["transform"]["location"][axis] for axis in "xyz"]
+        np.testing.assert_allclose(np.array(place) * (1, -1, 1), mine.origin_m.mean(axis=0), atol=1e-12)
+        assert float(one["attributes"]["range"]) == mine.gate_m[:, 1].max()
+        if index != 1:
+            fired = swept(one, document["fixed_delta_seconds"])
+            assert len(fired) == len(mine)
+            assert farthest_nearest(mine.direction, fired) < 1e-7
+            assert farthest_nearest(fired, mine.direction) < 1e-7

@@ -1,0 +1,382 @@
+"""What robots' tools make of an exported design: MuJoCo runs it, libsdformat, check_urdf and xacro parse it."""
+
+import shutil
+import subprocess
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from support.rigs import NASTY, even, farthest_nearest, read_sdf, rig, sdf_reader, spinning
+
+from lidardesign.design.files import load_design
+from lidardesign.design.layouts.rays import lay_out
+from lidardesign.design.sensor import DesignSpec
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.export import mjcf
+from lidardesign.export.common.names import identifier
+from lidardesign.export.common.poses import mounts
+from lidardesign.export.registry import EXPORTERS
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.scene import Body, Box, Mesh, Scene, Sphere, rigid
+
+ROBOTS = ("mjcf", "sdf", "urdf", "xacro", "carla", "isaac-json", "isaac-usd")
+GRIDS = ("sdf", "urdf", "xacro", "carla")
+DESIGN, RAYS = rig()
+NAMES = ("front_left", "b_script_amp_o_x_y", "down", "front_left_2")
+# libsdformat turns URDF into SDF with six digits
+URDF_DIGITS = 2e-5
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """The rig in every format, with its notes."""
+    folder = tmp_path_factory.mktemp("robots")
+    found = {}
+    for name in ROBOTS:
+        path = folder / f"rig{EXPORTERS[name].suffix}"
+        found[name] = (path, EXPORTERS[name].write(DESIGN, RAYS, path))
+    return found
+
+
+@pytest.fixture(scope="module")
+def reader(tmp_path_factory):
+    return sdf_reader(tmp_path_factory.mktemp("reader"))
+
+
+def turned(seed):
+    generator = np.random.default_rng(seed)
+    rotation = np.linalg.qr(generator.normal(size=(3, 3)))[0]
+    return rotation * np.sign(np.linalg.det(rotation))
+
+
+def scene():
+    """Boxes, balls and a mesh around the rig, with gaps between them."""
+    octahedron = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=np.float64)
+    faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+    return Scene(
+        (
+            Body(Box((1.5, 0.05, 1.2)), "wall", poses=rigid(turned(1), (-1.6, 0.9, 0.9))),
+            Body(Box((2.0, 2.0, 0.1)), "floor", poses=rigid(translation_m=(0.2, 0.1, -0.4))),
+            Body(Sphere(0.6), "ball", poses=rigid(translation_m=(0.9, -1.2, 1.4))),
+            Body(Sphere(0.3), "near", poses=rigid(translation_m=(-0.5, 0.3, 0.7))),
+            Body(Mesh(octahedron * (0.6, 0.5, 0.9), faces), "mesh", poses=rigid(turned(2), (1.3, -0.3, 0.6))),
+        ),
+        "around",
+    )
+
+
+def mujoco_scene(include):
+    """The same scene in MuJoCo's own words, with a file of sensors included."""
+    geoms, assets = [], ""
+    for index, body in enumerate(scene().bodies):
+        place = " ".join(map(repr, body.poses[:3, 3].tolist()))
+        axes = " ".join(repr(value) for value in body.poses[:3, :2].T.ravel().tolist())
+        shape = body.shape
+        if isinstance(shape, Box):
+            kind = f'type="box" size="{" ".join(map(str, shape.half_extents_m))}"'
+        elif isinstance(shape, Sphere):
+            kind = f'type="sphere" size="{shape.radius_m}"'
+        else:
+            vertex, face = (" ".join(map(str, values.ravel())) for values in (shape.vertices, shape.faces))
+            assets += f'<mesh name="m{index}" vertex="{vertex}" face="{face}"/>'
+            kind = f'type="mesh" mesh="m{index}"'
+        geoms.append(f'<geom {kind} pos="{place}" xyaxes="{axes}"/>')
+    return f'<mujoco><include file="{include}"/><asset>{assets}</asset><worldbody>{"".join(geoms)}</worldbody></mujoco>'
+
+
+def test_mujoco_measures_our_distances(exported):
+    import mujoco
+
+    path, _ = exported["mjcf"]
+    main = path.with_name("main.xml")
+    main.write_text(mujoco_scene(path.name), encoding="utf-8")
+    model = mujoco.MjModel.from_xml_path(str(main))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    ours = SceneCaster(scene()).first_hit(RAYS.origin_m, RAYS.direction)
+    hit = ours.body >= 0
+    assert set(ours.body[hit]) == set(range(5))
+    assert (~hit).any()
+    beyond = hit & (ours.range_m > RAYS.gate_m[:, 1])
+    assert beyond.any()
+    expected = np.where(hit, np.minimum(ours.range_m, RAYS.gate_m[:, 1]), -1.0)
+    np.testing.assert_allclose(data.sensordata, expected, atol=1e-4)
+    np.testing.assert_array_equal(model.sensor_user[:, :2], RAYS.gate_m)
+    np.testing.assert_array_equal(model.sensor_user[:, 2], RAYS.sensor)
+    np.testing.assert_array_equal(model.sensor_user[:, 3], RAYS.time_s)
+    bodies = {model.body(int(model.site_bodyid[model.sensor_objid[ray]])).name for ray in range(len(RAYS))}
+    assert bodies == {one.name for one in DESIGN.sensors}
+
+
+def test_a_ray_along_any_axis_is_a_site_that_looks_there(tmp_path):
+    import mujoco
+
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    rays = type(RAYS)(np.zeros((6, 3)), axes, np.tile((0.0, 0.0), (6, 1)), np.zeros(6), np.zeros(6))
+    for index, one in enumerate(DESIGN.sensors):
+        design = DesignSpec("axes", (one,))
+        path = tmp_path / f"{index}.xml"
+        EXPORTERS["mjcf"].write(design, rays, path)
+        model = mujoco.MjModel.from_xml_path(str(path))
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(data.site_xmat.reshape(-1, 3, 3)[:, :, 2], axes, atol=1e-15)
+        np.testing.assert_allclose(data.site_xpos, 0.0, atol=1e-15)
+
+
+def test_two_sensors_of_one_name_are_two_bodies(tmp_path):
+    import mujoco
+
+    twins = DesignSpec("twins", (DESIGN.sensors[0], DESIGN.sensors[0]), rays=2)
+    path = tmp_path / "twins.xml"
+    EXPORTERS["mjcf"].write(twins, lay_out(twins, 2), path)
+    model = mujoco.MjModel.from_xml_path(str(path))
+    assert {model.body(index).name for index in (1, 2)} == {"front left", "front left 2"}
+
+
+def test_no_name_is_a_word_of_the_format(reader, tmp_path):
+    import mujoco
+
+    for name in ("world", "include", "__model__", "a::b", "a\x00\nb", "x" * 5000):
+        design = DesignSpec(name, tuple(replace(one, name=name) for one in DESIGN.sensors[:1]))
+        rays = RAYS.subset(RAYS.sensor == 0)
+        path = tmp_path / "named"
+        EXPORTERS["mjcf"].write(design, rays, path)
+        model = mujoco.MjModel.from_xml_path(str(path))
+        assert model.nsensor == len(rays)
+        if name in ("world", "__model__"):
+            EXPORTERS["sdf"].write(design, rays, path)
+            check_gazebo(read_sdf(reader, path), design, rays, 1e-9)
+
+
+@pytest.mark.parametrize("name", ["mjcf", "sdf"])
+def test_what_is_written_for_a_simulator_is_a_design_again(tmp_path, name):
+    design, rays = spinning()
+    path = tmp_path / f"spin{EXPORTERS[name].suffix}"
+    EXPORTERS[name].write(design, rays, path)
+    found = lay_out(load_design(path))
+    assert len(found) == len(rays)
+    assert farthest_nearest(rays.direction, found.direction) < 1e-7
+    np.testing.assert_allclose(found.origin_m, rays.origin_m, atol=1e-12)
+    np.testing.assert_allclose(found.gate_m, rays.gate_m, atol=1e-12)
+
+
+def fired(sensor):
+    """Unit vectors in the model that a gpu_lidar of these values fires."""
+    w, x, y, z = (sensor[key] for key in ("qw", "qx", "qy", "qz"))
+    columns, rows = int(sensor["columns"]), int(sensor["rows"])
+    local = even(columns, rows, (sensor["left"], sensor["right"]), (sensor["low"], sensor["high"]))
+    axis = np.array([x, y, z])
+    return local + 2 * np.cross(axis, np.cross(axis, local) + w * local)
+
+
+def check_gazebo(found, design, rays, tolerance, rate_hz=10.0):
+    """That sensors as Gazebo sees them fire a design's rays, where those are on even grids."""
+    assert [one["kind"] for one in found] == ["gpu_lidar"] * len(design.sensors)
+    assert len({one["topic"] for one in found}) == len(found)
+    for index, one in enumerate(found):
+        mine = rays.sensor == index
+        place = np.array([one[key] for key in "xyz"])
+        np.testing.assert_allclose(place, rays.origin_m[mine].mean(axis=0), atol=tolerance)
+        gate = rays.gate_m[mine]
+        np.testing.assert_allclose(one["start"], max(gate[:, 0].min(), 0.001), atol=tolerance)
+        np.testing.assert_allclose(one["end"], gate[:, 1].max(), atol=tolerance)
+        assert one["rate"] == rate_hz
+        assert one["horizontal_resolution"] == one["vertical_resolution"] == 1
+        if index != 1:
+            assert one["columns"] * one["rows"] == mine.sum()
+            assert farthest_nearest(rays.direction[mine], fired(one)) < max(tolerance, 1e-7)
+
+
+def test_gazebo_fires_the_rays_that_are_on_even_grids(reader, exported):
+    found = read_sdf(reader, exported["sdf"][0])
+    check_gazebo(found, DESIGN, RAYS, 1e-9)
+    assert [one["name"] for one in found] == list(NAMES)
+
+
+def test_a_spinning_sensor_is_one_whole_turn(reader, tmp_path):
+    design, rays = spinning()
+    path = tmp_path / "spin.sdf"
+    notes = EXPORTERS["sdf"].write(design, rays, path, rate_hz=20.0)
+    check_gazebo(read_sdf(reader, path), design, rays, 1e-9, rate_hz=20.0)
+    assert not any("even grid" in note for note in notes)
+
+
+def test_gazebo_finds_the_sensors_of_a_description(reader, exported):
+    # in the order of their links' names
+    found = {one["name"]: one for one in read_sdf(reader, exported["urdf"][0])}
+    check_gazebo([found[name] for name in NAMES], DESIGN, RAYS, URDF_DIGITS)
+
+
+def check_urdf(path):
+    """The links that urdfdom finds below their parents."""
+    if shutil.which("check_urdf") is None:
+        pytest.skip("needs check_urdf: tools/install-consumers.sh")
+    done = subprocess.run(["check_urdf", path], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "Error" not in done.stdout + done.stderr
+    return {line.split(":")[1].strip() for line in done.stdout.splitlines() if line.strip().startswith("child(")}
+
+
+def test_urdfdom_finds_a_link_per_sensor(exported):
+    assert check_urdf(exported["urdf"][0]) == {"lidar_base", *(f"{name}_link" for name in NAMES)}
+
+
+@pytest.mark.parametrize("name", ["lidar_base", "World", "world link"])
+def test_no_sensor_takes_the_name_of_what_holds_it(tmp_path, name):
+    one = replace(DESIGN.sensors[0], name=name)
+    path = tmp_path / "named.urdf"
+    EXPORTERS["urdf"].write(DesignSpec(name, (one,)), RAYS.subset(RAYS.sensor == 0), path)
+    assert len(check_urdf(path)) == 2
+
+
+def test_xacro_mounts_the_sensors_on_a_robot(reader, exported, tmp_path):
+    xacro = pytest.importorskip("xacro", reason="needs xacro: the extra `consumers`")
+    robot = tmp_path / "robot.xacro"
+    inertia = '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
+    robot.write_text(
+        f'<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro"><link name="arm"><inertial><mass value="1"/>'
+        f'{inertia}</inertial></link><xacro:include filename="{exported["xacro"][0]}"/>'
+        '<xacro:a_rig parent="arm" prefix="left_"/></robot>'
+    )
+    expanded = tmp_path / "robot.urdf"
+    expanded.write_text(xacro.process_file(str(robot)).toprettyxml())
+    assert "left_down_link" in check_urdf(expanded)
+    assert {identifier(word) for word in ("include", "if", "property")} == {"s_include", "s_if", "s_property"}
+    found = {one["name"]: one for one in read_sdf(reader, expanded)}
+    check_gazebo([found[f"left_{name}"] for name in NAMES], DESIGN, RAYS, URDF_DIGITS)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_what_a_format_holds_comes_back(exported, name):
+    path, notes = exported[name]
+    found = EXPORTERS[name].rounding(DESIGN, RAYS, path)
+    loose = RAYS.sensor == 1
+    apart = RAYS.origin_m[loose] - RAYS.origin_m[loose].mean(axis=0)
+    spread = np.linalg.norm(apart, axis=1).max()
+    assert found["origin_m"].error == pytest.approx(0 if name == "mjcf" else spread, abs=1e-12)
+    assert any("start all over them" in note for note in notes) == (name != "mjcf")
+    if name in GRIDS:
+        gates = RAYS.gate_m[loose]
+        # of all gates, those of the loose bundle are widened most; Gazebo's start a millimetre late
+        widest = max(np.ptp(gates[:, 0]) if name != "carla" else 0.0, np.ptp(gates[:, 1]))
+        assert found["gate_m"].error == pytest.approx(widest)
+        assert any("gates of their own" in note for note in notes)
+    else:
+        assert found["direction_rad"].error < 1e-6
+        assert found["gate_m"].error < 1e-6
+        assert found["time_s"].error < 1.01e-9
+        assert not any("gates of their own" in note for note in notes)
+
+
+@pytest.mark.parametrize("name", GRIDS)
+def test_what_is_not_on_a_grid_is_counted_and_measured(exported, name):
+    path, notes = exported[name]
+    note = next(one for one in notes if "even grid" in one)
+    assert note.startswith("23 of 50 rays are not on an even grid")
+    off = EXPORTERS[name].rounding(DESIGN, RAYS, path)["direction_rad"].error
+    told = np.radians(float(note.split("at most ")[1].split(" deg")[0]))
+    # the note is of each ray's own cell: its nearest ray may be in the next one
+    assert off <= told * 1.05
+    assert told < 0.3
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_gate_start_that_is_not_held_is_told(exported, name):
+    told = [note for note in exported[name][1] if "gate start" in note]
+    assert len(told) == (name in ("mjcf", "carla"))
+    # Gazebo has one, but sees through what is nearer
+    assert any("3 of 4 sensors look through it" in note for note in exported[name][1]) == (name in GRIDS[:3])
+    if name == "mjcf":
+        assert "49 of 50 rays" in told[0]
+        assert f"{RAYS.gate_m[RAYS.gate_m[:, 0] > 0, 0].min():.3g} to 1 m" in told[0]
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_a_format_holds_its_frame_rate_or_refuses_one(tmp_path, name):
+    path = tmp_path / "out"
+    if name == "mjcf":
+        with pytest.raises(ConfigError, match="no frame rate"):
+            EXPORTERS[name].write(DESIGN, RAYS, path, 25.0)
+        return
+    EXPORTERS[name].write(DESIGN, RAYS, path, 25.0)
+    found = EXPORTERS[name].rounding(DESIGN, RAYS, path)
+    if name in GRIDS:
+        assert "time_s" not in found
+    else:
+        # the rays were laid out for ten frames a second: firing times shrink with the frame
+        assert found["time_s"].error < 1.01e-9
+
+
+@pytest.mark.parametrize("rate_hz", [np.nan, np.inf, 0.0, -1.0, 1e-320, 1e300])
+def test_no_sensor_has_such_a_frame_rate(tmp_path, rate_hz):
+    with pytest.raises(ConfigError, match=r"0\.001 to 1e"):
+        EXPORTERS["sdf"].write(DESIGN, RAYS, tmp_path / "out", rate_hz)
+    assert not list(tmp_path.iterdir())
+
+
+def test_carla_fires_whole_numbers_of_points_per_second(tmp_path):
+    with pytest.raises(ConfigError, match="whole number of points per second"):
+        EXPORTERS["carla"].write(DESIGN, RAYS, tmp_path / "out", 0.3)
+    found = []
+    for rate_hz in (1.3, 10.0):
+        EXPORTERS["carla"].write(DESIGN, RAYS, tmp_path / "out", rate_hz)
+        found.append(EXPORTERS["carla"].rounding(DESIGN, RAYS, tmp_path / "out"))
+    assert found[0]["rays"] == found[1]["rays"]
+    assert found[0]["direction_rad"].error == pytest.approx(found[1]["direction_rad"].error)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_no_rays_are_no_sensors(tmp_path, name):
+    none = RAYS.subset(np.zeros(0, dtype=np.int64))
+    path = tmp_path / "out"
+    notes = EXPORTERS[name].write(DESIGN, none, path)
+    assert any("4 of 4 sensors fire no ray" in note for note in notes)
+    assert all(estimate.error == 0 for estimate in EXPORTERS[name].rounding(DESIGN, none, path).values())
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_another_or_a_damaged_file_is_no_round_trip(exported, tmp_path, name):
+    exporter = EXPORTERS[name]
+    with pytest.raises(DataError):
+        exporter.rounding(DESIGN, RAYS, tmp_path / "none")
+    one, first = DesignSpec("one", DESIGN.sensors[:1]), RAYS.subset(RAYS.sensor == 0)
+    path = tmp_path / "out"
+    exporter.write(one, first, path)
+    with pytest.raises(DataError):
+        exporter.rounding(DESIGN, RAYS, path)
+    for file in [path] if path.is_file() else sorted(path.iterdir()):
+        file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(DataError):
+        exporter.rounding(one, first, path)
+
+
+def test_a_document_type_is_refused(tmp_path):
+    path = tmp_path / "x.xml"
+    path.write_text('<!DOCTYPE mujoco [<!ENTITY a "b">]><mujoco>&a;</mujoco>')
+    with pytest.raises(DataError, match="document type"):
+        mjcf.read(path)
+
+
+@pytest.mark.parametrize("name", ["mjcf", "sdf", "urdf", "xacro"])
+def test_names_cannot_leave_their_attribute(exported, name):
+    path, notes = exported[name]
+    text = path.read_text(encoding="utf-8")
+    ElementTree.fromstring(text)
+    assert NASTY not in text
+    assert "</script>" not in text
+    assert "${y}" not in text or name == "mjcf"
+    assert any("letters, digits and underscores" in note for note in notes) == (name != "mjcf")
+
+
+def test_libsdformat_finds_the_sensors_of_a_ray_pattern_plugin_where_they_stand(reader, tmp_path):
+    EXPORTERS["rgl"].write(DESIGN, RAYS, tmp_path / "rig.rgl")
+    found = read_sdf(reader, tmp_path / "rig.rgl" / "model.sdf")
+    assert [sensor["name"] for sensor in found] == [mount.name for mount in mounts(DESIGN, RAYS)]
+    for sensor, mount in zip(found, mounts(DESIGN, RAYS), strict=True):
+        assert sensor["kind"] == "custom"
+        place = RAYS.origin_m[mount.ray[0]]
+        np.testing.assert_allclose([sensor[axis] for axis in "xyz"], place, atol=1e-12)
+        quaternion = np.array([sensor[f"q{axis}"] for axis in "wxyz"])
+        assert abs(quaternion @ mount.quaternion) == pytest.approx(1, abs=1e-9)

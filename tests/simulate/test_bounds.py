@@ -1,0 +1,337 @@
+"""Bounds of effects: their closed forms, and that they grow with what causes them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+from scipy.stats import norm, poisson
+from simulate.test_plan import CONSUMER, SINGLE, TIMED, decisions, grid, room
+
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Rays
+from lidardesign.scene import Ambient, Body, Box, Capsule, Medium, Mesh, Plane, Receiver, Scene, Sphere, rigid
+from lidardesign.simulate.detector.detector import metres
+from lidardesign.simulate.effects.expected_counts import Counts, estimate_error_m, needed_counts, share_in_bins
+from lidardesign.simulate.effects.first_hits import Sight, edge_probability
+from lidardesign.simulate.effects.motion import entered_rays, moving_tracer, point_velocities
+from lidardesign.simulate.effects.multipath import _detours, _moved_m
+from lidardesign.simulate.physics import Physics, followed_light
+from lidardesign.simulate.plan import Planner
+
+
+def bound(name, scene, detector, rays=None):
+    return decisions(Planner(detector).plan(scene, [grid() if rays is None else rays]))[name].bound
+
+
+def sight(scene, detector, rays=None, frame=0):
+    return Sight.of(scene, frame, detector, [grid() if rays is None else rays], SceneCaster(scene, frame))
+
+
+def counts(scene, detector, rays=None):
+    return Counts(sight(scene, detector, rays))
+
+
+def facing_wall(**body):
+    """A wall far wider than the view, 2 m ahead, met head-on by a narrow beam."""
+    return Scene((Body(Box((0.05, 50, 50)), "wall", poses=rigid(translation_m=(2.05, 0, 0)), **body),))
+
+
+def box_mesh():
+    made = trimesh.creation.box((0.2, 0.1, 0.3))
+    return Mesh(np.array(made.vertices) + 0.05, np.array(made.faces))
+
+
+NARROW = grid(side=4, half_rad=1e-4)
+
+
+def test_rounding_is_off_by_a_bin_over_the_root_of_twelve():
+    assert bound("quantisation", room(), CONSUMER).range_m == pytest.approx(CONSUMER.bin_m / math.sqrt(12))
+
+
+def test_one_time_per_return_strays_by_the_whole_jitter():
+    assert bound("jitter", room(), TIMED).range_m == pytest.approx(metres(TIMED.jitter_sigma_s))
+
+
+def test_the_matched_filter_averages_photons():
+    never_blind = replace(SINGLE.photons, dead_s=0.0)
+    detector = replace(SINGLE, divergence_rad=0.0, footprint_rays=1, photons=never_blind)
+    signal = float(counts(facing_wall(), detector, NARROW).signal[0])
+    found = bound("photon_noise", facing_wall(), detector, NARROW).range_m
+    assert found == pytest.approx(metres(detector.timing_sigma_s) / math.sqrt(signal), rel=1e-3)
+    jitter = bound("jitter", facing_wall(), detector, NARROW).range_m
+    assert jitter == pytest.approx(metres(detector.jitter_sigma_s) / math.sqrt(signal), rel=1e-3)
+
+
+def test_expected_signal_is_the_light_budget_of_a_wall_met_head_on():
+    photons = SINGLE.photons
+    per_pulse = photons.pulse_energy_j / photons.photon_energy_j * photons.efficiency
+    expected = per_pulse * photons.aperture_m2 * 0.3 / (math.pi * 2.0**2) * photons.pulses_per_frame / 16
+    found = counts(facing_wall(reflectance=0.3), SINGLE, NARROW).signal
+    assert found == pytest.approx(np.full(16, expected), rel=1e-6)
+
+
+def test_the_air_takes_the_whole_way_from_the_signal():
+    clear, foggy = facing_wall(), replace_medium(facing_wall(), Medium(0.3, 0.0))
+    found = counts(foggy, SINGLE, NARROW)
+    assert found.signal == pytest.approx(counts(clear, SINGLE, NARROW).signal)
+    assert found.in_air == pytest.approx(found.signal * math.exp(-0.3 * 4.0), rel=1e-6)
+
+
+def replace_medium(scene, medium):
+    return Scene(scene.bodies, scene.name, medium=medium)
+
+
+@pytest.mark.parametrize("mean", [0.0, 1e-9, 1e-3, 0.2, 1.0, 7.3, 100.0, 4e4])
+@pytest.mark.parametrize("bins", [1.0, 40.0, 3000.0])
+@pytest.mark.parametrize("allowed", [0.5, 0.01, 1e-6])
+def test_a_return_needs_the_fewest_counts_that_background_rarely_reaches(mean, bins, allowed):
+    needed = float(needed_counts(np.array([mean]), np.array([bins]), allowed)[0])
+    rounding = 1 + 1e-6
+    assert needed >= 1
+    assert bins * poisson.sf(needed - 1, mean) <= allowed * rounding
+    assert needed == 1 or bins * poisson.sf(needed - 2, mean) * rounding > allowed
+
+
+def test_a_bin_holds_its_share_of_an_echo_on_its_edge():
+    bin_m, sigma_s = 0.01, 2e-11
+    assert share_in_bins(1, bin_m, metres(sigma_s)) == pytest.approx(norm.cdf(bin_m / metres(sigma_s)) - 0.5)
+    three = norm.cdf(2 * bin_m / metres(sigma_s)) - norm.cdf(-bin_m / metres(sigma_s))
+    assert share_in_bins(3, bin_m, metres(sigma_s)) == pytest.approx(three)
+    assert (share_in_bins(1, bin_m, 0.0), share_in_bins(3, bin_m, 0.0)) == (0.5, 1.0)
+
+
+@pytest.mark.parametrize("signal", [0.0, 3.0, 20.0, 80.0])
+@pytest.mark.parametrize("level", [0.01, 0.5, 4.0])
+def test_the_union_over_bins_bounds_how_often_another_bin_wins(signal, level):
+    """Against drawn histograms: within four standard errors."""
+    scene = facing_wall()
+    found = counts(scene, replace(CONSUMER, bin_s=1e-9, pulse_sigma_s=0.0, jitter_sigma_s=0.0), NARROW)
+    bins, draws, generator = int(found.bins[0]), 20_000, np.random.default_rng(3)
+    echo = generator.poisson(signal * 0.5 + level, draws)
+    other = generator.poisson(level, (draws, bins - 1)).max(axis=1)
+    wrong = float((other >= echo).mean())
+    bounded = found.mistaken(np.full(16, signal), np.full(16, level), np.full(16, level), np.zeros(16))[0]
+    assert wrong - 4 * math.sqrt(wrong * (1 - wrong) / draws) <= bounded <= 1
+
+
+@pytest.mark.parametrize("estimator", ["peak", "matched"])
+@pytest.mark.parametrize("signal", [1, 4, 30, 300, 10_000])
+@pytest.mark.parametrize("bins_per_sigma", [0.3, 1.0, 4.0])
+def test_estimated_ranges_stray_no_further_than_bounded(estimator, signal, bins_per_sigma):
+    """The highest bin and the mean of n photons, drawn 2000 times, after rounding is taken off."""
+    sigma_m, draws, generator = metres(5e-11), 2000, np.random.default_rng(5)
+    bin_m = sigma_m / bins_per_sigma
+    bin_s = 2 * bin_m / 299792458
+    detector = replace(SINGLE, estimator=estimator, pulse_sigma_s=5e-11, jitter_sigma_s=0.0, bin_s=bin_s)
+    bounded = float(estimate_error_m(detector, np.array([float(signal)]), sigma_m)[0])
+    photons = sigma_m * generator.normal(size=(draws, signal))
+    if estimator == "matched":
+        strayed = photons.mean(axis=1)
+    else:
+        edges = bin_m * (np.arange(-40, 41) + 0.5) if bins_per_sigma < 2 else bin_m * (np.arange(-80, 81) + 0.5)
+        heights = np.stack([np.histogram(row, edges)[0] for row in photons])
+        strayed = ((edges[1:] + edges[:-1]) / 2)[heights.argmax(axis=1)]
+    rms = float(np.sqrt(np.mean(strayed**2)))
+    rounding = bin_m / math.sqrt(12) if estimator == "peak" else 0.0
+    assert rms * (1 - 4 / math.sqrt(2 * draws)) <= bounded + rounding
+
+
+@pytest.mark.parametrize("mean", [1e-3, 0.1, 1.0, 5.0, 40.0])
+def test_first_photons_are_early_by_no_more_than_bounded(mean):
+    """E max of K normals for K Poisson and at least 1, by quadrature of the distribution of the first."""
+    x = np.linspace(-9, 9, 20_001)
+    # P(first <= x | K >= 1) = (1 - exp(-mean cdf)) / (1 - exp(-mean))
+    first = -np.expm1(-mean * norm.cdf(x)) / -np.expm1(-mean)
+    early = -float(np.sum((x[1:] + x[:-1]) / 2 * np.diff(first)))
+    several = mean / -math.expm1(-mean)
+    bounded = min(math.sqrt(2 * math.log(several)), (several - 1) / math.sqrt(math.pi))
+    assert 0 < early <= bounded
+
+
+def growing(name, cases):
+    found = [bound(name, *case) for case in cases]
+    ranges, lost = [one.range_m for one in found], [one.lost for one in found]
+    assert ranges == sorted(ranges)
+    assert lost == sorted(lost)
+    assert ranges[0] < ranges[-1] or lost[0] < lost[-1]
+
+
+def test_bounds_grow_with_the_light_of_the_surroundings():
+    scenes = [room(ambient=Ambient(lux)) for lux in (0.0, 1.0, 30.0, 1e3, 1e4, 1e5)]
+    growing("ambient", [(scene, SINGLE) for scene in scenes])
+    early_m = [bound("pile_up", scene, SINGLE).range_m for scene in scenes]
+    assert early_m == sorted(early_m)
+    assert early_m[-1] > 10 * early_m[0]
+
+
+def test_bounds_grow_with_the_width_of_beams():
+    growing("footprint", [(room(), replace(CONSUMER, divergence_rad=width)) for width in (0.001, 0.01, 0.05, 0.2)])
+
+
+def test_bounds_grow_with_speed():
+    speeds = (0.0, 0.01, 0.1, 1.0, 10.0)
+    growing("motion", [(room(ball={"velocity_m_s": (0.0, speed, 0.0)}), TIMED) for speed in speeds])
+
+
+def test_bounds_grow_with_fog():
+    growing("atmosphere", [(room(medium=Medium(a, a / 20)), SINGLE) for a in (0.0, 1e-4, 1e-2, 0.1, 1.0)])
+
+
+def test_bounds_grow_with_jitter_bins_and_dead_time():
+    growing("jitter", [(room(), replace(TIMED, jitter_sigma_s=sigma)) for sigma in (0.0, 1e-12, 1e-10)])
+    growing("quantisation", [(room(), replace(TIMED, bin_s=width)) for width in (1e-12, 1e-10, 1e-9)])
+    sunny = room(ambient=Ambient(1e5))
+    dead = [replace(SINGLE, photons=replace(SINGLE.photons, dead_s=dead_s)) for dead_s in (0.0, 7.7e-8, 1e-6)]
+    growing("pile_up", [(sunny, detector) for detector in dead])
+
+
+def test_a_slanted_plane_spreads_a_beam_by_the_tangent_of_incidence():
+    tilt, width = math.radians(60), 0.01
+    turned = np.array([[math.cos(tilt), -math.sin(tilt), 0], [math.sin(tilt), math.cos(tilt), 0], [0, 0, 1.0]])
+    wall = Body(Box((1e-6, 50, 50)), poses=rigid(turned, (2, 0, 0)))
+    detector = replace(TIMED, divergence_rad=width, footprint_rays=7)
+    found = bound("footprint", Scene((wall,)), detector, NARROW)
+    assert found.range_m == pytest.approx(2 * width / 2 * math.tan(tilt), rel=1e-3)
+    assert found.lost == 0
+
+
+def test_the_share_of_beams_on_a_depth_edge_is_that_of_drawn_edges():
+    """A straight edge between two walls, anywhere between the rays of a grid: on average exact."""
+    detector = replace(TIMED, divergence_rad=0.004, footprint_rays=7)
+    rays, found, true = grid(side=20, half_rad=0.2), [], []
+    for place in np.random.default_rng(0).uniform(-0.2, 0.2, 40):
+        near = Body(Box((0.01, 5, 5)), "near", poses=rigid(translation_m=(1, 5 + place, 0)))
+        seen = sight(Scene((near, *facing_wall().bodies)), detector, rays)
+        chance = edge_probability(seen, detector.divergence_rad / 2 * seen.range_m)
+        found.append(chance.mean())
+        azimuth = np.arctan2(rays.direction[:, 1], rays.direction[:, 0])
+        true.append((np.abs(azimuth - math.atan2(place, 1 - 0.01)) <= 0.002).mean())
+    error = np.std(np.array(found) - np.array(true)) / math.sqrt(40)
+    assert np.mean(found) >= np.mean(true) - 4 * error
+    assert np.mean(found) <= 4 * np.mean(true) + 4 * error
+
+
+def test_points_of_moving_bodies_move_with_them():
+    angle, rate = 0.01, 20.0
+    turned = rigid(np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]]))
+    place = rigid(translation_m=(1.0, 0, 0))
+    ball = Body(Sphere(0.3), poses=np.stack([place, turned @ place, turned @ turned @ place]))
+    scene = Scene((ball,), frame_rate_hz=rate)
+    for frame in (0, 1, 2):
+        seen = sight(scene, TIMED, frame=frame)
+        points = seen.rays.origin_m + seen.range_m[:, None] * seen.rays.direction
+        met = seen.hits.body == 0
+        speed = np.linalg.norm(point_velocities(seen), axis=1)
+        expected = angle * rate * np.hypot(points[met, 0], points[met, 1])
+        assert speed[met] == pytest.approx(expected, rel=1e-4)
+        assert not speed[~met].any()
+
+
+def test_a_receiver_loses_what_lies_outside_its_view_and_may_lose_all_it_does_not_share():
+    here = Receiver((0, 0, 0), 0.0, 0.0, 0.3, 3.0, (0.0, 10.0))
+    found = bound("shadowing", Scene(room().bodies, receiver=here), TIMED)
+    seen = sight(room(), TIMED)
+    azimuth = np.abs(np.arctan2(seen.rays.direction[:, 1], seen.rays.direction[:, 0]))
+    assert found.lost == pytest.approx((azimuth > 0.15).sum() / seen.returned.sum())
+    assert bound("shadowing", Scene(room().bodies, receiver=replace(here, origin_m=(0, 0.1, 0))), TIMED).lost == 1.0
+
+
+def test_a_wall_fills_half_of_what_the_floor_before_it_sees():
+    floor, wall = Body(Plane(), "floor"), Body(Box((0.05, 1e4, 1e4)), "wall", poses=rigid(translation_m=(2, 0, 0)))
+    down = grid(side=5, half_rad=0.2)
+    looking = down.direction[:, [1, 2, 0]] * np.array([1, 1, -1])
+    rays = replace(down, origin_m=down.origin_m + np.array([0, 0, 1.0]), direction=looking)
+    found = _detours(sight(Scene((floor, wall)), CONSUMER, rays), np.arange(25))
+    assert found.seen.mean() == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_convex_body_alone_lights_nothing_and_a_corner_lights_itself():
+    assert bound("multipath", Scene((Body(Sphere(0.3), poses=rigid(translation_m=(1, 0, 0))),)), CONSUMER).range_m == 0
+    side = Body(Box((2, 0.05, 2)), "side", poses=rigid(translation_m=(2, 0.3, 0)))
+    corner = Scene((*facing_wall().bodies, side))
+    assert bound("multipath", corner, CONSUMER).range_m > 0.005
+
+
+def test_the_spots_of_a_flood_light_each_other_as_two_small_surfaces_do():
+    """One spot on a wall ahead, one on a wall to the left of it, seen from two places."""
+    side = Body(Box((5, 0.05, 5)), "side", poses=rigid(translation_m=(0, 0.55, 0)), reflectance=0.4)
+    scene = Scene((*facing_wall(reflectance=0.2).bodies, side))
+    origin, looking = np.array([[1.0, 0, 0], [1.7, 0, 0]]), np.array([[1.0, 0, 0], [0, 1.0, 0]])
+    rays = Rays(origin, looking, np.tile((0.1, 4.0), (2, 1)), np.zeros(2), np.zeros(2))
+    detector = replace(CONSUMER, divergence_rad=0.0, footprint_rays=1)
+    ahead_m, aside_m = 0.3, 0.5
+    apart_m = math.hypot(ahead_m, aside_m)
+    factor = ahead_m * aside_m / (math.pi * apart_m**4) * detector.photons.field_of_view_sr / (1 - 0.4)
+    first = 0.4 * factor * 1.0**2 * (0.5 + apart_m - 1.0) / 2
+    second = 0.2 * factor * 0.5**2 * (1.0 + apart_m - 0.5) / 2
+    found = sight(scene, replace(detector, bin_s=1e-8), rays)
+    assert _moved_m(found, np.arange(2), np.arange(2)) == pytest.approx([first, second], rel=1e-6)
+
+
+def test_shares_of_light_that_leads_elsewhere_are_counted():
+    seen = sight(room(), TIMED)
+    share = (seen.hits.body == 0).sum() / seen.returned.sum()
+    assert bound("specular", room(ball={"specular": 0.2}), TIMED).lost == pytest.approx(share)
+    assert bound("specular", room(wall={"transmission": 0.2}), TIMED).lost == pytest.approx(1 - share)
+
+
+def test_beams_that_meet_what_lies_between_rays_call_for_their_width():
+    poles = tuple(Body(Capsule(0.004, 2.0), "pole", poses=rigid(translation_m=(1, y, 0))) for y in (-0.1, 0.0, 0.1))
+    scene, rays = Scene(poles), grid(side=12, half_rad=0.3)
+    wide = replace(TIMED, divergence_rad=0.03, footprint_rays=19)
+    assert (sight(scene, wide, rays).hits.body < 0).all()
+    assert "footprint" in Planner(wide).plan(scene, [rays]).effects
+    far = Scene((Body(Sphere(0.1), "ball", poses=rigid(translation_m=(-1, 0, 0))),))
+    assert "footprint" not in Planner(wide).plan(far, [rays]).effects
+
+
+MOVERS = {
+    "sphere": Sphere(0.1),
+    "box": Box((0.1, 0.05, 0.2)),
+    "capsule": Capsule(0.05, 0.1),
+    "plane": Plane(),
+    "mesh": box_mesh(),
+}
+
+
+@pytest.mark.parametrize("shape", MOVERS.values(), ids=MOVERS)
+def test_what_flies_into_view_calls_for_motion(shape):
+    """Nothing of the body is met when the frame begins; rays that it has reached by their time are, exactly."""
+    still = rigid(Rotation.from_rotvec((0.3, math.pi / 2, 0.2)).as_matrix(), (0.7, -0.8, 0.0))
+    moving = Body(shape, "flyer", poses=still, velocity_m_s=(0.0, 14.0, 0.0))
+    if isinstance(shape, Plane):
+        away = rigid(Rotation.from_rotvec((0.0, -math.pi / 2, 0.0)).as_matrix(), (9.0, 0.0, 0.0))
+        moving = replace(moving, poses=away, velocity_m_s=(-90.0, 0.0, 0.0))
+    wall = Body(Box((0.05, 9, 9)), "wall", poses=rigid(translation_m=(1.5, 0, 0)))
+    scene, rays = Scene((wall, moving)), grid(side=30)
+    seen = sight(scene, TIMED, rays)
+    assert (seen.hits.body == 0).all()
+    later = moving_tracer(scene, 0)(rays.origin_m, rays.direction, rays.time_s)
+    assert (later.body == 1).any()
+    assert np.array_equal(entered_rays(seen), later.body == 1)
+    assert "motion" in Planner(TIMED).plan(scene, [rays]).effects
+
+
+@pytest.mark.parametrize("place", [(4.8, 0, 0.3), (2, 0.01, 0), (0, 0, 0), (-1, 0.5, 0.2), (5, 1, 0)])
+@pytest.mark.parametrize("gate_m", [(0.1, 6.5), (2.5, 3.0)])
+def test_haze_beside_a_fixed_receiver_is_bounded(place, gate_m):
+    """Against what the effect counts: all haze, and the fullest cell per length."""
+    receiver = Receiver(place, 0.0, 0.0, 3.1, 3.1, (0.0, 20.0))
+    wall = Body(Box((0.05, 50, 50)), "wall", poses=rigid(translation_m=(6.05, 0, 0)))
+    scene = Scene((wall,), medium=Medium(0.01, 0.02), receiver=receiver)
+    rays = grid(side=8, half_rad=0.1, gate_m=gate_m)
+    found = counts(scene, replace(SINGLE, divergence_rad=0.0, footprint_rays=1), rays)
+    background = followed_light(
+        scene, 0, rays, SceneCaster(scene), Physics(found.sight.detector, frozenset({"atmosphere"}))
+    ).background
+    whole, fullest = found.haze_per_pulse
+    assert (background.counts.sum(axis=1) <= whole * (1 + 1e-6) + 1e-300).all()
+    length = np.diff(background.edges_m, axis=1)
+    long = length > found.bin_m
+    densest = np.where(long, background.counts / np.where(long, length, 1.0), 0.0).max(axis=1) * found.bin_m
+    assert (densest <= fullest * (1 + 1e-6) + 1e-300).all()

@@ -1,0 +1,360 @@
+"""Single bounces agree with a light-transport simulator: when they arrive, and how much light there is of each.
+
+Without the simulator only its process and its absence are tested; everything else is skipped, with the reason.
+"""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidardesign.errors import ConfigError, NumericalError
+from lidardesign.geometry.raycast import shared_caster
+from lidardesign.geometry.rays import Rays
+from lidardesign.registry import load_task
+from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Receiver, Scene, Sphere, rigid
+from lidardesign.simulate.detector.light import Beams, Echoes
+from lidardesign.simulate.effects.shadowing import heard
+from lidardesign.simulate.light_transport import process
+from lidardesign.simulate.light_transport.transport import Lights, PathBins, available, pixel_rays, render_transient
+from lidardesign.simulate.physics import direct_echoes
+
+needs_simulator = pytest.mark.skipif(
+    not available(), reason=f"the light-transport simulator cannot run here: {process.missing()}"
+)
+
+# float32 intersections against float64 ones: 1e-7 of lengths, some ten times that where surfaces are curved or grazed
+ENERGY, MOST_ENERGY = 1e-5, 5e-3
+BIN_M = 0.0075
+PULSE_FWHM_M = 0.015
+VIEW_RAD = 0.9
+
+
+def turned(seed: int) -> np.ndarray:
+    rotation = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    return rotation * np.sign(np.linalg.det(rotation))
+
+
+def plane_scene() -> Scene:
+    facing = np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
+    tilted = facing @ np.array([[math.cos(0.4), 0, math.sin(0.4)], [0, 1, 0], [-math.sin(0.4), 0, math.cos(0.4)]])
+    return Scene((Body(Plane(), reflectance=0.7, poses=rigid(tilted, (0.5, 0.02, -0.01))),), "plane")
+
+
+def sphere_scene() -> Scene:
+    return Scene((Body(Sphere(0.12), reflectance=0.4, poses=rigid(turned(1), (0.45, 0.01, 0.02))),), "sphere")
+
+
+@lru_cache(maxsize=1)
+def face_scene() -> Scene:
+    """A head of the face task, looked at along +x from 0.4 m."""
+    task = load_task("face")
+    config = task.Config(train=2, test=2)
+    (head,) = task.scenes(config, "test", 0)[0].bodies
+    about = rigid(np.diag([-1.0, -1.0, 1.0]), (0.4, 0, 0))
+    return Scene((replace(head, poses=about @ head.pose(0), velocity_m_s=(0.0, 0.0, 0.0), specular=0.0),), "face")
+
+
+SCENES = {"plane": plane_scene, "sphere": sphere_scene, "face": face_scene}
+BISTATIC = Receiver((-0.01, 0.06, 0.02), -0.1, 0.0, VIEW_RAD, VIEW_RAD, (0.0, 5.0))
+
+
+def spiral(count: int, half_angle_rad: float, axis: tuple[float, ...] = (1.0, 0.0, 0.0)) -> np.ndarray:
+    """Directions even in solid angle in a cone, shape (count, 3)."""
+    number = np.arange(count)
+    ahead = 1 - (1 - math.cos(half_angle_rad)) * (number + 0.5) / count
+    turn, across = number * math.pi * (3 - math.sqrt(5)), np.sqrt(1 - ahead**2)
+    forward = np.asarray(axis) / np.linalg.norm(axis)
+    left = np.cross(np.eye(3)[np.abs(forward).argmin()], forward)
+    left /= np.linalg.norm(left)
+    up = np.cross(forward, left)
+    return ahead[:, None] * forward + across[:, None] * (np.cos(turn)[:, None] * left + np.sin(turn)[:, None] * up)
+
+
+def rays_from(origin_m: tuple[float, ...], direction: np.ndarray, far_m: float = 10.0) -> Rays:
+    count = len(direction)
+    zeros = np.zeros(count)
+    gate_m = np.tile([0.0, far_m], (count, 1))
+    return Rays(np.tile(np.asarray(origin_m, dtype=float), (count, 1)), direction, gate_m, zeros, zeros)
+
+
+def single_bounces(scene: Scene, rays: Rays) -> Echoes:
+    """Our direct echoes that the receiver, where there is one, has in sight."""
+    caster, beams = shared_caster(scene, 0), Beams.of(rays)
+    hits = caster.first_hit(rays.origin_m, rays.direction)
+    echoes = direct_echoes(scene, beams, hits)
+    return heard(scene, beams, hits, echoes, lambda origin, direction, time_s: caster.first_hit(origin, direction))
+
+
+def histogram(path_m: np.ndarray, weight: np.ndarray, bins: PathBins) -> np.ndarray:
+    """Whole paths by bins, each spread as a pulse."""
+    cell = np.floor((path_m - bins.start_m) / bins.width_m).astype(int)
+    inside = (cell >= 0) & (cell < bins.count)
+    sharp = np.bincount(cell[inside], weight[inside], bins.count)
+    away = np.arange(-bins.count + 1, bins.count) * bins.width_m
+    pulse = np.exp(-4 * math.log(2) * (away / (2 * PULSE_FWHM_M)) ** 2)
+    return np.convolve(sharp, pulse / pulse.sum(), mode="valid")
+
+
+@needs_simulator
+@pytest.mark.parametrize("receiver", [None, BISTATIC], ids=["co-located", "bistatic"])
+@pytest.mark.parametrize("name", SCENES)
+def test_every_ray_has_the_gain_and_the_time_of_the_direct_component(name, receiver):
+    scene = replace(SCENES[name](), receiver=receiver)
+    rays = rays_from((0, 0, 0), spiral(4000, 0.3))
+    echoes = single_bounces(scene, rays)
+    # light is sent from the receiver: what is then seen along a beam is its gain
+    lights = Lights.flood(np.zeros((1, 3))) if receiver is None else Lights.receiver(receiver)
+    found = render_transient(scene, 0, rays, lights, PathBins(BIN_M, 400))
+    gain, path_m = np.zeros(len(rays)), np.zeros(len(rays))
+    gain[echoes.ray], path_m[echoes.ray] = echoes.gain, 2 * echoes.path_m
+    lit = gain > 0
+    # a ray past the very edge of a silhouette or a shadow may fall on either side in float32
+    assert np.mean(lit != (found.steady > 0)) < 2e-3
+    both = np.flatnonzero(lit & (found.steady > 0))
+    assert len(both) > 1000
+    ratio = found.steady[both] / gain[both]
+    assert abs(ratio.mean() - 1) < ENERGY
+    assert np.quantile(np.abs(ratio - 1), 0.99) < 10 * ENERGY
+    assert np.abs(ratio - 1).max() < MOST_ENERGY
+    peak = found.bins.centres_m[found.binned[both].argmax(axis=1)]
+    # within its bin; paths that end on a bin's edge may round to the next
+    assert np.abs(peak - path_m[both]).max() < BIN_M / 2 + 1e-6
+
+
+@needs_simulator
+@pytest.mark.parametrize("emitter_m", [(0.0, 0.0, 0.0), (-0.02, -0.08, 0.05)], ids=["co-located", "elsewhere"])
+@pytest.mark.parametrize("name", SCENES)
+def test_the_transient_of_a_whole_view_has_the_same_peak_and_energy(name, emitter_m):
+    """Forward: a spot light of 1 W and a camera of the simulator's, against our beams from the emitter."""
+    receiver = Receiver((0, 0, 0), 0.0, 0.0, VIEW_RAD, VIEW_RAD, (0.0, 5.0))
+    scene, half_rad, count = replace(SCENES[name](), receiver=receiver), 0.35, 60_000
+    axis = np.array([0.45, 0, 0]) - np.asarray(emitter_m)
+    rays = rays_from(emitter_m, spiral(count, half_rad, tuple(axis)))
+    echoes = single_bounces(scene, rays)
+    bins = PathBins(BIN_M, 320)
+    ours = histogram(2 * echoes.path_m, echoes.gain / count, bins)
+    pixels, solid_sr = pixel_rays(receiver, 240, 240)
+    solid_angle = 2 * math.pi * (1 - math.cos(half_rad))
+    lights = Lights.spot(np.array([emitter_m]), axis[None], half_rad, 1 / solid_angle)
+    found = render_transient(scene, 0, pixels, lights, bins)
+    seen = np.bincount(found.cell, found.radiance * solid_sr[found.ray], bins.count)
+    theirs = histogram(bins.centres_m, seen, bins)
+    # two quadratures of one integral: edges of cone, silhouettes and shadows are met to within a pixel
+    assert ours.sum() == pytest.approx(theirs.sum(), rel=0.005)
+    assert abs(ours.argmax() - theirs.argmax()) <= 1
+    assert np.abs(ours - theirs).sum() < 0.01 * theirs.sum()
+
+
+@needs_simulator
+@pytest.mark.parametrize("shape", [Sphere(0.3), Box((0.2, 0.3, 0.25)), Capsule(0.2, 0.25), Plane()], ids=repr)
+@pytest.mark.parametrize("offset_m", [0.0, 1e5])
+def test_every_shape_is_exported_where_it_is(shape, offset_m):
+    place = np.array([1.5 + offset_m, 0.2, 0.1])
+    scene = Scene((Body(shape, reflectance=0.6, poses=rigid(turned(2), place)),))
+    rays = rays_from((offset_m, 0.0, 0.0), spiral(500, 0.3), far_m=100.0)
+    echoes = single_bounces(scene, rays)
+    found = render_transient(scene, 0, rays, Lights.flood(rays.origin_m[:1]), PathBins(0.01, 1))
+    assert (np.flatnonzero(found.steady > 0) == echoes.ray).mean() == 1
+    np.testing.assert_allclose(found.steady[echoes.ray], echoes.gain, rtol=MOST_ENERGY)
+
+
+@needs_simulator
+def test_meshes_are_shaded_on_both_sides_and_follow_their_poses():
+    corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    mesh = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), "unsigned")
+    away = rigid(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), (5, 0, 0))
+    near = rigid(np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]), (2, 0, 0))
+    scene = Scene((Body(mesh, reflectance=0.5, poses=np.stack([away, near])),))
+    # not onto the edge that both triangles share
+    rays = rays_from((0, 0.3, 0.1), np.array([[1.0, 0, 0]]))
+    for frame, distance_m in ((0, 5.0), (1, 2.0)):
+        found = render_transient(scene, frame, rays, Lights.flood(rays.origin_m), PathBins(0.1, 200, -0.05))
+        assert found.steady[0] == pytest.approx(0.5 / (math.pi * distance_m**2), rel=1e-5)
+        assert found.cell.tolist() == [round(2 * distance_m / 0.1)]
+    behind = replace(scene, bodies=(replace(scene.bodies[0], poses=away),))
+    back = rays_from((7, 0.3, 0.1), np.array([[-1.0, 0, 0]]))
+    found = render_transient(behind, 0, back, Lights.flood(back.origin_m), PathBins(0.1, 200))
+    assert found.steady[0] == pytest.approx(0.5 / (math.pi * 4), rel=1e-5)
+
+
+@needs_simulator
+@pytest.mark.parametrize("bounces", [1, 2, 4, 7])
+def test_light_within_a_ball_adds_up_to_the_geometric_series(bounces):
+    """Inside a matt ball every bounce lights all of it evenly: E_k = rho^k Phi / (4 pi R^2), Ulbricht's sphere."""
+    radius_m, reflectance = 1.5, 0.6
+    scene = Scene((Body(Sphere(radius_m), reflectance=reflectance),))
+    rays = rays_from((0, 0, 0), spiral(200, math.pi))
+    lights = Lights.flood(np.zeros((1, 3)), 1 / (4 * math.pi))
+    found = render_transient(scene, 0, rays, lights, PathBins(0.1, 400, -0.05), bounces=bounces, samples=256, seed=5)
+    once = reflectance / (math.pi * 4 * math.pi * radius_m**2)
+    series = once * sum(reflectance**k for k in range(bounces))
+    spread = found.steady.std() / math.sqrt(len(rays))
+    assert found.steady.mean() == pytest.approx(series, abs=4 * spread + 1e-5 * series)
+    # a chord is 4 R / 3 long on average
+    late_m = found.binned.mean(axis=0) @ found.bins.centres_m / found.steady.mean()
+    share = np.array([reflectance**k for k in range(bounces)]) / sum(reflectance**k for k in range(bounces))
+    assert late_m == pytest.approx(2 * radius_m + share @ np.arange(bounces) * 4 * radius_m / 3, rel=0.01)
+
+
+@needs_simulator
+def test_mirrors_and_glass_take_their_shares_of_matt_light():
+    rays = rays_from((0, 0, 0), np.array([[1.0, 0, 0]]))
+    for shares in ({}, {"specular": 0.4}, {"transmission": 0.4}, {"specular": 0.3, "transmission": 0.4}):
+        wall = Body(Box((0.1, 1, 1)), reflectance=0.3, poses=rigid(translation_m=(2.1, 0.02, 0.03)), **shares)
+        found = render_transient(
+            Scene((wall,)), 0, rays, Lights.flood(np.zeros((1, 3))), PathBins(0.1, 100), samples=4096
+        )
+        assert found.steady[0] == pytest.approx(0.3 / (math.pi * 4), rel=0.08)
+
+
+@needs_simulator
+def test_what_a_ray_sees_does_not_depend_on_the_rays_after_it():
+    scene = Scene((Body(Box((1, 1, 1)), reflectance=0.5),))
+    many = rays_from((0.1, 0, 0), spiral(40, 1.0))
+    lights, bins = Lights.flood(np.array([[0.2, 0.1, 0.3]])), PathBins(0.05, 200)
+    whole, part = (
+        render_transient(scene, 0, rays, lights, bins, bounces=4, samples=64, seed=3)
+        for rays in (many, many.subset(np.arange(20)))
+    )
+    # sums are made in any order
+    np.testing.assert_allclose(whole.binned[:20], part.binned, rtol=1e-4, atol=1e-9)
+    other = render_transient(scene, 0, many, lights, bins, bounces=4, samples=64, seed=4)
+    assert np.abs(other.steady - whole.steady).max() > 1e-4 * whole.steady.max()
+
+
+@needs_simulator
+def test_no_rays_or_no_lights_give_no_light():
+    scene, bins = sphere_scene(), PathBins(0.1, 10)
+    none = rays_from((0, 0, 0), np.zeros((0, 3)))
+    assert render_transient(scene, 0, none, Lights.flood(np.zeros((1, 3))), bins).binned.shape == (0, 10)
+    rays = rays_from((0, 0, 0), spiral(3, 0.1))
+    assert not render_transient(scene, 0, rays, Lights.flood(np.zeros((0, 3))), bins).binned.any()
+
+
+def test_a_camera_fills_its_field_of_view():
+    receiver = Receiver((1, 2, 3), 0.4, -0.2, 1.0, 0.6, (0.0, 5.0))
+    rays, solid_sr = pixel_rays(receiver, 64, 48)
+    # a rectangle's solid angle, 4 asin(sin a sin b) for half angles a, b of its pyramid's sides
+    tangents = math.tan(0.5) * math.tan(0.3)
+    whole = 4 * math.atan(tangents / math.sqrt(1 + math.tan(0.5) ** 2 + math.tan(0.3) ** 2))
+    assert solid_sr.sum() == pytest.approx(whole, rel=1e-3)
+    ahead = np.array([math.cos(-0.2) * math.cos(0.4), math.cos(-0.2) * math.sin(0.4), math.sin(-0.2)])
+    mean = (rays.direction * solid_sr[:, None]).sum(axis=0)
+    np.testing.assert_allclose(mean / np.linalg.norm(mean), ahead, atol=1e-6)
+
+
+@pytest.mark.parametrize("numbers", [{"bounces": 0}, {"samples": 0}, {"own_light": True}])
+def test_impossible_requests_are_refused_before_anything_runs(numbers):
+    rays = rays_from((0, 0, 0), spiral(3, 0.1))
+    with pytest.raises(ConfigError, match="allowed"):
+        render_transient(sphere_scene(), 0, rays, Lights.flood(np.zeros((1, 3))), PathBins(0.1, 10), **numbers)
+
+
+@pytest.mark.parametrize("numbers", [(0.0, 10), (math.nan, 10), (0.1, 0), (0.1, 10, math.inf)])
+def test_bins_have_a_width_and_a_number(numbers):
+    with pytest.raises(ConfigError, match="allowed"):
+        PathBins(*numbers)
+
+
+@pytest.mark.parametrize(
+    ("name", "version"),
+    [
+        ("libLLVM-19.so", 19),
+        ("libLLVM-19.so.1", 19),
+        ("libLLVM.so.19.1", 19),
+        ("libLLVM-14.0.6.so.1", 14),
+        ("libLLVMSupport.so", None),
+    ],
+)
+def test_versions_are_read_from_the_names_of_libraries(name, version):
+    assert process.llvm_version(name) == version
+
+
+def test_an_old_or_absent_library_is_not_used_even_if_it_is_named(monkeypatch, tmp_path):
+    for name, usable in (("libLLVM-15.so", False), ("libLLVM-19.so", True), ("mine.so", True)):
+        path = tmp_path / name
+        path.touch()
+        monkeypatch.setenv(process.LLVM_VARIABLE, str(path))
+        assert (process.llvm_library() == str(path)) == usable
+    monkeypatch.setenv(process.LLVM_VARIABLE, str(tmp_path / "absent.so"))
+    assert process.llvm_library() is None
+
+
+def test_without_the_simulator_the_reason_and_the_remedy_are_given(monkeypatch):
+    process.end_worker()
+    monkeypatch.setattr(process, "PACKAGES", {"no_such_renderer": (1, 0)})
+    assert not available()
+    with pytest.raises(ConfigError, match="not installed: no_such_renderer") as caught:
+        process.ask({}, {})
+    assert "lidardesign[transport]" in str(caught.value)
+    assert "libllvm19" in str(caught.value)
+
+
+def test_a_simulator_that_is_too_old_is_not_used(monkeypatch):
+    monkeypatch.setattr(process, "PACKAGES", {"numpy": (1, 0)})
+    assert "numpy" not in (process.missing() or "")
+    monkeypatch.setattr(process, "PACKAGES", {"numpy": (99, 1)})
+    assert "too old: 99.1 or newer" in process.missing()
+
+
+def worker(code: str) -> process.Worker:
+    return process.Worker([sys.executable, "-c", code], {})
+
+
+def test_a_process_that_aborts_is_reported_with_what_it_said(tmp_path):
+    dying = worker("import os, sys; print('LLVM ERROR: Cannot select', file=sys.stderr, flush=True); os.abort()")
+    with pytest.raises(NumericalError, match="SIGABRT") as caught:
+        dying.ask(tmp_path, 60)
+    assert "LLVM ERROR: Cannot select" in str(caught.value)
+    assert "libllvm19" in str(caught.value)
+    assert not dying.alive
+
+
+def test_a_process_that_dies_on_a_request_is_reported(tmp_path):
+    dying = worker("import os; print('ready', flush=True); input(); os._exit(3)")
+    with pytest.raises(NumericalError, match="exit code 3"):
+        dying.ask(tmp_path, 60)
+    with pytest.raises(NumericalError, match="exit code 3"):
+        dying.ask(tmp_path, 60)
+
+
+def test_a_process_that_takes_too_long_is_ended(tmp_path):
+    slow = worker("import time; print('ready', flush=True); time.sleep(600)")
+    with pytest.raises(NumericalError, match="no answer within"):
+        slow.ask(tmp_path, 0.5)
+    assert not slow.alive
+
+
+@needs_simulator
+def test_the_simulator_runs_from_any_folder_and_is_imported_in_its_own_process_alone(tmp_path):
+    (tmp_path / "mitsuba.py").write_text("raise SystemExit('the wrong one')")
+    code = (
+        "import sys\n"
+        f"sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
+        "from simulate.test_light_transport import *\n"
+        "rays = rays_from((0, 0, 0), spiral(4, 0.1))\n"
+        "found = render_transient(sphere_scene(), 0, rays, Lights.flood(rays.origin_m[:1]), PathBins(0.1, 9))\n"
+        "assert found.steady.all()\n"
+        "assert not {'mitsuba', 'drjit', 'mitransient'} & set(sys.modules)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-P" if sys.version_info >= (3, 11) else "-s", "-c", code],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+
+
+@needs_simulator
+def test_a_request_that_fails_is_reported_and_the_next_one_is_answered():
+    with pytest.raises(NumericalError, match="KeyError"):
+        process.ask({}, {})
+    rays = rays_from((0, 0, 0), spiral(10, 0.1))
+    assert render_transient(sphere_scene(), 0, rays, Lights.flood(np.zeros((1, 3))), PathBins(0.1, 10)).steady.all()

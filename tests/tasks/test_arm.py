@@ -1,0 +1,352 @@
+"""The arm task: motions that an arm can do, scenes of them, and what tracking the ball is worth."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lidardesign_tasks.arm import ArmTask
+from lidardesign_tasks.arm_links import BALL
+from lidardesign_tasks.arm_motion import (
+    CLEARANCE_M,
+    FINAL_DESCENT_M,
+    HOVER_M,
+    PICK_M,
+    PLACE_M,
+    POSITION_RESIDUAL_M,
+    Arm,
+    RejectedError,
+    ball_path,
+    draw_waypoints,
+    highest_m,
+    minimum_jerk,
+    phase_shares,
+)
+from lidardesign_tasks.arm_robot import load_robot
+
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.geometry.raycast import SceneCaster
+from lidardesign.geometry.rays import Outcome, Rays, Returns
+from lidardesign.scene import Mesh
+from lidardesign.simulate.simulate import simulate
+from lidardesign.space import ELEVATION, aim
+from lidardesign.task import Task
+
+REAL = Path(__file__).parents[3] / "shared" / "data" / "iiwa14" / "iiwa14.xml"
+needs_real = pytest.mark.skipif(not REAL.exists(), reason="the real arm's model is not at ../shared/data/iiwa14")
+SMALL = {"size": "small"}
+TASK = ArmTask()
+
+
+@pytest.fixture(scope="module")
+def config():
+    return TASK.Config(**SMALL)
+
+
+@pytest.fixture(scope="module")
+def scenes(config):
+    return {split: TASK.scenes(config, split, 0) for split in ("train", "test")}
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return Arm(load_robot(None, 0.15), 1.0)
+
+
+def exact_returns(scene, places, frames=None, target=0):
+    """One return per frame that puts the ball exactly at `places`, from right above."""
+    radius = scene.bodies[target].shape.radius_m
+    returns = []
+    for frame in range(scene.frames) if frames is None else frames:
+        origin = places[frame] + np.array([0.0, 0.0, 0.5])
+        rays = Rays(origin[None], np.array([[0.0, 0.0, -1.0]]), np.array([[0.0, 2.0]]), np.zeros(1), np.zeros(1))
+        range_m = np.array([0.5 - 2 / 3 * radius])
+        returns.append(Returns(rays, np.array([Outcome.RETURN]), range_m, np.array([target]), frame))
+    return returns
+
+
+def test_the_task_keeps_the_contract(config, scenes):
+    assert isinstance(TASK, Task)
+    assert TASK.metric.unit == "m"
+    assert TASK.metric.better == "lower"
+    for split, one in scenes.items():
+        assert len(one) == 4
+        for scene in one:
+            assert scene.frames == 12
+            assert scene.frame_rate_hz == pytest.approx(12 / 8)
+            assert [body.role for body in scene.bodies].count("target") == 1
+            assert all(body.role == "occluder" for body in scene.bodies if body.name != "ball")
+            assert scene.name.startswith(split)
+
+
+def test_a_small_size_sets_only_what_was_not_set():
+    assert TASK.Config(size="small", train=7).train == 7
+    assert TASK.Config(size="small").model_dump()["frames"] == 12
+    full = TASK.Config()
+    assert (full.train, full.test, full.frames) == (40, 40, 50)
+    small = TASK.Config(size="small")
+    assert TASK.Config(**small.model_dump()) == small
+
+
+def test_sensors_are_on_the_ceiling_and_look_down(config):
+    space = TASK.space(config)
+    assert space.low[:3] == (-1.0, -1.0, 1.0)
+    assert space.high[:3] == (1.0, 1.0, 1.0)
+    assert space.full_azimuth
+    assert space.low[ELEVATION] == -math.pi / 2
+    assert space.high[ELEVATION] == pytest.approx(-math.pi / 3)
+    assert TASK.space(TASK.Config(elevation_max_deg=0)).high[ELEVATION] == 0
+
+
+def test_minimum_jerk_starts_and_ends_at_rest_without_acceleration():
+    share, step = np.linspace(0, 1, 2001), 1 / 2000
+    way = minimum_jerk(share)
+    velocity = np.gradient(way, step)
+    acceleration = np.gradient(velocity, step)
+    assert way[0] == 0
+    assert way[-1] == pytest.approx(1)
+    assert np.abs(velocity[[0, -1]]).max() < 1e-5
+    assert np.abs(acceleration[[0, -1]]).max() < 0.05
+    assert velocity.max() == pytest.approx(1.875, rel=1e-5)
+    assert np.abs(acceleration).max() == pytest.approx(10 / math.sqrt(3), rel=1e-3)
+    np.testing.assert_allclose(way + way[::-1], 1)
+    assert minimum_jerk(np.array([-1.0, 2.0])).tolist() == [0, 1]
+
+
+def test_no_other_smooth_way_from_rest_to_rest_has_less_jerk():
+    share = np.linspace(0, 1, 4001)
+    inner = slice(10, -10)  # differences at the ends are one-sided
+
+    def jerk(way):
+        third = way
+        for _ in range(3):
+            third = np.gradient(third, share)
+        return np.trapezoid(third[inner] ** 2, share[inner])
+
+    bump = share**3 * (1 - share) ** 3
+    for size in (-3.0, -0.5, 0.5, 3.0):
+        assert jerk(minimum_jerk(share) + size * bump) > jerk(minimum_jerk(share))
+
+
+def test_phases_pass_their_waypoints_at_rest_and_in_order():
+    waypoints = draw_waypoints(0.1, np.random.default_rng(0))
+    ends = phase_shares(waypoints)
+    np.testing.assert_allclose(ball_path(waypoints, ends), waypoints, atol=1e-12)
+    assert (np.diff(ends) > 0).all()
+    assert ends[[0, -1]].tolist() == [0, 1]
+    step = 1e-4
+    speed = np.linalg.norm(ball_path(waypoints, ends[1:-1] + step) - ball_path(waypoints, ends[1:-1] - step), axis=1)
+    assert (speed / (2 * step) < 1e-2).all()
+    hover, above_pick, pick, retract, above_place, final, place = waypoints
+    np.testing.assert_array_equal(hover, HOVER_M)
+    np.testing.assert_array_equal(above_pick, retract)
+    assert above_pick[2] > pick[2]
+    assert above_place[2] > final[2] > place[2]
+    assert final[2] - place[2] == pytest.approx(FINAL_DESCENT_M)
+
+
+@pytest.mark.parametrize("jitter_m", [0.02, 0.1, 0.3])
+def test_pick_and_place_points_differ_by_the_jitter_and_stay_above_the_floor(jitter_m):
+    drawn = np.stack([draw_waypoints(jitter_m, np.random.default_rng(seed)) for seed in range(200)])
+    for column, nominal in ((2, PICK_M), (6, PLACE_M)):
+        offset = drawn[:, column] - nominal
+        assert np.abs(offset).max() <= jitter_m
+        assert np.abs(offset[:, :2]).max() > 0.9 * jitter_m
+    assert drawn[:, :, 2].min() >= 0.03
+
+
+def test_the_ball_is_where_forward_kinematics_says_and_near_the_planned_path(scenes):
+    import mujoco
+
+    robot = load_robot(None, TASK.Config().tool_m)
+    data = mujoco.MjData(robot.model)
+    for scene in scenes["train"]:
+        for frame in range(scene.frames):
+            data.qpos[:] = scene.truth["joints_rad"][frame]
+            mujoco.mj_kinematics(robot.model, data)
+            np.testing.assert_allclose(data.site(BALL).xpos, scene.truth["ball_m"][frame], atol=1e-12)
+            np.testing.assert_allclose(data.site(BALL).xpos, scene.bodies[0].pose(frame)[:3, 3], atol=1e-12)
+            tool = scene.bodies[-1].pose(frame)
+            assert np.linalg.norm(tool[:2, 3] - data.site(BALL).xpos[:2]) < 2e-3
+            assert tool[2, 3] > data.site(BALL).xpos[2]
+
+
+def test_inverse_kinematics_keeps_the_path_the_limits_and_the_tool_upright(arm):
+    waypoints = draw_waypoints(0.1, np.random.default_rng(4))
+    motion = arm.follow(waypoints, 40, 5.0, Counter())
+    planned = ball_path(waypoints, np.linspace(0, 1, 40))
+    assert np.linalg.norm(motion.ball_m - planned, axis=1).max() <= POSITION_RESIDUAL_M
+    low, high = arm.robot.model.jnt_range.T
+    assert (motion.joints_rad >= low).all()
+    assert (motion.joints_rad <= high).all()
+    down = motion.links[-1][:, :3, 2]  # the tool's capsule lies along the flange's axis
+    assert np.abs(down[:, 2]).min() > math.cos(math.radians(0.5))
+
+
+def test_motions_are_smooth_and_the_yaw_stays_near_home(arm):
+    generator = np.random.default_rng(1)
+    for _ in range(3):
+        motion = arm.draw(0.1, 50, 6.25, generator, "smooth")
+        assert np.abs(np.diff(motion.joints_rad, axis=0)).max() < 0.3
+        assert np.abs(motion.joints_rad[:, 6] - arm.robot.home_rad[6]).max() < math.radians(30)
+
+
+def test_every_body_stays_below_the_ceiling_and_above_the_floor(scenes):
+    for scene in (*scenes["train"], *scenes["test"]):
+        for body in scene.bodies:
+            poses = body.poses if body.poses.ndim == 3 else body.poses[None]
+            assert highest_m(body.shape, poses) <= 1.0 - CLEARANCE_M
+        assert scene.truth["ball_m"][:, 2].min() > 0.02
+
+
+def test_a_motion_near_the_ceiling_too_fast_or_through_the_arm_is_rejected():
+    robot = load_robot(None, 0.15)
+    waypoints = draw_waypoints(0.1, np.random.default_rng(0))
+    with pytest.raises(RejectedError, match="ceiling"):
+        Arm(robot, 0.7).follow(waypoints, 10, 1.0, Counter())
+    with pytest.raises(RejectedError, match="too fast"):
+        Arm(robot, 1.0).follow(waypoints, 10, 500.0, Counter())
+    folded = np.tile([0.0, 1.2, 0.0, -2.05, 0.0, 1.5, 0.0], (3, 1))  # the tool reaches into the pedestal
+    with pytest.raises(RejectedError, match="collide"):
+        Arm(robot, 1.0)._forward(folded, 1.0)
+
+
+def test_an_arm_that_can_do_nothing_is_refused_with_the_reasons(arm):
+    with pytest.raises(DataError, match=r"none of 50 drawn motions \(50 too near the ceiling\)"):
+        Arm(arm.robot, 0.5).draw(0.1, 4, 1.0, np.random.default_rng(0), "train 0")
+
+
+def test_scenes_without_jitter_are_refused():
+    with pytest.raises(ConfigError, match="jitter_m"):
+        TASK.scenes(TASK.Config(jitter_m=0, size="small"), "train", 0)
+
+
+def test_scenes_are_the_same_for_the_same_seed_and_differ_for_another(config, scenes):
+    again, other = TASK.scenes(config, "train", 0), TASK.scenes(config, "train", 1)
+    for first, second, third in zip(scenes["train"], again, other, strict=True):
+        for body, same in zip(first.bodies, second.bodies, strict=True):
+            np.testing.assert_array_equal(body.poses, same.poses)
+        assert np.abs(first.truth["ball_m"] - third.truth["ball_m"]).max() > 1e-3
+
+
+def test_training_and_held_out_trajectories_are_disjoint(scenes):
+    for train in scenes["train"]:
+        assert all(np.abs(train.truth["ball_m"] - test.truth["ball_m"]).max() > 1e-3 for test in scenes["test"])
+
+
+def test_more_trajectories_keep_the_first_ones(scenes):
+    (alone,) = TASK.scenes(TASK.Config(size="small", train=1), "train", 0)
+    np.testing.assert_array_equal(alone.truth["ball_m"], scenes["train"][0].truth["ball_m"])
+
+
+def test_a_ball_placed_exactly_by_its_returns_scores_zero(scenes):
+    for scene in scenes["test"]:
+        score = TASK.score(scene, exact_returns(scene, scene.truth["ball_m"]))
+        assert not score.failed
+        assert score.value < 1e-9
+        assert score.details["tracked_share"] == 1
+
+
+def test_a_score_uses_time_stamps_and_not_the_order_of_returns(scenes):
+    scene = scenes["test"][0]
+    returns = exact_returns(scene, scene.truth["ball_m"] + 0.01)
+    assert TASK.score(scene, returns).value == pytest.approx(0.01 * math.sqrt(3))
+    lost = [returns[frame] for frame in (0, 3, 11)]
+    assert TASK.score(scene, lost).value > TASK.score(scene, returns).value
+    assert TASK.score(scene, lost).details["tracked_share"] == 3 / 12
+
+
+def test_fewer_than_two_tracked_frames_fail_with_the_worst_value(scenes):
+    scene = scenes["test"][0]
+    none = simulate(scene, Rays(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0)))
+    for returns in (none, exact_returns(scene, scene.truth["ball_m"], frames=[5])):
+        score = TASK.score(scene, returns)
+        assert score.failed
+        assert score.value == TASK.metric.worst
+    two = TASK.score(scene, exact_returns(scene, scene.truth["ball_m"], frames=[2, 9]))
+    assert not two.failed
+    assert 0 < two.value < 1
+
+
+def test_residuals_are_where_the_ball_was_by_the_square_of_how_far_off_its_place_is(scenes):
+    scene = scenes["test"][0]
+    ball, shift = scene.truth["ball_m"], np.zeros((scene.frames, 3))
+    assert TASK.residuals(scene, exact_returns(scene, ball)).values.max() < 1e-9
+    shift[[3, 7], 0] = 0.02, 0.01
+    found = TASK.residuals(scene, exact_returns(scene, ball + shift))
+    np.testing.assert_array_equal(found.points_m, ball)
+    expected = np.zeros(scene.frames)
+    expected[[3, 7]] = TASK.score(scene, exact_returns(scene, ball + shift)).value * np.array([0.8, 0.2])
+    np.testing.assert_allclose(found.values, expected, atol=1e-9)
+
+
+def test_a_frame_that_was_not_seen_is_where_the_error_is(scenes):
+    scene = scenes["test"][0]
+    seen = [frame for frame in range(scene.frames) if frame not in (5, 6)]
+    found = TASK.residuals(scene, exact_returns(scene, scene.truth["ball_m"], frames=seen))
+    assert set(np.argsort(found.values)[-2:]) == {5, 6}
+    assert found.values[[5, 6]].sum() == pytest.approx(found.values.sum())
+
+
+def test_returns_from_the_arm_are_no_returns_from_the_ball(scenes):
+    scene = scenes["test"][0]
+    score = TASK.score(scene, exact_returns(scene, scene.truth["ball_m"], target=0))
+    wrong = [
+        Returns(one.rays, one.outcome, one.range_m, np.full(1, 3), one.frame)
+        for one in exact_returns(scene, scene.truth["ball_m"])
+    ]
+    assert not score.failed
+    assert TASK.score(scene, wrong).failed
+
+
+def seen_share(scene, config, frame, count=4000):
+    """Of admissible rays from the ceiling towards the ball's centre, the share that nothing stops."""
+    space, ball = TASK.space(config), scene.truth["ball_m"][frame]
+    generator = np.random.default_rng(frame)
+    origins = np.column_stack([generator.uniform(-1, 1, (count, 2)), np.ones(count)])
+    design = aim(origins, ball)
+    origins, design = origins[space.contains(design)], design[space.contains(design)]
+    hits = SceneCaster(scene, frame).first_hit(origins, (ball - origins) / design[:, 5:])
+    return (hits.body == 0).mean()
+
+
+def test_the_arm_hides_the_ball_from_above_but_not_from_everywhere(config, scenes):
+    for scene in scenes["test"]:
+        for frame in range(scene.frames):
+            ball = scene.truth["ball_m"][frame]
+            above = np.array([[ball[0], ball[1], 1.0]])
+            assert SceneCaster(scene, frame).first_hit(above, np.array([[0.0, 0.0, -1.0]])).body[0] != 0
+            assert 0.2 < seen_share(scene, config, frame) < 0.8
+
+
+def test_dense_rays_from_around_track_the_ball_in_every_frame_within_its_radius(config, scenes):
+    scene = scenes["test"][0]
+    balls = scene.truth["ball_m"]
+    generator = np.random.default_rng(0)
+    turn = generator.uniform(0, 2 * math.pi, (30, 1)) + 0 * balls[:, 0]
+    out = generator.uniform(0.3, 0.55, (30, 1)) * (1 - balls[:, 2])
+    shift = np.stack([out * np.cos(turn), out * np.sin(turn), 0 * out], axis=-1)
+    origins = (np.array([1, 1, 0]) * balls + [0, 0, 1.0] + shift).reshape(-1, 3)
+    design = aim(origins, np.broadcast_to(balls, (30, 12, 3)).reshape(-1, 3))
+    assert TASK.space(config).contains(design).all()
+    direction = (np.broadcast_to(balls, (30, 12, 3)).reshape(-1, 3) - origins) / design[:, 5:]
+    rays = Rays(origins, direction, np.tile([0.1, 2.0], (360, 1)), np.zeros(360), np.zeros(360))
+    score = TASK.score(scene, simulate(scene, rays))
+    assert score.details["tracked_share"] == 1
+    assert score.value < 0.02
+
+
+@needs_real
+def test_the_real_arms_meshes_are_shared_by_all_scenes_and_hide_the_ball_likewise():
+    config = TASK.Config(robot=REAL, size="small", train=2, test=1)
+    made = [*TASK.scenes(config, "train", 0), *TASK.scenes(config, "test", 0)]
+    meshes = [[id(body.shape) for body in scene.bodies if isinstance(body.shape, Mesh)] for scene in made]
+    assert len(meshes[0]) == 8
+    assert meshes[0] == meshes[1] == meshes[2]
+    own = TASK.scenes(TASK.Config(**SMALL, train=1), "train", 0)[0]
+    np.testing.assert_allclose(made[0].truth["ball_m"], own.truth["ball_m"], atol=2.5e-3)
+    for frame in (0, 6, 11):
+        assert seen_share(made[0], config, frame) == pytest.approx(seen_share(own, config, frame), abs=0.15)

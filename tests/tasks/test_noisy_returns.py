@@ -1,0 +1,159 @@
+"""Every shipped task scores what noisy detectors report: nothing at all, or returns that no surface sent."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from lidardesign_tasks.arm import ArmTask
+from lidardesign_tasks.emitter import EmitterTask
+from lidardesign_tasks.face import FaceTask
+from lidardesign_tasks.flatland import FlatlandTask
+from lidardesign_tasks.meshes import MeshesTask
+from lidardesign_tasks.surface import surface_score, with_visible_truth
+from lidardesign_tasks.warehouse import WarehouseTask
+from tasks.test_tasks import write_ball
+
+from lidardesign.evaluate.baselines.candidates import rays_at
+from lidardesign.evaluate.scene_scores import checked_score, score_lists
+from lidardesign.geometry.rays import Outcome, Rays
+from lidardesign.scene import Body, Box, Mesh, Scene, rigid
+from lidardesign.simulate.detector.detector import Detector
+from lidardesign.simulate.physics import Physics
+from lidardesign.simulate.simulate import build_casters, simulate
+from lidardesign.space import DIMENSIONS, RANGE, DesignSpace, direction
+from lidardesign.task import Metric, Score, conditions_of, scenes_of
+
+TASKS = {
+    "arm": (ArmTask, {"train": 1, "test": 1, "frames": 12}),
+    "emitter": (EmitterTask, {"train": 1, "test": 1, "truth_points": 800}),
+    "face": (FaceTask, {"train": 1, "test": 1, "truth_points": 800}),
+    "flatland": (FlatlandTask, {"train": 1, "test": 1}),
+    "meshes": (MeshesTask, {"folder": "balls", "truth_points": 800, "poses": 2}),
+    "warehouse": (WarehouseTask, {"train": 1, "test": 1}),
+}
+
+
+@pytest.fixture(params=sorted(TASKS))
+def measured(request, tmp_path):
+    """A task, a scene of it, and what even rays return there, one list per condition value and frame."""
+    make, options = TASKS[request.param]
+    task = make()
+    if "folder" in options:
+        for name in ("one", "two", "three"):
+            write_ball(tmp_path / "balls" / f"{name}.stl", (0.1, 0.12, 0.2))
+        options = {**options, "folder": tmp_path / "balls"}
+    config = task.Config(**options)
+    space = task.space(config)
+    scene = scenes_of(task, config, "test", 0, space)[0]
+    returns = []
+    for condition in conditions_of(task, config, space):
+        points = space.sample(300, np.random.default_rng(1))
+        for name, value in condition.items():
+            points[:, DIMENSIONS.index(name)] = value
+        gates = np.tile((space.low[RANGE], space.high[RANGE]), (len(points), 1))
+        looking = direction(points[:, 3], points[:, 4])
+        rays = Rays(points[:, :3], looking, gates, np.zeros(len(points)), np.zeros(len(points)))
+        returns += simulate(scene, rays)
+    return task, scene, returns
+
+
+def turned(returns, chosen, outcome, range_m):
+    """Returns in which chosen rays have another outcome and range, of no body."""
+    mask = np.broadcast_to(chosen, returns.outcome.shape)
+    return replace(
+        returns,
+        outcome=np.where(mask, outcome, returns.outcome),
+        range_m=np.where(mask, range_m, returns.range_m),
+        body=np.where(mask, -1, returns.body),
+    )
+
+
+def test_without_a_single_detection_a_design_fails_at_the_worst_value(measured):
+    task, scene, returns = measured
+    score = checked_score(task, scene, [turned(one, True, Outcome.NOT_DETECTED, np.nan) for one in returns])
+    assert score.failed
+    assert score.value == task.metric.worst
+
+
+def test_invented_returns_are_scored_as_returns_of_no_body(measured):
+    task, scene, returns = measured
+    generator = np.random.default_rng(2)
+    noisy = []
+    for one in returns:
+        gate = one.rays.gate_m
+        noisy.append(turned(one, generator.uniform(size=len(gate)) < 0.3, 0, generator.uniform(gate[:, 0], gate[:, 1])))
+    clean, score = (checked_score(task, scene, each) for each in (returns, noisy))
+    sign = 1 if task.metric.better == "lower" else -1
+    assert np.isfinite(score.value)
+    # where even clean returns are too few, chance may do better
+    assert clean.failed or sign * score.value >= sign * clean.value
+    invented = [turned(one, True, 0, one.rays.gate_m[:, 1] * 0.999) for one in returns]
+    assert clean.failed or sign * checked_score(task, scene, invented).value >= sign * clean.value
+
+
+def test_noise_is_not_told_from_the_ball_that_a_robot_carries():
+    task = ArmTask()
+    config = task.Config(**TASKS["arm"][1])
+    scene = scenes_of(task, config, "test", 0, task.space(config))[0]
+    ball = next(body for body in scene.bodies if body.is_target)
+    aside = np.eye(3)
+    places = np.stack([ball.pose(frame)[:3, 3] for frame in range(scene.frames)])
+    found = []
+    for frame, place in enumerate(places):
+        origins = place + aside
+        looking = (place - origins) / np.linalg.norm(place - origins, axis=1, keepdims=True)
+        rays = Rays(origins, looking, np.tile((0.0, 3.0), (3, 1)), np.zeros(3), np.zeros(3))
+        found.append(replace(simulate(Scene((ball,)), rays, casters=None)[frame], frame=frame))
+    index = scene.bodies.index(ball)
+    clean = [replace(one, body=np.where(one.returned, index, -1)) for one in found]
+    noisy = [turned(one, np.array([True, False, False]), Outcome.RETURN, 0.1) for one in clean]
+    assert task.score(scene, clean).value < 0.01
+    assert task.score(scene, noisy).value > 0.1
+
+
+@pytest.mark.parametrize("radius_m", [0.1, 3.0])
+def test_outliers_are_returns_off_the_surface_however_large_it_is(radius_m):
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=radius_m)
+    space = DesignSpace(
+        (4 * radius_m, 0, 0, np.pi - 0.25, -0.25, 0.0), (4 * radius_m, 0, 0, np.pi + 0.25, 0.25, 5 * radius_m)
+    )
+    scene = Scene((Body(Mesh(ball.vertices, ball.faces), "ball"),))
+    scene = with_visible_truth(scene, space, 5000, np.random.default_rng(0))
+    (found,) = simulate(scene, rays_at(space.sample(400, np.random.default_rng(1)), np.array([0.0, 5 * radius_m])))
+    metric = MeshesTask.metric
+    assert surface_score(metric, scene, [found]).details["outliers_percent"] == 0.0
+    wrong = np.flatnonzero(found.returned)[::4]
+    off_m = np.zeros(len(found.rays))
+    off_m[wrong] = -radius_m
+    score = surface_score(metric, scene, [replace(found, range_m=found.range_m + off_m)])
+    assert score.details["outliers_percent"] == pytest.approx(100 * len(wrong) / found.returned.sum())
+
+
+class Remembering:
+    """A task that keeps the returns that it is asked to score."""
+
+    name, metric = "remembering", Metric("nothing", "m", "lower", worst=1.0, tolerance=0.1)
+
+    def __init__(self):
+        self.ranges = []
+
+    def score(self, scene, returns):
+        self.ranges.append([one.range_m for one in returns])
+        return Score(0.0)
+
+
+def test_chance_is_the_same_for_rival_rays_and_another_one_at_each_position():
+    wall = Body(Box((0.05, 2, 2)), "wall", poses=rigid(translation_m=(1.05, 0, 0)))
+    scene, count = Scene((wall,)), 50
+    along = np.tile((1.0, 0.0, 0.0), (count, 1))
+    rays = Rays(np.zeros((count, 3)), along, np.tile((0.5, 2.0), (count, 1)), np.zeros(count), np.zeros(count))
+    task, detector = Remembering(), Detector("timed", jitter_sigma_s=1e-11)
+    jobs = [(rays, rays), (rays, rays)]
+    list(score_lists(task, scene, jobs, build_casters(scene), Physics(detector, frozenset({"jitter"}))))
+    (here, there), (other_here, other_there) = task.ranges
+    assert np.array_equal(here, other_here)
+    assert np.array_equal(there, other_there)
+    assert abs(np.corrcoef(here, there)[0, 1]) < 4 / np.sqrt(count)

@@ -1,0 +1,405 @@
+"""The laws that every shipped task keeps, over one table of configurations."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from lidardesign_tasks.arm import ArmTask
+from lidardesign_tasks.emitter import EmitterTask
+from lidardesign_tasks.face import FaceTask
+from lidardesign_tasks.flatland import FlatlandTask
+from lidardesign_tasks.meshes import MeshesTask
+from lidardesign_tasks.pose import jittered_pose
+from lidardesign_tasks.warehouse import WarehouseTask
+
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.geometry.rays import Outcome, Rays, Returns
+from lidardesign.scene import Scene
+from lidardesign.simulate.simulate import simulate
+from lidardesign.space import aim, direction
+from lidardesign.task import Task, conditions_of, notes_of, scenes_of
+
+REAL_MODEL = Path(__file__).parents[3] / "shared" / "data" / "ict_face.h5"
+SMALL = {"train": 2, "test": 2, "truth_points": 800}
+NOISE_M = 0.03
+HALF_GATE_M = 0.02
+
+CASES = {
+    "flatland surface": (FlatlandTask, {"train": 3, "test": 2}),
+    "flatland discs": (FlatlandTask, {"train": 3, "test": 2, "scene": "discs"}),
+    "flatland occluded": (FlatlandTask, {"train": 3, "test": 2, "scene": "occluded"}),
+    "face embedded": (FaceTask, SMALL),
+    "face with a free origin": (FaceTask, {**SMALL, "origin_box_m": 0.05}),
+    "face of the real model": (FaceTask, {**SMALL, "model": str(REAL_MODEL)}),
+    "emitter": (EmitterTask, SMALL),
+    "meshes": (MeshesTask, {"folder": "three", "truth_points": 800, "poses": 2}),
+    "one mesh": (MeshesTask, {"folder": "one", "truth_points": 800, "poses": 2}),
+    "meshes behind an occluder": (MeshesTask, {"folder": "three", "occluders": "front", "truth_points": 800}),
+}
+
+
+def write_ball(path, radii, shift=(0.0, 0.0, 0.0)):
+    trimesh = pytest.importorskip("trimesh")
+    ball = trimesh.creation.icosphere(3)
+    content = trimesh.Trimesh(ball.vertices * radii + np.array(shift), ball.faces).export(file_type="stl")
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(content)
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    root = tmp_path_factory.mktemp("meshes")
+    for index, radii in enumerate([(0.1, 0.12, 0.2), (0.12, 0.1, 0.22), (0.11, 0.13, 0.18)]):
+        write_ball(root / "three" / f"ball{index}.stl", radii)
+    write_ball(root / "one" / "only.stl", (0.1, 0.12, 0.2))
+    write_ball(root / "front" / "post.stl", (0.02, 0.02, 0.3), shift=(0.4, 0.05, 0.0))
+    return root
+
+
+@pytest.fixture(scope="module", params=CASES)
+def case(request, folders):
+    """Task, configuration, and its scenes by split."""
+    kind, values = CASES[request.param]
+    if values.get("model") == str(REAL_MODEL) and not REAL_MODEL.exists():
+        pytest.skip("../shared/data/ict_face.h5 is not here")
+    paths = {key: str(folders / values[key]) for key in ("folder", "occluders") if key in values}
+    task, config = kind(), kind.Config(**{**values, **paths})
+    return task, config, {split: list(task.scenes(config, split, 0)) for split in ("train", "test")}
+
+
+def truth_points(scene: Scene) -> np.ndarray:
+    if "curve_m" in scene.truth:
+        return np.column_stack([scene.truth["curve_m"], np.zeros(len(scene.truth["curve_m"]))])
+    return scene.truth["surface"].points
+
+
+def rays_at_truth(task, config, scene, count) -> Rays:
+    """Rays from admissible origins at points spread over the truth, listening around them."""
+    points = truth_points(scene)
+    points = points[np.linspace(0, len(points) - 1, count).astype(int)]
+    origins = task.space(config).sample(count, np.random.default_rng(3))[:, :3]
+    design = aim(origins, points)
+    gates = np.clip(design[:, 5:] + np.array([-HALF_GATE_M, HALF_GATE_M]), 0, None)
+    return Rays(origins, direction(design[:, 3], design[:, 4]), gates, np.zeros(count), np.zeros(count))
+
+
+def score(task, scene, rays):
+    return task.score(scene, simulate(scene, rays))
+
+
+def bodies_equal(first: Scene, second: Scene) -> bool:
+    def content(scene):
+        return [
+            (body.name, body.role, body.pose().tobytes(), getattr(body.shape, "content_hash", body.shape))
+            for body in scene.bodies
+        ]
+
+    return content(first) == content(second)
+
+
+def test_the_task_keeps_the_contract(case):
+    task, _, scenes = case
+    assert isinstance(task, Task)
+    assert task.metric.better == "lower"
+    assert task.api_version == 1
+    assert len(task.defaults.rays) > 0
+    assert all(scene.frames == 1 for split in scenes.values() for scene in split)
+
+
+def test_every_scene_has_a_target_and_a_truth_inside_the_design_space(case):
+    task, config, scenes = case
+    space = task.space(config)
+    fixed = space.low[:3] == space.high[:3]
+    for scene in scenes["train"]:
+        assert any(body.is_target for body in scene.bodies)
+        points = truth_points(scene)
+        assert len(points) > 100
+        assert np.isfinite(points).all()
+        if fixed:
+            assert space.contains(aim(np.array(space.low[:3]), points)).all()
+
+
+def test_scenes_are_the_same_for_the_same_seed_and_differ_for_another(case):
+    task, config, scenes = case
+    again, other = task.scenes(config, "train", 0), task.scenes(config, "train", 1)
+    for first, second in zip(scenes["train"], again, strict=True):
+        assert bodies_equal(first, second)
+        np.testing.assert_array_equal(truth_points(first), truth_points(second))
+    assert not any(bodies_equal(first, second) for first, second in zip(scenes["train"], other, strict=False))
+
+
+def test_training_and_held_out_scenes_are_disjoint(case):
+    _, _, scenes = case
+    for train in scenes["train"]:
+        assert not any(bodies_equal(train, test) for test in scenes["test"])
+
+
+def test_more_rays_on_the_truth_score_better(case):
+    task, config, scenes = case
+    for scene in scenes["train"]:
+        sparse, dense = (score(task, scene, rays_at_truth(task, config, scene, n)) for n in (12, 600))
+        assert not dense.failed
+        assert dense.value < sparse.value <= task.metric.worst
+        assert all(np.isfinite(value) for value in dense.details.values())
+
+
+def test_noise_makes_the_score_worse(case):
+    task, config, scenes = case
+    for scene in scenes["train"]:
+        returns = simulate(scene, rays_at_truth(task, config, scene, 300))
+        noise = NOISE_M * np.random.default_rng(5).normal(size=300)
+        noisy = [Returns(r.rays, r.outcome, r.range_m + noise, r.body, r.frame) for r in returns]
+        assert task.score(scene, noisy).value > task.score(scene, returns).value
+
+
+def test_the_order_of_rays_does_not_matter(case):
+    task, config, scenes = case
+    scene = scenes["train"][0]
+    rays = rays_at_truth(task, config, scene, 120)
+    shuffled = rays.subset(np.random.default_rng(6).permutation(120))
+    assert score(task, scene, shuffled).value == pytest.approx(score(task, scene, rays).value, rel=1e-9)
+
+
+def test_rays_without_a_return_do_not_change_the_reconstruction(case):
+    task, config, scenes = case
+    scene = scenes["train"][0]
+    (returns,) = simulate(scene, rays_at_truth(task, config, scene, 120))
+    lost = Returns(
+        returns.rays,
+        np.where(returns.returned, returns.outcome, Outcome.NOT_DETECTED),
+        returns.range_m,
+        returns.body,
+    )
+    assert task.score(scene, [lost]).value == task.score(scene, [returns]).value
+
+
+def test_scenes_survive_the_way_to_a_worker_process(case):
+    task, config, scenes = case
+    scene = pickle.loads(pickle.dumps(scenes["train"][0]))
+    rays = rays_at_truth(task, config, scene, 60)
+    assert score(task, scene, rays).value == score(task, scenes["train"][0], rays).value
+
+
+def test_a_score_reads_only_rays_and_ranges_not_what_was_hit(case):
+    task, config, scenes = case
+    scene = scenes["train"][0]
+    (returns,) = simulate(scene, rays_at_truth(task, config, scene, 120))
+    blind = Returns(returns.rays, returns.outcome, returns.range_m, np.zeros_like(returns.body))
+    assert task.score(scene, [blind]).value == task.score(scene, [returns]).value
+
+
+def test_residuals_add_up_to_the_score(case):
+    task, config, scenes = case
+    for scene in scenes["train"]:
+        returns = simulate(scene, rays_at_truth(task, config, scene, 120))
+        found, judged = task.residuals(scene, returns), task.score(scene, returns)
+        assert judged.value < task.metric.worst
+        assert found.values.sum() == pytest.approx(judged.value, rel=1e-9)
+        low, high = truth_points(scene).min(axis=0) - 0.1, truth_points(scene).max(axis=0) + 0.1
+        assert ((found.points_m >= low) & (found.points_m <= high)).all()
+
+
+def test_a_design_that_fails_is_equally_wrong_everywhere(case):
+    task, config, scenes = case
+    scene = scenes["train"][0]
+    nothing = simulate(scene, rays_at_truth(task, config, scene, 0))
+    assert task.score(scene, nothing).failed
+    found = task.residuals(scene, nothing)
+    np.testing.assert_array_equal(found.points_m, truth_points(scene))
+    np.testing.assert_allclose(found.values, task.metric.worst / len(truth_points(scene)))
+
+
+def test_residuals_are_where_no_ray_was_fired(case):
+    task, config, scenes = case
+    for scene in scenes["train"]:
+        rays = rays_at_truth(task, config, scene, 600)
+        (everywhere,) = simulate(scene, rays)
+        # the side of the truth along its longest axis whose rays are left out
+        points = truth_points(scene)
+        axis = np.ptp(points, axis=0).argmax()
+        middle = np.median(points[:, axis])
+        aimed = rays.origin_m + rays.direction * rays.gate_m.mean(axis=1, keepdims=True)
+        returns = simulate(scene, rays.subset(aimed[:, axis] < middle))
+        before, after = task.residuals(scene, [everywhere]), task.residuals(scene, returns)
+        left_out = [one.values[one.points_m[:, axis] >= middle].sum() for one in (before, after)]
+        seen = [one.values[one.points_m[:, axis] < middle].sum() for one in (before, after)]
+        assert left_out[1] > 3 * left_out[0]
+        assert left_out[1] - left_out[0] > 5 * abs(seen[1] - seen[0])
+
+
+UNIFORM_RAYS = 20_000
+# Tasks whose scenes move, or are seen from several places, have no single surface as their truth.
+SEEN_OFTEN = {
+    "arm": (ArmTask, {"train": 2, "test": 1, "frames": 6}),
+    "warehouse": (WarehouseTask, {"size": "small", "train": 2, "test": 1}),
+}
+
+
+@pytest.fixture(scope="module", params=SEEN_OFTEN)
+def often(request):
+    """Task, configuration, a list of uniform rays for each condition value, and scenes by split."""
+    kind, values = SEEN_OFTEN[request.param]
+    task, config = kind(), kind.Config(**values)
+    space, generator = task.space(config), np.random.default_rng(2)
+    lists, conditions = [], conditions_of(task, config, space)
+    for condition in conditions:
+        points = space.at(condition).sample(UNIFORM_RAYS // len(conditions), generator)
+        gates = np.tile([space.low[5], space.high[5]], (len(points), 1))
+        looking = direction(points[:, 3], points[:, 4])
+        lists.append(Rays(points[:, :3], looking, gates, np.zeros(len(points)), np.zeros(len(points))))
+    return task, config, lists, {split: task.scenes(config, split, 0) for split in ("train", "test")}
+
+
+def score_often(task, scene, lists):
+    """The score of one list of rays per condition value, each in every frame."""
+    return task.score(scene, [one for rays in lists for one in simulate(scene, rays)])
+
+
+def test_a_task_that_is_seen_often_keeps_the_contract(often):
+    task, _, lists, scenes = often
+    assert isinstance(task, Task)
+    assert task.api_version == 1
+    assert max(scene.frames for scene in scenes["test"]) * len(lists) > 1
+    for scene in scenes["train"]:
+        found = score_often(task, scene, lists)
+        assert not found.failed
+        assert 0 <= found.value < task.metric.worst
+        assert all(np.isfinite(value) for value in found.details.values())
+
+
+def test_many_scenes_survive_the_way_to_a_worker_process_and_repeat(often):
+    task, config, lists, scenes = often
+    again = task.scenes(config, "train", 0)
+    for scene, other in zip(scenes["train"], again, strict=True):
+        value = score_often(task, scene, lists).value
+        assert score_often(task, pickle.loads(pickle.dumps(scene)), lists).value == value
+        assert score_often(task, other, lists).value == value
+
+
+def test_residuals_of_many_frames_or_positions_add_up_to_the_score(often):
+    task, _, lists, scenes = often
+    # rays at the first position alone leave something to be missed
+    lists = [rays if index == 0 else rays.subset(np.zeros(0, dtype=int)) for index, rays in enumerate(lists)]
+    for scene in scenes["train"]:
+        returns = [one for rays in lists for one in simulate(scene, rays)]
+        judged, found = task.score(scene, returns), task.residuals(scene, returns)
+        assert 0 < judged.value < task.metric.worst
+        assert found.values.sum() == pytest.approx(judged.value, rel=1e-9)
+        blind = [replace(one, outcome=np.full_like(one.outcome, Outcome.MISS)) for one in returns]
+        assert task.residuals(scene, blind).values.sum() == pytest.approx(task.metric.worst, rel=1e-9)
+
+
+@pytest.mark.parametrize("kind", [ArmTask, EmitterTask, FaceTask, FlatlandTask, MeshesTask, WarehouseTask])
+@pytest.mark.parametrize("values", [{"no_such_key": 1}, {"train": float("nan")}])
+def test_unknown_keys_and_values_that_are_no_numbers_are_refused(kind, values):
+    with pytest.raises(ValueError, match="validation error"):
+        kind.Config(**values)
+
+
+def test_more_scenes_keep_the_first_ones():
+    for kind, values in ((FaceTask, {"truth_points": 200}), (FlatlandTask, {})):
+        few, more = (kind().scenes(kind.Config(**values, train=n), "train", 0) for n in (1, 3))
+        assert bodies_equal(few[0], more[0])
+
+
+def test_the_truth_follows_a_design_space_that_a_run_sets():
+    task = FaceTask()
+    config = FaceTask.Config(train=1, truth_points=300)
+    space = task.space(config)
+    narrow = type(space)(
+        (*space.low[:3], np.pi - 0.1, -0.1, space.low[5]), (*space.high[:3], np.pi + 0.1, 0.1, space.high[5])
+    )
+    (scene,) = scenes_of(task, config, "train", 0, narrow)
+    assert narrow.contains(aim(np.array(narrow.low[:3]), truth_points(scene))).all()
+
+
+def test_a_folder_that_is_missing_unset_or_empty_is_refused(tmp_path):
+    task = MeshesTask()
+    with pytest.raises(ConfigError, match="no folder"):
+        task.scenes(MeshesTask.Config(), "train", 0)
+    with pytest.raises(DataError, match="holds no mesh file"):
+        task.space(MeshesTask.Config(folder=str(tmp_path)))
+    with pytest.raises(DataError, match="is not a folder"):
+        task.space(MeshesTask.Config(folder=str(tmp_path / "nowhere")))
+
+
+def test_one_mesh_without_jitter_is_refused_as_both_splits_would_be_the_same(folders):
+    config = MeshesTask.Config(folder=str(folders / "one"), jitter_rotation_deg=0, jitter_translation_m=0)
+    with pytest.raises(ConfigError, match="the same"):
+        MeshesTask().scenes(config, "train", 0)
+
+
+def test_heads_that_are_all_the_same_are_refused():
+    config = FaceTask.Config(identity_scale=0, jitter_rotation_deg=0, jitter_translation_m=0)
+    with pytest.raises(ConfigError, match="all heads are the same"):
+        FaceTask().scenes(config, "train", 0)
+
+
+def test_each_mesh_is_in_exactly_one_split(folders):
+    config = MeshesTask.Config(folder=str(folders / "three"), poses=1, truth_points=100)
+    names = [{s.bodies[0].name for s in MeshesTask().scenes(config, split, 4)} for split in ("train", "test")]
+    assert not names[0] & names[1]
+    assert len(names[0] | names[1]) == 3
+
+
+def test_what_is_held_out_stays_held_out_whatever_the_seed_of_training_scenes(case):
+    task, config, scenes = case
+    for seed in (1, 2, 3):
+        for train in task.scenes(config, "train", seed):
+            assert not any(bodies_equal(train, test) for test in scenes["test"])
+
+
+def test_meshes_that_are_held_out_are_so_with_every_seed(folders):
+    config = MeshesTask.Config(folder=str(folders / "three"), poses=1, truth_points=100)
+    held_out = {scene.bodies[0].name for scene in MeshesTask().scenes(config, "test", 0)}
+    for seed in range(1, 9):
+        trained = {scene.bodies[0].name for scene in MeshesTask().scenes(config, "train", seed)}
+        assert not trained & held_out
+
+
+@pytest.mark.parametrize("up", ["x", "y", "z"])
+def test_turning_the_up_axis_keeps_handedness(folders, up):
+    config = MeshesTask.Config(folder=str(folders / "one"), up=up, truth_points=100, poses=1)
+    mesh = MeshesTask().scenes(config, "train", 0)[0].bodies[0].shape
+    assert mesh.sign == "solid"
+    assert not any("inside out" in note for note in mesh.notes)
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    assert np.einsum("fk,fk->f", a, np.cross(b, c)).sum() > 0
+    height = {"x": 0.2, "y": 0.24, "z": 0.4}[up]
+    assert np.ptp(mesh.bounds_m[:, 2]) == pytest.approx(height, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "origin", [None, (0.0, 0.0, 1.0), (-0.7, 0.7, 0.4), (0.0, 0.0, 0.0), (0.5, 0.0, -0.6)]
+)
+@pytest.mark.parametrize("box", [0.0, 0.1])
+def test_the_derived_design_space_sees_the_whole_of_every_mesh(folders, origin, box):
+    config = MeshesTask.Config(folder=str(folders / "one"), origin_m=origin, origin_box_m=box)
+    space = MeshesTask().space(config)
+    corners = np.array([(x, y, z) for x in (-0.1, 0.1) for y in (-0.12, 0.12) for z in (-0.2, 0.2)])
+    for place in (space.low[:3], space.high[:3]):
+        assert space.contains(aim(np.array(place), corners)).all()
+
+
+def test_jitter_is_rigid_about_its_centre_and_bounded():
+    centre = np.array([0.1, -0.2, 0.3])
+    for seed in range(20):
+        pose = jittered_pose(np.random.default_rng(seed), 4.0, 0.0, centre)
+        np.testing.assert_allclose(pose[:3, :3] @ centre + pose[:3, 3], centre, atol=1e-12)
+        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
+        angle = np.rad2deg(np.arccos((np.trace(pose[:3, :3]) - 1) / 2))
+        assert angle <= 4.0 * 2.5 * np.sqrt(3) + 1e-9
+
+
+def test_a_mesh_in_millimetres_without_a_scale_is_noted_by_its_file(tmp_path):
+    trimesh.creation.box((120, 90, 70)).export(tmp_path / "box.obj")
+    for scale, noted in ((1.0, True), (0.001, False)):
+        task = MeshesTask()
+        config = task.Config(folder=tmp_path, scale=scale)
+        notes = " ".join(notes_of(task, config, task.space(config)))
+        assert ("box.obj: is 120 m long" in notes) == noted

@@ -1,0 +1,325 @@
+"""Every law of the task contract is kept by a good task and broken by one that breaks it."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.plugins import GOOD
+
+from lidardesign.errors import ConfigError, PluginError
+from lidardesign.registry import load_task
+from lidardesign.scene import Body, Medium, Mesh, Scene, Sphere
+from lidardesign.testing import BrokenLawError, Limits, check_task, contract_of
+from lidardesign.testing.contract import LAWS
+from lidardesign.testing.fingerprint import fingerprint, geometry_fingerprint
+from lidardesign.testing.geometry import ground_of
+from lidardesign.testing.watch import Watch
+
+METRIC = 'Metric("radius error", "mm", "lower", worst=100.0, tolerance=0.5)'
+DEFAULTS = 'Defaults(density={"sigma_m": 0.05})'
+SPACE = "        return DesignSpace("
+SCENES = "    def scenes(self, config, split, seed):\n"
+SCORE = "    def score(self, scene, returns):\n"
+VALUE = "        return Score(min(1000 * off + 50 / len(points), 100.0))\n"
+CENTRE = "        centre = np.array([generator.uniform(2.0, 3.0), generator.uniform(-0.5, 0.5), 0.0])\n"
+CONFIG = "    Config = TaskConfig\n"
+RESIDUALS = "    def residuals(self, scene, returns):\n        return "
+# What a task is changed into, by the law that it then breaks: words that are replaced, and what is said of it.
+BROKEN = {
+    "configuration is strict": [
+        (CONFIG, "    Config = type('Loose', (TaskConfig,), {'model_config': {'extra': 'allow'}})\n", "does not know"),
+        (CONFIG, "    class Config(TaskConfig):\n        depth: int = 3\n", "'depth' has no description"),
+        (
+            CONFIG,
+            "    class Config(TaskConfig):\n        model_config = {'allow_inf_nan': True}\n        d_m: float = 1\n",
+            "takes NaN for 'd_m'",
+        ),
+    ],
+    "metric is defined": [
+        (METRIC, METRIC.replace("0.5", "0.0"), "metric.tolerance is 0.0"),
+        (METRIC, METRIC.replace("100.0", "float('inf')"), "metric.worst is inf"),
+        (METRIC, METRIC.replace("lower", "smaller"), "metric.better is 'smaller'"),
+        (METRIC, METRIC.replace("100.0", "10**400"), "OverflowError"),
+    ],
+    "defaults are accepted": [
+        (DEFAULTS, "Defaults(layout='spiral')", "defaults.layout is 'spiral'"),
+        (DEFAULTS, "Defaults(rays=())", "defaults.rays is ()"),
+        (DEFAULTS, "Defaults(rays=36)", "defaults.rays is 36"),
+        (DEFAULTS, "Defaults(level=95)", "defaults.level is 95"),
+        (DEFAULTS, "Defaults(learning={'rough': {}})", "the preset 'rough'"),
+        (DEFAULTS, "Defaults(learning={'fine': {'step': 3}})", "preset fine: unknown key 'learning.step'"),
+    ],
+    "space is fixed": [
+        (SPACE, "        self.asked = getattr(self, 'asked', 4) + 1\n" + SPACE, "another one the second time"),
+        ("4.0))", "4.0 + self.asked))", ""),
+    ],
+    "conditions lie in the space": [
+        ("4.0))", "4.0), condition=('azimuth_rad',))\n    def conditions(self, config):\n"
+         "        return [{'azimuth_rad': 9.0}]", "outside the design space"),
+    ],
+    "scenes are made": [
+        (SCENES, SCENES + "        if split == 'test': return []\n", "the split test has no scenes"),
+        (SCENES, SCENES + "        1 / 0\n", "ZeroDivisionError: division by zero"),
+    ],
+    "scenes repeat": [
+        (CENTRE, CENTRE.replace("generator", "np.random.default_rng()"), "has another scene 0"),
+    ],
+    "seeds differ": [
+        ("random_generator(seed,", "random_generator(0,", "the same training scenes"),
+        (SCORE, RESIDUALS + "None\n\n" + SCORE, ""),
+    ],
+    "splits are disjoint": [("split, i)", "i)", "is the held-out scene 'test 0'")],
+    "scenes are picklable": [('{"at": centre}', '{"at": centre, "f": lambda: 0}', "cannot be pickled")],
+    "targets are in reach": [(CENTRE, CENTRE.replace("0.0]", "90.0]"), "none of 3000 rays")],
+    "scores are numbers": [
+        (VALUE, "        return 3.0\n", "score returned float"),
+        (VALUE, "        return Score(float('inf'))\n", "score returned inf"),
+        (VALUE, "        return Score(1.0, details={'seen': 'much'})\n", "the detail 'seen'"),
+    ],
+    "nothing heard is scored": [
+        ("Score(self.metric.worst, failed=True)", "Score(-5.0)", "no rays score -5, better than"),
+    ],
+    "best on the truth": [
+        (METRIC, METRIC.replace("lower", "higher").replace("100.0", "0.0"), "does not reward seeing the targets"),
+        (VALUE, "        return Score(100.0)\n", "100 of 400 rays at targets, 100 of 12, 100 of none"),
+    ],
+    "worse under noise": [
+        (VALUE, "        return Score(max(60 - 1000 * off, 1) + 50 / len(points))\n", "noise on the ranges makes"),
+    ],
+    "order does not matter": [
+        (VALUE, "        return Score(20 + abs(points[0, 1]))\n", "rays in another order change the score by"),
+    ],
+    "scores repeat": [
+        (VALUE, "        self.calls = getattr(self, 'calls', 0) + 1\n        return Score(1 + 1e-9 * self.calls)\n",
+         "for the same returns"),
+    ],
+    "scores change nothing": [
+        (VALUE, "        returns[0].range_m[:] = 1.0\n" + VALUE, "score changed returns"),
+        (VALUE, "        scene.bodies[0].poses[0, 3] += 1e-9\n" + VALUE, "score changed the scene 'train 0'"),
+    ],
+    "residuals are places": [
+        (SCORE, RESIDUALS + "None\n\n" + SCORE, "residuals returned NoneType"),
+        (SCORE, RESIDUALS + "__import__('lidardesign.task').task.Residuals([[0, 0, 0]], [-1])\n\n" + SCORE, "negative"),
+    ],
+    "no global random state": [
+        (VALUE, "        np.random.uniform()\n" + VALUE, "numpy's random in score"),
+        (VALUE, "        import random; random.random()\n" + VALUE, "Python's random in score"),
+    ],
+    "nothing is written": [
+        (VALUE, "        try: open('left.txt', 'a')\n        except OSError: pass\n" + VALUE, "left.txt"),
+        (VALUE, "        import os\n        try: os.mkdir('left')\n        except OSError: pass\n" + VALUE, "left"),
+    ],
+    "nothing else is changed": [
+        (VALUE, "        import os; os.environ['MINE'] = '1'\n" + VALUE, "the environment (MINE) in score"),
+        (VALUE, "        import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n" + VALUE, "who hears SIGINT"),
+        (VALUE, "        import locale; locale.setlocale(locale.LC_ALL, 'C.UTF-8')\n" + VALUE, "the locale in score"),
+        (VALUE, "        np.seterr(all='ignore')\n" + VALUE, "numpy's error settings in score"),
+    ],
+}  # fmt: skip
+# Laws whose breakers replace several words at once.
+TOGETHER = ("space is fixed", "seeds differ")
+# Laws that are broken below, not by words of a task.
+OTHERWISE = {
+    "scenes repeat elsewhere",
+    "fields are finite",
+    "fields have the right sign",
+    "gradients have length 1",
+    "fields and rays agree",
+    "within time",
+    "within memory",
+}
+
+
+def task_of(source: str):
+    """The task of a source, as a module would have it."""
+    namespace: dict[str, object] = {"__name__": "a_task"}
+    exec(source.replace("NAME", "ball"), namespace)
+    return namespace["Task"]()
+
+
+def replaced(changes) -> str:
+    source = GOOD
+    for before, after, _ in changes:
+        assert before in source
+        source = source.replace(before, after)
+    return source
+
+
+def mutants():
+    """Law, source and words of every broken task."""
+    for law, changes in BROKEN.items():
+        groups = [changes] if law in TOGETHER else [[change] for change in changes]
+        for group in groups:
+            yield pytest.param(law, replaced(group), group[0][2], id=f"{law}: {group[0][2]}")
+
+
+@pytest.mark.parametrize(("law", "source", "words"), list(mutants()))
+def test_a_task_that_breaks_a_law_is_told_so(law, source, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    finding = contract_of(task_of(source)).finding(law)
+    assert (finding.outcome, finding.law) == ("fail", law), finding
+    assert words in finding.detail
+    assert os.listdir(tmp_path) == []
+
+
+def test_every_law_is_broken_by_something():
+    assert {law.name for law in LAWS} == {*BROKEN, *OTHERWISE}
+    assert len({law.name for law in LAWS}) == len(LAWS)
+
+
+@pytest.fixture(scope="module")
+def kept():
+    """The findings of a good task, by law."""
+    return {finding.law: finding for finding in contract_of(task_of(GOOD)).findings()}
+
+
+def test_a_good_task_keeps_every_law_that_applies(kept):
+    assert {finding.law for finding in kept.values() if finding.outcome == "skip"} == {
+        "conditions lie in the space",
+        "scenes repeat elsewhere",
+        "residuals are places",
+    }
+    assert not [finding for finding in kept.values() if finding.outcome == "fail"]
+    assert kept["best on the truth"].figures["dense"] < kept["best on the truth"].figures["none"]
+
+
+SHIPPED = {
+    "arm": ("train=2", "test=2", "frames=6"),
+    "face": ("train=2", "test=2", "truth_points=500"),
+    "flatland": ("train=2", "test=2"),
+    "warehouse": ("train=2", "test=2", "size=small"),
+}
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_the_shipped_tasks_keep_the_contract(name):
+    contract = contract_of(load_task(name), overrides=SHIPPED[name])
+    for law in LAWS:
+        # in another process they are made again by the tests of workers
+        if law.name != "scenes repeat elsewhere":
+            finding = contract.finding(law.name)
+            assert finding.outcome != "fail", finding
+
+
+class Bent:
+    """A field that is changed by a function of its values."""
+
+    def __init__(self, field, distance=lambda d: d, slope=1.0):
+        self.field, self.columns, self.distance, self.factor = field, field.columns, distance, slope
+
+    def distances(self, points):
+        return self.distance(self.field.distances(points))
+
+    def gradient(self, points, weights):
+        return self.factor * self.field.gradient(points, weights)
+
+
+@pytest.mark.parametrize(
+    ("law", "distance", "slope"),
+    [
+        ("fields are finite", lambda d: np.where(d < 0.5, np.nan, d), 1.0),
+        ("fields are finite", lambda d: d, np.inf),
+        ("fields have the right sign", lambda d: -d, 1.0),
+        ("fields have the right sign", np.abs, 1.0),
+        ("gradients have length 1", lambda d: d, 1.4),
+        ("fields and rays agree", lambda d: d + 0.01, 1.0),
+        ("fields and rays agree", lambda d: 1.1 * d, 1.0),
+    ],
+)
+def test_a_field_that_is_wrong_is_noticed(law, distance, slope):
+    contract = contract_of(task_of(GOOD))
+    assert contract.finding("targets are in reach").outcome == "pass"
+    ground = ground_of(contract.subject)
+    ground.field = Bent(ground.field, distance, slope)
+    assert contract.finding(law).outcome == "fail"
+
+
+def test_limits_of_time_and_memory_are_kept():
+    contract = contract_of(task_of(GOOD), limits=Limits(seconds=1e-9, memory_bytes=1))
+    assert "took" in contract.finding("within time").detail
+    assert contract.finding("within memory").outcome == "fail"
+
+
+def test_scenes_that_hang_on_the_hashes_of_a_process_are_noticed(tmp_path, monkeypatch):
+    source = GOOD.replace("random_generator(seed,", "random_generator(abs(hash(split)),").replace("NAME", "hashed")
+    (tmp_path / "hashed_task.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONHASHSEED", "20251")
+    import hashed_task
+
+    contract = contract_of(hashed_task.Task())
+    assert contract.finding("scenes repeat").outcome == "pass"
+    assert "another process makes another scene 0" in contract.finding("scenes repeat elsewhere").detail
+
+
+def test_laws_that_need_a_broken_one_are_not_tried_and_say_so():
+    contract = contract_of(task_of(GOOD.replace(SCENES, SCENES + "        1 / 0\n")))
+    finding = contract.finding("worse under noise")
+    assert (finding.outcome, finding.detail) == ("skip", "needs: scores are numbers")
+
+
+def test_check_task_returns_findings_or_raises_with_every_broken_law():
+    with pytest.raises(BrokenLawError, match=r"2 of \d+ laws do not hold: metric is defined") as caught:
+        check_task(task_of(GOOD.replace(METRIC, METRIC.replace("radius error", " ")).replace("split, i)", "i)")))
+    assert caught.value.exit_code == 6
+    with pytest.raises(PluginError, match="version 9"):
+        contract_of(task_of(GOOD.replace("api_version = 1", "api_version = 9")))
+    with pytest.raises(ConfigError, match="unknown key"):
+        contract_of(task_of(GOOD), overrides=["depth=1"])
+    with pytest.raises(ConfigError, match="unknown law"):
+        contract_of(task_of(GOOD)).finding("scenes are pretty")
+
+
+def test_a_fingerprint_is_of_the_content_alone():
+    def scene(name="a", radius=0.2, **truth):
+        return Scene((Body(Sphere(radius), name),), name, truth=truth)
+
+    assert fingerprint(scene()) == fingerprint(scene())
+    assert fingerprint(scene(x=1, y={"b", "a"})) == fingerprint(scene(y={"a", "b"}, x=1))
+    assert fingerprint(scene(x=np.zeros(2))) != fingerprint(scene(x=np.zeros(3)))
+    assert fingerprint(scene(x=1)) != fingerprint(scene(x=1.0))
+    assert geometry_fingerprint(scene("a")) == geometry_fingerprint(scene("b"))
+    assert geometry_fingerprint(scene()) != geometry_fingerprint(scene(radius=0.3))
+    assert geometry_fingerprint(scene()) != geometry_fingerprint(replace(scene(), medium=Medium(0.1, 0.01)))
+    assert geometry_fingerprint(scene()) == geometry_fingerprint(replace(scene(x=1), notes=("one",)))
+    mesh = Mesh(np.eye(3), np.array([[0, 1, 2]]), "unsigned")
+    before = fingerprint(mesh)
+    assert mesh.content_hash
+    assert fingerprint(mesh) == before
+    loop: list[object] = []
+    loop.append(loop)
+    with pytest.raises(ValueError, match="hold themselves"):
+        fingerprint(loop)
+
+
+def test_what_is_watched_is_refused_outside_and_put_back(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
+    (tmp_path / "here").mkdir()
+    (tmp_path / "there.txt").write_text("as it was")
+    watch, state = Watch(), np.random.get_state()[1].copy()  # noqa: NPY002
+    with watch.during("a test"):
+        (tmp_path / "temporary" / "fine.txt").write_text("allowed")
+        for attempt in (
+            lambda: (tmp_path / "there.txt").write_text("changed"),
+            lambda: (tmp_path / "there.txt").unlink(),
+            lambda: (tmp_path / "there.txt").rename(tmp_path / "here" / "moved.txt"),
+            lambda: os.mkdir(tmp_path / "made"),
+            lambda: os.rmdir(tmp_path / "here"),
+            lambda: os.symlink(tmp_path, tmp_path / "link"),
+        ):
+            with pytest.raises(PermissionError):
+                attempt()
+        np.random.seed(3)  # noqa: NPY002
+        os.chdir(tmp_path)
+    assert (tmp_path / "there.txt").read_text() == "as it was"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["here", "temporary", "there.txt"]
+    assert (np.random.get_state()[1] == state).all()  # noqa: NPY002
+    assert watch.drawn == ["numpy's random in a test"]
+    assert watch.changed == ["the working folder in a test"]
+    (tmp_path / "after.txt").write_text("nobody watches")

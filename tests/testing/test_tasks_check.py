@@ -1,0 +1,180 @@
+"""`tasks check` names what is broken in a plugin, law by law, and no plugin harms anything but its own check."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from support.command_line import caller, files_under
+from support.plugins import GOOD, install_plugins
+
+from lidardesign import registry
+from lidardesign.errors import ConfigError
+from lidardesign.registry import START_SECONDS
+from lidardesign.testing import process
+from lidardesign.testing.contract import LAWS
+from lidardesign.testing.law import Finding, Limits
+from lidardesign.testing.process import CheckRequest, check_apart
+
+SCORE = "    def score(self, scene, returns):\n"
+SCENES = "    def scenes(self, config, split, seed):\n"
+# How a plugin is broken: its source, the law that names it, and words of what is said.
+BROKEN = {
+    "import_error": ("import a_module_that_is_not_there\n" + GOOD, "plugin loads", "a_module_that_is_not_there"),
+    "system_exit": ("raise SystemExit(3)\n" + GOOD, "plugin loads", "tried to end the program (exit 3)"),
+    "hang": (
+        GOOD.replace(SCENES, SCENES + "        import time\n        while True: time.sleep(1)\n"),
+        "scenes are made",
+        "did not end within",
+    ),
+    "wrong_version": (GOOD.replace("api_version = 1", "api_version = 7"), "plugin loads", "version 7 of the task"),
+    "duplicate": (GOOD, "plugin loads", "is offered by first 1.0 (first_duplicate:Task) and second 1.0"),
+    "nan_metric": (GOOD.replace("50 / len(points)", "float('nan')"), "scores are numbers", "returned np.float64(nan)"),
+    "wrong_types": (
+        GOOD.replace(SCENES, SCENES + "        return ['a scene', 'another']\n"),
+        "scenes are made",
+        "scenes gave one str",
+    ),
+    "writes_outside": (
+        GOOD.replace(SCENES, SCENES + "        try: open('OUTSIDE', 'w').write('x')\n        except OSError: pass\n"),
+        "nothing is written",
+        "mark",
+    ),
+    "global_seed": (
+        GOOD.replace(SCENES, SCENES + "        np.random.seed(seed)\n"),
+        "no global random state",
+        "numpy's random in scenes",
+    ),
+    "mutates_scenes": (
+        GOOD.replace(SCORE, SCORE + "        scene.truth['scored'] = True\n"),
+        "scores change nothing",
+        "score changed the scene",
+    ),
+}
+# What only a limit on a process or its end can contain.
+CONTAINED = {
+    "crash": (
+        GOOD.replace(SCENES, SCENES + "        import ctypes; ctypes.string_at(0)\n"),
+        "scenes are made",
+        "crashes while this is tried (Segmentation fault)",
+    ),
+    "hog": (GOOD.replace(SCENES, SCENES + "        np.ones(2**28)\n"), "scenes are made", "needs more than 768 MiB"),
+}
+# What is unusual and keeps the contract: it says much, never ends by itself, holds a library that sets variables of its
+# own, and has scenes that differ in their fog alone.
+UNUSUAL = (
+    "import atexit, os, threading\natexit.register(print, 'bye')\nos.environ.setdefault('KMP_INIT_AT_FORK', 'FALSE')\n"
+    "threading.Thread(target=threading.Event().wait).start()\n"
+    + GOOD.replace(SCENES, SCENES + "        os.system('echo one more')\n")
+    .replace("generator.uniform(2.0, 3.0), generator.uniform(-0.5, 0.5), 0.0", "2.5, 0.0, 0.0")
+    .replace('{"at": centre})', '{"at": centre}, medium=Medium(generator.uniform(0.01, 0.1), 0.001))')
+    .replace("import Body,", "import Body, Medium,")
+)
+SECONDS = {"hang": 2.0}
+MEMORY = {"hog": 3 * 2**28}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder on the path with all the plugins, and beside it what must not be written."""
+    root = tmp_path_factory.mktemp("check")
+    sources = {name: source.replace("OUTSIDE", str(root / "mark")) for name, (source, *_) in BROKEN.items()}
+    sources |= {name: source for name, (source, *_) in CONTAINED.items()}
+    twin = sources.pop("duplicate")
+    install_plugins(root / "installed", {"good": GOOD, "unusual": UNUSUAL, **sources})
+    for package in ("first", "second"):
+        install_plugins(root / "installed", {"duplicate": twin}, package=package)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.syspath_prepend(root / "installed")
+        yield root
+
+
+@pytest.fixture(scope="module")
+def findings(place):
+    """What `tasks check` found of every plugin, by name: all at once, as they are processes of their own."""
+
+    def checked(name):
+        limits = Limits(SECONDS.get(name, 60.0), MEMORY.get(name, 2**32))
+        return name, list(check_apart(CheckRequest(name, limits=limits)))
+
+    before = files_under(place)
+    with ThreadPoolExecutor(4) as pool:
+        found = dict(pool.map(checked, [*BROKEN, *CONTAINED, "unusual"]))
+    assert files_under(place) == before
+    return found
+
+
+@pytest.mark.parametrize("name", [*BROKEN, *CONTAINED])
+def test_each_broken_plugin_is_named_by_the_law_that_it_breaks(findings, name):
+    _, law, words = {**BROKEN, **CONTAINED}[name]
+    failed = {finding.law: finding.detail for finding in findings[name] if finding.outcome == "fail"}
+    assert law in failed, findings[name]
+    assert words in failed[law]
+
+
+@pytest.mark.parametrize("name", [*BROKEN, *CONTAINED])
+def test_every_law_has_its_finding_and_those_that_stand_on_a_broken_one_are_not_tried(findings, name):
+    found = findings[name]
+    assert [finding.law for finding in found] == ["plugin loads", *(law.name for law in LAWS)]
+    broken = [finding.law for finding in found if finding.outcome == "fail"]
+    assert len(broken) == 1, broken
+    assert all(finding.detail for finding in found)
+
+
+def test_an_unusual_plugin_keeps_every_law_that_applies(findings):
+    assert [finding for finding in findings["unusual"] if finding.outcome == "fail"] == []
+    kept = {finding.law for finding in findings["unusual"] if finding.outcome == "pass"}
+    assert kept >= {"scenes repeat elsewhere", "splits are disjoint", "nothing else is changed"}
+
+
+class Playing:
+    """A process that says given lines, and how long each is waited for."""
+
+    def __init__(self, *lines):
+        self.lines, self.waits = [json.dumps(line).encode() for line in lines], []
+
+    def next_line(self, deadline):
+        self.waits.append(deadline - time.monotonic())
+        return 0.0, self.lines.pop(0) if self.lines else None
+
+
+def test_every_call_of_a_law_has_its_own_time():
+    finding = Finding("law", "group", "statement", "pass", "").as_dict()
+    child = Playing({"called": "score"}, {"called": ""}, {"called": "score"}, finding)
+    assert process._next_finding(child, 2.0, loading=False) == finding
+    waiting, calling = START_SECONDS + 8.0, 8.0
+    assert child.waits == pytest.approx([waiting, calling, waiting, calling], abs=0.5)
+    assert process._next_finding(Playing({"called": "score"}), 2.0, loading=False) == "score did not end within 6 s"
+    assert process._next_finding(Playing({"other": 1}), 2.0, loading=True).startswith("writes into what is not its own")
+
+
+def test_none_of_them_is_imported_here_or_spoils_the_others(findings, place, tmp_path, monkeypatch, capsys):
+    assert not [name for name in sys.modules if name.startswith(("plugins_", "first_", "second_"))]
+    assert registry.load_task("flatland").name == "flatland"
+    result = caller(capsys, tmp_path, monkeypatch)("tasks", "check", "wrong_types", "--json")
+    assert result.code == 6
+    assert result.json["keeps"] is False
+    assert (result.json["fail"], result.json["task"]) == (1, "wrong_types")
+    assert f"1 of {len(LAWS) + 1} laws do not hold: scenes are made" in result.err
+    (law,) = [law for law in result.json["laws"] if law["outcome"] == "fail"]
+    assert law["group"] == "scenes"
+
+
+def test_a_good_plugin_keeps_every_law_that_applies(place, tmp_path, monkeypatch, capsys):
+    result = caller(capsys, tmp_path, monkeypatch)("tasks", "check", "good")
+    assert result.code == 0, result.out + result.err
+    assert "FAIL" not in result.out
+    assert " laws hold, 0 do not" in result.out
+    assert files_under(tmp_path) == {}
+
+
+def test_an_unknown_task_and_a_refused_configuration_are_the_users_errors(place, tmp_path, monkeypatch, capsys):
+    with pytest.raises(ConfigError, match="did you mean 'good'"):
+        list(check_apart(CheckRequest("god")))
+    call = caller(capsys, tmp_path, monkeypatch)
+    result = call("tasks", "check", "good", "--set", "no_such_key=1", "--json")
+    assert result.code == 2
+    assert json.loads(result.out)["error"]["where"] == "--set no_such_key=1"
