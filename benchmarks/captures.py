@@ -33,7 +33,7 @@ def add_head(figures: Figures, scene: Any, run: Any, designs: Sequence[Path], op
 
     from lidardesign.design.files import load_design
     from lidardesign.design.layouts.rays import lay_out
-    from lidardesign.export.galvo import read, write
+    from lidardesign.export.galvo import read_galvo, write_galvo
 
     detector = laboratory.load_detector(options.detector)
     laboratory.write_mesh(scene, folder / "head.ply")
@@ -44,8 +44,8 @@ def add_head(figures: Figures, scene: Any, run: Any, designs: Sequence[Path], op
     for estimator in ESTIMATORS:
         add_rows(figures, folder / "scan.npz", list(rays.items()), estimator, folder)
     for name, design in loaded.items():
-        write(design, rays[name], folder / "mirrors.csv")
-        mirrors = read(folder / "mirrors.csv")
+        write_galvo(design, rays[name], folder / "mirrors.csv")
+        mirrors = read_galvo(folder / "mirrors.csv")
         laboratory.write_capture(scene, mirrors, detector, folder / "gated.npz")
         for estimator in ESTIMATORS:
             add_rows(figures, folder / "gated.npz", [(name, mirrors)], estimator, folder, gate="detector")

@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 
 from lidardesign.design.galvo import SPEED_OF_LIGHT_M_PER_PS, degree_frame, scan_directions
 from lidardesign.evaluate.captures.capture import Capture, load_capture
-from lidardesign.export.galvo import read
+from lidardesign.export.galvo import read_galvo
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.files import write_atomic
@@ -80,7 +80,7 @@ def main() -> None:
         score("What would the designs have measured?", scan, designs, head, estimator)
     for file in mirrors:
         gated = folder / f"{file.name.partition('.')[0]}-gated.npz"
-        write_capture(scene, read(file), detector, gated)
+        write_capture(scene, read_galvo(file), detector, gated)
         score("The detector was switched on by the gates.", gated, [file], head, "matched")
     picture = options.picture or folder / "capture.png"
     draw(load_capture(scan), scan, gated, designs[-1].stem, picture)

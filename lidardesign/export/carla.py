@@ -21,7 +21,6 @@ from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.even_grid import EvenGrid, grid_of, grid_sensor_losses
 from lidardesign.export.common.poses import Held, Mount, held_rounding, mounts
-from lidardesign.export.sdf import matched
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import HALF_DIGITS
 from lidardesign.run.files import write_atomic
@@ -33,7 +32,7 @@ MIRROR = np.diag([1.0, -1.0, 1.0])
 NARROWEST_DEG = 0.001
 
 
-def write(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+def write_carla(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the file, atomically; returns notes of what the format cannot hold.
 
     Raises:
@@ -50,7 +49,7 @@ def write(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth
     return _losses(design, mounted, rays)
 
 
-def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+def carla_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """How far the rays that CARLA fires are from the design's; its sensors have no gate start, so only ends count.
 
     Raises:
@@ -62,7 +61,7 @@ def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
         found = [_held(one, document["fixed_delta_seconds"]) for one in document["sensors"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"holds no lidars: {error!r}", where=str(path)) from error
-    return held_rounding(rays, mounted, matched(found, mounted, path))
+    return held_rounding(rays, mounted, found, path)
 
 
 def _refuse_slow_rates(mounted: Sequence[Mount], rate_hz: float) -> None:

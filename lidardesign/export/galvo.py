@@ -35,8 +35,8 @@ from lidardesign.design.galvo import (
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
-from lidardesign.export.common.columns import losses
-from lidardesign.export.common.read_back import rays_rounding
+from lidardesign.export.common.poses import rays_rounding
+from lidardesign.export.ray_lists import ray_list_losses
 from lidardesign.geometry.rays import Rays, fire_times
 from lidardesign.numerics import ROUNDING, SLACK, TINY
 from lidardesign.run.files import write_atomic
@@ -229,7 +229,7 @@ class Position:
     own_travel_deg: float
 
 
-def write(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+def write_galvo(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     """Write the file, atomically; returns what it came to and notes of what the format cannot hold.
 
     Raises:
@@ -247,12 +247,12 @@ def write(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
             row = (len(lines) - 1, number, *shared, repr(x), repr(y), start, width, int(rays.sensor[ray]), ray)
             lines.append(",".join(map(str, row)))
     write_atomic(path, "\n".join(lines) + "\n")
-    return [*_summary(positions), *losses(design), "firing times follow from the order of the rows"]
+    return [*_summary(positions), *ray_list_losses(design), "firing times follow from the order of the rows"]
 
 
-def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+def galvo_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose: gates open outward to whole picoseconds; firing times are not held."""
-    return rays_rounding(rays, read(path), path, times=False)
+    return rays_rounding(rays, read_galvo(path), path, times=False)
 
 
 def plan(design: DesignSpec, rays: Rays) -> list[Position]:
@@ -269,8 +269,8 @@ def plan(design: DesignSpec, rays: Rays) -> list[Position]:
     return found
 
 
-def read(path: Path) -> Rays:
-    """The rays of a file that `write` made, in the design's own order.
+def read_galvo(path: Path) -> Rays:
+    """The rays of a file that `write_galvo` made, in the design's own order.
 
     They fire at the times of their steps, 10 frames a second. Directions come back to rounding, gates to the whole
     picoseconds that hold them.
@@ -297,7 +297,7 @@ def read(path: Path) -> Rays:
 
 
 def is_galvo_file(path: Path) -> bool:
-    """Whether a file begins as `write` begins one."""
+    """Whether a file begins as `write_galvo` begins one."""
     header = ",".join(COLUMNS).encode()
     try:
         with Path(path).open("rb") as file:

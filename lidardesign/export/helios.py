@@ -17,8 +17,7 @@ import numpy as np
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.export.common.names import write_folder
-from lidardesign.export.common.poses import Mount, design_losses, mounts, rays_of_parts, require_rays
-from lidardesign.export.common.read_back import rays_rounding
+from lidardesign.export.common.poses import Mount, design_losses, mounts, rays_of_parts, rays_rounding, require_rays
 from lidardesign.export.common.xml import child, document, element, read_xml
 from lidardesign.geometry.rays import Rays
 from lidardesign.scene import SPEED_OF_LIGHT_M_S
@@ -40,7 +39,7 @@ MM_PER_M = 1000
 QUARTER_TURN_DEG = 90.0
 
 
-def write(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> list[str]:
+def write_helios(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> list[str]:
     """Write the folder; returns notes of what the format cannot hold.
 
     Raises:
@@ -118,8 +117,8 @@ def _survey(design: DesignSpec, mount: Mount, rays: Rays, pulse_hz: int) -> Elem
     return root
 
 
-def read(path: Path, design: DesignSpec, rays: Rays) -> Rays:
-    """The rays of a folder that `write` made of a design and its rays, with their sensors and times.
+def read_helios(path: Path, design: DesignSpec, rays: Rays) -> Rays:
+    """The rays of a folder that `write_helios` made of a design and its rays, with their sensors and times.
 
     Raises:
         DataError: The folder cannot be read, or holds something else.
@@ -150,6 +149,6 @@ def _part(ray: np.ndarray, scanner: Element | None, survey: Path) -> Part:
         raise DataError(f"holds no survey of this design: {error}", where=str(survey)) from error
 
 
-def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+def helios_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose."""
-    return rays_rounding(rays, read(path, design, rays), path, times=False)
+    return rays_rounding(rays, read_helios(path, design, rays), path, times=False)

@@ -1,26 +1,37 @@
-"""What Isaac Sim's lidar profiles hold of a sensor, shared by their JSON and their USD form.
+"""Isaac Sim: a solid-state lidar per sensor, as JSON profiles (before version 5) and as USD prims (from version 5 on).
 
-A solid-state lidar with one emitter state: an emitter per ray at its azimuth (x forward, y at +90 degrees, z up) and
-elevation in degrees, its firing time in the frame, and the number of its range. Ranges are the different gates of the
-sensor, so gates of single rays are held. All emitters are one line: nothing says that rays lie in rows.
+A lidar has one emitter state: an emitter per ray at its azimuth (x forward, y at +90 degrees, z up) and elevation in
+degrees, its firing time in the frame, and the number of its range. Ranges are the different gates of the sensor, so
+gates of single rays are held. All emitters are one line: nothing says that rays lie in rows.
+
+JSON: the folder has NAME.json for each sensor, which Isaac finds by that name in its folder of lidar configurations,
+and `mounts.json`: names, places [m] and quaternions (w, x, y, z), as its command that creates a lidar takes them.
+
+USD, in its text form: attributes have the names and types of OmniSensorGenericLidarCoreAPI. `reportRateBaseHz` became
+`patternFiringRateHz` in version 6: both are written. Each prim is posed by translate and orient ops below one Xform,
+in metres, z up.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
-from lidardesign.export.common.names import renamed_note
-from lidardesign.export.common.poses import Mount, design_losses, fire_times_s, origin_losses
-from lidardesign.export.common.read_back import rays_rounding
+from lidardesign.export.common.names import renamed_note, write_folder
+from lidardesign.export.common.poses import Mount, design_losses, fire_times_s, mounts, origin_losses, rays_rounding
 from lidardesign.geometry.rays import Rays
+from lidardesign.geometry.rotation import rotations_of_quaternions
+from lidardesign.run.files import write_atomic
 from lidardesign.space import direction
 
 NANOSECONDS_PER_SECOND = 1_000_000_000
@@ -72,7 +83,7 @@ def whole_rate_hz(rate_hz: float) -> int:
     return round(rate_hz)
 
 
-def losses(design: DesignSpec, mounted: Sequence[Mount], rate_hz: float) -> list[str]:
+def isaac_losses(design: DesignSpec, mounted: Sequence[Mount], rate_hz: float) -> list[str]:
     """Notes of what Isaac's profiles cannot hold."""
     notes = [*design_losses(design, mounted), *origin_losses(mounted)]
     if whole_rate_hz(rate_hz) != rate_hz:
@@ -120,8 +131,8 @@ def profile_rounding(
         gate[mount.ray] = held.ranges_m[held.range_id]
         time[mount.ray] = held.fire_time_ns / NANOSECONDS_PER_SECOND
         expected[mount.ray] = fire_times_s(rays, sensor.rate_hz)[mount.ray]
-    asked = Rays(rays.origin_m, rays.direction, rays.gate_m, rays.sensor, expected)
-    return rays_rounding(asked, Rays(origin, ray, np.sort(gate, axis=1), rays.sensor, time), path)
+    found_rays = Rays(origin, ray, np.sort(gate, axis=1), rays.sensor, time)
+    return rays_rounding(replace(rays, time_s=expected), found_rays, path)
 
 
 def found_emitters(values: Mapping[str, Any], ranges_m: Any) -> Emitters:
@@ -136,4 +147,278 @@ def found_emitters(values: Mapping[str, Any], ranges_m: Any) -> Emitters:
         np.array(values["fireTimeNs"], dtype=np.int64),
         np.array(values["rangeId"], dtype=np.int64),
         np.array(ranges_m, dtype=np.float64).reshape(-1, 2),
+    )
+
+
+MOUNTS = "mounts.json"
+# No sensor's file is called so.
+MOUNTS_NAME = "mounts"
+# What a profile must have and a design says nothing of: those of NVIDIA's example of a solid-state lidar.
+OPTICS = {
+    "effectiveApertureSize": 0.0145,
+    "focusDistM": 0.16,
+    "avgPowerW": 0.002,
+    "minReflectance": 0.1,
+    "wavelengthNm": 1550.0,
+    "pulseTimeNs": 6,
+}
+LEAST_REFLECTANCE_RANGE_M = 270.0
+
+
+def write_isaac_json(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+    """Write the folder's files, each atomically; returns notes of what the format cannot hold.
+
+    Raises:
+        DataError: The path is a file, or cannot be written to.
+    """
+    mounted, whole_hz = mounts(design, rays), whole_rate_hz(rate_hz)
+    files = {f"{file_name(mount)}.json": _profile(mount, rays, whole_hz) for mount in mounted}
+    files[MOUNTS] = {"design": design.name, "sensors": [_placed(mount) for mount in mounted]}
+    notes = write_folder(path, {name: f"{json.dumps(value, indent=1)}\n".encode() for name, value in files.items()})
+    optics = "power, aperture, wavelength and least reflectance are those of NVIDIA's example: a design has none"
+    return [*isaac_losses(design, mounted, rate_hz), f"a profile has no pose: places stand in {MOUNTS}", optics, *notes]
+
+
+def isaac_json_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+    """What the written numbers lose.
+
+    Raises:
+        DataError: A file is missing, or holds no such profile.
+    """
+    mounted = mounts(design, rays)
+    try:
+        placed = json.loads((path / MOUNTS).read_text(encoding="utf-8"))["sensors"]
+        found = [_read_profile(one, path) for one in placed]
+    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        raise DataError(f"holds no profiles of lidars: {error!r}", where=str(path)) from error
+    return profile_rounding(rays, mounted, found, path)
+
+
+def file_name(mount: Mount) -> str:
+    """What the profile of a sensor is called, without its suffix."""
+    return f"{mount.name}_lidar" if mount.name.lower() == MOUNTS_NAME else mount.name
+
+
+def _placed(mount: Mount) -> dict[str, Any]:
+    return {
+        "config": file_name(mount),
+        "name": mount.sensor.name,
+        "translation_m": mount.origin_m.tolist(),
+        "orientation_wxyz": list(mount.quaternion),
+    }
+
+
+def _profile(mount: Mount, rays: Rays, rate_hz: int) -> dict[str, Any]:
+    held, count = emitters_of(mount, rays, rate_hz), len(mount.ray)
+    near, far = mount.gate_m
+    state = {
+        "azimuthDeg": [float(str(value)) for value in held.azimuth_deg],
+        "elevationDeg": [float(str(value)) for value in held.elevation_deg],
+        "fireTimeNs": held.fire_time_ns.tolist(),
+        # counted from 0 in this form, from 1 in USD
+        "channelId": list(range(count)),
+        "rangeId": held.range_id.tolist(),
+        "bank": [0] * count,
+    }
+    profile = {
+        "scanType": "solidState",
+        "intensityProcessing": "normalization",
+        "rotationDirection": "CW",
+        "rayType": "IDEALIZED",
+        "nearRangeM": near,
+        "farRangeM": far,
+        # returns nearer than this are lost
+        "minDistBetweenEchos": 0.0,
+        "rangeResolutionM": 0.0,
+        "rangeAccuracyM": 0.0,
+        **OPTICS,
+        "minReflectanceRange": max(LEAST_REFLECTANCE_RANGE_M, far),
+        "maxReturns": 1,
+        "scanRateBaseHz": float(rate_hz),
+        "reportRateBaseHz": rate_hz,
+        "numberOfEmitters": count,
+        "numberOfChannels": count,
+        "rangeCount": len(held.ranges_m),
+        "ranges": [{"min": start, "max": end} for start, end in held.ranges_m.tolist()],
+        "azimuthErrorMean": 0.0,
+        "azimuthErrorStd": 0.0,
+        "elevationErrorMean": 0.0,
+        "elevationErrorStd": 0.0,
+        "stateResolutionStep": 1,
+        "numLines": 1,
+        "numRaysPerLine": [count],
+        "emitterStateCount": 1,
+        "emitterStates": [state],
+        "intensityMappingType": "LINEAR",
+    }
+    return {
+        "class": "sensor",
+        "type": "lidar",
+        "name": mount.sensor.name,
+        "driveWorksId": "GENERIC",
+        "profile": profile,
+    }
+
+
+def _read_profile(placed: dict[str, Any], folder: Path) -> FoundSensor:
+    profile = json.loads((folder / f"{placed['config']}.json").read_text(encoding="utf-8"))["profile"]
+    ranges = [[one["min"], one["max"]] for one in profile["ranges"]]
+    return FoundSensor(
+        np.array(placed["translation_m"]),
+        rotations_of_quaternions(np.array(placed["orientation_wxyz"])),
+        profile["scanRateBaseHz"],
+        found_emitters(profile["emitterStates"][0], ranges),
+    )
+
+
+CORE = "omni:sensor:Core:"
+STATE = f"{CORE}emitterState:s001:"
+SCHEMAS = ("OmniSensorGenericLidarCoreAPI", "OmniSensorGenericLidarCoreEmitterStateAPI:s001")
+ROOT_PRIM = "Lidar"
+_PRIM = re.compile(r'^    def OmniLidar "(?P<name>[^"]*)"')
+_ATTRIBUTE = re.compile(r"^        (?:uniform )?(?P<type>[a-z0-9]+(?:\[\])?) (?P<name>[\w:]+) = (?P<value>.*)$")
+
+
+def write_isaac_usd(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+    """Write the layer, atomically; returns notes of what the format cannot hold."""
+    mounted, whole_hz = mounts(design, rays), whole_rate_hz(rate_hz)
+    lines = [
+        "#usda 1.0",
+        "(",
+        f'    defaultPrim = "{ROOT_PRIM}"',
+        "    metersPerUnit = 1",
+        '    upAxis = "Z"',
+        ")",
+        "",
+        f'def Xform "{ROOT_PRIM}" (',
+        f"    displayName = {quoted(design.name)}",
+        ")",
+        "{",
+    ]
+    for mount in mounted:
+        lines += _prim(mount, rays, whole_hz)
+    write_atomic(path, "\n".join([*lines, "}"]) + "\n")
+    return isaac_losses(design, mounted, rate_hz)
+
+
+def isaac_usd_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+    """What the written numbers lose.
+
+    Raises:
+        DataError: The file cannot be read, or holds other prims.
+    """
+    mounted = mounts(design, rays)
+    try:
+        found = [_read_prim(values) for values in _prims(path.read_text(encoding="utf-8").splitlines())]
+    except (OSError, ValueError, KeyError) as error:
+        raise DataError(f"holds no such lidars: {error!r}", where=str(path)) from error
+    return profile_rounding(rays, mounted, found, path)
+
+
+def quoted(text: str) -> str:
+    """Text as a string of USD's text form: printable ASCII and Unicode in double quotes, the rest escaped.
+
+    Line ends and other control characters become spaces, as one line is one attribute.
+    """
+    plain = "".join(letter if letter.isprintable() else " " for letter in text)
+    return '"' + plain.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def _prim(mount: Mount, rays: Rays, rate_hz: int) -> list[str]:
+    schemas = json.dumps(SCHEMAS)
+    lines = [f'    def OmniLidar "{mount.name}" (', f"        displayName = {quoted(mount.sensor.name)}"]
+    lines += [f"        prepend apiSchemas = {schemas}", "    )", "    {"]
+    held = emitters_of(mount, rays, rate_hz)
+    attributes = [*_core(mount, held, rate_hz), *_state(held)]
+    lines += [f"        {kind} {name} = {value}" for kind, name, value in attributes]
+    lines += [
+        f"        double3 xformOp:translate = {_vector(mount.origin_m)}",
+        f"        quatd xformOp:orient = {_vector(mount.quaternion)}",
+        '        uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:orient"]',
+    ]
+    return [*lines, "    }"]
+
+
+def _core(mount: Mount, held: Emitters, rate_hz: int) -> list[tuple[str, str, str]]:
+    """Type, name and value of what holds for all emitters of a sensor."""
+    count, (near, far) = len(mount.ray), mount.gate_m
+    values: list[tuple[str, str, str]] = [
+        ("token", "scanType", '"SOLID_STATE"'),
+        ("token", "rayType", '"IDEALIZED"'),
+        ("token", "elementsCoordsType", '"CARTESIAN"'),
+        ("token", "outputFrameOfReference", '"SENSOR"'),
+        *(("uint", name, str(rate_hz)) for name in ("scanRateBaseHz", "reportRateBaseHz", "patternFiringRateHz")),
+        *(("uint", name, str(count)) for name in ("numberOfEmitters", "numberOfChannels")),
+        ("uint", "maxReturns", "1"),
+        ("uint", "numLines", "1"),
+        ("uint[]", "numRaysPerLine", f"[{count}]"),
+        ("float", "nearRangeM", _single(near)),
+        ("float", "farRangeM", _single(far)),
+        # returns nearer than this are lost
+        ("float", "minDistBetweenEchosM", "0"),
+        ("uint", "rangeCount", str(len(held.ranges_m))),
+        ("float[]", "rangesMinM", _singles(held.ranges_m[:, 0])),
+        ("float[]", "rangesMaxM", _singles(held.ranges_m[:, 1])),
+        # a design says nothing of errors: there are none
+        *(("float", f"{axis}Error{what}", "0") for axis in ("azimuth", "elevation") for what in ("Mean", "Std")),
+        ("float", "rangeAccuracyM", "0"),
+    ]
+    named = ("string", "omni:sensor:marketName", quoted(mount.sensor.name))
+    return [
+        named,
+        ("float", "omni:sensor:tickRate", str(rate_hz)),
+        *((kind, CORE + name, value) for kind, name, value in values),
+    ]
+
+
+def _state(held: Emitters) -> list[tuple[str, str, str]]:
+    """Type, name and value of the arrays of one emitter state."""
+    count = len(held.azimuth_deg)
+    values = [
+        ("float[]", "azimuthDeg", _singles(held.azimuth_deg)),
+        ("float[]", "elevationDeg", _singles(held.elevation_deg)),
+        ("uint[]", "fireTimeNs", json.dumps(held.fire_time_ns.tolist())),
+        # counted from 1
+        ("uint[]", "channelId", json.dumps(list(range(1, count + 1)))),
+        ("uint[]", "rangeId", json.dumps(held.range_id.tolist())),
+        ("uint[]", "bank", json.dumps([0] * count)),
+    ]
+    return [(kind, STATE + name, value) for kind, name, value in values]
+
+
+def _single(value: float) -> str:
+    return str(np.float32(value))
+
+
+def _singles(values: Iterable[float]) -> str:
+    return f"[{', '.join(map(_single, values))}]"
+
+
+def _vector(values: Iterable[float]) -> str:
+    return f"({', '.join(repr(float(value)) for value in values)})"
+
+
+def _prims(lines: Iterable[str]) -> list[dict[str, str]]:
+    """Values by attribute name of each lidar prim of a layer that `write` wrote."""
+    found: list[dict[str, str]] = []
+    for line in lines:
+        attribute = _ATTRIBUTE.match(line)
+        if _PRIM.match(line):
+            found.append({})
+        elif attribute and found:
+            found[-1][attribute["name"]] = attribute["value"]
+    return found
+
+
+def _read_prim(values: Mapping[str, str]) -> FoundSensor:
+    def array(name: str) -> list[Any]:
+        return json.loads(values[name].replace("(", "[").replace(")", "]"))
+
+    ranges = np.stack([array(f"{CORE}rangesMinM"), array(f"{CORE}rangesMaxM")], axis=1)
+    state = {name: array(f"{STATE}{name}") for name in ("azimuthDeg", "elevationDeg", "fireTimeNs", "rangeId")}
+    return FoundSensor(
+        np.array(array("xformOp:translate")),
+        rotations_of_quaternions(np.array(array("xformOp:orient"))),
+        float(values[f"{CORE}scanRateBaseHz"]),
+        found_emitters(state, ranges),
     )

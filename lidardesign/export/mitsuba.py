@@ -16,8 +16,15 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.export.common.names import write_folder
-from lidardesign.export.common.poses import Place, design_losses, mounts, places, rays_of_parts, require_rays
-from lidardesign.export.common.read_back import rays_rounding
+from lidardesign.export.common.poses import (
+    Place,
+    design_losses,
+    mounts,
+    places,
+    rays_of_parts,
+    rays_rounding,
+    require_rays,
+)
 from lidardesign.export.common.xml import child, document, element, read_xml
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import unit_vectors
@@ -36,7 +43,7 @@ DEPTH = 2
 MM_PER_M = 1000
 
 
-def write(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+def write_mitsuba(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     """Write the folder; returns notes of what the format cannot hold.
 
     Raises:
@@ -116,8 +123,8 @@ def _add_vector(parent: Element, tag: str, name: str, values: np.ndarray) -> Non
     child(parent, tag, name=name, x=x, y=y, z=z)
 
 
-def read(path: Path, design: DesignSpec, rays: Rays) -> Rays:
-    """The rays of a folder that `write` made of a design and its rays, with their sensors and times.
+def read_mitsuba(path: Path, design: DesignSpec, rays: Rays) -> Rays:
+    """The rays of a folder that `write_mitsuba` made of a design and its rays, with their sensors and times.
 
     Raises:
         DataError: The folder cannot be read, or holds something else.
@@ -141,6 +148,6 @@ def _part(place: Place, path: Path) -> Part:
         raise DataError(f"holds no sensor of this design: {error}", where=str(path), hint="export it again") from error
 
 
-def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+def mitsuba_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose, gates on whole bins that rays share included."""
-    return rays_rounding(rays, read(path, design, rays), path, times=False)
+    return rays_rounding(rays, read_mitsuba(path, design, rays), path, times=False)

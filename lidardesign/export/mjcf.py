@@ -18,8 +18,7 @@ from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.names import distinct, xml_text
-from lidardesign.export.common.poses import Mount, design_losses, mounts
-from lidardesign.export.common.read_back import rays_rounding
+from lidardesign.export.common.poses import Mount, design_losses, mounts, rays_rounding
 from lidardesign.export.common.xml import element, number, numbers, read_xml, write_xml
 from lidardesign.geometry.rays import Rays
 from lidardesign.geometry.rotation import rotations_of_quaternions
@@ -32,7 +31,7 @@ WORLD = "world"
 SITE_SIZE_M = 0.002
 
 
-def write(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+def write_mjcf(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     """Write the model, atomically; returns notes of what the format cannot hold."""
     mounted = mounts(design, rays)
     bodies = distinct([xml_text(one.sensor.name) for one in mounted], " ", taken=[WORLD])
@@ -46,8 +45,8 @@ def write(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     return _losses(design, mounted, rays)
 
 
-def read(path: Path) -> Rays:
-    """The rays of a file that `write` made, in the order of its rangefinders.
+def read_mjcf(path: Path) -> Rays:
+    """The rays of a file that `write_mjcf` made, in the order of its rangefinders.
 
     Raises:
         DataError: The file cannot be read, or is no such model.
@@ -66,11 +65,11 @@ def read(path: Path) -> Rays:
         raise DataError(f"is no model of rangefinders: {error!r}", where=str(path)) from error
 
 
-def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+def mjcf_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose."""
     if not len(rays):
         return rays_rounding(rays, rays, path)
-    return rays_rounding(rays, read(path), path)
+    return rays_rounding(rays, read_mjcf(path), path)
 
 
 def _body(mount: Mount, name: str, rays: Rays, sites: np.ndarray) -> Element:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ import numpy as np
 
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.estimates import ROUNDING, Estimate
+from lidardesign.estimates import Estimate
 from lidardesign.export.common.poses import (
     Place,
     design_losses,
@@ -24,9 +25,9 @@ from lidardesign.export.common.poses import (
     mounts,
     places,
     rays_of_parts,
+    rays_rounding,
     require_rays,
 )
-from lidardesign.export.common.read_back import rays_rounding
 from lidardesign.geometry.rays import Rays
 from lidardesign.geometry.rotation import rotation_of_rpy
 from lidardesign.numerics import FULL_TURN, unit_vectors
@@ -42,7 +43,7 @@ NANOSECONDS_PER_S = 10**9
 MOST_US = 2**32 - 1
 
 
-def write(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> list[str]:
+def write_osi(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> list[str]:
     """Write the file, atomically; returns notes of what the format cannot hold.
 
     Raises:
@@ -98,8 +99,8 @@ def _vector(values: np.ndarray) -> dict[str, float]:
     return dict(zip("xyz", values.tolist(), strict=True))
 
 
-def read(path: Path, design: DesignSpec, rays: Rays) -> tuple[Rays, float]:
-    """The rays of a file that `write` made of a design and its rays, with their own gates, and the frame rate [Hz].
+def read_osi(path: Path, design: DesignSpec, rays: Rays) -> tuple[Rays, float]:
+    """The rays of a file that `write_osi` made of a design and its rays, with their own gates, and the frame rate [Hz].
 
     Raises:
         DataError: The file cannot be read, or holds something else.
@@ -129,12 +130,8 @@ def _part(place: Place, lidar: dict[str, Any], rays: Rays) -> Part:
     return place.ray, origin, unit_vectors(looking @ turn.T), rays.gate_m[place.ray]
 
 
-def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+def osi_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose: times are whole microseconds; gates are not held."""
-    found, rate_hz = read(path, design, rays)
-    errors = rays_rounding(rays, found, path, times=False)
-    late_s = float(np.abs(found.time_s - fire_times_s(rays, rate_hz)).max())
-    return {
-        **{name: errors[name] for name in ("origin_m", "direction_rad")},
-        "time_s": Estimate(None, late_s, "s", ROUNDING),
-    }
+    found, rate_hz = read_osi(path, design, rays)
+    errors = rays_rounding(replace(rays, time_s=fire_times_s(rays, rate_hz)), found, path)
+    return {name: errors[name] for name in ("origin_m", "direction_rad", "time_s")}

@@ -17,7 +17,7 @@ from lidardesign.design.layouts.grid import field_on_sphere
 from lidardesign.design.sensor import DesignSpec, tangent_directions
 from lidardesign.errors import DataError
 from lidardesign.export.common.names import write_folder
-from lidardesign.export.common.read_back import rays_rounding
+from lidardesign.export.common.poses import constraint_losses, rays_rounding
 from lidardesign.geometry.rays import Rays
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ PARTS = 12
 LONGEST_NAME = 60
 
 
-def write(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+def write_ply(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     """Write the folder; returns notes of what the format cannot hold."""
     comments = [
         f"comment sensor {index} {json.dumps(one.name[:LONGEST_NAME])}" for index, one in enumerate(design.sensors)
@@ -57,9 +57,7 @@ def write(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     moving = [length for length, _ in (sensor.travel_m for _, sensor in seen) if length > 0]
     if moving:
         notes.append(f"{len(moving)} sensors are regions of up to {max(moving):.3g} m: frusta stand in their middles")
-    if design.constraints:
-        notes.append("the constraints of the design are not held")
-    return notes
+    return notes + constraint_losses(design)
 
 
 def _file(comments: list[str], **elements: np.ndarray) -> bytes:
@@ -140,8 +138,8 @@ def _shell_faces() -> np.ndarray:
     return np.concatenate([inner, outer, *walls])
 
 
-def read(path: Path) -> Rays:
-    """The rays of a folder that `write` made.
+def read_ply(path: Path) -> Rays:
+    """The rays of a folder that `write_ply` made.
 
     Raises:
         DataError: The folder cannot be read, or holds something else.
@@ -164,6 +162,6 @@ def read(path: Path) -> Rays:
     return Rays(origin, looking, gate, table["sensor"], table["time"])
 
 
-def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+def ply_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose: nothing, they are kept bit for bit."""
-    return rays_rounding(rays, read(path), path)
+    return rays_rounding(rays, read_ply(path), path)

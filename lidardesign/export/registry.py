@@ -24,8 +24,8 @@ class Exporter:
         name: As `export --format` takes it.
         suffix: Of the file that it writes, with the dot; of the folder where it writes several.
         summary: One line for `export --list`.
-        module: Where its `write(design, rays, path) -> list[str]` is, and `rounding(design, rays, path)`, which reads
-            the file back and says what its numbers lose.
+        module: Where its `write_NAME(design, rays, path) -> list[str]` is, and `NAME_rounding(design, rays, path)`,
+            which reads the file back and says what its numbers lose.
         reader: The program that reads it.
         checked: How the tests show that this program takes what is written.
         folder: Whether it writes a folder of files.
@@ -41,6 +41,11 @@ class Exporter:
     folder: bool = False
     rated: bool = False
 
+    @property
+    def word(self) -> str:
+        """Its name as its functions bear it."""
+        return self.name.replace("-", "_")
+
     def write(self, design: DesignSpec, rays: Rays, path: Path, rate_hz: float | None = None) -> list[str]:
         """Write the file, atomically; returns notes of what the format cannot hold.
 
@@ -54,11 +59,10 @@ class Exporter:
             ConfigError: A frame rate for a format that holds none, or one that no sensor has.
             DataError: The file cannot be written, or the format cannot hold such a design at all.
         """
-        write = import_module(self.module).write
+        write = getattr(import_module(self.module), f"write_{self.word}")
         self.check_rate(rate_hz)
-        if self.rated:
-            return write(design, rays, Path(path), rate_hz=Bandwidth().rate_hz if rate_hz is None else rate_hz)
-        return write(design, rays, Path(path))
+        rate = {"rate_hz": Bandwidth().rate_hz if rate_hz is None else rate_hz} if self.rated else {}
+        return write(design, rays, Path(path), **rate)
 
     def check_rate(self, rate_hz: float | None) -> None:
         """Refuse a frame rate [Hz] that no sensor has, or that the format cannot hold.
@@ -80,7 +84,7 @@ class Exporter:
         Raises:
             DataError: The file does not hold what was written.
         """
-        return import_module(self.module).rounding(design, rays, Path(path))
+        return getattr(import_module(self.module), f"{self.word}_rounding")(design, rays, Path(path))
 
 
 EXPORTERS: dict[str, Exporter] = {
@@ -90,7 +94,7 @@ EXPORTERS: dict[str, Exporter] = {
             "csv",
             ".csv",
             "one ray per row: origin, direction, angles, gate, time",
-            "lidardesign.export.csv",
+            "lidardesign.export.ray_lists",
             reader="anything that reads CSV; `evaluate` and `fit` too",
             checked="read by numpy, and read back",
         ),
@@ -98,7 +102,7 @@ EXPORTERS: dict[str, Exporter] = {
             "npz",
             ".npz",
             "the same columns as numpy arrays",
-            "lidardesign.export.npz",
+            "lidardesign.export.ray_lists",
             reader="numpy",
             checked="read by numpy, and read back",
         ),
@@ -106,7 +110,7 @@ EXPORTERS: dict[str, Exporter] = {
             "sensors-csv",
             ".sensors.csv",
             "one sensor per row, the 16 columns of the research code",
-            "lidardesign.export.sensors_csv",
+            "lidardesign.export.ray_lists",
             reader="the research code of the paper",
             checked="read back; the columns are those of its own files",
         ),
@@ -148,7 +152,7 @@ EXPORTERS: dict[str, Exporter] = {
             "xacro",
             ".urdf.xacro",
             "the same as a macro that mounts it on a robot",
-            "lidardesign.export.xacro",
+            "lidardesign.export.urdf",
             reader="ROS, xacro",
             checked="expanded by xacro and parsed by check_urdf",
             rated=True,
@@ -166,7 +170,7 @@ EXPORTERS: dict[str, Exporter] = {
             "isaac-json",
             ".isaac",
             "a solid-state profile per sensor, and where they are",
-            "lidardesign.export.isaac_json",
+            "lidardesign.export.isaac",
             reader="Isaac Sim before 5",
             checked="fields, types and lengths against a JSON Schema of NVIDIA's profiles",
             folder=True,
@@ -176,7 +180,7 @@ EXPORTERS: dict[str, Exporter] = {
             "isaac-usd",
             ".usda",
             "an OmniLidar per sensor, gates per ray",
-            "lidardesign.export.isaac_usd",
+            "lidardesign.export.isaac",
             reader="Isaac Sim from 5 on",
             checked="opened with OpenUSD; types, tokens and lengths as its schema has them",
             rated=True,

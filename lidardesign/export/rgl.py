@@ -8,6 +8,7 @@ and the `.time1f` files (float32, milliseconds) are.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
-from lidardesign.estimates import ROUNDING, Estimate
+from lidardesign.estimates import Estimate
 from lidardesign.export.common.names import identifier, renamed_note, write_folder
 from lidardesign.export.common.poses import (
     Mount,
@@ -25,9 +26,9 @@ from lidardesign.export.common.poses import (
     mounts,
     quaternion,
     rays_of_parts,
+    rays_rounding,
     require_rays,
 )
-from lidardesign.export.common.read_back import rays_rounding
 from lidardesign.export.common.xml import child, document, element, numbers, read_xml
 from lidardesign.geometry.rays import Rays
 from lidardesign.geometry.rotation import rotations_of_quaternions
@@ -45,7 +46,7 @@ SDF_VERSION = "1.9"
 POSE_NUMBERS = 6
 
 
-def write(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> list[str]:
+def write_rgl(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> list[str]:
     """Write the folder; returns notes of what the format cannot hold.
 
     Raises:
@@ -107,8 +108,8 @@ def _add_sensor(link: Element, mount: Mount, rays: Rays, pattern: Path, rate_hz:
     child(plugin, "pattern_preset_path", text=pattern)
 
 
-def read(path: Path, design: DesignSpec, rays: Rays) -> tuple[Rays, float]:
-    """The rays of a folder that `write` made of a design and its rays, with their sensors, and the frame rate [Hz].
+def read_rgl(path: Path, design: DesignSpec, rays: Rays) -> tuple[Rays, float]:
+    """The rays of a folder that `write_rgl` made of a design and its rays, with their sensors, and the frame rate [Hz].
 
     Raises:
         DataError: The folder cannot be read, or holds something else.
@@ -155,8 +156,7 @@ def _floats(path: Path, shape: tuple[int, ...]) -> np.ndarray:
         raise DataError(f"cannot be read as a pattern: {error}", where=str(path), hint="export it again") from error
 
 
-def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+def rgl_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose: patterns are float32."""
-    found, rate_hz = read(path, design, rays)
-    late_s = float(np.abs(found.time_s - fire_times_s(rays, rate_hz)).max())
-    return {**rays_rounding(rays, found, path, times=False), "time_s": Estimate(None, late_s, "s", ROUNDING)}
+    found, rate_hz = read_rgl(path, design, rays)
+    return rays_rounding(replace(rays, time_s=fire_times_s(rays, rate_hz)), found, path)

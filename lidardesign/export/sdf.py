@@ -29,24 +29,24 @@ LINK = "lidar"
 NEAREST_M = 0.001
 
 
-def write(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+def write_sdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the model, atomically; returns notes of what the format cannot hold."""
     mounted = mounts(design, rays)
     sensors = [sensor_element(one, rate_hz, posed=True) for one in mounted]
     link = element("link", {"name": LINK}, sensors)
     model = element("model", {"name": identifier(design.name)}, [element("static", text="true"), link])
     write_xml(path, element("sdf", {"version": VERSION}, [model]))
-    return losses(design, mounted, rays)
+    return sdf_losses(design, mounted, rays)
 
 
-def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+def sdf_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """How far the rays that Gazebo fires are from the design's."""
     mounted = mounts(design, rays)
     found = read_xml(path, "sdf").findall(f"model/link[@name='{LINK}']/sensor")
-    return held_rounding(rays, mounted, matched([held(one, path) for one in found], mounted, path))
+    return held_rounding(rays, mounted, [held(one, path) for one in found], path)
 
 
-def losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
+def sdf_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
     """Notes of what gpu_lidar sensors cannot hold."""
     near = [one for one in mounted if one.gate_m[0] < NEAREST_M]
     late = [one.gate_m[0] for one in mounted if one.gate_m[0] >= NEAREST_M]
@@ -122,16 +122,3 @@ def held(sensor: Element, path: Path, pose: np.ndarray | None = None) -> Held:
         raise DataError(f"holds no such lidar: {error}", where=str(path)) from error
     grid = EvenGrid(columns, rows, (azimuth[0], azimuth[1]), (elevation[0], elevation[1]))
     return Held(pose[:3], grid.directions() @ turn.T, (start, end))
-
-
-def matched(found: Sequence[Held], mounted: Sequence[Mount], path: Path) -> Sequence[Held]:
-    """What was read back, if it is as many sensors as were written.
-
-    Raises:
-        DataError: It is another number.
-    """
-    if len(found) != len(mounted):
-        raise DataError(
-            f"does not hold what was written: {len(found)} of {len(mounted)} sensors came back", where=str(path)
-        )
-    return found

@@ -16,7 +16,7 @@ from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.estimates import ROUNDING, Estimate
 from lidardesign.export.common.names import identifier
-from lidardesign.export.common.read_back import angles_between
+from lidardesign.export.common.poses import angles_between, constraint_losses, require_sensors
 from lidardesign.numerics import unit_vectors
 from lidardesign.run.files import write_atomic
 
@@ -33,7 +33,7 @@ KEYWORDS = ("solid", "facet", "loop", "vertex")
 _VERTEX = re.compile(r"^\s*vertex (\S+) (\S+) (\S+)$", re.MULTILINE)
 
 
-def write(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
+def write_stl(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     """Write the file, atomically; returns notes of what the format cannot hold."""
     write_atomic(path, "".join(_solid(index, sensor) for index, sensor in enumerate(design.sensors)))
     notes = [
@@ -43,9 +43,7 @@ def write(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
     moving = [length for length, _ in (sensor.travel_m for sensor in design.sensors) if length > 0]
     if moving:
         notes.append(f"{len(moving)} sensors are regions of up to {max(moving):.3g} m: solids stand in their middles")
-    if design.constraints:
-        notes.append("the constraints of the design are not held")
-    return notes
+    return notes + constraint_losses(design)
 
 
 def _solid(index: int, sensor: Sensor) -> str:
@@ -69,8 +67,8 @@ def _numbers(values: np.ndarray) -> str:
     return " ".join(map(repr, values.tolist()))
 
 
-def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Places [m], shape (G, 3), and boresight frames, shape (G, 3, 3), of the solids of a file that `write` made.
+def read_stl(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Places [m], shape (G, 3), and boresight frames, shape (G, 3, 3), of the solids of a file that `write_stl` made.
 
     Raises:
         DataError: The file cannot be read, or holds other solids.
@@ -88,12 +86,10 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return tip / MM_PER_M, np.stack([np.cross(across, up), across, up], axis=1)
 
 
-def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+def stl_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose, of places, boresights and rolls."""
-    places, frames = read(path)
-    if len(places) != len(design.sensors):
-        message = f"does not hold what was written: {len(places)} of {len(design.sensors)} sensors came back"
-        raise DataError(message, where=str(path))
+    places, frames = read_stl(path)
+    require_sensors(len(design.sensors), len(places), path)
     written = np.stack([sensor.frame for sensor in design.sensors])
     origin = np.linalg.norm(places - np.array([sensor.origin_m for sensor in design.sensors]), axis=1)
     turned = np.concatenate([angles_between(frames[:, row], written[:, row]) for row in range(3)])

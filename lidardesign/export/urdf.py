@@ -1,7 +1,9 @@
-"""ROS: a link per sensor, fixed to one base link, and Gazebo's gpu_lidar on each, as URDF.
+"""ROS: a link per sensor with Gazebo's gpu_lidar on it, as a URDF or as a xacro macro.
 
-Links follow REP 103: x forward, y to the left, z up, in metres and radians. The base link is fixed to `world`, and has
-a nominal mass: Gazebo leaves out links without one, with all that is fixed to them.
+Links follow REP 103: x forward, y to the left, z up, in metres and radians. In the URDF they are fixed to a base link,
+which is fixed to `world` and has a nominal mass: Gazebo leaves out links without one, with all that is fixed to them.
+The macro mounts them on a robot's own link, `<xacro:include filename="FILE"/>` and
+`<xacro:NAME parent="base_link" prefix=""/>` in the robot's description; poses are relative to the parent.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from lidardesign.estimates import Estimate
 from lidardesign.export.common.names import identifier
 from lidardesign.export.common.poses import Held, Mount, held_rounding, mounts
 from lidardesign.export.common.xml import element, numbers, read_xml, write_xml
-from lidardesign.export.sdf import held, losses, matched, sensor_element
+from lidardesign.export.sdf import held, sdf_losses, sensor_element
 from lidardesign.geometry.rays import Rays
 
 # No sensor's link is called so: those end in _link. Nor its joint, for none has the name of the world.
@@ -28,26 +30,26 @@ _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 BASE_MASS_KG, BASE_INERTIA_KG_M2 = 0.1, 0.0001
 
 
-def write(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+def write_urdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
     """Write the description, atomically; returns notes of what the format cannot hold."""
     mounted = mounts(design, rays)
     parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent=BASE)]
     write_xml(path, element("robot", {"name": identifier(design.name)}, [*_base(), *parts]))
     mass = f"{BASE} has a nominal mass of {BASE_MASS_KG:g} kg, without which Gazebo would leave the sensors out"
-    return [*notes(design, mounted, rays), mass]
+    return [*urdf_losses(design, mounted, rays), mass]
 
 
-def rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+def urdf_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """How far the rays of the described sensors are from the design's."""
     mounted = mounts(design, rays)
     found = held_sensors(read_xml(path, "robot"), path)
-    return held_rounding(rays, mounted, matched(found, mounted, path))
+    return held_rounding(rays, mounted, found, path)
 
 
-def notes(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
+def urdf_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
     """Notes of what a description of links and Gazebo sensors cannot hold."""
     return [
-        *losses(design, mounted, rays),
+        *sdf_losses(design, mounted, rays),
         "URDF has no sensors of its own: rays, gates and rates stand in <gazebo> extensions, which Gazebo reads",
     ]
 
@@ -101,3 +103,30 @@ def held_sensors(root: Element, path: Path) -> list[Held]:
         except (KeyError, StopIteration, IndexError, ValueError) as error:
             raise DataError(f"holds no joint for a sensor: {error!r}", where=str(path)) from error
     return found
+
+
+NAMESPACE = "http://www.ros.org/wiki/xacro"
+MACRO = "xacro:macro"
+
+
+def write_xacro(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+    """Write the macro, atomically; returns how to use it and notes of what the format cannot hold."""
+    name, mounted = identifier(design.name), mounts(design, rays)
+    parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent="${parent}", prefix="${prefix}")]
+    macro = element(MACRO, {"name": name, "params": "parent prefix:=''"}, parts)
+    write_xml(path, element("robot", {"xmlns:xacro": NAMESPACE, "name": name}, [macro]))
+    usage = f'include it and call <xacro:{name} parent="base_link"/>: poses are relative to the parent'
+    return [usage, *urdf_losses(design, mounted, rays)]
+
+
+def xacro_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+    """How far the rays of the described sensors are from the design's.
+
+    Raises:
+        DataError: The file holds no such macro.
+    """
+    mounted = mounts(design, rays)
+    macro = next((part for part in read_xml(path, "robot") if part.tag == MACRO), None)
+    if macro is None:
+        raise DataError("holds no macro", where=str(path))
+    return held_rounding(rays, mounted, held_sensors(macro, path), path)

@@ -36,7 +36,9 @@ class Element(ElementTree.Element):
     line: int = 0
 
 
-def read_xml(path: Path, allowed: str) -> Element:
+def read_xml(
+    path: Path, allowed: str, *, largest_bytes: int = LARGEST_BYTES, most_elements: int = MOST_ELEMENTS
+) -> Element:
     """The root element of a file.
 
     Raises:
@@ -46,12 +48,12 @@ def read_xml(path: Path, allowed: str) -> Element:
         if path.exists() and not path.is_file():
             raise DataError("is no regular file", where=str(path), allowed=allowed)
         with path.open("rb") as file:
-            content = file.read(LARGEST_BYTES + 1)
+            content = file.read(largest_bytes + 1)
     except OSError as error:
         raise DataError(f"cannot be read: {error.strerror or error}", where=str(path), allowed=allowed) from None
-    if len(content) > LARGEST_BYTES:
-        raise DataError("the file is too large", where=str(path), allowed=f"at most {LARGEST_BYTES} bytes")
-    builder = _Builder(path)
+    if len(content) > largest_bytes:
+        raise DataError("the file is too large", where=str(path), allowed=f"at most {largest_bytes} bytes")
+    builder = _Builder(path, most_elements)
     try:
         return builder.build(content)
     except expat.ExpatError as error:
@@ -66,8 +68,8 @@ def read_xml(path: Path, allowed: str) -> Element:
 class _Builder:
     """Builds the tree from the parser's events."""
 
-    def __init__(self, path: Path) -> None:
-        self._path, self._count = path, 0
+    def __init__(self, path: Path, most_elements: int = MOST_ELEMENTS) -> None:
+        self._path, self._count, self._most = path, 0, most_elements
         # the root stays below the elements that are open
         self._open: list[Element] = []
         self._parser = expat.ParserCreate()
@@ -95,7 +97,7 @@ class _Builder:
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
         self._count += 1
-        if len(self._open) >= DEEPEST or self._count > MOST_ELEMENTS:
+        if len(self._open) >= DEEPEST or self._count > self._most:
             where = f"{self._path}:{self._parser.CurrentLineNumber}"
             raise DataError("is nested too deep or has too many elements", where=where, allowed=f"{DEEPEST} levels")
         element = Element(tag, attributes)

@@ -26,8 +26,7 @@ from lidardesign.design.fit import fit
 from lidardesign.design.sensor import MOST_RAYS, interval_factor
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.evaluate.captures.capture import load_capture
-from lidardesign.export import csv as csv_format
-from lidardesign.export import npz as npz_format
+from lidardesign.export import ray_lists
 from lidardesign.meshio import check_mesh, load_mesh
 from lidardesign.run.manifest import record
 from lidardesign.samples import Samples, load_samples
@@ -96,7 +95,7 @@ def test_no_room_is_made_for_what_a_header_only_promises(tmp_path, shape):
     header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
     with zipfile.ZipFile(tmp_path / "rays.npz", "w") as archive:
         archive.writestr("points.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + bytes(80))
-    for read in (npz_format.read, load_capture):
+    for read in (ray_lists.read_npz, load_capture):
         with pytest.raises(DataError, match="80 bytes of data"):
             read(tmp_path / "rays.npz")
 
@@ -146,10 +145,10 @@ RAY_ROW = ["0", "0", "0", "1", "0", "0", "0", "0", "1", "2", "3", "0.1"]
 def test_numbers_of_rays_that_cannot_be_are_refused_without_a_warning(tmp_path, column, text):
     path = tmp_path / "rays.csv"
     path.write_text(f"{RAY_COLUMNS}\n{','.join(RAY_ROW)}\n")
-    assert csv_format.read(path).sensor[0] == 3
+    assert ray_lists.read_csv(path).sensor[0] == 3
     path.write_text(f"{RAY_COLUMNS}\n{','.join([*RAY_ROW[:column], text, *RAY_ROW[column + 1 :]])}\n")
     with pytest.raises(DataError, match="holds no ray list"):
-        csv_format.read(path)
+        ray_lists.read_csv(path)
 
 
 # --- geometry

@@ -21,7 +21,7 @@ from lidardesign.design.galvo import (
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.export.galvo import COLUMNS, is_galvo_file, read, short_tour, travel, write
+from lidardesign.export.galvo import COLUMNS, is_galvo_file, read_galvo, short_tour, travel, write_galvo
 from lidardesign.geometry.rays import Rays
 
 C_M_PER_PS = 299_792_458e-12
@@ -172,8 +172,8 @@ def test_tours_are_the_same_every_time():
 
 def test_rays_come_back_in_their_order_with_gates_that_hold_theirs(tmp_path):
     rays = lay_out(design())
-    notes = write(design(), rays, tmp_path / "f.csv")
-    back = read(tmp_path / "f.csv")
+    notes = write_galvo(design(), rays, tmp_path / "f.csv")
+    back = read_galvo(tmp_path / "f.csv")
     np.testing.assert_allclose(back.direction, rays.direction, atol=1e-14)
     np.testing.assert_array_equal(back.origin_m, rays.origin_m)
     np.testing.assert_array_equal(back.sensor, rays.sensor)
@@ -182,14 +182,14 @@ def test_rays_come_back_in_their_order_with_gates_that_hold_theirs(tmp_path):
     assert np.abs(back.gate_m - rays.gate_m).max() < C_M_PER_PS / 2
     assert sorted(back.time_s) == pytest.approx(np.arange(60) / 600)
     assert "degrees per frame" in notes[0]
-    write(design(), back, tmp_path / "again.csv")
-    again = read(tmp_path / "again.csv")
+    write_galvo(design(), back, tmp_path / "again.csv")
+    again = read_galvo(tmp_path / "again.csv")
     np.testing.assert_array_equal(again.gate_m, back.gate_m)
     np.testing.assert_allclose(again.direction, back.direction, atol=1e-14)
 
 
 def test_every_column_says_its_unit(tmp_path):
-    write(design(), lay_out(design()), tmp_path / "f.csv")
+    write_galvo(design(), lay_out(design()), tmp_path / "f.csv")
     lines = (tmp_path / "f.csv").read_text().splitlines()
     assert lines[0] == ",".join(COLUMNS)
     assert len(lines) == 61
@@ -201,7 +201,7 @@ def test_every_column_says_its_unit(tmp_path):
 def test_the_rows_follow_each_other_closely(tmp_path):
     own = design(rays=576)
     rays = lay_out(own)
-    write(own, rays, tmp_path / "f.csv")
+    write_galvo(own, rays, tmp_path / "f.csv")
     table = np.genfromtxt(tmp_path / "f.csv", delimiter=",", names=True)
     stops = np.stack([table["x_deg"], table["y_deg"]], axis=1)
     assert travel(stops) < 0.7 * travel(stops[np.argsort(table["ray"])])
@@ -209,19 +209,19 @@ def test_the_rows_follow_each_other_closely(tmp_path):
 
 
 def test_no_rays_make_a_file_without_rows(tmp_path):
-    write(design(), lay_out(design(), 0), tmp_path / "f.csv")
-    assert len(read(tmp_path / "f.csv")) == 0
+    write_galvo(design(), lay_out(design(), 0), tmp_path / "f.csv")
+    assert len(read_galvo(tmp_path / "f.csv")) == 0
 
 
 def test_sensors_at_other_places_are_positions_of_their_own(tmp_path):
     own = design(sensor("a", 3.0, 0.0), sensor("b", 0.5, -0.9, origin=(0.0, 1.0, 2.0)))
     rays = lay_out(own)
-    notes = write(own, rays, tmp_path / "f.csv")
+    notes = write_galvo(own, rays, tmp_path / "f.csv")
     assert any("2 places" in note for note in notes)
     table = np.genfromtxt(tmp_path / "f.csv", delimiter=",", names=True)
     assert (np.diff(table["position"]) >= 0).all()
     np.testing.assert_array_equal(table["sensor"], table["position"])
-    np.testing.assert_allclose(read(tmp_path / "f.csv").direction, rays.direction, atol=1e-14)
+    np.testing.assert_allclose(read_galvo(tmp_path / "f.csv").direction, rays.direction, atol=1e-14)
 
 
 def test_rays_of_a_sensor_that_start_at_many_places_are_refused(tmp_path):
@@ -230,7 +230,7 @@ def test_rays_of_a_sensor_that_start_at_many_places_are_refused(tmp_path):
     moved[:7, 1] += np.arange(7) * 0.01
     rays = Rays(moved, base.direction, base.gate_m, base.sensor, base.time_s)
     with pytest.raises(ConfigError, match="sensor 'left' start at 7 places") as caught:
-        write(design(), rays, tmp_path / "f.csv")
+        write_galvo(design(), rays, tmp_path / "f.csv")
     assert "origin.fixed_m" in caught.value.hint
     assert not list(tmp_path.iterdir())
 
@@ -238,7 +238,7 @@ def test_rays_of_a_sensor_that_start_at_many_places_are_refused(tmp_path):
 def test_rays_out_of_reach_are_refused_with_their_number_and_the_worst(tmp_path):
     wide = design(sensor("a", 2.6, 0.0), sensor("b", 3.6, 0.0))
     with pytest.raises(ConfigError, match=r"\d+ of 60 rays are out of the mirrors' reach, the furthest at x = -?3\d\."):
-        write(wide, lay_out(wide), tmp_path / "f.csv")
+        write_galvo(wide, lay_out(wide), tmp_path / "f.csv")
     assert not list(tmp_path.iterdir())
 
 
@@ -246,8 +246,8 @@ def test_rays_exactly_at_the_limit_are_within_reach(tmp_path):
     corners = np.array([[20.0, 20.0], [-20.0, -20.0], [20.0, -20.0], [-20.0, 20.0]])
     looking = scan_directions(degree_frame(180.0, 0.0), corners)
     rays = Rays(np.tile(HERE, (4, 1)), looking, np.tile([0.1, 0.2], (4, 1)), np.zeros(4), np.zeros(4))
-    write(design(sensor("a", np.pi, 0.0)), rays, tmp_path / "f.csv")
-    np.testing.assert_allclose(read(tmp_path / "f.csv").direction, looking, atol=1e-8)
+    write_galvo(design(sensor("a", np.pi, 0.0)), rays, tmp_path / "f.csv")
+    np.testing.assert_allclose(read_galvo(tmp_path / "f.csv").direction, looking, atol=1e-8)
 
 
 BROKEN = {
@@ -272,10 +272,10 @@ BROKEN = {
 @pytest.mark.parametrize("name", BROKEN)
 def test_a_damaged_file_is_refused_where_it_is_damaged(tmp_path, name):
     damage, message = BROKEN[name]
-    write(design(), lay_out(design()), tmp_path / "f.csv")
+    write_galvo(design(), lay_out(design()), tmp_path / "f.csv")
     (tmp_path / "f.csv").write_text(damage((tmp_path / "f.csv").read_text()))
     with pytest.raises(DataError, match=message):
-        read(tmp_path / "f.csv")
+        read_galvo(tmp_path / "f.csv")
 
 
 def test_bytes_that_are_no_text_and_no_file_at_all_are_refused(tmp_path):
@@ -283,7 +283,7 @@ def test_bytes_that_are_no_text_and_no_file_at_all_are_refused(tmp_path):
     for path in (tmp_path / "f.csv", tmp_path / "absent.csv", tmp_path):
         assert not is_galvo_file(path)
         with pytest.raises(DataError):
-            read(path)
+            read_galvo(path)
 
 
 def test_the_program_exports_and_says_what_the_mirrors_travel(capsys, tmp_path, monkeypatch):

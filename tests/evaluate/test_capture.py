@@ -27,7 +27,7 @@ from lidardesign.evaluate.captures.scan import (
     whole_window,
 )
 from lidardesign.evaluate.captures.score import CaptureSettings, evaluate_capture
-from lidardesign.export.galvo import read, write
+from lidardesign.export.galvo import read_galvo, write_galvo
 from lidardesign.geometry.rays import Rays
 
 BIN_M = BIN_PS * C_M_PER_PS / 2
@@ -337,15 +337,15 @@ def test_fields_across_azimuth_zero_and_behind_are_one_field(tmp_path):
 
 def test_the_export_of_a_design_measures_what_the_design_does(noisy, tmp_path):
     rays = lay_out(ball_design())
-    write(ball_design(), rays, tmp_path / "ball.galvo.csv")
-    again = read(tmp_path / "ball.galvo.csv")
+    write_galvo(ball_design(), rays, tmp_path / "ball.galvo.csv")
+    again = read_galvo(tmp_path / "ball.galvo.csv")
     pixels = [scan(noisy, one, 0.1, Estimation()).pixel for one in (rays, again)]
     np.testing.assert_array_equal(*pixels)
 
 
 def test_a_capture_of_the_exported_rays_alone_is_enough(tmp_path):
-    write(ball_design(), lay_out(ball_design()), tmp_path / "ball.galvo.csv")
-    rays = read(tmp_path / "ball.galvo.csv")
+    write_galvo(ball_design(), lay_out(ball_design()), tmp_path / "ball.galvo.csv")
+    rays = read_galvo(tmp_path / "ball.galvo.csv")
     counts = np.zeros((len(rays), 600), np.uint8)
     known = ball_range_m(rays.direction)
     counts[np.arange(len(rays)), ((2 * known / C_M_PER_PS - START_PS) / BIN_PS).astype(int)] = 9
@@ -362,7 +362,7 @@ def test_a_capture_of_the_exported_rays_alone_is_enough(tmp_path):
 def call(capsys, tmp_path, monkeypatch, files):
     run = caller(capsys, tmp_path, monkeypatch)
     save_design(ball_design(), tmp_path / "ball.yaml")
-    write(ball_design(), lay_out(ball_design()), tmp_path / "ball.galvo.csv")
+    write_galvo(ball_design(), lay_out(ball_design()), tmp_path / "ball.galvo.csv")
     for path in files.iterdir():
         (tmp_path / path.name).symlink_to(path)
     return run

@@ -10,7 +10,7 @@ from lidardesign.design.files import load_design
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.export.common.columns import ray_columns
+from lidardesign.export.ray_lists import ray_columns
 from lidardesign.export.registry import EXPORTERS, find_exporter
 
 

@@ -356,7 +356,7 @@ def test_a_document_type_is_refused(tmp_path):
     path = tmp_path / "x.xml"
     path.write_text('<!DOCTYPE mujoco [<!ENTITY a "b">]><mujoco>&a;</mujoco>')
     with pytest.raises(DataError, match="document type"):
-        mjcf.read(path)
+        mjcf.read_mjcf(path)
 
 
 @pytest.mark.parametrize("name", ["mjcf", "sdf", "urdf", "xacro"])

@@ -11,8 +11,8 @@ from lidardesign.design.galvo import SPEED_OF_LIGHT_M_PER_PS
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import DataError
-from lidardesign.export import csv, npz
-from lidardesign.export.common.read_back import angles_between, rays_rounding
+from lidardesign.export.common.poses import angles_between, rays_rounding
+from lidardesign.export.ray_lists import read_csv, read_npz
 from lidardesign.export.registry import EXPORTERS
 
 ROUNDING = 1e-15
@@ -42,12 +42,12 @@ def test_every_format_says_what_its_numbers_lose(tmp_path, name):
         )
 
 
-@pytest.mark.parametrize("module", [csv, npz])
+@pytest.mark.parametrize(("name", "read"), [("csv", read_csv), ("npz", read_npz)])
 @pytest.mark.parametrize("count", [0, 1, 37])
-def test_ray_lists_are_read_as_they_were(tmp_path, module, count):
+def test_ray_lists_are_read_as_they_were(tmp_path, name, read, count):
     rays = RAYS.subset(np.arange(count))
-    module.write(design(), rays, tmp_path / "rays")
-    found = module.read(tmp_path / "rays")
+    EXPORTERS[name].write(design(), rays, tmp_path / "rays")
+    found = read(tmp_path / "rays")
     for name in ("origin_m", "direction", "gate_m", "sensor", "time_s"):
         np.testing.assert_array_equal(getattr(found, name), getattr(rays, name))
 
@@ -85,15 +85,15 @@ def test_angles_are_exact_from_the_smallest_to_the_largest(angle):
     assert angles_between(first, second)[0] == pytest.approx(angle, rel=1e-7)
 
 
-@pytest.mark.parametrize("module", [csv, npz])
-def test_damage_is_found(tmp_path, module):
+@pytest.mark.parametrize("name", ["csv", "npz"])
+def test_damage_is_found(tmp_path, name):
     path = tmp_path / "rays"
-    module.write(design(), RAYS, path)
+    EXPORTERS[name].write(design(), RAYS, path)
     whole = path.read_bytes()
     for damage in (b"", b"nonsense", whole[: len(whole) // 2]):
         path.write_bytes(damage)
         with pytest.raises(DataError, match="rays"):
-            module.rounding(design(), RAYS, path)
-    module.write(design(), RAYS.subset(np.arange(5)), path)
+            EXPORTERS[name].rounding(design(), RAYS, path)
+    EXPORTERS[name].write(design(), RAYS.subset(np.arange(5)), path)
     with pytest.raises(DataError, match="5 of 37 rays"):
-        module.rounding(design(), RAYS, path)
+        EXPORTERS[name].rounding(design(), RAYS, path)

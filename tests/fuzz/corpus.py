@@ -21,9 +21,7 @@ from lidardesign.design.files import design_document
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.rigs.sensor_csv import QUERY_COLUMN, write_sensor_csv
 from lidardesign.design.sensor import Coupling, DesignSpec, Sensor, Track
-from lidardesign.export import csv as csv_format
-from lidardesign.export import galvo
-from lidardesign.export import npz as npz_format
+from lidardesign.export import galvo, ray_lists
 from lidardesign.geometry.rays import Rays
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import note, read_manifest
@@ -228,21 +226,21 @@ def captures_hdf5(_: Path) -> list[bytes]:
 def steering_lists(folder: Path) -> list[bytes]:
     """Ray lists for a scanner."""
     design = sample_designs()[0]
-    galvo.write(design, lay_out(design), folder / "rays.galvo.csv")
+    galvo.write_galvo(design, lay_out(design), folder / "rays.galvo.csv")
     return [(folder / "rays.galvo.csv").read_bytes()]
 
 
 def ray_tables(folder: Path) -> list[bytes]:
     """Ray lists as text."""
     design = sample_designs()[1]
-    csv_format.write(design, lay_out(design), folder / "rays.csv")
+    ray_lists.write_csv(design, lay_out(design), folder / "rays.csv")
     return [(folder / "rays.csv").read_bytes()]
 
 
 def ray_archives(folder: Path) -> list[bytes]:
     """Ray lists as numpy archives."""
     design = sample_designs()[1]
-    npz_format.write(design, lay_out(design), folder / "rays.npz")
+    ray_lists.write_npz(design, lay_out(design), folder / "rays.npz")
     return [(folder / "rays.npz").read_bytes()]
 
 

@@ -149,21 +149,21 @@ def read_steering(path: Path) -> object:
     """As `capture` does with an exported list."""
     from lidardesign.export import galvo
 
-    return galvo.read(path)
+    return galvo.read_galvo(path)
 
 
 def read_ray_table(path: Path) -> object:
     """As `export --format csv` reads back."""
-    from lidardesign.export import csv
+    from lidardesign.export.ray_lists import read_csv
 
-    return csv.read(path)
+    return read_csv(path)
 
 
 def read_ray_archive(path: Path) -> object:
     """As `export --format npz` reads back."""
-    from lidardesign.export import npz
+    from lidardesign.export.ray_lists import read_npz
 
-    return npz.read(path)
+    return read_npz(path)
 
 
 def read_robot(path: Path) -> object:

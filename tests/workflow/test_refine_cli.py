@@ -19,7 +19,7 @@ from lidardesign.design.fit import fit
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.evaluate.refinement.reweighting import Reweighting
 from lidardesign.evaluate.scene_scores import checked_score
-from lidardesign.export.npz import read
+from lidardesign.export.ray_lists import read_npz
 from lidardesign.geometry.rays import Rays
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest
@@ -284,7 +284,7 @@ def test_export_lays_a_weighted_design_out_by_the_same_weighted_samples(lidardes
     result = lidardesign("export", weighted, "--format", "npz", "--rays", 20, "--out", out)
     assert result.code == 0, result.err
     rays = by_hand(weighted, flat, 20)
-    written = read(out)
+    written = read_npz(out)
     np.testing.assert_array_equal(written.gate_m, rays.gate_m)
     np.testing.assert_allclose(written.direction, rays.direction, atol=1e-12)
 

@@ -157,7 +157,7 @@ def _rays(path: Path, count: int | None, at: dict[str, float], seed: int, consol
 
 def _listed_rays(path: Path, count: int | None, at: dict[str, float], seed: int, console: Output) -> Rays:
     from lidardesign.cli.commands.export import design_and_rays
-    from lidardesign.export.galvo import is_galvo_file, read
+    from lidardesign.export.galvo import is_galvo_file, read_galvo
 
     if not is_there(path):
         raise DataError("no such design", where=str(path), hint="give design files or files of export --format galvo")
@@ -169,7 +169,7 @@ def _listed_rays(path: Path, count: int | None, at: dict[str, float], seed: int,
                 allowed="a design file with --rays and --at",
                 hint="leave them out",
             )
-        return read(path)
+        return read_galvo(path)
     return design_and_rays(read_design(path, console), path, "galvo", count, at, seed, console)[1]
 
 

@@ -2,8 +2,6 @@
 
 Rays of any layout are replaced by the grid of about as many rays that is nearest to them. Azimuth and elevation are
 those of the sensor's own frame: x forward, y to the left, z up.
-
-Sensors that can only fire even grids: which grid stands for a sensor's rays, and what that costs.
 """
 
 from __future__ import annotations
@@ -15,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidardesign.design.sensor import DesignSpec
-from lidardesign.export.common.poses import Mount, design_losses, gate_losses, origin_losses
-from lidardesign.export.common.read_back import angles_between
+from lidardesign.export.common.poses import Mount, angles_between, design_losses, gate_losses, origin_losses
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.space import direction
@@ -104,12 +101,10 @@ def _row_counts(azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> list[int]
     middle = min(max(round(square), 1), count)
     low = max(middle - TRIED_ROWS // 2, 1)
     tried = set(range(low, min(low + TRIED_ROWS, count) + 1))
-    distinct = len(np.unique(np.round(elevation_rad / ON_GRID_RAD / 2)))
-    return sorted({1, *tried, distinct, max(round(count / max(_distinct_azimuths(azimuth_rad), 1)), 1)})
-
-
-def _distinct_azimuths(azimuth_rad: np.ndarray) -> int:
-    return len(np.unique(np.round(azimuth_rad / ON_GRID_RAD / 2)))
+    azimuths, elevations = (
+        len(np.unique(np.round(values / ON_GRID_RAD / 2))) for values in (azimuth_rad, elevation_rad)
+    )
+    return sorted({1, *tried, elevations, max(round(count / max(azimuths, 1)), 1)})
 
 
 def _fitted(values: np.ndarray, count: int) -> tuple[float, float]:
@@ -134,8 +129,8 @@ def _nearest(values: np.ndarray, bounds: tuple[float, float], count: int) -> np.
     return low + index * ((high - low) / (count - 1))
 
 
-# So many sensors are told apart in the notes.
-TOLD = 4
+# So many sensors are named in the notes.
+MOST_NAMED = 4
 
 
 def grid_of(mount: Mount) -> EvenGrid:
@@ -166,8 +161,8 @@ def grid_losses(mounted: Sequence[Mount], rays: Rays) -> list[str]:
         return []
     count = sum(int((distance > ON_GRID_RAD).sum()) for _, _, distance in off)
     worst = math.degrees(max(float(distance.max()) for _, _, distance in off))
-    grids = ", ".join(f"{grid.columns} x {grid.rows} of {mount.name}" for mount, grid, _ in off[:TOLD])
-    more = f", and those of {len(off) - TOLD} more sensors" if len(off) > TOLD else ""
+    grids = ", ".join(f"{grid.columns} x {grid.rows} of {mount.name}" for mount, grid, _ in off[:MOST_NAMED])
+    more = f", and those of {len(off) - MOST_NAMED} more sensors" if len(off) > MOST_NAMED else ""
     fired = len(rays) + sum(len(grid) - len(mount.ray) for mount, grid, _ in off)
     total = "" if fired == len(rays) else f", {fired} rays in all"
     return [

@@ -1,7 +1,4 @@
-"""Names of designs and sensors as other programs take them: plain identifiers, or text without control characters.
-
-Formats of several files: a folder whose files are each whole or absent.
-"""
+"""Names as other programs take them, and folders of files: each is whole or absent."""
 
 from __future__ import annotations
 

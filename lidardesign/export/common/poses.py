@@ -1,17 +1,17 @@
-"""Where sensors are mounted and which rays they fire from there, as robots and simulators hold it.
+"""Sensors and rays as other programs hold them: at mounting poses, or by the places where rays start.
 
 A mount has the sensor's place and boresight frame: x forward, y to the left (growing azimuth), z up. By fixed axes
 (URDF, SDF) its rotation is roll = the sensor's roll, pitch = -elevation, yaw = azimuth. The rays are given in that
-frame. What starts elsewhere than at its sensor's place is told in notes, and so are gates of single rays.
-
-Rays by the place where they start, and rays that were read place by place.
+frame. What formats lose becomes notes (`*_losses`); what their numbers lose is measured by reading files back
+(`*_rounding`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -19,10 +19,83 @@ from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import DataError
 from lidardesign.estimates import ROUNDING, Estimate
 from lidardesign.export.common.names import identifiers
-from lidardesign.export.common.read_back import angles_between
 from lidardesign.geometry.rays import DEFAULT_RATE_HZ, Rays
 from lidardesign.numerics import SLACK
-from lidardesign.space import angles
+from lidardesign.space import angles, direction
+
+
+def rays_rounding(written: Rays, found: Rays, path: Path, *, times: bool = True) -> dict[str, Estimate]:
+    """The largest differences of rays that were read back, ray by ray.
+
+    Arguments:
+        written: What went into the file.
+        found: What came out of it.
+        path: The file, for errors.
+        times: Whether the format holds firing times.
+
+    Raises:
+        DataError: The file holds other rays.
+    """
+    if len(written) != len(found) or (written.sensor != found.sensor).any():
+        raise DataError(
+            f"does not hold what was written: {len(found)} of {len(written)} rays came back, or in another order",
+            where=str(path),
+            hint="export it again, to another disk",
+        )
+    origin = np.linalg.norm(found.origin_m - written.origin_m, axis=1)
+    errors = {
+        "origin_m": _largest(origin, "m"),
+        "direction_rad": _largest(angles_between(found.direction, written.direction), "rad"),
+        "gate_m": _largest(np.abs(found.gate_m - written.gate_m), "m"),
+    }
+    return {**errors, "time_s": _largest(np.abs(found.time_s - written.time_s), "s")} if times else errors
+
+
+def sensors_rounding(written: Sequence[Sensor], found: Sequence[Sensor], path: Path) -> dict[str, Estimate]:
+    """The largest differences of sensors that were read back, sensor by sensor.
+
+    Raises:
+        DataError: The file holds another number of sensors.
+    """
+    require_sensors(len(written), len(found), path)
+
+    def differences(read: Callable[[Sensor], object]) -> np.ndarray:
+        return np.array([np.subtract(read(new), read(old)) for old, new in zip(written, found, strict=True)])
+
+    boresights = [
+        direction(*(np.array([getattr(one, name) for one in sensors]) for name in ("azimuth_rad", "elevation_rad")))
+        for sensors in (written, found)
+    ]
+    origin = np.linalg.norm(differences(lambda one: one.origin_m), axis=1)
+    spread = differences(lambda one: (one.spread_horizontal_rad, one.spread_vertical_rad))
+    gate = differences(lambda one: (one.range_m, one.spread_range_m))
+    return {
+        "origin_m": _largest(origin, "m"),
+        "direction_rad": _largest(angles_between(*boresights), "rad"),
+        "spread_rad": _largest(np.abs(spread), "rad"),
+        "range_m": _largest(np.abs(gate), "m"),
+        "weight": _largest(np.abs(differences(lambda one: one.weight)), ""),
+    }
+
+
+def require_sensors(written: int, found: int, path: Path) -> None:
+    """Refuse a file that holds another number of sensors than were written.
+
+    Raises:
+        DataError: It does.
+    """
+    if found != written:
+        raise DataError(f"does not hold what was written: {found} of {written} sensors came back", where=str(path))
+
+
+def angles_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Angles between unit vectors (N, 3) [rad], exact for the smallest too: 2 arcsin(|a - b| / 2), shape (N,)."""
+    return 2 * np.arcsin(np.minimum(np.linalg.norm(first - second, axis=1) / 2, 1.0))
+
+
+def _largest(differences: np.ndarray, unit: str) -> Estimate:
+    return Estimate(None, float(differences.max(initial=0.0)), unit, ROUNDING)
+
 
 # Origins and gates closer than this are the same.
 SAME_M = SLACK
@@ -119,13 +192,16 @@ def fire_times_s(rays: Rays, rate_hz: float) -> np.ndarray:
 
 def design_losses(design: DesignSpec, mounted: Sequence[Mount]) -> list[str]:
     """What no format of mounted sensors holds of a design, and sensors that fire nothing."""
-    notes = ["weights, spreads and origin covariances of the sensors are not held"]
-    if design.constraints:
-        notes.append("the constraints of the design are not held")
+    notes = ["weights, spreads and origin covariances of the sensors are not held", *constraint_losses(design)]
     silent = len(design.sensors) - len(mounted)
     if silent:
         notes.append(f"{silent} of {len(design.sensors)} sensors fire no ray and are left out")
     return notes
+
+
+def constraint_losses(design: DesignSpec) -> list[str]:
+    """What no format but ours holds of a design."""
+    return ["the constraints of the design are not held"] if design.constraints else []
 
 
 def origin_losses(mounted: Sequence[Mount]) -> list[str]:
@@ -160,13 +236,17 @@ class Held:
     gate_m: tuple[float, float]
 
 
-def held_rounding(rays: Rays, mounted: Sequence[Mount], found: Sequence[Held]) -> dict[str, Estimate]:
+def held_rounding(rays: Rays, mounted: Sequence[Mount], found: Sequence[Held], path: Path) -> dict[str, Estimate]:
     """The largest differences from what one place, one gate and other rays make of a sensor's.
 
     A direction is off by the angle to the nearest ray that its sensor fires.
+
+    Raises:
+        DataError: Another number of sensors was read back.
     """
     from scipy.spatial import cKDTree
 
+    require_sensors(len(mounted), len(found), path)
     origin, ray, gate = [0.0], [0.0], [0.0]
     for mount, held in zip(mounted, found, strict=True):
         origin.append(float(np.linalg.norm(rays.origin_m[mount.ray] - held.origin_m, axis=1).max()))

@@ -1,4 +1,4 @@
-"""Writing XML files, and reading back those that were written: escaped by the standard library, no doctype."""
+"""Writing XML files, escaped by the standard library, and reading back those that were written."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from xml.etree.ElementTree import Element
 
 from lidardesign.errors import DataError
 from lidardesign.export.common.names import xml_text
+from lidardesign.run import xml
 from lidardesign.run.files import write_atomic
 
 # A million rays of some 300 bytes.
@@ -68,17 +69,9 @@ def read_xml(path: Path, tag: str) -> Element:
     """The root of a document that `write_xml` wrote.
 
     Raises:
-        DataError: It cannot be read, is no such document, or declares a document type or entities.
+        DataError: It cannot be read, is no such document, or declares a document type.
     """
-    try:
-        if path.stat().st_size > MOST_BYTES:
-            raise DataError("is too large", where=str(path), allowed=f"{MOST_BYTES} bytes")
-        content = path.read_bytes()
-        if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
-            raise DataError("declares a document type, which none of these formats has", where=str(path))
-        root = ElementTree.fromstring(content)
-    except (OSError, ElementTree.ParseError, ValueError) as error:
-        raise DataError(f"cannot be read as XML: {error}", where=str(path)) from error
+    root = xml.read_xml(path, f"a <{tag}> document", largest_bytes=MOST_BYTES, most_elements=MOST_BYTES)
     if root.tag != tag:
         raise DataError(f"is no <{tag}> document but a <{root.tag[:40]}>", where=str(path))
     return root
