@@ -12,7 +12,7 @@ import numpy as np
 from lidardesign.design.bandwidth import split_budget
 from lidardesign.design.constraints.budget import BandwidthBudget, fit_within_budget
 from lidardesign.design.constraints.check import ConstraintCheck, check_design
-from lidardesign.design.constraints.document import MOST_FITTED, Constraints
+from lidardesign.design.constraints.document import MOST_FITTED, Constraints, SensorRules
 from lidardesign.design.constraints.feasibility import check_feasible, most_rays
 from lidardesign.design.constraints.origins import is_mounted, most_mounted, placement_notes, snap_to_space
 from lidardesign.design.fit_result import FitResult, fit_estimates, likelihood_error
@@ -62,6 +62,7 @@ class _Request:
 
     samples: Samples
     constraints: Constraints
+    rules: tuple[SensorRules, ...]
     seed: int
     restarts: int
     em_samples: int
@@ -115,7 +116,7 @@ def fit(
     _check_options(constraints, samples, sensors, layout, rays)
     if samples.space.conditioned:
         return _along_condition(samples, constraints, rays, level, seed, name)
-    request = _Request(samples, constraints, seed, restarts, em_samples, level, retarget)
+    request = _Request(samples, constraints, constraints.rules, seed, restarts, em_samples, level, retarget)
     read_out = BandwidthBudget.of(constraints, rays)
     supports, ensemble, design, snap = _made(request, read_out, sensors, layout, gates or own_gates(layout), name)
     checks = _checked(design, constraints, samples)
@@ -128,7 +129,7 @@ def fit(
         satisfied=all(check.satisfied for check in checks),
         constraints=checks,
         seconds=time.perf_counter() - started,
-        notes=(*moved, *placement_notes(constraints), *ensemble.notes, *(snap.notes if snap else ())),
+        notes=(*moved, *placement_notes(constraints.rules), *ensemble.notes, *(snap.notes if snap else ())),
         error_estimates=fit_estimates(score, supports, samples, design.sensors),
         snap=snap.report if snap else None,
     )
@@ -150,7 +151,7 @@ def _along_condition(
         satisfied=all(check.satisfied for check in checks),
         constraints=checks,
         seconds=time.perf_counter() - started,
-        notes=placement_notes(constraints),
+        notes=placement_notes(constraints.rules),
         error_estimates=fit_estimates(score, [fitted.support], samples, fitted.design.sensors),
     )
 
@@ -164,17 +165,17 @@ def _solved(
     request: _Request, read_out: BandwidthBudget, sensors: int | str | None, layout: Layout
 ) -> tuple[list[Support], tuple[Sensor, ...], int | None, Ensemble]:
     """Samples, sensors, rays per frame, and the fit that keeps its budget."""
-    constraints, space = request.constraints, request.samples.space
+    space = request.samples.space
     if layout == "scan":
         request = replace(request, em_samples=max(request.em_samples, SAMPLES_PER_RAY * rays_of(read_out)))
         supports = _supports(request, 1)
         part = _features(request, supports, 1)[0]
-        beams, fit = fit_scan(part.features, space, constraints, part.group, read_out, request.level, request.seed)
+        beams, fit = fit_scan(part.features, space, request.rules, part.group, read_out, request.level, request.seed)
         return supports, beams, len(beams), fit
     supports, ensemble = _fitted(request, sensors, read_out.rays)
     ensemble, total = fit_within_budget(ensemble, Ensemble.narrowed, lambda e: (e.widths_m, e.weights), read_out)
     fitted = add_couplings(ensemble, sensors_of(ensemble, space, request.level))
-    if not constraints.each:
+    if len(request.rules) == 1:
         fitted = heaviest_first(fitted)
     return supports, fitted, total, ensemble
 
@@ -183,7 +184,7 @@ def _made(
     request: _Request, read_out: BandwidthBudget, sensors: int | str | None, layout: Layout, gates: Gates, name: str
 ) -> tuple[list[Support], Ensemble, DesignSpec, SnappedDesign | None]:
     """Samples, what was fitted to them, and the design that it stands for."""
-    if wants_parts(request.constraints):
+    if wants_parts(request.rules):
         supports, snap = _snapped(request, read_out, sensors, name)
         return supports, snap.ensemble, snap.design, snap
     if layout == "density" and gates == "ray" and read_out.rays is not None:
@@ -201,9 +202,9 @@ def _snapped(
     # the parts have gates of their own: the budget is theirs
     free = replace(read_out, limit_mbps=None, rays=None)
     supports, fitted, _, ensemble = _solved(request, free, sensors, "grid")
-    fixed = fix_part_origins(constraints, fitted)
+    fixed = fix_part_origins(request.rules, fitted)
     if fixed is not None:
-        supports, fitted, _, ensemble = _solved(replace(request, constraints=fixed), free, len(fitted), "grid")
+        supports, fitted, _, ensemble = _solved(replace(request, rules=fixed), free, len(fitted), "grid")
     parts = snap_design(ensemble, constraints, space, read_out, level=request.level, seed=request.seed, name=name)
     moved = () if fixed is None else (ONE_PLACE,)
     design = replace(parts.design, at=fixed_conditions(space))
@@ -232,13 +233,13 @@ def _check_options(
             hint=f"--layout scan, or {' '.join(f'--at {condition}=VALUE' for condition in names)}",
         )
     if layout == "scan":
-        if wants_parts(constraints):
+        if wants_parts(constraints.rules):
             raise ConfigError(
                 "every ray of a scan is a sensor of its own, and no part has a single steered ray",
                 where="snap",
                 hint="--layout grid --sensors N",
             )
-        if is_mounted(constraints):
+        if is_mounted(constraints.rules):
             raise ConfigError(
                 "the rays of a scan have origins of their own",
                 where="--layout scan",
@@ -262,7 +263,7 @@ def _sensor_counts(constraints: Constraints, sensors: int | str | None, rays: in
     if isinstance(sensors, int) or asked.count is not None:
         return [sensors if isinstance(sensors, int) else int(asked.count or 1)]
     low = max(asked.min or 1, len(constraints.each), 1)
-    mounted = most_mounted(constraints)
+    mounted = most_mounted(constraints.rules)
     high = max(MOST_SENSORS, mounted or 0) if asked.max is None else asked.max
     for limit in (mounted, rays, most_rays(constraints)):
         high = high if limit is None else min(high, limit)
@@ -274,12 +275,12 @@ def _sensor_counts(constraints: Constraints, sensors: int | str | None, rays: in
 
 def _fitted(request: _Request, sensors: int | str | None, rays: int | None) -> tuple[list[Support], Ensemble]:
     counts = _sensor_counts(request.constraints, sensors, rays)
-    if is_mounted(request.constraints):
-        fixed, counts = choose_mounts(request.constraints, request.samples, counts, request.retarget, request.seed)
-        request = replace(request, constraints=fixed)
+    if is_mounted(request.rules):
+        fixed, counts = choose_mounts(request.rules, request.samples, counts, request.retarget, request.seed)
+        request = replace(request, rules=fixed)
     supports = _supports(request, counts[-1])
     count = counts[0] if len(counts) == 1 else _chosen_count(request, supports, counts)
-    kept = supports if len(supports) == len(groups(request.constraints, request.samples.space, count)) else None
+    kept = supports if len(supports) == len(groups(request.rules, request.samples.space, count)) else None
     supports = kept or _supports(request, count)
     return supports, fit_parts(_features(request, supports, count), request.seed, request.restarts)
 
@@ -288,15 +289,15 @@ def _fitted(request: _Request, sensors: int | str | None, rays: int | None) -> t
 def _supports(request: _Request, count: int) -> list[Support]:
     """The samples of each group of sensors, refused where they are too few."""
     found = []
-    members = groups(request.constraints, request.samples.space, count)
+    members = groups(request.rules, request.samples.space, count)
     for index, group in enumerate(members):
         free = all(pin is None for pin in group.pins)
         if free:
-            support = restrict_samples(request.samples, request.constraints, group)
+            support = restrict_samples(request.samples, request.rules, group)
         else:
             generator = random_generator(request.seed, "pinned", index)
             support = pin_samples(
-                request.samples, request.constraints, group, request.retarget, request.em_samples, generator
+                request.samples, request.rules, group, request.retarget, request.em_samples, generator
             )
         mass = support.total if free else None
         check_support(support, group, mass=mass, several=len(members) > 1)
@@ -318,7 +319,7 @@ def _features(request: _Request, supports: list[Support], count: int) -> list[Gr
     measure is another, they share by numbers of sensors.
     """
     space = request.samples.space
-    members = groups(request.constraints, space, count)
+    members = groups(request.rules, space, count)
     shares = np.array([len(group.sensors) for group in members], dtype=np.float64) / count
     is_pinned = np.array([any(pin is not None for pin in group.pins) for group in members])
     totals = np.array([support.total for support in supports])
@@ -328,7 +329,7 @@ def _features(request: _Request, supports: list[Support], count: int) -> list[Gr
     for index, (group, support) in enumerate(zip(members, supports, strict=True)):
         points, weights = _thinned(support, request.em_samples, random_generator(request.seed, "em", index))
         features = Features.of(points, weights, Axes.of(space, group.pins), space)
-        bounds = bounds_of(request.constraints, space, group.sensors, request.interval)
+        bounds = bounds_of(request.rules, space, group.sensors, request.interval)
         parts.append(GroupSamples(group, float(shares[index]), features, bounds))
     return parts
 
@@ -346,7 +347,7 @@ def _chosen_count(request: _Request, supports: list[Support], counts: list[int])
     scores: dict[int, tuple[float, float]] = {}
     waiting, best = 0, -math.inf
     for count in counts:
-        if len(groups(request.constraints, request.samples.space, count)) != len(supports):
+        if len(groups(request.rules, request.samples.space, count)) != len(supports):
             continue
         train, test = _split(_features(request, supports, count), request.seed)
         mean, error = fit_parts(train, request.seed, request.restarts).held_out(test)

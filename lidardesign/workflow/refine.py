@@ -158,8 +158,8 @@ class Fitter:
             return False
         if constraints is None:
             return True
-        members = groups(constraints, self.base.space, max(len(constraints.each), 1) + 1)
-        return not is_mounted(constraints) and all(pin is None for group in members for pin in group.pins)
+        members = groups(constraints.rules, self.base.space, max(len(constraints.each), 1) + 1)
+        return not is_mounted(constraints.rules) and all(pin is None for group in members for pin in group.pins)
 
 
 def fitted(order: FitOrder, weighting: Weighting, console: Output) -> tuple[FitResult, Weighting]:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from lidardesign.design.constraints.check import check_design
-from lidardesign.design.constraints.document import Constraints, DistanceRange, Gate
+from lidardesign.design.constraints.document import Constraints, DistanceRange, Gate, rules_of
 from lidardesign.design.constraints.feasibility import check_feasible
 from lidardesign.design.files import design_document, design_from_document
 from lidardesign.design.fit import fit
@@ -224,10 +224,10 @@ def test_entries_of_each_lie_over_the_common_keys():
         "each": [{"gate": {"width_m": {"max": 0.2}}}, {}],
     }
     constraints = Constraints.from_mapping(values)
-    assert constraints.of_sensor(0).gate.width_m.max == 0.2
-    assert constraints.of_sensor(0).gate.width_m.min == 0.1
-    assert constraints.of_sensor(1).gate.width_m.max == 0.5
-    assert constraints.of_sensor(7).gate.width_m.max == 0.5
+    assert rules_of(constraints.rules, 0).gate.width_m.max == 0.2
+    assert rules_of(constraints.rules, 0).gate.width_m.min == 0.1
+    assert rules_of(constraints.rules, 1).gate.width_m.max == 0.5
+    assert rules_of(constraints.rules, 7).gate.width_m.max == 0.5
     assert constraints.as_document() == values
 
 
@@ -235,11 +235,11 @@ def test_an_entry_of_each_is_named_where_a_key_stands_in_it():
     constraints = Constraints.from_mapping(
         {"gate": {"width_m": {"min": 0.1}}, "each": [{"gate": {"width_m": {"max": 0.2}}}, {}]}
     )
-    assert constraints.name_of(0, "gate.width_m.max") == "each[0].gate.width_m.max"
-    assert constraints.name_of(0, "gate.width_m.min") == "gate.width_m.min"
-    assert constraints.name_of(0, "gate.width_m.max.deeper") == "gate.width_m.max.deeper"
-    assert constraints.name_of(1, "gate.width_m.max") == "gate.width_m.max"
-    assert constraints.name_of(2, "gate.width_m.max") == "gate.width_m.max"
+    assert rules_of(constraints.rules, 0).path("gate.width_m.max") == "each[0].gate.width_m.max"
+    assert rules_of(constraints.rules, 0).path("gate.width_m.min") == "gate.width_m.min"
+    assert rules_of(constraints.rules, 0).path("gate.width_m.max.deeper") == "gate.width_m.max.deeper"
+    assert rules_of(constraints.rules, 1).path("gate.width_m.max") == "gate.width_m.max"
+    assert rules_of(constraints.rules, 2).path("gate.width_m.max") == "gate.width_m.max"
 
 
 def test_a_document_holds_what_was_given_and_no_more():

@@ -157,7 +157,7 @@ def test_pinning_a_free_origin_needs_the_target():
 
 def test_samples_of_a_pinned_origin_have_the_density_seen_from_there():
     where = [0.04, -0.03, 0.02]
-    rules = constrained(origin={"fixed_m": where})
+    rules = constrained(origin={"fixed_m": where}).rules
     support = pin_samples(MOVING, rules, Group(tuple(where), (0,)), log_target, 8000, np.random.default_rng(0))
     weights = support.weights / support.weights.sum()
     fixed = DesignSpace((*where, *FREE.low[3:]), (*where, *FREE.high[3:]))
@@ -201,7 +201,7 @@ def test_a_thin_box_pins_one_coordinate():
 
 
 def test_the_support_outside_the_gate_is_left_out():
-    rules = constrained(gate={"end_m": {"max": 0.6}})
+    rules = constrained(gate={"end_m": {"max": 0.6}}).rules
     support = restrict_samples(FIXED, rules, Group((None, None, None), (0,)))
     assert support.points[:, 5].max() <= 0.6
     assert support.total == pytest.approx(FIXED.weights[FIXED.points[:, 5] <= 0.6].sum())

@@ -156,11 +156,11 @@ def test_a_matching_is_found_exactly_where_one_exists(options):
 
 
 def test_the_number_of_sensors_is_limited_only_where_all_of_them_are_mounted():
-    assert most_mounted(Constraints.from_mapping({})) is None
-    assert most_mounted(Constraints.from_mapping({"each": [{"origin": {"mounts_m": MOUNTS}}, {}]})) is None
-    assert most_mounted(Constraints.from_mapping({"origin": {"mounts_m": MOUNTS}})) == 4
+    assert most_mounted(Constraints.from_mapping({}).rules) is None
+    assert most_mounted(Constraints.from_mapping({"each": [{"origin": {"mounts_m": MOUNTS}}, {}]}).rules) is None
+    assert most_mounted(Constraints.from_mapping({"origin": {"mounts_m": MOUNTS}}).rules) == 4
     shared = {"origin": {"mounts_m": MOUNTS}, "each": [{"origin": {"mounts_m": [MOUNTS[0]]}}]}
-    assert most_mounted(Constraints.from_mapping(shared)) == 4
+    assert most_mounted(Constraints.from_mapping(shared).rules) == 4
 
 
 def test_a_sensor_with_one_mount_keeps_it_though_another_would_see_more_from_there():

@@ -40,7 +40,7 @@ interval_drawn = st.tuples(st.tuples(coordinate, coordinate, coordinate), st.tup
 
 
 def one_with(boxes, **origin):
-    return Constraints.from_mapping({"origin": {"exclude": boxes, **origin}}).of_sensor(0)
+    return Constraints.from_mapping({"origin": {"exclude": boxes, **origin}}).rules[0]
 
 
 def reaches_into(low, high, box):
@@ -298,15 +298,15 @@ def test_old_parameters_are_kept_where_nothing_is_better():
 @given(boxes_drawn, st.integers(1, 4), st.integers(0, 1000), st.sampled_from([None, 0.4]))
 def test_the_likelihood_never_falls_and_all_iterates_keep_out(boxes, count, number, spread):
     constraints = Constraints.from_mapping({"origin": {"exclude": boxes, "spread_m": {"max": spread}}})
-    if not len(free_boxes(constraints.of_sensor(0), SPACE).low_m):
+    if not len(free_boxes(constraints.rules[0], SPACE).low_m):
         return
     generator = np.random.default_rng(number)
     points = SPACE.sample(400, generator)
-    points = points[~inside_excluded(points[:, :3], constraints.of_sensor(0))]
+    points = points[~inside_excluded(points[:, :3], constraints.rules[0])]
     if len(points) < 30:
         return
     features = Features.of(points, np.ones(len(points)), Axes.of(SPACE), SPACE)
-    bounds = bounds_of(constraints, SPACE, tuple(range(count)), Z)
+    bounds = bounds_of(constraints.rules, SPACE, tuple(range(count)), Z)
     trace = run_em(seed_mixture(features, bounds, generator), features, bounds, iterations=15)
     assert (np.diff(trace.history) >= 0).all()
     assert Floors.of(features).origin_m > 0

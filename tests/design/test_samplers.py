@@ -259,8 +259,8 @@ def bump(points):
 
 def restricted_draws(document, space=BOX, log_p_star=bump, count=8000):
     samples, constraints = samples_of(log_p_star, space), Constraints.from_mapping(document)
-    (group,) = groups(constraints, space, 1)
-    support = restrict_samples(samples, constraints, group)
+    (group,) = groups(constraints.rules, space, 1)
+    support = restrict_samples(samples, constraints.rules, group)
     drawn = support.points[systematic_draw(support.weights, count, np.random.default_rng(10))]
     return support, drawn
 
@@ -342,8 +342,8 @@ def test_draws_from_a_pinned_origin_have_the_density_at_that_origin():
 
     samples = samples_of(log_p_star, space)
     constraints = Constraints.from_mapping({"origin": {"fixed_m": [0.04, 0, 0]}})
-    (group,) = groups(constraints, space, 1)
-    support = pin_samples(samples, constraints, group, log_p_star, 60_000, np.random.default_rng(11))
+    (group,) = groups(constraints.rules, space, 1)
+    support = pin_samples(samples, constraints.rules, group, log_p_star, 60_000, np.random.default_rng(11))
     drawn = support.points[systematic_draw(support.weights, 4000, np.random.default_rng(12))]
     assert (drawn[:, 0] == 0.04).all()
     edges = [np.linspace(-0.8, 0.8, 15), np.linspace(-0.7, 0.7, 13), np.linspace(0.5, 2.0, 13)]

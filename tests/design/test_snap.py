@@ -102,12 +102,12 @@ def test_the_key_is_written_as_it_was_given(values):
     constraints = Constraints.from_mapping(values)
     assert constraints.as_document() == values
     assert Constraints.from_mapping(constraints.as_document()).as_document() == values
-    assert wants_parts(constraints)
+    assert wants_parts(constraints.rules)
 
 
 def test_an_empty_mapping_is_the_short_form():
     assert Constraints.from_mapping({"snap": {}}).as_document() == {"snap": "catalog"}
-    assert not wants_parts(Constraints.from_mapping({"gate": {"width_m": {"max": 1.0}}}))
+    assert not wants_parts(Constraints.from_mapping({"gate": {"width_m": {"max": 1.0}}}).rules)
 
 
 @pytest.mark.parametrize(
@@ -185,7 +185,7 @@ RULES = st.fixed_dictionaries(
 @given(rules=RULES)
 def test_a_sensor_may_become_the_parts_whose_own_figures_keep_its_constraints(rules):
     constraints = Constraints.from_mapping({"snap": {"otherwise": "keep"}, **rules})
-    (found,) = part_options(constraints, SPACE, [1.5])
+    (found,) = part_options(constraints.rules, SPACE, [1.5])
     expected = {part.name for part in parts_of(constraints.snap) if naive_keeps(part, rules)}
     assert {shape.part.name for shape in found.shapes} == expected
     assert bool(found.lacking) == (not expected)
@@ -289,7 +289,7 @@ def fitted_ensemble(sensors=2):
     """A fit of the samples, as snapping is given it."""
     from lidardesign.design import fit as module
 
-    request = module._Request(samples(), Constraints(), 1, 4, 20_000, 0.95, None)
+    request = module._Request(samples(), Constraints(), Constraints().rules, 1, 4, 20_000, 0.95, None)
     return module._solved(request, BandwidthBudget.of(Constraints(), None), sensors, "grid")[3]
 
 

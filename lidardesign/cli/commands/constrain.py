@@ -101,7 +101,7 @@ def _usual(constraints: Constraints, design: DesignSpec | None, run: Run) -> str
     from lidardesign.design.sensor import fitted_layout
     from lidardesign.design.snap.parts import wants_parts
 
-    if wants_parts(constraints):
+    if wants_parts(constraints.rules):
         return "grid"
     return fitted_layout(design.layout) if design else usual_layout(run)
 
@@ -131,10 +131,9 @@ def check_parts(constraints: Constraints) -> None:
     """
     from lidardesign.design.snap.parts import parts_of
 
-    for index in range(len(constraints.each) + 1):
-        snap = constraints.of_sensor(index).snap
-        if snap is not None and snap.parts is not None:
-            parts_of(snap)
+    for rules in constraints.rules:
+        if rules.snap is not None and rules.snap.parts is not None:
+            parts_of(rules.snap)
 
 
 def load_constraints(file: Path | None, overrides: list[str], console: Output | None = None) -> Constraints:
@@ -176,7 +175,7 @@ def _sensors(given: Any, constraints: Constraints, design: DesignSpec | None, us
     asked = constraints.sensors
     if given is not None or asked.count is not None:
         return given if given is not None else asked.count
-    if is_mounted(constraints):
+    if is_mounted(constraints.rules):
         # the mounts say how many
         return None
     usual = max(len(design.sensors) if design else usual, len(constraints.each))
@@ -193,7 +192,7 @@ def _rays(
     """The number of rays: the option's, then the constraints', the design's; a ray table needs one, parts have some."""
     from lidardesign.design.snap.parts import wants_parts
 
-    if given is not None or wants_parts(constraints):
+    if given is not None or wants_parts(constraints.rules):
         return given
     if constraints.budget.rays is not None:
         return constraints.budget.rays

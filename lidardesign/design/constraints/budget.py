@@ -42,8 +42,8 @@ class BandwidthBudget:
         """The read-out that a constraint file and an option ask for."""
         budget = constraints.budget
         names = ["budget.rays"] if budget.rays is not None else ["--rays"] if rays is not None else []
-        for index in range(len(constraints.each) + 1):
-            names += least_width(constraints, index)[1]
+        for rules in constraints.rules:
+            names += least_width(rules)[1]
         model = Bandwidth(budget.bin_ps, budget.bits_per_bin, budget.rate_hz)
         wanted = budget.rays if rays is None else rays
         return cls(model, budget.bandwidth_mbps, wanted, tuple(dict.fromkeys(names)))

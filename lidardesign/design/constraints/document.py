@@ -19,7 +19,9 @@ Entries of `each` apply to the first, second, ... sensor over the common keys.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -202,6 +204,34 @@ class SensorConstraints(_Keys):
     snap: Snap | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class SensorRules:
+    """What one sensor must keep, its entry of `each` laid over the common keys, and where the file says so.
+
+    Arguments:
+        origin, boresight, field_of_view, gate, snap: The bounds.
+        index: The sensor's place in the design; of the last rules, that of the first sensor beyond `each`.
+        own_keys: The keys, as `gate.width_m.max`, that its own entry has.
+    """
+
+    origin: Origin
+    boresight: Boresight
+    field_of_view: FieldOfViewRange
+    gate: Gate
+    snap: Snap | None
+    index: int
+    own_keys: frozenset[str]
+
+    def path(self, key: str) -> str:
+        """Where the file has one of the keys, as `each[1].gate.width_m.max`."""
+        return f"each[{self.index}].{key}" if key in self.own_keys else key
+
+
+def rules_of(rules: Sequence[SensorRules], sensor: int) -> SensorRules:
+    """The rules of one sensor; all sensors beyond the entries of `each` have the last ones."""
+    return rules[min(sensor, len(rules) - 1)]
+
+
 class Constraints(SensorConstraints):
     """A whole constraint file; every key is optional."""
 
@@ -238,22 +268,17 @@ class Constraints(SensorConstraints):
         given = _without_empty(dict(values or {}))
         return check_model(cls, given, locate or named)
 
-    def of_sensor(self, index: int) -> SensorConstraints:
-        """The constraints of one sensor: its entry of `each` over the common keys."""
+    @cached_property
+    def rules(self) -> tuple[SensorRules, ...]:
+        """What each sensor must keep: by its entry of `each`, and last what every further sensor must."""
         common = self.model_dump(exclude_none=True, include=set(SensorConstraints.model_fields))
-        if index < len(self.each):
-            common = merged(common, self.each[index].model_dump(exclude_none=True))
-        return SensorConstraints.model_validate(common)
-
-    def name_of(self, index: int, key: str) -> str:
-        """The path under which sensor `index` finds `key`, as `each[1].gate.width_m.max`."""
-        if index < len(self.each):
-            values: Any = self.each[index].model_dump(exclude_none=True)
-            for part in key.split("."):
-                values = values.get(part) if isinstance(values, dict) else None
-            if values is not None:
-                return f"each[{index}].{key}"
-        return key
+        rules = []
+        for index, entry in enumerate([*self.each, SensorConstraints()]):
+            own = entry.model_dump(exclude_none=True)
+            resolved = SensorConstraints.model_validate(merged(common, own))
+            keys = frozenset(_key_paths(own)) if index < len(self.each) else frozenset()
+            rules.append(SensorRules(**dict(resolved), index=index, own_keys=keys))
+        return tuple(rules)
 
     def as_document(self) -> dict[str, Any]:
         """The plain values that were given, for the design file."""
@@ -267,6 +292,16 @@ def merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
         both = isinstance(value, Mapping) and isinstance(result.get(key), dict)
         result[key] = merged(result[key], value) if both else value
     return result
+
+
+def _key_paths(values: Mapping[str, Any], prefix: str = "") -> list[str]:
+    """The keys of plain values at every depth, joined by dots."""
+    paths = []
+    for key, value in values.items():
+        paths.append(prefix + key)
+        if isinstance(value, Mapping):
+            paths += _key_paths(value, f"{prefix}{key}.")
+    return paths
 
 
 def _without_empty(values: dict[str, Any]) -> dict[str, Any]:

@@ -18,11 +18,12 @@ Where sensors are asked to stand and where a design space lets them: two numbers
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidardesign.design.constraints.document import Constraints, SensorConstraints
+from lidardesign.design.constraints.document import Constraints, SensorRules, rules_of
 from lidardesign.numerics import HALF_DIGITS, SLACK
 from lidardesign.space import DIMENSIONS, DesignSpace
 
@@ -44,44 +45,44 @@ class Boxes(NamedTuple):
     high_m: np.ndarray
 
 
-def origin_box(one: SensorConstraints, space: DesignSpace) -> tuple[np.ndarray, np.ndarray]:
+def origin_box(rules: SensorRules, space: DesignSpace) -> tuple[np.ndarray, np.ndarray]:
     """The box of a sensor's mean origin inside the design space, (3,) each [m]; a point where it is fixed."""
     low, high = (np.array(bound[:3], dtype=np.float64) for bound in (space.low, space.high))
-    if one.origin.low_m is not None:
-        low = np.maximum(low, one.origin.low_m)
-    if one.origin.high_m is not None:
-        high = np.minimum(high, one.origin.high_m)
-    if one.origin.fixed_m is not None:
-        fixed = np.array(one.origin.fixed_m)
+    if rules.origin.low_m is not None:
+        low = np.maximum(low, rules.origin.low_m)
+    if rules.origin.high_m is not None:
+        high = np.minimum(high, rules.origin.high_m)
+    if rules.origin.fixed_m is not None:
+        fixed = np.array(rules.origin.fixed_m)
         free = np.isin(np.arange(3), space.free)
         low = high = np.where(free, fixed, np.array(space.low[:3]))
     return low, np.maximum(low, high)
 
 
-def excluded(one: SensorConstraints) -> Boxes:
+def excluded_boxes(rules: SensorRules) -> Boxes:
     """The boxes that a sensor's constraints exclude, flat ones included."""
-    boxes = one.origin.exclude or []
+    boxes = rules.origin.exclude or []
     low, high = ([getattr(box, key) for box in boxes] for key in ("low_m", "high_m"))
     return Boxes(np.array(low, dtype=np.float64).reshape(-1, 3), np.array(high, dtype=np.float64).reshape(-1, 3))
 
 
-def inside_excluded(origins_m: np.ndarray, one: SensorConstraints) -> np.ndarray:
+def inside_excluded(origins_m: np.ndarray, rules: SensorRules) -> np.ndarray:
     """Which origins (N, 3) lie in the interior of an excluded box, shape (N,) bool."""
     inside = np.zeros(len(origins_m), dtype=bool)
-    for low, high in zip(*excluded(one), strict=True):
+    for low, high in zip(*excluded_boxes(rules), strict=True):
         inside |= ((origins_m > low) & (origins_m < high)).all(axis=1)
     return inside
 
 
-def free_boxes(one: SensorConstraints, space: DesignSpace) -> Boxes:
+def free_boxes(rules: SensorRules, space: DesignSpace) -> Boxes:
     """The maximal boxes between the excluded ones that hold a sensor's intervals; none where all is excluded.
 
     Where no excluded box meets the origin box they may reach beyond it; along axes without freedom they are the line.
     """
-    low, high = origin_box(one, space)
+    low, high = origin_box(rules, space)
     fixed = high - low <= PINNED_BOX_M
     middle = (low + high) / 2
-    bottoms, tops = excluded(one)
+    bottoms, tops = excluded_boxes(rules)
     held = np.where(fixed, (bottoms < middle) & (middle < tops), bottoms < tops).all(axis=1)
     bottoms, tops = bottoms[held], tops[held]
     inside = (((bottoms < high) & (tops > low)) | fixed).all(axis=1).any()
@@ -143,30 +144,29 @@ def nearest_admitted(origins_m: np.ndarray, low: np.ndarray, high: np.ndarray) -
 Mount = tuple[float, float, float]
 
 
-def mounts_of(constraints: Constraints, sensor: int) -> list[Mount]:
-    """The mounts that one sensor may take, those in an excluded box left out; none where it is not mounted."""
-    one = constraints.of_sensor(sensor)
-    listed = [(x, y, z) for x, y, z in one.origin.mounts_m or []]
-    dropped = inside_excluded(np.array(listed, dtype=np.float64).reshape(-1, 3), one)
-    return [mount for mount, inside in zip(listed, dropped, strict=True) if not inside]
+def mounts_of(rules: SensorRules) -> list[Mount]:
+    """The mounts that a sensor may take, those in an excluded box left out; none where it is not mounted."""
+    listed = [(x, y, z) for x, y, z in rules.origin.mounts_m or []]
+    inside = inside_excluded(np.array(listed, dtype=np.float64).reshape(-1, 3), rules)
+    return [mount for mount, dropped in zip(listed, inside, strict=True) if not dropped]
 
 
-def is_mounted(constraints: Constraints) -> bool:
+def is_mounted(rules: Sequence[SensorRules]) -> bool:
     """Whether any sensor sits at a mount."""
-    return any(mounts_of(constraints, sensor) for sensor in range(len(constraints.each) + 1))
+    return any(mounts_of(one) for one in rules)
 
 
-def most_mounted(constraints: Constraints) -> int | None:
+def most_mounted(rules: Sequence[SensorRules]) -> int | None:
     """The largest number of sensors that all find a mount; None where the number is not limited.
 
     Sensors beyond the entries of `each` share the common list.
     """
-    common = mounts_of(constraints, len(constraints.each))
-    count = len(constraints.each) + len(common)
-    options = [mounts_of(constraints, sensor) for sensor in range(count)]
+    entries, common = len(rules) - 1, mounts_of(rules[-1])
+    count = entries + len(common)
+    options = [mounts_of(rules_of(rules, sensor)) for sensor in range(count)]
     while not mounts_suffice([mounts for mounts in options[:count] if mounts]):
         count -= 1
-    return None if not common and count == len(constraints.each) else count
+    return None if not common and count == entries else count
 
 
 def mounts_suffice(options: Sequence[Sequence[Mount]]) -> bool:
@@ -182,29 +182,28 @@ def mounts_suffice(options: Sequence[Sequence[Mount]]) -> bool:
     return bool((maximum_bipartite_matching(csr_array(admitted), perm_type="column") >= 0).all())
 
 
-def fix_origins(constraints: Constraints, places: Sequence[Mount | None]) -> Constraints:
-    """The constraints with sensor i fixed at the i-th place, and no mounts left to choose."""
-    each = []
-    for sensor, place in enumerate(places):
-        one = constraints.of_sensor(sensor)
-        if place is not None:
-            origin = one.origin.model_copy(update={"mounts_m": None, "fixed_m": list(place)})
-            one = one.model_copy(update={"origin": origin})
-        each.append(one)
-    common = constraints.origin.model_copy(update={"mounts_m": None})
-    return constraints.model_copy(update={"origin": common, "each": each})
+def fix_origin(rules: SensorRules, place: Mount) -> SensorRules:
+    """The rules of a sensor that is fixed at a place, with no mounts left to choose."""
+    return replace(rules, origin=rules.origin.model_copy(update={"mounts_m": None, "fixed_m": list(place)}))
 
 
-def placement_notes(constraints: Constraints) -> tuple[str, ...]:
-    """What the constraints say without effect: mounts in excluded boxes, and excluded boxes without volume."""
+def fix_origins(rules: Sequence[SensorRules], places: Sequence[Mount | None]) -> tuple[SensorRules, ...]:
+    """The rules with sensor i fixed at the i-th place, where there is one, and no mounts left to choose for others."""
+    own = [replace(rules_of(rules, sensor), index=sensor) for sensor in range(len(places))]
+    fixed = [one if place is None else fix_origin(one, place) for one, place in zip(own, places, strict=True)]
+    further = replace(rules[-1], origin=rules[-1].origin.model_copy(update={"mounts_m": None}), index=len(places))
+    return (*fixed, further)
+
+
+def placement_notes(rules: Sequence[SensorRules]) -> tuple[str, ...]:
+    """What rules say without effect: mounts in excluded boxes, and excluded boxes without volume."""
     notes = []
-    for index in range(len(constraints.each) + 1):
-        one = constraints.of_sensor(index)
-        left, listed = mounts_of(constraints, index), one.origin.mounts_m or []
-        name = constraints.name_of(index, "origin.exclude")
+    for one in rules:
+        left, listed = mounts_of(one), one.origin.mounts_m or []
+        name = one.path("origin.exclude")
         if len(left) < len(listed):
-            mounts = constraints.name_of(index, "origin.mounts_m")
             places = ", ".join(str(mount) for mount in listed if tuple(mount) not in left)
+            mounts = one.path("origin.mounts_m")
             notes.append(f"{len(listed) - len(left)} of {len(listed)} {mounts} left out, inside {name}: {places}")
         for number, box in enumerate(one.origin.exclude or []):
             if not all(low < high for low, high in zip(box.low_m, box.high_m, strict=True)):

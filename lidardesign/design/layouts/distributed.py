@@ -38,7 +38,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri, ndtri
 
-from lidardesign.design.constraints.document import Constraints, SensorConstraints
+from lidardesign.design.constraints.document import Constraints, SensorRules, rules_of
 from lidardesign.design.constraints.origins import box_around, free_boxes, inside_excluded, origin_box
 from lidardesign.design.layouts.gates import SMALLEST_CELL, central_intervals, kept_gates
 from lidardesign.design.layouts.grid import field_on_sphere, low_discrepancy
@@ -115,7 +115,7 @@ def owned(
         fired.append(own)
         if share == 0:
             continue
-        one = constraints.of_sensor(index)
+        one = rules_of(constraints.rules, index)
         low, high = origin_box(one, space)
         inside = ((own[:, :3] >= low - ROUNDING_M) & (own[:, :3] <= high + ROUNDING_M)).all(axis=1)
         inside &= ~inside_excluded(own[:, :3], one)
@@ -219,9 +219,9 @@ def distributed_beams(design: DesignSpec, shares: np.ndarray, samples: Samples |
         members, fired = owned(design, samples.points, samples.weights, space, constraints)
     beams = []
     for index, (sensor, count) in enumerate(zip(design.sensors, shares, strict=True)):
-        bounds = bounds_of(constraints, space, (index,), interval_factor(design.level))
+        bounds = bounds_of(constraints.rules, space, (index,), interval_factor(design.level))
         if samples is None or count == 0 or len(np.unique(fired[index][:, :RANGE], axis=0)) < count:
-            box = _own_box(sensor, constraints.of_sensor(index), space)
+            box = _own_box(sensor, rules_of(constraints.rules, index), space)
             beams.append(_gaussian_beams(sensor, int(count), bounds, box, space))
             continue
         generator = random_generator(seed, "distributed layout", index)
@@ -241,7 +241,7 @@ def _space_of(design: DesignSpec) -> DesignSpace:
     return DesignSpace((*low, 0.0, -math.pi / 2, 0.0), (*high, FULL_TURN, math.pi / 2, farthest))
 
 
-def _own_box(sensor: Sensor, one: SensorConstraints, space: DesignSpace) -> np.ndarray:
+def _own_box(sensor: Sensor, one: SensorRules, space: DesignSpace) -> np.ndarray:
     """Lowest and highest origins of a sensor's rays, outside the excluded boxes, shape (2, 3) [m]."""
     low, high = origin_box(one, space)
     free = free_boxes(one, space)

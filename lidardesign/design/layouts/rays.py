@@ -256,7 +256,7 @@ def _refit(design: DesignSpec, total: int, samples: Samples, seed: int) -> Desig
     if "budget" in document:
         document["budget"] = {key: value for key, value in document["budget"].items() if key != "rays"}
     constraints = Constraints.from_mapping(document, where=f"constraints of {design.name}")
-    if any(pin is not None for group in groups(constraints, samples.space, 1) for pin in group.pins):
+    if any(pin is not None for group in groups(constraints.rules, samples.space, 1) for pin in group.pins):
         raise ConfigError(
             f"a scan from a pinned origin cannot be fitted anew to {total} rays without its target density",
             where=design.name,
@@ -357,7 +357,7 @@ def _ray_gates(design: DesignSpec, tangents: list[np.ndarray], seen: list[Member
             wanted, effective = central_intervals(inside.range_m, inside.weights, cell, len(tangent), design.level)
             known = np.flatnonzero((effective >= SMALLEST_CELL) & (np.diff(wanted, axis=1)[:, 0] > 0))
             wanted = np.clip(wanted[known], *sensor.gate_m)
-            bounds = bounds_of(constraints, space, (index,), interval_factor(design.level))
+            bounds = bounds_of(constraints.rules, space, (index,), interval_factor(design.level))
             own[known] = kept_gates(wanted, sensor, bounds.take(np.zeros(len(known), dtype=np.int64)))
         gates.append(own)
     return np.concatenate(gates)

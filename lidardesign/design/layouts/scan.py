@@ -17,12 +17,13 @@ origins free in a 10 cm box at 196 rays 25 mm with origins and directions, 11.3 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from lidardesign.design.constraints.budget import BandwidthBudget, fit_within_budget
-from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.document import SensorRules
 from lidardesign.design.layouts.gates import admissible_gates, central_intervals
 from lidardesign.design.layouts.quantise import lloyd
 from lidardesign.design.mixture.bounds import Bounds, Group, bounds_of
@@ -46,7 +47,7 @@ FEWEST_PER_RAY = 4
 def fit_scan(
     features: Features,
     space: DesignSpace,
-    constraints: Constraints,
+    rules: Sequence[SensorRules],
     group: Group,
     read_out: BandwidthBudget,
     level: float,
@@ -57,7 +58,7 @@ def fit_scan(
     Arguments:
         features: Weighted samples.
         space: The design space.
-        constraints: Bounds that every ray keeps.
+        rules: What every ray keeps.
         group: The pinned origin, if any.
         read_out: The number of rays and the bandwidth budget.
         level: The share that intervals hold.
@@ -75,7 +76,7 @@ def fit_scan(
             hint="learn with more samples (learning.samples)",
         )
     everyone = Group(group.pins, tuple(range(count)))
-    bounds = bounds_of(constraints, space, everyone.sensors, interval_factor(level))
+    bounds = bounds_of(rules, space, everyone.sensors, interval_factor(level))
     generator = random_generator(seed, "scan")
     _, labels = lloyd(ray_features(features), features.weights, count, generator, iterations=LLOYD_ITERATIONS)
     part = GroupSamples(everyone, 1.0, features, bounds)

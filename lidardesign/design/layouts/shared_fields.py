@@ -236,7 +236,8 @@ def ray_gates(design: DesignSpec, heard: Heard, sensor: np.ndarray, samples: Sam
     """Gates by what rays hear, inside their sensors' bounds and the design's bandwidth, shape (N, 2) [m]."""
     constraints = Constraints.from_mapping(design.constraints, where=f"constraints of {design.name}")
     count = len(design.sensors)
-    bounds = bounds_of(constraints, samples.space, tuple(range(count)), interval_factor(design.level)).take(sensor)
+    bounds = bounds_of(constraints.rules, samples.space, tuple(range(count)), interval_factor(design.level))
+    bounds = bounds.take(sensor)
     model, limit = bandwidth_limit(constraints, len(sensor))
     return gates_within(heard, bounds, design.level, model, limit)
 

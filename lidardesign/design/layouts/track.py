@@ -12,11 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidardesign.design.mixture.bounds import mean_azimuth
 from lidardesign.design.mixture.conditions import shown
 from lidardesign.design.sensor import DesignSpec, Sensor, Track, interval_factor
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Rays
+from lidardesign.numerics import wrap_angle, wrap_turn
 from lidardesign.space import DIMENSIONS
 
 # Conditions that a sensor can travel along: where a ray starts, not where it looks.
@@ -84,7 +84,7 @@ def interpolated(track: Track, at: float) -> tuple[np.ndarray, np.ndarray, np.nd
 def boresight_azimuth(unrolled_rad: float) -> float:
     """An azimuth as it is written: as it stands within a turn of 0, else in [0, 2 pi) [rad]."""
     within = -2 * math.pi < unrolled_rad < 2 * math.pi
-    return float(unrolled_rad if within else mean_azimuth(np.float64(unrolled_rad)))
+    return float(unrolled_rad if within else wrap_turn(wrap_angle(np.float64(unrolled_rad))))
 
 
 def travels(track: Track) -> tuple[float, float]:

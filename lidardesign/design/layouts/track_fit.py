@@ -98,13 +98,13 @@ def fit_track(
         raise ConfigError("a track needs its number of rays per position", where="--layout scan", hint="give --rays N")
     group = Group((None, None, None), tuple(range(read_out.rays)))
     ends = _ends(samples.space, constraints, dimension, level)
-    support = restrict_samples(samples, constraints, group)
+    support = restrict_samples(samples, constraints.rules, group)
     support = replace(support, mass=support.total)
     check_support(support, group, mass=support.total, several=False)
     places = _knots(*ends, support.effective, read_out.rays, knots)
     used = support.weights > 0
     along = Along.of(support.points[used], support.weights[used], places, dimension, samples.space)
-    bounds = bounds_of(constraints, samples.space, group.sensors, interval_factor(level))
+    bounds = bounds_of(constraints.rules, samples.space, group.sensors, interval_factor(level))
     centres, labels = aimed_rays(along, read_out.rays, random_generator(seed, "track"))
     azimuth, elevation = _admitted(centres, along, bounds)
     track = _with_gates(along, labels, azimuth, elevation, bounds, level, read_out)
@@ -151,7 +151,7 @@ def _ends(space: DesignSpace, constraints: Constraints, dimension: int, level: f
     Raises:
         InfeasibleError: The constraints hold the origin still.
     """
-    one = constraints.of_sensor(0)
+    one = constraints.rules[0]
     name = DIMENSIONS[dimension]
     low, high = _way(constraints, space, dimension)
     if not low < high:
@@ -178,7 +178,7 @@ def _way(constraints: Constraints, space: DesignSpace, dimension: int) -> tuple[
     Raises:
         InfeasibleError: Excluded boxes divide it.
     """
-    one = constraints.of_sensor(0)
+    one = constraints.rules[0]
     low, high = (float(end[dimension]) for end in origin_box(one, space))
     if not low < high:
         return low, high

@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.origins import Mount, fix_origins, mounts_of, mounts_suffice
-from lidardesign.design.mixture.bounds import Bounds, Floors, Group, mean_azimuth, pins_of
+from lidardesign.design.constraints.document import SensorRules, rules_of
+from lidardesign.design.constraints.origins import Mount, fix_origin, fix_origins, mounts_of, mounts_suffice
+from lidardesign.design.mixture.bounds import Bounds, Floors, Group, pins_of
 from lidardesign.design.mixture.em import EMResult, fit_mixture, run_em
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.m_step import maximise
@@ -26,7 +26,7 @@ from lidardesign.design.mixture.mixture import Mixture, expect, log_density
 from lidardesign.design.mixture.support import Retarget, reaim_samples
 from lidardesign.design.sensor import Sensor
 from lidardesign.errors import InfeasibleError
-from lidardesign.numerics import systematic_draw
+from lidardesign.numerics import systematic_draw, wrap_angle, wrap_turn
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
@@ -167,7 +167,7 @@ def _sensor(part: GroupSamples, mixture: Mixture, row: int, space: DesignSpace, 
         weight=float(mixture.weights[row]),
         origin_m=origin,
         origin_covariance_m2=covariance,
-        azimuth_rad=float(mean_azimuth(mixture.azimuth_rad[row])) if axes.horizontal else axes.azimuth_rad,
+        azimuth_rad=float(wrap_turn(wrap_angle(mixture.azimuth_rad[row]))) if axes.horizontal else axes.azimuth_rad,
         elevation_rad=float(mixture.elevation_rad[row]) if axes.vertical else axes.elevation_rad,
         roll_rad=float(mixture.roll_rad[row]),
         spread_horizontal_rad=float(horizontal * axes.angle_scale) if axes.horizontal else 0.0,
@@ -185,15 +185,15 @@ ENOUGH_SHARE = 0.95
 
 
 def choose_mounts(
-    constraints: Constraints, samples: Samples, counts: list[int], retarget: Retarget | None, seed: int
-) -> tuple[Constraints, list[int]]:
-    """The constraints with every mounted sensor fixed at the mount chosen for it, and the counts that are left.
+    rules: Sequence[SensorRules], samples: Samples, counts: list[int], retarget: Retarget | None, seed: int
+) -> tuple[tuple[SensorRules, ...], list[int]]:
+    """The rules with every mounted sensor fixed at the mount chosen for it, and the counts that are left.
 
     Where sensors beyond `each` are mounted and their number is open, it is the least of the counts whose mounts
     see 95 % of what those of the largest count see together.
 
     Arguments:
-        constraints: Feasible constraints.
+        rules: Feasible rules of all sensors.
         samples: Samples of the density.
         counts: Numbers of sensors that may be chosen, ascending.
         retarget: log p* of design points, (N, 6) to (N,).
@@ -203,64 +203,48 @@ def choose_mounts(
         ConfigError: There is a choice, but no way to evaluate the target density.
         InfeasibleError: No mount sees any of the density.
     """
-    open_count = bool(mounts_of(constraints, len(constraints.each))) and len(counts) > 1
-    count = counts[-1] if mounts_of(constraints, len(constraints.each)) else len(constraints.each)
-    options = [mounts_of(constraints, sensor) for sensor in range(count)]
-    chosen = None if open_count else _only_choice(constraints, options)
-    if chosen is None:
-        views = _views(constraints, samples, options, retarget, seed)
+    entries, common = len(rules) - 1, mounts_of(rules[-1])
+    count = counts[-1] if common else entries
+    options = [mounts_of(rules_of(rules, sensor)) for sensor in range(count)]
+    open_count = bool(common) and len(counts) > 1
+    if not open_count and not entries and len(options[0]) == len(options):
+        # alike sensors at all the mounts, in the file's order
+        chosen = dict(enumerate(options[0]))
+    else:
+        views = _views(rules, samples, options, retarget, seed)
         chosen, together = _greedy(views, options)
         if open_count:
             seen = {n: _greedy(views, options[:n]) for n in counts}
             count = min(n for n in counts if seen[n][1] >= ENOUGH_SHARE * together)
             chosen = seen[count][0]
-    fixed = fix_origins(constraints, [chosen.get(sensor) for sensor in range(count)])
-    return fixed, [count] if mounts_of(constraints, len(constraints.each)) else counts
-
-
-def _only_choice(constraints: Constraints, options: list[list[Mount]]) -> dict[int, Mount] | None:
-    """Alike sensors at all the mounts, in the file's order; None where there is something to choose."""
-    if constraints.each or len(options[0]) != len(options):
-        return None
-    return dict(enumerate(options[0]))
+    fixed = fix_origins(rules, [chosen.get(sensor) for sensor in range(count)])
+    return fixed, [count] if common else counts
 
 
 def _views(
-    constraints: Constraints,
+    rules: Sequence[SensorRules],
     samples: Samples,
     options: list[list[Mount]],
     retarget: Retarget | None,
     seed: int,
 ) -> dict[tuple[int, Mount], np.ndarray]:
     """What each sensor would see of each drawn sample's scene point from each of its mounts, (N,) each."""
-    chosen = systematic_draw(samples.weights, MOUNT_SAMPLES, random_generator(seed, "mounts"))
-    last = len(constraints.each)
+    drawn = systematic_draw(samples.weights, MOUNT_SAMPLES, random_generator(seed, "mounts"))
+    last = len(rules) - 1
     views: dict[tuple[int, Mount], np.ndarray] = {}
     for sensor, mounts in enumerate(options):
         for mount in mounts:
             # sensors beyond the entries of `each` are alike
             view = views.get((last, mount)) if sensor > last else None
             if view is None:
-                view = _view(constraints, samples, chosen, sensor, mount, retarget)
+                fixed = fix_origin(rules_of(rules, sensor), mount)
+                group = Group(pins_of(fixed, samples.space), (0,))
+                view = reaim_samples(samples, drawn, (fixed,), group, retarget)[1]
             views[sensor, mount] = view
     if not any(view.any() for view in views.values()):
-        names = [constraints.name_of(0, "origin.mounts_m")]
+        names = [rules[0].path("origin.mounts_m")]
         raise InfeasibleError("no mount sees any of the density", conflicts=names, hint="add mounts elsewhere")
     return views
-
-
-def _view(
-    constraints: Constraints,
-    samples: Samples,
-    chosen: np.ndarray,
-    sensor: int,
-    mount: Mount,
-    retarget: Retarget | None,
-) -> np.ndarray:
-    places: list[Mount | None] = [None] * sensor
-    fixed = fix_origins(constraints, [*places, mount])
-    pins = pins_of(fixed.of_sensor(sensor), samples.space)
-    return reaim_samples(samples, chosen, fixed, Group(pins, (sensor,)), retarget)[1]
 
 
 def _greedy(

@@ -13,12 +13,12 @@ $w(d)\, \frac{p^*(d') / r'^2}{p^*(d) / r^2}$ with d' = aim(x', s).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.document import SensorRules
 from lidardesign.design.constraints.feasibility import azimuth_interval
 from lidardesign.design.constraints.origins import inside_excluded, origin_box
 from lidardesign.design.mixture.bounds import Group, Pins
@@ -57,12 +57,11 @@ class Support:
     mass: float | None = None
 
 
-def admissible(points: np.ndarray, constraints: Constraints, space: DesignSpace, group: Group) -> np.ndarray:
+def admissible(points: np.ndarray, rules: Sequence[SensorRules], space: DesignSpace, group: Group) -> np.ndarray:
     """Which design points some sensor of a group may measure, (N, 6) to (N,) bool."""
-    distinct = {min(i, len(constraints.each)) for i in group.sensors}
     keep = np.zeros(len(points), dtype=bool)
-    for index in sorted(distinct):
-        one = constraints.of_sensor(index)
+    for index in sorted({min(sensor, len(rules) - 1) for sensor in group.sensors}):
+        one = rules[index]
         low, high = origin_box(one, space)
         inside = ((points[:, :3] >= low - TOLERANCE) & (points[:, :3] <= high + TOLERANCE)).all(axis=1)
         inside &= ~inside_excluded(points[:, :3], one)
@@ -74,14 +73,14 @@ def admissible(points: np.ndarray, constraints: Constraints, space: DesignSpace,
     return keep
 
 
-def _in_sight(points: np.ndarray, one: object, space: DesignSpace) -> np.ndarray:
+def _in_sight(points: np.ndarray, rules: SensorRules, space: DesignSpace) -> np.ndarray:
     """Directions that a sensor with bounded boresight and bounded field of view can reach."""
-    widest = one.field_of_view.horizontal_deg.max, one.field_of_view.vertical_deg.max
-    aims = one.boresight
+    widest = rules.field_of_view.horizontal_deg.max, rules.field_of_view.vertical_deg.max
+    aims = rules.boresight
     bounded = any(v is not None for part in (aims.azimuth_deg, aims.elevation_deg) for v in (part.min, part.max))
     if None in widest or not bounded:
         return np.ones(len(points), dtype=bool)
-    low, high = azimuth_interval(one, space)
+    low, high = azimuth_interval(rules, space)
     middle, half = (low + high) / 2, (high - low) / 2
     azimuth = middle + np.clip(wrap_angle(points[:, AZIMUTH] - middle), -half, half)
     bottom = -90.0 if aims.elevation_deg.min is None else aims.elevation_deg.min
@@ -92,16 +91,16 @@ def _in_sight(points: np.ndarray, one: object, space: DesignSpace) -> np.ndarray
     return np.einsum("ni,ni->n", nearest, ray) >= math.cos(min(reach, math.pi))
 
 
-def restrict_samples(samples: Samples, constraints: Constraints, group: Group) -> Support:
+def restrict_samples(samples: Samples, rules: Sequence[SensorRules], group: Group) -> Support:
     """The samples of p inside the admissible set of a group without pins; `total` is the admissible mass."""
-    keep = admissible(samples.points, constraints, samples.space, group)
+    keep = admissible(samples.points, rules, samples.space, group)
     weights = samples.weights[keep]
     return Support(samples.points[keep], weights, float(weights.sum()), effective_count(weights))
 
 
 def pin_samples(
     samples: Samples,
-    constraints: Constraints,
+    rules: Sequence[SensorRules],
     group: Group,
     retarget: Retarget | None,
     count: int,
@@ -111,7 +110,7 @@ def pin_samples(
 
     Arguments:
         samples: Samples of the density with free origins.
-        constraints: The constraint file.
+        rules: What the sensors must keep.
         group: Sensors and their pinned coordinates.
         retarget: log p* of design points, (N, 6) to (N,).
         count: How many samples are re-aimed; they are drawn by weight first.
@@ -121,13 +120,13 @@ def pin_samples(
         ConfigError: No way to evaluate the target density was given.
     """
     chosen = systematic_draw(samples.weights, count, generator)
-    aimed, weights = reaim_samples(samples, chosen, constraints, group, retarget)
+    aimed, weights = reaim_samples(samples, chosen, rules, group, retarget)
     used = weights > 0
     return Support(aimed[used], weights[used], float(weights.sum()) / count, effective_count(weights))
 
 
 def reaim_samples(
-    samples: Samples, chosen: np.ndarray, constraints: Constraints, group: Group, retarget: Retarget | None
+    samples: Samples, chosen: np.ndarray, rules: Sequence[SensorRules], group: Group, retarget: Retarget | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Chosen samples aimed from the pins at what they observed, (N, 6), and their new weights, (N,); 0 where unseen.
 
@@ -145,7 +144,7 @@ def reaim_samples(
     aimed = space.wrap(_from_pins(points, group.pins))
     weights = np.zeros(len(aimed))
     log_old = _per_scene_volume(points, samples.log_target[chosen], space)
-    keep = space.contains(aimed, TOLERANCE) & admissible(aimed, constraints, space, group)
+    keep = space.contains(aimed, TOLERANCE) & admissible(aimed, rules, space, group)
     keep &= np.isfinite(log_old) & (aimed[:, RANGE] > 0)
     if not keep.any():
         return aimed, weights

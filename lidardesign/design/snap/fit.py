@@ -12,7 +12,7 @@ import numpy as np
 from lidardesign.design.bandwidth import split_budget
 from lidardesign.design.catalog.placing import Pose, interleaved, part_sensor
 from lidardesign.design.constraints.budget import BandwidthBudget
-from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.document import Constraints, SensorRules, rules_of
 from lidardesign.design.constraints.origins import fix_origins
 from lidardesign.design.files import MOST_TABLE_RAYS
 from lidardesign.design.mixture.ensemble import Ensemble, sensors_of
@@ -53,10 +53,12 @@ class _Placed:
     seen: Features
 
 
-def fix_part_origins(constraints: Constraints, sensors: Sequence[Sensor]) -> Constraints | None:
-    """The constraints with sensors that become parts fixed at their mean origins; None where they are already."""
+def fix_part_origins(
+    rules: Sequence[SensorRules], sensors: Sequence[Sensor]
+) -> tuple[SensorRules, ...] | None:
+    """The rules with sensors that become parts fixed at their mean origins; None where they are already."""
     spread = [
-        bool(np.any(sensor.origin_covariance_m2)) and constraints.of_sensor(index).snap is not None
+        bool(np.any(sensor.origin_covariance_m2)) and rules_of(rules, index).snap is not None
         for index, sensor in enumerate(sensors)
     ]
     if not any(spread):
@@ -65,7 +67,7 @@ def fix_part_origins(constraints: Constraints, sensors: Sequence[Sensor]) -> Con
         (float(x), float(y), float(z)) if moves else None
         for (x, y, z), moves in zip((sensor.origin_m for sensor in sensors), spread, strict=True)
     ]
-    return fix_origins(constraints, places)
+    return fix_origins(rules, places)
 
 
 def snap_design(
@@ -94,20 +96,20 @@ def snap_design(
         ConfigError: A part that is not there; more rays than a design file holds.
     """
     before = sensors_of(ensemble, space, level)
-    options = part_options(constraints, space, [sensor.range_m for sensor in before])
+    options = part_options(constraints.rules, space, [sensor.range_m for sensor in before])
     if (read_out.rays or 0) > MOST_TABLE_RAYS:
         raise ConfigError(f"{read_out.rays} rays of parts", where="--rays", allowed=f"at most {MOST_TABLE_RAYS}")
     choices = nearest_parts(ensemble, options, read_out.rays, seed)
     fitted_widths = np.array([sensor.gate_m[1] - sensor.gate_m[0] for sensor in before])
     choices = affordable(choices, options, ensemble.weights, fitted_widths, read_out)
-    held = [(one := constraints.of_sensor(i).snap) is not None and one.pose == "fitted" for i in range(len(before))]
-    refitted = fit_part_poses(ensemble, choices, held)
+    snaps = [rules_of(constraints.rules, index).snap for index in range(len(before))]
+    refitted = fit_part_poses(ensemble, choices, [snap is not None and snap.pose == "fitted" for snap in snaps])
     placed = _placed(before, sensors_of(refitted, space, level), choices, ensemble)
     if not constraints.each:
         order = sorted(range(len(placed)), key=lambda i: -round(placed[i].sensor.weight, 9))
         placed = [_renamed(placed[old], f"s{new}") for new, old in enumerate(order)]
         options = [options[old] for old in order]
-    placed = _apart(placed, constraints)
+    placed = _apart(placed, constraints.rules)
     counts = _counts(placed, read_out)
     design = _design(placed, counts, constraints, level, name)
     report = {
@@ -147,14 +149,14 @@ def _at(one: _Placed, pose: Pose) -> _Placed:
     return replace(one, sensor=sensor, pose=pose)
 
 
-def _apart(placed: Sequence[_Placed], constraints: Constraints) -> list[_Placed]:
+def _apart(placed: Sequence[_Placed], rules: Sequence[SensorRules]) -> list[_Placed]:
     """Parts of a kind that stand and look alike fire between each other's rays, where they may turn that far."""
     found = list(placed)
     alike: list[list[int]] = []
     for index, one in enumerate(placed):
-        rules = constraints.of_sensor(index)
-        aims = rules.boresight
-        bounded = (rules.snap is not None and rules.snap.pose == "fitted") or any(
+        own = rules_of(rules, index)
+        aims = own.boresight
+        bounded = (own.snap is not None and own.snap.pose == "fitted") or any(
             value is not None for end in (aims.azimuth_deg, aims.elevation_deg) for value in (end.min, end.max)
         )
         if one.pose is None or bounded or one.seen.axes.angular < 2:

@@ -30,7 +30,7 @@ import numpy as np
 
 from lidardesign.design.catalog.library import SUFFIX, Library, load_library
 from lidardesign.design.catalog.part import Part
-from lidardesign.design.constraints.document import Constraints, SensorConstraints, Snap
+from lidardesign.design.constraints.document import SensorRules, Snap, rules_of
 from lidardesign.design.mixture.bounds import Bounds, Floors
 from lidardesign.design.mixture.em import CONVERGENCE_NATS, EMResult
 from lidardesign.design.mixture.ensemble import Ensemble
@@ -64,16 +64,16 @@ class PartOptions:
     lacking: tuple[str, ...] = ()
 
 
-def wants_parts(constraints: Constraints) -> bool:
+def wants_parts(rules: Sequence[SensorRules]) -> bool:
     """Whether any sensor is to become a part."""
-    return any(constraints.of_sensor(index).snap is not None for index in range(len(constraints.each) + 1))
+    return any(one.snap is not None for one in rules)
 
 
-def part_options(constraints: Constraints, space: DesignSpace, middles_m: Sequence[float]) -> list[PartOptions]:
+def part_options(rules: Sequence[SensorRules], space: DesignSpace, middles_m: Sequence[float]) -> list[PartOptions]:
     """What each of some sensors may become.
 
     Arguments:
-        constraints: The constraint file.
+        rules: What the sensors must keep.
         space: The design space.
         middles_m: The mean range of each sensor: a part that does not measure there is none for it.
 
@@ -81,21 +81,24 @@ def part_options(constraints: Constraints, space: DesignSpace, middles_m: Sequen
         InfeasibleError: No part keeps a sensor's constraints, and it is not said that it may stay as it is.
         ConfigError: A part that is not there, or no part file.
     """
-    last = len(constraints.each)
-    snaps = [constraints.of_sensor(min(index, last)).snap for index in range(min(len(middles_m), last + 1))]
-    parts = [[] if snap is None else parts_of(snap) for snap in snaps]
-    options = [_options(constraints, i, space, middle, parts[min(i, last)]) for i, middle in enumerate(middles_m)]
+    rules = rules[: len(middles_m)]
+    parts = [[] if one.snap is None else parts_of(one.snap) for one in rules]
+    last = len(rules) - 1
+    options = [
+        _options(rules[min(sensor, last)], space, middle, parts[min(sensor, last)])
+        for sensor, middle in enumerate(middles_m)
+    ]
     refused = [
-        index
-        for index, one in enumerate(options)
-        if one.lacking and (snap := constraints.of_sensor(index).snap) is not None and snap.otherwise == "refuse"
+        sensor
+        for sensor, option in enumerate(options)
+        if option.lacking and (snap := rules_of(rules, sensor).snap) is not None and snap.otherwise == "refuse"
     ]
     if refused:
         names = tuple(dict.fromkeys(name for index in refused for name in options[index].lacking))
         which = ", ".join(f"s{index}" for index in refused)
         raise InfeasibleError(
             f"no part can stand in for {which} and keep {', '.join(names)}",
-            conflicts=[*names, constraints.name_of(refused[0], "snap")],
+            conflicts=[*names, rules_of(rules, refused[0]).path("snap")],
             hint="loosen one of the constraints named, or leave such sensors as they are: --set snap.otherwise=keep",
         )
     return options
@@ -152,32 +155,27 @@ def _modes(library: Library, part: Part) -> list[Part]:
     return [library.part(f"{stem}:{mode}") for mode in part.modes] or [part]
 
 
-def _options(
-    constraints: Constraints, index: int, space: DesignSpace, middle_m: float, parts: Sequence[Part]
-) -> PartOptions:
-    one = constraints.of_sensor(index)
-    if one.snap is None:
+def _options(rules: SensorRules, space: DesignSpace, middle_m: float, parts: Sequence[Part]) -> PartOptions:
+    if rules.snap is None:
         return PartOptions([], snapped=False)
     every = [shapes_of(part, space) for part in parts]
     heard = [shapes for shapes in every if shapes and shapes[0].gate_m[0] <= middle_m <= shapes[0].gate_m[1]]
-    broken = [_broken(shapes[0], one) for shapes in heard]
+    broken = [_broken(shapes[0], rules) for shapes in heard]
     kept = [shape for shapes, found in zip(heard, broken, strict=True) if not found for shape in shapes]
     if kept:
         return PartOptions(kept, snapped=True)
     lacking = _smallest_lacking(broken) if broken else ()
-    return PartOptions(
-        [], snapped=False, lacking=tuple(constraints.name_of(index, key) for key in lacking) or (SPACE_RANGE,)
-    )
+    return PartOptions([], snapped=False, lacking=tuple(map(rules.path, lacking)) or (SPACE_RANGE,))
 
 
-def _broken(shape: PartShape, one: SensorConstraints) -> set[str]:
+def _broken(shape: PartShape, rules: SensorRules) -> set[str]:
     """Keys of the constraints that a part does not keep."""
     horizontal, vertical = (math.degrees(angle) for angle in shape.part.field_of_view_rad)
     start, end = shape.gate_m
     values = (horizontal, vertical, start, end, end - start)
     found = set()
     for key, value in zip(BOUNDED, values, strict=True):
-        bounds: Any = one
+        bounds: Any = rules
         for part in key.split("."):
             bounds = getattr(bounds, part)
         if bounds.min is not None and value < bounds.min * (1 - SLACK):

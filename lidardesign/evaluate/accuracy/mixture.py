@@ -166,8 +166,8 @@ class FitBench:
     def bounds(self) -> Bounds:
         """What the space alone asks of the sensors."""
         space, free = self.samples.space, Constraints()
-        group = groups(free, space, self.sensors)[0]
-        return bounds_of(free, space, group.sensors, interval_factor(self.level))
+        group = groups(free.rules, space, self.sensors)[0]
+        return bounds_of(free.rules, space, group.sensors, interval_factor(self.level))
 
     @property
     def splits(self) -> int:

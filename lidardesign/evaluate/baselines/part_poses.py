@@ -254,7 +254,7 @@ def fitted_poses(
 def _fit(
     features: Features, space: DesignSpace, shape: PartShape, number: int, generator: np.random.Generator
 ) -> tuple[Mixture, float]:
-    free = bounds_of(Constraints(), space, tuple(range(number)), interval_factor(DEFAULT_LEVEL))
+    free = bounds_of(Constraints().rules, space, tuple(range(number)), interval_factor(DEFAULT_LEVEL))
     bounds = shaped_bounds(free, [shape] * number, features.axes)
     trace = fit_mixture(features, bounds, generator, restarts=RESTARTS)
     return trace.mixture, trace.log_likelihood

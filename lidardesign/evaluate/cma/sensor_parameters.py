@@ -81,16 +81,15 @@ def _mounted(origins: np.ndarray, constraints: Constraints) -> np.ndarray:
 
 def held_still(constraints: Constraints, bounds: Bounds) -> np.ndarray:
     """Which sensors are at a point: mounted, or fixed by their constraints, shape (G,) bool."""
-    fixed = [constraints.of_sensor(sensor).origin.fixed_m is not None for sensor in range(len(constraints.each) + 1)]
+    fixed = [rules.origin.fixed_m is not None for rules in constraints.rules]
     mounted = _mounts(constraints, len(bounds))
     return np.array([bool(mounts) or fixed[min(i, len(constraints.each))] for i, mounts in enumerate(mounted)])
 
 
 def _mounts(constraints: Constraints, count: int) -> list[list[Mount]]:
     """The mounts that each of the first sensors may take; those beyond `each` share the common ones."""
-    last = len(constraints.each)
-    distinct = [mounts_of(constraints, sensor) for sensor in range(min(count, last + 1))]
-    return [distinct[min(sensor, last)] for sensor in range(count)]
+    distinct = [mounts_of(rules) for rules in constraints.rules]
+    return [distinct[min(sensor, len(distinct) - 1)] for sensor in range(count)]
 
 
 def admitted_covariances(
@@ -158,13 +157,12 @@ class Setting:
     @cached_property
     def spread_axes(self) -> tuple[int, ...]:
         """The axes along which sensors' rays start at different places; none where all sensors are held still."""
-        rules = [self.constraints.of_sensor(sensor).origin for sensor in range(len(self.constraints.each) + 1)]
-        still = all(one.fixed_m is not None or one.mounts_m for one in rules)
+        still = all(rules.origin.fixed_m is not None or rules.origin.mounts_m for rules in self.constraints.rules)
         return () if self.layout != "distributed" or still else self.axes.origin
 
     def bounds(self, count: int) -> Bounds:
         """The bounds of the first sensors."""
-        return bounds_of(self.constraints, self.space, tuple(range(count)), self.interval)
+        return bounds_of(self.constraints.rules, self.space, tuple(range(count)), self.interval)
 
 
 @dataclass(frozen=True, eq=False)
