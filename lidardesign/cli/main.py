@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from lidardesign import __version__
 from lidardesign.cli.commands.capture import capture
 from lidardesign.cli.commands.catalog import catalog_app
 from lidardesign.cli.commands.compare import compare
-from lidardesign.cli.commands.completion import answer, completion, is_asked
+from lidardesign.cli.commands.completion import VARIABLE, answer_shell, completion
 from lidardesign.cli.commands.config import config_app
 from lidardesign.cli.commands.constrain import constrain
 from lidardesign.cli.commands.evaluate import evaluate
@@ -79,8 +80,8 @@ def program(
 def run(arguments: list[str] | None = None) -> None:
     """Run the program on command line arguments and exit; where a shell asks what to complete, answer it."""
     set_thread_defaults()
-    if is_asked():
-        sys.exit(answer(app))
+    if VARIABLE in os.environ:
+        sys.exit(answer_shell(app))
     set_cache_default()
     make_streams_tolerant()
     terminate_cleanly()

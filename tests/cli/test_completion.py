@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 import time
+from unittest import mock
 
 import pytest
 import typer
@@ -17,10 +18,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.command_line import make_run, program
 
-from lidardesign.cli import completion_values
+from lidardesign.cli import candidates
+from lidardesign.cli.candidates import BASELINES, FILE, FOLDER, PATH, BashCompletion, ShellCompletion, split_line
 from lidardesign.cli.commands.completion import VARIABLE
-from lidardesign.cli.completing import FILES, FOLDERS, NOTHING, PATHS, answer_of, respond, words_of_line
-from lidardesign.cli.completion_names import BASELINES
 from lidardesign.cli.main import app
 from lidardesign.design.catalog.library import load_library
 from lidardesign.errors import ConfigError
@@ -50,9 +50,15 @@ def place(tmp_path_factory):
     return folder
 
 
+def items_at(root, line):
+    """The candidates at the end of a line, as the parser has them."""
+    *before, current = split_line(line, len(line))[0]
+    return ShellCompletion(root, {}, "lidardesign", VARIABLE).get_completions(before, current)
+
+
 def completed(root, line):
     """The candidates at the end of a line."""
-    return [value for value, _ in answer_of(words_of_line(line, len(line))[0], root).items]
+    return [item.value for item in items_at(root, line)]
 
 
 def every_parameter(command, path=()):
@@ -67,14 +73,10 @@ def test_every_option_and_argument_is_completed_or_known_to_be_free(root):
         metavar = parameter.metavar
         if metavar is None or getattr(parameter, "is_flag", False):
             continue
-        listed = completion_values.source_of(command, parameter) is not None
-        kinds = (
-            completion_values.WITH_FILES,
-            completion_values.WITH_FOLDERS,
-            completion_values.WITH_RUNS,
-            completion_values.WITH_DESIGNS,
-        )
-        known = listed or any(metavar in kind for kind in kinds)
+        listed = candidates.source_of(command, parameter) is not None
+        known = listed or metavar in {
+            "RUN", *candidates.FILE_METAVARS, *candidates.FOLDER_METAVARS, *candidates.DESIGN_METAVARS
+        }  # fmt: skip
         assert known or metavar in FREE or metavar.split("|")[0] in FREE or (command, metavar) in NEW_NAMES, (
             f"{command} {metavar}"
         )
@@ -156,29 +158,31 @@ def test_runs_and_designs_are_completed_and_other_folders_lead_on(root, place, m
 @pytest.mark.parametrize(
     ("line", "kind"),
     [
-        ("learn face --config ", FILES),
-        ("evaluate run --plots ", FOLDERS),
-        ("evaluate ", PATHS),
-        ("fit run --rays ", NOTHING),
-        ("fit run extra ", NOTHING),
-        ("learn face --unknown ", NOTHING),
+        ("learn face --config ", {FILE}),
+        ("evaluate run --plots ", {FOLDER}),
+        ("evaluate ", {PATH}),
+        ("fit run --rays ", set()),
+        ("fit run extra ", set()),
+        ("learn face --unknown ", set()),
     ],
 )
-def test_what_the_shell_lists_itself_is_left_to_it(root, line, kind):
-    assert answer_of(words_of_line(line, len(line))[0], root).kind == kind
+def test_what_the_shell_lists_itself_is_left_to_it(root, place, monkeypatch, line, kind):
+    monkeypatch.chdir(place)
+    assert {item.type for item in items_at(root, line)} == kind
 
 
 @given(st.lists(st.text(alphabet=st.characters(exclude_categories=("Cc", "Cs"))), min_size=1, max_size=5))
 def test_a_line_is_taken_apart_as_the_shell_does(words):
     line = shlex.join(words)
-    assert words_of_line(line, len(line)) == (words, False)
-    assert words_of_line(f"{line} ", len(line) + 1) == ([*words, ""], False)
+    assert split_line(line, len(line)) == (words, False)
+    assert split_line(f"{line} ", len(line) + 1) == ([*words, ""], False)
 
 
-@given(st.text(), st.integers(0, 40))
+@given(st.text(st.characters(exclude_characters="\0", exclude_categories=("Cs",))), st.integers(0, 40))
 def test_no_line_is_too_odd_to_be_asked_about(root, line, point):
     environment = {"COMP_LINE": f"lidardesign {line}", "COMP_POINT": str(12 + point)}
-    assert respond("bash", [], environment, root)
+    with mock.patch.dict(os.environ, environment):
+        assert BashCompletion(root, {}, "lidardesign", VARIABLE).complete()
 
 
 def asked(shell, *words, before="", **environment):
@@ -194,17 +198,17 @@ def test_no_slow_library_is_loaded_to_complete_keys():
     before = f"import atexit, sys; atexit.register(lambda: print([m for m in {slow} if m in sys.modules]))"
     code, out, _ = asked("fish", "learn", "face", "--set", "density.si", before=before)
     assert code == 0
-    assert out.splitlines() == ["words", "density.sigma_m=\tstandard deviation of the surface proximity [m]", "[]"]
+    assert out.splitlines() == ["plain", "density.sigma_m=\tstandard deviation of the surface proximity [m]", "[]"]
 
 
 def test_a_plugin_that_prints_spoils_nothing_and_one_that_hangs_is_not_waited_for():
     loads = "from lidardesign import registry\nkept = registry.load_task\n"
     printing = f"{loads}registry.load_task = lambda name: (print('I am here'), kept(name))[1]"
     assert asked("zsh", "learn", "flatland", "--set", "vari", before=printing)[1].splitlines() == [
-        "words",
+        "plain",
         "variation=\thow much scenes differ",
     ]
-    hanging = "import time\nfrom lidardesign.cli import completion\ncompletion.MOST_SECONDS = 0.3\n"
+    hanging = "import time\nfrom lidardesign.cli.commands import completion\ncompletion.MOST_SECONDS = 0.3\n"
     hanging += f"{loads}registry.load_task = lambda name: time.sleep(60)"
     code, out, err = asked("zsh", "learn", "flatland", "--set", "vari", before=hanging)
     assert (code != 0, out, err) == (True, "", "")

@@ -1,14 +1,11 @@
-"""`lidardesign completion`: the script that makes a shell complete command lines, and the answers to it.
-
-What shells are told, so that they ask the program what may stand where the cursor is.
-"""
+"""`lidardesign completion`: the script that makes a shell ask the program what may stand at its cursor."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import signal
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -90,8 +87,6 @@ complete -c lidardesign -f -a '(__lidardesign_complete)'
 """
 
 SCRIPTS = {"bash": BASH, "zsh": ZSH, "fish": FISH}
-
-
 # Nobody waits longer at a prompt: plugins that hang while they are imported are left out.
 MOST_SECONDS = 5.0
 
@@ -104,28 +99,25 @@ def completion(
     debug: options.Debug = False,
 ) -> None:
     """Print the script that completes commands, options, tasks, keys, formats, parts, runs and designs in a shell."""
-    with command(json=json, quiet=quiet, debug=debug) as console:
-        check_choice(shell, "SHELL", tuple(SCRIPTS))
-        script = SCRIPTS[shell]
-        shown = {"shell": shell, "script": script}
-        console.result(shown, lambda rich: print(script, end="", file=console.stream), show_costs=False)
+    with command(json=json, quiet=quiet, debug=debug) as output:
+        script = SCRIPTS[check_choice(shell, "SHELL", tuple(SCRIPTS))]
+        document = {"shell": shell, "script": script}
+        output.result(document, lambda rich: print(script, end="", file=output.stream), show_costs=False)
 
 
-def is_asked() -> bool:
-    """Whether a shell asks what may stand at its cursor."""
-    return VARIABLE in os.environ
-
-
-def answer(app: Any) -> int:
-    """Answer a shell; where that fails nobody can be told, and nothing is completed."""
-    from lidardesign.cli.completing import print_response
-
+def answer_shell(app: typer.Typer) -> int:
+    """Answer a shell; where that fails nobody can be asked, and nothing is completed."""
     with contextlib.suppress(ValueError, AttributeError):
         # by its default the signal ends the process, whatever a plugin does
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_REAL, MOST_SECONDS)
     try:
-        print_response(os.environ[VARIABLE], typer.main.get_command(app))
+        with open(os.devnull, "w", encoding="utf-8") as nowhere, contextlib.redirect_stdout(nowhere):
+            from lidardesign.cli.candidates import BashCompletion, ShellCompletion
+
+            shell = BashCompletion if os.environ[VARIABLE] == "bash" else ShellCompletion
+            answer = shell(typer.main.get_command(app), {}, "lidardesign", VARIABLE).complete()
     except Exception:
         return 1
+    print(answer)
     return 0
