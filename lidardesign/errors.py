@@ -119,3 +119,14 @@ class ThresholdError(LidardesignError):
     """A threshold that the user set was missed (exit 1)."""
 
     exit_code, kind = 1, "threshold"
+
+
+def check_choice(value: str, where: str, allowed: Sequence[str]) -> str:
+    """A value that must be one of a few words.
+
+    Raises:
+        ConfigError: It is none of them.
+    """
+    if value not in allowed:
+        raise ConfigError(f"{value!r}", where=where, allowed=", ".join(allowed))
+    return value

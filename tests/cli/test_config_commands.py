@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,13 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.command_line import caller, make_run
 
-from lidardesign.cli.commands.config import Chosen, config_text, default_document, schema_of, uncommented
 from lidardesign.config import PRESETS, DensitySettings, LearningSettings, resolve
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.errors import ConfigError
 from lidardesign.registry import list_tasks, load_task
 from lidardesign.run.yaml import dump_yaml, parse_yaml
 from lidardesign.task import Metric, TaskConfig
+from lidardesign.workflow.config_reference import config_template, config_text, default_document, schema_of
 
 TASKS = [item.name for item in list_tasks() if item.error is None and item.distribution.startswith("lidardesign ")]
 # They need a folder, so that no configuration follows from the defaults alone.
@@ -31,12 +32,17 @@ def lidardesign(capsys, tmp_path, monkeypatch):
     return caller(capsys, tmp_path, monkeypatch)
 
 
-def written(task, tmp_path, preset="standard", **chosen):
-    document = default_document(task, preset) if task.name in WITHOUT_DEFAULTS else resolve(task, preset=preset)
-    document = document if isinstance(document, dict) else document.as_document()
+def written(task, tmp_path, preset=None):
     path = tmp_path / "config.yaml"
-    path.write_text(config_text(task, document, Chosen(preset, **chosen)))
+    path.write_text(config_template(task, preset=preset)[1])
     return path
+
+
+def uncommented(text):
+    """A file to begin with, with every default set."""
+    whole, count = re.subn(r"(?m)^( *)#(?=\S)", r"\1", text)
+    assert count
+    return whole
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -115,7 +121,7 @@ def test_no_word_of_a_task_leaves_its_comment(summary, description, unit):
         metric=Metric("name", unit, "lower", 1.0, 0.1),
         defaults=SimpleNamespace(density={}, learning={}),
     )
-    text = config_text(task, default_document(task, "draft"), Chosen("draft"))
+    text = config_text(task, default_document(task, "draft"), "draft")
     assert parse_yaml(text, where="text").value == {
         "schema_version": 1, "task_name": "odd", "task": None, "space": None, "density": None, "learning": None
     }  # fmt: skip

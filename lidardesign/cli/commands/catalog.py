@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,12 +11,10 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.output import Output, command
-from lidardesign.errors import ConfigError
+from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from lidardesign.design.catalog.part import Part
     from lidardesign.design.catalog.placing import Pose
     from lidardesign.design.sensor import DesignSpec
@@ -115,19 +115,21 @@ def list_(
     debug: options.Debug = False,
 ) -> None:
     """List all parts in all their modes: pattern, field of view, range and what reading them costs."""
-    with command(json=json, quiet=quiet, debug=debug) as console:
+    with command(json=json, quiet=quiet, debug=debug) as output:
         with phase("libraries"):
-            from lidardesign.cli.tables.parts import part_entry, show_list
+            from lidardesign.cli.tables.parts import part_entry, show_parts
             from lidardesign.design.catalog.library import load_library
 
-        check_conditions(reflectance, klux)
-        parts = [_under(part, reflectance, klux) for part in load_library(own or ()).every_mode()]
-        vouched = [part for part in parts if part is not None]
+        _check_conditions(reflectance, klux)
+        parts, vouched = load_library(own or ()).every_mode(), []
+        for part in parts:
+            with contextlib.suppress(ConfigError):  # no source states a range under such conditions
+                vouched.append(_under(part, reflectance, klux))
         left_out = len(parts) - len(vouched)
         document = {"parts": [part_entry(part) for part in vouched], "left_out": left_out}
-        console.result(document, lambda rich: show_list(vouched, rich), show_costs=False)
+        output.result(document, lambda rich: show_parts(vouched, rich), show_costs=False)
         if left_out:
-            console.note(f"note: {left_out} of {len(parts)} parts and modes have no range stated for such conditions")
+            output.note(f"note: {left_out} of {len(parts)} parts and modes have no range stated for such conditions")
 
 
 @catalog_app.command("show")
@@ -150,64 +152,59 @@ def show(
     debug: options.Debug = False,
 ) -> None:
     """Show a part: every figure, its conditions and its source; with --out also write a design of it."""
-    with command(json=json, quiet=quiet, debug=debug) as console:
+    with command(json=json, quiet=quiet, debug=debug) as output:
         with phase("libraries"):
             from lidardesign.cli.tables.parts import part_document, show_part
             from lidardesign.design.catalog.library import find_part
+            from lidardesign.design.files import MOST_TABLE_RAYS, save_design
 
-        check_conditions(reflectance, klux)
-        part = find_part(name, own or ())
-        if reflectance is not None or klux is not None:
-            part = part.under(reflectance_percent=reflectance, illuminance_klux=klux)
+        _check_conditions(reflectance, klux)
+        part = _under(find_part(name, own or ()), reflectance, klux)
         document = part_document(part)
         given = {
             "--at-origin": at_origin, "--azimuth-deg": azimuth, "--elevation-deg": elevation, "--roll-deg": roll,
             "--rays": rays, "--parts": parts, "--arrange": arrange,
         }  # fmt: skip
         if out is not None:
-            design = _design(part, given, out.stem, console)
+            design = _placed(part, given, out.stem, output)
             document |= {"design": str(out), "design_rays": design.rays, "sensors": len(design.sensors)}
-            _write(design, out)
-        else:
-            _refuse_without_out(given)
+            if (design.rays or 0) > MOST_TABLE_RAYS:
+                raise ConfigError(
+                    f"{design.rays} rays are too many for a design file",
+                    where=str(out),
+                    allowed=f"at most {MOST_TABLE_RAYS:,}",
+                    hint="--rays N takes an evenly spread subset",
+                )
+            with phase("writing"):
+                save_design(design, out)
+        elif useless := [option for option, value in given.items() if value is not None]:
+            raise ConfigError("says how a design is made", where=useless[0], hint="--out FILE.yaml writes one")
+        output.result(document, lambda rich: show_part(part, document, rich), show_costs=False)
 
-        console.result(document, lambda rich: show_part(part, document, rich), show_costs=False)
 
-
-def check_conditions(reflectance: float | None, klux: float | None) -> None:
-    """Refuse conditions that no target and no light can have.
-
-    Raises:
-        ConfigError: A reflectance outside 0 to 100 %, or negative light.
-    """
+def _check_conditions(reflectance: float | None, klux: float | None) -> None:
+    """Refuse conditions that no target and no light can have."""
     if reflectance is not None and not 0 < reflectance <= 100:
         raise ConfigError(f"found {reflectance:g}", where="--reflectance", allowed="a percentage above 0, at most 100")
     if klux is not None and not 0 <= klux <= 1000:
         raise ConfigError(f"found {klux:g}", where="--klux", allowed="0 (darkness) to 1000; sunlight is about 100")
 
 
-def _under(part: Part, reflectance: float | None, klux: float | None) -> Part | None:
-    """The part with its range under conditions; None where no source vouches for one."""
+def _under(part: Part, reflectance: float | None, klux: float | None) -> Part:
+    """The part with its range under the conditions that are given.
+
+    Raises:
+        ConfigError: No source states one.
+    """
     if reflectance is None and klux is None:
         return part
-    try:
-        return part.under(reflectance_percent=reflectance, illuminance_klux=klux)
-    except ConfigError:
-        return None
+    return part.under(reflectance_percent=reflectance, illuminance_klux=klux)
 
 
-def _refuse_without_out(given: dict[str, Any]) -> None:
-    """Refuse options that say how to place a part where no design is written."""
-    for option, value in given.items():
-        if value is not None:
-            raise ConfigError("says how a design is made", where=option, hint="--out FILE.yaml writes one")
-
-
-def _design(part: Part, given: dict[str, Any], name: str, console: Output) -> DesignSpec:
-    """The design that the options ask for."""
+def _placed(part: Part, given: dict[str, Any], name: str, output: Output) -> DesignSpec:
+    """The design of a part that the options ask for."""
     from lidardesign.design.catalog.placing import interleaved, part_design, parts_for, side_by_side
     from lidardesign.design.sensor import MOST_RAYS
-    from lidardesign.workflow.runs import check_choice
 
     count, number = given["--rays"], given["--parts"]
     arrange = check_choice(given["--arrange"] or ARRANGEMENTS[0], "--arrange", ARRANGEMENTS)
@@ -219,7 +216,7 @@ def _design(part: Part, given: dict[str, Any], name: str, console: Output) -> De
     if count is None and part.rays * needed > MOST_RAYS:
         raise ConfigError(f"{part.rays * needed} rays", where="--parts", hint="--rays N takes an even subset")
     if needed > 1 and number is None:
-        console.note(f"note: {count} rays take {needed} x {part.name}, {arrange}")
+        output.note(f"note: {count} rays take {needed} x {part.name}, {arrange}")
     return part_design(part, poses, count, name=name)
 
 
@@ -227,25 +224,19 @@ def _pose(given: dict[str, Any]) -> Pose:
     """Where the options put the first part.
 
     Raises:
-        ConfigError: Angles that are not finite or beyond the zenith.
+        ConfigError: A place that is none, angles that are not finite or beyond the zenith.
     """
-    import math
+    import numpy as np
 
     from lidardesign.design.catalog.placing import Pose
+    from lidardesign.space import FARTHEST_M
 
     degrees = {option: given[option] or 0.0 for option in ("--azimuth-deg", "--elevation-deg", "--roll-deg")}
     for option, value in degrees.items():
         most = 90 if option == "--elevation-deg" else 360
         if not abs(value) <= most:
             raise ConfigError(f"found {value:g}", where=option, allowed=f"-{most} to {most} degrees")
-    return Pose(_origin(given["--at-origin"]), *(math.radians(value) for value in degrees.values()))
-
-
-def _origin(text: str | None) -> np.ndarray:
-    import numpy as np
-
-    from lidardesign.space import FARTHEST_M
-
+    text = given["--at-origin"]
     try:
         origin = np.array([float(item) for item in (text or "0,0,0").split(",")])
     except ValueError:
@@ -253,19 +244,4 @@ def _origin(text: str | None) -> np.ndarray:
     if origin.shape != (3,) or not np.isfinite(origin).all() or np.abs(origin).max() > FARTHEST_M:
         allowed = f"three numbers, as 0.5,0,1.8 [m], each at most {FARTHEST_M:g}"
         raise ConfigError(f"found {text!r}", where="--at-origin", allowed=allowed)
-    return origin
-
-
-def _write(design: DesignSpec, out: Path) -> None:
-    """Write the design, and say what to do where it has more rays than a file takes."""
-    from lidardesign.design.files import MOST_TABLE_RAYS, save_design
-
-    if (design.rays or 0) > MOST_TABLE_RAYS:
-        raise ConfigError(
-            f"{design.rays} rays are too many for a design file",
-            where=str(out),
-            allowed=f"at most {MOST_TABLE_RAYS:,}",
-            hint="--rays N takes an evenly spread subset",
-        )
-    with phase("writing"):
-        save_design(design, out)
+    return Pose(origin, *(math.radians(value) for value in degrees.values()))

@@ -54,7 +54,7 @@ def part_document(part: Part) -> dict[str, Any]:
     return {**part_entry(part), "figures": figures, "sources": sources}
 
 
-def show_list(parts: Sequence[Part], rich: RichConsole) -> None:
+def show_parts(parts: Sequence[Part], rich: RichConsole) -> None:
     """Print one row per part and mode; a mode stands under its part."""
     from rich.markup import escape
     from rich.table import Table
@@ -64,51 +64,59 @@ def show_list(parts: Sequence[Part], rich: RichConsole) -> None:
         table.add_column(escape(heading), justify="left" if heading in WORDS else "right", no_wrap=True)
     above = None
     for part in parts:
+        widths = [high - low for low, high in (part.view.azimuth, part.view.elevation)]
+        is_round = part.view.shape == "ellipse" and widths[0] == widths[1]
+        near, far = part.range_m
+        # no source may say where the range begins
+        reach = f"{near:.3g} - {far:.4g}" if "near_m" in part.figures else f"? - {far:.4g}"
+        stated = part.figures["far_m"][0]
+        held = [] if stated.reflectance_percent is None else [f"{stated.reflectance_percent:g} %"]
+        if stated.illuminance_klux is not None:
+            held.append(f"{stated.illuminance_klux:g} klux" if stated.illuminance_klux else "dark")
         stem = part.name.partition(":")[0]
         name, above = f"  :{part.mode}" if above == stem else part.name, stem
-        costs = (number(part.histogram_mbps, 3), number(part.processed_mbps, 3))
-        held = _short_conditions(part.figures["far_m"][0]) or "-"
-        table.add_row(escape(name), part.kind, str(part.rays), shown_field(part), shown_range(part), escape(held),
-                      number(part.rate_hz), *costs)  # fmt: skip
+        table.add_row(
+            escape(name),
+            part.kind,
+            str(part.rays),
+            f"{widths[0]:g} round" if is_round else " x ".join(f"{width:.4g}" for width in widths),
+            reach,
+            escape(", ".join(held) or "-"),
+            number(part.rate_hz),
+            number(part.histogram_mbps, 3),
+            number(part.processed_mbps, 3),
+        )
     rich.print(table)
     rich.print("catalog show NAME, or NAME:MODE, gives every figure with its source", markup=False)
-
-
-def _short_conditions(statement: Any) -> str:
-    """Reflectance and ambient light of a statement, as `88 %, dark`."""
-    told = [] if statement.reflectance_percent is None else [f"{statement.reflectance_percent:g} %"]
-    if statement.illuminance_klux is not None:
-        told.append(f"{statement.illuminance_klux:g} klux" if statement.illuminance_klux else "dark")
-    return ", ".join(told)
-
-
-def shown_field(part: Part) -> str:
-    """A field of view in degrees, as `45 x 45`; a round one as `38.4 round`."""
-    widths = [high - low for low, high in (part.view.azimuth, part.view.elevation)]
-    if part.view.shape == "ellipse" and widths[0] == widths[1]:
-        return f"{widths[0]:g} round"
-    return " x ".join(f"{width:.4g}" for width in widths)
-
-
-def shown_range(part: Part) -> str:
-    """A range in metres, as `0.02 - 4`; `? - 4` where no source says where it begins."""
-    near, far = part.range_m
-    return f"{near:.3g} - {far:.4g}" if "near_m" in part.figures else f"? - {far:.4g}"
 
 
 def show_part(part: Part, document: dict[str, Any], rich: RichConsole) -> None:
     """Print every figure of a part with its conditions and source, and what follows from them."""
     from rich.markup import escape
+    from rich.table import Table
 
     rich.print(f"[bold]{escape(part.name)}[/bold]: {escape(part.product)}, {part.kind}")
     rich.print(part.summary, markup=False)
     if part.modes:
         rich.print(f"mode {part.mode} of {', '.join(part.modes)}", markup=False)
-    rich.print(_figures_table(part, document["disagreements"]))
+    table = Table("figure", "value", "conditions", "source", "note")
+    for name, statements in part.figures.items():
+        label = name + (" (!)" if name in document["disagreements"] else "")
+        for statement in statements:
+            cells = (label, _figure(statement), conditions_of(statement), statement.source, statement.note or "")
+            table.add_row(*(escape(cell) for cell in cells))
+            label = ""
+    rich.print(table)
     for key, source in part.sources.items():
-        told = [source.title, source.kind, source.publisher, source.revision and f"revision {source.revision}"]
-        rich.print(f"{key}: {', '.join(one for one in told if one)}", markup=False, soft_wrap=True)
-    rich.print(_read_out(part), markup=False, soft_wrap=True)
+        parts = [source.title, source.kind, source.publisher, source.revision and f"revision {source.revision}"]
+        rich.print(f"{key}: {', '.join(text for text in parts if text)}", markup=False, soft_wrap=True)
+    histograms, processed = part.histogram_mbps, part.processed_mbps
+    costs = [
+        "no source says how long its histograms are" if histograms is None else f"histograms {histograms:.3g} Mbit/s",
+        "no source says how long its frames are" if processed is None else f"processed {processed:.3g} Mbit/s",
+    ]
+    cost = f"{part.rays} rays at {part.rate_hz:g} Hz; read-out: {', '.join(costs)}"
+    rich.print(cost, markup=False, soft_wrap=True)
     if document["disagreements"]:
         names = ", ".join(document["disagreements"])
         rich.print(f"sources disagree about {names}; the first figure is used", markup=False, soft_wrap=True)
@@ -118,44 +126,19 @@ def show_part(part: Part, document: dict[str, Any], rich: RichConsole) -> None:
         rich.print(f"wrote {document['design']} ({document['design_rays']} rays of {sensors})", markup=False)
 
 
-def _figures_table(part: Part, disagreeing: Sequence[str]) -> Any:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table("figure", "value", "conditions", "source", "note")
-    for name, statements in part.figures.items():
-        for index, one in enumerate(statements):
-            label = (name + (" (!)" if name in disagreeing else "")) if index == 0 else ""
-            cells = (label, _said(one), conditions_of(one), one.source, one.note or "")
-            table.add_row(*(escape(cell) for cell in cells))
-    return table
-
-
-def _said(statement: Any) -> str:
+def _figure(statement: Any) -> str:
     """What a statement says, without where it comes from."""
-    told = statement.model_dump(exclude_none=True)
+    values = statement.model_dump(exclude_none=True)
     for key in ("source", "note", "at", "reflectance_percent", "illuminance_klux", "detection_percent"):
-        told.pop(key, None)
-    if list(told) == ["value"]:
-        return number(told["value"], 6)
-    if told.get("shape") == "rectangle":
-        del told["shape"]
-    kind = told.pop("kind", None)
-    words = [kind] if kind else []
-    return " ".join([*words, ", ".join(f"{key} {_short(value)}" for key, value in told.items())])
-
-
-def _short(value: Any) -> str:
-    if isinstance(value, list) and len(value) > LONGEST_LIST:
-        return f"{len(value)} from {value[0]:g} to {value[-1]:g}"
-    return number(value, 5)
-
-
-def _read_out(part: Part) -> str:
-    """What reading the part costs, histograms and processed results apart."""
-    histograms, processed = part.histogram_mbps, part.processed_mbps
-    told = [
-        "no source says how long its histograms are" if histograms is None else f"histograms {histograms:.3g} Mbit/s",
-        "no source says how long its frames are" if processed is None else f"processed {processed:.3g} Mbit/s",
-    ]
-    return f"{part.rays} rays at {part.rate_hz:g} Hz; read-out: {', '.join(told)}"
+        values.pop(key, None)
+    if list(values) == ["value"]:
+        return number(values["value"], 6)
+    if values.get("shape") == "rectangle":
+        del values["shape"]
+    words = [values.pop("kind")] if values.get("kind") else []
+    texts = []
+    for key, value in values.items():
+        is_long = isinstance(value, list) and len(value) > LONGEST_LIST
+        text = f"{len(value)} from {value[0]:g} to {value[-1]:g}" if is_long else number(value, 5)
+        texts.append(f"{key} {text}")
+    return " ".join([*words, ", ".join(texts)])
