@@ -136,7 +136,7 @@ def measure(run_folder: Path, options: Any, folder: Path) -> None:
     """Fit, capture and print."""
     import capture as laboratory
 
-    from lidardesign.workflow.runs import open_run
+    from lidardesign import open_run
 
     run = open_run(run_folder)
     words = ("--rays", str(laboratory.RAYS), "--sensors")

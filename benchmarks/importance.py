@@ -73,8 +73,7 @@ class Bench:
 
     def samples(self, settings: Mapping[str, Any]) -> Any:
         """The run's samples with the weights of some settings."""
-        from lidardesign.workflow.layouts import RunTarget
-        from lidardesign.workflow.weighting import Weighting, weighted_samples
+        from lidardesign.workflow.weighting import RunTarget, Weighting, weighted_samples
 
         texts = tuple(f"{key}={value}" for key, value in settings.items())
         weighting = Weighting(texts, range_spread_m=self.spread_m)
@@ -207,8 +206,8 @@ def main() -> None:
     made.add_argument("--spread-mm", type=float, default=20.0, help="of samples in range (default %(default)s)")
     made.add_argument("--picture", type=Path, metavar="FILE", help="also draw where rays go")
     options = made.parse_args()
+    from lidardesign import open_run
     from lidardesign.simulate.simulate import build_casters
-    from lidardesign.workflow.runs import open_run
 
     settings = face_settings(options.model) if options.run is None else {}
     scans: dict[tuple[str, int], Measured] = {}

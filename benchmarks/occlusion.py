@@ -67,12 +67,13 @@ def rays_needed(rays: Sequence[int], distance_m: Sequence[float], reached_m: flo
 
 def curves(run_folder: Path, layout: str, sensors: int, rays: Sequence[int], seed: int) -> tuple[Curve, Curve]:
     """Of a design fitted with a seed, and of its twin."""
+    from lidardesign import open_run
     from lidardesign.design.constraints.document import Constraints
     from lidardesign.design.fit import fit
     from lidardesign.evaluate.score import EvaluationRequest, evaluate
     from lidardesign.samples import load_samples
-    from lidardesign.workflow.layouts import TWIN_NAME, RunTarget, layouts_of, twin_without_visibility
-    from lidardesign.workflow.runs import open_run
+    from lidardesign.workflow.layouts import TWIN_NAME, Layouts, twin_without_visibility
+    from lidardesign.workflow.weighting import RunTarget
 
     run = open_run(run_folder)
     config, samples = run.config, load_samples(run.folder)
@@ -91,7 +92,7 @@ def curves(run_folder: Path, layout: str, sensors: int, rays: Sequence[int], see
         retarget=RunTarget(run),
     ).design
     design = replace(design, provenance={**design.provenance, "seed": seed})
-    layouts = layouts_of([(design, run)])
+    layouts = Layouts.of([(design, run)])
     request = EvaluationRequest(
         task=run.task,
         config=config.task,

@@ -154,9 +154,9 @@ def main() -> None:
 
 def measure(run_folder: Path, options: Any) -> None:
     """Fit, simulate and print."""
+    from lidardesign import open_run
     from lidardesign.design.files import load_design
     from lidardesign.evaluate.entries import entries_of
-    from lidardesign.workflow.runs import open_run
 
     run = open_run(run_folder)
     paths = [fitted(run_folder, f"sunlight-{n}", "--sensors", str(n))[0] for n in options.sensors]

@@ -66,12 +66,12 @@ def verdicts(found: dict[str, Any]) -> list[str]:
 
 def miss_rates(run_folder: Path, designs: list[Path], x_m: float, rays: int) -> dict[str, float]:
     """Mean miss rate [%] on the held-out shelves seen from one position, by design and baseline."""
+    from lidardesign import open_run
     from lidardesign.design.files import load_design
     from lidardesign.evaluate.score import EvaluationRequest, evaluate
     from lidardesign.samples import load_samples
     from lidardesign.task import scenes_of
-    from lidardesign.workflow.layouts import layouts_of
-    from lidardesign.workflow.runs import open_run
+    from lidardesign.workflow.layouts import Layouts
 
     run = open_run(run_folder)
     config = run.config
@@ -79,7 +79,7 @@ def miss_rates(run_folder: Path, designs: list[Path], x_m: float, rays: int) -> 
     samples = load_samples(run.folder)
     space = config.space.at({"x_m": x_m})
     train, test = (scenes_of(run.task, config.task, split, config.seed, space) for split in ("train", "test"))
-    layouts = layouts_of([(design, run) for design in loaded])
+    layouts = Layouts.of([(design, run) for design in loaded])
     request = EvaluationRequest(
         task=run.task,
         config=config.task,
@@ -105,11 +105,11 @@ def divergence_nats(run_folder: Path, x_m: float, log_likelihood: float) -> floa
     """
     import numpy as np
 
+    from lidardesign import open_run
     from lidardesign.design.mixture.conditions import MOVED_SAMPLES, at_condition
     from lidardesign.samples import load_samples
     from lidardesign.task import random_generator
-    from lidardesign.workflow.layouts import RunTarget
-    from lidardesign.workflow.runs import open_run
+    from lidardesign.workflow.weighting import RunTarget
 
     run = open_run(run_folder)
     generator = random_generator(run.config.seed, "condition")  # the fit's own samples

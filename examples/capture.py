@@ -24,6 +24,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from lidardesign import open_run
 from lidardesign.design.galvo import SPEED_OF_LIGHT_M_PER_PS, degree_frame, scan_directions
 from lidardesign.evaluate.captures.capture import Capture, load_capture
 from lidardesign.export.galvo import read_galvo
@@ -36,7 +37,6 @@ from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, Detector
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.physics import Physics
 from lidardesign.space import RANGE, DesignSpace
-from lidardesign.workflow.runs import open_run
 
 SUNLIGHT = ("illuminance_lux=100000", "light=sun")
 SENSORS = (4, 10)

@@ -19,6 +19,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
+from lidardesign import open_run
 from lidardesign.design.files import load_design
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.geometry.raycast import SceneCaster
@@ -26,7 +27,6 @@ from lidardesign.geometry.rays import Rays, Returns
 from lidardesign.samples import load_samples
 from lidardesign.scene import Body, Plane, Scene
 from lidardesign.simulate.simulate import simulate
-from lidardesign.workflow.runs import open_run
 
 RAYS, SENSORS = 400, 4
 FRAME = 26

@@ -23,6 +23,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 
+from lidardesign import open_run
 from lidardesign.design.files import load_design
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import DesignSpec
@@ -31,7 +32,6 @@ from lidardesign.scene import Scene
 from lidardesign.simulate.detector.detector import IDEAL
 from lidardesign.simulate.physics import Physics
 from lidardesign.simulate.simulate import simulate
-from lidardesign.workflow.runs import open_run
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
 from emitter import EMITTERS

@@ -24,6 +24,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from scipy.ndimage import gaussian_filter
 
+from lidardesign import open_run
 from lidardesign.design.files import load_design
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import DesignSpec
@@ -32,7 +33,6 @@ from lidardesign.samples import Samples, load_samples
 from lidardesign.scene import Scene
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import AZIMUTH, ELEVATION, X
-from lidardesign.workflow.runs import open_run
 
 RAYS = 12
 POSITION_M = 0.37

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from lidardesign.errors import ConfigError
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, errors too.")]
 Seed = Annotated[
@@ -131,3 +134,37 @@ ConfigFile = Annotated[
         show_default=False,
     ),
 ]
+
+
+def parse_at(texts: list[str] | None) -> dict[str, float]:
+    """The values of `--at`, as {"x_m": 0.37}; whether a density has them is for the design space to say.
+
+    Raises:
+        ConfigError: One is not NAME=VALUE with a finite number, or a name is given twice.
+    """
+    values: dict[str, float] = {}
+    for text in texts or []:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not (name and equals and math.isfinite(number)):
+            raise ConfigError(f"{text!r}", where="--at", allowed="NAME=VALUE with a finite number, as x_m=0.37")
+        if name in values:
+            raise ConfigError(f"{name} is given twice: {values[name]:g} and {number:g}", where="--at")
+        values[name] = number
+    return values
+
+
+def sensor_count(text: str | None) -> int | str | None:
+    """The value of `--sensors`: a number from 1, `auto`, or None.
+
+    Raises:
+        ConfigError: It is neither.
+    """
+    if text is None or text == "auto":
+        return text
+    if not text.isdecimal() or int(text) < 1:
+        raise ConfigError(f"{text!r}", where="--sensors", allowed="a whole number from 1, or auto")
+    return int(text)

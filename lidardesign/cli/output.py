@@ -91,6 +91,10 @@ class Output:
         if not self.quiet:
             print_message(text)
 
+    def remark(self, text: str) -> None:
+        """Print what the program has to remark, marked as a note."""
+        self.note(f"note: {text}")
+
     def result(
         self, document: dict[str, Any], show: Callable[[RichConsole], None], *, show_costs: bool = True
     ) -> None:

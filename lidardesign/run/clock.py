@@ -79,6 +79,12 @@ def running(clock: Clock | None = None) -> Iterator[Clock]:
         _RUNNING.reset(token)
 
 
+def outermost_clock() -> Clock | None:
+    """The clock that has run longest, as a command's; None where none runs."""
+    clocks = _RUNNING.get()
+    return clocks[0] if clocks else None
+
+
 @contextlib.contextmanager
 def phase(name: str) -> Iterator[None]:
     """Count the time inside towards a phase of every clock that runs; also a decorator."""

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING
 
-from lidardesign.run.clock import Clock, phase
-
-if TYPE_CHECKING:
-    from lidardesign.evaluate.figures.figure_data import Pictured
-    from lidardesign.evaluate.report.report import Report
-    from lidardesign.evaluate.request import EvaluationRequest
-    from lidardesign.evaluate.results import Evaluation
-    from lidardesign.workflow.runs import Run
+from lidardesign.evaluate.figures.figure_data import Pictured
+from lidardesign.evaluate.report.report import Report
+from lidardesign.evaluate.report.tables import CommandTimes, Reproduction
+from lidardesign.evaluate.request import EvaluationRequest
+from lidardesign.evaluate.results import Evaluation
+from lidardesign.evaluate.verdicts import held_out
+from lidardesign.run.clock import phase
+from lidardesign.run.manifest import read_manifest, versions
+from lidardesign.space import observed_point
+from lidardesign.task import random_generator
+from lidardesign.workflow.run_folder import CONFIGURATION, RunFolder
 
 # Drawn in the 3D view of what the density observes: enough to see its shape, few enough to see through.
 DENSITY_POINTS = 3000
@@ -23,21 +24,9 @@ STREAM = "report"
 COMMAND = "evaluate"
 
 
-def times_so_far(run: Path, clock: Clock) -> dict[str, dict[str, float]]:
-    """Seconds by phase of each command on a run, in the order in which they first ran; of this one until now."""
-    from lidardesign.run.manifest import read_manifest
-
-    times: dict[str, dict[str, float]] = {}
-    for command, entry in read_manifest(run).get("timings", {}).items():
-        phases = entry.get("phases") if isinstance(entry, dict) else None  # those of older versions are plain numbers
-        if isinstance(phases, dict) and all(isinstance(seconds, int | float) for seconds in phases.values()):
-            times[command] = dict(phases)
-    return {**times, COMMAND: clock.timings()}
-
-
 @phase("report")
 def evaluation_report(
-    evaluation: Evaluation, request: EvaluationRequest, run: Run, pictured: Pictured, command: Sequence[str]
+    evaluation: Evaluation, request: EvaluationRequest, run: RunFolder, pictured: Pictured, command: Sequence[str]
 ) -> Report:
     """Everything that the report of an evaluation is made of.
 
@@ -48,14 +37,6 @@ def evaluation_report(
         pictured: What is drawn beside the scores.
         command: The command line that makes the page again.
     """
-    from lidardesign.config import FILE_NAME
-    from lidardesign.evaluate.report.report import Report
-    from lidardesign.evaluate.report.tables import CommandTimes, Reproduction
-    from lidardesign.evaluate.verdicts import held_out
-    from lidardesign.run.manifest import read_manifest, versions
-    from lidardesign.space import observed_point
-    from lidardesign.task import random_generator
-
     manifest = read_manifest(run.folder)
     density = request.density() if request.density is not None else None
     points = None
@@ -82,7 +63,7 @@ def evaluation_report(
         times.append(
             CommandTimes(title, str(entry.get("when", "")), seconds, memory if isinstance(memory, int) else None)
         )
-    config = run.folder / FILE_NAME
+    config = run.folder / CONFIGURATION
     return Report(
         evaluation,
         pictured.shown,

@@ -1,59 +1,36 @@
-"""`learn --tolerance` and `--time-budget`: how long to learn follows from how good, or how soon."""
+"""How long to learn follows from how good (a tolerance), or how soon (a time budget)."""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import typer
-
-from lidardesign.cli.output import Output
+from lidardesign.config import RunConfig
 from lidardesign.errors import ConfigError, DataError, ThresholdError
-from lidardesign.run.clock import phase
+from lidardesign.run.clock import Clock, outermost_clock, phase
+from lidardesign.run.manifest import DAMAGED_HINT, FILE_NAME, read_manifest
+from lidardesign.run.yaml import leaves, load_yaml
+from lidardesign.task import Task
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from lidardesign.config import RunConfig
     from lidardesign.density.learn import LearnProgress, LearnResult
     from lidardesign.density.training.schedule import ToleranceGoal
-    from lidardesign.task import Task
 
 TOLERANCE, TIME_BUDGET = "--tolerance", "--time-budget"
 # More is a mistake in the unit; the numbers of steps that it makes are beyond what a file may hold.
 LONGEST_S = 366 * 24 * 3600.0
 STEPS_KEY, FIELDS_KEY = "learning.steps", "density.field_resolution"
 GOAL = "goal"
-# What passes before the command's clock runs, where the system does not tell: the program's own imports take 0.3 s.
+# What passes before a command's clock runs, where the system does not tell: the program's own imports take 0.3 s.
 STARTUP_S = 0.5
 # A process that is older than this did something else before.
 MOST_STARTUP_S = 30.0
 # Where Linux says when a process began, in ticks since the computer was started; the fields after its name in brackets.
 _STATUS, _STARTED_FIELD = Path("/proc/self/stat"), 19
-
-Tolerance = Annotated[
-    float | None,
-    typer.Option(
-        TOLERANCE,
-        metavar="SHARE",
-        help="Learn until at most this share of the density's mass is in the wrong place, in stages of doubled steps "
-        "from an eighth to four times those of the preset; exit 1 when none is good enough.",
-        show_default=False,
-    ),
-]
-TimeBudget = Annotated[
-    float | None,
-    typer.Option(
-        TIME_BUDGET,
-        metavar="SECONDS",
-        help="Learn as many steps as let the command end within this time; they are planned from its own first steps.",
-        show_default=False,
-    ),
-]
 
 
 @dataclass(frozen=True)
@@ -87,7 +64,7 @@ def checked_goal(tolerance: float | None, time_budget_s: float | None, given: Ma
 
     Arguments:
         tolerance, time_budget_s: The options.
-        given: The other options of the configuration.
+        given: The other options of the configuration, as `lidardesign.config.resolve` takes them.
 
     Raises:
         ConfigError: Both, a value that is none, or a number of steps beside a time.
@@ -110,8 +87,6 @@ def checked_goal(tolerance: float | None, time_budget_s: float | None, given: Ma
 
 def _refuse_steps_in(path: Path) -> None:
     """Refuse a configuration file that sets what the time decides."""
-    from lidardesign.run.yaml import leaves, load_yaml
-
     document, key = load_yaml(path), tuple(STEPS_KEY.split("."))
     if key in dict(leaves(document.value)):
         where = f"{TIME_BUDGET}, {document.locate(key)}"
@@ -125,8 +100,6 @@ def resumed_goal(asked: Goal, run: Path) -> Goal:
         ConfigError: Another one is asked for.
         DataError: The manifest's word of it is damaged.
     """
-    from lidardesign.run.manifest import DAMAGED_HINT, FILE_NAME, read_manifest
-
     found = read_manifest(run).get(GOAL) or {}
     stored = Goal(found.get("tolerance"), found.get("time_budget_s"))
     if not all(isinstance(value, float | int | None) for value in stored.as_dict().values()):
@@ -151,30 +124,30 @@ class Learner:
         run: The folder.
         device: auto, cpu or cuda.
         progress: Called about every tenth step.
-        console: Whose clock the time budget is measured by.
+        clock: By which a time budget is measured.
     """
 
     task: Task
     run: Path
     device: str
-    progress: Callable[[LearnProgress], None]
-    console: Output
+    progress: Callable[[LearnProgress], None] | None
+    clock: Clock
 
     def learn(self, config: RunConfig, goal: Goal, *, resume: bool) -> LearnResult:
         """Learn a configuration, or to a goal, or go on with it."""
         with phase("libraries"):
             from lidardesign.density.learn import learn as learn_density
-            from lidardesign.run.manifest import read_manifest
 
-        options: dict[str, Any] = {"device": self.device, "progress": self.progress}
         if goal.tolerance is not None:
-            return self._to_tolerance(config, goal, resume, options)
+            return self._to_tolerance(config, goal, resume)
         if goal.time_budget_s is not None and not resume:
-            return self._within(config, goal.time_budget_s, options)
-        result = learn_density(self.task, config, self.run, resume=resume, **options)
+            return self._within(config, goal.time_budget_s)
+        result = learn_density(
+            self.task, config, self.run, resume=resume, device=self.device, progress=self.progress
+        )
         return result if goal.is_none else replace(result, goal=read_manifest(self.run)[GOAL])
 
-    def _to_tolerance(self, config: RunConfig, goal: Goal, resume: bool, options: dict[str, Any]) -> LearnResult:
+    def _to_tolerance(self, config: RunConfig, goal: Goal, resume: bool) -> LearnResult:
         from lidardesign.density.learn import learn as learn_density
         from lidardesign.density.training.schedule import goal_of, learn_to_tolerance
         from lidardesign.density.training.training_data import prepare_ground
@@ -185,12 +158,20 @@ class Learner:
         ground = prepare_ground(self.task, config)
 
         def once(staged: RunConfig, going_on: bool) -> LearnResult:
-            return learn_density(self.task, staged, self.run, resume=going_on, ground=ground, **options)
+            return learn_density(
+                self.task,
+                staged,
+                self.run,
+                resume=going_on,
+                ground=ground,
+                device=self.device,
+                progress=self.progress,
+            )
 
         result, reached = learn_to_tolerance(config, self.run, begun, once, resume=resume)
         tried = ", ".join(f"{stage.misplaced:.3g} with {stage.steps}" for stage in reached.stages)
-        told = f"misplaced {tried} steps; the tolerance is {reached.tolerance:g}"
-        return self._whole(result, "; ".join(filter(None, [told, note])), reached.as_dict())
+        summary = f"misplaced {tried} steps; the tolerance is {reached.tolerance:g}"
+        return self._whole(result, "; ".join(filter(None, [summary, note])), reached.as_dict())
 
     def _begun(self, config: RunConfig, goal: Goal) -> tuple[RunConfig, ToleranceGoal, str]:
         """The configuration with fields for the tolerance, and what they leave of it to learning."""
@@ -210,31 +191,44 @@ class Learner:
         begun = ToleranceGoal(goal.tolerance, config.learning.steps, (), chosen.misplaced)
         return replace(config, density=chosen.density), begun, chosen.note
 
-    def _within(self, config: RunConfig, time_budget_s: float, options: dict[str, Any]) -> LearnResult:
+    def _within(self, config: RunConfig, time_budget_s: float) -> LearnResult:
         from lidardesign.density.learn import choose_device
         from lidardesign.density.learn import learn as learn_density
         from lidardesign.density.training.schedule import Timekeeper
         from lidardesign.density.training.training_data import prepare_ground
 
-        place = choose_device(self.device)
-        clock, age = self.console.clock, _age_s()
-        startup = STARTUP_S if age is None or age - clock.seconds > MOST_STARTUP_S else age - clock.seconds
-        keeper = Timekeeper(time_budget_s, lambda: clock.seconds + startup, config, self.run)
+        place, startup = choose_device(self.device), self._startup_s()
+        keeper = Timekeeper(time_budget_s, lambda: self.clock.seconds + startup, config, self.run)
         ground = prepare_ground(self.task, config)
         with phase("planning"):
             planned = keeper.plan(ground, place)
-        result = learn_density(self.task, planned, self.run, ground=ground, replan=keeper.replan, **options)
+        result = learn_density(
+            self.task,
+            planned,
+            self.run,
+            ground=ground,
+            replan=keeper.replan,
+            device=self.device,
+            progress=self.progress,
+        )
         plan = keeper.planned
-        told = (
+        summary = (
             f"{plan.pathwise_steps} + {plan.balancing_steps} steps fit into {time_budget_s:g} s: "
             f"{1e3 * plan.pathwise_s:.0f} and {1e3 * plan.balancing_s:.0f} ms each"
         )
-        return self._whole(result, told, plan.as_dict())
+        return self._whole(result, summary, plan.as_dict())
 
-    def _whole(self, result: LearnResult, told: str, goal: dict[str, Any]) -> LearnResult:
+    def _startup_s(self) -> float:
+        """What passed before the clock was made, if it is a command's: that counts for whoever waits [s]."""
+        if self.clock is not outermost_clock():
+            return 0.0
+        age = _age_s()
+        return STARTUP_S if age is None or age - self.clock.seconds > MOST_STARTUP_S else age - self.clock.seconds
+
+    def _whole(self, result: LearnResult, note: str, goal: dict[str, Any]) -> LearnResult:
         """A result with all the time that its goal took."""
-        seconds = round(self.console.clock.seconds, 3)
-        return replace(result, notes=(*result.notes, told), goal=goal, seconds=seconds)
+        seconds = round(self.clock.seconds, 3)
+        return replace(result, notes=(*result.notes, note), goal=goal, seconds=seconds)
 
 
 def _age_s() -> float | None:

@@ -1,32 +1,42 @@
-"""How `fit` and `constrain` fit a design, and refine it on training scenes that were drawn for that."""
+"""How a design is fitted, refined on training scenes that were drawn for that, and checked before anyone sees it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.cli.tables.designs import number
-from lidardesign.errors import ConfigError, DataError
+import numpy as np
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.constraints.check import ConstraintCheck, check_design
+from lidardesign.design.constraints.origins import is_mounted
+from lidardesign.design.files import design_document
+from lidardesign.design.fit import fit as fit_samples
+from lidardesign.design.fit_result import FitResult
+from lidardesign.design.layouts.quantise import SAMPLES_PER_RAY
+from lidardesign.design.mixture.bounds import groups
+from lidardesign.design.mixture.conditions import MOVED_SAMPLES, at_condition, shown
+from lidardesign.design.mixture.support import LEAST_SAMPLES
+from lidardesign.design.sensor import DesignSpec
+from lidardesign.errors import ConfigError, DataError, InfeasibleError
 from lidardesign.run.clock import phase
-from lidardesign.workflow.layouts import Layouts, RunTarget
-from lidardesign.workflow.weighting import Weighting
+from lidardesign.run.yaml import dump_yaml, parse_yaml
+from lidardesign.samples import Samples, load_samples
+from lidardesign.scene import Scene
+from lidardesign.space import observed_point
+from lidardesign.task import conditions_of, random_generator
+from lidardesign.workflow.fit import FitRequest
+from lidardesign.workflow.layouts import Layouts
+from lidardesign.workflow.run_folder import Notes, RunFolder, log_note, provenance
+from lidardesign.workflow.weighting import KEY, RunTarget, Weighting
 
 if TYPE_CHECKING:
-    import numpy as np
-    from rich.console import Console as RichConsole
-
-    from lidardesign.cli.output import Output
-    from lidardesign.design.constraints.document import Constraints
-    from lidardesign.design.fit import FitResult
     from lidardesign.evaluate.refinement.attention import Attention
     from lidardesign.evaluate.refinement.refinement import Refinement, Round, Shape, Trial
     from lidardesign.evaluate.refinement.regating import Gating
     from lidardesign.evaluate.refinement.reweighting import Reweighting
-    from lidardesign.samples import Samples
-    from lidardesign.scene import Scene
-    from lidardesign.workflow.runs import Run
 
 # The share of the training scenes whose residuals are looked at; the others judge.
 LOOK_SHARE = 0.6
@@ -36,78 +46,42 @@ ANCHOR_POOL = 20_000
 LEARN_LONGER = "learn longer (--preset standard or fine), or with a larger density.sigma_m"
 
 
-@dataclass(frozen=True, eq=False)
-class FitOrder:
-    """What `fit` or `constrain` was asked for.
-
-    Arguments:
-        run: An opened run.
-        name: The design's name.
-        seed: Root of the random streams.
-        constraints: Checked constraints, or None.
-        at: Condition values that the design is for.
-        choices: sensors, layout, rays, gates and level.
-    """
-
-    run: Run
-    name: str
-    seed: int
-    constraints: Constraints | None
-    at: Mapping[str, float]
-    choices: Mapping[str, Any]
-
-    @property
-    def count(self) -> int:
-        """The number of rays that a refined design is judged at: its own, else the task's middle budget."""
-        budgets = sorted(self.run.task.defaults.rays)
-        asked = None if self.constraints is None else self.constraints.budget.rays
-        return self.choices.get("rays") or asked or budgets[len(budgets) // 2]
-
-
 class Fitter:
-    """Fits designs of one order under different weightings, which have the same settings of the task.
+    """Fits designs of one request under different weightings, which have the same settings of the task.
 
     Raises:
         ConfigError: A setting that cannot be, or a name that is no condition of the density.
         DataError: The density is too rough, with or without the settings.
     """
 
-    def __init__(self, order: FitOrder, weighting: Weighting, console: Output) -> None:
-        self.order, self.console = order, console
-        settings_alone = replace(weighting, reweighting=None, range_spread_m=0.0)
-        self.target = RunTarget(order.run, weighting=settings_alone)
-        order.run.config.space.at(order.at)
+    def __init__(self, request: FitRequest, notes: Notes = log_note) -> None:
+        self.request, self.notes = request, notes
+        settings_alone = replace(request.weighting, reweighting=None, range_spread_m=0.0)
+        self.target = RunTarget(request.run, weighting=settings_alone)
+        request.run.config.space.at(request.at)
         self.base = self._base(settings_alone)
-        self._told = False
+        self._has_noted_condition = False
 
     @phase("samples")
     def _base(self, weighting: Weighting) -> Samples:
         """The samples of the run under the settings."""
-        from lidardesign.samples import load_samples
-
-        samples = load_samples(self.order.run.folder)
-        _check_worth(samples, self.order.run, LEARN_LONGER)
+        samples = load_samples(self.request.run.folder)
+        _check_effective_samples(samples, self.request.run, LEARN_LONGER)
         settings = weighting.settings
         if not settings:
             return samples
-        weighed = weighting.log_target(samples, self.target)
-        _check_worth(weighed, self.order.run, "a setting nearer to what was learned, or learn with it")
-        now, before = weighed.effective_sample_size, samples.effective_sample_size
-        self.console.note(f"note: with {', '.join(settings)} the samples have ESS {now:.2f}, as learned {before:.2f}")
-        return weighed
+        weighted = weighting.log_target(samples, self.target)
+        hint = "a setting nearer to what was learned, or learn with it"
+        _check_effective_samples(weighted, self.request.run, hint)
+        now, before = weighted.effective_sample_size, samples.effective_sample_size
+        self.notes(f"with {', '.join(settings)} the samples have ESS {now:.2f}, as learned {before:.2f}")
+        return weighted
 
     def samples(self, weighting: Weighting) -> Samples:
         """What designs are laid out by: of all conditions, weighted."""
         factor = weighting.reweighting
         samples = self.base if factor is None else self.base.reweighted(factor.log_factor(self.base.points))
-        return weighting.spread(samples, self.order.run.config.seed)
-
-    def usable(self, weighting: Weighting) -> Weighting:
-        """The weighting without its spread in range where samples are moved and weighed anew."""
-        if not weighting.range_spread_m or self.may_spread:
-            return weighting
-        self.console.note("note: samples that are aimed anew are not spread in range, as they were for the design")
-        return replace(weighting, range_spread_m=0.0)
+        return weighting.spread(samples, self.request.run.config.seed)
 
     def retarget(self, factor: Reweighting | None) -> Callable[[np.ndarray], np.ndarray]:
         """log p* with a factor; the target itself is prepared once."""
@@ -118,43 +92,33 @@ class Fitter:
     @phase("fitting")
     def fit(self, weighting: Weighting, samples: Samples, **choices: Any) -> FitResult:
         """The design under a weighting, from its samples."""
-        from lidardesign.design.fit import fit as fit_design
-
-        order, retarget = self.order, self.retarget(weighting.reweighting)
-        if order.at:
+        request, retarget = self.request, self.retarget(weighting.reweighting)
+        if request.at:
             samples = self._at(samples, retarget)
-        return fit_design(
+        return fit_samples(
             samples,
-            constraints=order.constraints,
-            seed=order.seed,
-            name=order.name,
+            constraints=request.constraints,
+            seed=request.seed,
+            name=request.name,
             retarget=retarget,
-            **{**order.choices, **choices},
+            **{**request.choices, **choices},
         )
 
     def _at(self, samples: Samples, retarget: Callable[[np.ndarray], np.ndarray]) -> Samples:
-        """The samples at the order's conditions."""
-        from lidardesign.design.layouts.quantise import SAMPLES_PER_RAY
-        from lidardesign.design.mixture.conditions import MOVED_SAMPLES, at_condition, shown
-        from lidardesign.task import random_generator
-
-        order = self.order
-        count = max(MOVED_SAMPLES, SAMPLES_PER_RAY * (order.choices.get("rays") or 0))
-        moved = at_condition(samples, order.at, retarget, count, random_generator(order.seed, "condition"))
-        worth = moved.effective_sample_size
-        if not self._told:
-            self.console.note(f"note: at {shown(order.at)} {len(moved)} samples have ESS {worth:.2f}")
-        self._told = True
+        """The samples at the request's conditions."""
+        request = self.request
+        count = max(MOVED_SAMPLES, SAMPLES_PER_RAY * (request.choices.get("rays") or 0))
+        moved = at_condition(samples, request.at, retarget, count, random_generator(request.seed, "condition"))
+        if not self._has_noted_condition:
+            self.notes(f"at {shown(request.at)} {len(moved)} samples have ESS {moved.effective_sample_size:.2f}")
+        self._has_noted_condition = True
         return moved
 
     @cached_property
     def may_spread(self) -> bool:
         """Whether samples may be spread in range: not where weights at other places have to be worked out for them."""
-        from lidardesign.design.constraints.origins import is_mounted
-        from lidardesign.design.mixture.bounds import groups
-
-        constraints = self.order.constraints
-        if self.order.at:
+        constraints = self.request.constraints
+        if self.request.at:
             return False
         if constraints is None:
             return True
@@ -162,23 +126,115 @@ class Fitter:
         return not is_mounted(constraints.rules) and all(pin is None for group in members for pin in group.pins)
 
 
-def fitted(order: FitOrder, weighting: Weighting, console: Output) -> tuple[FitResult, Weighting]:
-    """A design as it was ordered."""
-    fitter = Fitter(order, weighting, console)
-    return fitter.fit(weighting, fitter.samples(weighting)), weighting
+def _check_effective_samples(samples: Samples, run: RunFolder, hint: str) -> None:
+    """Refuse samples of which too few are effective to fit anything to, whatever the constraints.
+
+    Raises:
+        DataError: They are fewer than a fit needs.
+    """
+    effective = samples.effective_sample_size * len(samples)
+    if effective < LEAST_SAMPLES:
+        raise DataError(
+            f"the density is too rough: its {len(samples)} samples are worth {effective:.0f}",
+            where=str(run.folder),
+            allowed=f"at least {LEAST_SAMPLES}",
+            hint=hint,
+        )
 
 
-def refined(
-    order: FitOrder, weighting: Weighting, rounds: int, console: Output
-) -> tuple[tuple[FitResult, Weighting], dict[str, Any]]:
-    """A design that was refined, how its samples are weighted, and how it went, for the document.
+@dataclass(frozen=True, eq=False)
+class FittedDesign:
+    """What a request came to.
+
+    Arguments:
+        result: The fit; its design says where it came from, its checks are of the design's own text.
+        refinement: How refinement went, as plain values; None without.
+    """
+
+    result: FitResult
+    refinement: Mapping[str, Any] | None = None
+
+
+def fit_design(
+    request: FitRequest, *, progress: Callable[[Round], None] | None = None, notes: Notes = log_note
+) -> FittedDesign:
+    """Fit the design of a request, refine it if asked to, and check it; nothing is written.
+
+    Arguments:
+        request: What is asked for.
+        progress: Called with every round of refinement.
+        notes: Called with every note.
+
+    Raises:
+        ConfigError: Choices that do not fit together, or a task that cannot be refined for.
+        DataError: The density is too rough.
+        InfeasibleError: Constraints that contradict each other, or that the best design does not keep.
+    """
+    run, weighting, document = request.run, request.weighting, None
+    if request.refine is None:
+        fitter = Fitter(request, notes)
+        result = fitter.fit(weighting, fitter.samples(weighting))
+    else:
+        refinement = _refined(request, request.refine, progress, notes)
+        result = refinement.trial.result
+        weighting = Weighting(weighting.settings, refinement.reweighting, refinement.shape.range_spread_m)
+        document = _document(refinement, run.task.metric.unit)
+    for note in result.notes:
+        notes(note)
+    design, further = result.design, {KEY: weighting.as_document()} if weighting else {}
+    if len(request.names) == len(design.sensors):
+        named = (replace(sensor, name=name) for sensor, name in zip(design.sensors, request.names, strict=True))
+        design = replace(design, sensors=tuple(named))
+    origin = provenance(run, run.design_path(request.name), request.command, request.seed, **further)
+    design = replace(design, provenance={**design.provenance, **origin})
+    with phase("writing"):
+        checks = check_written(design, request)
+    satisfied = all(check.satisfied for check in checks)
+    return FittedDesign(replace(result, design=design, constraints=checks, satisfied=satisfied), document)
+
+
+def check_written(design: DesignSpec, request: FitRequest) -> list[ConstraintCheck]:
+    """Check a design's own text against its constraints with code that the fit does not share.
+
+    Raises:
+        InfeasibleError: A constraint does not hold.
+    """
+    if request.constraints is None:
+        return []
+    written = parse_yaml(dump_yaml(design_document(design)), where=design.name).value
+    checks = list(check_design(written, request.constraints, request.run.config.space))
+    refuse_broken(checks)
+    return checks
+
+
+def refuse_broken(checks: Sequence[ConstraintCheck]) -> None:
+    """Refuse a design that breaks a constraint.
+
+    Raises:
+        InfeasibleError: It does.
+    """
+    broken = [check for check in checks if not check.satisfied]
+    if broken:
+        first = broken[0]
+        raise InfeasibleError(
+            f"the best design found breaks {first.name}: {first.value}, bound {first.bound}",
+            conflicts=[check.name for check in broken],
+            hint="loosen one of the constraints; no file was written",
+        )
+
+
+def _refined(
+    request: FitRequest, rounds: int, progress: Callable[[Round], None] | None, notes: Notes
+) -> Refinement:
+    """The best design of so many rounds.
 
     Raises:
         ConfigError: The task does not say where its error is, or has too few training scenes.
     """
+    from lidardesign.evaluate.refinement.refinement import Refiner, Shape
     from lidardesign.evaluate.scene_scores import gives_residuals
 
-    run = order.run
+    run, weighting = request.run, request.weighting
     if not gives_residuals(run.task):
         raise ConfigError(
             f"the task {run.task.name} does not say where its error is",
@@ -186,45 +242,29 @@ def refined(
             allowed="tasks with residuals",
             hint="leave --refine out, or give the task a method residuals(scene, returns)",
         )
-    fitter = Fitter(order, weighting, console)
-    found = _refine(fitter, weighting, rounds, console)
-    shape = found.shape
-    used = Weighting(weighting.settings, found.reweighting, shape.range_spread_m)
-    return (found.trial.result, used), {"refinement": _document(found, run.task.metric.unit)}
-
-
-def _refine(fitter: Fitter, weighting: Weighting, rounds: int, console: Output) -> Refinement:
-    from lidardesign.evaluate.refinement.refinement import Refiner, Shape
-
-    order, start = fitter.order, weighting.reweighting
-    unit = order.run.task.metric.unit
-    look, judge = _scenes(order)
+    fitter = Fitter(request, notes)
+    start = weighting.reweighting
+    look, judge = refinement_scenes(request)
     gating = _Gating(fitter, look)
-
-    def told(one: Round) -> None:
-        console.note(f"refine {one.number}: {_shown(one, unit)}")
-
     refiner = Refiner(
-        order.run.task,
+        run.task,
         lambda factor, shape: _trial(fitter, replace(weighting, reweighting=factor), shape, gating),
         look,
         judge,
         _attention(fitter, start),
-        sigma_m=order.run.config.density.sigma_m,
+        sigma_m=run.config.density.sigma_m,
         spreads=fitter.may_spread,
-        progress=told,
+        progress=progress,
     )
-    shape = Shape(order.choices["level"], weighting.range_spread_m)
+    shape = Shape(request.choices["level"], weighting.range_spread_m)
     return refiner.run(rounds, shape, None if start is None else start.log_factors)
 
 
 def _attention(fitter: Fitter, start: Reweighting | None) -> Attention:
-    """Anchors over the density, or those of what was found before, which then goes on."""
+    """Anchors over the density, or those of an earlier refinement, which then goes on."""
     from lidardesign.evaluate.refinement.attention import Attention, anchors_for
-    from lidardesign.space import observed_point
-    from lidardesign.task import conditions_of, random_generator
 
-    run, seed = fitter.order.run, fitter.order.seed
+    run, seed = fitter.request.run, fitter.request.seed
     places = observed_point(fitter.base.resample(ANCHOR_POOL, random_generator(seed, "anchor places")))
     if start is not None:
         return Attention.at(start.points_m, places)
@@ -239,12 +279,12 @@ class _Gating:
         self._fitter, self._look = fitter, look
 
     @cached_property
-    def made(self) -> Gating:
+    def gating(self) -> Gating:
         """The gating, with casters of all scenes."""
         from lidardesign.evaluate.refinement.regating import Gating
         from lidardesign.simulate.simulate import build_casters
 
-        run = self._fitter.order.run
+        run = self._fitter.request.run
         scenes = [*self._look, *run.scenes("train", run.config.seed)]
         return Gating([(s, build_casters(s)) for s in scenes], run.config.space, run.config.density.sigma_m)
 
@@ -255,50 +295,36 @@ def _trial(fitter: Fitter, weighting: Weighting, shape: Shape, gating: _Gating) 
     Raises:
         InfeasibleError: It cannot be fitted, or breaks a constraint.
     """
-    from lidardesign.cli.commands.fit import refuse_broken
-    from lidardesign.design.bandwidth import Bandwidth
     from lidardesign.evaluate.baselines.candidates import mean_mbps
     from lidardesign.evaluate.refinement.refinement import Trial
-    from lidardesign.task import conditions_of
 
-    order = fitter.order
-    run = order.run
+    request = fitter.request
+    run, constraints = request.run, request.constraints
     weighting = replace(weighting, range_spread_m=shape.range_spread_m)
     samples = fitter.samples(weighting)
     result = fitter.fit(weighting, samples, level=shape.level)
-    layouts = Layouts({order.name: fitter.retarget(weighting.reweighting)})
+    layouts = Layouts({request.name: fitter.retarget(weighting.reweighting)})
     conditions = conditions_of(run.task, run.config.task, run.config.space)
-    count = result.design.rays or order.count
+    count = result.design.rays or request.judged_rays
     if shape.traced_gates:
         rays = layouts(result.design, count, samples, at=conditions[0])
-        design = gating.made(result.design, rays, shape.range_spread_m)
-        result = _checked(replace(result, design=design), order)
+        design = gating.gating(result.design, rays, shape.range_spread_m)
+        document = design_document(design)
+        checks = [] if constraints is None else list(check_design(document, constraints, run.config.space))
+        result = replace(result, design=design, constraints=checks)
     refuse_broken(result.constraints)
     positions = tuple(layouts(result.design, count, samples, at=condition) for condition in conditions)
     return Trial(result, positions, mean_mbps(positions, Bandwidth()))
 
 
-def _checked(result: FitResult, order: FitOrder) -> FitResult:
-    """A fit whose design was changed, checked anew."""
-    from lidardesign.design.constraints.check import check_design
-    from lidardesign.design.files import design_document
-
-    constraints = order.constraints
-    document = design_document(result.design)
-    found = [] if constraints is None else check_design(document, constraints, order.run.config.space)
-    return replace(result, constraints=list(found))
-
-
-def _scenes(order: FitOrder) -> tuple[list[Scene], list[Scene]]:
+def refinement_scenes(request: FitRequest) -> tuple[list[Scene], list[Scene]]:
     """Training scenes that nothing was learned from: some to look at, others to judge by.
 
     Raises:
         ConfigError: There are too few.
     """
-    from lidardesign.task import random_generator
-
-    seed = int(random_generator(order.seed, "refinement scenes").integers(2**31))
-    scenes = order.run.scenes("train", seed)
+    seed = int(random_generator(request.seed, "refinement scenes").integers(2**31))
+    scenes = request.run.scenes("train", seed)
     if len(scenes) < FEWEST_SCENES:
         raise ConfigError(
             f"{len(scenes)} training scene", where="--refine", allowed=f"at least {FEWEST_SCENES}",
@@ -308,64 +334,14 @@ def _scenes(order: FitOrder) -> tuple[list[Scene], list[Scene]]:
     return scenes[:looked], scenes[looked:]
 
 
-def _check_worth(samples: Samples, run: Run, hint: str) -> None:
-    """Refuse samples that are worth too few to fit anything to, whatever the constraints.
-
-    Raises:
-        DataError: They are worth fewer than a fit needs.
-    """
-    from lidardesign.design.mixture.support import LEAST_SAMPLES
-
-    worth = samples.effective_sample_size * len(samples)
-    if worth < LEAST_SAMPLES:
-        raise DataError(
-            f"the density is too rough: its {len(samples)} samples are worth {worth:.0f}",
-            where=str(run.folder),
-            allowed=f"at least {LEAST_SAMPLES}",
-            hint=hint,
-        )
-
-
-def _document(found: Refinement, unit: str) -> dict[str, Any]:
+def _document(refinement: Refinement, unit: str) -> dict[str, Any]:
     return {
-        "start": found.start,
-        "end": found.end,
+        "start": refinement.start,
+        "end": refinement.end,
         "unit": unit,
-        "level": found.shape.level,
-        "range_spread_m": found.shape.range_spread_m,
-        "traced_gates": found.shape.traced_gates,
-        "scenes": {"looked_at": found.looked_at, "judged_on": found.judged_on},
-        "rounds": [one.as_dict() for one in found.rounds],
+        "level": refinement.shape.level,
+        "range_spread_m": refinement.shape.range_spread_m,
+        "traced_gates": refinement.shape.traced_gates,
+        "scenes": {"looked_at": refinement.looked_at, "judged_on": refinement.judged_on},
+        "rounds": [entry.as_dict() for entry in refinement.rounds],
     }
-
-
-def _shown(one: Round, unit: str) -> str:
-    if one.score is None:
-        return f"{one.change} (refused, {number(one.seconds, 2)} s)"
-    verdict = "kept" if one.kept else "not better"
-    return (
-        f"{one.change}: {number(one.score)} {unit} at {number(one.bandwidth_mbps, 3)} Mbit/s, {verdict} "
-        f"({number(one.seconds, 2)} s)"
-    )
-
-
-def show_refinement(document: Mapping[str, Any], rich: RichConsole) -> None:
-    """Print what every round of a refinement brought."""
-    from rich.markup import escape
-    from rich.table import Table
-
-    found = document.get("refinement")
-    if found is None:
-        return
-    scenes = found["scenes"]
-    title = (
-        f"refinement: {scenes['looked_at']} training scenes to look at, score on {scenes['judged_on']} others "
-        f"({number(found['start'])} to {number(found['end'])} {found['unit']})"
-    )
-    table = Table(title=title, title_justify="left")
-    for heading in ("round", "change", found["unit"], "Mbit/s", "kept", "s"):
-        table.add_column(heading, justify="left" if heading == "change" else "right")
-    for one in found["rounds"]:
-        figures = (number(one["score"]), number(one["bandwidth_mbps"], 3), "yes" if one["kept"] else "no")
-        table.add_row(str(one["round"]), escape(one["change"]), *figures, number(one["seconds"], 2))
-    rich.print(table)

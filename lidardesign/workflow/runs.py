@@ -1,288 +1,287 @@
-"""Runs and designs as commands are given them.
-
-Rigs of others beside a run: how far their rays are heard where no file says it, and how many they can fire.
-"""
+"""Runs as users hold them: a task that was learned, whose density is fitted to, and whose scenes judge designs."""
 
 from __future__ import annotations
 
-import math
-import os
-import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.errors import ConfigError, DataError, LidardesignError
-from lidardesign.run.clock import phase
-from lidardesign.run.files import is_input, is_there, readable
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.errors import DataError, LidardesignError
+from lidardesign.run.manifest import DAMAGED_HINT, read_manifest
+from lidardesign.workflow.designs import Design, html_table
+from lidardesign.workflow.fit import FitOptions, FitRequest
+from lidardesign.workflow.learn import LearnOptions, LearnRequest, learning_advice
+from lidardesign.workflow.learning_budget import check_met
+from lidardesign.workflow.run_folder import MANIFEST, Notes, RunFolder, folder_of, log_note, reach_of, read_design
 
 if TYPE_CHECKING:
-    from lidardesign.cli.output import Output
-    from lidardesign.config import RunConfig
-    from lidardesign.design.sensor import DesignSpec
-    from lidardesign.scene import Scene
-    from lidardesign.task import Split, Task
+    from lidardesign.density.learn import LearnProgress
+    from lidardesign.density.learned import LearnedDensity
+    from lidardesign.evaluate.refinement.refinement import Round
+    from lidardesign.workflow.evaluate import Scores
 
-
-DESIGN_FOLDER = "designs"
-MANIFEST = "manifest.json"
-NAME_PATTERN = re.compile(r"[^\W.][\w.+-]{0,99}")
+FIGURES = ("ess", "kl_nats", "log_z", "coverage", "misplaced")
 
 
 @dataclass(frozen=True)
-class Run:
-    """A run folder that was opened: its task and configuration."""
+class LearnedQuality:
+    """How good a learned density is.
 
-    folder: Path
-    task: Task
-    config: RunConfig
+    Arguments:
+        ess: Effective share of the samples, 0 to 1.
+        kl_nats: Divergence from the learned density to the target [nats].
+        log_z: Log of the target's normalisation.
+        coverage: Share of the target's mass that the density reaches.
+        misplaced: Share of the density's mass in the wrong place.
+        errors: The standard errors of these, where they are known.
+    """
 
-    def design_path(self, name: str) -> Path:
-        """Where a design of this run is written."""
-        return self.folder / DESIGN_FOLDER / f"{name}.yaml"
+    ess: float
+    kl_nats: float
+    log_z: float
+    coverage: float
+    misplaced: float
+    errors: Mapping[str, float | None] = field(default_factory=dict)
 
-    @phase("scenes")
-    def scenes(self, split: Split, seed: int) -> list[Scene]:
-        """The scenes of a split, judged by the run's own design space.
+
+class Run(RunFolder):
+    """A run folder: a task with its configuration, the density that was learned, and the designs fitted to it.
+
+    `lidardesign.learn(task)` makes one, `lidardesign.open_run(folder)` opens one. Everything about it is in its folder,
+    so commands and scripts go on with each other's runs.
+
+    Arguments:
+        folder: The folder.
+        task: The task.
+        config: The whole configuration.
+
+    Example:
+        >>> run = lidardesign.open_run(folder)
+        >>> 0 < run.quality.ess <= 1
+        True
+        >>> run.density.sample(5).shape
+        (5, 6)
+        >>> design = run.fit(sensors=2, name="two")
+        >>> design.save().name, [design.name for design in run.designs()]
+        ('two.yaml', ['two'])
+        >>> scores = run.evaluate([design], rays=[16])
+        >>> scores.rows[0].design
+        'two'
+    """
+
+    @property
+    def quality(self) -> LearnedQuality:
+        """How good the learned density is.
 
         Raises:
-            PluginError: The task's own code failed.
+            DataError: Learning did not end, or the manifest is damaged.
         """
-        from lidardesign.registry import plugin_guard
-        from lidardesign.task import scenes_of
+        learned, where = read_manifest(self.folder).get("learn"), str(self.folder / MANIFEST)
+        if learned is None:
+            raise DataError("the run was not learned to its end", where=where, hint="resume it")
+        try:
+            estimates = learned.get("error_estimates") or {}
+            errors = {name: estimates[name].get("error") for name in FIGURES if name in estimates}
+            return LearnedQuality(*(float(learned[name]) for name in FIGURES), errors)
+        except (KeyError, TypeError, ValueError, AttributeError):
+            raise DataError("the figures of learning are damaged", where=where, hint=DAMAGED_HINT) from None
 
-        with plugin_guard(self.task.name):
-            return list(scenes_of(self.task, self.config.task, split, seed, self.config.space))
+    @property
+    def density(self) -> LearnedDensity:
+        """The learned density: `sample(count)` and `log_prob(points)`; needs torch."""
+        from lidardesign.density.learned import LearnedDensity
 
-    def designs(self) -> list[Path]:
-        """The designs of this run by name."""
-        return sorted((self.folder / DESIGN_FOLDER).glob("*.yaml"))
+        return LearnedDensity(self.folder, self.config)
+
+    def fit(
+        self,
+        *,
+        sensors: int | str | None = None,
+        constraints: Constraints | Mapping[str, Any] | Path | str | None = None,
+        rays: int | None = None,
+        layout: str | None = None,
+        at: Mapping[str, float] | None = None,
+        refine: int | None = None,
+        name: str | None = None,
+        seed: int | None = None,
+        progress: Callable[[Round], None] | None = None,
+        notes: Notes = log_note,
+        **further: Any,
+    ) -> Design:
+        """Fit a design to the learned density; nothing is learned again, and nothing is saved yet.
+
+        Arguments:
+            sensors: How many, or "auto": as many as held-out likelihood says.
+            constraints: Constraints, a mapping of them, or a YAML file of them.
+            rays: Rays per frame over all sensors.
+            layout: grid, density, scan or distributed; the task's by default.
+            at: Values of conditions that the design is for, as {"x_m": 0.37}.
+            refine: At most so many rounds of refinement on training scenes.
+            name: The design's name.
+            seed: Root of every random stream; the run's by default.
+            progress: Called with every round of refinement.
+            notes: Called with every note; they are logged by default.
+            further: gates, level, weights and like, as of `FitOptions`.
+
+        Raises:
+            ConfigError: Choices that do not fit together.
+            DataError: The density is too rough to fit to.
+            InfeasibleError: Constraints that contradict each other, or hold too little of the density.
+        """
+        options = FitOptions(
+            sensors=sensors,
+            constraints=constraints,
+            rays=rays,
+            layout=layout,
+            at=at or {},
+            refine=refine,
+            name=name,
+            seed=seed,
+            **further,
+        )
+        return Design.fitted(FitRequest.resolve(self, options, notes=notes), progress=progress, notes=notes)
+
+    def designs(self) -> list[Design]:
+        """The designs that are saved in the run, by name."""
+        return [Design(read_design(path), self, path) for path in self.design_paths()]
+
+    def evaluate(
+        self,
+        designs: Sequence[Design | Path | str] | None = None,
+        *,
+        rays: Sequence[int] | None = None,
+        baselines: Sequence[str] = (),
+        seed: int | None = None,
+        effects: str = "auto",
+        detector: str = "ideal",
+        settings: Sequence[str] | Mapping[str, Any] = (),
+        progress: Callable[[int, int, str], None] | None = None,
+        notes: Notes = log_note,
+        **further: Any,
+    ) -> Scores:
+        """Score designs on held-out scenes beside uniform, random and bounding.
+
+        Arguments:
+            designs: Designs and design files; all that are saved in the run by default.
+            rays: Numbers of rays per frame; the task's by default.
+            baselines: Further baselines, as "occupancy", "no-visibility", "cma" or "catalog:NAME".
+            seed: Root of every random stream; the run's by default.
+            effects: Physical effects: "auto", "all", "none", "audit" or names between commas.
+            detector: What measures: a name, or a YAML file.
+            settings: Settings of the task, to judge by other scenes than were learned.
+            progress: Called with the scenes done, all scenes, and the name of the scene.
+            notes: Called with every note.
+            further: range_tolerance_mm, return_tolerance, workers, cma_seconds and accuracy, as of `ScoreOptions`.
+
+        Raises:
+            ConfigError: Choices that cannot be, or designs of runs that differ.
+            DataError: There are no designs, or one is not there.
+        """
+        from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest
+
+        options = ScoreOptions(
+            rays=rays,
+            baselines=baselines,
+            seed=seed,
+            effects=effects,
+            detector=detector,
+            settings=settings,
+            **further,
+        )
+        chosen = self.designs() if designs is None else designs
+        targets = [design if isinstance(design, Design) else Path(design) for design in chosen]
+        scores = ScoreRequest.resolve(targets, options, [self], notes).score(progress)
+        return scores.with_accuracy(progress) if options.accuracy else scores
+
+    def __repr__(self) -> str:
+        return f"<Run {self.folder}: task {self.task.name}, preset {self.config.preset}, seed {self.config.seed}>"
+
+    def _repr_html_(self) -> str:
+        quality = self.quality
+        rows: list[tuple[str, object]] = [
+            ("task", self.task.name),
+            ("preset", self.config.preset),
+            ("seed", self.config.seed),
+            *((name, f"{getattr(quality, name):.3f}") for name in FIGURES),
+            ("designs", ", ".join(path.stem for path in self.design_paths()) or "none"),
+        ]
+        return html_table(f"run {self.folder}", (), rows)
 
 
-def open_run(folder: Path) -> Run:
-    """Open a run folder.
+def open_run(folder: Path | str) -> Run:
+    """Open a run folder that `learn` made.
 
     Raises:
         DataError: There is none, or it is damaged.
     """
-    with phase("libraries"):
-        from lidardesign.config import load_run_config
-
-    task, config = load_run_config(folder)
-    return Run(folder, task, config)
+    return Run.open(folder)
 
 
-def read_design(path: Path, console: Output, reach_m: float | None = None) -> DesignSpec:
-    """A design file or a rig of others, or standard input for `-`.
+def learn(
+    task: str,
+    *,
+    preset: str | None = None,
+    out: Path | str | None = None,
+    seed: int | None = None,
+    settings: Mapping[str, Any] | Sequence[str] = (),
+    config: Path | str | None = None,
+    device: str = "auto",
+    resume: bool = False,
+    progress: Callable[[LearnProgress], None] | None = None,
+    notes: Notes = log_note,
+    **further: Any,
+) -> Run:
+    """Learn where rays are worth firing for a task, into a run folder.
 
-    One of a run that is not as it was written says so: it may be cut, or mended by hand. A rig says what its file
-    does not.
+    Arguments:
+        task: The name of a task; `lidardesign tasks` lists them.
+        preset: Effort: draft, standard or fine.
+        out: The folder to make; runs/TASK by default.
+        seed: Root of every random stream.
+        settings: Settings by dotted keys, as {"learning.steps": 60, "density.sigma_m": 0.01}.
+        config: A YAML file of settings.
+        device: auto, cpu or cuda.
+        resume: Go on with an interrupted run.
+        progress: Called about every tenth step.
+        notes: Called with every note; they are logged by default.
+        further: tolerance or time_budget_s, which decide the number of steps.
+
+    Raises:
+        ConfigError: An unknown task, settings that cannot be, or a folder that is not empty.
+        ThresholdError: The tolerance was not reached; the run is finished and can be opened.
+    """
+    options = LearnOptions(
+        preset=preset, out=out, seed=seed, settings=settings, config=config, device=device, resume=resume, **further
+    )
+    request = LearnRequest.resolve(task, options, notes)
+    for note in request.task_notes():
+        notes(note)
+    result = request.run(progress)
+    for note in (*result.notes, *learning_advice(result)):
+        notes(note)
+    check_met(result, request.goal)
+    return open_run(request.folder)
+
+
+def load_design(path: Path | str, run: Run | None = None, notes: Notes = log_note) -> Design:
+    """Load a design file, or the file of a rig: rays as CSV or NPZ, a MuJoCo model, an SDF file.
 
     Arguments:
         path: The file.
-        console: Where notes go.
-        reach_m: How far the rays of a rig are heard where its file does not say so [m].
+        run: The run that it is to be fitted in again; the one that it names by default, if that is there.
+        notes: Called with every note.
 
     Raises:
         ConfigError, DataError: It cannot be read.
     """
-    from lidardesign.design.files import load_design
-
-    difference = _difference(path)
-    try:
-        with readable(path) as file:
-            design = load_design(file, reach_m)
-    except (ConfigError, DataError) as error:
-        if difference is None:
-            raise
-        hint = f"the file {difference}; fit it again, or mend it"
-        raise type(error)(error.message, where=error.where, allowed=error.allowed, hint=hint) from None
-    if difference is not None:
-        console.note(f"note: {path} {difference}")
-    tell_notes(design, str(path), console)
-    return design
-
-
-def _difference(path: Path) -> str | None:
-    """In what a design differs from the one that its run's manifest has, where it lies in a run."""
-    from lidardesign.run.manifest import changed_since_recorded
-
-    folder, run = path.absolute().parent, path.absolute().parent.parent
-    if folder.name != DESIGN_FOLDER or not path.is_file() or not (run / MANIFEST).is_file():
-        return None
-    try:
-        return changed_since_recorded(run, f"{DESIGN_FOLDER}/{path.name}")
-    except DataError:  # a manifest that is damaged is told by whatever needs it
-        return None
-
-
-def open_target(path: Path, console: Output) -> tuple[Run | None, DesignSpec | None]:
-    """Open what a command was given: a run folder, or a design file and the run that it came from.
-
-    Returns:
-        (run, None) for a folder, (run or None, design) for a file.
-
-    Raises:
-        DataError: There is no such file or folder, or it cannot be read.
-    """
-    if path.is_dir():
-        return open_run(path), None
-    if not is_there(path):
-        raise DataError("no such run or design", where=str(path), hint="give a run folder or a design file")
-    design = read_design(path, console)
-    return run_of(design, path), design
-
-
-def run_of(design: DesignSpec, path: Path) -> Run | None:
-    """The run that a design came from, if it is there."""
-    folder = folder_of(design, path)
-    return None if folder is None else open_run(folder)
-
-
-def folder_of(design: DesignSpec, path: Path) -> Path | None:
-    """The folder of the run that a design came from, if it is there: its provenance names it relative to its file."""
-    named = design.provenance.get("run")
-    if not isinstance(named, str):
-        return None
-    folder = Path(os.path.normpath(path.parent / named))
-    # a design that was copied elsewhere names a folder that is none of its run's
-    return folder if (folder / MANIFEST).is_file() else None
-
-
-def need_run(run: Run | None, path: Path) -> Run:
-    """The run of a target.
-
-    Raises:
-        DataError: The design was not made by a run, or the run has gone.
-    """
-    if run is None:
-        raise DataError(
-            "the run of this design is not there",
-            where=str(path),
-            hint="give the run folder (RUN --like FILE for a rig), or put the design back into its designs folder",
-        )
-    return run
-
-
-def provenance(run: Run, path: Path, command: str, seed: int, **further: Any) -> dict[str, Any]:
-    """What a design file says about where it came from; the run's place is relative to the design's."""
-    from lidardesign.run.manifest import versions
-
-    return {
-        "command": command,
-        "task": run.task.name,
-        "run": os.path.relpath(run.folder.absolute(), path.parent.absolute()),
-        "seed": seed,
-        "versions": versions(),
-        **further,
-    }
-
-
-def check_name(name: str) -> str:
-    """A design's name, which is also its file's.
-
-    Raises:
-        ConfigError: It could not be a file's name everywhere.
-    """
-    if not NAME_PATTERN.fullmatch(name):
-        allowed = "letters, digits, _, -, + and . (not in front), at most 100"
-        raise ConfigError(f"{name!r} is no name for a design", where="--name", allowed=allowed)
-    return name
-
-
-def check_choice(value: str, option: str, allowed: tuple[str, ...]) -> str:
-    """A value that must be one of a few words.
-
-    Raises:
-        ConfigError: It is none of them.
-    """
-    if value not in allowed:
-        raise ConfigError(f"{value!r}", where=option, allowed=", ".join(allowed))
-    return value
-
-
-def parse_at(texts: list[str] | None) -> dict[str, float]:
-    """The values of `--at`, as {"x_m": 0.37}; whether a density has them is for the design space to say.
-
-    Raises:
-        ConfigError: One is not NAME=VALUE with a finite number, or a name is given twice.
-    """
-    found: dict[str, float] = {}
-    for text in texts or []:
-        name, equals, value = (part.strip() for part in text.partition("="))
+    path = Path(path)
+    specification = read_design(path, notes, reach_of([run]) if run else None)
+    folder = folder_of(specification, path)
+    if run is None and folder is not None:
         try:
-            number = float(value)
-        except ValueError:
-            number = math.nan
-        if not (name and equals and math.isfinite(number)):
-            raise ConfigError(f"{text!r}", where="--at", allowed="NAME=VALUE with a finite number, as x_m=0.37")
-        if name in found:
-            raise ConfigError(f"{name} is given twice: {found[name]:g} and {number:g}", where="--at")
-        found[name] = number
-    return found
-
-
-def sensor_count(text: str | None, fallback: int | str | None) -> int | str | None:
-    """The value of `--sensors`: a number from 1, `auto`, or the fallback.
-
-    Raises:
-        ConfigError: It is neither.
-    """
-    if text is None:
-        return fallback
-    if text == "auto":
-        return "auto"
-    if not text.isdecimal() or int(text) < 1:
-        raise ConfigError(f"{text!r}", where="--sensors", allowed="a whole number from 1, or auto")
-    return int(text)
-
-
-def reach_of(runs: Sequence[Run]) -> float | None:
-    """How far any ray of the first run's design space may be heard [m]; None without a run."""
-    from lidardesign.space import RANGE
-
-    return runs[0].config.space.high[RANGE] if runs else None
-
-
-def reach_beside(files: Iterable[Path], runs: Sequence[Run]) -> float | None:
-    """How far rays may be heard in the first of the runs, or in that of the first design that came from one [m]."""
-    from lidardesign.design.files import load_design
-
-    if runs:
-        return reach_of(runs)
-    for path in files:
-        if is_input(path):
-            continue
-        try:
-            run = run_of(load_design(path), path)
-        except LidardesignError:
-            # whoever reads it for good says what is wrong with it
-            continue
-        if run is not None:
-            return reach_of([run])
-    return None
-
-
-def tell_notes(design: DesignSpec, shown: str, console: Output) -> None:
-    """Say what the file of a rig did not: only what was read from others has such notes."""
-    notes = design.provenance.get("notes")
-    if "source" in design.provenance and isinstance(notes, list):
-        for note in notes:
-            console.note(f"note: {shown}: {note}")
-
-
-def budgets_within(designs: Iterable[DesignSpec], budgets: Sequence[int], console: Output) -> list[int]:
-    """The numbers of rays to evaluate at where none is asked for: those that every fixed ray list has.
-
-    Where a rig has fewer rays than the task's largest budget, its own number takes the place of those beyond it.
-    """
-    from lidardesign.design.layouts.rays import own_count
-
-    fixed = {design.name: own_count(design) for design in designs if design.layout == "fixed"}
-    usual = sorted(set(budgets))
-    if not fixed or min(fixed.values()) >= usual[-1]:
-        return usual
-    name = min(fixed, key=lambda name: fixed[name])
-    console.note(f"note: {name} fires {fixed[name]} rays: at equal rays no more are compared; --rays has other numbers")
-    return sorted({*(count for count in usual if count <= fixed[name]), fixed[name]})
+            run = open_run(folder)
+        except LidardesignError as error:
+            notes(f"the run of {path} cannot be opened: {error}")
+    return Design(specification, run, path)

@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from lidardesign.config import judged_by
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError
+from lidardesign.run.manifest import read_manifest
+from lidardesign.samples import Samples, load_samples
+from lidardesign.space import FARTHEST_M
+from lidardesign.task import random_generator
+from lidardesign.workflow.run_folder import RunFolder
 
 if TYPE_CHECKING:
-    from lidardesign.design.sensor import DesignSpec
+    from lidardesign.density.target.target import Target
     from lidardesign.evaluate.refinement.reweighting import Reweighting
-    from lidardesign.samples import Samples
-    from lidardesign.workflow.layouts import RunTarget
-    from lidardesign.workflow.runs import Run
 
 KEY = "weighting"
 OPTION = "--weight"
-# Refinement spreads by a few sigma of the density, which is at most the largest length: ten times `space.FARTHEST_M`,
-# which stands here as a number because --help loads no numpy.
-WIDEST_SPREAD_M = 1e10
+# Refinement spreads by a few sigma of the density, which is at most the largest length.
+WIDEST_SPREAD_M = 10 * FARTHEST_M
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,34 +98,47 @@ class Weighting:
         return samples
 
     def spread(self, samples: Samples, seed: int) -> Samples:
-        """The samples spread in range, where that was found worth it."""
-        from lidardesign.task import random_generator
-
+        """The samples spread in range, where that was found to gain something."""
         if not self.range_spread_m:
             return samples
         return samples.spread_in_range(self.range_spread_m, random_generator(seed, "range spread"))
 
 
-def weighted_samples(run: Run, weighting: Weighting, target: RunTarget) -> Samples:
+class RunTarget:
+    """log p* of a run, prepared when it is first asked for: most layouts never do.
+
+    Arguments:
+        run: The run.
+        visibility: The visibility to take instead of what the run decided.
+        weighting: Settings of the task whose scenes it is of instead, and a factor.
+    """
+
+    def __init__(self, run: RunFolder, visibility: str | None = None, weighting: Weighting | None = None) -> None:
+        self._run, self._visibility = run, visibility
+        self._weighting = Weighting() if weighting is None else weighting
+
+    @cached_property
+    def _target(self) -> Target:
+        from lidardesign.density.target.prepare import prepare_target
+
+        run, weighting = self._run, self._weighting
+        if weighting.settings:
+            run = replace(run, config=judged_by(run.task, run.config, weighting.settings, option=weighting.origin))
+        decided = self._visibility or read_manifest(run.folder).get("visibility")
+        return prepare_target(run.scenes("train", run.config.seed), run.config, visibility=decided, compiled=False)[0]
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """Design points (N, 6) to (N,)."""
+        values = self._target.log_density(points)
+        factor = self._weighting.reweighting
+        return values if factor is None else values + factor.log_factor(points)
+
+
+def weighted_samples(run: RunFolder, weighting: Weighting, target: RunTarget) -> Samples:
     """The samples of a run as a design was fitted to them.
 
     Raises:
-        DataError: The samples are damaged, or no sample is worth anything under the weighting.
+        DataError: The samples are damaged, or all weights are zero.
     """
-    from lidardesign.samples import load_samples
-
     samples = weighting.log_target(load_samples(run.folder), target)
     return weighting.spread(samples, run.config.seed)
-
-
-def designs_samples(made: Sequence[tuple[DesignSpec, Run]], targets: Mapping[str, RunTarget]) -> dict[str, Samples]:
-    """The samples of designs by their names; designs with the same weighting of a run share them."""
-    known: dict[Any, Samples] = {}
-    found = {}
-    for design, run in made:
-        weighting = Weighting.of(design)
-        key = (run.folder, design.name if weighting else None)
-        if key not in known:
-            known[key] = weighted_samples(run, weighting, targets[design.name])
-        found[design.name] = known[key]
-    return found

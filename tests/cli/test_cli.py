@@ -268,12 +268,10 @@ def test_a_damaged_run_is_noticed_before_anything_is_written(lidardesign, flat):
 
 
 def test_a_design_that_breaks_a_constraint_is_never_written(lidardesign, flat, monkeypatch):
-    from lidardesign.cli.commands import fit as fit_module
-
-    def refuse(design, constraints, space):
+    def refuse(design, request):
         raise InfeasibleError("broken", conflicts=["gate.width_m.max"])
 
-    monkeypatch.setattr(fit_module, "check_written", refuse)
+    monkeypatch.setattr("lidardesign.workflow.refine.check_written", refuse)
     result = lidardesign("constrain", flat, "--set", "gate.width_m.max=0.3", "--json")
     assert result.code == 4
     assert result.json["error"]["conflicts"] == ["gate.width_m.max"]
@@ -281,7 +279,7 @@ def test_a_design_that_breaks_a_constraint_is_never_written(lidardesign, flat, m
 
 
 def test_a_run_that_is_being_written_is_left_alone(lidardesign, flat, monkeypatch):
-    monkeypatch.setattr("lidardesign.cli.tables.designs.WAIT_S", 0.1)
+    monkeypatch.setattr("lidardesign.workflow.designs.WAIT_S", 0.1)
     (flat / ".lock").write_text(json.dumps({"pid": 1, "host": "elsewhere"}))
     result = lidardesign("fit", flat)
     assert result.code == 2
@@ -429,9 +427,9 @@ def test_a_design_that_was_copied_away_from_its_run_says_what_it_lacks(lidardesi
 
 @pytest.mark.parametrize("decided", ["raycast", "off", None])
 def test_a_pinned_origin_is_weighted_with_the_visibility_that_the_run_decided_on(flat, monkeypatch, decided):
+    from lidardesign import open_run
     from lidardesign.run.manifest import note
-    from lidardesign.workflow.layouts import RunTarget
-    from lidardesign.workflow.runs import open_run
+    from lidardesign.workflow.weighting import RunTarget
 
     asked = []
 
@@ -455,10 +453,10 @@ def test_a_pinned_origin_is_weighted_with_the_visibility_that_the_run_decided_on
 def test_a_density_that_was_learned_badly_comes_with_advice():
     from types import SimpleNamespace
 
-    from lidardesign.cli.commands.learn import _advice
+    from lidardesign.workflow.learn import learning_advice
 
-    assert _advice(SimpleNamespace(ess=0.6, coverage=0.98)) == []
-    assert len(_advice(SimpleNamespace(ess=0.01, coverage=0.1))) == 2
+    assert learning_advice(SimpleNamespace(ess=0.6, coverage=0.98)) == []
+    assert len(learning_advice(SimpleNamespace(ess=0.01, coverage=0.1))) == 2
 
 
 def test_compiled_code_has_a_folder_where_nothing_else_can_be_written(monkeypatch):

@@ -38,7 +38,7 @@ def make_conditioned_run(folder, count=6000, condition="[x_m]"):
 @pytest.fixture
 def lidardesign(capsys, tmp_path, monkeypatch):
     """Run the program in this process; the target density is the planted one."""
-    monkeypatch.setattr("lidardesign.workflow.layouts.RunTarget.__call__", lambda self, points: log_target(points))
+    monkeypatch.setattr("lidardesign.workflow.weighting.RunTarget.__call__", lambda self, points: log_target(points))
     return caller(capsys, tmp_path, monkeypatch)
 
 

@@ -8,7 +8,6 @@ import trimesh
 from lidardesign_tasks.units import doubtful_meshes, doubtful_motion
 from support.command_line import caller, make_run
 
-from lidardesign.cli.output import Output
 from lidardesign.config import load_run_config
 from lidardesign.density.target.resolution import resolution_notes
 from lidardesign.design.compare import outside_notes
@@ -16,7 +15,7 @@ from lidardesign.errors import ConfigError, PluginError
 from lidardesign.registry import load_task
 from lidardesign.space import DesignSpace
 from lidardesign.task import notes_of
-from lidardesign.workflow.runs import read_design
+from lidardesign.workflow.run_folder import read_design
 
 SPACE = DesignSpace(low=(1.0, 0, 0, 2.8, -0.4, 0.5), high=(1.0, 0, 0, 3.5, 0.4, 1.5))
 QUICK = [word for key in ("poses=1", "truth_points=100", "density.field_resolution=8", "density.visibility=off")
@@ -169,8 +168,8 @@ def test_a_rig_in_millimetres_is_told_wherever_it_meets_a_run(capsys, monkeypatc
 
 def test_a_rig_that_hears_only_far_beyond_the_space_is_told(flat):
     space = load_run_config(flat)[1].space
-    near = read_design(rig(flat, "near.csv", 1), Output())
-    far = read_design(rig(flat, "far.csv", 1, start=500.0), Output())
+    near = read_design(rig(flat, "near.csv", 1))
+    far = read_design(rig(flat, "far.csv", 1, start=500.0))
     assert outside_notes(near, space) == []
     assert "hears from 500 m on" in outside_notes(far, space)[0]
 

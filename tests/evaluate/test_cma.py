@@ -6,13 +6,14 @@ import itertools
 import json
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from support.command_line import caller
 
+from lidardesign.cli.commands.evaluate import search_display
 from lidardesign.cli.output import Output
-from lidardesign.cli.searches import check_cma_seconds, told
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
@@ -33,6 +34,7 @@ from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.simulate.plan import Planner
 from lidardesign.space import AZIMUTH, ELEVATION, DesignSpace
 from lidardesign.task import Defaults, Metric, Score, TaskConfig
+from lidardesign.workflow.evaluate import ScoreOptions
 
 FIXED = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 4.0))
 FREE = DesignSpace((-0.2, -0.2, -0.2, -0.6, -0.5, 0.05), (0.2, 0.2, 0.2, 0.6, 0.5, 4.0))
@@ -515,12 +517,12 @@ def test_without_a_design_there_is_nothing_to_vary():
 )
 def test_a_time_that_is_none_or_that_nothing_takes_is_refused(seconds, names):
     with pytest.raises(ConfigError, match="--cma-seconds"):
-        check_cma_seconds(seconds, names)
+        ScoreOptions(cma_seconds=seconds, baselines=names)
 
 
 def test_a_time_is_taken_where_it_is_asked_for_or_left_out():
-    check_cma_seconds(5.0, ["cma"])
-    check_cma_seconds(None, [])
+    ScoreOptions(cma_seconds=5.0, baselines=["cma"])
+    ScoreOptions()
 
 
 @pytest.fixture
@@ -556,9 +558,14 @@ class Bar:
         self.updates.append((self.lines[line], fields))
 
 
+def shown_settings(bar):
+    request = SimpleNamespace(cma_seconds=FAST.seconds, run=SimpleNamespace(task=MissTask()))
+    return CmaSettings(FAST, search_display(request, Output(), bar))
+
+
 def test_each_search_has_a_line_that_shows_how_far_it_is_and_its_best_score():
     bar = Bar()
-    settings = told(CmaSettings(FAST), MissTask.metric, Output(), bar)
+    settings = shown_settings(bar)
     candidate_of("grid", settings).positions([], 12)
     candidate_of("grid", settings).positions([], 13)
     assert bar.lines == ["cma, 12 rays", "cma, 13 rays"]
@@ -569,7 +576,7 @@ def test_each_search_has_a_line_that_shows_how_far_it_is_and_its_best_score():
 
 
 def test_without_a_terminal_a_search_is_announced_once(capsys):
-    settings = told(CmaSettings(FAST), MissTask.metric, Output(), None)
+    settings = shown_settings(None)
     candidate_of("grid", settings).positions([], 12)
     said = capsys.readouterr().err
     assert said.count("cma, 12 rays: searching") == 1

@@ -34,9 +34,9 @@ def rerecord(run: Path, name: str, content: bytes) -> None:
 
 def open_manifests(folder: Path) -> Read:
     """As every command does that is given a run."""
+    from lidardesign import open_run
     from lidardesign.density.training.checkpoint import kept_snapshots
     from lidardesign.run.manifest import verify
-    from lidardesign.workflow.runs import open_run
 
     run = make_run(folder / "run", count=50)
 

@@ -48,10 +48,10 @@ def read_configuration(path: Path) -> object:
 
 def open_overrides(_: Path) -> Read:
     """As `--set` does, for a configuration and for constraints."""
-    from lidardesign.cli.commands.constrain import load_constraints
     from lidardesign.config import resolve
     from lidardesign.errors import LidardesignError
     from lidardesign.registry import load_task
+    from lidardesign.workflow.fit import load_constraints
 
     def configured(text: str) -> object:
         return resolve(load_task("flatland"), overrides=[text])
@@ -81,12 +81,12 @@ def _spaces() -> list[object]:
 
 def read_constraints(path: Path) -> object:
     """As `constrain --constraints` does, up to the check that any design can satisfy them."""
-    from lidardesign.cli.commands.constrain import load_constraints
     from lidardesign.design.constraints.feasibility import check_feasible
     from lidardesign.errors import InfeasibleError
     from lidardesign.run.yaml import dump_yaml, parse_yaml
+    from lidardesign.workflow.fit import load_constraints
 
-    constraints = load_constraints(path, [])
+    constraints = load_constraints(path)
     parse_yaml(dump_yaml(constraints.as_document()), where="written again")
     refused = []
     for space in _spaces():

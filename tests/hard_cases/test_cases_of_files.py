@@ -14,7 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.hard_cases import hard_case
 
-from lidardesign.cli.commands.constrain import load_constraints
 from lidardesign.config import resolve
 from lidardesign.density.training.checkpoint import FORMAT, load_arrays, save_arrays
 from lidardesign.density.training.training import CHECKPOINT
@@ -24,6 +23,7 @@ from lidardesign.registry import load_task
 from lidardesign.run.manifest import record, start_manifest
 from lidardesign.run.yaml import MAX_BYTES, MAX_DEPTH, parse_yaml
 from lidardesign.simulate.detector.files import load_detector
+from lidardesign.workflow.fit import load_constraints
 
 BOMB_LEVELS = 7
 # name: text, position of the mistake, words of the reason
@@ -64,7 +64,7 @@ def readers(folder):
     path = folder / "input.yaml"
     return {
         "configuration": lambda: resolve(load_task("flatland"), config_file=path),
-        "constraints": lambda: load_constraints(path, []),
+        "constraints": lambda: load_constraints(path),
         "design": lambda: load_design(path),
         "detector": lambda: load_detector(path),
     }

@@ -183,7 +183,7 @@ class TestKillsFullDisksAndTwoWriters:
         assert remove_stray_temporaries(run) == []
 
     def test_a_second_writer_is_told_who_writes_and_changes_nothing(self, tmp_path, lidardesign, monkeypatch):
-        monkeypatch.setattr("lidardesign.cli.tables.designs.WAIT_S", 0.05)
+        monkeypatch.setattr("lidardesign.workflow.designs.WAIT_S", 0.05)
         run = make_run(tmp_path / "run", count=1000)
         before = files_under(run)
         with run_lock(run):

@@ -11,6 +11,7 @@ import yaml
 from lidardesign_tasks.flatland import FlatlandTask
 from support.command_line import caller, make_run
 
+from lidardesign import open_run
 from lidardesign.config import resolve, save_run_config
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
@@ -27,10 +28,9 @@ from lidardesign.samples import Samples, load_samples, save_samples
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import RANGE, direction
 from lidardesign.task import Residuals, scenes_of
-from lidardesign.workflow.layouts import RunTarget
-from lidardesign.workflow.refine import FitOrder, _scenes
-from lidardesign.workflow.runs import open_run
-from lidardesign.workflow.weighting import Weighting
+from lidardesign.workflow.fit import FitRequest
+from lidardesign.workflow.refine import refinement_scenes
+from lidardesign.workflow.weighting import RunTarget, Weighting
 
 SEED = 3
 
@@ -188,7 +188,7 @@ def curves(scenes):
 @pytest.mark.parametrize("seed", [SEED, 0, 1, 77])
 def test_scenes_that_judge_are_neither_held_out_nor_learned_from_nor_looked_at(flat, seed):
     run = open_run(flat)
-    look, judge = _scenes(FitOrder(run, "r", seed, None, {}, {}))
+    look, judge = refinement_scenes(FitRequest(run, "r", seed))
     other = curves(run.scenes("test", SEED)) | curves(run.scenes("train", SEED)) | curves(run.scenes("test", seed))
     assert len(curves(look)) == 3
     assert len(curves(judge)) == 2

@@ -13,10 +13,10 @@ from lidardesign.cli.output import Output, command, keep_times
 from lidardesign.cli.streams import claim_outputs, written_file
 from lidardesign.cli.tables.designs import number
 from lidardesign.cli.tables.grids import print_table
-from lidardesign.errors import ConfigError, DataError
+from lidardesign.errors import ConfigError, DataError, check_choice
 from lidardesign.run.clock import phase
 from lidardesign.run.files import is_input, is_there
-from lidardesign.workflow.runs import check_choice, folder_of, parse_at, read_design
+from lidardesign.workflow.run_folder import folder_of, read_design
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
@@ -103,7 +103,7 @@ def capture(
             from lidardesign.evaluate.captures.capture import load_capture
             from lidardesign.evaluate.captures.score import evaluate_capture
 
-        place = parse_at(at)
+        place = options.parse_at(at)
         named = _named_apart([(path, _rays(path, rays, place, seed or 0, console)) for path in designs])
         with phase("capture"):
             captured = load_capture(file)
@@ -156,8 +156,8 @@ def _rays(path: Path, count: int | None, at: dict[str, float], seed: int, consol
 
 
 def _listed_rays(path: Path, count: int | None, at: dict[str, float], seed: int, console: Output) -> Rays:
-    from lidardesign.cli.commands.export import design_and_rays
     from lidardesign.export.galvo import is_galvo_file, read_galvo
+    from lidardesign.workflow.export import DesignSource
 
     if not is_there(path):
         raise DataError("no such design", where=str(path), hint="give design files or files of export --format galvo")
@@ -170,7 +170,8 @@ def _listed_rays(path: Path, count: int | None, at: dict[str, float], seed: int,
                 hint="leave them out",
             )
         return read_galvo(path)
-    return design_and_rays(read_design(path, console), path, "galvo", count, at, seed, console)[1]
+    source = DesignSource(read_design(path, console.remark), path=path)
+    return source.lay_out(count, at, seed, notes=console.remark)[1]
 
 
 def _folders(designs: list[Path]) -> list[Path]:

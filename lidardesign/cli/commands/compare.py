@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from lidardesign.cli.output import Output
     from lidardesign.design.sensor import DesignSpec
     from lidardesign.evaluate.score import Evaluation, EvaluationRequest
-    from lidardesign.workflow.evaluation_request import JudgedDesign
-    from lidardesign.workflow.runs import Run
+    from lidardesign.workflow.designs import Design
+    from lidardesign.workflow.run_folder import RunFolder
 
 RayCounts = Annotated[
     list[int] | None,
@@ -61,17 +61,17 @@ def compare(
             from lidardesign.design.compare import paired_sensors, readout_of
 
         entries, run = _read(first, second, space_of, console)
-        designs = [entry.design for entry in entries]
+        designs = [entry.specification for entry in entries]
         if run is None and rays:
             raise ConfigError("no run says what the designs see", where="--rays", hint="--in RUN")
         document: dict[str, Any] = {
             "designs": [
                 {
                     "design": str(entry.path),
-                    "name": entry.design.name,
-                    "layout": entry.design.layout,
-                    "sensors": len(entry.design.sensors),
-                    "bandwidth": readout_of(entry.design).as_dict(),
+                    "name": entry.specification.name,
+                    "layout": entry.specification.layout,
+                    "sensors": len(entry.specification.sensors),
+                    "bandwidth": readout_of(entry.specification).as_dict(),
                 }
                 for entry in entries
             ],
@@ -85,20 +85,21 @@ _NO_SCORES: dict[str, Any] = {"metric": None, "scenes": None, "rows": [], "paire
 
 
 @phase("designs")
-def _read(first: Path, second: Path, space_of: Path | None, console: Output) -> tuple[list[JudgedDesign], Run | None]:
+def _read(first: Path, second: Path, space_of: Path | None, console: Output) -> tuple[list[Design], RunFolder | None]:
     """Both designs under names that differ, and the run whose scenes they are scored in, if one is known."""
-    from lidardesign.workflow.evaluation_request import JudgedDesign, common_run
-    from lidardesign.workflow.runs import open_run, reach_beside, read_design, run_of
+    from lidardesign.workflow.designs import Design
+    from lidardesign.workflow.evaluate import common_run
+    from lidardesign.workflow.run_folder import RunFolder, reach_beside, read_design, run_of
 
-    given = [open_run(space_of)] if space_of is not None else []
+    given = [RunFolder.open(space_of)] if space_of is not None else []
     entries = []
     reach_m = reach_beside((first, second), given)
     for path in (first, second):
-        design = read_design(path, console, reach_m)
-        entries.append(JudgedDesign(design, path, run_of(design, path)))
-    if entries[0].design.name == entries[1].design.name:
+        design = read_design(path, console.remark, reach_m)
+        entries.append(Design(design, run_of(design, path), path))
+    if entries[0].specification.name == entries[1].specification.name:
         for entry, place in zip(entries, ("first", "second"), strict=True):
-            entry.design = replace(entry.design, name=f"{entry.design.name} ({place})")
+            entry.specification = replace(entry.specification, name=f"{entry.specification.name} ({place})")
     if not given and all(entry.run is None for entry in entries):
         console.note("note: no run says what the designs see, so there are no scores; --in RUN has scenes")
         return entries, None
@@ -106,21 +107,21 @@ def _read(first: Path, second: Path, space_of: Path | None, console: Output) -> 
 
 
 def _scores(
-    run: Run, entries: Sequence[JudgedDesign], rays: list[int] | None, seed: int | None, console: Output
+    run: RunFolder, entries: Sequence[Design], rays: list[int] | None, seed: int | None, console: Output
 ) -> dict[str, Any]:
     """Scores on held-out scenes and their paired differences, first minus second."""
-    from lidardesign.workflow.evaluation_request import request_of
+    from lidardesign.workflow.evaluate import evaluation_request
 
     with phase("libraries"):
         from lidardesign.design.compare import outside_notes
         from lidardesign.evaluate.score import evaluate
 
-    own = [_own_count(entry.design) for entry in entries]
-    counts = rays or _counts([entry.design for entry in entries], own, run, console)
-    _check_fired([entry.design for entry in entries], counts, console)
-    request = replace(request_of(run, list(entries), counts, [], seed), equal_bandwidth=False)
+    own = [_own_count(entry.specification) for entry in entries]
+    counts = rays or _counts([entry.specification for entry in entries], own, run, console)
+    _check_fired([entry.specification for entry in entries], counts, console)
+    request = replace(evaluation_request(run, entries, counts, [], seed), equal_bandwidth=False)
     for entry in entries:
-        for line in outside_notes(entry.design, run.config.space):
+        for line in outside_notes(entry.specification, run.config.space):
             console.note(f"note: {line}")
     found = evaluate(request)
     rows, paired = [row.as_dict() for row in found.rows], [pair.as_dict() for pair in found.paired]
@@ -158,13 +159,22 @@ def _own_count(design: DesignSpec) -> int | None:
     return readout_of(design).rays
 
 
-def _counts(designs: Sequence[DesignSpec], own: Sequence[int | None], run: Run, console: Output) -> list[int]:
-    """Rays at which two designs are compared: what both were made for, else the budgets that both have."""
-    from lidardesign.workflow.runs import budgets_within
+def _counts(designs: Sequence[DesignSpec], own: Sequence[int | None], run: RunFolder, console: Output) -> list[int]:
+    """Rays at which two designs are compared: what both were made for, else the budgets that both have.
+
+    Where a rig has fewer rays than the task's largest budget, its own number takes the place of those beyond it.
+    """
+    from lidardesign.design.layouts.rays import own_count
 
     if own[0] is not None and own[0] == own[1]:
         return [own[0]]
-    return budgets_within(designs, run.task.defaults.rays, console)
+    fixed = {design.name: own_count(design) for design in designs if design.layout == "fixed"}
+    usual = sorted(set(run.task.defaults.rays))
+    if not fixed or min(fixed.values()) >= usual[-1]:
+        return usual
+    name = min(fixed, key=lambda name: fixed[name])
+    console.remark(f"{name} fires {fixed[name]} rays: at equal rays no more are compared; --rays has other numbers")
+    return sorted({*(count for count in usual if count <= fixed[name]), fixed[name]})
 
 
 def _as_they_are(request: EvaluationRequest, own: Sequence[int]) -> tuple[list[dict[str, Any]], dict[str, Any]]:

@@ -11,7 +11,7 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.output import command
-from lidardesign.workflow.runs import check_choice
+from lidardesign.errors import check_choice
 
 # Set where the program is asked; its value is the shell.
 VARIABLE = "_LIDARDESIGN_COMPLETE"

@@ -4,32 +4,29 @@ from __future__ import annotations
 
 import math
 import sys
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.dry_run import DryRun, tell_plan
+from lidardesign.cli.dry_run import DryRun, show_plan
 from lidardesign.cli.output import Output, command, keep_times
-from lidardesign.cli.physics import Detector, Effects, RangeTolerance, ReturnTolerance, planner_of
-from lidardesign.cli.searches import CmaSeconds, check_cma_seconds, searching, told
 from lidardesign.cli.streams import claim_outputs, is_output, written_file
 from lidardesign.cli.tables.designs import number
 from lidardesign.cli.tables.scores import show_evaluation
 from lidardesign.errors import ConfigError, ThresholdError
 from lidardesign.run.clock import phase
-from lidardesign.workflow.evaluation_report import times_so_far
-from lidardesign.workflow.evaluation_request import ALWAYS, JudgedDesign, collect, common_run, named_apart, request_of
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
+    from rich.progress import Progress as RichProgress
+    from rich.progress import TaskID
 
-    from lidardesign.cli.dry_run import Plan
-    from lidardesign.evaluate.score import Evaluation, EvaluationRequest
-    from lidardesign.workflow.runs import Run
-
+    from lidardesign.evaluate.cma.candidate import Show
+    from lidardesign.evaluate.cma.search import Progress
+    from lidardesign.evaluate.results import Evaluation
+    from lidardesign.workflow.evaluate import ScoreRequest, Scores
 
 BASELINE_HELP = (
     "A further baseline beside uniform, random and bounding: occupancy (rays towards cells that targets occupy) or "
@@ -111,6 +108,51 @@ Workers = Annotated[
         "(extra: cluster). The scores are the same.",
     ),
 ]
+CmaSeconds = Annotated[
+    float | None,
+    typer.Option(
+        "--cma-seconds",
+        metavar="SECONDS",
+        help="Wall time of each search of `--baseline cma`: one per number of rays, and one per bandwidth of the first "
+        "design.",
+        show_default="60",
+    ),
+]
+Effects = Annotated[
+    str,
+    typer.Option(
+        "--effects",
+        metavar="auto|all|none|audit|LIST",
+        help="Physical effects: those that each scene calls for, all, none, or names between commas; audit: as auto, "
+        "and every row under all effects too (exit 1 where a score moves by more than the metric's tolerance).",
+    ),
+]
+Detector = Annotated[
+    str,
+    typer.Option(
+        "--detector",
+        metavar="NAME|FILE",
+        help="What measures: ideal, single-photon, consumer-8x8, or a YAML file.",
+    ),
+]
+RangeTolerance = Annotated[
+    float | None,
+    typer.Option(
+        "--range-tolerance-mm",
+        metavar="MM",
+        help="What all skipped effects together may change of ranges, rms.",
+        show_default="a tenth of a bin, or 1, and at most the metric's tolerance where it is a length",
+    ),
+]
+ReturnTolerance = Annotated[
+    float | None,
+    typer.Option(
+        "--return-tolerance",
+        metavar="SHARE",
+        help="What all skipped effects together may change of returns.",
+        show_default="0.001",
+    ),
+]
 
 
 def evaluate(
@@ -136,189 +178,110 @@ def evaluate(
     debug: options.Debug = False,
 ) -> None:
     """Score designs on held-out scenes against the baselines uniform, random and bounding."""
-    with command(json=json, quiet=quiet, debug=debug) as console:
-        claim_outputs(console, dry_run=dry_run, csv=csv, report=report, plots=plots)
+    with command(json=json, quiet=quiet, debug=debug) as output:
+        claim_outputs(output, dry_run=dry_run, csv=csv, report=report, plots=plots)
+        if fail_above is not None and not math.isfinite(fail_above):
+            raise ConfigError(f"{fail_above}", where="--fail-above", allowed="a finite number")
         with phase("libraries"):
-            import lidardesign.evaluate.score  # noqa: F401
-            from lidardesign.config import judged_by
-            from lidardesign.evaluate.request import usual_numbers
+            from lidardesign.workflow.evaluate import ScoreOptions, ScoreRequest
 
-        wanted = _checked(workers, baseline or [], cma_seconds, fail_above)
-        planner, audit = planner_of(effects, detector, range_tolerance_mm, return_tolerance)
-        entries, runs = collect(targets, console)
-        run = learned = common_run(named_apart(entries), runs)
-        rays = rays or usual_numbers([entry.design for entry in entries], run.task.defaults.rays)
-        if accuracy:
-            _check_measurable(learned)
-        if overrides:
-            run = replace(run, config=judged_by(run.task, run.config, overrides))
-        if range_tolerance_mm is None:
-            planner = replace(planner, tolerance=planner.tolerated.within(run.task.metric))
+        chosen = ScoreOptions(
+            rays=rays,
+            baselines=baseline or (),
+            seed=seed,
+            effects=effects,
+            detector=detector,
+            range_tolerance_mm=range_tolerance_mm,
+            return_tolerance=return_tolerance,
+            settings=overrides or (),
+            workers=workers,
+            cma_seconds=cma_seconds,
+            accuracy=accuracy,
+        )
+        request = ScoreRequest.resolve(targets, chosen, notes=output.remark)
+        files = (report, plots, csv)
         if dry_run:
-            outputs = {"--report": report, "--plots": plots, "--csv": csv}
-            further = {"--effects": effects, "--detector": detector, "--set": overrides, "--accuracy": accuracy}
-            return tell_plan(_plan(run, entries, rays, baseline or [], outputs, further), console)
-        request = request_of(run, entries, rays, [*ALWAYS, *(baseline or [])], seed)
-        request, files = replace(request, planner=planner, audit=audit), (report, plots, csv)
-        evaluation = _evaluate_with(wanted, replace(request, cma=searching(cma_seconds)), console)
+            return show_plan(request.plan({"--report": report, "--plots": plots, "--csv": csv}), output)
+        scores = _score(request, output)
         # accuracy takes minutes: what was scored by then is written already
-        early = (None if accuracy and is_output(path) else path for path in files)
-        written = _write_files(evaluation, request, learned, times_so_far(run.folder, console.clock), *early)
+        written = _write_files(scores, *(None if accuracy and is_output(path) else path for path in files))
         if accuracy:
-            evaluation = _with_accuracy(evaluation, request, learned, console)
-            written = _write_files(evaluation, request, learned, times_so_far(run.folder, console.clock), *files)
-        document = {**evaluation.as_dict(), "set": overrides or [], "files": [str(path) for path in written]}
-        keep_times(run.folder, "evaluate", console)
-        shown = {**document, "notes": []} if console.quiet else document
-        console.result(document, lambda rich: _show(evaluation, shown, written, rich))
-        _check_threshold(evaluation, fail_above)
-        _check_audit(evaluation)
+            scores = _with_accuracy(scores, output)
+            written = _write_files(scores, *files)
+        document = {**scores.as_dict(), "files": [str(path) for path in written]}
+        keep_times(request.run.folder, "evaluate", output)
+        shown = {**document, "notes": []} if output.quiet else document
+
+        def show(rich: RichConsole) -> None:
+            if scores.evaluation.accuracy is not None:
+                from lidardesign.cli.tables.times import show_accuracy
+
+                show_accuracy(scores.evaluation.accuracy, rich)
+            show_evaluation(shown, written, rich)
+
+        output.result(document, show)
+        _check_threshold(scores.evaluation, fail_above)
+        _check_audit(scores.evaluation)
 
 
-def _show(evaluation: Evaluation, document: dict[str, Any], written: list[Path], rich: RichConsole) -> None:
-    if evaluation.accuracy is not None:
-        from lidardesign.cli.tables.times import show_accuracy
-
-        show_accuracy(evaluation.accuracy, rich)
-    show_evaluation(document, written, rich)
-
-
-def _checked(
-    workers: str, baselines: list[str], cma_seconds: float | None, fail_above: float | None
-) -> int | str | None:
-    """What the options of an evaluation say where nothing has to be read for it; returns the workers.
-
-    Raises:
-        ConfigError: One of them says nothing that can be done.
-    """
-    from lidardesign.evaluate.baselines.simple import baseline_of
-    from lidardesign.evaluate.workers.pool import check_workers
-
-    if fail_above is not None and not math.isfinite(fail_above):
-        raise ConfigError(f"{fail_above}", where="--fail-above", allowed="a finite number")
-    wanted = check_workers(workers)
-    for name in baselines:
-        baseline_of(name, where="--baseline")
-    check_cma_seconds(cma_seconds, baselines)
-    return wanted
-
-
-def _plan(
-    run: Run,
-    entries: list[JudgedDesign],
-    rays: list[int],
-    baselines: list[str],
-    outputs: dict[str, Path | None],
-    settings: dict[str, Any],
-) -> Plan:
-    """What this evaluation would do."""
-    from lidardesign.cli.dry_run import evaluate_plan
-
-    return evaluate_plan(
-        run,
-        [(entry.design, entry.path) for entry in entries],
-        rays=sorted(set(rays)),
-        baselines=tuple(dict.fromkeys([*ALWAYS, *baselines])),
-        outputs=outputs,
-        settings=settings,
-    )
-
-
-def _evaluate_with(wanted: int | str, request: EvaluationRequest, console: Output) -> Evaluation:
-    """The evaluation, its scenes scored by the workers that were asked for."""
-    from lidardesign.evaluate.workers.pool import workers_of
-
-    with workers_of(wanted, most=len(request.test)) as scorer:
-        if scorer is None:
-            return _evaluate(request, console)
-        scorer.prepare(request)
-        return _evaluate(replace(request, scorer=scorer), console)
-
-
-def _evaluate(request: EvaluationRequest, console: Output) -> Evaluation:
-    from lidardesign.evaluate.score import evaluate as score
-
-    with console.progress("row") as bar:
+def _score(request: ScoreRequest, output: Output) -> Scores:
+    """The scores, with a bar for scenes and one for each search of the baseline cma."""
+    with output.progress("row") as bar:
         line = bar.add_task("evaluating", total=None, row="") if bar else None
 
         def show(done: int, total: int, row: str = "") -> None:
             if bar is not None and line is not None:
                 bar.update(line, completed=done, total=total, row=row)
 
-        return score(replace(request, cma=told(request.cma, request.task.metric, console, bar)), progress=show)
+        return request.score(show, search_display(request, output, bar))
 
 
-def _check_measurable(run: Run) -> None:
-    """Refuse a run that is unfinished or damaged before it is evaluated, which may take minutes."""
-    with phase("libraries"):
-        from lidardesign.density.training.snapshot_quality import check_kept
+def search_display(request: ScoreRequest, output: Output, bar: RichProgress | None) -> Show:
+    """What shows the best score of each search in a bar; without one, a note when it begins."""
+    lines: dict[str, TaskID] = {}
+    begun: set[str] = set()
 
-    check_kept(run.folder)
+    def show(label: str, progress: Progress) -> None:
+        if bar is None:
+            if label not in begun:
+                output.note(f"{label}: searching for {request.cma_seconds:g} s ...")
+            begun.add(label)
+            return
+        if label not in lines:
+            lines[label] = bar.add_task(label, total=1.0, row="")
+        best = f"best {progress.best:.4g} {request.run.task.metric.unit}"
+        bar.update(lines[label], completed=progress.share, row=best)
+
+    return show
 
 
-def _with_accuracy(evaluation: Evaluation, request: EvaluationRequest, run: Run, console: Output) -> Evaluation:
-    """The evaluation with the ladders of the run, whose density is that of its own scenes, whatever it is judged by."""
-    if (request.config, request.seed) != (run.config.task, run.config.seed):
-        request = replace(request, train=run.scenes("train", run.config.seed))
-    with phase("accuracy"), console.progress("ladder") as bar:
-        from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest, measure_accuracy
-
+def _with_accuracy(scores: Scores, output: Output) -> Scores:
+    with output.progress("ladder") as bar:
         line = bar.add_task("measuring accuracy", total=None, ladder="") if bar else None
 
         def show(done: int, total: int, ladder: str) -> None:
             if bar is not None and line is not None:
                 bar.update(line, completed=done, total=total, ladder=ladder)
             elif ladder:
-                console.note(f"accuracy: {ladder} ...")
+                output.note(f"accuracy: {ladder} ...")
 
-        asked = AccuracyRequest(run.config, run.folder, request, evaluation)
-        return replace(evaluation, accuracy=measure_accuracy(asked, progress=show))
+        return scores.with_accuracy(show)
 
 
 @phase("writing")
-def _write_files(
-    evaluation: Evaluation,
-    request: EvaluationRequest,
-    run: Run,
-    times: dict[str, dict[str, float]],
-    report: Path | None,
-    plots: Path | None,
-    csv: Path | None,
-) -> list[Path]:
+def _write_files(scores: Scores, report: Path | None, plots: Path | None, csv: Path | None) -> list[Path]:
+    """Write rows, pictures and report, the last two of one drawing's material."""
     written: list[Path] = []
     if csv is not None:
-        from lidardesign.evaluate.results import write_csv
-
         with written_file(csv) as file:
-            write_csv(evaluation, file)
+            scores.to_csv(file)
         written.append(csv)
-    return written + _write_drawn(evaluation, request, run, times, report, plots) if report or plots else written
-
-
-def _write_drawn(
-    evaluation: Evaluation,
-    request: EvaluationRequest,
-    run: Run,
-    times: dict[str, dict[str, float]],
-    report: Path | None,
-    plots: Path | None,
-) -> list[Path]:
-    """Pictures and report, of one drawing's material."""
-    from lidardesign.evaluate.figures.figure_data import pictured_of
-
-    written: list[Path] = []
-    pictured = pictured_of(evaluation, request, times)
+    pictured = scores.figure_data() if report or plots else None
     if plots is not None:
-        from lidardesign.evaluate.figures.plots import write_plots
-
-        written += write_plots(evaluation, plots, pictured)
+        written += scores.plots(plots, pictured)
     if report is not None:
-        from lidardesign.evaluate.report.report import write_report
-        from lidardesign.workflow.evaluation_report import evaluation_report
-
-        command_line = ["lidardesign", *sys.argv[1:]]
         with written_file(report) as file:
-            write_report(evaluation_report(evaluation, request, run, pictured, command_line), file)
+            scores.report(file, ("lidardesign", *sys.argv[1:]), pictured)
         written.append(report)
     return written
 

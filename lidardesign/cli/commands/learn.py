@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,33 +12,34 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.dry_run import DryRun, tell_plan
+from lidardesign.cli.dry_run import DryRun, show_plan
 from lidardesign.cli.output import Output, command, keep_times
-from lidardesign.errors import DataError
 from lidardesign.run.clock import WAIT_S, phase
-from lidardesign.workflow.learning_budget import Learner, TimeBudget, Tolerance, check_met, checked_goal
-from lidardesign.workflow.run_lifecycle import (
-    CHECKPOINTS,
-    Job,
-    begin,
-    check_can_start,
-    has_stages,
-    made,
-    resumed,
-    started,
-    undone_on_failure,
-)
-from lidardesign.workflow.runs import check_choice
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
     from lidardesign.density.learn import LearnProgress, LearnResult
 
-DEVICES = ("auto", "cpu", "cuda")
-# Below these a density is too rough for figures that are meant seriously.
-LOW_ESS = 0.1
-LOW_COVERAGE = 0.9
+Tolerance = Annotated[
+    float | None,
+    typer.Option(
+        "--tolerance",
+        metavar="SHARE",
+        help="Learn until at most this share of the density's mass is in the wrong place, in stages of doubled steps "
+        "from an eighth to four times those of the preset; exit 1 when none is good enough.",
+        show_default=False,
+    ),
+]
+TimeBudget = Annotated[
+    float | None,
+    typer.Option(
+        "--time-budget",
+        metavar="SECONDS",
+        help="Learn as many steps as let the command end within this time; they are planned from its own first steps.",
+        show_default=False,
+    ),
+]
 
 
 def learn(
@@ -67,81 +69,43 @@ def learn(
     debug: options.Debug = False,
 ) -> None:
     """Learn where rays are worth firing for TASK, into a run folder."""
-    with command(json=json, quiet=quiet, debug=debug) as console:
-        check_choice(device, "--device", DEVICES)
-        choices = {"preset": preset, "config_file": config, "overrides": overrides or (), "seed": seed}
-        goal = checked_goal(tolerance, time_budget, choices)
+    with command(json=json, quiet=quiet, debug=debug) as output:
         with phase("libraries"):
-            import lidardesign.config  # noqa: F401
-            from lidardesign.registry import load_task
+            from lidardesign.workflow.learn import LearnOptions, LearnRequest, learning_advice
+            from lidardesign.workflow.learning_budget import check_met
 
-        plugin = load_task(task)
-        run = out if out is not None else Path("runs") / task
-        job = resumed(plugin, run, goal, choices, console) if resume else started(plugin, run, goal, choices)
-        told = _tell_task_notes(job, console)
+        chosen = LearnOptions(
+            out=out,
+            preset=preset,
+            settings=overrides or (),
+            config=config,
+            seed=seed,
+            device=device,
+            resume=resume,
+            tolerance=tolerance,
+            time_budget_s=time_budget,
+            command=("lidardesign", *sys.argv[1:]),
+        )
+        request = LearnRequest.resolve(task, chosen, output.remark)
+        task_notes = request.task_notes()
+        for note in task_notes:
+            output.remark(note)
         if dry_run:
-            from lidardesign.cli.dry_run import learn_plan
-
-            tell_plan(learn_plan(job, device, config), console)
-            return
-        result = _learn_in_folder(job, device, console)
-        keep_times(run, "learn", console, wait_s=WAIT_S)
-        result = replace(result, notes=(*result.notes, *_advice(result)))
-        untold = [] if console.quiet else [note for note in result.notes if note not in told]
-        console.result(_document(result), lambda rich: _show(result, untold, rich))
-        check_met(result, goal)
-
-
-def _tell_task_notes(job: Job, console: Output) -> list[str]:
-    """Say what the task has to say of its configuration before anything takes time; returns what was said."""
-    from lidardesign.registry import plugin_guard
-    from lidardesign.task import notes_of
-
-    with phase("scenes"), plugin_guard(job.task.name):
-        found = notes_of(job.task, job.settings.task, job.settings.space)
-    for line in found:
-        console.note(f"note: {line}")
-    return found
-
-
-def _learn_in_folder(job: Job, device: str, console: Output) -> LearnResult:
-    from lidardesign.run.lock import run_lock
-
-    task, run = job.task.name, job.run
-    with made(run), run_lock(run):
-        if not job.begun:
-            check_can_start(run)  # another process may have been faster
-        with undone_on_failure(job):
-            if not job.begun:
-                begin(job)
-            console.when_interrupted = lambda: _interruption(task, run)
-            with _progress(console) as progress:
-                learner = Learner(job.task, run, device, progress, console)
-                try:
-                    return learner.learn(job.settings, job.goal, resume=job.has_checkpoint)
-                except DataError as error:
-                    # only what ended the writing, as a full disk does
-                    if not isinstance(error.__cause__, OSError):
-                        raise
-                    hint = f"{error.hint}; {_interruption(task, run)}"
-                    raise DataError(error.message, where=error.where, hint=hint) from error.__cause__
-
-
-def _interruption(task: str, run: Path) -> str | None:
-    checkpoints = sorted(path.name for path in run.glob(CHECKPOINTS))
-    if checkpoints:
-        kept = f"the last checkpoint is {run / checkpoints[-1]}"
-    elif has_stages(run):
-        kept = f"{run} keeps what the finished stages reached"
-    else:
-        return "before the first checkpoint; nothing was kept"
-    return f"{kept}\n  continue with: lidardesign learn {task} --out {run} --resume"
+            return show_plan(request.plan(), output)
+        output.when_interrupted = request.resume_hint
+        with _progress(output) as progress:
+            result = request.run(progress)
+        keep_times(request.folder, "learn", output, wait_s=WAIT_S)
+        result = replace(result, notes=(*result.notes, *learning_advice(result)))
+        further = [] if output.quiet else [note for note in result.notes if note not in task_notes]
+        output.result(_document(result), lambda rich: _show(result, further, rich))
+        check_met(result, request.goal)
 
 
 @contextlib.contextmanager
-def _progress(console: Output) -> Iterator[Callable[[LearnProgress], None]]:
+def _progress(output: Output) -> Iterator[Callable[[LearnProgress], None]]:
     """A function that shows the progress: a bar on a terminal, else one note per phase."""
-    with console.progress("loss", "ess", "left") as bar:
+    with output.progress("loss", "ess", "left") as bar:
         line = bar.add_task("learning", total=None, loss="", ess="", left="") if bar else None
         phase = ""
 
@@ -149,7 +113,7 @@ def _progress(console: Output) -> Iterator[Callable[[LearnProgress], None]]:
             nonlocal phase
             if bar is None or line is None:
                 if now.phase != phase:
-                    console.note(f"{now.phase} ...")
+                    output.note(f"{now.phase} ...")
             else:
                 bar.update(
                     line,
@@ -163,18 +127,6 @@ def _progress(console: Output) -> Iterator[Callable[[LearnProgress], None]]:
             phase = now.phase
 
         yield show
-
-
-def _advice(result: LearnResult) -> list[str]:
-    """What to do about a density that was learned badly."""
-    advice = []
-    if result.ess < LOW_ESS:
-        advice.append(f"ESS below {LOW_ESS:g}: the density is rough; --preset standard or fine learns longer")
-    if result.coverage < LOW_COVERAGE:
-        advice.append(
-            f"coverage below {LOW_COVERAGE:g}: a part of the scenes was missed; learn longer or another --seed"
-        )
-    return advice
 
 
 def _document(result: LearnResult) -> dict[str, Any]:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lidardesign.design.compare import Readout
     from lidardesign.design.constraints.check import ConstraintCheck
     from lidardesign.design.sensor import DesignSpec
-    from lidardesign.workflow.runs import Run
+    from lidardesign.workflow.run_folder import RunFolder
 
 SpaceOf = Annotated[
     Path | None,
@@ -48,11 +48,11 @@ def show(
             from lidardesign.cli.tables.designs import show_constraints, show_design
             from lidardesign.design.compare import readout_of
             from lidardesign.design.layouts.track import placed
-            from lidardesign.workflow.runs import open_run, parse_at, reach_of, read_design
+            from lidardesign.workflow.run_folder import RunFolder, reach_of, read_design
 
-        condition = parse_at(at)
-        run = None if space_of is None else open_run(space_of)
-        loaded = read_design(design, console, reach_of([run]) if run else None)
+        condition = options.parse_at(at)
+        run = None if space_of is None else RunFolder.open(space_of)
+        loaded = read_design(design, console.remark, reach_of([run]) if run else None)
         checks = _checks(loaded, design, run, console)
         _tell_outside(loaded, design, run, console)
         loaded = placed(loaded, condition) if condition else loaded
@@ -67,11 +67,11 @@ def show(
         console.result(_document(loaded, design, checks, readout), print_all, show_costs=False)
 
 
-def _tell_outside(design: DesignSpec, path: Path, run: Run | None, console: Output) -> None:
+def _tell_outside(design: DesignSpec, path: Path, run: RunFolder | None, console: Output) -> None:
     """Say where a design stands far outside the design space of the run that it is shown in, or came from."""
     from lidardesign.design.compare import outside_notes
     from lidardesign.errors import LidardesignError
-    from lidardesign.workflow.runs import run_of
+    from lidardesign.workflow.run_folder import run_of
 
     try:
         run = run or run_of(design, path)
@@ -102,12 +102,12 @@ def _document(loaded: DesignSpec, path: Path, checks: list[ConstraintCheck], rea
     }
 
 
-def _checks(design: DesignSpec, path: Path, run: Run | None, console: Output) -> list[ConstraintCheck]:
+def _checks(design: DesignSpec, path: Path, run: RunFolder | None, console: Output) -> list[ConstraintCheck]:
     """Every constraint that the design was made under, checked anew; in its run's design space where that is there."""
     from lidardesign.design.constraints.check import check_design
     from lidardesign.design.files import design_document
     from lidardesign.errors import LidardesignError
-    from lidardesign.workflow.runs import run_of
+    from lidardesign.workflow.run_folder import run_of
 
     if not design.constraints:
         return []

@@ -1,0 +1,540 @@
+"""Scoring designs on held-out scenes: what is asked for, resolved by runs and designs, and the scores that it gives."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lidardesign.config import judged_by
+from lidardesign.design.compare import outside_notes
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.evaluate.baselines.simple import baseline_of
+from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
+from lidardesign.evaluate.cma.search import Budget
+from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, left_out, usual_numbers
+from lidardesign.evaluate.results import Evaluation, Paired, Row, write_csv
+from lidardesign.evaluate.score import evaluate as score_designs
+from lidardesign.evaluate.workers.pool import check_workers, workers_of
+from lidardesign.run.clock import Clock, outermost_clock, phase, running
+from lidardesign.run.files import is_there
+from lidardesign.simulate.detector.files import load_detector
+from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
+from lidardesign.task import judged_by_keys
+from lidardesign.workflow.designs import Design, html_table
+from lidardesign.workflow.layouts import Layouts, learned_density, twin_without_visibility
+from lidardesign.workflow.plans import Plan, last_time
+from lidardesign.workflow.run_folder import (
+    CONFIGURATION,
+    MANIFEST,
+    SAMPLES,
+    Notes,
+    RunFolder,
+    log_note,
+    reach_beside,
+    read_design,
+    run_of,
+    settings_texts,
+)
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
+
+    from lidardesign.evaluate.cma.candidate import Show
+    from lidardesign.evaluate.figures.figure_data import Pictured
+
+Progress = Callable[[int, int, str], None]
+
+ALWAYS = ("uniform", "random", "bounding")
+CMA = "cma"
+LEAST_CMA_SECONDS = 0.1
+MILLIMETRES = 1000.0
+MOST_NAMED = 8
+THIS = "evaluate"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoreOptions:
+    """What a user may choose for an evaluation.
+
+    Arguments:
+        rays: Numbers of rays per frame; the task's by default, and those of smaller fixed patterns.
+        baselines: Further baselines beside uniform, random and bounding, by name.
+        seed: Root of every random stream; the run's by default.
+        effects: auto, all, none, audit, or names of effects between commas.
+        detector: The name of a detector, or its file.
+        range_tolerance_mm: What all skipped effects together may change of ranges.
+        return_tolerance: What all skipped effects together may change of returns.
+        settings: Settings of the task to judge by other scenes than were learned.
+        workers: Processes that score scenes, or the address of a scheduler.
+        cma_seconds: Wall time of each search of the baseline cma [s].
+        accuracy: Whether what accuracy costs will be measured, too.
+
+    Raises:
+        ConfigError: One of them says nothing that can be done.
+    """
+
+    rays: Sequence[int] | None = None
+    baselines: Sequence[str] = ()
+    seed: int | None = None
+    effects: str = "auto"
+    detector: str = "ideal"
+    range_tolerance_mm: float | None = None
+    return_tolerance: float | None = None
+    settings: Sequence[str] | Mapping[str, Any] = ()
+    workers: int | str = 1
+    cma_seconds: float | None = None
+    accuracy: bool = False
+
+    def __post_init__(self) -> None:
+        check_workers(str(self.workers))
+        for name in self.baselines:
+            baseline_of(name, where="--baseline")
+        seconds = self.cma_seconds
+        if seconds is not None and not (math.isfinite(seconds) and seconds >= LEAST_CMA_SECONDS):
+            allowed = f"a finite number from {LEAST_CMA_SECONDS:g}"
+            raise ConfigError(f"{seconds:g} s", where="--cma-seconds", allowed=allowed)
+        if seconds is not None and CMA not in self.baselines:
+            hint = f"add --baseline {CMA}, or leave it out"
+            raise ConfigError("nothing is searched for", where="--cma-seconds", hint=hint)
+        tolerances = {"--range-tolerance-mm": self.range_tolerance_mm, "--return-tolerance": self.return_tolerance}
+        for option, value in tolerances.items():
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise ConfigError(f"{value:g}", where=option, allowed="a finite number above 0")
+
+    def planner(self) -> tuple[Planner, bool]:
+        """How effects are chosen, and whether the choice is audited.
+
+        Raises:
+            ConfigError: An unknown effect or detector.
+        """
+        audit = self.effects.strip() == "audit"
+        choice = parse_effects("auto" if audit else self.effects)
+        detector = load_detector(self.detector)
+        usual, given_mm = Tolerance.of(detector), self.range_tolerance_mm
+        range_m = usual.range_m if given_mm is None else given_mm / MILLIMETRES
+        return_share = usual.lost if self.return_tolerance is None else self.return_tolerance
+        return Planner(detector, choice, Tolerance(range_m, return_share)), audit
+
+
+@dataclass(frozen=True, eq=False)
+class ScoreRequest:
+    """An evaluation with nothing left open.
+
+    Arguments:
+        run: The run whose task judges, by the settings that are judged by.
+        learned: The same run as it was learned.
+        designs: The designs, by distinct names.
+        rays: Numbers of rays.
+        baselines: All of them, by name.
+        seed: Root of the random streams.
+        planner: The detector, and how effects are chosen.
+        audit: Whether all rows are scored under all effects too.
+        options: The user's choices.
+    """
+
+    run: RunFolder
+    learned: RunFolder
+    designs: Sequence[Design]
+    rays: Sequence[int]
+    baselines: Sequence[str]
+    seed: int
+    planner: Planner
+    audit: bool
+    options: ScoreOptions
+
+    @classmethod
+    def resolve(
+        cls,
+        targets: Sequence[Design | Path],
+        options: ScoreOptions,
+        runs: Sequence[RunFolder] = (),
+        notes: Notes = log_note,
+    ) -> ScoreRequest:
+        """The request of a user's choices.
+
+        Arguments:
+            targets: Designs, design files, and run folders, which stand for all their designs.
+            options: The choices.
+            runs: Runs that were opened for it; the first one's task judges.
+            notes: Called with every note.
+
+        Raises:
+            ConfigError: Runs that differ, or choices that cannot be.
+            DataError: A design or a run is not there, or damaged.
+        """
+        planner, audit = options.planner()
+        designs, opened = collect_designs(targets, runs, notes)
+        run = learned = common_run(name_apart(designs), opened)
+        rays = options.rays or usual_numbers([design.specification for design in designs], run.task.defaults.rays)
+        if options.accuracy:
+            _check_measurable(learned)
+        overrides = settings_texts(options.settings)
+        if overrides:
+            run = replace(run, config=judged_by(run.task, run.config, overrides))
+        if options.range_tolerance_mm is None:
+            planner = replace(planner, tolerance=planner.tolerated.within(run.task.metric))
+        return cls(
+            run,
+            learned,
+            designs,
+            sorted(set(rays)),
+            tuple(dict.fromkeys([*ALWAYS, *options.baselines])),
+            run.config.seed if options.seed is None else options.seed,
+            planner,
+            audit,
+            options,
+        )
+
+    def plan(self, outputs: Mapping[str, Path | None] | None = None) -> Plan:
+        """What the evaluation would do.
+
+        Arguments:
+            outputs: Files that are to be written, by the option that says so; None for those that are not.
+
+        Raises:
+            ConfigError: No design can fire any of the numbers of rays.
+        """
+        run, options = self.run, self.options
+        specifications = [design.specification for design in self.designs]
+        counts = fired_numbers(specifications, self.rays)
+        scored = sum(can_fire(design, count) for design in specifications for count in counts)
+        rows, matched = scored + len(self.baselines) * len(counts), scored * len(self.baselines)
+        names = [design.name for design in specifications]
+        listed = ", ".join(names[:MOST_NAMED])
+        listed += f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+        settings = {
+            "--effects": options.effects,
+            "--detector": options.detector,
+            "--set": list(settings_texts(options.settings)) or None,
+            "--accuracy": options.accuracy,
+        }
+        given = [f"{name} {value}" for name, value in settings.items() if value not in (None, (), [], False)]
+        samples = [run.folder / SAMPLES] if run.has_samples else []
+        written = [
+            f"{path}/" if option == "--plots" else path for option, path in (outputs or {}).items() if path is not None
+        ]
+        return Plan(
+            THIS,
+            [
+                f"score {listed} in the held-out scenes of task {run.task.name}, with {', '.join(map(str, counts))} "
+                "rays per frame",
+                f"beside {', '.join(self.baselines)}: {rows} rows at equal rays, up to {matched} at equal bandwidth",
+                *left_out(specifications, self.rays),
+                *(line for design in specifications for line in outside_notes(design, run.config.space)),
+                *([f"with {', '.join(given)}"] if given else []),
+            ],
+            [
+                *(design.name if design.path is None else design.path for design in self.designs),
+                *(run.folder / name for name in (CONFIGURATION, MANIFEST)),
+                *samples,
+            ],
+            [*written, run.folder / MANIFEST],
+            {"designs": names, "rays": counts, "baselines": list(self.baselines), **settings},
+            last_time(run.folder, THIS),
+        )
+
+    @property
+    def cma_seconds(self) -> float:
+        """Wall time of each search of the baseline cma [s]."""
+        return DEFAULT_SECONDS if self.options.cma_seconds is None else self.options.cma_seconds
+
+    def evaluation_request(self, searching: Show | None = None) -> EvaluationRequest:
+        """The request of the scoring itself, with scenes and samples.
+
+        Arguments:
+            searching: Called with how the searches of the baseline cma stand.
+        """
+        request = evaluation_request(self.run, self.designs, self.rays, self.baselines, self.seed)
+        cma = CmaSettings(Budget(self.cma_seconds), searching)
+        return replace(request, planner=self.planner, audit=self.audit, cma=cma)
+
+    def score(self, progress: Progress | None = None, searching: Show | None = None) -> Scores:
+        """Score every design and baseline on every held-out scene.
+
+        Arguments:
+            progress: Called with the scenes done, all scenes, and the name of the scene.
+            searching: Called with how the searches of the baseline cma stand.
+
+        Raises:
+            ConfigError: No scenes, or an effect that was named and cannot be simulated here.
+            PluginError: The task's score raised, or returned something that is no finite score.
+        """
+        with nullcontext(outermost_clock()) if outermost_clock() else running() as clock:
+            request = self.evaluation_request(searching)
+            with workers_of(check_workers(str(self.options.workers)), most=len(request.test)) as scorer:
+                scoring = request
+                if scorer is not None:
+                    scorer.prepare(request)
+                    scoring = replace(request, scorer=scorer)
+                evaluation = score_designs(scoring, progress=progress)
+        return Scores(evaluation, replace(request, cma=replace(request.cma, show=None)), self.learned, clock, self)
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """What designs and baselines score on held-out scenes, and how they differ, scene by scene.
+
+    `run.evaluate([...])` gives scores.
+
+    Arguments:
+        evaluation: Rows, differences, effects and notes.
+        evaluation_request: What was evaluated.
+        run: The run as it was learned.
+        clock: Where the time went.
+        request: What was asked for.
+
+    Example:
+        >>> scores = run.evaluate([run.fit(sensors=2, rays=36, name="two")], rays=[16])
+        >>> [row.design for row in scores.rows]
+        ['two', 'uniform', 'random', 'bounding']
+        >>> [pair.b for pair in scores.paired]
+        ['uniform', 'random', 'bounding']
+        >>> scores.to_csv("scores.csv").name
+        'scores.csv'
+    """
+
+    evaluation: Evaluation
+    evaluation_request: EvaluationRequest
+    run: RunFolder
+    clock: Clock
+    request: ScoreRequest
+
+    @property
+    def rows(self) -> Sequence[Row]:
+        """Designs, then baselines, at equal numbers of rays."""
+        return self.evaluation.rows
+
+    @property
+    def paired(self) -> Sequence[Paired]:
+        """Every design against every baseline and every later design, scene by scene."""
+        return self.evaluation.paired
+
+    def as_dict(self) -> dict[str, Any]:
+        """What `lidardesign evaluate --json` prints of them."""
+        return {**self.evaluation.as_dict(), "set": list(settings_texts(self.request.options.settings))}
+
+    def with_accuracy(self, progress: Progress | None = None) -> Scores:
+        """The scores with what accuracy costs in time here; takes minutes.
+
+        Arguments:
+            progress: Called with the sweeps done, all sweeps, and the name of the sweep.
+
+        Raises:
+            DataError: The run is unfinished or damaged.
+        """
+        run, request = self.run, self.evaluation_request
+        # the density is that of the run's own scenes, whatever it is judged by
+        if (request.config, request.seed) != (run.config.task, run.config.seed):
+            request = replace(request, train=run.scenes("train", run.config.seed))
+        with phase("accuracy"):
+            from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest, measure_accuracy
+
+            asked = AccuracyRequest(run.config, run.folder, request, self.evaluation)
+            accuracy = measure_accuracy(asked, progress=progress)
+        return replace(self, evaluation=replace(self.evaluation, accuracy=accuracy))
+
+    @phase("writing")
+    def to_csv(self, path: Path | str) -> Path:
+        """Write the rows as CSV."""
+        write_csv(self.evaluation, Path(path))
+        return Path(path)
+
+    def figure_data(self) -> Pictured:
+        """What pictures and reports draw beside the scores."""
+        from lidardesign.evaluate.figures.figure_data import pictured_of
+
+        # what the clock counts under this command's name up to now
+        times = {**self.run.command_times(), THIS: self.clock.timings()}
+        return pictured_of(self.evaluation, self.evaluation_request, times)
+
+    @phase("writing")
+    def plots(self, folder: Path | str, pictured: Pictured | None = None) -> list[Path]:
+        """Write pictures for papers into a folder, as PNG and SVG."""
+        from lidardesign.evaluate.figures.plots import write_plots
+
+        return write_plots(self.evaluation, Path(folder), self.figure_data() if pictured is None else pictured)
+
+    @phase("writing")
+    def report(self, path: Path | str, command: Sequence[str] = (), pictured: Pictured | None = None) -> Path:
+        """Write one HTML page: tables, curves, a 3D view, and how to get the same figures again.
+
+        Arguments:
+            path: The file.
+            command: What the page says that it was made by; this program's arguments by default.
+            pictured: What `figure_data` gave, to be used again.
+        """
+        from lidardesign.evaluate.report.report import write_report
+        from lidardesign.workflow.evaluation_report import evaluation_report
+
+        pictured = self.figure_data() if pictured is None else pictured
+        request = self.evaluation_request
+        write_report(
+            evaluation_report(self.evaluation, request, self.run, pictured, command or sys.argv), Path(path)
+        )
+        return Path(path)
+
+    def figure(self, against: str = "rays") -> go.Figure:
+        """The scores with their intervals against "rays" or "bandwidth" (plotly)."""
+        from lidardesign.evaluate.report.notebook import scores_figure
+
+        return scores_figure(self.evaluation, against)
+
+    def __repr__(self) -> str:
+        metric = self.evaluation.metric
+        return f"<Scores: {metric.name} [{metric.unit}] over {self.evaluation.scenes} scenes, {len(self.rows)} rows>"
+
+    def _repr_html_(self) -> str:
+        metric = self.evaluation.metric
+        headings = ("design", "rays", f"{metric.name} [{metric.unit}]", "95 % interval", "failures", "Mbit/s")
+        rows = [
+            (
+                row.design,
+                row.rays,
+                f"{row.value:.4g}",
+                f"{row.ci_low:.4g} - {row.ci_high:.4g}",
+                row.failures,
+                f"{row.bandwidth_mbps:.4g}",
+            )
+            for row in self.rows
+        ]
+        caption = f"{metric.name}, {metric.better} is better, over {self.evaluation.scenes} held-out scenes"
+        return html_table(caption, headings, rows)
+
+
+@phase("designs")
+def collect_designs(
+    targets: Sequence[Design | Path], runs: Sequence[RunFolder] = (), notes: Notes = log_note
+) -> tuple[list[Design], list[RunFolder]]:
+    """The designs that were named, and the runs: of folders all designs, of files the file; each once.
+
+    Raises:
+        DataError: One is not there.
+    """
+    designs: list[Design] = []
+    paths = [target for target in targets if isinstance(target, Path)]
+    opened = {path: RunFolder.open(path) for path in paths if path.is_dir()}
+    runs = [*runs, *opened.values()]
+    reach_m = reach_beside([path for path in paths if path.is_file()], runs)
+    for target in targets:
+        if isinstance(target, Design):
+            designs.append(target)
+        elif target in opened:
+            run = opened[target]
+            designs += [Design(read_design(path, notes), run, path) for path in run.design_paths()]
+        elif not is_there(target):
+            raise DataError("no such run or design", where=str(target), hint="give run folders or design files")
+        else:
+            design = read_design(target, notes, reach_m)
+            designs.append(Design(design, run_of(design, target), target))
+    seen: dict[object, Design] = {}
+    for design in designs:
+        seen.setdefault(id(design) if design.path is None else design.path.resolve(), design)
+    # they may be renamed: a user's own keep their names
+    return [Design(design.specification, design.run, design.path) for design in seen.values()], runs
+
+
+def name_apart(designs: list[Design]) -> list[Design]:
+    """Designs that share a name take in front their run's name, or behind their file's ending, as tells them apart.
+
+    Raises:
+        ConfigError: Two are still called the same.
+    """
+    alike: dict[str, list[Design]] = {}
+    for design in designs:
+        alike.setdefault(design.name, []).append(design)
+    for name, group in alike.items():
+        folders = [_home(design) for design in group]
+        for design, folder in zip(group, folders, strict=True):
+            # files of one folder, as rig.csv and rig.sdf, differ in their endings alone
+            ending = design.path.suffix if design.path is not None and folders.count(folder) > 1 else ""
+            front = f"{folder}/" if len(set(folders)) > 1 else ""
+            if len(group) > 1:
+                design.specification = replace(design.specification, name=f"{front}{name}{ending}")
+    names = [design.name for design in designs]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice:
+        raise ConfigError(f"two designs are called {twice!r}", hint="rename one of the files")
+    return designs
+
+
+def _home(design: Design) -> str:
+    """The name of the folder that a design is told apart by."""
+    folder = design.run.folder if design.run else design.path.parent if design.path else Path()
+    return folder.resolve().name
+
+
+def common_run(designs: Sequence[Design], runs: Sequence[RunFolder]) -> RunFolder:
+    """The run whose task and configuration all designs are judged by.
+
+    Raises:
+        ConfigError: There is none, or runs differ.
+        DataError: There are no designs.
+    """
+    candidates = [*runs, *(design.run for design in designs if design.run is not None)]
+    if not candidates:
+        raise ConfigError(
+            "no design names a run that is there, so the task is unknown",
+            hint="give the run folder too: lidardesign evaluate RUN DESIGN",
+        )
+
+    def scenes_key(run: RunFolder) -> tuple[Any, ...]:
+        """What runs share whose designs are scored in the same scenes."""
+        return run.config.task_name, judged_by_keys(run.task, run.config.task), run.config.space
+
+    first = candidates[0]
+    for other in candidates[1:]:
+        if scenes_key(other) != scenes_key(first):
+            raise ConfigError(
+                f"{first.folder} and {other.folder} differ in task, configuration or design space",
+                hint="evaluate them one by one: scores of different scenes do not compare",
+            )
+    if not designs:
+        raise DataError("the run has no designs yet", where=str(first.folder), hint=f"lidardesign fit {first.folder}")
+    return first
+
+
+def evaluation_request(
+    run: RunFolder, designs: Sequence[Design], rays: Iterable[int], baselines: Sequence[str], seed: int | None = None
+) -> EvaluationRequest:
+    """The request that scores designs in a run's scenes.
+
+    Arguments:
+        run: Whose task and configuration judge.
+        designs: The designs.
+        rays: Numbers of rays.
+        baselines: By name.
+        seed: Root of the random streams; None: the run's.
+    """
+    config = run.config
+    seed = config.seed if seed is None else seed
+    from_runs = [(design.specification, design.run) for design in designs if design.run is not None]
+    layouts = Layouts.of(from_runs)
+    return EvaluationRequest(
+        task=run.task,
+        config=config.task,
+        space=config.space,
+        seed=seed,
+        designs=[design.specification for design in designs],
+        rays=sorted(set(rays)),
+        baselines=tuple(dict.fromkeys(baselines)),
+        samples=layouts.samples(from_runs),
+        train=run.scenes("train", seed),
+        test=run.scenes("test", seed),
+        lay_out=layouts,
+        without_visibility=(lambda: twin_without_visibility(*from_runs[0], layouts)) if from_runs else None,
+        density=cache(lambda: learned_density(from_runs[0][1] if from_runs else run)),
+    )
+
+
+def _check_measurable(run: RunFolder) -> None:
+    """Refuse a run that is unfinished or damaged before it is evaluated, which may take minutes."""
+    with phase("libraries"):
+        from lidardesign.density.training.snapshot_quality import check_kept
+
+    check_kept(run.folder)

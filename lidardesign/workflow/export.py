@@ -1,0 +1,294 @@
+"""The explicit rays of a design, and writing them in other programs' formats."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lidardesign.design.layouts.rays import gates_of, lay_out, own_count, refitted
+from lidardesign.design.layouts.track import placed
+from lidardesign.design.mixture.conditions import conditioned
+from lidardesign.design.mixture.support import Retarget
+from lidardesign.design.sensor import DesignSpec
+from lidardesign.errors import ConfigError
+from lidardesign.estimates import Estimate, as_documents
+from lidardesign.export.registry import EXPORTERS, Exporter
+from lidardesign.geometry.rays import Rays
+from lidardesign.run.clock import phase
+from lidardesign.run.files import STDIO, is_input
+from lidardesign.samples import Samples
+from lidardesign.workflow.layouts import may_need_samples
+from lidardesign.workflow.plans import Plan, last_time
+from lidardesign.workflow.run_folder import CONFIGURATION, MANIFEST, Notes, RunFolder, folder_of, log_note, run_of
+from lidardesign.workflow.weighting import RunTarget, Weighting, weighted_samples
+
+# Formats that hold sensors only, so that the number of rays may stay open.
+WITHOUT_RAYS = ("sensors-csv", "stl")
+
+
+class DesignSource:
+    """A design with what its rays may follow from.
+
+    Arguments:
+        specification: The design.
+        run: The run that it came from, where that is open; else the one that its file names is opened when needed.
+        path: Its file; None while it has none.
+    """
+
+    def __init__(self, specification: DesignSpec, run: RunFolder | None = None, path: Path | None = None) -> None:
+        self.specification, self.run, self.path = specification, run, path
+
+    @property
+    def folder(self) -> Path | None:
+        """The folder of the run that it came from, if it is there."""
+        if self.run is not None:
+            return self.run.folder
+        return None if self.path is None else folder_of(self.specification, self.path)
+
+    def opened_run(self) -> RunFolder | None:
+        """The run that it came from, if it is there."""
+        if self.run is not None or self.path is None:
+            return self.run
+        return run_of(self.specification, self.path)
+
+    @property
+    def leaves_rays_open(self) -> bool:
+        """Whether nothing in the design says how many rays it fires."""
+        design = self.specification
+        counted = all(sensor.rays is not None for sensor in design.sensors)
+        return design.rays is None and design.ray_table is None and not counted and design.layout != "scan"
+
+    def largest_budget(self) -> int:
+        """The rays of a design that leaves them open: the largest number that its task is evaluated at.
+
+        Raises:
+            ConfigError: Its run is not there.
+        """
+        run = self.opened_run()
+        if run is None:
+            where = self.specification.name if self.path is None else str(self.path)
+            raise ConfigError("the design leaves the number of rays open", where=where, hint="give --rays N")
+        return max(run.task.defaults.rays)
+
+    @phase("rays")
+    def lay_out(
+        self,
+        count: int | None = None,
+        at: Mapping[str, float] | None = None,
+        seed: int = 0,
+        *,
+        may_stay_open: bool = False,
+        notes: Notes = log_note,
+    ) -> tuple[DesignSpec, Rays]:
+        """The design and its explicit rays at a condition; another number of rays may need the samples of its run.
+
+        A scan of another number of rays has other sensors, so the design that is given back is that one. A design that
+        leaves its number of rays open takes the largest budget of its task.
+
+        Arguments:
+            count: Rays per frame.
+            at: Condition values.
+            seed: Root of the random streams.
+            may_stay_open: Whether sensors alone are wanted where no number is given.
+            notes: Called with every note.
+
+        Raises:
+            ConfigError: The design is nowhere at such a condition, or needs a run that is not there.
+        """
+        design, at = self.specification, at or {}
+        if at or design.track is not None:
+            # refuses a wrong place before anything is fitted
+            placed(design, at)
+        if count is None and self.leaves_rays_open and not may_stay_open:
+            count = self.largest_budget()
+            notes(f"the design leaves the number of rays open; {count} is the task's largest budget")
+        samples, retarget = None, None
+        if count is not None and may_need_samples(design) and (self.leaves_rays_open or count != own_count(design)):
+            run = self.opened_run()
+            if run is not None:
+                samples, retarget = self._samples(run, at)
+            if design.layout == "scan":
+                design = refitted(design, count, samples, seed)
+        count = 0 if may_stay_open else count
+        gates = gates_of(design, samples)
+        rays = lay_out(design, count, samples, gates=gates, seed=seed, at=at, retarget=retarget)
+        return placed(design, at) if at or design.track is not None else design, rays
+
+    def _samples(self, run: RunFolder, at: Mapping[str, float]) -> tuple[Samples, Retarget]:
+        """The samples that the design follows from: of all conditions for a track, else of the design's own."""
+        design = self.specification
+        weighting = Weighting.of(design)
+        retarget = RunTarget(run, weighting=weighting)
+        samples = weighted_samples(run, weighting, retarget)
+        if design.track is None and samples.space.conditioned:
+            samples = conditioned(samples, {**at, **design.at}, retarget)
+        return samples, retarget
+
+
+@dataclass(frozen=True, eq=False)
+class Exported:
+    """What an export wrote.
+
+    Arguments:
+        path: The file or folder.
+        format: The format's name.
+        rays: How many rays it holds.
+        sensors: How many sensors.
+        bytes: The size of what was written; None for what is no file, as a pipe.
+        notes: What the format cannot hold.
+        rounding: What its numbers lose, found by reading the file back.
+    """
+
+    path: Path
+    format: str
+    rays: int
+    sensors: int
+    bytes: int | None
+    notes: tuple[str, ...] = ()
+    rounding: Mapping[str, Estimate] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The contract's JSON form; the path of the design is for the caller to add."""
+        return {
+            "format": self.format,
+            "out": str(self.path),
+            "rays": self.rays,
+            "bytes": self.bytes,
+            "notes": list(self.notes),
+            "error_estimates": as_documents(self.rounding),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class ExportRequest:
+    """What is exported: how many rays, at which condition, at how many frames per second, to where.
+
+    Arguments:
+        source: The design.
+        exporter: The format.
+        target: The file or folder to write.
+        rays: Rays per frame; None takes the design's own.
+        at: Condition values.
+        rate_hz: Frames per second, in formats that hold it [Hz].
+        seed: Root of the random streams.
+    """
+
+    source: DesignSource
+    exporter: Exporter
+    target: Path
+    rays: int | None = None
+    at: Mapping[str, float] = field(default_factory=dict)
+    rate_hz: float | None = None
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        name = self.exporter.name
+        if self.rays is not None and name in WITHOUT_RAYS and self.source.specification.layout != "scan":
+            # of a scan another number of rays is another number of sensors
+            raise ConfigError(f"{name} holds sensors, not rays", where="--rays", hint="leave it out")
+        self.exporter.check_rate(self.rate_hz)
+
+    def plan(self) -> Plan:
+        """What the export would do.
+
+        Raises:
+            ConfigError: The design is nowhere at such a condition, or leaves its rays open without a run.
+        """
+        source, design, exporter = self.source, self.source.specification, self.exporter
+        if self.at or design.track is not None:
+            placed(design, self.at)
+        count = self.rays
+        if exporter.name in WITHOUT_RAYS:
+            count = None
+        elif count is None:
+            count = source.largest_budget() if source.leaves_rays_open else own_count(design)
+        content = "its sensors" if count is None else f"its {count} rays"
+        place = "".join(f" at {key} = {value:g}" for key, value in self.at.items())
+        run = [] if source.folder is None else [source.folder / CONFIGURATION, source.folder / MANIFEST]
+        return Plan(
+            "export",
+            [
+                f"write {content}{place} as {exporter.name}: {exporter.summary}",
+                "read the file back, and say what its numbers lose",
+            ],
+            [design.name if source.path is None else source.path, *run],
+            [f"{self.target}/" if exporter.folder else self.target],
+            {"format": exporter.name, "rays": count, "at": dict(self.at)},
+            last_time(source.folder, "export"),
+        )
+
+    def write(self, file: Path | None = None, notes: Notes = log_note) -> Exported:
+        """Write the design and read it back.
+
+        Arguments:
+            file: What is written instead of the target, which it is copied to later.
+            notes: Called with every note.
+        """
+        file, exporter = self.target if file is None else file, self.exporter
+        sensors_only = exporter.name in WITHOUT_RAYS
+        design, rays = self.source.lay_out(self.rays, self.at, self.seed, may_stay_open=sensors_only, notes=notes)
+        with phase("writing"):
+            lost = tuple(exporter.write(design, rays, file, self.rate_hz))
+        with phase("reading back"):
+            rounding = exporter.rounding(design, rays, file)
+        for note in lost:
+            notes(note)
+        return Exported(
+            self.target, exporter.name, len(rays), len(design.sensors), _written_bytes(file), lost, rounding
+        )
+
+
+def exporter_of(name: str | None, path: Path | None = None) -> Exporter:
+    """The format of a name; without one that whose suffix a path has.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    if name is None and path is not None:
+        fitting = [exporter for exporter in EXPORTERS.values() if path.name.endswith(exporter.suffix)]
+        if fitting:
+            return max(fitting, key=lambda exporter: len(exporter.suffix))
+    if name not in EXPORTERS:
+        problem = "no format was given" if name is None else f"unknown format {name!r}"
+        raise ConfigError(problem, where="--format", allowed=", ".join(EXPORTERS))
+    return EXPORTERS[name]
+
+
+def export_target(path: Path | None, out: Path | None, exporter: Exporter) -> Path:
+    """Where to write a design: where a user says, or beside its file.
+
+    Raises:
+        ConfigError: Over the design, to standard output a folder, or nowhere that is known.
+    """
+    if out is None and path is not None and is_input(path):
+        raise ConfigError(
+            "a design from standard input stands beside nothing", where="DESIGN -", hint="give --out PATH"
+        )
+    if out is None and path is None:
+        raise ConfigError("a design without a file stands beside nothing", hint="save it, or say where to export it")
+    target = out if out is not None else path.with_suffix(exporter.suffix)
+    if str(target) == STDIO and exporter.folder:
+        raise ConfigError(f"{exporter.name} is a folder of files", where="--out -", hint="give --out FOLDER")
+    if path is not None and target.exists() and path.exists() and target.samefile(path):
+        raise ConfigError("would overwrite the design itself", where=str(target), hint="give another --out")
+    return target
+
+
+def check_frame_rate(rate_hz: float | None) -> None:
+    """Refuse a frame rate that is none.
+
+    Raises:
+        ConfigError: So it is.
+    """
+    if rate_hz is not None and not (math.isfinite(rate_hz) and rate_hz > 0):
+        raise ConfigError(f"{rate_hz}", where="--rate-hz", allowed="a finite number above 0")
+
+
+def _written_bytes(target: Path) -> int | None:
+    """What was written [bytes], of a folder all files; None for what is no file, as a pipe."""
+    if target.is_dir():
+        return sum(path.stat().st_size for path in target.rglob("*") if path.is_file())
+    return target.stat().st_size if target.is_file() else None

@@ -1,0 +1,341 @@
+"""What a fit is asked for: the choices of a user, resolved by the run, an earlier design, constraints and a rig."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lidardesign.config import apply_override, parse_override
+from lidardesign.design.constraints.document import CATALOG, Constraints
+from lidardesign.design.constraints.feasibility import check_feasible
+from lidardesign.design.constraints.origins import is_mounted, snap_to_space
+from lidardesign.design.constraints.rig_constraints import moved_notes, rig_constraints, rig_notes
+from lidardesign.design.sensor import LEVELS, DesignSpec, fitted_layout
+from lidardesign.design.snap.parts import parts_of, wants_parts
+from lidardesign.errors import ConfigError, check_choice
+from lidardesign.run.manifest import verify
+from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml
+from lidardesign.workflow.plans import Plan, last_time
+from lidardesign.workflow.run_folder import (
+    CONFIGURATION,
+    MANIFEST,
+    SAMPLES,
+    Notes,
+    RunFolder,
+    check_name,
+    log_note,
+    reach_of,
+    read_design,
+    settings_texts,
+)
+from lidardesign.workflow.weighting import Weighting
+
+LAYOUTS = ("grid", "density", "scan", "distributed")
+# In the others rays are sensors of their own, or leave their sensors' places.
+RIG_LAYOUTS = ("grid", "density")
+GATES = ("sensor", "ray")
+# Keys by which tasks are told where sensors may be.
+PLACE_KEYS = ("origin_m", "origin_box_m")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitOptions:
+    """What a user may choose for a fit; what is left out follows from an earlier design, the constraints or the task.
+
+    Arguments:
+        sensors: How many sensors, or "auto": as many as held-out likelihood says. A scan has one per ray.
+        constraints: Constraints, a mapping of them, or a YAML file of them.
+        layout: grid, density, scan or distributed.
+        rays: Rays per frame over all sensors.
+        gates: "sensor" or "ray": one gate per sensor, or one per ray.
+        level: The share of rays and returns that fields of view and gates hold.
+        at: Values of conditions that the design is for, as {"x_m": 0.37}.
+        weights: Settings of the task towards which the learned density is weighted.
+        refine: At most so many rounds of refinement on training scenes.
+        like: The file of a rig to be like: as many sensors at its places, none wider, as many rays.
+        name: The design's name.
+        seed: Root of every random stream; the run's by default.
+
+    Raises:
+        ConfigError: A name, a layout or gates that cannot be.
+    """
+
+    sensors: int | str | None = None
+    constraints: Constraints | Mapping[str, Any] | Path | str | None = None
+    layout: str | None = None
+    rays: int | None = None
+    gates: str | None = None
+    level: float | None = None
+    at: Mapping[str, float] = field(default_factory=dict)
+    weights: Sequence[str] | Mapping[str, Any] = ()
+    refine: int | None = None
+    like: Path | str | None = None
+    name: str | None = None
+    seed: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.name is not None:
+            check_name(self.name)
+        if self.layout is not None:
+            check_choice(self.layout, "--layout", LAYOUTS)
+        if self.gates is not None:
+            check_choice(self.gates, "--gates", GATES)
+
+
+@dataclass(frozen=True, eq=False)
+class FitRequest:
+    """A fit with nothing left open.
+
+    Arguments:
+        run: The run whose samples are fitted to.
+        name: The design's name.
+        seed: Root of the random streams.
+        constraints: Checked constraints, or None.
+        at: Condition values that the design is for; without any, one for all of them.
+        choices: sensors, layout, rays, gates and level, as `lidardesign.design.fit.fit` takes them.
+        weighting: What the density is multiplied by.
+        refine: Rounds of refinement, or None.
+        names: What sensors are called, where there are as many; none numbers them.
+        command: For the design's provenance.
+        files: Files that were read for it.
+    """
+
+    run: RunFolder
+    name: str
+    seed: int
+    constraints: Constraints | None = None
+    at: Mapping[str, float] = field(default_factory=dict)
+    choices: Mapping[str, Any] = field(default_factory=dict)
+    weighting: Weighting = field(default_factory=Weighting)
+    refine: int | None = None
+    names: Sequence[str] = ()
+    command: str = "fit"
+    files: Sequence[Path] = ()
+
+    @classmethod
+    def resolve(
+        cls,
+        run: RunFolder,
+        options: FitOptions,
+        base: DesignSpec | None = None,
+        *,
+        files: Sequence[Path] = (),
+        notes: Notes = log_note,
+    ) -> FitRequest:
+        """The request of a user's choices.
+
+        Arguments:
+            run: The run.
+            options: The choices.
+            base: An earlier design, which says what the user does not.
+            files: Files that were read for the request.
+            notes: Called with every note.
+
+        Raises:
+            ConfigError: Choices that do not fit together.
+            DataError: The rig cannot be read.
+            InfeasibleError: The rig stands where the run's sensors may not.
+        """
+        asked = load_constraints(options.constraints, notes=notes)
+        if asked is None and base is not None:
+            asked = Constraints()
+        defaults = run.task.defaults
+        constraints, layout, names = _with_rig(options, asked, run, notes)
+        if constraints is not None:
+            constraints, moved = snap_to_space(constraints, run.config.space)
+            for note in moved:
+                notes(note)
+        rules = Constraints() if constraints is None else constraints
+        layout = layout or _usual_layout(rules, base, run)
+        if options.sensors is not None and layout == "scan":
+            raise ConfigError(
+                f"{options.sensors} sensors of a scan, whose every ray is a sensor of its own",
+                where="--sensors",
+                hint="give --rays N alone, or another --layout",
+            )
+        level = options.level if options.level is not None else base.level if base else defaults.level
+        if not LEVELS[0] <= level <= LEVELS[1]:
+            raise ConfigError(f"{level:g}", where="--level", allowed=f"{LEVELS[0]:g} to {LEVELS[1]:g}")
+        open_budget = layout == "grid" and options.gates != "ray"
+        return cls(
+            run,
+            options.name or ("fit" if asked is None else "constrained"),
+            run.config.seed if options.seed is None else options.seed,
+            constraints,
+            {**(base.at if base else {}), **options.at},
+            {
+                "sensors": _sensors(options.sensors, rules, base, defaults.sensors),
+                "layout": layout,
+                "rays": _rays(options.rays, rules, base, None if open_budget else max(defaults.rays)),
+                "gates": options.gates,
+                "level": level,
+            },
+            _weighting(settings_texts(options.weights), base, notes),
+            options.refine,
+            names,
+            "fit" if asked is None else "constrain",
+            tuple(files) if options.like is None else (*files, Path(options.like)),
+        )
+
+    @property
+    def judged_rays(self) -> int:
+        """The number of rays that a refined design is judged at: its own, else the task's middle budget."""
+        budgets = sorted(self.run.task.defaults.rays)
+        asked = None if self.constraints is None else self.constraints.budget.rays
+        return self.choices.get("rays") or asked or budgets[len(budgets) // 2]
+
+    def plan(self) -> Plan:
+        """What the fit would do.
+
+        Raises:
+            ConfigError: A name that is no condition of the density.
+            DataError: The run has no samples yet, or they are not those that were recorded.
+            InfeasibleError: The constraints contradict each other.
+        """
+        run, choices = self.run, self.choices
+        run.config.space.at(self.at)
+        verify(run.folder, SAMPLES)
+        if self.constraints is not None:
+            counted = choices["sensors"] if isinstance(choices["sensors"], int) else None
+            check_feasible(self.constraints, run.config.space, sensors=counted, rays=choices["rays"])
+        settings = {
+            **choices,
+            "name": self.name,
+            "seed": self.seed,
+            "at": dict(self.at),
+            "weights": list(self.weighting.settings),
+            "refine": self.refine,
+            "constraints": None if self.constraints is None else self.constraints.as_document(),
+        }
+        return Plan(
+            self.command,
+            self._steps(settings["constraints"]),
+            [*self.files, *(run.folder / name for name in (CONFIGURATION, MANIFEST, SAMPLES))],
+            [run.design_path(self.name), run.folder / MANIFEST],
+            settings,
+            last_time(run.folder, self.command),
+        )
+
+    def _steps(self, constraints: Mapping[str, Any] | None) -> list[str]:
+        choices = self.choices
+        rays = "rays left open" if choices["rays"] is None else f"{choices['rays']} rays"
+        counted = {None: "sensors as many as follow", "auto": "sensors as many as held-out likelihood says"}
+        sensors = counted.get(choices["sensors"], f"{choices['sensors']} sensors")
+        sensors = "one sensor per ray" if choices["layout"] == "scan" else sensors
+        place = "".join(f", {key} = {value:g}" for key, value in self.at.items())
+        how = f"layout {choices['layout']}, {rays}, level {choices['level']:g}{place}, seed {self.seed}"
+        steps = [f"fit {sensors}, {how}"]
+        if self.weighting.settings:
+            steps.append(f"weigh the density with {', '.join(self.weighting.settings)}")
+        if constraints:
+            steps.append(f"keep to constraints of {', '.join(constraints)}; check them on the finished file")
+        if self.refine:
+            task = self.run.task.name
+            steps.append(f"refine it in up to {self.refine} rounds on training scenes of task {task}")
+        return steps
+
+
+def _with_rig(
+    options: FitOptions, asked: Constraints | None, run: RunFolder, notes: Notes
+) -> tuple[Constraints | None, str | None, tuple[str, ...]]:
+    """Constraints with those of a rig below them, the layout, and the rig's sensors' names; as asked without a rig."""
+    if options.like is None:
+        return asked, options.layout, ()
+    layout = options.layout or RIG_LAYOUTS[0]
+    if layout not in RIG_LAYOUTS:
+        raise ConfigError(f"{layout} beside --like", where="--layout", allowed=", ".join(RIG_LAYOUTS))
+    rig = read_design(Path(options.like), notes, reach_of([run]))
+    own, space = Constraints() if asked is None else asked, run.config.space
+    keys = [key for key in PLACE_KEYS if key in type(run.config.task).model_fields]
+    others = "the keys x_m, y_m and z_m of its space"
+    hint = f"learn with {' / '.join(keys) or others} for the rig's places: lidardesign tasks show {run.task.name}"
+    constraints = rig_constraints(rig, space, own, rays=options.rays, hint=hint)
+    for line in (*rig_notes(rig, constraints, own), *moved_notes(rig, space, constraints)):
+        notes(line)
+    return constraints, layout, tuple(sensor.name for sensor in rig.sensors)
+
+
+def _usual_layout(constraints: Constraints, base: DesignSpec | None, run: RunFolder) -> str:
+    """The layout where none is named: the design's, else the task's; sensors that become parts are fitted as grids."""
+    if wants_parts(constraints.rules):
+        return "grid"
+    if base is not None:
+        return fitted_layout(base.layout)
+    return check_choice(run.task.defaults.layout, f"defaults.layout of task {run.task.name}", LAYOUTS)
+
+
+def _sensors(
+    asked: int | str | None, constraints: Constraints, base: DesignSpec | None, usual: int
+) -> int | str | None:
+    """The number of sensors: the user's, then what the constraints ask for, the design's, the task's."""
+    bounds = constraints.sensors
+    if asked is not None or bounds.count is not None:
+        return asked if asked is not None else bounds.count
+    if is_mounted(constraints.rules):
+        # the mounts say how many
+        return None
+    usual = max(len(base.sensors) if base else usual, len(constraints.each))
+    return min(max(usual, bounds.min or usual), bounds.max or usual)
+
+
+def _rays(asked: int | None, constraints: Constraints, base: DesignSpec | None, usual: int | None) -> int | None:
+    """The number of rays: the user's, then the constraints', the design's, the usual; parts bring their own."""
+    if asked is not None or wants_parts(constraints.rules):
+        return asked
+    if constraints.budget.rays is not None:
+        return constraints.budget.rays
+    return base.rays if base is not None and base.rays is not None else usual
+
+
+def _weighting(settings: tuple[str, ...], base: DesignSpec | None, notes: Notes) -> Weighting:
+    """How samples are weighted: by the user's settings, else as they were for the design."""
+    own = Weighting.of(base) if base else Weighting()
+    if not settings:
+        return own
+    if own.reweighting is not None:
+        notes("with --weight the design's refinement is left out; --refine finds another")
+    return Weighting(settings)
+
+
+def load_constraints(
+    given: Constraints | Mapping[str, Any] | Path | str | None, overrides: Sequence[str] = (), notes: Notes = log_note
+) -> Constraints | None:
+    """Constraints of a mapping or a YAML file, with `--set` laid over them; None where nothing is given.
+
+    Raises:
+        ConfigError: At file:line:column, or at the `--set` option; also for parts that there are none of.
+    """
+    if isinstance(given, Constraints) or (given is None and not overrides):
+        return given
+    if isinstance(given, Mapping):
+        return _check_parts(Constraints.from_mapping(given))
+    document = load_yaml(Path(given)) if given else Document({}, "constraints")
+    values: dict[str, Any] = document.mapping
+    if given and all(value in (None, {}, []) for _, value in leaves(values)):
+        notes(f"{document.where} holds no constraints")
+    origins: dict[KeyPath, str] = {}
+    for text in overrides:
+        override = parse_override(text)
+        if len(override.path) > 1 and override.path[0] == "snap" and values.get("snap") == CATALOG:
+            # the short form of a mapping without keys
+            values["snap"] = {}
+        origins[apply_override(values, override)] = override.where
+
+    def locate(path: KeyPath, *, key: bool = False) -> str:
+        path = tuple(path)
+        for origin, where in origins.items():
+            if path[: len(origin)] == origin or origin[: len(path)] == path != ():
+                return where
+        return document.locate(path, key=key)
+
+    return _check_parts(Constraints.from_mapping(values, where=document.where, locate=locate))
+
+
+def _check_parts(constraints: Constraints) -> Constraints:
+    """Constraints whose parts of the catalogue are all known; refused before anything is fitted."""
+    for rules in constraints.rules:
+        if rules.snap is not None and rules.snap.parts is not None:
+            parts_of(rules.snap)
+    return constraints

@@ -1,0 +1,356 @@
+"""Learning a task into a run folder: what is asked for, and the folder started, resumed, or taken away again."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel
+
+from lidardesign.config import RunConfig, load_run_config, resolve, save_run_config
+from lidardesign.errors import ConfigError, DataError, LidardesignError, check_choice
+from lidardesign.registry import load_task, plugin_guard
+from lidardesign.run.clock import Clock, outermost_clock, phase
+from lidardesign.run.files import is_temporary
+from lidardesign.run.lock import run_lock
+from lidardesign.run.manifest import note, read_manifest, start_manifest
+from lidardesign.run.yaml import dump_yaml, leaves, load_yaml, parse_yaml
+from lidardesign.task import Task, notes_of
+from lidardesign.workflow.learning_budget import GOAL, Goal, Learner, checked_goal, resumed_goal
+from lidardesign.workflow.plans import EarlierRun, Plan, last_time
+from lidardesign.workflow.run_folder import CONFIGURATION, MANIFEST, SAMPLES, Notes, log_note, settings_texts
+
+if TYPE_CHECKING:
+    from lidardesign.density.learn import LearnProgress, LearnResult
+
+DEVICES = ("auto", "cpu", "cuda")
+LOCK = ".lock"
+# A run has begun once it has its configuration, which is written last; snapshots are of no use without a checkpoint.
+STARTED_FILES = {CONFIGURATION, MANIFEST, "progress.jsonl", "snapshots"}
+CHECKPOINTS = "checkpoint*"
+LEARNED_FILES = (
+    CONFIGURATION, MANIFEST, "progress.jsonl", "checkpoint.safetensors", "flow.safetensors", SAMPLES, "snapshots/",
+)  # fmt: skip
+# The sections that learning takes its time from; a seed changes nothing of that.
+TIME_SECTIONS = ("task_name", "task", "space", "density", "learning")
+# Below these a density is too rough for figures that are meant seriously.
+LOW_ESS = 0.1
+LOW_COVERAGE = 0.9
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnOptions:
+    """What a user may choose for learning.
+
+    Arguments:
+        out: The run folder to make; runs/TASK by default.
+        preset: draft, standard or fine.
+        settings: Settings by dotted keys, as {"learning.steps": 60} or ["learning.steps=60"].
+        config: A YAML file of settings.
+        seed: Root of every random stream.
+        device: auto, cpu or cuda.
+        resume: Go on with an interrupted run.
+        tolerance: Learn until at most this share of the density's mass is in the wrong place.
+        time_budget_s: Learn as many steps as end within this time [s].
+        command: What the manifest says that the run was made by.
+    """
+
+    out: Path | str | None = None
+    preset: str | None = None
+    settings: Sequence[str] | Mapping[str, Any] = ()
+    config: Path | str | None = None
+    seed: int | None = None
+    device: str = "auto"
+    resume: bool = False
+    tolerance: float | None = None
+    time_budget_s: float | None = None
+    command: Sequence[str] = field(default_factory=lambda: tuple(sys.argv))
+
+
+@dataclass(frozen=True, eq=False)
+class LearnRequest:
+    """What is learned where.
+
+    Arguments:
+        task: The task.
+        folder: The run folder.
+        settings: The whole configuration.
+        goal: What decides the number of steps, where the configuration does not.
+        device: auto, cpu or cuda.
+        begun: Whether a run is gone on with.
+        config_file: The configuration file that was given.
+        command: What the manifest says that the run was made by.
+    """
+
+    task: Task
+    folder: Path
+    settings: RunConfig
+    goal: Goal
+    device: str = "auto"
+    begun: bool = False
+    config_file: Path | None = None
+    command: Sequence[str] = ()
+
+    @classmethod
+    def resolve(cls, task: str, options: LearnOptions, notes: Notes = log_note) -> LearnRequest:
+        """The request of a user's choices.
+
+        Raises:
+            ConfigError: An unknown task, settings that cannot be, or a folder that is not empty.
+            DataError: There is no run to resume.
+        """
+        check_choice(options.device, "--device", DEVICES)
+        config_file = None if options.config is None else Path(options.config)
+        choices = {
+            "preset": options.preset,
+            "config_file": config_file,
+            "overrides": settings_texts(options.settings),
+            "seed": options.seed,
+        }
+        goal = checked_goal(options.tolerance, options.time_budget_s, choices)
+        plugin = load_task(task)
+        folder = Path("runs") / task if options.out is None else Path(options.out)
+        begun = False
+        if options.resume:
+            if not folder.is_dir():
+                raise DataError("there is no run to resume", where=str(folder), hint="leave out --resume to start it")
+            begun = not _was_killed_before_it_began(folder)
+            if not begun:
+                notes("nothing of the run was kept yet; it starts from the beginning")
+        if begun:
+            goal = resumed_goal(goal, folder)
+            plugin, settings = _resumed_settings(plugin, folder, choices)
+        else:
+            check_can_start(folder)
+            settings = resolve(plugin, **choices)
+        request = cls(plugin, folder, settings, goal, options.device, begun, config_file, options.command)
+        if begun and not request.has_checkpoint:
+            notes("the run has no checkpoint yet; it starts from the beginning")
+        return request
+
+    @property
+    def has_checkpoint(self) -> bool:
+        """Whether there is one to go on from."""
+        return self.begun and any(self.folder.glob(CHECKPOINTS))
+
+    @phase("scenes")
+    def task_notes(self) -> list[str]:
+        """What the task has to say of its configuration, before anything takes time."""
+        with plugin_guard(self.task.name):
+            return notes_of(self.task, self.settings.task, self.settings.space)
+
+    def plan(self) -> Plan:
+        """What learning would do."""
+        settings = self.settings
+        learning, goal = settings.learning, self.goal
+        if goal.tolerance is not None:
+            length = f"until at most {goal.tolerance:g} of its mass is in the wrong place, in stages from "
+            length += f"{learning.steps // 8:,} steps"
+        elif goal.time_budget_s is not None:
+            length = f"as many steps as end within {goal.time_budget_s:g} s"
+        else:
+            length = f"{learning.steps:,} steps of {learning.batch:,} points"
+        steps = [
+            f"{'go on with' if self.has_checkpoint else 'learn'} task {self.task.name}, preset {settings.preset}, "
+            f"seed {settings.seed}, on {self.device}",
+            length,
+            f"draw {learning.samples:,} samples for fit and constrain, and measure how good they are",
+        ]
+        reads = [path for path in (self.config_file, *_paths_in(settings.task)) if path is not None]
+        if self.begun:
+            reads += sorted(path for path in self.folder.iterdir() if path.is_file() and not path.name.startswith("."))
+        # as other runs' files have it
+        document = parse_yaml(dump_yaml(settings.as_document()), where=CONFIGURATION).mapping
+        return Plan(
+            "learn",
+            steps,
+            reads,
+            [f"{self.folder / name}/" if name.endswith("/") else self.folder / name for name in LEARNED_FILES],
+            document,
+            None if self.begun else _time_of_twin(self.folder, {name: document[name] for name in TIME_SECTIONS}),
+        )
+
+    def run(self, progress: Callable[[LearnProgress], None] | None = None) -> LearnResult:
+        """Learn into the folder; what failed before anything was learned is taken away again.
+
+        Arguments:
+            progress: Called about every tenth step.
+
+        Raises:
+            ConfigError, DataError: Unusable settings or scenes, or a folder that cannot be written.
+            DivergenceError: Learning stayed non-finite; the last good checkpoint is kept.
+        """
+        folder = self.folder
+        with _made_folder(folder), run_lock(folder):
+            if not self.begun:
+                check_can_start(folder)  # another process may have been faster
+            with self._undone_on_failure():
+                if not self.begun:
+                    self._begin()
+                learner = Learner(self.task, folder, self.device, progress, outermost_clock() or Clock())
+                try:
+                    return learner.learn(self.settings, self.goal, resume=self.has_checkpoint)
+                except DataError as error:
+                    # of errors about data, those that only ended the writing: a full disk
+                    if not isinstance(error.__cause__, OSError):
+                        raise
+                    hint = f"{error.hint}; {self.resume_hint()}"
+                    raise type(error)(error.message, where=error.where, hint=hint) from error.__cause__
+
+    def resume_hint(self) -> str:
+        """What an interruption leaves, and how to go on from there."""
+        checkpoints = sorted(path.name for path in self.folder.glob(CHECKPOINTS))
+        if checkpoints:
+            rest = f"the last checkpoint is {self.folder / checkpoints[-1]}"
+        elif has_stages(self.folder):
+            rest = f"{self.folder} keeps what the finished stages reached"
+        else:
+            return "before the first checkpoint; nothing was kept"
+        return f"{rest}\n  continue with: lidardesign learn {self.task.name} --out {self.folder} --resume"
+
+    def _begin(self) -> None:
+        """Write what the run is before anything is learned; the configuration last."""
+        start_manifest(self.folder, command=list(self.command), seed=self.settings.seed)
+        if not self.goal.is_none:
+            note(self.folder, **{GOAL: self.goal.as_dict()})
+        save_run_config(self.settings, self.folder)
+
+    @contextlib.contextmanager
+    def _undone_on_failure(self) -> Iterator[None]:
+        """When a new run fails before anything was learned, take away what was put there."""
+        try:
+            yield
+        except BaseException:
+            if not self.begun:
+                _take_away(self.folder)
+            raise
+
+
+def learning_advice(result: LearnResult) -> list[str]:
+    """What to do about a density that was learned badly."""
+    advice = []
+    if result.ess < LOW_ESS:
+        advice.append(f"ESS below {LOW_ESS:g}: the density is rough; --preset standard or fine learns longer")
+    if result.coverage < LOW_COVERAGE:
+        advice.append(
+            f"coverage below {LOW_COVERAGE:g}: a part of the scenes was missed; learn longer or another --seed"
+        )
+    return advice
+
+
+def _time_of_twin(run: Path, settings: Mapping[str, Any]) -> EarlierRun | None:
+    """How long learning took in another run in the same folder, whose configuration has the same sections."""
+    for manifest in sorted(run.absolute().parent.glob(f"*/{MANIFEST}")):
+        other = manifest.parent
+        try:
+            sections = load_yaml(other / CONFIGURATION).mapping
+        except LidardesignError:
+            continue
+        before = last_time(other, "learn")
+        if before is not None and all(sections.get(name) == value for name, value in settings.items()):
+            return EarlierRun(before.seconds, f"learning {other.name}, which has the same settings,")
+    return None
+
+
+def _paths_in(config: BaseModel) -> list[Path]:
+    """The files and folders that a task's configuration names."""
+
+    def within(value: Any) -> list[Path]:
+        if isinstance(value, Path):
+            return [value]
+        if isinstance(value, dict):
+            value = list(value.values())
+        if isinstance(value, list | tuple):
+            return [path for item in value for path in within(item)]
+        return _paths_in(value) if hasattr(value, "model_fields_set") else []
+
+    return within([value for _, value in config])
+
+
+def check_can_start(run: Path) -> None:
+    """Refuse a folder that holds anything, so that no run is ever overwritten.
+
+    Raises:
+        ConfigError: It is a file, or not empty.
+    """
+    if run.is_file():
+        raise ConfigError("is a file", where=f"--out {run}", allowed="a folder that is new or empty")
+    if run.is_dir() and not _was_killed_before_it_began(run):
+        hint = "continue it with --resume, or give another --out"
+        raise ConfigError("the folder is not empty", where=f"--out {run}", allowed="a new or empty folder", hint=hint)
+
+
+def _was_killed_before_it_began(run: Path) -> bool:
+    """Whether a folder holds nothing but what a start that was killed leaves; an empty one does."""
+    names = {entry.name for entry in run.iterdir()}
+    return CONFIGURATION not in names and all(
+        name in STARTED_FILES or name == LOCK or is_temporary(name) for name in names
+    )
+
+
+def _resumed_settings(plugin: Task, run: Path, choices: Mapping[str, Any]) -> tuple[Task, RunConfig]:
+    """The task and configuration of a run; another configuration is refused, repeating its own options is fine."""
+    task, stored = load_run_config(run)
+    wanted = resolve(
+        task if task.name == plugin.name else plugin,
+        preset=choices["preset"] or stored.preset,
+        config_file=choices["config_file"] or run / CONFIGURATION,
+        overrides=choices["overrides"],
+        seed=stored.seed if choices["seed"] is None else choices["seed"],
+    )
+    old, new = dict(leaves(stored.as_document())), dict(leaves(wanted.as_document()))
+    steps = ("learning", "steps")
+    if new[steps] == (read_manifest(run).get(GOAL) or {}).get("planned_steps"):
+        # the stage at work towards a tolerance has its own number of them
+        new[steps] = old[steps]
+    for path in [*old, *new]:
+        if old.get(path) != new.get(path):
+            key = ".".join(map(str, path))
+            raise ConfigError(
+                f"the run was started with {key} = {old.get(path)!r}, not {new.get(path)!r}",
+                where=str(run / CONFIGURATION),
+                hint="resume without options, or start a new run with another --out",
+            )
+    return task, stored
+
+
+@contextlib.contextmanager
+def _made_folder(run: Path) -> Iterator[None]:
+    """Make the folder; after a failure take it away again where it is empty."""
+    new = [folder for folder in (run, *run.parents) if not folder.exists()]
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"cannot be made: {error.strerror or error}", where=f"--out {run}") from None
+    try:
+        yield
+    except BaseException:
+        with contextlib.suppress(OSError):
+            for folder in new:
+                folder.rmdir()
+        raise
+
+
+def _take_away(run: Path) -> None:
+    entries = [entry for entry in run.iterdir() if entry.name != LOCK]
+    nothing_learned = all(entry.name in STARTED_FILES or entry.stat().st_size == 0 for entry in entries)
+    if not nothing_learned or has_stages(run):
+        return
+    with contextlib.suppress(OSError):
+        # without its configuration a run has not begun, whatever else is left of it
+        (run / CONFIGURATION).unlink(missing_ok=True)
+        for entry in entries:
+            shutil.rmtree(entry) if entry.is_dir() else entry.unlink(missing_ok=True)
+
+
+def has_stages(run: Path) -> bool:
+    """Whether trainings were finished on the way to a tolerance: what they reached can be gone on from."""
+    try:
+        return bool((read_manifest(run).get(GOAL) or {}).get("stages"))
+    except DataError:
+        return False

@@ -1,0 +1,242 @@
+"""Run folders and the designs in and beside them: opened, read, and traced back to where they came from."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lidardesign.config import RunConfig, load_run_config
+from lidardesign.design.files import load_design
+from lidardesign.design.sensor import DesignSpec
+from lidardesign.errors import ConfigError, DataError, LidardesignError
+from lidardesign.registry import plugin_guard
+from lidardesign.run.clock import phase
+from lidardesign.run.files import is_input, is_there, readable
+from lidardesign.run.manifest import changed_since_recorded, read_manifest, versions
+from lidardesign.scene import Scene
+from lidardesign.space import RANGE
+from lidardesign.task import Split, Task, scenes_of
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+DESIGN_FOLDER = "designs"
+CONFIGURATION, MANIFEST, SAMPLES = "config.yaml", "manifest.json", "samples.npz"
+NAME_PATTERN = re.compile(r"[^\W.][\w.+-]{0,99}")
+
+Notes = Callable[[str], None]
+
+
+def log_note(text: str) -> None:
+    """Where notes go when nobody asks for them: to the log of this package."""
+    logging.getLogger("lidardesign").info(text)
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A run folder that was opened: its task and configuration."""
+
+    folder: Path
+    task: Task
+    config: RunConfig
+
+    @classmethod
+    def open(cls, folder: Path | str) -> Self:
+        """Open a run folder.
+
+        Raises:
+            DataError: There is none, or it is damaged.
+        """
+        folder = Path(folder)
+        return cls(folder, *load_run_config(folder))
+
+    def design_path(self, name: str) -> Path:
+        """Where a design of this run is written."""
+        return self.folder / DESIGN_FOLDER / f"{name}.yaml"
+
+    @phase("scenes")
+    def scenes(self, split: Split, seed: int) -> list[Scene]:
+        """The scenes of a split, judged by the run's own design space.
+
+        Raises:
+            PluginError: The task's own code failed.
+        """
+        with plugin_guard(self.task.name):
+            return list(scenes_of(self.task, self.config.task, split, seed, self.config.space))
+
+    def design_paths(self) -> list[Path]:
+        """The files of this run's designs by name."""
+        return sorted((self.folder / DESIGN_FOLDER).glob("*.yaml"))
+
+    @property
+    def has_samples(self) -> bool:
+        """Whether learning has left samples of the density."""
+        return (self.folder / SAMPLES).exists()
+
+    def command_times(self) -> dict[str, dict[str, float]]:
+        """Seconds by phase of each command on this run, in the order in which they first ran."""
+        entries = read_manifest(self.folder).get("timings", {})
+        phases = {name: entry.get("phases") for name, entry in entries.items() if isinstance(entry, dict)}
+        return {
+            name: dict(seconds)
+            for name, seconds in phases.items()
+            # entries of older versions have no phases
+            if isinstance(seconds, dict) and all(isinstance(value, int | float) for value in seconds.values())
+        }
+
+
+def read_design(path: Path, notes: Notes = log_note, reach_m: float | None = None) -> DesignSpec:
+    """A design file or a rig of others, or standard input for `-`.
+
+    One of a run that is not as it was written says so: it may be cut, or mended by hand. A rig says what its file
+    does not.
+
+    Arguments:
+        path: The file.
+        notes: Called with every note.
+        reach_m: How far the rays of a rig are heard where its file does not say so [m].
+
+    Raises:
+        ConfigError, DataError: It cannot be read.
+    """
+    difference = _difference(path)
+    try:
+        with readable(path) as file:
+            design = load_design(file, reach_m)
+    except (ConfigError, DataError) as error:
+        if difference is None:
+            raise
+        hint = f"the file {difference}; fit it again, or mend it"
+        raise type(error)(error.message, where=error.where, allowed=error.allowed, hint=hint) from None
+    if difference is not None:
+        notes(f"{path} {difference}")
+    # only what was read from others has notes
+    further = design.provenance.get("notes")
+    if "source" in design.provenance and isinstance(further, list):
+        for note in further:
+            notes(f"{path}: {note}")
+    return design
+
+
+def _difference(path: Path) -> str | None:
+    """In what a design differs from the one that its run's manifest has, where it lies in a run."""
+    folder, run = path.absolute().parent, path.absolute().parent.parent
+    if folder.name != DESIGN_FOLDER or not path.is_file() or not (run / MANIFEST).is_file():
+        return None
+    try:
+        return changed_since_recorded(run, f"{DESIGN_FOLDER}/{path.name}")
+    except DataError:  # whatever needs the manifest says that it is damaged
+        return None
+
+
+def open_target(path: Path, notes: Notes = log_note) -> tuple[RunFolder | None, DesignSpec | None]:
+    """Open a run folder, or a design file and the run that it came from.
+
+    Returns:
+        (run, None) for a folder, (run or None, design) for a file.
+
+    Raises:
+        DataError: There is no such file or folder, or it cannot be read.
+    """
+    if path.is_dir():
+        return RunFolder.open(path), None
+    if not is_there(path):
+        raise DataError("no such run or design", where=str(path), hint="give a run folder or a design file")
+    design = read_design(path, notes)
+    return run_of(design, path), design
+
+
+def run_of(design: DesignSpec, path: Path) -> RunFolder | None:
+    """The run that a design came from, if it is there."""
+    folder = folder_of(design, path)
+    return None if folder is None else RunFolder.open(folder)
+
+
+def folder_of(design: DesignSpec, path: Path) -> Path | None:
+    """The folder of the run that a design came from, if it is there: its provenance names it relative to its file."""
+    named = design.provenance.get("run")
+    if not isinstance(named, str):
+        return None
+    folder = Path(os.path.normpath(path.parent / named))
+    # a design that was copied elsewhere names a folder that is none of its run's
+    return folder if (folder / MANIFEST).is_file() else None
+
+
+def need_run(run: RunFolder | None, path: Path | str) -> RunFolder:
+    """The run of a design.
+
+    Raises:
+        DataError: The design was not made by a run, or the run has gone.
+    """
+    if run is None:
+        raise DataError(
+            "the run of this design is not there",
+            where=str(path),
+            hint="give the run folder (RUN --like FILE for a rig), or put the design back into its designs folder",
+        )
+    return run
+
+
+def provenance(run: RunFolder, path: Path, command: str, seed: int, **further: Any) -> dict[str, Any]:
+    """What a design file says about where it came from; the run's place is relative to the design's."""
+    return {
+        "command": command,
+        "task": run.task.name,
+        "run": relative_folder(run.folder, path),
+        "seed": seed,
+        "versions": versions(),
+        **further,
+    }
+
+
+def relative_folder(folder: Path, path: Path) -> str:
+    """How the file of a design names the folder of its run."""
+    return os.path.relpath(folder.absolute(), path.parent.absolute())
+
+
+def check_name(name: str) -> str:
+    """A design's name, which is also its file's.
+
+    Raises:
+        ConfigError: It could not be a file's name everywhere.
+    """
+    if not NAME_PATTERN.fullmatch(name):
+        allowed = "letters, digits, _, -, + and . (not in front), at most 100"
+        raise ConfigError(f"{name!r} is no name for a design", where="--name", allowed=allowed)
+    return name
+
+
+def reach_of(runs: Sequence[RunFolder]) -> float | None:
+    """How far any ray of the first run's design space may be heard [m]; None without a run."""
+    return runs[0].config.space.high[RANGE] if runs else None
+
+
+def reach_beside(files: Iterable[Path], runs: Sequence[RunFolder]) -> float | None:
+    """How far rays may be heard in the first of the runs, or in that of the first design that came from one [m]."""
+    if runs:
+        return reach_of(runs)
+    for path in files:
+        if is_input(path):
+            continue
+        try:
+            run = run_of(load_design(path), path)
+        except LidardesignError:
+            # whoever reads it for good says what is wrong with it
+            continue
+        if run is not None:
+            return reach_of([run])
+    return None
+
+
+def settings_texts(settings: Sequence[str] | Mapping[str, Any]) -> tuple[str, ...]:
+    """Settings as KEY=VALUE: as they are, or of a mapping of dotted keys."""
+    if not isinstance(settings, Mapping):
+        return tuple(settings)
+    texts = {key: value if isinstance(value, str | Path) else json.dumps(value) for key, value in settings.items()}
+    return tuple(f"{key}={value}" for key, value in texts.items())
