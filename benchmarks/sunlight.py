@@ -92,9 +92,9 @@ def add_figures(tally: Tally, scene: Any, rays: Any, detector: Any, caster: Any)
     import numpy as np
 
     from lidardesign.simulate.effects.expected_counts import Counts
-    from lidardesign.simulate.effects.first_hits import Sight
+    from lidardesign.simulate.effects.first_hits import FirstHits
 
-    sight = Sight.of(scene, 0, detector, [rays], caster)
+    sight = FirstHits.of(scene, 0, detector, [rays], caster)
     counts = Counts(sight)
     seen = sight.returned
     per_bin, sigma_s = counts.per_bin, detector.timing_sigma_s

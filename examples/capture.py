@@ -32,9 +32,9 @@ from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.files import write_atomic
 from lidardesign.scene import Mesh, Scene
-from lidardesign.simulate.detector.counting import photon_histograms
 from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, Detector
 from lidardesign.simulate.detector.files import load_detector
+from lidardesign.simulate.measure import photon_histograms
 from lidardesign.simulate.physics import Physics
 from lidardesign.space import RANGE, DesignSpace
 

@@ -170,3 +170,16 @@ class Crossings(NamedTuple):
     row: np.ndarray
     range_m: np.ndarray
     cosine: np.ndarray
+
+
+def gate_outcomes(range_m: np.ndarray, gate_m: np.ndarray) -> np.ndarray:
+    """Outcomes of first hits: ranges (N,) [m], infinite on a miss, and gates (N, 2) [m] to `Outcome` (N,).
+
+    A gate is closed at its start and open at its end: start <= range < end is a return, a hit before the
+    start is an occlusion, one at or behind the end lies after the gate.
+    """
+    outcome = np.full(len(range_m), Outcome.RETURN, dtype=np.int64)
+    outcome[range_m < gate_m[:, 0]] = Outcome.OCCLUDED
+    outcome[range_m >= gate_m[:, 1]] = Outcome.AFTER_GATE
+    outcome[np.isinf(range_m)] = Outcome.MISS
+    return outcome

@@ -1,14 +1,12 @@
 """The plan: which effects a scene calls for with a detector and lists of rays, and why.
 
-Each effect's bound says what it could change at most (`simulate.bounds`). The smallest are skipped as long as all that
-is skipped stays within a tolerance together: errors of range add up in the worst case, and so do shares of returns.
-Where nothing calls for an effect that is seen without casting a ray.
+Each effect's `bound` (`simulate.effects`) says what it could change at most. The smallest are skipped as long as all
+that is skipped stays within a tolerance together: errors of range add up in the worst case, and so do shares of
+returns. Where nothing calls for an effect that is seen without casting a ray.
 
-What simulating an effect takes, predicted per ray and frame.
-
-Measured on one core (2.5 GHz) with a face of 20,000 triangles, some hundred photons per ray and a gate of 1 m, each
-effect added to photon noise alone. Elsewhere the relation between effects holds roughly; full sunlight and wide gates
-take several times as much.
+What simulating an effect takes is predicted per ray and frame, as measured on one core (2.5 GHz) with a face of 20,000
+triangles, some hundred photons per ray and a gate of 1 m, each effect added to photon noise alone. Elsewhere the
+relation between effects holds roughly; full sunlight and wide gates take several times as much.
 """
 
 from __future__ import annotations
@@ -27,11 +25,22 @@ from lidardesign.geometry.receiver import path_windows
 from lidardesign.run.clock import phase
 from lidardesign.run.validation import suggest
 from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import IDEAL, Detector
-from lidardesign.simulate.detector.histogram import check_windows
-from lidardesign.simulate.effects.bounds import MODULES
+from lidardesign.simulate.detector.detector import IDEAL, Detector, check_windows
+from lidardesign.simulate.effects import (
+    ambient,
+    atmosphere,
+    footprint,
+    jitter,
+    motion,
+    multipath,
+    photon_noise,
+    pile_up,
+    quantisation,
+    shadowing,
+    specular,
+)
 from lidardesign.simulate.effects.expected_counts import Counts
-from lidardesign.simulate.effects.first_hits import Sight, Stake
+from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 from lidardesign.simulate.physics import EFFECTS, Physics, check_effects
 from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import Metric
@@ -56,6 +65,19 @@ def predicted_seconds(effect: str, detector: Detector, rays: int) -> float:
     return rays * ROUNDING_SECONDS
 
 
+EFFECT_MODULES = {
+    "footprint": footprint,
+    "motion": motion,
+    "specular": specular,
+    "multipath": multipath,
+    "shadowing": shadowing,
+    "atmosphere": atmosphere,
+    "photon_noise": photon_noise,
+    "jitter": jitter,
+    "ambient": ambient,
+    "pile_up": pile_up,
+    "quantisation": quantisation,
+}
 Choice = Literal["auto", "all", "none"] | frozenset[str]
 # Ranges may be off by this share of a bin, or by this where there are none [m].
 TOLERATED_BIN_SHARE = 0.1
@@ -225,7 +247,7 @@ class Planner:
         if self.choice == "auto":
             return sorted(_called_for(found, self.tolerated))
         if self.choice == "all":
-            return [name for name in EFFECTS if name in found_here(self.detector)]
+            return [name for name in EFFECTS if name in available_effects(self.detector)]
         return [] if self.choice == "none" else sorted(self.choice)
 
     def _chosen(self, found: dict[str, Bound], missing: dict[str, str | None]) -> frozenset[str]:
@@ -259,11 +281,9 @@ def _allowed() -> str:
     return f"{', '.join(WORDS)}, or any of {', '.join(EFFECTS)}"
 
 
-def found_here(detector: Detector) -> frozenset[str]:
+def available_effects(detector: Detector) -> frozenset[str]:
     """The effects that a detector has at all."""
-    from lidardesign.simulate.effects.motion import is_instant
-
-    return frozenset(EFFECTS) - ({"motion"} if is_instant(detector) else set())
+    return frozenset(EFFECTS) - ({"motion"} if motion.is_instant(detector) else set())
 
 
 def _called_for(found: dict[str, Bound], tolerance: Tolerance) -> set[str]:
@@ -292,7 +312,7 @@ def _bounds(
     scene: Scene, lists: Sequence[Rays], detector: Detector, casters: Sequence[SceneCaster] | None
 ) -> dict[str, Bound]:
     """The bound of every effect over frames evenly spread, for the list that it changes most."""
-    absent = {name: MODULES[name].absent(detector, scene, lists) for name in EFFECTS}
+    absent = {name: EFFECT_MODULES[name].why_absent(detector, scene, lists) for name in EFFECTS}
     present = [name for name, reason in absent.items() if reason is None]
     found = {name: Bound(0.0, 0.0, reason) for name, reason in absent.items() if reason is not None}
     if not present:
@@ -304,9 +324,9 @@ def _bounds(
     casters = build_casters(scene) if casters is None else casters
     for frame in _spread(scene.frames):
         caster = casters[frame]
-        counts = Counts(Sight.of(scene, frame, detector, fired, caster))
+        counts = Counts(FirstHits.of(scene, frame, detector, fired, caster))
         for name, stake in _stakes(counts, present).items():
-            sums[name].add(counts.sight, stake)
+            sums[name].add(counts.first_hits, stake)
     return found | {name: total.bound() for name, total in sums.items()}
 
 
@@ -316,9 +336,9 @@ def _spread(frames: int) -> list[int]:
     return [int((i + 0.5) * frames / most) for i in range(most)]
 
 
-def _stakes(counts: Counts, present: Sequence[str]) -> dict[str, Stake]:
+def _stakes(counts: Counts, present: Sequence[str]) -> dict[str, EffectBound]:
     """What each effect could change: anything, where mirrors and glass lead light to what no first hit shows."""
-    stakes = {name: MODULES[name].stake(counts.sight, counts) for name in present}
+    stakes = {name: EFFECT_MODULES[name].bound(counts.first_hits, counts) for name in present}
     led = stakes["specular"].lost if "specular" in stakes else np.zeros(0)
     if not led.any():
         return stakes
@@ -339,16 +359,16 @@ class _Sum:
         self._unseen_m2, self._rays = np.zeros(lists), np.zeros(lists)
         self._reason, self._largest = "", -1.0
 
-    def add(self, sight: Sight, stake: Stake) -> None:
+    def add(self, first_hits: FirstHits, stake: EffectBound) -> None:
         def per_list(values: np.ndarray) -> np.ndarray:
-            return np.bincount(sight.row, weights=values, minlength=len(self._lost))
+            return np.bincount(first_hits.row, weights=values, minlength=len(self._lost))
 
-        squared, lost = per_list(stake.squared_m2 * sight.returned), per_list(stake.lost)
+        squared, lost = per_list(stake.squared_m2 * first_hits.returned), per_list(stake.lost)
         self._unseen_m2 += per_list(stake.squared_m2)
-        self._rays += per_list(np.ones(len(sight)))
+        self._rays += per_list(np.ones(len(first_hits)))
         self._squared_m2 += squared
         self._lost += lost
-        self._returns += per_list(sight.returned.astype(float))
+        self._returns += per_list(first_hits.returned.astype(float))
         if float(squared.max() + lost.max()) > self._largest:
             self._largest, self._reason = float(squared.max() + lost.max()), stake.reason
 

@@ -8,18 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Outcome, Rays, Returns
+from lidardesign.geometry.rays import Outcome, Rays, Returns, gate_outcomes
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
-
-if TYPE_CHECKING:
-    from lidardesign.simulate.physics import Physics
+from lidardesign.simulate.physics import Physics
 
 
 def simulate(
@@ -74,7 +71,8 @@ def simulate_many(
     if not lists:
         return []
     if physics is not None and physics.effects:
-        from lidardesign.simulate.physics import measure
+        # its effects load compiled loops, which geometry alone does without
+        from lidardesign.simulate.measure import measure
 
         each = [physics if repeats is None else replace(physics, repeat=repeats[i]) for i in range(len(lists))]
         return [
@@ -104,14 +102,3 @@ def build_casters(scene: Scene) -> list[SceneCaster]:
     return [SceneCaster(scene, frame) for frame in range(scene.frames)]
 
 
-def gate_outcomes(range_m: np.ndarray, gate_m: np.ndarray) -> np.ndarray:
-    """Outcomes of first hits: ranges (N,) [m], infinite on a miss, and gates (N, 2) [m] to `Outcome` (N,).
-
-    A gate is closed at its start and open at its end: start <= range < end is a return, a hit before the
-    start is an occlusion, one at or behind the end lies after the gate.
-    """
-    outcome = np.full(len(range_m), Outcome.RETURN, dtype=np.int64)
-    outcome[range_m < gate_m[:, 0]] = Outcome.OCCLUDED
-    outcome[range_m >= gate_m[:, 1]] = Outcome.AFTER_GATE
-    outcome[np.isinf(range_m)] = Outcome.MISS
-    return outcome

@@ -5,8 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,14 +36,14 @@ from lidardesign.evaluate.metrics import (
 from lidardesign.evaluate.scene_scores import checked_score
 from lidardesign.evaluate.score import evaluate
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Outcome, Rays
+from lidardesign.geometry.rays import Outcome, Rays, gate_outcomes
 from lidardesign.geometry.receiver import path_of_range, path_windows, range_of_path
 from lidardesign.scene import Body, Box, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.detector.detector import IDEAL, Detector
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.physics import EFFECTS, Physics
 from lidardesign.simulate.plan import Planner, parse_effects
-from lidardesign.simulate.simulate import gate_outcomes, simulate
+from lidardesign.simulate.simulate import simulate
 from lidardesign.space import DesignSpace, direction
 from lidardesign.task import conditions_of
 
@@ -257,49 +255,6 @@ class TestEffectsNotCalledFor:
             "with one generator for all effects, switching one on moves the random numbers of the next: its first "
             f"normal number turns from {shared.normal():.2f} to {noisy.normal():.2f}"
         )
-
-    def test_geometry_alone_and_a_plan_that_finds_nothing_import_no_effect(self):
-        code = """
-import sys
-import numpy as np
-from lidardesign.scene import Body, Scene, Sphere, rigid
-from lidardesign.simulate.plan import Planner
-from lidardesign.geometry.rays import Rays
-from lidardesign.simulate.simulate import simulate
-ahead = np.array([[1.0, 0.0, 0.0]])
-rays = Rays(0 * ahead, ahead, np.array([[0.0, 5.0]]), np.zeros(1), np.zeros(1))
-scene = Scene((Body(Sphere(0.5), poses=rigid(translation_m=(3, 0, 0))),))
-planner = Planner()
-plan = planner.plan(scene, [rays])
-assert plan.effects == frozenset(), plan.effects
-(returns,) = simulate(scene, rays, physics=planner.physics(plan, 0))
-assert returns.returned.all()
-print(*(name for name in sys.modules if name.startswith("lidardesign.simulate.effects.")))
-"""
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-        assert done.stdout.split() == []
-
-    @pytest.mark.parametrize("effect", ["footprint", "motion", "specular", "shadowing", "atmosphere"])
-    def test_an_effect_imports_no_other(self, effect):
-        code = f"""
-import sys
-import numpy as np
-from lidardesign.scene import Body, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector.detector import Detector
-from lidardesign.simulate.physics import Physics
-from lidardesign.geometry.rays import Rays
-from lidardesign.simulate.simulate import simulate
-ahead = np.array([[1.0, 0.0, 0.0]])
-rays = Rays(0 * ahead, ahead, np.array([[0.0, 5.0]]), np.zeros(1), np.zeros(1))
-receiver = Receiver((0.0, 0.1, 0.0), 0.0, 0.0, 1.0, 1.0, (0.0, 9.0))
-scene = Scene((Body(Sphere(0.5), poses=rigid(translation_m=(3, 0, 0))),), receiver=receiver)
-(returns,) = simulate(scene, rays, physics=Physics(Detector("plain"), frozenset({{{effect!r}}})))
-assert returns.returned.all()
-names = [name for name in sys.modules if name.startswith("lidardesign.simulate.effects.")]
-print(*(name.rpartition(".")[2] for name in names))
-"""
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-        assert set(done.stdout.split()) - {"sight"} == {effect}
 
     def test_what_a_scene_does_not_call_for_changes_not_a_bit(self):
         (head,) = heads()[:1]

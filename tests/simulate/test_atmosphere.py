@@ -16,12 +16,11 @@ from lidardesign.geometry.rays import Rays
 from lidardesign.geometry.receiver import path_windows
 from lidardesign.scene import Body, Box, Medium, Receiver, Scene, rigid
 from lidardesign.simulate.detector.detector import IDEAL, Detector, Photons
-from lidardesign.simulate.detector.light import Background, Beams
 from lidardesign.simulate.effects.atmosphere import through_air
 from lidardesign.simulate.effects.expected_counts import haze_per_pulse
-from lidardesign.simulate.effects.first_hits import Sight
-from lidardesign.simulate.effects.footprint import split
-from lidardesign.simulate.physics import direct_echoes
+from lidardesign.simulate.effects.first_hits import FirstHits
+from lidardesign.simulate.effects.footprint import split_beams
+from lidardesign.simulate.light import Background, Beams, direct_echoes
 
 PHOTONS = Photons(905e-9, 1e-6, 1e4, "scanned", 1e6, 1e-6, 1e-4, 0.2, 1e-9, 1e3, 0.0)
 COUNTING = Detector("counting", photons=PHOTONS)
@@ -36,7 +35,7 @@ def rays_along(directions, gate_m=(0.5, 8.0), origin=(0.0, 0.0, 0.0)):
 
 
 def in_air(scene, rays, detector=COUNTING):
-    beams = split(Beams.of(rays), detector)
+    beams = split_beams(Beams.of(rays), detector)
     hits = SceneCaster(scene).first_hit(beams.origin_m, beams.direction)
     echoes = direct_echoes(scene, beams, hits)
     background = Background(np.zeros(len(rays)))
@@ -170,7 +169,7 @@ def test_the_planner_bounds_the_haze_that_is_counted(gate, pixel_sr):
     detector = replace(COUNTING, photons=replace(PHOTONS, field_of_view_sr=pixel_sr))
     scene, rays = Scene((WALL,), medium=FOG), rays_along([[1.0, 0, 0], [0.8, 0.6, 0], [-1.0, 0, 0]], gate)
     _, _, background = in_air(scene, rays, detector)
-    sight = Sight.of(scene, 0, detector, [rays], SceneCaster(scene))
+    sight = FirstHits.of(scene, 0, detector, [rays], SceneCaster(scene))
     whole, fullest = haze_per_pulse(sight, np.full(3, PHOTONS.emitted(3)), 0.01)
     assert (background.counts.sum(axis=1) <= whole * (1 + 1e-6)).all()
     # all but what fades within the window

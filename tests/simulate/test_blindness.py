@@ -12,8 +12,8 @@ from simulate.test_plan import SINGLE, grid
 
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Ambient, Body, Box, Medium, Scene, rigid
-from lidardesign.simulate.detector.counting import photon_histograms
 from lidardesign.simulate.effects.expected_counts import Blindness, missed_behind, unevenness
+from lidardesign.simulate.measure import photon_histograms
 from lidardesign.simulate.physics import Physics
 from lidardesign.simulate.plan import Planner
 

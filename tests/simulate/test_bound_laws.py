@@ -14,7 +14,7 @@ from simulate.test_plan import CONSUMER, SINGLE, TIMED, decisions, grid
 
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Ambient, Body, Box, Capsule, Medium, Scene, Sphere, rigid
-from lidardesign.simulate.effects.first_hits import Sight
+from lidardesign.simulate.effects.first_hits import FirstHits
 from lidardesign.simulate.physics import EFFECTS, Physics
 from lidardesign.simulate.plan import Planner, Tolerance
 from lidardesign.simulate.simulate import simulate
@@ -95,7 +95,7 @@ def errors(scene, rays, physics, far_m):
 
 
 def resolution_m(scene, detector, rays):
-    return Sight.of(scene, 0, detector, [rays], SceneCaster(scene)).resolution_m
+    return FirstHits.of(scene, 0, detector, [rays], SceneCaster(scene)).resolution_m
 
 
 def check_effect(name, bound, scene, detector, rays):

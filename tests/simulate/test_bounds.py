@@ -17,10 +17,11 @@ from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Ambient, Body, Box, Capsule, Medium, Mesh, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.detector.detector import metres
 from lidardesign.simulate.effects.expected_counts import Counts, estimate_error_m, needed_counts, share_in_bins
-from lidardesign.simulate.effects.first_hits import Sight, edge_probability
+from lidardesign.simulate.effects.first_hits import FirstHits, edge_probability
 from lidardesign.simulate.effects.motion import entered_rays, moving_tracer, point_velocities
 from lidardesign.simulate.effects.multipath import _detours, _moved_m
-from lidardesign.simulate.physics import Physics, followed_light
+from lidardesign.simulate.measure import followed_light
+from lidardesign.simulate.physics import Physics
 from lidardesign.simulate.plan import Planner
 
 
@@ -29,7 +30,7 @@ def bound(name, scene, detector, rays=None):
 
 
 def sight(scene, detector, rays=None, frame=0):
-    return Sight.of(scene, frame, detector, [grid() if rays is None else rays], SceneCaster(scene, frame))
+    return FirstHits.of(scene, frame, detector, [grid() if rays is None else rays], SceneCaster(scene, frame))
 
 
 def counts(scene, detector, rays=None):
@@ -327,7 +328,7 @@ def test_haze_beside_a_fixed_receiver_is_bounded(place, gate_m):
     rays = grid(side=8, half_rad=0.1, gate_m=gate_m)
     found = counts(scene, replace(SINGLE, divergence_rad=0.0, footprint_rays=1), rays)
     background = followed_light(
-        scene, 0, rays, SceneCaster(scene), Physics(found.sight.detector, frozenset({"atmosphere"}))
+        scene, 0, rays, SceneCaster(scene), Physics(found.first_hits.detector, frozenset({"atmosphere"}))
     ).background
     whole, fullest = found.haze_per_pulse
     assert (background.counts.sum(axis=1) <= whole * (1 + 1e-6) + 1e-300).all()

@@ -19,10 +19,9 @@ from support.synthetic_light import (
 )
 
 from lidardesign.errors import ConfigError
-from lidardesign.simulate.detector import detection
-from lidardesign.simulate.detector.counting import PHOTONS_ONE_BY_ONE
+from lidardesign.simulate.detector.detection import PHOTONS_ONE_BY_ONE
 from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, Detector, Photons, metres
-from lidardesign.simulate.detector.light import Background, Echoes
+from lidardesign.simulate.light import Background, Echoes
 
 RAYS = 4000
 SIGMA_S = 50e-12
@@ -284,12 +283,12 @@ def test_results_do_not_depend_on_how_many_rays_are_counted_at_once(monkeypatch)
     whole = detected(windows(rays, 1.0, 3.0), echoes, light, detector, ALL)
     assert np.isfinite(whole.path_m).mean() > 0.5
     for at_once in (1, 700):
-        monkeypatch.setattr(detection, "BINS_AT_ONCE", at_once)
+        monkeypatch.setattr("lidardesign.simulate.detector.detector.BINS_AT_ONCE", at_once)
         parts = detected(windows(rays, 1.0, 3.0), echoes, light, detector, ALL)
         assert np.array_equal(parts.path_m, whole.path_m, equal_nan=True)
         assert np.array_equal(parts.body, whole.body)
     monkeypatch.undo()
-    monkeypatch.setattr(detection, "RAYS_AT_ONCE", 7)
+    monkeypatch.setattr("lidardesign.simulate.detector.detector.RAYS_AT_ONCE", 7)
     parts = detected(windows(rays, 1.0, 3.0), echoes, light, detector, ALL)
     assert np.array_equal(parts.path_m, whole.path_m, equal_nan=True)
 

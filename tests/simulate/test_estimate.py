@@ -10,7 +10,7 @@ from scipy.special import pdtrc
 from scipy.stats import norm
 from support.references import first_photon_distribution
 
-from lidardesign.simulate.detector.estimate_kernels import (
+from lidardesign.simulate.detector.kernels import (
     alive_shares,
     at_least,
     find_corrected,

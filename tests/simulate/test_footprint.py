@@ -12,9 +12,8 @@ from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Body, Box, Plane, Scene, rigid
 from lidardesign.simulate.detector.detector import Detector
-from lidardesign.simulate.detector.light import Beams
-from lidardesign.simulate.effects.footprint import even_disc, split
-from lidardesign.simulate.physics import direct_echoes
+from lidardesign.simulate.effects.footprint import even_disc, split_beams
+from lidardesign.simulate.light import Beams, direct_echoes
 from lidardesign.space import direction
 
 HALF_RAD = 0.02
@@ -57,7 +56,7 @@ def test_points_of_the_disc_keep_their_distance():
 @pytest.mark.parametrize("half_rad", [1e-6, 0.02, 1.0, math.pi])
 def test_a_beams_parts_lie_in_its_cone_evenly_over_its_solid_angle(count, half_rad):
     looking = direction(np.array([0.3, 2.0]), np.array([-0.7, 1.1]))
-    parts = split(beams_along(looking), wide(count, 2 * half_rad))
+    parts = split_beams(beams_along(looking), wide(count, 2 * half_rad))
     assert np.bincount(parts.ray).tolist() == [count, count]
     assert np.bincount(parts.ray, weights=parts.share) == pytest.approx([1, 1])
     assert np.linalg.norm(parts.direction, axis=1) == pytest.approx(np.ones(2 * count), abs=1e-14)
@@ -73,18 +72,18 @@ def test_a_beams_parts_lie_in_its_cone_evenly_over_its_solid_angle(count, half_r
 
 def test_thin_beams_and_single_ones_stay_the_same_object():
     beams = beams_along([[1.0, 0.0, 0.0]])
-    assert split(beams, wide(16, 0.0)) is beams
-    assert split(beams, wide(1)) is beams
+    assert split_beams(beams, wide(16, 0.0)) is beams
+    assert split_beams(beams, wide(1)) is beams
 
 
 def test_the_pattern_turns_with_the_azimuth_and_depends_on_no_other_beam():
     looking = direction(np.array([0.1, 0.4, 2.0]), np.array([0.2, -1.0, math.pi / 2]))
     turn = Rotation.from_euler("z", 1.3)
-    together = split(beams_along(looking), wide()).direction.reshape(3, -1, 3)
-    turned = split(beams_along(turn.apply(looking[:2])), wide()).direction.reshape(2, -1, 3)
+    together = split_beams(beams_along(looking), wide()).direction.reshape(3, -1, 3)
+    turned = split_beams(beams_along(turn.apply(looking[:2])), wide()).direction.reshape(2, -1, 3)
     for index in range(2):
         assert turn.apply(together[index]) == pytest.approx(turned[index], abs=1e-14)
-    alone = split(beams_along(looking[1:2]), wide()).direction
+    alone = split_beams(beams_along(looking[1:2]), wide()).direction
     assert np.array_equal(alone, together[1])
     assert np.isfinite(together).all()
 
@@ -94,7 +93,7 @@ def test_the_mean_range_on_a_tilted_plane_is_that_of_the_cone():
     tilt = math.radians(50)
     turn = Rotation.from_euler("z", tilt).as_matrix() @ Rotation.from_euler("y", -math.pi / 2).as_matrix()
     scene = Scene((Body(Plane(), poses=rigid(turn, (2.0, 0.0, 0.0))),))
-    echoes = echoes_of(scene, split(beams_along([[1.0, 0.0, 0.0]]), wide(512)))
+    echoes = echoes_of(scene, split_beams(beams_along([[1.0, 0.0, 0.0]]), wide(512)))
     # the second-order mean over the disc of 2 / (cos u - tan(tilt) sin u): <u^2> = half^2 / 4 per axis
     tangent = math.tan(tilt)
     expected = 2 * (1 + HALF_RAD**2 / 8 * (1 + 2 * tangent**2) + HALF_RAD**2 / 8)
@@ -111,7 +110,7 @@ def test_at_an_edge_both_depths_get_their_share_of_the_disc(inside):
     plate = Body(Box((0.0005, 5.0, 5.0)), poses=rigid(translation_m=(2.0005, 5.0 + edge_m, 0.0)), reflectance=0.8)
     wall = Body(Box((0.0005, 20.0, 20.0)), poses=rigid(translation_m=(4.0005, 0.0, 0.0)), reflectance=0.2)
     scene = Scene((plate, wall))
-    beams = split(beams_along([[1.0, 0.0, 0.0]]), wide(1024))
+    beams = split_beams(beams_along([[1.0, 0.0, 0.0]]), wide(1024))
     echoes = echoes_of(scene, beams)
     share = (math.acos(h) - h * math.sqrt(1 - h * h)) / math.pi
     near = echoes.body == 0

@@ -12,8 +12,8 @@ from lidardesign.geometry.rays import Outcome, Rays
 from lidardesign.scene import Ambient, Body, Medium, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.detector.detector import IDEAL
 from lidardesign.simulate.detector.files import load_detector
-from lidardesign.simulate.detector.light import Beams
-from lidardesign.simulate.physics import EFFECTS, Physics, direct_echoes
+from lidardesign.simulate.light import Beams, direct_echoes
+from lidardesign.simulate.physics import EFFECTS, Physics
 from lidardesign.simulate.simulate import simulate
 
 EVERYTHING = frozenset(EFFECTS) - {"multipath"}

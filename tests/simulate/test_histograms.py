@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -15,11 +13,11 @@ from support.synthetic_light import PHOTON_EFFECTS
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Outcome, Rays
 from lidardesign.scene import SPEED_OF_LIGHT_M_S, Ambient, Body, Box, Plane, Scene, Sphere, rigid
-from lidardesign.simulate.detector.counting import photon_histograms
 from lidardesign.simulate.detector.detector import PLANCK_J_S, metres
 from lidardesign.simulate.detector.files import load_detector
-from lidardesign.simulate.detector.light import FIRST_NM, LED_AT_1_LUX, STEP_NM, SUN_AT_100_KLUX, spectral_irradiance
-from lidardesign.simulate.physics import Physics, followed_light
+from lidardesign.simulate.light import FIRST_NM, LED_AT_1_LUX, STEP_NM, SUN_AT_100_KLUX, spectral_irradiance
+from lidardesign.simulate.measure import followed_light, photon_histograms
+from lidardesign.simulate.physics import Physics
 from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.simulate import build_casters, simulate
 
@@ -225,28 +223,3 @@ def test_gates_that_a_detector_cannot_hear_are_refused_whatever_is_simulated(cho
     short = replace(DETECTOR, bins=100)
     with pytest.raises(ConfigError, match="longer than the histogram"):
         Planner(short, choice).plan(scene, [rays_towards(directions, (0.3, 0.6))])
-
-
-SCRIPT = """
-import sys
-import numpy as np
-from lidardesign.scene import Body, Scene, Sphere
-from lidardesign.simulate.detector.files import load_detector
-from lidardesign.simulate.physics import Physics
-from lidardesign.geometry.rays import Rays
-from lidardesign.simulate.simulate import simulate
-rays = Rays(np.array([[0.0, 0.0, 3.0]]), np.array([[0.0, 0.0, -1.0]]), np.array([[0.0, 5.0]]), [0], [0.0])
-simulate(Scene((Body(Sphere(1.0)),)), rays, physics=Physics(load_detector("single-photon"), frozenset({effects})))
-print(" ".join(sorted(name for name in sys.modules if name.startswith("lidardesign.simulate.effects."))))
-"""
-
-
-@pytest.mark.parametrize("effects", [set(), {"jitter"}, {"photon_noise", "quantisation"}, {"ambient", "pile_up"}])
-def test_only_effects_that_are_on_are_imported(effects):
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT.replace("{effects}", repr(sorted(effects)))],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout.split() == sorted(f"lidardesign.simulate.effects.{name}" for name in effects)

@@ -20,11 +20,11 @@ from lidardesign.geometry.raycast import shared_caster
 from lidardesign.geometry.rays import Rays
 from lidardesign.registry import load_task
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector.light import Beams, Echoes
-from lidardesign.simulate.effects.shadowing import heard
+from lidardesign.simulate.effects.motion import still_tracer
+from lidardesign.simulate.effects.shadowing import visible_echoes
+from lidardesign.simulate.light import Beams, Echoes, direct_echoes
 from lidardesign.simulate.light_transport import process
 from lidardesign.simulate.light_transport.transport import Lights, PathBins, available, pixel_rays, render_transient
-from lidardesign.simulate.physics import direct_echoes
 
 needs_simulator = pytest.mark.skipif(
     not available(), reason=f"the light-transport simulator cannot run here: {process.missing()}"
@@ -90,7 +90,7 @@ def single_bounces(scene: Scene, rays: Rays) -> Echoes:
     caster, beams = shared_caster(scene, 0), Beams.of(rays)
     hits = caster.first_hit(rays.origin_m, rays.direction)
     echoes = direct_echoes(scene, beams, hits)
-    return heard(scene, beams, hits, echoes, lambda origin, direction, time_s: caster.first_hit(origin, direction))
+    return visible_echoes(scene, beams, hits, echoes, still_tracer(caster))
 
 
 def histogram(path_m: np.ndarray, weight: np.ndarray, bins: PathBins) -> np.ndarray:

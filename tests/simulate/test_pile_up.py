@@ -9,7 +9,7 @@ from support.references import STANDARD_ERRORS, first_photon_distribution, naive
 from support.synthetic_light import PULSES, background, counted, counting_detector, no_echoes, single_echoes, windows
 
 from lidardesign.errors import ConfigError
-from lidardesign.simulate.detector.counting import coates
+from lidardesign.simulate.detector.detection import coates
 from lidardesign.simulate.detector.detector import metres
 from lidardesign.simulate.effects.pile_up import (
     DRAWS_PER_BIN,

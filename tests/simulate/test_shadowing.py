@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector.light import Beams
-from lidardesign.simulate.effects.shadowing import heard
-from lidardesign.simulate.physics import direct_echoes
+from lidardesign.simulate.effects.shadowing import visible_echoes
+from lidardesign.simulate.light import Beams, direct_echoes
 from lidardesign.space import direction
 
 BESIDE = Receiver((0.0, 1.0, 0.0), 0.0, 0.0, 3.0, 3.0, (0.0, 1e6))
@@ -39,7 +38,7 @@ def both(scene, directions, origin=(0.0, 0.0, 0.0)):
 
     hits = tracer(beams.origin_m, beams.direction, beams.time_s)
     direct = direct_echoes(scene, beams, hits)
-    return direct, heard(scene, beams, hits, direct, tracer)
+    return direct, visible_echoes(scene, beams, hits, direct, tracer)
 
 
 def wall(x_m=4.0, **material):

@@ -13,11 +13,10 @@ from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.detector.detector import Detector
-from lidardesign.simulate.detector.light import Beams
 from lidardesign.simulate.effects import specular
-from lidardesign.simulate.effects.footprint import split
+from lidardesign.simulate.effects.footprint import split_beams
 from lidardesign.simulate.effects.specular import MAXIMUM_TURNS, detours
-from lidardesign.simulate.physics import direct_echoes
+from lidardesign.simulate.light import Beams, direct_echoes
 from lidardesign.space import direction
 
 EVERYWHERE = {"azimuth_rad": 0.0, "elevation_rad": 0.0, "horizontal_rad": 3.1, "vertical_rad": 3.1}
@@ -252,7 +251,7 @@ def test_beams_that_are_followed_in_groups_have_the_echoes_that_they_have_togeth
     scene = Scene((window, slab(2.0, specular=0.4, reflectance=0.5)))
     generator = np.random.default_rng(2)
     rays = beams_along(direction(*generator.uniform(-0.5, 0.5, (2, 40))))
-    beams = split(rays, Detector("wide", divergence_rad=0.2, footprint_rays=3))
+    beams = split_beams(rays, Detector("wide", divergence_rad=0.2, footprint_rays=3))
     _, together = traced(scene, beams)
     monkeypatch.setattr(specular, "BEAMS_AT_ONCE", at_once)
     _, apart = traced(scene, beams)

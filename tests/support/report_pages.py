@@ -16,10 +16,9 @@ from lidardesign.evaluate.report.report import Report
 from lidardesign.evaluate.report.tables import CommandTimes, Reproduction
 from lidardesign.evaluate.results import Evaluation, Paired, Row
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Outcome, Rays
+from lidardesign.geometry.rays import Outcome, Rays, gate_outcomes
 from lidardesign.samples import Samples
 from lidardesign.scene import Body, Box, Capsule, Plane, Scene, Sphere, rigid
-from lidardesign.simulate.simulate import gate_outcomes
 from lidardesign.space import DesignSpace
 from lidardesign.task import Metric
 

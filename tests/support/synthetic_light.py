@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from lidardesign.scene import Body, Scene, Sphere
-from lidardesign.simulate.detector.counting import Light, histogram
-from lidardesign.simulate.detector.detection import detect
+from lidardesign.simulate.detector.detection import ArrivingLight, count_photons, detect
 from lidardesign.simulate.detector.detector import Detector, Photons
-from lidardesign.simulate.detector.light import Background, Echoes
+from lidardesign.simulate.light import Background, Echoes
 from lidardesign.simulate.physics import Physics
 
 WAVELENGTH_M = 905e-9
@@ -60,8 +59,8 @@ def background(rays: int, per_metre: float = 0.0) -> Background:
 def counted(windows_m, echoes, light, detector, effects, seed: int = 0):
     """Counts per bin, shape (N, B), of rays whose windows have equally many bins, and the bins."""
     physics = Physics(detector, frozenset(effects), seed)
-    whole = Light.of(windows_m, echoes, light, physics)
-    counts = histogram(SCENE, 0, whole, physics)
+    whole = ArrivingLight.of(windows_m, echoes, light, physics)
+    counts = count_photons(SCENE, 0, whole, physics)
     return counts.reshape(len(windows_m), -1), whole.bins
 
 

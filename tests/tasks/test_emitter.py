@@ -27,11 +27,11 @@ from lidardesign.samples import Samples
 from lidardesign.scene import Ambient, Body, Box, Medium, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.detector.detector import IDEAL
 from lidardesign.simulate.detector.files import load_detector
-from lidardesign.simulate.detector.light import Beams
 from lidardesign.simulate.effects.expected_counts import Counts
-from lidardesign.simulate.effects.first_hits import Sight
-from lidardesign.simulate.effects.multipath import _hidden, stake
-from lidardesign.simulate.physics import EFFECTS, Physics, direct_echoes
+from lidardesign.simulate.effects.first_hits import FirstHits
+from lidardesign.simulate.effects.multipath import _hidden, bound
+from lidardesign.simulate.light import Beams, direct_echoes
+from lidardesign.simulate.physics import EFFECTS, Physics
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import RANGE, aim, direction
 
@@ -228,12 +228,12 @@ def test_detours_are_bounded_by_all_returns_of_which_nothing_else_is_heard():
     rays = rays_from(np.array([0.4, 0.15, 0.0]), targets)
     (free,) = simulate(replace(room, receiver=None), rays)
     hidden = ~is_heard(SceneCaster(room), room.receiver, free.points_m)
-    sight = Sight.of(room, 0, detector, [rays], SceneCaster(room))
+    sight = FirstHits.of(room, 0, detector, [rays], SceneCaster(room))
     np.testing.assert_array_equal(_hidden(sight, np.flatnonzero(sight.returned)), hidden)
     # from inside a room every point sees its walls; of a few of the points 5 % more or less are hidden
-    assert stake(sight, Counts(sight)).lost[sight.returned].mean() > hidden.mean() - 0.15 > 0.0
-    alone = Sight.of(replace(room, receiver=None), 0, detector, [rays], SceneCaster(room))
-    assert not stake(alone, Counts(alone)).lost.any()
+    assert bound(sight, Counts(sight)).lost[sight.returned].mean() > hidden.mean() - 0.15 > 0.0
+    alone = FirstHits.of(replace(room, receiver=None), 0, detector, [rays], SceneCaster(room))
+    assert not bound(alone, Counts(alone)).lost.any()
 
 
 # the monostatic limit

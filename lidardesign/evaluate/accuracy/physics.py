@@ -20,9 +20,8 @@ from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.receiver import path_windows
 from lidardesign.registry import plugin_guard
 from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import Detector
+from lidardesign.simulate.detector.detector import Detector, check_windows
 from lidardesign.simulate.detector.files import load_detector
-from lidardesign.simulate.detector.histogram import check_windows
 from lidardesign.simulate.physics import EFFECTS, Physics
 from lidardesign.simulate.plan import Plan, Planner, predicted_seconds
 from lidardesign.simulate.simulate import build_casters

@@ -5,7 +5,7 @@ only the bins whose middles lie in its gate.
 
 Ranges from captured histograms, cut to the bins that each ray hears.
 
-They are found as `lidardesign.simulate.detector.estimate_kernels` finds them in simulated histograms. Where a gate
+They are found as `lidardesign.simulate.detector.kernels` finds them in simulated histograms. Where a gate
 holds too few photons to tell the background, its threshold takes the level that is usual in the whole capture.
 """
 
@@ -51,7 +51,7 @@ def measured(
     Raises:
         DataError: The matched filter is asked for, and the capture does not say how wide its pulse is.
     """
-    from lidardesign.simulate.detector.estimate_kernels import find_returns
+    from lidardesign.simulate.detector.kernels import find_returns
 
     matched = estimation.estimator == "matched"
     if matched and capture.pulse_fwhm_ps is None:

@@ -15,9 +15,9 @@ import numpy as np
 
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Outcome, Rays
+from lidardesign.geometry.rays import Outcome, Rays, gate_outcomes
 from lidardesign.scene import Scene
-from lidardesign.simulate.simulate import build_casters, gate_outcomes, simulate_many
+from lidardesign.simulate.simulate import build_casters, simulate_many
 
 if TYPE_CHECKING:
     from lidardesign.simulate.plan import Planner

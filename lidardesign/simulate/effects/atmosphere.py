@@ -9,13 +9,12 @@ to the solid angle A (1 / r - 1 / f)^2, as an aperture A seen from r is wider th
 angle catches its share of that (the overlap of an ideal lens). So haze right before the sensor counts no more than a
 pixel's solid angle, and not 1 / r^2. A fixed receiver elsewhere hears all haze in its view.
 
-Fog and haze: light that fades, and light that comes back from the air itself.
-
-Over a range R the air leaves exp(-2 alpha R) of an echo's photons: the range strays more and returns are lost, as
-from fewer photons. Haze sends h counts into a bin, most at the gate's start; it is taken for the echo with at most
-(B - 1) exp(-(sqrt(s) - sqrt(h))^2) (see `Counts.mistaken`), and raises the level that an echo has to stand out from. A
-ray without a return may take it for one where any of it is counted: 1 - exp(-all of its counts), as one count is enough
-in the dark. Where a detector is blind after a count, haze before an echo leaves less of it (see `Blindness`).
+What it could change (`bound`): over a range R the air leaves exp(-2 alpha R) of an echo's photons: the range strays
+more and returns are lost, as from fewer photons. Haze sends h counts into a bin, most at the gate's start; it is taken
+for the echo with at most (B - 1) exp(-(sqrt(s) - sqrt(h))^2) (see `Counts.mistaken`), and raises the level that an echo
+has to stand out from. A ray without a return may take it for one where any of it is counted: 1 - exp(-all of its
+counts), as one count is enough in the dark. Where a detector is blind after a count, haze before an echo leaves less of
+it (see `Blindness`).
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ from lidardesign.geometry.receiver import in_view, path_of_range, range_of_path
 from lidardesign.numerics import safe_divide
 from lidardesign.scene import Medium, Receiver, Scene
 from lidardesign.simulate.detector.detector import Detector, Photons
-from lidardesign.simulate.detector.light import Background, Beams, Echoes
 from lidardesign.simulate.effects.expected_counts import Blindness, Counts, Echo, changed_share
-from lidardesign.simulate.effects.first_hits import Sight, Stake
+from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
+from lidardesign.simulate.light import Background, Beams, Echoes
 
 # Cells of haze along a ray, each longer than the one before by the same factor: counts are even within a cell, and
 # over a gate from 1 cm to 10 m its profile falls by a third from each to the next.
@@ -166,16 +165,16 @@ def _solid_angle_sr(distance_m: np.ndarray, aperture_m2: float) -> np.ndarray:
     return 2 * math.pi * squared / (slant * (slant + distance_m))
 
 
-def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
+def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
     """Why the air does not matter, if so."""
     if scene.medium is None or scene.medium.extinction_per_m == scene.medium.backscatter_per_m_sr == 0:
         return "the air is clear"
     return None if detector.photons is not None else "the detector hears an echo however weak"
 
 
-def stake(sight: Sight, counts: Counts) -> Stake:
+def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     """Of air that weakens and scatters."""
-    sigma_m = sight.sigma_m()
+    sigma_m = first_hits.sigma_m()
     blind, without = Blindness.of(counts), Blindness.of(counts, haze=False)
     clear, left = counts.signal, blind.left
     haze, fullest = (counts.pulses * part for part in counts.haze_per_pulse)
@@ -186,7 +185,7 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     wrong = np.minimum(counts.mistaken(left, counts.per_bin + fullest, own, sigma_m), any_count)
     changed = np.maximum(changed_share(clear, counts.in_air), changed_share(without.left, left))
     squared = counts.error_m(left, sigma_m) ** 2 * np.minimum(2 * np.sqrt(changed) + any_count, 1.0)
-    lost = np.where(sight.returned, fewer + wrong, any_count)
-    medium = sight.scene.medium
+    lost = np.where(first_hits.returned, fewer + wrong, any_count)
+    medium = first_hits.scene.medium
     reason = f"air that dims light by {100 * -np.expm1(-2 * medium.extinction_per_m):.3g} % per metre of range"
-    return Stake(squared, np.minimum(lost, 1.0), reason)
+    return EffectBound(squared, np.minimum(lost, 1.0), reason)

@@ -4,15 +4,12 @@ Counts are Poisson. A return is the highest of B bins, or where a pulse fits bes
 width around it hold at least k counts, the fewest that background alone brings to any of B such places with at most the
 detector's probability of a false alarm.
 
-Expected counts of light that the emitter did not send, and of what the air sends back.
-
-What a detector that is blind after each count leaves of echoes and of background: pile-up, for all bounds.
-
-Per pulse s counts of the echo, m counts before it and w in the whole gate are expected. Of the echo the first photon
-counts, with the probability exp(-m) (1 - exp(-s)); every count also blinds the c pulses that its dead time reaches
-into, which leaves the share 1 / (1 + c (1 - exp(-w))) of them. Of K photons, normal with sigma, the first is early by
-at most sigma min(sqrt(2 ln K), (K - 1) / sqrt(pi)), in the mean over K >= 1 as well (both bounds are concave in K or
-linear; Jensen), with E K = s / (1 - exp(-s)).
+A detector that is blind after each count leaves a part of echoes and of background (`Blindness`). Per pulse s counts of
+the echo, m counts before it and w in the whole gate are expected. Of the echo the first photon counts, with the
+probability exp(-m) (1 - exp(-s)); every count also blinds the c pulses that its dead time reaches into, which leaves
+the share 1 / (1 + c (1 - exp(-w))) of them. Of K photons, normal with sigma, the first is early by at most sigma
+min(sqrt(2 ln K), (K - 1) / sqrt(pi)), in the mean over K >= 1 as well (both bounds are concave in K or linear; Jensen),
+with E K = s / (1 - exp(-s)).
 
 Background is thinned alike: from all of it at the gate's start to exp(-m) under the echo. Its mean level, which returns
 are judged by, lies below its start, so that the start itself may be taken for a return.
@@ -29,32 +26,31 @@ import numpy as np
 from lidardesign.geometry.receiver import range_of_path
 from lidardesign.numerics import COARSE_SLACK, EPSILON, TINY, safe_divide
 from lidardesign.scene import SPEED_OF_LIGHT_M_S
-from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, Detector, metres
-from lidardesign.simulate.detector.histogram import bin_width_m
-from lidardesign.simulate.detector.light import spectral_irradiance
-from lidardesign.simulate.effects.first_hits import Sight
+from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, Detector, bin_width_m, metres
+from lidardesign.simulate.effects.first_hits import FirstHits
+from lidardesign.simulate.light import spectral_irradiance
 
 # Rays pass a receiver no nearer than this share of their way: differences of arctangents are then exact to 1e-9.
 NEAREST_SHARE = COARSE_SLACK
 
 
-def ambient_per_metre(sight: Sight) -> np.ndarray:
+def ambient_per_metre(first_hits: FirstHits) -> np.ndarray:
     """Ambient and dark counts per pulse and metre of range, shape (N,).
 
     What a ray meets has the radiance reflectance E / pi, seen through the aperture and the pixel's field of view, and
     what meets nothing sees no light; a metre of range takes 2 / c.
     """
-    photons, ambient = sight.detector.photons, sight.scene.ambient
-    rate_hz = np.full(len(sight), photons.dark_hz)
+    photons, ambient = first_hits.detector.photons, first_hits.scene.ambient
+    rate_hz = np.full(len(first_hits), photons.dark_hz)
     if ambient is not None:
         irradiance = spectral_irradiance(ambient, photons.wavelength_m, photons.filter_m)
         power_w = irradiance / math.pi * photons.filter_m * photons.aperture_m2 * photons.field_of_view_sr
-        reflectance = np.array([*(body.reflectance for body in sight.scene.bodies), 0.0])[sight.hits.body]
+        reflectance = np.array([*(body.reflectance for body in first_hits.scene.bodies), 0.0])[first_hits.hits.body]
         rate_hz += reflectance * power_w * photons.efficiency / photons.photon_energy_j
     return rate_hz * 2 / SPEED_OF_LIGHT_M_S
 
 
-def haze_per_pulse(sight: Sight, emitted: np.ndarray, bin_m: float) -> tuple[np.ndarray, np.ndarray]:
+def haze_per_pulse(first_hits: FirstHits, emitted: np.ndarray, bin_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Counts per pulse that the air sends back, at most: in the window up to the return, and in one bin, shapes (N,).
 
     From r to r + dr it sends beta Omega(r) exp(-2 alpha r) dr into an aperture, a disc of radius a seen under the solid
@@ -62,16 +58,16 @@ def haze_per_pulse(sight: Sight, emitted: np.ndarray, bin_m: float) -> tuple[np.
     window is not taken off. Before the range 1 / (1 / f + sqrt(pixel / A)), f that of what the ray meets, haze is
     blurred beyond the pixel, which catches pixel / (1 - r / f)^2 instead. Of a fixed receiver see `_beside`.
     """
-    photons, medium = sight.detector.photons, sight.scene.medium
+    photons, medium = first_hits.detector.photons, first_hits.scene.medium
     if medium is None:
-        return np.zeros(len(sight)), np.zeros(len(sight))
-    start, end = sight.window_m[:, 0], sight.window_m[:, 0] + sight.before_m
+        return np.zeros(len(first_hits)), np.zeros(len(first_hits))
+    start, end = first_hits.window_m[:, 0], first_hits.window_m[:, 0] + first_hits.before_m
     light = emitted * photons.efficiency * medium.backscatter_per_m_sr
     light = light * np.exp(-2 * medium.extinction_per_m * start)
-    if sight.scene.receiver is not None:
-        whole, fullest = _beside(sight, end, bin_m)
+    if first_hits.scene.receiver is not None:
+        whole, fullest = _beside(first_hits, end, bin_m)
         return light * whole, light * fullest
-    focus = 1 / np.maximum(sight.hits.range_m, TINY)
+    focus = 1 / np.maximum(first_hits.hits.range_m, TINY)
     sharp = 1 / (focus + math.sqrt(photons.field_of_view_sr / photons.aperture_m2))
     sharp = np.clip(sharp, start, end)
     before = safe_divide(sharp - start, (1 - start * focus) * (1 - sharp * focus))
@@ -83,16 +79,16 @@ def haze_per_pulse(sight: Sight, emitted: np.ndarray, bin_m: float) -> tuple[np.
     return whole, np.minimum(2 * math.pi * light * bin_m * squared / (near * (near + sharp)), whole)
 
 
-def _beside(sight: Sight, end_m: np.ndarray, bin_m: float) -> tuple[np.ndarray, np.ndarray]:
+def _beside(first_hits: FirstHits, end_m: np.ndarray, bin_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Solid angle times length of the haze that a fixed receiver hears, up to half paths (N,), and in one bin, (N,).
 
     It sees all of a ray that passes it at the distance h, c from the ray's start: at most the integral of
     A / (h^2 + (r - c)^2), A / h times the difference of arctan((r - c) / h), and no more than half of all around. Half
     a path grows by (1 + (r - c) / b) / 2 per range, b the way from there to the receiver: least where the ray starts.
     """
-    rays, receiver = sight.rays, sight.scene.receiver
-    aperture_m2 = sight.detector.photons.aperture_m2
-    ends = [range_of_path(rays, receiver, path_m) for path_m in (sight.window_m[:, 0], end_m)]
+    rays, receiver = first_hits.rays, first_hits.scene.receiver
+    aperture_m2 = first_hits.detector.photons.aperture_m2
+    ends = [range_of_path(rays, receiver, path_m) for path_m in (first_hits.window_m[:, 0], end_m)]
     low, high = (np.nan_to_num(range_m, nan=0.0) for range_m in ends)
     offset = np.asarray(receiver.origin_m) - rays.origin_m
     along = np.einsum("nk,nk->n", offset, rays.direction)
@@ -133,13 +129,13 @@ class Echo:
 
 @dataclass(frozen=True, eq=False)
 class Counts:
-    """Counts per frame of every ray of a sight, for a detector that counts photons.
+    """Counts per frame of every ray of a first_hits, for a detector that counts photons.
 
     Arguments:
-        sight: What the rays meet.
+        first_hits: What the rays meet.
     """
 
-    sight: Sight
+    first_hits: FirstHits
 
     @cached_property
     def pulses(self) -> np.ndarray:
@@ -149,12 +145,12 @@ class Counts:
     @cached_property
     def signal_per_pulse(self) -> np.ndarray:
         """Counts of a return in clear air, 0 where there is none, shape (N,)."""
-        return np.where(self.sight.returned, self._of_first_hit, 0.0)
+        return np.where(self.first_hits.returned, self._of_first_hit, 0.0)
 
     @cached_property
     def _of_first_hit(self) -> np.ndarray:
-        photons = self.sight.detector.photons
-        return self._by_sharing("emitted") * photons.aperture_m2 * photons.efficiency * self.sight.gain
+        photons = self.first_hits.detector.photons
+        return self._by_sharing("emitted") * photons.aperture_m2 * photons.efficiency * self.first_hits.gain
 
     def leaked(self, sigma_m: np.ndarray) -> np.ndarray:
         """Counts that the pulse of a hit outside the gate spills into it in a frame, in clear air, shape (N,).
@@ -163,8 +159,8 @@ class Counts:
         """
         from scipy.special import ndtr
 
-        share = ndtr(-self.sight.gate_edge_m / np.maximum(sigma_m, TINY))
-        return np.where(self.sight.returned, 0.0, self._of_first_hit * self.pulses * share)
+        share = ndtr(-self.first_hits.gate_edge_m / np.maximum(sigma_m, TINY))
+        return np.where(self.first_hits.returned, 0.0, self._of_first_hit * self.pulses * share)
 
     @cached_property
     def signal(self) -> np.ndarray:
@@ -174,37 +170,37 @@ class Counts:
     @property
     def typical(self) -> str:
         """The median of `in_air` over returns, for people."""
-        returned = self.in_air[self.sight.returned]
+        returned = self.in_air[self.first_hits.returned]
         return count_text(float(np.median(returned))) if len(returned) else "no"
 
     @cached_property
     def in_air(self) -> np.ndarray:
         """`signal` weakened by the air, shape (N,)."""
-        medium = self.sight.scene.medium
+        medium = self.first_hits.scene.medium
         if medium is None:
             return self.signal
-        path_m = self.sight.window_m[:, 0] + self.sight.before_m
+        path_m = self.first_hits.window_m[:, 0] + self.first_hits.before_m
         return self.signal * np.exp(-2 * medium.extinction_per_m * path_m)
 
     @cached_property
     def background_per_metre(self) -> np.ndarray:
         """Ambient light and dark counts per pulse and metre, shape (N,)."""
-        return ambient_per_metre(self.sight)
+        return ambient_per_metre(self.first_hits)
 
     @cached_property
     def haze_per_pulse(self) -> tuple[np.ndarray, np.ndarray]:
         """Counts that the air sends back: in the whole window, and in its fullest bin, shapes (N,)."""
-        return haze_per_pulse(self.sight, self._by_sharing("emitted"), self.bin_m)
+        return haze_per_pulse(self.first_hits, self._by_sharing("emitted"), self.bin_m)
 
     @cached_property
     def bin_m(self) -> float:
         """The width of a histogram's bins [m]."""
-        return bin_width_m(self.sight.detector)
+        return bin_width_m(self.first_hits.detector)
 
     @cached_property
     def bins(self) -> np.ndarray:
         """How many of them a window has, shape (N,)."""
-        return np.maximum(np.ceil(self.sight.width_m / self.bin_m), 1.0)
+        return np.maximum(np.ceil(self.first_hits.width_m / self.bin_m), 1.0)
 
     @cached_property
     def per_bin(self) -> np.ndarray:
@@ -214,7 +210,7 @@ class Counts:
     @cached_property
     def pulse_bins(self) -> int:
         """How many bins a pulse is wide, at half of its height: 2 half + 1."""
-        return 2 * int(FWHM_PER_SIGMA * metres(self.sight.detector.timing_sigma_s) / (2 * self.bin_m)) + 1
+        return 2 * int(FWHM_PER_SIGMA * metres(self.first_hits.detector.timing_sigma_s) / (2 * self.bin_m)) + 1
 
     def needed(self, per_bin: np.ndarray) -> np.ndarray:
         """The fewest counts in a pulse's width that are reported in so much background per bin (N,), shape (N,).
@@ -224,7 +220,7 @@ class Counts:
         level, bins = (_rounded_up(values) for values in (per_bin * self.pulse_bins, self.bins))
         # pairs as complex numbers: those are told apart fastest
         pairs, place = np.unique(level + 1j * bins, return_inverse=True)
-        return needed_counts(pairs.real, pairs.imag, self.sight.detector.false_alarm)[place]
+        return needed_counts(pairs.real, pairs.imag, self.first_hits.detector.false_alarm)[place]
 
     def missed(self, signal: np.ndarray, per_bin: np.ndarray | float, sigma_m: np.ndarray) -> np.ndarray:
         """Probability that the echo's bins hold fewer counts than it takes to be reported, shape (N,).
@@ -258,18 +254,18 @@ class Counts:
         Poisson counts X of the fullest other bin (`other`) and Y of the echo's. The matched filter compares places as
         wide as a pulse, no worse than by their sums.
         """
-        wide = self.pulse_bins if self.sight.detector.estimator == "matched" else 1
+        wide = self.pulse_bins if self.first_hits.detector.estimator == "matched" else 1
         expected = signal * share_in_bins(wide, self.bin_m, sigma_m) + wide * per_bin
         lead = np.maximum(np.sqrt(expected) - np.sqrt(wide * other), 0.0)
         return np.minimum((self.bins - 1) * np.exp(-(lead**2)), 1.0)
 
     def error_m(self, signal: np.ndarray, sigma_m: np.ndarray) -> np.ndarray:
         """How far the range from so many photons strays, rms, shape (N,) [m]."""
-        return estimate_error_m(self.sight.detector, signal, sigma_m)
+        return estimate_error_m(self.first_hits.detector, signal, sigma_m)
 
     def _by_sharing(self, name: str) -> np.ndarray:
-        shared, place = np.unique(self.sight.sharing, return_inverse=True)
-        return np.array([getattr(self.sight.detector.photons, name)(int(rays)) for rays in shared])[place]
+        shared, place = np.unique(self.first_hits.sharing, return_inverse=True)
+        return np.array([getattr(self.first_hits.detector.photons, name)(int(rays)) for rays in shared])[place]
 
 
 def _rounded_up(values: np.ndarray) -> np.ndarray:
@@ -351,18 +347,18 @@ class Blindness:
     @classmethod
     def of(cls, counts: Counts, *, ambient: bool = True, haze: bool = True) -> Blindness:
         """With ambient light and dark counts, and with what the air sends back, or as if there were none."""
-        sight, photons = counts.sight, counts.sight.detector.photons
+        first_hits, photons = counts.first_hits, counts.first_hits.detector.photons
         echo = safe_divide(counts.in_air, counts.pulses)
         from_air = counts.haze_per_pulse[0] * haze
         per_metre = counts.background_per_metre * ambient
-        whole = per_metre * sight.width_m + from_air + echo
+        whole = per_metre * first_hits.width_m + from_air + echo
         if photons.dead_s == 0:
-            every = np.ones(len(sight))
-            return cls(counts.in_air, every, every, every, np.zeros(len(sight)), whole)
+            every = np.ones(len(first_hits))
+            return cls(counts.in_air, every, every, every, np.zeros(len(first_hits)), whole)
         first = -np.expm1(-echo)
-        covered = np.floor((photons.dead_s + sight.width_m / metres(1)) * photons.repetition_hz)
+        covered = np.floor((photons.dead_s + first_hits.width_m / metres(1)) * photons.repetition_hz)
         awake = 1 / (1 + covered * -np.expm1(-whole))
-        under = awake * np.exp(-(per_metre * sight.before_m + from_air))
+        under = awake * np.exp(-(per_metre * first_hits.before_m + from_air))
         level = awake * safe_divide(-np.expm1(-whole), whole, 1.0)
         several = np.maximum(safe_divide(echo, first, 1.0), 1.0)
         early = np.minimum(np.sqrt(2 * np.log(several)), (several - 1) / math.sqrt(math.pi))
@@ -394,6 +390,6 @@ def variance_of_missing(counts: Counts, before: np.ndarray, left: np.ndarray, si
     """Variance by what is not there: all of the error where many photons are gone, its share where few are, (N,)."""
     gone = changed_share(before, left)
     error = counts.error_m(left, sigma_m) ** 2
-    if counts.sight.detector.estimator == "matched":
+    if counts.first_hits.detector.estimator == "matched":
         return error * gone
     return error * np.minimum(2 * np.sqrt(gone), 1.0)

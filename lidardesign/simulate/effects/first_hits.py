@@ -1,7 +1,4 @@
-"""What all rays of a scene's frame meet, and the light that comes back from it: what bounds are worked out from.
-
-Depth edges between neighbouring rays: how likely a step aside leads to another surface.
-"""
+"""What all rays of a scene's frame meet first, and what an effect could change of it: what bounds start from."""
 
 from __future__ import annotations
 
@@ -12,15 +9,12 @@ from functools import cached_property
 import numpy as np
 
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Hits, Outcome, Rays
+from lidardesign.geometry.rays import Hits, Outcome, Rays, gate_outcomes
 from lidardesign.geometry.receiver import path_of_range, path_windows
 from lidardesign.numerics import safe_divide
 from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import Detector, metres
-from lidardesign.simulate.detector.histogram import resolution_m
-from lidardesign.simulate.detector.light import Beams
-from lidardesign.simulate.physics import direct_echoes
-from lidardesign.simulate.simulate import gate_outcomes
+from lidardesign.simulate.detector.detector import Detector, metres, resolution_m
+from lidardesign.simulate.light import Beams, direct_echoes
 
 # A surface that is grazed more flatly than this counts as met at it: ranges then change by up to 50 times a step aside.
 FLATTEST_COSINE = 0.02
@@ -31,7 +25,7 @@ PULSE_REACH = 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class Stake:
+class EffectBound:
     """What an effect could change, ray by ray.
 
     Arguments:
@@ -46,7 +40,7 @@ class Stake:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class FirstHits:
     """First hits of all rays in a frame.
 
     Arguments:
@@ -70,7 +64,7 @@ class Sight:
     caster: SceneCaster
 
     @classmethod
-    def of(cls, scene: Scene, frame: int, detector: Detector, lists: Sequence[Rays], caster: SceneCaster) -> Sight:
+    def of(cls, scene: Scene, frame: int, detector: Detector, lists: Sequence[Rays], caster: SceneCaster) -> FirstHits:
         """What lists of rays meet in a frame."""
         names = ("origin_m", "direction", "gate_m", "sensor", "time_s")
         rays = Rays(*(np.concatenate([getattr(one, name) for one in lists]) for name in names))
@@ -82,9 +76,9 @@ class Sight:
     def __len__(self) -> int:
         return len(self.rays)
 
-    def nothing(self, reason: str) -> Stake:
+    def nothing(self, reason: str) -> EffectBound:
         """No error, and nothing lost."""
-        return Stake(np.zeros(len(self)), np.zeros(len(self)), reason)
+        return EffectBound(np.zeros(len(self)), np.zeros(len(self)), reason)
 
     @cached_property
     def neighbours(self) -> np.ndarray:
@@ -190,7 +184,7 @@ class Sight:
 STEEPER = 2.0
 
 
-def edge_probability(sight: Sight, aside_m: np.ndarray) -> np.ndarray:
+def edge_probability(first_hits: FirstHits, aside_m: np.ndarray) -> np.ndarray:
     """Probability that an edge lies within a distance aside of where a ray ends, shape (N,).
 
     Two neighbouring rays, a distance d apart, that end on different bodies, or further apart in range than the slope
@@ -199,17 +193,17 @@ def edge_probability(sight: Sight, aside_m: np.ndarray) -> np.ndarray:
     surface are not seen, in expectation over where rays fall they weigh as much as those that are.
 
     Arguments:
-        sight: What rays meet.
+        first_hits: What rays meet.
         aside_m: How far aside, shape (N,) [m].
     """
     if not aside_m.any():
-        return np.zeros(len(sight))
-    range_m, body, tangent = sight.range_m, sight.hits.body, sight.tangent
+        return np.zeros(len(first_hits))
+    range_m, body, tangent = first_hits.range_m, first_hits.hits.body, first_hits.tangent
     met = body >= 0
-    chance = np.zeros(len(sight))
-    for other in sight.neighbours.T:
-        reach_m = np.minimum(sight.hits.range_m, sight.hits.range_m[other])
-        apart_m = _apart_m(sight, other, np.where(np.isfinite(reach_m), reach_m, 0.0))
+    chance = np.zeros(len(first_hits))
+    for other in first_hits.neighbours.T:
+        reach_m = np.minimum(first_hits.hits.range_m, first_hits.hits.range_m[other])
+        apart_m = _apart_m(first_hits, other, np.where(np.isfinite(reach_m), reach_m, 0.0))
         sloped_m = STEEPER * apart_m * (1 + tangent + tangent[other])
         edge = (body != body[other]) | (met & met[other] & (np.abs(range_m - range_m[other]) > sloped_m))
         further = np.maximum(aside_m, aside_m[other])
@@ -218,7 +212,7 @@ def edge_probability(sight: Sight, aside_m: np.ndarray) -> np.ndarray:
     return chance
 
 
-def _apart_m(sight: Sight, other: np.ndarray, reach_m: np.ndarray) -> np.ndarray:
+def _apart_m(first_hits: FirstHits, other: np.ndarray, reach_m: np.ndarray) -> np.ndarray:
     """How far rays are from others (N,) at ranges (N,) along both, shape (N,) [m]."""
-    origin, direction = sight.rays.origin_m, sight.rays.direction
+    origin, direction = first_hits.rays.origin_m, first_hits.rays.direction
     return np.linalg.norm(origin - origin[other] + reach_m[:, None] * (direction - direction[other]), axis=1)

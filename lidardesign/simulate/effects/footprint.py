@@ -3,9 +3,8 @@
 What a detector makes of several echoes of one ray is its own matter (`simulate.detection`): near ones merge into one
 mixed return, of distant ones it reports one.
 
-The width of a beam: slanted surfaces spread an echo, and beams on a depth edge meet two surfaces.
-
-A beam of half angle h is R h wide at the range R; on a surface met at the angle theta its ranges spread by
+What it could change (`bound`), as slanted surfaces spread an echo and beams on a depth edge meet two surfaces: a beam
+of half angle h is R h wide at the range R; on a surface met at the angle theta its ranges spread by
 +-R h tan(theta), so a return is off by at most that, and may leave or enter a gate that ends within it. An edge within
 R h of the ray's end mixes both surfaces: the return may be of either and counts as lost, or between them, as far apart
 as the detector does not tell them apart; see `edge_probability` (an estimate). What lies between rays is met by a beam
@@ -23,9 +22,9 @@ import numpy as np
 from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Scene
 from lidardesign.simulate.detector.detector import Detector
-from lidardesign.simulate.detector.light import Beams
 from lidardesign.simulate.effects.expected_counts import Counts
-from lidardesign.simulate.effects.first_hits import FLATTEST_COSINE, STEEPER, Sight, Stake, edge_probability
+from lidardesign.simulate.effects.first_hits import FLATTEST_COSINE, STEEPER, EffectBound, FirstHits, edge_probability
+from lidardesign.simulate.light import Beams
 from lidardesign.simulate.light_transport.multipath_bound import GOLDEN_ANGLE_RAD
 
 # Pairs of opposite points are turned by the golden share of a half turn from one to the next: the most even spiral
@@ -46,7 +45,7 @@ def even_disc(count: int) -> np.ndarray:
     return np.concatenate([np.zeros((count % 2, 2)), half, -half])
 
 
-def split(beams: Beams, detector: Detector) -> Beams:
+def split_beams(beams: Beams, detector: Detector) -> Beams:
     """Each beam as `detector.footprint_rays` thin ones of equal share, even over the solid angle of its cone.
 
     The pattern is upright: it turns with the azimuth of a beam. Beams of no width stay as they are.
@@ -87,40 +86,40 @@ def _across(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 MESH_ROUNDING = 1e-5
 
 
-def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
+def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
     """Why beams are lines, if so."""
     if detector.divergence_rad == 0:
         return "beams are thin lines"
     return None if detector.footprint_rays > 1 else "the detector gives beams one sub-ray each"
 
 
-def stake(sight: Sight, counts: Counts) -> Stake:
+def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     """Of beams with a width."""
-    radius_m, wide_rad = sight.beam_m, sight.detector.divergence_rad
-    spread_m = radius_m * sight.tangent
-    edge = edge_probability(sight, radius_m)
-    squared = np.minimum(spread_m, sight.width_m) ** 2 + edge * sight.resolution_m**2
-    lost = np.maximum(edge, (sight.gate_edge_m <= spread_m) | stray_rims(sight))
-    wide_m = float(np.median(2 * radius_m[sight.returned])) if sight.returned.any() else 0.0
+    radius_m, wide_rad = first_hits.beam_m, first_hits.detector.divergence_rad
+    spread_m = radius_m * first_hits.tangent
+    edge = edge_probability(first_hits, radius_m)
+    squared = np.minimum(spread_m, first_hits.width_m) ** 2 + edge * first_hits.resolution_m**2
+    lost = np.maximum(edge, (first_hits.gate_edge_m <= spread_m) | stray_rims(first_hits))
+    wide_m = float(np.median(2 * radius_m[first_hits.returned])) if first_hits.returned.any() else 0.0
     reason = f"beams of {1000 * wide_rad:.3g} mrad are {1000 * wide_m:.3g} mm wide where they return"
-    return Stake(squared, lost, reason)
+    return EffectBound(squared, lost, reason)
 
 
-def stray_rims(sight: Sight) -> np.ndarray:
+def stray_rims(first_hits: FirstHits) -> np.ndarray:
     """Which beams meet, at one place on their rim, a surface that is not the one in their middle, (N,).
 
     Surfaces that meet, as those of joined bodies, are one.
     """
-    rays, hits, half_rad = sight.rays, sight.hits, sight.detector.divergence_rad / 2
+    rays, hits, half_rad = first_hits.rays, first_hits.hits, first_hits.detector.divergence_rad / 2
     level = np.cross(np.eye(3)[np.abs(rays.direction).argmin(axis=1)], rays.direction)
     level /= np.linalg.norm(level, axis=1, keepdims=True)
-    turn = (GOLDEN_ANGLE_RAD * np.arange(len(sight)))[:, None]
+    turn = (GOLDEN_ANGLE_RAD * np.arange(len(first_hits)))[:, None]
     aside = np.cos(turn) * level + np.sin(turn) * np.cross(rays.direction, level)
-    rim = sight.caster.first_hit(rays.origin_m, math.cos(half_rad) * rays.direction + math.sin(half_rad) * aside)
+    rim = first_hits.caster.first_hit(rays.origin_m, math.cos(half_rad) * rays.direction + math.sin(half_rad) * aside)
     both = np.flatnonzero((hits.body >= 0) & (rim.body >= 0))
     cosine = np.abs(np.einsum("nk,nk->n", rim.normal[both], rays.direction[both]))
-    slope = 1 + sight.tangent[both] + 1 / np.maximum(cosine, FLATTEST_COSINE)
+    slope = 1 + first_hits.tangent[both] + 1 / np.maximum(cosine, FLATTEST_COSINE)
     stray = (rim.body >= 0) != (hits.body >= 0)
     step_m = np.abs(rim.range_m[both] - hits.range_m[both])
-    stray[both] = step_m > STEEPER * sight.beam_m[both] * slope + MESH_ROUNDING * hits.range_m[both]
+    stray[both] = step_m > STEEPER * first_hits.beam_m[both] * slope + MESH_ROUNDING * hits.range_m[both]
     return stray

@@ -1,13 +1,11 @@
 """The timing of a photon strays: by diode and converter, as a normal error that every photon has anew.
 
-Timing errors of the detector: (c / 2) sigma_j for one time per return, less for the mean of n photons.
-
-Without photons each return has one normal error, (c / 2) sigma_j rms. With n photons the matched filter averages them:
-(c / 2) sigma_j / sqrt(n). The highest bin does not average; with timing errors it strays as `estimate_error_m` says of
-pulse and timing together, and without them it strayed by itself, so that the two differ by at most
-sqrt(e(sigma_p, sigma_j)^2 + e(sigma_p)^2). A wider echo is also lower: returns are lost where it now falls below what
-is reported, and surfaces outside a gate spill more photons into it. Of several photons in a pulse a detector that is
-blind after a count times the first, which is the earlier the more they stray.
+What it could change (`bound`): without photons each return has one normal error, (c / 2) sigma_j rms. With n photons
+the matched filter averages them: (c / 2) sigma_j / sqrt(n). The highest bin does not average; with timing errors it
+strays as `estimate_error_m` says of pulse and timing together, and without them it strayed by itself, so that the two
+differ by at most sqrt(e(sigma_p, sigma_j)^2 + e(sigma_p)^2). A wider echo is also lower: returns are lost where it now
+falls below what is reported, and surfaces outside a gate spill more photons into it. Of several photons in a pulse a
+detector that is blind after a count times the first, which is the earlier the more they stray.
 
 The pulse is taken as Gaussian and n as its expectation: an estimate where n is small.
 """
@@ -20,42 +18,35 @@ import numpy as np
 
 from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Scene
-from lidardesign.simulate.detector.arrival_kernels import poisson_of_bins
 from lidardesign.simulate.detector.detector import Detector, metres
 from lidardesign.simulate.effects.expected_counts import Blindness, Counts, Echo, estimate_error_m
-from lidardesign.simulate.effects.first_hits import Sight, Stake
+from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 from lidardesign.simulate.streams import normals
 
-# draws of a ray: one per photon, and far beyond one per bin
-FIRST_BIN = 1 << 40
 
-
-def displaced(path_m: np.ndarray, ray: np.ndarray, order: np.ndarray, detector: Detector, key: int) -> np.ndarray:
+def add_timing_errors(
+    path_m: np.ndarray, ray: np.ndarray, order: np.ndarray, detector: Detector, key: int
+) -> np.ndarray:
     """Half paths as they are timed [m], shape (K,): of photons by ray and order in it, or of whole returns."""
     if detector.jitter_sigma_s == 0:
         return path_m
     return path_m + metres(detector.jitter_sigma_s) * normals(key, ray, order)
 
 
-def of_bins(expected: np.ndarray, offset: np.ndarray, rays: np.ndarray, key: int) -> np.ndarray:
-    """Counts in the bins of rays (R,) whose many photons stray, where their number is not chance: Poisson in each."""
-    return poisson_of_bins(expected, offset, rays, np.uint64(key), FIRST_BIN)
-
-
-def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
+def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
     """Why photons are timed exactly, if so."""
     return None if detector.jitter_sigma_s > 0 else "the detector times without error"
 
 
-def stake(sight: Sight, counts: Counts) -> Stake:
+def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     """Of a timing error per return, or per photon."""
-    detector = sight.detector
+    detector = first_hits.detector
     sigma_s, timed = detector.jitter_sigma_s, f"timed to {1e12 * detector.jitter_sigma_s:.3g} ps"
     if detector.photons is None:
-        error = np.full(len(sight), metres(sigma_s))
-        return Stake(error**2, np.zeros(len(sight)), f"a return is {timed}")
+        error = np.full(len(first_hits), metres(sigma_s))
+        return EffectBound(error**2, np.zeros(len(first_hits)), f"a return is {timed}")
     blind = Blindness.of(counts)
-    signal, pulse_m, both_m = blind.left, sight.sigma_m(jitter=False), sight.sigma_m()
+    signal, pulse_m, both_m = blind.left, first_hits.sigma_m(jitter=False), first_hits.sigma_m()
     if detector.estimator == "matched":
         squared = estimate_error_m(detector, signal, metres(sigma_s)) ** 2
     else:
@@ -64,4 +55,4 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     lost = counts.more_missed(Echo(signal, pulse_m), Echo(signal, both_m))
     spilled = -np.expm1(-np.maximum(counts.leaked(both_m) - counts.leaked(pulse_m), 0.0))
     reason = f"a photon is {timed}; a return has about {counts.typical} of them"
-    return Stake(squared, np.where(sight.returned, lost, spilled), reason)
+    return EffectBound(squared, np.where(first_hits.returned, lost, spilled), reason)

@@ -6,14 +6,12 @@ travel along it, which is how the links of a robot move when one joint turns (Mu
 Rays that are sent later than a frame lasts meet it on its way to the pose after that. After its last pose a body goes
 on as it came. A body at rest in all frames goes on with its velocity.
 
-What moves while the rays of a frame are fired one after another.
-
-A ray fired at the time t meets a body that has moved by v t, v the velocity of the point it meets: its range changes by
-at most |v| t / cos(theta) on a plane met at the angle theta, which may lead it into or out of its gate, and at the
-body's edges it meets something else, with the probability that an edge lies within |v| t; see `edge_probability` (an
-estimate). What a body moves into that it was not in front of is met by moving the ray back by v t, v where the ray
-passes the body, and casting it (exact for bodies that do not turn, and for one that moves alone). A detector without
-any error or width, `ideal`, takes the whole frame at one instant.
+What it could change (`bound`): a ray fired at the time t meets a body that has moved by v t, v the velocity of the
+point it meets: its range changes by at most |v| t / cos(theta) on a plane met at the angle theta, which may lead it
+into or out of its gate, and at the body's edges it meets something else, with the probability that an edge lies within
+|v| t; see `edge_probability` (an estimate). What a body moves into that it was not in front of is met by moving the ray
+back by v t, v where the ray passes the body, and casting it (exact for bodies that do not turn, and for one that moves
+alone). A detector without any error or width, `ideal`, takes the whole frame at one instant.
 """
 
 from __future__ import annotations
@@ -34,8 +32,8 @@ from lidardesign.geometry.triangles import SecondCasts, mesh_caster
 from lidardesign.scene import Body, Box, Mesh, Plane, Scene, Shape, inverse_rigid
 from lidardesign.simulate.detector.detector import IDEAL, Detector
 from lidardesign.simulate.effects.expected_counts import Counts
-from lidardesign.simulate.effects.first_hits import Sight, Stake, edge_probability
-from lidardesign.simulate.physics import Tracer
+from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits, edge_probability
+from lidardesign.simulate.light import Tracer
 
 # Rays (N, 3), (N, 3) in a body's own frame and limits (N,) to ranges (N,), infinite on a miss, and normals (N, 3).
 LocalTracer = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -197,6 +195,11 @@ def _still(scene: Scene) -> tuple[SceneCaster | None, np.ndarray]:
     return shared_caster(part), indices
 
 
+def still_tracer(caster: SceneCaster) -> Tracer:
+    """First hits of rays in a scene that stands still within a frame."""
+    return lambda origins, directions, time_s: caster.first_hit(origins, directions)
+
+
 def moving_tracer(scene: Scene, frame: int) -> Tracer:
     """First hits of rays (N, 3), (N, 3) of unit length that are sent at times (N,) [s] within a frame."""
     caster, indices = _still(scene)
@@ -218,7 +221,7 @@ def moving_tracer(scene: Scene, frame: int) -> Tracer:
     return trace
 
 
-def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
+def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
     """Why all rays of a frame see one moment, if so."""
     if is_instant(detector):
         return "the detector takes a frame at one instant"
@@ -232,39 +235,39 @@ def is_instant(detector: Detector) -> bool:
     return replace(detector, name=IDEAL.name) == IDEAL
 
 
-def stake(sight: Sight, counts: Counts) -> Stake:
+def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     """Of moving bodies."""
-    velocity = point_velocities(sight)
-    step_m = np.linalg.norm(velocity, axis=1) * sight.rays.time_s
-    moved_m = step_m / sight.cosine
-    edge = edge_probability(sight, step_m)
-    squared = np.minimum(moved_m, sight.width_m) ** 2 + edge * sight.resolution_m**2
-    entered = entered_rays(sight)
-    lost = np.maximum(edge, ((sight.gate_edge_m <= moved_m) & (moved_m > 0)) | entered)
+    velocity = point_velocities(first_hits)
+    step_m = np.linalg.norm(velocity, axis=1) * first_hits.rays.time_s
+    moved_m = step_m / first_hits.cosine
+    edge = edge_probability(first_hits, step_m)
+    squared = np.minimum(moved_m, first_hits.width_m) ** 2 + edge * first_hits.resolution_m**2
+    entered = entered_rays(first_hits)
+    lost = np.maximum(edge, ((first_hits.gate_edge_m <= moved_m) & (moved_m > 0)) | entered)
     reason = f"surfaces move by up to {1000 * step_m.max(initial=0.0):.3g} mm within a frame"
     if entered.any():
         reason += f", and into {100 * entered.mean():.3g} % of rays"
-    return Stake(squared, lost, reason)
+    return EffectBound(squared, lost, reason)
 
 
-def entered_rays(sight: Sight) -> np.ndarray:
+def entered_rays(first_hits: FirstHits) -> np.ndarray:
     """Which rays meet, at their own time, a moving body that they do not meet when the frame begins, shape (N,)."""
-    entered = np.zeros(len(sight), dtype=bool)
-    rays, range_m = sight.rays, sight.hits.range_m
-    for index, body in enumerate(sight.scene.bodies):
+    entered = np.zeros(len(first_hits), dtype=bool)
+    rays, range_m = first_hits.rays, first_hits.hits.range_m
+    for index, body in enumerate(first_hits.scene.bodies):
         if not _moves(body):
             continue
-        rows = np.flatnonzero((sight.hits.body != index) & (rays.time_s > 0))
-        middle, radius_m = _ball(body, sight.frame)
-        drift = _velocity(sight.scene, body, sight.frame, middle[None])[0]
+        rows = np.flatnonzero((first_hits.hits.body != index) & (rays.time_s > 0))
+        middle, radius_m = _ball(body, first_hits.frame)
+        drift = _velocity(first_hits.scene, body, first_hits.frame, middle[None])[0]
         offset = middle + rays.time_s[rows, None] * drift - rays.origin_m[rows]
         along = np.einsum("nk,nk->n", offset, rays.direction[rows])
         aside_m = np.sqrt(np.maximum(np.einsum("nk,nk->n", offset, offset) - along**2, 0.0))
         passing = (aside_m <= radius_m) & (along >= -radius_m) & (along - radius_m <= range_m[rows])
         rows, along = rows[passing], along[passing]
         place = rays.origin_m[rows] + along[:, None] * rays.direction[rows]
-        back = rays.time_s[rows, None] * _velocity(sight.scene, body, sight.frame, place)
-        found = sight.caster.first_hit(rays.origin_m[rows] - back, rays.direction[rows])
+        back = rays.time_s[rows, None] * _velocity(first_hits.scene, body, first_hits.frame, place)
+        found = first_hits.caster.first_hit(rays.origin_m[rows] - back, rays.direction[rows])
         entered[rows] |= (found.body == index) & (found.range_m < range_m[rows])
     return entered
 
@@ -282,14 +285,14 @@ def _ball(body: Body, frame: int) -> tuple[np.ndarray, float]:
     return pose[:3, 3], shape.radius_m + getattr(shape, "half_length_m", 0.0)
 
 
-def point_velocities(sight: Sight) -> np.ndarray:
+def point_velocities(first_hits: FirstHits) -> np.ndarray:
     """How the points that rays meet move with their bodies, shape (N, 3) [m/s]; 0 on a miss."""
-    points = sight.rays.origin_m + sight.range_m[:, None] * sight.rays.direction
-    velocity = np.zeros((len(sight), 3))
-    for index, body in enumerate(sight.scene.bodies):
-        met = np.flatnonzero(sight.hits.body == index)
+    points = first_hits.rays.origin_m + first_hits.range_m[:, None] * first_hits.rays.direction
+    velocity = np.zeros((len(first_hits), 3))
+    for index, body in enumerate(first_hits.scene.bodies):
+        met = np.flatnonzero(first_hits.hits.body == index)
         if len(met) and _moves(body):
-            velocity[met] = _velocity(sight.scene, body, sight.frame, points[met])
+            velocity[met] = _velocity(first_hits.scene, body, first_hits.frame, points[met])
     return velocity
 
 

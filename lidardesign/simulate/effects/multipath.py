@@ -25,21 +25,19 @@ that; their noise falls with the root of `PATHS`, which all rays share.
 Echoes are the simulator's bins of half path, a quarter of the detector's resolution where no more than `MOST_CELLS` of
 them reach to the gates' ends. They name the body of the ray's first hit, whose echo they disturb.
 
-Light that comes back by way of other surfaces: later, and weaker by each bounce.
+What it could change (`bound`): from points that rays meet, other surfaces are looked for, and what they send there is
+bounded (`multipath_bound`): of a flood or for one receiver that hears all, what they get of the light; where one spot
+at a time is lit and seen, what falls on it again. What is late by less than a detector tells apart moves the echo by
+its delay times its share; what is late by more makes its own peak, taken for the echo at most where all of it outweighs
+that. Where a receiver that stands elsewhere does not hear the echo at all, whatever comes by detours may be taken for
+it.
 
-From points that rays meet, other surfaces are looked for, and what they send there is bounded (`multipath_bound`): of
-a flood or for one receiver that hears all, what they get of the light; where one spot at a time is lit and seen,
-what falls on it again. What is late by less than a detector tells apart moves the echo by its delay times its share;
-what is late by more makes its own peak, taken for the echo at most where all of it outweighs that. Where a receiver
-that stands elsewhere does not hear the echo at all, whatever comes by detours may be taken for it.
-
-Light that the spots of other rays send to a ray's own, where a flood lights all of them at once.
-
-All rays have the same power. Ray j lights a spot Q at the distance R_j, which sends rho_Q of it on; a spot P of the
-area A, seen by pixel i, gets rho_Q cos cos A / (pi d^2) of what its own ray gives it, late by (R_j + d - R_i) / 2 of
-half path. Further bounces bring at most 1 / (1 - rho) times as much in all, rho the largest reflectance (energy is
-kept; a geometric series). Whether anything stands between the spots is not asked, and beams are taken to end on them:
-where only part of a wide beam does, its own light is weaker than is said here.
+Where a flood lights all spots at once, other rays' spots send light to a ray's own. All rays have the same power. Ray j
+lights a spot Q at the distance R_j, which sends rho_Q of it on; a spot P of the area A, seen by pixel i, gets rho_Q cos
+cos A / (pi d^2) of what its own ray gives it, late by (R_j + d - R_i) / 2 of half path. Further bounces bring at most 1
+/ (1 - rho) times as much in all, rho the largest reflectance (energy is kept; a geometric series). Whether anything
+stands between the spots is not asked, and beams are taken to end on them: where only part of a wide beam does, its own
+light is weaker than is said here.
 """
 
 from __future__ import annotations
@@ -55,14 +53,13 @@ from lidardesign.geometry.rays import Hits, Rays
 from lidardesign.geometry.receiver import in_view, path_windows
 from lidardesign.numerics import EPSILON_FLOAT32, safe_divide
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere
-from lidardesign.simulate.detector.detector import Detector
-from lidardesign.simulate.detector.histogram import resolution_m
-from lidardesign.simulate.detector.light import Beams, Echoes
+from lidardesign.simulate.detector.detector import Detector, resolution_m
 from lidardesign.simulate.effects.expected_counts import Counts
-from lidardesign.simulate.effects.first_hits import Sight, Stake
+from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
+from lidardesign.simulate.light import Beams, Echoes, direct_echoes
 from lidardesign.simulate.light_transport.multipath_bound import Detours, lamp_bound, pixel_bound
 from lidardesign.simulate.light_transport.transport import Lights, PathBins, Transients, render_transient
-from lidardesign.simulate.physics import Physics, direct_echoes
+from lidardesign.simulate.physics import Physics
 
 MOST_SURFACES = 6
 # Light paths of a frame, all rays together: about a second.
@@ -245,34 +242,34 @@ MOST_POINTS, AT_ONCE = 64, 8
 WHITEST = 0.999
 
 
-def moved_by_spots_m(sight: Sight) -> np.ndarray:
+def moved_by_spots_m(first_hits: FirstHits) -> np.ndarray:
     """How far light from the spots of the same list moves ranges, for some rays of each list, shape (K,) [m]."""
     found = [np.zeros(1)]
-    for row in np.unique(sight.row[sight.returned]):
-        rays = np.flatnonzero((sight.row == row) & (sight.hits.body >= 0))
-        own = np.flatnonzero((sight.row == row) & sight.returned)
+    for row in np.unique(first_hits.row[first_hits.returned]):
+        rays = np.flatnonzero((first_hits.row == row) & (first_hits.hits.body >= 0))
+        own = np.flatnonzero((first_hits.row == row) & first_hits.returned)
         own = own[np.unique(np.linspace(0, len(own) - 1, MOST_POINTS).astype(int))]
         # a few at a time, so that memory stays small beside long lists
-        found += [_moved_m(sight, some, rays) for some in np.array_split(own, max(len(own) // AT_ONCE, 1))]
+        found += [_moved_m(first_hits, some, rays) for some in np.array_split(own, max(len(own) // AT_ONCE, 1))]
     return np.concatenate(found)
 
 
-def _moved_m(sight: Sight, own: np.ndarray, rays: np.ndarray) -> np.ndarray:
+def _moved_m(first_hits: FirstHits, own: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """Of spots `own` by those of `rays`, all of one list, shape (len(own),) [m]."""
-    place = sight.rays.origin_m + sight.range_m[:, None] * sight.rays.direction
-    reflectance = np.array([body.reflectance for body in sight.scene.bodies])[sight.hits.body[rays]]
-    photons, half_rad = sight.detector.photons, sight.detector.divergence_rad / 2
+    place = first_hits.rays.origin_m + first_hits.range_m[:, None] * first_hits.rays.direction
+    reflectance = np.array([body.reflectance for body in first_hits.scene.bodies])[first_hits.hits.body[rays]]
+    photons, half_rad = first_hits.detector.photons, first_hits.detector.divergence_rad / 2
     pixel_sr = max(photons.field_of_view_sr, math.pi * half_rad**2)
-    area_m2 = (pixel_sr * sight.range_m**2 / sight.cosine)[own, None]
+    area_m2 = (pixel_sr * first_hits.range_m**2 / first_hits.cosine)[own, None]
     between = place[rays] - place[own, None]
     apart_m = np.linalg.norm(between, axis=2)
-    leaving = np.maximum(np.einsum("ikx,ix->ik", between, sight.hits.normal[own]), 0.0)
-    facing = np.maximum(-np.einsum("ikx,kx->ik", between, sight.hits.normal[rays]), 0.0)
+    leaving = np.maximum(np.einsum("ikx,ix->ik", between, first_hits.hits.normal[own]), 0.0)
+    facing = np.maximum(-np.einsum("ikx,kx->ik", between, first_hits.hits.normal[rays]), 0.0)
     share = reflectance * np.minimum(safe_divide(leaving * facing * area_m2, math.pi * apart_m**4), 1.0)
-    late_m = np.abs(sight.range_m[rays] + apart_m - sight.range_m[own, None]) / 2
-    near = late_m < sight.resolution_m
-    whitest = min(max(body.reflectance for body in sight.scene.bodies), WHITEST)
-    return np.minimum((share * late_m * near).sum(axis=1) / (1 - whitest), sight.resolution_m)
+    late_m = np.abs(first_hits.range_m[rays] + apart_m - first_hits.range_m[own, None]) / 2
+    near = late_m < first_hits.resolution_m
+    whitest = min(max(body.reflectance for body in first_hits.scene.bodies), WHITEST)
+    return np.minimum((share * late_m * near).sum(axis=1) / (1 - whitest), first_hits.resolution_m)
 
 
 # What lies in the way by less than this share of it is the surface itself: rays are traced to float32.
@@ -281,7 +278,7 @@ CLEARANCE_SHARE = 1e-4
 TINY_PERCENT = 0.01
 
 
-def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
+def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
     """Why no light can go from one surface to another, if so."""
     if len(scene.bodies) == 1 and _convex_from(scene.bodies[0], lists):
         return "one convex body lights nothing else"
@@ -292,16 +289,16 @@ def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | Non
     return None
 
 
-def stake(sight: Sight, counts: Counts) -> Stake:
+def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     """Of light that is late, the same for all rays: as its rms over points."""
-    rows = np.flatnonzero(sight.returned)
+    rows = np.flatnonzero(first_hits.returned)
     if not len(rows):
-        return sight.nothing("no ray returns")
-    found = _detours(sight, rows)
-    moved_m = np.minimum(found.shift_m, sight.width_m[rows][found.chosen])
+        return first_hits.nothing("no ray returns")
+    found = _detours(first_hits, rows)
+    moved_m = np.minimum(found.shift_m, first_hits.width_m[rows][found.chosen])
     squared_m2 = np.mean(moved_m**2)
-    by_spots_m2 = np.mean(moved_by_spots_m(sight) ** 2) if _is_flood(sight) else 0.0
-    alone = _hidden(sight, rows[found.chosen]) & (found.seen > 0)
+    by_spots_m2 = np.mean(moved_by_spots_m(first_hits) ** 2) if _is_flood(first_hits) else 0.0
+    alone = _hidden(first_hits, rows[found.chosen]) & (found.seen > 0)
     outweighed = np.mean((found.apart > 1) | alone)
     late = 100 * found.share.mean()
     reason = (
@@ -311,42 +308,43 @@ def stake(sight: Sight, counts: Counts) -> Stake:
     )
     if by_spots_m2 > squared_m2:
         reason = f"the spots of a flood light each other, {reason}"
-    return Stake(np.full(len(sight), max(squared_m2, by_spots_m2)), np.where(sight.returned, outweighed, 0.0), reason)
+    squared = np.full(len(first_hits), max(squared_m2, by_spots_m2))
+    return EffectBound(squared, np.where(first_hits.returned, outweighed, 0.0), reason)
 
 
-def _hidden(sight: Sight, rows: np.ndarray) -> np.ndarray:
+def _hidden(first_hits: FirstHits, rows: np.ndarray) -> np.ndarray:
     """Whether the light of some rays that hit something does not come straight to a receiver elsewhere, (K,) bool."""
-    receiver = sight.scene.receiver
+    receiver = first_hits.scene.receiver
     if receiver is None:
         return np.zeros(len(rows), dtype=bool)
-    home, origin_m = np.asarray(receiver.origin_m), sight.rays.origin_m[rows]
-    points = origin_m + sight.range_m[rows, None] * sight.rays.direction[rows]
+    home, origin_m = np.asarray(receiver.origin_m), first_hits.rays.origin_m[rows]
+    points = origin_m + first_hits.range_m[rows, None] * first_hits.rays.direction[rows]
     way, hidden = points - home, ~in_view(receiver, points)
     length_m = np.linalg.norm(way, axis=1)
     asked = ~hidden & (origin_m != home).any(axis=1) & (length_m > 0)
-    met_m = sight.caster.first_hit(np.broadcast_to(home, way[asked].shape), way[asked]).range_m
+    met_m = first_hits.caster.first_hit(np.broadcast_to(home, way[asked].shape), way[asked]).range_m
     hidden[asked] = met_m < length_m[asked] * (1 - CLEARANCE_SHARE)
     return hidden
 
 
-def _is_flood(sight: Sight) -> bool:
+def _is_flood(first_hits: FirstHits) -> bool:
     """Whether all rays are lit at once, and each is heard where it starts."""
-    photons = sight.detector.photons
-    return sight.scene.receiver is None and photons is not None and photons.emission == "flood"
+    photons = first_hits.detector.photons
+    return first_hits.scene.receiver is None and photons is not None and photons.emission == "flood"
 
 
-def _detours(sight: Sight, rows: np.ndarray) -> Detours:
-    rays, hits = sight.rays.subset(rows), sight.hits
+def _detours(first_hits: FirstHits, rows: np.ndarray) -> Detours:
+    rays, hits = first_hits.rays.subset(rows), first_hits.hits
     hits = Hits(hits.range_m[rows], hits.body[rows], hits.normal[rows])
-    photons, receiver = sight.detector.photons, sight.scene.receiver
+    photons, receiver = first_hits.detector.photons, first_hits.scene.receiver
     flood = photons is not None and photons.emission == "flood"
     if not flood and receiver is None:
-        beam_sr = math.pi * (sight.detector.divergence_rad / 2) ** 2
+        beam_sr = math.pi * (first_hits.detector.divergence_rad / 2) ** 2
         pixel_sr = beam_sr if photons is None else max(photons.field_of_view_sr, beam_sr)
-        return pixel_bound(sight.scene, rays, hits, sight.caster, pixel_sr, sight.resolution_m)
+        return pixel_bound(first_hits.scene, rays, hits, first_hits.caster, pixel_sr, first_hits.resolution_m)
     # a flood's pixels look at spots that its emitters light; a receiver alone hears what is sent anywhere in its view
     lamp_m = None if flood or receiver is None else np.asarray(receiver.origin_m)
-    return lamp_bound(sight.scene, rays, hits, sight.caster, lamp_m, sight.resolution_m)
+    return lamp_bound(first_hits.scene, rays, hits, first_hits.caster, lamp_m, first_hits.resolution_m)
 
 
 def _convex_from(body: Body, lists: Sequence[Rays]) -> bool:

@@ -4,9 +4,8 @@ Every photon falls into one of a ray's P pulses, each as likely as the others. A
 within the dead time before is alive; in it, the photon is counted. Light that is not synchronous with the pulses, and
 counts before the window opens, blind nobody: the detector is armed at the window's start.
 
-A detector that is blind after a count: echoes shifted towards their start, thinned, or hidden by what came before.
-
-What is left of the echo (see `Blindness`) strays, and is missed or mistaken, as fewer photons do: bounds grow by the
+What it could change (`bound`), as echoes are shifted towards their start, thinned, or hidden by what came before: what
+is left of the echo (see `Blindness`) strays, and is missed or mistaken, as fewer photons do: bounds grow by the
 difference. Nothing of this can be where no pulse has two counts: lost is at most the expected number of counts that are
 not there. Echoes are those that the air leaves, and haze is part of what they are mistaken for. Without an echo,
 background that is uneven is taken for one more often than is allowed, and haze less often than without.
@@ -22,8 +21,7 @@ from numba import njit
 
 from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import Detector, Photons, metres
-from lidardesign.simulate.detector.histogram import Bins
+from lidardesign.simulate.detector.detector import Bins, Detector, Photons, metres
 from lidardesign.simulate.effects.expected_counts import (
     Blindness,
     Counts,
@@ -32,7 +30,7 @@ from lidardesign.simulate.effects.expected_counts import (
     unevenness,
     variance_of_missing,
 )
-from lidardesign.simulate.effects.first_hits import Sight, Stake
+from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 from lidardesign.simulate.streams import normal, uniform
 
 # More photons in one bin than this are counted together, by mean and variance of how many pulses they fall into
@@ -49,7 +47,9 @@ DRAWS_PER_BIN = 1 << 32
 FIRST_BIN = 1 << 62
 
 
-def counted(counts: np.ndarray, bins: Bins, photons: Photons, rays: int, key: int, first_ray: int) -> np.ndarray:
+def survive_dead_time(
+    counts: np.ndarray, bins: Bins, photons: Photons, rays: int, key: int, first_ray: int
+) -> np.ndarray:
     """The photons that are counted among those that arrive, flat as `bins` says.
 
     Arguments:
@@ -183,22 +183,22 @@ def _by_pulse(times, size, pulses):  # noqa: ANN001, ANN202
     return ordered
 
 
-def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
+def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
     """Why it is never blind, if so."""
     if detector.photons is None:
         return "the detector does not count photons"
     return None if detector.photons.dead_s > 0 else "the detector has no dead time"
 
 
-def stake(sight: Sight, counts: Counts) -> Stake:
+def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     """Of counts that blind it."""
-    sigma_m = sight.sigma_m()
+    sigma_m = first_hits.sigma_m()
     blind = Blindness.of(counts)
     squared = (sigma_m * blind.early) ** 2 + variance_of_missing(counts, counts.in_air, blind.left, sigma_m)
-    lost = np.where(sight.returned, _beaten(counts, blind, sigma_m), _invented(counts, blind))
-    typical = float(np.median(blind.per_pulse[sight.returned] if sight.returned.any() else blind.per_pulse))
-    dead_ns = 1e9 * sight.detector.photons.dead_s
-    return Stake(squared, lost, f"{count_text(typical)} counts a pulse, {dead_ns:.3g} ns blind after each")
+    lost = np.where(first_hits.returned, _beaten(counts, blind, sigma_m), _invented(counts, blind))
+    typical = float(np.median(blind.per_pulse[first_hits.returned] if first_hits.returned.any() else blind.per_pulse))
+    dead_ns = 1e9 * first_hits.detector.photons.dead_s
+    return EffectBound(squared, lost, f"{count_text(typical)} counts a pulse, {dead_ns:.3g} ns blind after each")
 
 
 def _beaten(counts: Counts, blind: Blindness, sigma_m: np.ndarray) -> np.ndarray:

@@ -1,11 +1,10 @@
 """A receiver that stands elsewhere may not see what the emitter lights.
 
-What a fixed receiver sees of lit points: those in its view with nothing in between, or nothing but glass.
+It sees lit points in its view with nothing in between, or nothing but glass.
 
-A receiver that stands elsewhere: what the emitter lights may be hidden from it.
-
-What it sees of each point is not known without casting a ray there, so every return may be lost. Where a ray starts at
-the receiver the two see the same, and only what lies outside of the receiver's own view is lost, exactly.
+What it could change (`bound`): what the receiver sees of each point is not known without casting a ray there, so every
+return may be lost. Where a ray starts at the receiver the two see the same, and only what lies outside of the
+receiver's own view is lost, exactly.
 """
 
 from __future__ import annotations
@@ -21,10 +20,9 @@ from lidardesign.geometry.receiver import in_view
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.scene import Mesh, Scene
 from lidardesign.simulate.detector.detector import Detector
-from lidardesign.simulate.detector.light import Beams, Echoes
 from lidardesign.simulate.effects.expected_counts import Counts
-from lidardesign.simulate.effects.first_hits import Sight, Stake
-from lidardesign.simulate.physics import Tracer
+from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
+from lidardesign.simulate.light import Beams, Echoes, Tracer
 
 # Closed forms round at 1e-15 of a distance or so; this clears a surface and is far below the thickness of any pane.
 CLEARANCE_SHARE = 1e-5
@@ -102,7 +100,7 @@ def sight_shares(
     return share
 
 
-def heard(scene: Scene, beams: Beams, hits: Hits, echoes: Echoes, tracer: Tracer) -> Echoes:
+def visible_echoes(scene: Scene, beams: Beams, hits: Hits, echoes: Echoes, tracer: Tracer) -> Echoes:
     """The direct echoes that reach the scene's receiver, those behind glass fainter; all of them without a receiver.
 
     Arguments:
@@ -124,17 +122,17 @@ def heard(scene: Scene, beams: Beams, hits: Hits, echoes: Echoes, tracer: Tracer
     return replace(echoes, gain=echoes.gain * share).kept(share > 0)
 
 
-def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
+def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
     """Why all that is lit is seen, if so."""
     return None if scene.receiver is not None else "every ray is heard where it starts"
 
 
-def stake(sight: Sight, counts: Counts) -> Stake:
+def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     """Of points that the receiver does not see."""
-    receiver, rays = sight.scene.receiver, sight.rays
+    receiver, rays = first_hits.scene.receiver, first_hits.rays
     together = (rays.origin_m == np.asarray(receiver.origin_m)).all(axis=1)
-    points = rays.origin_m + sight.range_m[:, None] * rays.direction
-    lost = np.where(together, ~in_view(receiver, points), True) & sight.returned
+    points = rays.origin_m + first_hits.range_m[:, None] * rays.direction
+    lost = np.where(together, ~in_view(receiver, points), True) & first_hits.returned
     away, hidden = (f"{100 * share.mean():.3g} %" for share in (~together, lost))
     reason = f"{away} of rays start away from the receiver, {hidden} may not be seen by it"
-    return Stake(np.zeros(len(sight)), lost.astype(float), reason)
+    return EffectBound(np.zeros(len(first_hits)), lost.astype(float), reason)

@@ -9,8 +9,7 @@ where it stands are heard as without one. Mirrors are flat over the width of a b
 spread it. Panes do not bend light. A mirror that a beam meets squarely enough to shine back into the receiver is not
 taken for an echo.
 
-Mirrors and glass: what they lead elsewhere may meet anything, so every ray that they meet may be wrong.
-
+What it could change (`bound`): what they lead elsewhere may meet anything, so every ray that they meet may be wrong.
 Lost is the share of rays whose first hit is on a body that mirrors or lets through, and what else comes back of them
 may move their echoes by as much as the detector does not tell apart; the others are as they were. It bounds strictly:
 where that light goes is not known without following it, and how much it weighs is not asked.
@@ -28,11 +27,10 @@ from lidardesign.geometry.rays import Hits, Rays
 from lidardesign.geometry.receiver import in_view
 from lidardesign.scene import Scene
 from lidardesign.simulate.detector.detector import Detector
-from lidardesign.simulate.detector.light import Beams, Echoes
 from lidardesign.simulate.effects.expected_counts import Counts
-from lidardesign.simulate.effects.first_hits import Sight, Stake
+from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 from lidardesign.simulate.effects.shadowing import clearance_m, sight_shares
-from lidardesign.simulate.physics import Tracer, direct_echoes
+from lidardesign.simulate.light import Beams, Echoes, Tracer, direct_echoes
 
 # Beams that have met more surfaces than this are given up: four panes, in and out.
 MAXIMUM_TURNS = 8
@@ -179,18 +177,19 @@ def _no_echoes() -> Echoes:
     return Echoes(np.empty(0, dtype=np.int64), np.empty(0), np.empty(0), np.empty(0, dtype=np.int64))
 
 
-def absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
+def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:
     """Why light is led nowhere else, if so."""
     return None if any(_leads(body) for body in scene.bodies) else "nothing mirrors or lets light through"
 
 
-def stake(sight: Sight, counts: Counts) -> Stake:
+def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     """Of light that goes on."""
-    leading = np.array([_leads(body) for body in sight.scene.bodies])
-    met = np.where(sight.hits.body >= 0, leading[sight.hits.body], False)
-    names = ", ".join(dict.fromkeys(body.name for body in sight.scene.bodies if _leads(body)))
-    moved_m = np.minimum(sight.resolution_m, sight.width_m) * met
-    return Stake(moved_m**2, met.astype(float), f"{100 * met.mean():.3g} % of rays meet mirrors or glass: {names}")
+    leading = np.array([_leads(body) for body in first_hits.scene.bodies])
+    met = np.where(first_hits.hits.body >= 0, leading[first_hits.hits.body], False)
+    names = ", ".join(dict.fromkeys(body.name for body in first_hits.scene.bodies if _leads(body)))
+    moved_m = np.minimum(first_hits.resolution_m, first_hits.width_m) * met
+    reason = f"{100 * met.mean():.3g} % of rays meet mirrors or glass: {names}"
+    return EffectBound(moved_m**2, met.astype(float), reason)
 
 
 def _leads(body: object) -> bool:

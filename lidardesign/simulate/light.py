@@ -1,22 +1,20 @@
-"""Light on its way out and back: beams that leave an emitter, echoes that come home.
+"""Light on its way out and back: beams that leave an emitter, echoes that come home, and light of the surroundings.
 
-Both are flat lists that name the ray of a design that each entry belongs to, so that a ray may have many.
-
-How much light of the surroundings falls on surfaces per wavelength, given its illuminance.
-
-The sun is the global spectrum of ASTM G173-03, which gives 109,495 lux (683 lm/W and the photopic curve of CIE 1924).
-Rooms have white LEDs: CIE's illuminant LED-B3 (CIE 15:2018, 4103 K). Both are means of 10 nm; finer lines, as of
-oxygen at 760 nm, are not resolved.
+Beams and echoes are flat lists that name the ray of a design that each entry belongs to, so that a ray may have many.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from lidardesign.geometry.rays import Rays
-from lidardesign.scene import Ambient
+from lidardesign.geometry.rays import Hits, Rays
+from lidardesign.scene import Ambient, Scene
+
+# First hits of rays (N, 3), (N, 3) that are sent at times (N,) [s] within the frame.
+Tracer = Callable[[np.ndarray, np.ndarray, np.ndarray], Hits]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +92,27 @@ class Background:
     counts: np.ndarray | None = None
 
 
+def direct_echoes(scene: Scene, beams: Beams, hits: Hits) -> Echoes:
+    """The echo of every beam's first hit, wherever it is heard: share * reflectance * cosine / (pi * distance^2)."""
+    seen = np.flatnonzero(hits.body >= 0)
+    points = beams.origin_m[seen] + hits.range_m[seen, None] * beams.direction[seen]
+    origins = beams.origin_m[seen]
+    home = origins if scene.receiver is None else np.broadcast_to(np.asarray(scene.receiver.origin_m), origins.shape)
+    back = home - points
+    # what starts at the receiver comes back by the way that it took, to the last bit
+    back_m = np.where((origins == home).all(axis=1), hits.range_m[seen], np.linalg.norm(back, axis=1))
+    reflectance = np.array([body.reflectance for body in scene.bodies])[hits.body[seen]]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cosine = np.maximum(np.einsum("nk,nk->n", hits.normal[seen], back) / back_m, 0.0)
+        gain = beams.share[seen] * reflectance * cosine / (np.pi * back_m**2)
+    # a surface that touches the receiver blinds it, unless it is black: finite, and stronger than anything else
+    gain = np.nan_to_num(gain, nan=np.finfo(float).max, posinf=np.finfo(float).max) * (reflectance > 0)
+    return Echoes(beams.ray[seen], (hits.range_m[seen] + back_m) / 2, gain, hits.body[seen])
+
+
+# The sun is the global spectrum of ASTM G173-03, which gives 109,495 lux (683 lm/W and the photopic curve of CIE 1924).
+# Rooms have white LEDs: CIE's illuminant LED-B3 (CIE 15:2018, 4103 K). Both are means of 10 nm; finer lines, as of
+# oxygen at 760 nm, are not resolved.
 STEP_NM = 10.0
 FIRST_NM = 380.0
 # W / (m^2 nm) at 100,000 lux
