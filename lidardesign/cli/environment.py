@@ -24,7 +24,7 @@ STREAM_DESCRIPTORS = (0, 1, 2)
 
 
 class TerminatedError(KeyboardInterrupt):
-    """SIGTERM, treated like an interruption by whoever cleans up."""
+    """SIGTERM, treated like an interruption where things are tidied up."""
 
 
 def set_thread_defaults() -> None:
@@ -38,16 +38,13 @@ def set_cache_default() -> None:
 
     numba refuses to import otherwise. Nobody else can write there: numba's cache is code.
     """
-    places = (Path(__file__).parents[1] / "density" / "fields" / "__pycache__", _user_caches() / "numba")
+    user_caches = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+    places = (Path(__file__).parents[1] / "density" / "fields" / "__pycache__", user_caches / "numba")
     if "NUMBA_CACHE_DIR" in os.environ or any(_can_be_written(place) for place in places):
         return
     folder = tempfile.mkdtemp(prefix="lidardesign-numba-")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     os.environ["NUMBA_CACHE_DIR"] = folder
-
-
-def _user_caches() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
 
 
 def _can_be_written(folder: Path) -> bool:
@@ -62,7 +59,11 @@ def _can_be_written(folder: Path) -> bool:
 
 def make_streams_tolerant() -> None:
     """Escape characters that the terminal lacks; a stream that was closed swallows its output."""
-    _occupy_descriptors()
+    for descriptor in STREAM_DESCRIPTORS:
+        try:
+            os.fstat(descriptor)
+        except OSError:  # closed: else the next file that is opened takes its place, and what is printed there
+            os.open(os.devnull, os.O_RDWR)
     if sys.stdout is None:
         sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - lives as long as the process
     if sys.stderr is None:
@@ -70,15 +71,6 @@ def make_streams_tolerant() -> None:
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(AttributeError, ValueError):
             stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
-
-
-def _occupy_descriptors() -> None:
-    """Open those of the streams that are closed on nothing: else the next file takes their place, and what they say."""
-    for descriptor in STREAM_DESCRIPTORS:
-        try:
-            os.fstat(descriptor)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)
 
 
 def terminate_cleanly() -> None:

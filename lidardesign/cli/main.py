@@ -25,7 +25,7 @@ from lidardesign.cli.commands.learn import learn
 from lidardesign.cli.commands.show import show
 from lidardesign.cli.commands.tasks import tasks_app
 from lidardesign.cli.environment import make_streams_tolerant, set_cache_default, set_thread_defaults, terminate_cleanly
-from lidardesign.cli.manual import PAGES, add_manuals
+from lidardesign.cli.manual import ManualCommand
 from lidardesign.cli.output import (
     EXIT_BROKEN_PIPE,
     Output,
@@ -59,7 +59,9 @@ app.add_typer(catalog_app, name="catalog")
 app.add_typer(config_app, name="config")
 for subcommand in (learn, fit, constrain, evaluate, export, capture, show, compare, completion):
     app.command(context_settings=SETTINGS)(subcommand)
-add_manuals({"": app, "tasks": tasks_app, "catalog": catalog_app, "config": config_app}, PAGES)
+for group in (app, tasks_app, catalog_app, config_app):
+    for registered in group.registered_commands:
+        registered.cls = ManualCommand
 
 
 def _print_version(wanted: bool) -> None:

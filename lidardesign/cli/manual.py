@@ -1,6 +1,6 @@
 """The manual page behind `--help`: what a command reads and writes, examples, exit codes, where to read on.
 
-What the manual pages say, by command. Every example is parsed, and run where it can be, by the tests.
+Every example is parsed, and run where it can be, by the tests.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import typer
 from typer.core import TyperCommand
 
 WIDEST = 100
@@ -52,63 +51,30 @@ class ManualCommand(TyperCommand):
             print(manual_text(manual, min(WIDEST, shutil.get_terminal_size().columns)))
 
 
-MANUALS: dict[str, Manual] = {}
-
-
-def add_manuals(groups: Mapping[str, typer.Typer], pages: Mapping[str, Manual]) -> None:
-    """Give every command of the program its manual.
-
-    Arguments:
-        groups: The program, by "", and its groups of commands by name.
-        pages: Manuals by the words of the command.
-    """
-    for group, application in groups.items():
-        for information in application.registered_commands:
-            own = information.name or str(getattr(information.callback, "__name__", "")).strip("_").replace("_", "-")
-            path = f"{group} {own}".strip()
-            if path in pages:
-                MANUALS[path], information.cls = pages[path], ManualCommand
-
-
 def manual_text(manual: Manual, width: int) -> str:
-    """The manual as text; examples stay on one line, so that they can be copied.
+    """The manual as text, so wide; examples stay on one line, so that they can be copied."""
 
-    Arguments:
-        manual: What to say.
-        width: Columns of the terminal.
-    """
-    sections: list[tuple[str, list[str]]] = []
-    if manual.about:
-        sections.append(("About", _wrapped(manual.about, width)))
-    if manual.files:
-        sections.append(("Files", [line for entry in manual.files for line in _wrapped(entry, width)]))
-    if manual.examples:
-        sections.append(("Examples", _example_lines(manual.examples, width)))
-    codes = {**COMMON_EXITS, **(manual.exits or {})}
-    exits = "; ".join(f"{code} {words}" for code, words in sorted(codes.items()))
-    sections.append(("Exit codes", _wrapped(exits, width)))
-    if manual.see:
-        sections.append(("See", [f"   {', '.join(DOCS + page for page in manual.see)}"]))
-    return "\n".join(line for title, lines in sections for line in (f" {title}", *lines, ""))
+    def wrapped(text: str, indent: str = "   ", further: str = "     ", **how: bool) -> list[str]:
+        return textwrap.wrap(text, width - 1, initial_indent=indent, subsequent_indent=further, **how)
 
-
-def _wrapped(text: str, width: int) -> list[str]:
-    return textwrap.wrap(
-        text, width - 1, initial_indent="   ", subsequent_indent="     ", break_long_words=False, break_on_hyphens=False
-    )
-
-
-def _example_lines(examples: Mapping[str, str], width: int) -> list[str]:
-    lines = []
-    for example, words in examples.items():
-        lines.append(f"   {example}")
-        lines += textwrap.wrap(words, width - 1, initial_indent=" " * 7, subsequent_indent=" " * 7)
-    return lines
+    whole_words = {"break_long_words": False, "break_on_hyphens": False}
+    examples: list[str] = []
+    for example, words in manual.examples.items():
+        examples += [f"   {example}", *wrapped(words, " " * 7, " " * 7)]
+    codes = sorted({**COMMON_EXITS, **(manual.exits or {})}.items())
+    sections = {
+        "About": wrapped(manual.about, **whole_words),
+        "Files": [line for entry in manual.files for line in wrapped(entry, **whole_words)],
+        "Examples": examples,
+        "Exit codes": wrapped("; ".join(f"{code} {words}" for code, words in codes), **whole_words),
+        "See": [f"   {', '.join(DOCS + page for page in manual.see)}"] if manual.see else [],
+    }
+    return "\n".join(line for title, lines in sections.items() if lines for line in (f" {title}", *lines, ""))
 
 
 GOAL = {1: "a threshold was missed"}
 
-PAGES: dict[str, Manual] = {
+MANUALS: dict[str, Manual] = {
     "learn": Manual(
         {
             "lidardesign learn face --preset draft --out runs/face": "half a minute, for trials",
