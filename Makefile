@@ -1,5 +1,6 @@
 # make demo   sets everything up in .venv and runs the whole chain on the built-in face task, about three minutes
-# make test   sets up, lints and runs the tests, a few minutes; also installs the light-transport simulator, 200 MB
+# make test   sets up, lints and runs the tests, a few minutes; installs nothing outside of .venv, 400 MB there
+# make consumers  installs the programs that tests give exported files to, from the system's packages, as CI does
 # make test-arithmetic  runs the commands of the docs with the arithmetic of a plain processor, two minutes
 # make fuzz   reads 100,000 damaged files, an hour on two cores; the result goes to docs/soak
 # make coverage  measures the lines and branches that the tests take, an hour
@@ -15,7 +16,7 @@ export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 export OMP_WAIT_POLICY ?= PASSIVE
 
-.PHONY: demo test test-arithmetic coverage mutation lint fuzz soak soak-runs soak-seeds soak-kills clean
+.PHONY: demo test consumers system-programs test-arithmetic coverage mutation lint fuzz soak soak-runs soak-seeds soak-kills clean
 
 $(BIN)/.ready: pyproject.toml constraints.txt
 	@echo "Setting up $(VENV): once, a minute or more"
@@ -32,15 +33,20 @@ $(BIN)/.transport: $(BIN)/.ready
 	@echo "Adding the light-transport simulator: once, 200 MB"
 	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[transport]' \
 		&& touch $@ || echo "It could not be installed; its tests are skipped"
-	@tools/install-llvm.sh $(BIN)/python
 
 $(BIN)/.consumers: $(BIN)/.ready
 	@echo "Adding the readers of exported files: once, 200 MB"
 	@PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[consumers]' \
 		&& touch $@ || echo "They could not be installed; their tests are skipped"
+
+# Programs of the system's packages: in CI and on demand alone. Tests that miss one are skipped and say why.
+system-programs: $(BIN)/.transport
+	@tools/install-llvm.sh $(BIN)/python
 	@tools/install-consumers.sh
 
-test: $(BIN)/.ready $(BIN)/.transport $(BIN)/.consumers
+consumers: $(BIN)/.transport $(BIN)/.consumers system-programs
+
+test: $(BIN)/.ready $(BIN)/.transport $(BIN)/.consumers $(if $(filter true,$(CI)),system-programs)
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from pydantic import Field, model_validator
+from support.tables import each_row
 
 from lidardesign import config as config_module
 from lidardesign.config import (
@@ -196,7 +197,7 @@ BAD_OVERRIDES = {
 }
 
 
-@pytest.mark.parametrize("override", BAD_OVERRIDES)
+@each_row("override", BAD_OVERRIDES)
 def test_errors_in_an_override_show_it(override):
     with pytest.raises(ConfigError) as caught:
         resolve(TASK, overrides=[override])
@@ -260,7 +261,7 @@ def test_a_run_is_judged_by_other_values_of_its_task_and_keeps_the_rest():
     assert judged_by(TASK, config, []) == config
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("override", "message"),
     [
         ("count=4", "design space"),

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from lidardesign_tasks.arm_files import model_files
 from lidardesign_tasks.arm_robot import load_robot
+from support.tables import each_row
 
 from lidardesign.design.files import load_design
 from lidardesign.errors import ConfigError, DataError
@@ -71,14 +72,14 @@ def unsafe(tree):
 READS_NO_FILE = {"lidardesign/testing/scenes.py": "imports pickle"}
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+@each_row("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_a_module_runs_no_code_of_files(path):
     known = READS_NO_FILE.get(path.relative_to(ROOT).as_posix())
     found = [words.partition(": ")[2] for words in unsafe(ast.parse(path.read_text(encoding="utf-8")))]
     assert found == ([known] if known else [])
 
 
-@pytest.mark.parametrize(
+@each_row(
     "code",
     [
         "import pickle", "from pickle import loads", "import torch\ntorch.load(p)", "np.load(p)", "eval(text)",
@@ -90,7 +91,7 @@ def test_what_could_run_code_is_found(code):
     assert len(list(unsafe(ast.parse(code)))) == 1
 
 
-@pytest.mark.parametrize("mark", ["\\e[31m", "\\e]0;title\\a", "\\r", "\\b", "\\x9b2J", "\\n"])
+@each_row("mark", ["\\e[31m", "\\e]0;title\\a", "\\r", "\\b", "\\x9b2J", "\\n"])
 def test_a_name_that_would_steer_the_terminal_is_refused(tmp_path, mark):
     path = tmp_path / "d.yaml"
     sensor = "origin_m: {mean: [0, 0, 0]}\n  boresight: {azimuth_rad: 0, elevation_rad: 0}\n"

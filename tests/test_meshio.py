@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from support.tables import each_row
 
 from lidardesign.errors import DataError
 from lidardesign.meshio import (
@@ -33,7 +34,7 @@ def write_box(path, vertices=BOX_VERTICES, faces=BOX_FACES):
     return path
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@each_row("suffix", SUFFIXES)
 def test_a_closed_box_comes_back_from_every_format_as_a_solid(tmp_path, suffix):
     mesh = load_mesh(write_box(tmp_path / f"box{suffix}"))
     assert mesh.sign == "solid"

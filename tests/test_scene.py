@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 from support import references
+from support.tables import each_row
 
 from lidardesign.errors import DataError
 from lidardesign.geometry.surface import sample_body, sample_triangles, surface_area_m2
@@ -35,7 +36,7 @@ BAD_BODIES = {
 }
 
 
-@pytest.mark.parametrize("case", BAD_BODIES)
+@each_row("case", BAD_BODIES)
 def test_poses_that_are_not_rigid_are_refused_with_the_body(case):
     poses, message = BAD_BODIES[case]
     with pytest.raises(DataError, match=f"(?s)'lamp'.*{message}"):
@@ -70,7 +71,7 @@ BAD_MESHES = {
 }
 
 
-@pytest.mark.parametrize("case", BAD_MESHES)
+@each_row("case", BAD_MESHES)
 def test_meshes_that_cannot_be_are_refused(case):
     vertices, faces, message = BAD_MESHES[case]
     with pytest.raises(DataError, match=message):
@@ -102,7 +103,7 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@each_row("name", SHAPES)
 def test_surface_points_lie_on_the_surface_and_areas_are_right(name):
     shape, area = SHAPES[name]
     body = Body(shape, poses=rigid(Rotation.from_rotvec([0.4, 1.0, -0.2]).as_matrix(), (0.1, 0.2, 0.3)))

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support import references
+from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.space import AZIMUTH, ELEVATION, DesignSpace, aim, angles, direction, observed_point
@@ -162,7 +163,7 @@ BAD_BOUNDS = {
 }
 
 
-@pytest.mark.parametrize("case", BAD_BOUNDS)
+@each_row("case", BAD_BOUNDS)
 def test_bounds_that_cannot_be_are_refused_by_name(case):
     low, high, options, message = BAD_BOUNDS[case]
     with pytest.raises(ConfigError, match=message):

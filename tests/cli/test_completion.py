@@ -17,6 +17,7 @@ import typer
 from hypothesis import given
 from hypothesis import strategies as st
 from support.command_line import make_run, program
+from support.tables import each_row
 
 from lidardesign.cli import candidates
 from lidardesign.cli.candidates import BASELINES, FILE, FOLDER, PATH, BashCompletion, ShellCompletion, split_line
@@ -95,7 +96,7 @@ def test_an_option_that_may_stand_once_is_not_offered_again(root):
     assert "--set" in options
 
 
-@pytest.mark.parametrize("line", ["learn fl", "learn --seed 3 fl", "config init fl", "tasks show fl", "learn -- fl"])
+@each_row("line", ["learn fl", "learn --seed 3 fl", "config init fl", "tasks show fl", "learn -- fl"])
 def test_tasks_are_completed_where_one_is_wanted(root, line):
     assert completed(root, line) == ["flatland"]
 
@@ -155,7 +156,7 @@ def test_runs_and_designs_are_completed_and_other_folders_lead_on(root, place, m
     assert completed(root, "fit absent/") == []
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("line", "kind"),
     [
         ("learn face --config ", {FILE}),

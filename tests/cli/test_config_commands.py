@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.command_line import caller, make_run
+from support.tables import each_row
 
 from lidardesign.config import PRESETS, DensitySettings, LearningSettings, resolve
 from lidardesign.design.constraints.document import Constraints
@@ -45,7 +46,7 @@ def uncommented(text):
     return whole
 
 
-@pytest.mark.parametrize("name", TASKS)
+@each_row("name", TASKS)
 def test_a_file_to_begin_with_changes_nothing(name, tmp_path):
     task = load_task(name)
     needed = ("folder=.",) if name in WITHOUT_DEFAULTS else ()
@@ -58,8 +59,8 @@ def test_a_file_to_begin_with_changes_nothing(name, tmp_path):
         assert resolve(task, preset=preset, config_file=path) == resolve(task, preset=preset)
 
 
-@pytest.mark.parametrize("name", [name for name in TASKS if name not in WITHOUT_DEFAULTS])
-@pytest.mark.parametrize("preset", PRESETS)
+@each_row("name", [name for name in TASKS if name not in WITHOUT_DEFAULTS])
+@each_row("preset", PRESETS)
 def test_all_of_its_defaults_are_the_ones_that_hold(name, preset, tmp_path):
     task = load_task(name)
     path = written(task, tmp_path, preset)
@@ -67,7 +68,7 @@ def test_all_of_its_defaults_are_the_ones_that_hold(name, preset, tmp_path):
     assert resolve(task, config_file=path).as_document() == resolve(task, preset=preset).as_document()
 
 
-@pytest.mark.parametrize("name", TASKS)
+@each_row("name", TASKS)
 def test_every_key_is_there_with_what_it_is(name, tmp_path):
     task = load_task(name)
     text = written(task, tmp_path).read_text()
@@ -158,7 +159,7 @@ def test_schemas_are_schemas_and_are_printed_as_such(lidardesign, kind):
     assert lidardesign("config", "schema", kind, "--json").json["schema"] == printed
 
 
-@pytest.mark.parametrize("name", TASKS)
+@each_row("name", TASKS)
 def test_a_configuration_that_is_resolved_is_valid(name, tmp_path):
     task = load_task(name)
     document = parse_yaml(uncommented(written(task, tmp_path).read_text()), where="text").value
@@ -197,7 +198,7 @@ CONFIGURATIONS = [
 ]
 
 
-@pytest.mark.parametrize("values", CONFIGURATIONS, ids=str)
+@each_row("values", CONFIGURATIONS, ids=str)
 def test_the_schema_of_a_configuration_takes_what_the_program_takes(values, tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text(dump_yaml(values))
@@ -238,7 +239,7 @@ CONSTRAINTS = [
 ]
 
 
-@pytest.mark.parametrize("values", CONSTRAINTS, ids=str)
+@each_row("values", CONSTRAINTS, ids=str)
 def test_the_schema_of_constraints_takes_what_the_program_takes(values):
     try:
         Constraints.from_mapping(values)

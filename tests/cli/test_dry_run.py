@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from support.command_line import caller, files_under, make_run
+from support.tables import each_row
 
 from lidardesign.run.manifest import read_manifest, write_manifest
 
@@ -128,7 +129,7 @@ def refusing(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize(("arguments", "code"), REFUSED, ids=[one[0] for one in REFUSED])
+@each_row(("arguments", "code"), REFUSED, ids=[one[0] for one in REFUSED])
 def test_what_the_command_would_refuse_is_refused(capsys, monkeypatch, refusing, arguments, code):
     call = caller(capsys, refusing, monkeypatch)
     if not (refusing / "fitted" / "designs").exists():

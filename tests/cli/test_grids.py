@@ -6,6 +6,7 @@ import io
 
 import pytest
 from rich.console import Console
+from support.tables import each_row
 
 from lidardesign.cli.tables.grids import print_table
 from lidardesign.evaluate.verdicts import plain
@@ -46,7 +47,7 @@ def test_wide_terminals_have_one_line_per_row():
     assert "│" not in printed(56)
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("value", "digits", "shown"),
     [(0.0, 2, "0"), (1300.0, 2, "1,300"), (99.9, 2, "100"), (14.71, 3, "14.7"), (0.0036, 2, "0.0036"),
      (1.7e-7, 2, "<0.0001"), (1.0, 2, "1"), (1.5, 2, "1.5")],

@@ -43,19 +43,10 @@ def test_listing_formats_and_tasks_imports_no_torch():
 
 
 def test_the_modules_that_constrain_needs_import_no_torch():
-    code = "\n".join(
-        f"import lidardesign.{name}"
-        for name in ("config", "samples", "design.files", "design.fit", "design.constraints.check")
-    )
-    assert not modules_after(code) & {
-        "torch",
-        "zuko",
-        "numba",
-        "trimesh",
-        "matplotlib",
-        "plotly",
-        "scipy.stats",
-    }
+    constraints = ("design.constraints.check", "design.constraints.document")
+    names = ("config", "samples", "design.files", "design.fit", *constraints)
+    code = "\n".join(f"import lidardesign.{name}" for name in names)
+    assert not modules_after(code) & {"torch", "zuko", "numba", "trimesh", "matplotlib", "plotly", "scipy.stats"}
 
 
 def test_threads_are_limited_before_torch_can_be_imported():

@@ -20,6 +20,7 @@ import pytest
 import trimesh
 import typer
 from support.command_line import caller, files_under, make_run, program
+from support.tables import each_row
 
 from lidardesign.cli.main import app
 from lidardesign.cli.manual import MANUALS
@@ -248,7 +249,7 @@ def examples():
                     yield pytest.param(words[words.index("lidardesign") + 1 :], id=f"{name}: {part}")
 
 
-@pytest.mark.parametrize("words", list(examples()))
+@each_row("words", list(examples()))
 def test_an_example_is_parsed_by_the_program(words):
     command = typer.main.get_command(app)
     while hasattr(command, "commands"):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from support.tables import each_row
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.flow.flow import DesignFlow
@@ -47,9 +48,9 @@ def targets(space, visibility, sigma_m=0.03):
     return host, on_device(host, CPU)
 
 
-@pytest.mark.parametrize("visibility", ["off", "quadrature"])
-@pytest.mark.parametrize("space", [FIXED, FREE], ids=["fixed origin", "free origin, in angles"])
-@pytest.mark.parametrize("sigma_m", [None, 0.1])
+@each_row("visibility", ["off", "quadrature"])
+@each_row("space", [FIXED, FREE], ids=["fixed origin", "free origin, in angles"])
+@each_row("sigma_m", [None, 0.1])
 def test_values_and_gradients_are_those_of_the_compiled_loops(space, visibility, sigma_m):
     host, device = targets(space, visibility)
     assert isinstance(device, DeviceTarget)

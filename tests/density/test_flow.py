@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from support import references
+from support.tables import each_row
 
 from lidardesign.density.flow.flow import DesignFlow
 from lidardesign.density.flow.objective import Coordinates
@@ -48,7 +49,7 @@ def draw(flow, count, seed=1):
     return base, context
 
 
-@pytest.mark.parametrize("name", FLOWS)
+@each_row("name", FLOWS)
 def test_samples_have_the_density_that_foreign_points_there_have(name):
     flow = flow_of(name)
     base, context = draw(flow, 300)
@@ -59,7 +60,7 @@ def test_samples_have_the_density_that_foreign_points_there_have(name):
     np.testing.assert_allclose(again.numpy(), log_prob.numpy(), atol=references.FLOW_ROUND_TRIP_NATS)
 
 
-@pytest.mark.parametrize("name", FLOWS)
+@each_row("name", FLOWS)
 def test_the_density_is_the_jacobian_of_sampling(name):
     flow = flow_of(name)
     base, context = draw(flow, 10)
@@ -94,7 +95,7 @@ def test_a_conditional_density_integrates_to_one_for_every_condition_and_depends
     assert (curves[0] - curves[2]).abs().max() > 0.05
 
 
-@pytest.mark.parametrize("name", FLOWS)
+@each_row("name", FLOWS)
 def test_every_parameter_gets_a_finite_gradient(name):
     flow = flow_of(name, scale=1.0)
     base, context = draw(flow, 64)

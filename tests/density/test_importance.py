@@ -10,6 +10,7 @@ import torch
 import trimesh
 from lidardesign_tasks.face import FaceConfig, FaceTask
 from support.small_runs import shifted
+from support.tables import each_row
 
 from lidardesign.config import DensitySettings, LearningSettings, RunConfig
 from lidardesign.density.fields.grids import grid_around
@@ -108,7 +109,7 @@ def built(make, visibility, shape, factor=1.0):
     return build_target(make(shape, factor), SPACE, SETTINGS, visibility)
 
 
-@pytest.mark.parametrize("case", CASES)
+@each_row("case", CASES)
 def test_no_weights_and_weights_of_one_are_the_same_target_to_the_bit(case):
     make, visibility, _ = CASES[case]
     points = SPACE.sample(300, np.random.default_rng(1))
@@ -126,7 +127,7 @@ def test_no_weights_and_weights_of_one_are_the_same_target_to_the_bit(case):
 CONSTANTS = [(case, of) for case in CASES for of in ("vertices", "body") if of == "body" or CASES[case][0] is not mixed]
 
 
-@pytest.mark.parametrize(("case", "of"), CONSTANTS)
+@each_row(("case", "of"), CONSTANTS)
 def test_a_constant_weight_moves_log_density_by_its_log_and_nothing_else(case, of):
     make, visibility, kind = CASES[case]
     points = SPACE.sample(300, np.random.default_rng(1))
@@ -144,7 +145,7 @@ def test_a_constant_weight_moves_log_density_by_its_log_and_nothing_else(case, o
     assert weighted.log_peak - plain.log_peak == pytest.approx(np.log(7.0), abs=1e-6)
 
 
-@pytest.mark.parametrize("case", CASES)
+@each_row("case", CASES)
 def test_the_gradient_is_that_of_finite_differences(case):
     make, visibility, _ = CASES[case]
     target = built(make, visibility, ball(sideways))
@@ -338,7 +339,7 @@ def test_independent_proposals_measure_log_z_of_the_weighted_density(make):
     assert log_z[1] == pytest.approx(float(logsumexp(parts + np.log(factors))), abs=1e-6)
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("weights", "words"),
     [
         (np.ones(5), "shape"),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from support.small_runs import shifted
+from support.tables import each_row
 
 from lidardesign.config import DensitySettings, LearningSettings, RunConfig
 from lidardesign.density import learn as learning
@@ -244,7 +245,7 @@ def damage_missing(path):
     path.unlink()
 
 
-@pytest.mark.parametrize("damage", [damage_truncate, damage_flip, damage_pickle, damage_foreign, damage_missing])
+@each_row("damage", [damage_truncate, damage_flip, damage_pickle, damage_foreign, damage_missing])
 def test_a_damaged_checkpoint_is_a_data_error_that_names_it(tmp_path, damage):
     with pytest.raises(KeyboardInterrupt):
         learn(BallTask(), config_of(), tmp_path, progress=Interrupter(60))

@@ -7,6 +7,7 @@ import pytest
 from density.test_learn import BallTask, Interrupter, config_of
 from hypothesis import given
 from hypothesis import strategies as st
+from support.tables import each_row
 
 from lidardesign.config import LearningSettings
 from lidardesign.density.learn import learn
@@ -34,7 +35,7 @@ def contents(run):
     return {path.name: path.read_bytes() for path in (run / FOLDER).iterdir()}
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("steps", "balance", "kept"),
     [
         (1000, 0.5, (500, 609, 625, 734, 750)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from support.tables import each_row
 from torch import Tensor
 
 from lidardesign.density.flow.splines import EDGE, BoundedSpline, spline
@@ -30,8 +31,8 @@ def reference(values: Tensor, parameters: Tensor, inverted: bool) -> tuple[Tenso
     return made.call_and_ladj(values)
 
 
-@pytest.mark.parametrize("inverted", [False, True])
-@pytest.mark.parametrize("scale", [0.1, 1.0, 5.0])
+@each_row("inverted", [False, True])
+@each_row("scale", [0.1, 1.0, 5.0])
 def test_compiled_splines_agree_with_array_splines(scale, inverted):
     values, parameters = values_of(), parameters_of(scale)
     for found, expected in zip(
@@ -40,8 +41,8 @@ def test_compiled_splines_agree_with_array_splines(scale, inverted):
         torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-10)
 
 
-@pytest.mark.parametrize("inverted", [False, True])
-@pytest.mark.parametrize("scale", [0.1, 1.0, 3.0])
+@each_row("inverted", [False, True])
+@each_row("scale", [0.1, 1.0, 3.0])
 def test_their_gradients_agree_by_values_and_by_every_parameter(scale, inverted):
     weights = values_of(2), values_of(3)
     gradients = []
@@ -73,9 +74,9 @@ def test_float32_parameters_cost_only_the_rounding_of_the_parameters():
         assert (single.double() - double).abs().max() <= 16 * torch.finfo(torch.float32).eps * (1 + double.abs().max())
 
 
-@pytest.mark.parametrize("inverted", [False, True])
-@pytest.mark.parametrize("scale", [10.0, 1000.0])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@each_row("inverted", [False, True])
+@each_row("scale", [10.0, 1000.0])
+@each_row("dtype", [torch.float32, torch.float64])
 def test_extreme_parameters_and_edges_stay_finite_inside_the_box(scale, inverted, dtype):
     parameters = parameters_of(scale, dtype=dtype).requires_grad_()
     values = values_of(dtype=dtype)

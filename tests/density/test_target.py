@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from support import references
+from support.tables import each_row
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.target.target import build_target
@@ -61,8 +62,8 @@ def test_the_target_equals_its_naive_twin(visibility):
     np.testing.assert_allclose(target.log_density(points), expected, atol=1e-9, rtol=1e-12)
 
 
-@pytest.mark.parametrize("space", [SPACE, ANGLES], ids=["solid angle", "angles"])
-@pytest.mark.parametrize("visibility", ["off", "quadrature", "raycast"])
+@each_row("space", [SPACE, ANGLES], ids=["solid angle", "angles"])
+@each_row("visibility", ["off", "quadrature", "raycast"])
 def test_gradients_match_differences_of_the_values(visibility, space):
     target = build_target(balls(), space, SETTINGS, visibility)
     points = points_near(spread=0.15)
@@ -88,7 +89,7 @@ def test_values_are_the_same_with_and_without_gradient_and_in_any_chunks(visibil
     np.testing.assert_array_equal(np.concatenate([part[1] for part in parts]), gradient)
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("visibility", "incidence_deg"),
     # at an angle the soft edge of the quadrature reaches into the margin: T is 0.96 at 45 degrees
     [("off", 0.0), ("raycast", 0.0), ("quadrature", 0.0), ("off", 45.0), ("raycast", 45.0)],

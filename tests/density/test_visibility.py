@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
+from support.tables import each_row
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields.distance import build_field
@@ -56,8 +57,8 @@ def both_ways(scene, points=2000):
     return {"raycast": Raycast([scene]), "quadrature": Quadrature(field, points)}
 
 
-@pytest.mark.parametrize("name", ["raycast", "quadrature"])
-@pytest.mark.parametrize("thing", ["ball", "plate", "mesh"])
+@each_row("name", ["raycast", "quadrature"])
+@each_row("thing", ["ball", "plate", "mesh"])
 def test_transmittance_lies_between_zero_and_one_and_never_rises_with_range(name, thing):
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.3)
     bodies = {

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.command_line import caller, make_run
+from support.tables import each_row
 
 from lidardesign.design.catalog.library import FOLDER, find_part, load_library
 from lidardesign.design.catalog.part import Part, conditions_of, disagreements, thinned, to_angles, to_directions
@@ -96,7 +97,7 @@ def test_more_than_twenty_parts_are_shipped_and_all_that_were_asked_for():
     assert len(LIBRARY.names) >= 40
 
 
-@pytest.mark.parametrize("name", LIBRARY.names)
+@each_row("name", LIBRARY.names)
 def test_every_source_of_a_part_is_used_and_every_statement_has_one(name):
     file = LIBRARY.files[name]
     modes = list(file.modes) or [None]
@@ -104,7 +105,7 @@ def test_every_source_of_a_part_is_used_and_every_statement_has_one(name):
     assert used == set(file.sources)
 
 
-@pytest.mark.parametrize("name", PARTS)
+@each_row("name", PARTS)
 def test_the_rays_of_a_part_are_unit_vectors_inside_its_field_and_as_many_as_it_says(name):
     part = PARTS[name]
     assert np.allclose(np.linalg.norm(part.directions, axis=1), 1, atol=1e-12)
@@ -115,13 +116,13 @@ def test_the_rays_of_a_part_are_unit_vectors_inside_its_field_and_as_many_as_it_
     assert columns * rows >= part.rays > (columns - 1) * (rows - 1)
 
 
-@pytest.mark.parametrize("name", [name for name, part in PARTS.items() if part.value("points_per_s")])
+@each_row("name", [name for name, part in PARTS.items() if part.value("points_per_s")])
 def test_rays_and_frames_make_the_points_per_second_that_the_maker_states(name):
     part = PARTS[name]
     assert part.rays * part.rate_hz == pytest.approx(part.value("points_per_s"), rel=0.001)
 
 
-@pytest.mark.parametrize("name", PARTS)
+@each_row("name", PARTS)
 def test_a_part_fills_its_field_up_to_one_cell(name):
     part = PARTS[name]
     if part.rays == 1:
@@ -279,7 +280,7 @@ def test_a_frame_gives_back_its_boresight(azimuth, elevation, roll):
     assert np.allclose(boresight_frame(*boresight_of(frame)), frame, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ZONES)
+@each_row("name", ZONES)
 def test_zones_are_the_even_grid_of_their_field_where_that_has_their_rows(name):
     part = PARTS[name]
     design = part_design(part, some_pose())
@@ -290,7 +291,7 @@ def test_zones_are_the_even_grid_of_their_field_where_that_has_their_rows(name):
         assert np.allclose(own_rays.direction, even.direction, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", SOME)
+@each_row("name", SOME)
 def test_a_pose_moves_a_part_as_a_rigid_body(name):
     part, pose = PARTS[name], some_pose()
     here = part_rays(part, Pose(), min(part.rays, 60))
@@ -304,7 +305,7 @@ def test_a_pose_moves_a_part_as_a_rigid_body(name):
     assert len(np.unique(np.round(local, 9), axis=0)) == len(there) == len(here)
 
 
-@pytest.mark.parametrize("name", PARTS)
+@each_row("name", PARTS)
 def test_the_sensor_of_a_part_has_its_field_its_range_and_looks_at_its_centre(name):
     part, pose = PARTS[name], some_pose(3)
     sensor = part_sensor(part, pose)
@@ -324,7 +325,7 @@ def test_a_part_can_be_made_to_look_anywhere(name, azimuth, elevation):
     assert abs(pose.elevation_rad) <= math.pi / 2 + 1e-12
 
 
-@pytest.mark.parametrize("name", SOME)
+@each_row("name", SOME)
 def test_a_part_covers_what_its_rays_see_within_its_range_and_nothing_else(name):
     part, pose = PARTS[name], some_pose(5)
     rays = part_rays(part, pose, min(part.rays, 200))
@@ -552,7 +553,7 @@ def test_two_own_parts_of_one_name_are_refused(tmp_path):
         load_library([tmp_path / "a", tmp_path / "b"])
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("name", "message"),
     [
         ("vlp16", "there is no part 'vlp16'"),

@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from support.tables import each_row
 
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
@@ -77,8 +78,8 @@ MUTATIONS = {
 }
 
 
-@pytest.mark.parametrize("name", MUTATIONS)
-@pytest.mark.parametrize("sensor", [0, 1])
+@each_row("name", MUTATIONS)
+@each_row("sensor", [0, 1])
 def test_each_violation_of_a_sensor_is_caught_by_name(document, name, sensor):
     bad = copy.deepcopy(document)
     MUTATIONS[name](bad["sensors"][sensor])

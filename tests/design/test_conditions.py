@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.tables import each_row
 
 from lidardesign.design.mixture.conditions import at_condition, conditioned, fixed_conditions
 from lidardesign.errors import ConfigError, DataError, NumericalError
@@ -58,7 +59,7 @@ def estimate(samples, values):
     return mean, math.sqrt(np.square(samples.weights) @ np.square(values - mean))
 
 
-@pytest.mark.parametrize("value", [0.0, 0.37, 1.2, 3.91, 4.0])
+@each_row("value", [0.0, 0.37, 1.2, 3.91, 4.0])
 def test_moments_at_a_value_are_those_of_the_conditional_density(value):
     found = at_condition(SAMPLES, {"x_m": value}, log_target, 20_000, np.random.default_rng(1))
     for column, centre, spread in zip((AZIMUTH, RANGE), means(value), TARGET, strict=True):

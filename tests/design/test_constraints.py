@@ -11,6 +11,7 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from support.tables import each_row
 
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints, DistanceRange, Gate, rules_of
@@ -83,7 +84,7 @@ CONTRADICTIONS = {
 }
 
 
-@pytest.mark.parametrize("name", CONTRADICTIONS)
+@each_row("name", CONTRADICTIONS)
 def test_a_contradiction_names_the_smallest_conflicting_set(name):
     values, conflicts = CONTRADICTIONS[name]
     with pytest.raises(InfeasibleError) as caught:
@@ -99,7 +100,7 @@ def test_a_fixed_angle_admits_no_field_of_view_along_it():
     assert "space.elevation_rad" in caught.value.conflicts
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("values", "text"),
     [
         ({"gates": {}}, "unknown key 'gates'"),
@@ -150,7 +151,7 @@ LIMITS = {
 }
 
 
-@pytest.mark.parametrize("key", LIMITS)
+@each_row("key", LIMITS)
 def test_every_number_is_taken_up_to_its_limit_and_not_beyond(key):
     taken, refused = LIMITS[key]
 
@@ -198,7 +199,7 @@ def test_constraints_that_were_read_cannot_be_changed():
         constraints.gate.width_m.max = 0.6
 
 
-@pytest.mark.parametrize("values", [[], "gate", 3, False, ()])
+@each_row("values", [[], "gate", 3, False, ()])
 def test_what_is_no_mapping_is_named(values):
     with pytest.raises(ConfigError, match=f"found one {type(values).__name__}"):
         Constraints.from_mapping(values)

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.special import chdtri
+from support.tables import each_row
 
 from lidardesign.design.files import design_document, design_from_document
 from lidardesign.design.fit import fit
@@ -114,8 +115,8 @@ def test_what_does_not_vary_has_no_slope():
     assert (found.direction_per_m == 0).all()
 
 
-@pytest.mark.parametrize("samples", [RING, None], ids=["samples", "design file"])
-@pytest.mark.parametrize("count", [1, 7, 400])
+@each_row("samples", [RING, None], ids=["samples", "design file"])
+@each_row("count", [1, 7, 400])
 def test_rays_start_inside_the_ellipsoids_of_their_sensors(samples, count):
     design = without_table(FITTED.design)
     rays = lay_out(design, count, samples)

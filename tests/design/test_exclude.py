@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.command_line import caller, make_run
+from support.tables import each_row
 
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
@@ -80,8 +81,8 @@ def places(result):
     return [(*sensor.origin_m, *sensor.origin_covariance_m2.ravel()) for sensor in result.design.sensors]
 
 
-@pytest.mark.parametrize("layout", ["grid", "density", "distributed", "scan"])
-@pytest.mark.parametrize("box", [SLAB, PILLAR], ids=["slab", "pillar"])
+@each_row("layout", ["grid", "density", "distributed", "scan"])
+@each_row("box", [SLAB, PILLAR], ids=["slab", "pillar"])
 def test_no_sensor_and_no_ray_is_in_an_excluded_box(layout, box):
     result = fitted(layout=layout, rays=40, origin={"exclude": [box]})
     assert_outside(result.design, [box])
@@ -160,7 +161,7 @@ def test_a_sensor_may_sit_on_the_surface_of_a_box():
     assert result.satisfied
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("values", "conflicts"),
     [
         ({"origin": {"exclude": [PILLAR], "fixed_m": [0, 0, 1]}}, ["origin.exclude[0]", "origin.fixed_m"]),
@@ -200,7 +201,7 @@ def test_boxes_that_leave_no_place_are_refused_by_name(values, conflicts):
     assert list(caught.value.conflicts) == conflicts
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("box", "message"),
     [
         ({"low_m": [0, 0, 1], "high_m": [1, 1, 0]}, "low_m is above high_m along z"),

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.tables import each_row
 
 from lidardesign.design.files import (
     SCHEMA_FILE,
@@ -307,7 +308,7 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("old", "new", "position", "says"), BAD)
+@each_row(("old", "new", "position", "says"), BAD)
 def test_a_bad_file_is_refused_with_its_position_and_what_is_allowed(tmp_path, old, new, position, says):
     path = tmp_path / "bad.yaml"
     assert GOOD.count(old) == 1
@@ -346,7 +347,7 @@ def test_a_damaged_file_is_read_or_refused_but_never_crashes(tmp_path_factory, a
         assert same(design_from_document(design_document(design)), design)
 
 
-@pytest.mark.parametrize("content", ["", "[]", "3", "just text", "a: 1", "sensors: []\nschema_version: 1\n"])
+@each_row("content", ["", "[]", "3", "just text", "a: 1", "sensors: []\nschema_version: 1\n"])
 def test_a_file_that_is_no_design_is_refused(tmp_path, content):
     path = tmp_path / "other.yaml"
     path.write_text(content)

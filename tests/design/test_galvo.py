@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.command_line import caller
+from support.tables import each_row
 
 from lidardesign.design.files import save_design
 from lidardesign.design.galvo import (
@@ -57,7 +58,7 @@ def through_two_mirrors(x_deg, y_deg):
     return mirrored(mirrored(sideways, x_mirror), y_mirror)
 
 
-@pytest.mark.parametrize(("x", "y"), [*itertools.product((-20.0, -3.0, 0.0, 11.0, 20.0), repeat=2)])
+@each_row(("x", "y"), [*itertools.product((-20.0, -3.0, 0.0, 11.0, 20.0), repeat=2)])
 def test_a_scan_angle_is_twice_the_angle_of_a_real_mirror(x, y):
     found = scan_directions(np.eye(3), np.array([[x, y]]))[0]
     np.testing.assert_allclose(found, through_two_mirrors(x, y), atol=1e-15)
@@ -122,7 +123,7 @@ def shortest_by_trying(points):
     return min(travel(points[list(tour)]) for tour in tours)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@each_row("seed", range(8))
 def test_short_tours_are_the_shortest_or_nearly(seed):
     points = np.random.default_rng(seed).uniform(-20, 20, (8, 2))
     assert travel(points[short_tour(points)]) <= 1.05 * shortest_by_trying(points)
@@ -269,7 +270,7 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize("name", BROKEN)
+@each_row("name", BROKEN)
 def test_a_damaged_file_is_refused_where_it_is_damaged(tmp_path, name):
     damage, message = BROKEN[name]
     write_galvo(design(), lay_out(design()), tmp_path / "f.csv")

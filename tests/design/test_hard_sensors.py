@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.tables import each_row
 
 from lidardesign.design.files import design_from_document
 from lidardesign.design.layouts.rays import lay_out
@@ -40,7 +41,7 @@ MISTAKES = {
 }
 
 
-@pytest.mark.parametrize("mistake", MISTAKES)
+@each_row("mistake", MISTAKES)
 def test_a_mistake_in_a_coupling_is_refused_in_words(mistake):
     key, value, words = MISTAKES[mistake]
     with pytest.raises(ConfigError, match=words):

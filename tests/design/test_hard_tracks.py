@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from cli.test_conditions_cli import make_conditioned_run
 from support.command_line import caller
+from support.tables import each_row
 
 from lidardesign.design.files import design_from_document
 from lidardesign.design.layouts.gates import central_intervals
@@ -56,7 +57,7 @@ MISTAKES = {
 }
 
 
-@pytest.mark.parametrize("mistake", MISTAKES)
+@each_row("mistake", MISTAKES)
 def test_a_mistake_in_a_track_is_refused_in_words(mistake):
     changes, words = MISTAKES[mistake]
     with pytest.raises(ConfigError, match=words):

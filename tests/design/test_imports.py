@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from support.command_line import caller, make_run
+from support.tables import each_row
 
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.constraints.rig_constraints import rig_constraints
@@ -195,7 +196,7 @@ BAD_LISTS = {
 }
 
 
-@pytest.mark.parametrize("case", BAD_LISTS)
+@each_row("case", BAD_LISTS)
 def test_a_ray_list_that_cannot_be_used_is_refused_at_its_cell(tmp_path, monkeypatch, case):
     content, where, message = BAD_LISTS[case]
     monkeypatch.chdir(tmp_path)
@@ -206,7 +207,7 @@ def test_a_ray_list_that_cannot_be_used_is_refused_at_its_cell(tmp_path, monkeyp
     assert message in refused.value.message
 
 
-@pytest.mark.parametrize(
+@each_row(
     "arrays",
     [
         {"azimuth_rad": np.zeros(3), "elevation_rad": np.zeros(2), "gate_end_m": np.ones(3)},
@@ -343,7 +344,7 @@ BAD_XML = {
 }
 
 
-@pytest.mark.parametrize("case", BAD_XML)
+@each_row("case", BAD_XML)
 def test_xml_that_cannot_be_used_is_refused_by_what_is_wrong(tmp_path, case):
     content, message = BAD_XML[case]
     path = tmp_path / "m.xml"
@@ -570,7 +571,7 @@ BAD_SDF = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", BAD_SDF)
+@each_row("case", BAD_SDF)
 def test_poses_that_cannot_be_found_are_refused_with_their_line(tmp_path, case):
     text, message = BAD_SDF[case]
     with pytest.raises(DataError) as refused:
@@ -579,7 +580,7 @@ def test_poses_that_cannot_be_found_are_refused_with_their_line(tmp_path, case):
     assert refused.value.where == f"{tmp_path / 'robot.sdf'}:3"
 
 
-@pytest.mark.parametrize(
+@each_row(
     "options",
     [
         {"columns": (0, 0, 1)}, {"columns": (2.5, 0, 1)}, {"columns": (5, 1, 0)}, {"columns": (5, -9, 9)},

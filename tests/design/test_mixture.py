@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.tables import each_row
 
 from lidardesign.design.mixture.bounds import Bounds, Floors
 from lidardesign.design.mixture.em import fit_mixture, from_labels, run_em, seed_mixture
@@ -437,7 +438,7 @@ FIXED = {
 }
 
 
-@pytest.mark.parametrize("name", FIXED)
+@each_row("name", FIXED)
 def test_fixed_dimensions_leave_the_density(name):
     space = DesignSpace(*FIXED[name])
     generator = np.random.default_rng(14)
@@ -483,7 +484,7 @@ def case_of(name, count=70):
     return mixture, features_of(space.sample(count, generator), space, generator.uniform(0.1, 1, count))
 
 
-@pytest.mark.parametrize("name", SPACES)
+@each_row("name", SPACES)
 def test_density_and_shares_are_those_of_the_free_dimensions_alone(name):
     mixture, features = case_of(name)
     terms = naive_terms(mixture, features)
@@ -492,8 +493,8 @@ def test_density_and_shares_are_those_of_the_free_dimensions_alone(name):
     np.testing.assert_allclose(responsibilities(mixture, features), np.exp(terms - whole[:, None]), atol=1e-9)
 
 
-@pytest.mark.parametrize("block", [1, 7, 70, 1000])
-@pytest.mark.parametrize("name", SPACES)
+@each_row("block", [1, 7, 70, 1000])
+@each_row("name", SPACES)
 def test_statistics_are_sums_over_the_shares_in_blocks_of_any_length(name, block, monkeypatch):
     monkeypatch.setattr("lidardesign.design.mixture.mixture.BLOCK", block)
     mixture, features = case_of(name)
@@ -517,7 +518,7 @@ def tangent_sums(mixture, features, shares):
     return sums
 
 
-@pytest.mark.parametrize("name", SPACES)
+@each_row("name", SPACES)
 def test_hard_statistics_are_sums_over_the_samples_of_a_label(name):
     mixture, features = case_of(name)
     labels = np.random.default_rng(22).choice([0, 2], size=len(features))
@@ -529,7 +530,7 @@ def test_hard_statistics_are_sums_over_the_samples_of_a_label(name):
     np.testing.assert_allclose(found.tangent, tangent_sums(mixture, features, shares), rtol=1e-9, atol=1e-13)
 
 
-@pytest.mark.parametrize("name", SPACES)
+@each_row("name", SPACES)
 def test_the_mean_direction_of_a_cell_is_that_of_its_mean_unit_vector(name):
     _, features = case_of(name)
     labels = np.random.default_rng(23).choice([0, 1, 3], size=len(features))

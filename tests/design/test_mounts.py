@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.tables import each_row
 
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
@@ -98,7 +99,7 @@ def test_each_sensor_keeps_its_own_gate_at_its_mount():
     assert result.satisfied
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("values", "conflicts"),
     [
         ({"sensors": {"count": 5}, "origin": {"mounts_m": MOUNTS}}, ["sensors.count", "origin.mounts_m"]),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.tables import each_row
 
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.constraints.origins import box_around, free_boxes, inside_excluded, nearest_admitted, origin_box
@@ -203,8 +204,8 @@ def test_one_bounded_axis_is_fitted_as_a_gate_and_the_others_follow_it(side):
     np.testing.assert_allclose(covariance, expected, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("axes", [1, 2, 3])
-@pytest.mark.parametrize("most", [np.inf, 0.02])
+@each_row("axes", [1, 2, 3])
+@each_row("most", [np.inf, 0.02])
 def test_steps_keep_the_bounds_and_only_gain(axes, most):
     generator = np.random.default_rng(axes)
     mean, scatter = moments(generator, 200, axes)

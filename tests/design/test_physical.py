@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support import references
+from support.tables import each_row
 
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
@@ -82,7 +83,7 @@ def test_what_a_turned_design_returns_in_a_turned_scene_is_the_same():
     np.testing.assert_allclose(outcomes[0][1], outcomes[1][1], atol=1e-9)
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("azimuth", "elevation"),
     [(0.0, 0.0), (2 * math.pi - 1e-3, 0.3), (1.0, -math.pi / 2), (4.0, math.pi / 2), (0.0, -1.5), (3.0, 1.55)],
 )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.tables import each_row
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.layouts.gates import Heard, _Prices, central_intervals, gates_within
@@ -48,8 +49,8 @@ def test_never_more_bins_than_allowed(seed, rays, share):
     assert (gates[:, 0] >= 0).all()
 
 
-@pytest.mark.parametrize("bin_ps", [1.0, 100.0, 10_000.0])
-@pytest.mark.parametrize("heaviest", [1.0, 1e9])
+@each_row("bin_ps", [1.0, 100.0, 10_000.0])
+@each_row("heaviest", [1.0, 1e9])
 def test_one_bin_per_ray_is_always_enough(bin_ps, heaviest):
     heard, model = hearing(0, 200), Bandwidth(bin_ps=bin_ps)
     heard = replace(heard, weights=np.where(heard.ray == 0, heaviest, heard.weights))

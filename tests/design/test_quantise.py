@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.tables import each_row
 
 from lidardesign.design.layouts.quantise import Nearest, lloyd
 from lidardesign.errors import ConfigError
@@ -27,8 +28,8 @@ def naive_lloyd(features, weights, centres, iterations=2000):
     return centres
 
 
-@pytest.mark.parametrize("count", [1, 2, 7, 40])
-@pytest.mark.parametrize("dimensions", [1, 2, 5])
+@each_row("count", [1, 2, 7, 40])
+@each_row("dimensions", [1, 2, 5])
 def test_every_centre_is_the_weighted_mean_of_its_cell_and_every_label_the_nearest_centre(count, dimensions):
     features, weights = cloud(count, dimensions=dimensions)
     centres, labels = lloyd(features, weights, count, np.random.default_rng(0), iterations=2000)
@@ -121,7 +122,7 @@ def test_weights_of_any_size_stay_finite():
     assert len(np.unique(labels)) == 5
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("features", "weights", "count"),
     [
         (np.zeros((0, 2)), np.zeros(0), 1),
@@ -137,8 +138,8 @@ def test_what_cannot_be_quantised_is_refused(features, weights, count):
         lloyd(features, weights, count, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("moved", [1e-6, 0.02, 1.0])
-@pytest.mark.parametrize("count", [1, 2, 40])
+@each_row("moved", [1e-6, 0.02, 1.0])
+@each_row("count", [1, 2, 40])
 def test_bounds_spare_searches_and_change_no_answer(count, moved):
     points, _ = cloud(11, count=600, dimensions=3)
     centres = points[:count].copy()

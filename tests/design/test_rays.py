@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.tables import each_row
 
 from lidardesign.design.bandwidth import split_budget
 from lidardesign.design.layouts.grid import grid_rows, grid_tangent
@@ -124,7 +125,7 @@ def test_fewer_rays_than_sensors_leave_some_without():
     assert split_budget(np.array([0.1, 0.2, 0.7]), 0).tolist() == [0, 0, 0]
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("weights", "count"),
     [
         *[([], 3), ([0.0, 0.0], 3), ([-1.0, 2.0], 3), ([np.nan], 3), ([1.0, np.inf], 3), ([1.0], -1), ([1.0], 2.5)],
@@ -173,7 +174,7 @@ def test_a_grid_has_exactly_its_rays_spread_over_rows_that_differ_by_one_at_most
         np.testing.assert_allclose(tangent.mean(axis=0)[0], 0, atol=1e-9)
 
 
-@pytest.mark.parametrize("side", [1, 2, 5, 6, 10, 14, 19, 24])
+@each_row("side", [1, 2, 5, 6, 10, 14, 19, 24])
 def test_a_square_budget_in_a_square_field_is_the_regular_grid(side):
     centres = (np.arange(side) + 0.5) / side - 0.5
     across, up = np.meshgrid(centres, centres)
@@ -192,9 +193,9 @@ def test_no_ray_stands_on_the_edge_of_its_field():
     assert np.abs(tangent[:, 1]).max() <= 0.15 - 0.3 / (2 * 6) + 1e-12
 
 
-@pytest.mark.parametrize("elevation", [-math.pi / 2, -1.2, 0.0, 1.0, math.pi / 2])
-@pytest.mark.parametrize("layout", ["grid", "density"])
-@pytest.mark.parametrize("spread", [0.05, 0.4, 1.7])
+@each_row("elevation", [-math.pi / 2, -1.2, 0.0, 1.0, math.pi / 2])
+@each_row("layout", ["grid", "density"])
+@each_row("spread", [0.05, 0.4, 1.7])
 def test_all_rays_are_inside_the_field_of_view_also_straight_down(elevation, layout, spread):
     looking = sensor(elevation_rad=elevation, spread_horizontal_rad=spread)
     design = DesignSpec("d", (looking,), layout=layout)
@@ -240,8 +241,8 @@ def test_permuting_the_sensors_permutes_their_rays(layout):
         assert (rays.direction[rays.sensor == old] == other.direction[other.sensor == new]).all()
 
 
-@pytest.mark.parametrize("layout", ["grid", "density"])
-@pytest.mark.parametrize("count", [0, 1, 2, 3, 50])
+@each_row("layout", ["grid", "density"])
+@each_row("count", [0, 1, 2, 3, 50])
 def test_rays_are_ordered_by_sensor_and_fire_evenly_over_the_frame(layout, count):
     design = DesignSpec("d", three_sensors(), layout=layout)
     rays = lay_out(design, count, drawn_from(design), rate_hz=20)
@@ -554,7 +555,7 @@ def test_rays_share_the_gate_of_their_sensor_unless_they_are_to_have_their_own(l
         assert (rays.gate_m[rays.sensor == index] == component.gate_m).all()
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("layout", "samples", "wide", "expected"),
     [
         ("grid", True, (), "sensor"),

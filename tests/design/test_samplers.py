@@ -14,6 +14,7 @@ from design.test_mixture import drawn as drawn_from_mixture
 from design.test_rays import sensor
 from scipy.stats import chi2, norm
 from support.chi_square import UNLIKELY, counts_of_cells, mass_of_cells, p_value, pooled
+from support.tables import each_row
 
 from lidardesign.density.flow.objective import Coordinates
 from lidardesign.density.training.losses import Pool, draw_conditions
@@ -96,8 +97,8 @@ def of_flow(flow, context):
     return density
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("name", GRIDS)
+@each_row("dtype", [torch.float64, torch.float32])
+@each_row("name", GRIDS)
 def test_samples_of_a_flow_have_its_integrated_density(name, dtype):
     sizes, inside, scale = GRIDS[name]
     flow = flow_of(name, layers=2, scale=scale)
@@ -121,7 +122,7 @@ def test_a_sampler_that_is_a_little_wrong_is_found_out():
     assert p_value(counts_of_cells(shifted, edges), DRAWS * mass / mass.sum()) < UNLIKELY
 
 
-@pytest.mark.parametrize("name", FLOWS)
+@each_row("name", FLOWS)
 def test_samples_weighted_by_their_inverse_density_measure_the_volume_of_every_part_of_the_box(name):
     # in all dimensions together, where no grid reaches: the mean of 1 / p over samples inside a part is its volume
     flow = flow_of(name, layers=2, scale=1.0)
@@ -480,8 +481,8 @@ def test_points_of_an_occupancy_grid_are_drawn_by_its_probabilities():
     assert p_value(counts_of_cells(points, edges), expected) > UNLIKELY
 
 
-@pytest.mark.parametrize("count", [400, 1000, 20_000])
-@pytest.mark.parametrize("axes", [2, 3, 4, 5, 6])
+@each_row("count", [400, 1000, 20_000])
+@each_row("axes", [2, 3, 4, 5, 6])
 def test_even_points_are_more_even_than_draws_in_every_pair_of_their_axes(axes, count):
     points = low_discrepancy(count, axes)
     edges = edges_of(10, 10, low=0.0)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.tables import each_row
 
 from lidardesign.design.files import load_design
 from lidardesign.design.rigs.sensor_csv import COLUMNS, looks_like_sensor_csv, read_sensor_csv, write_sensor_csv
@@ -155,7 +156,7 @@ def test_another_level_is_noted(tmp_path):
     assert not any("is not held: intervals" in note for note in write_sensor_csv(plain, tmp_path / "d.csv"))
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("text", "position", "says"),
     [
         (ROW.replace("3.14", "abc"), ":1:4", "azimuth_mean is 'abc'"),
@@ -197,7 +198,7 @@ def test_an_empty_file_and_bytes_that_are_no_text_are_refused(tmp_path):
         load_design(path)
 
 
-@pytest.mark.parametrize(
+@each_row(
     "text", ["schema_version: 1\nsensors: [1, 2]\n", "a: 1, 2", "{a: 1, b: 2}", "[1, 2]", "- 1"]
 )
 def test_yaml_is_not_taken_for_a_table(tmp_path, text):

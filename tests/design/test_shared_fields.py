@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.tables import each_row
 
 from lidardesign.design.bandwidth import Bandwidth, split_budget
 from lidardesign.design.constraints.check import check_design
@@ -55,7 +56,7 @@ def inside_fields(design, directions, sensors):
         assert (tangent <= np.array(sensor.field_of_view_rad) / 2 + FIELD_SLACK_RAD).all()
 
 
-@pytest.mark.parametrize("count", [1, 2, 7, 60, 333])
+@each_row("count", [1, 2, 7, 60, 333])
 def test_rays_sum_exactly_and_lie_in_the_fields_of_their_sensors(count):
     rays = lay_out(DESIGN, count, SAMPLES, gates="ray")
     assert len(rays) == count
@@ -152,7 +153,7 @@ RULES = {
 }
 
 
-@pytest.mark.parametrize("name", RULES)
+@each_row("name", RULES)
 def test_designs_pass_the_independent_checker(name):
     constraints = Constraints.from_mapping(RULES[name], where="test")
     result = made(constraints=RULES[name])
@@ -164,8 +165,8 @@ def test_designs_pass_the_independent_checker(name):
     inside_fields(result.design, rays.direction, rays.sensor)
 
 
-@pytest.mark.parametrize("name", ["bandwidth", "bins", "all"])
-@pytest.mark.parametrize("count", [15, 60, 151])
+@each_row("name", ["bandwidth", "bins", "all"])
+@each_row("count", [15, 60, 151])
 def test_a_bandwidth_holds_at_every_number_of_rays(name, count):
     budget = {"bin_ps": 100.0, "bits_per_bin": 40, "rate_hz": 10, **RULES[name]["budget"]}
     model = Bandwidth(budget["bin_ps"], budget["bits_per_bin"], budget["rate_hz"])

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.command_line import caller, make_run
+from support.tables import each_row
 
 from lidardesign.design.catalog.library import find_part, load_library
 from lidardesign.design.constraints.budget import BandwidthBudget
@@ -110,7 +111,7 @@ def test_an_empty_mapping_is_the_short_form():
     assert not wants_parts(Constraints.from_mapping({"gate": {"width_m": {"max": 1.0}}}).rules)
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("value", "message"),
     [
         ("shop", "catalog"),

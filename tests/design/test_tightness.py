@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from support.tables import each_row
 
 from lidardesign.design.constraints.check import ConstraintCheck
 from lidardesign.design.constraints.slack import constraint_slack, room_of
@@ -12,7 +13,7 @@ def check(name, bound, value, satisfied=True):
     return ConstraintCheck(name, bound, value, satisfied)
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("found", "room", "share"),
     [
         (check("a.gate.width_m.max", 0.2, 0.15), 0.05, 0.25),

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.tables import each_row
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.check import check_design
@@ -356,7 +357,7 @@ def test_a_refitted_track_keeps_the_constraints(tight):
     assert Bandwidth().mbps(rays) <= 0.03
 
 
-@pytest.mark.parametrize("at", [{}, None, {"x_m": -0.6}, {"x_m": 4.1}, {"x_m": math.nan}, {"y_m": 0.0}])
+@each_row("at", [{}, None, {"x_m": -0.6}, {"x_m": 4.1}, {"x_m": math.nan}, {"y_m": 0.0}])
 def test_a_track_needs_a_place_between_its_ends(free, at):
     with pytest.raises(ConfigError, match=r"--at(.|\n)*(-0.5 to 4|x_m)"):
         lay_out(free.design, at=at)
@@ -542,7 +543,7 @@ BROKEN = [
 ]
 
 
-@pytest.mark.parametrize(("change", "words"), BROKEN, ids=[words for _, words in BROKEN])
+@each_row(("change", "words"), BROKEN, ids=[words for _, words in BROKEN])
 def test_a_broken_track_is_refused_with_its_place(tight, change, words):
     with pytest.raises(ConfigError, match=words):
         design_from_document(broken(tight.design, change))
@@ -584,7 +585,7 @@ VIOLATIONS = [
 ]
 
 
-@pytest.mark.parametrize(("change", "name"), VIOLATIONS, ids=[name for _, name in VIOLATIONS])
+@each_row(("change", "name"), VIOLATIONS, ids=[name for _, name in VIOLATIONS])
 def test_the_check_names_the_ray_and_the_knot_that_break_a_bound(tight, change, name):
     last = len(tight.design.track.knots) - 1
     assert name.format(last=last) in unsatisfied(broken(tight.design, lambda d: change(d["track"])))

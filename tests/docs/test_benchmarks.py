@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from support.small_runs import shifting_environment
+from support.tables import each_row
 
 from lidardesign.scene import Mesh
 
@@ -31,7 +32,7 @@ def common():
     del sys.modules[spec.name]
 
 
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+@each_row("script", SCRIPTS, ids=lambda path: path.stem)
 def test_a_benchmark_imports_and_explains_itself(script):
     if script.stem == "em":
         pytest.importorskip("sklearn")

@@ -9,6 +9,7 @@ import typer
 from support.docs_output import difference
 from support.docs_pages import PAGES, ROOT, Block, Command, blocks_of, commands_of
 from support.docs_session import COLUMNS, Library, Session, is_installed
+from support.tables import each_row
 
 from lidardesign.cli.main import app
 
@@ -40,7 +41,7 @@ def named(page) -> str:
     return str(page.relative_to(ROOT))
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("shown", "agrees"),
     [
         (TABLE, True),
@@ -106,7 +107,7 @@ def program_commands() -> list[tuple[str, Command]]:
     ]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=named)
+@each_row("page", PAGES, ids=named)
 def test_the_program_understands_every_command_of_a_page(page):
     root = typer.main.get_command(app)
     for where, command in program_commands():

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from support.tables import each_row
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.layouts.grid import low_discrepancy
@@ -66,8 +67,8 @@ def design_points(rays):
     return np.column_stack([rays.origin_m, azimuth, elevation, rays.gate_m[:, 0]])
 
 
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("name", BUILT)
+@each_row("case", CASES)
+@each_row("name", BUILT)
 def test_any_number_of_rays_is_met_exactly_inside_the_space_and_repeats(case, name):
     space, train = CASES[case]
     source, same = (Baselines(space, train, seed=4) for _ in range(2))
@@ -155,9 +156,9 @@ def test_bounding_without_any_return_is_uniform():
     assert np.array_equal(bounding.gate_m, uniform.gate_m)
 
 
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("name", BUILT)
-@pytest.mark.parametrize("limit", [0.0, 0.01, 0.5, 3.0])
+@each_row("case", CASES)
+@each_row("name", BUILT)
+@each_row("limit", [0.0, 0.01, 0.5, 3.0])
 def test_as_many_rays_as_fit_in_a_bandwidth_fit_and_one_more_does_not(case, name, limit):
     space, train = CASES[case]
     bandwidth = Bandwidth()

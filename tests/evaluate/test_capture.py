@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.captures import BALL_AT, BALL_M, BIN_PS, C_M_PER_PS, START_PS, ball_range_m, make_capture
 from support.command_line import caller
+from support.tables import each_row
 
 from lidardesign.design.files import save_design
 from lidardesign.design.galvo import degree_frame, scan_directions
@@ -88,7 +89,7 @@ def test_rays_beside_the_pixels_take_the_nearest_and_say_how_far_it_is(clean):
     assert np.degrees(found.away_rad[0]) == pytest.approx(0.5, rel=1e-4)
 
 
-@pytest.mark.parametrize("gate", [(0.3, 2.0), (0.5, 0.55), (0.4501, 0.4502), (0.0, 0.1), (1.9, 50.0)])
+@each_row("gate", [(0.3, 2.0), (0.5, 0.55), (0.4501, 0.4502), (0.0, 0.1), (1.9, 50.0)])
 def test_a_gate_hears_the_bins_whose_middles_lie_in_it(clean, gate):
     first, last = gate_bins(clean, np.zeros(1, dtype=int), np.array([gate]))
     middles = (START_PS + (np.arange(clean.bins) + 0.5) * BIN_PS) * C_M_PER_PS / 2

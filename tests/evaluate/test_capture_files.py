@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 from support.captures import BINS, make_capture
+from support.tables import each_row
 
 from lidardesign.errors import DataError
 from lidardesign.evaluate.captures.arrays import read_arrays, read_matlab
@@ -45,8 +46,8 @@ def path_of(folder, kind):
     return folder / f"scan.{kind.split()[0]}"
 
 
-@pytest.mark.parametrize("images", [True, False])
-@pytest.mark.parametrize("kind", FORMATS)
+@each_row("images", [True, False])
+@each_row("kind", FORMATS)
 def test_a_capture_is_the_same_from_every_kind_of_file(tmp_path, kind, images):
     arrays = make_capture(9, images=images)
     FORMATS[kind](path_of(tmp_path, kind), arrays)
@@ -160,7 +161,7 @@ WRONG = {
 ONLY_NUMPY = {"flat counts"}
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("kind", "name"),
     [(kind, name) for kind in ("npz", "mat 5") for name in WRONG if kind == "npz" or name not in ONLY_NUMPY],
 )
@@ -221,8 +222,8 @@ NUMBERS = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "?")
 SHAPES = ((1, 1), (1, 3), (4, 1), (2, 3), (3, 2, 4), (0, 3), (0, 0))
 
 
-@pytest.mark.parametrize("kind", NUMBERS)
-@pytest.mark.parametrize("packed", [True, False])
+@each_row("kind", NUMBERS)
+@each_row("packed", [True, False])
 def test_every_type_and_shape_of_matlab_5_comes_through(kind, packed):
     generator = np.random.default_rng(0)
     arrays = {f"a{n}": (100 * generator.random(shape)).astype(kind) for n, shape in enumerate(SHAPES)}
@@ -236,7 +237,7 @@ def test_every_type_and_shape_of_matlab_5_comes_through(kind, packed):
         np.testing.assert_array_equal(found[name], array)
 
 
-@pytest.mark.parametrize("kind", ["f8", "f4", "i4", "i2", "u1"])
+@each_row("kind", ["f8", "f4", "i4", "i2", "u1"])
 def test_matrices_of_matlab_4_come_through(kind):
     arrays = {"first": np.arange(12).reshape(3, 4).astype(kind), "b": np.ones((1, 1), kind)}
     content = io.BytesIO()
@@ -288,8 +289,8 @@ def test_matlab_7_structures_and_foreign_hdf5_are_refused(tmp_path):
         load_capture(path)
 
 
-@pytest.mark.parametrize("kind", FORMATS)
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.999])
+@each_row("kind", FORMATS)
+@each_row("share", [0.0, 0.01, 0.3, 0.9, 0.999])
 def test_a_file_that_was_cut_short_is_refused(tmp_path, kind, share):
     path = path_of(tmp_path, kind)
     FORMATS[kind](path, make_capture(5))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from support.command_line import caller, make_run
+from support.tables import each_row
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.catalog.library import find_part
@@ -82,7 +83,7 @@ def cloud(centre, space, count=400, spread=0.1):
     return space.wrap(aim(origins, np.array(centre) + generator.normal(0, spread, (count, 3))))
 
 
-@pytest.mark.parametrize(("case", "name"), PAIRS)
+@each_row(("case", "name"), PAIRS)
 def test_any_number_of_rays_is_met_exactly_with_the_parts_range_and_repeats(case, name):
     space, train = CASES[case]
     source, same = (Baselines(space, train, seed=4) for _ in range(2))
@@ -124,7 +125,7 @@ def test_more_rays_than_a_part_has_come_from_several_that_no_one_overtaxes():
     assert len(np.unique(np.round(rays.direction, 6), axis=0)) == 150
 
 
-@pytest.mark.parametrize("case", CASES)
+@each_row("case", CASES)
 def test_a_part_looks_where_the_target_is(case):
     space, train = CASES[case]
     source = Baselines(space, train, seed=0)
@@ -231,8 +232,8 @@ def test_a_row_of_a_part_lies_in_the_plane_that_the_space_holds_all_rays_in():
     assert np.ptp(rays.direction[:, 2]) > 0.15
 
 
-@pytest.mark.parametrize("name", ["vl53l5cx", "vlp-16", "rplidar-c1"])
-@pytest.mark.parametrize("limit", [0.0, 0.05, 3.0])
+@each_row("name", ["vl53l5cx", "vlp-16", "rplidar-c1"])
+@each_row("limit", [0.0, 0.05, 3.0])
 def test_as_many_rays_as_fit_in_a_bandwidth_fit_and_one_more_does_not(name, limit):
     bandwidth = Bandwidth()
     source = Baselines(*CASES["fixed origin"], seed=0)
@@ -256,7 +257,7 @@ def test_a_pose_may_be_given():
     assert np.bincount(three.sensor).tolist() == [50, 50, 50]
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("name", "message"),
     [
         ("catalog", "lacks what it is to be of"),
@@ -313,7 +314,7 @@ def test_rows_of_several_parts_say_how_many():
 # views and shapes
 
 
-@pytest.mark.parametrize("name", ["vl53l5cx", "rplidar-c1", "mid-360", "azure-kinect", "tmf8821:3x6"])
+@each_row("name", ["vl53l5cx", "rplidar-c1", "mid-360", "azure-kinect", "tmf8821:3x6"])
 def test_a_part_has_all_its_rays_in_view(name):
     part = find_part(name)
     assert in_view(part, part.directions).all()

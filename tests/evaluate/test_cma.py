@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from support.command_line import caller
+from support.tables import each_row
 
 from lidardesign.cli.commands.evaluate import search_display
 from lidardesign.cli.output import Output
@@ -101,7 +102,7 @@ def models_of(space, train, layout, rules, count=3):
     return [SensorModel(setting, start, [{}], rules) for start in found]
 
 
-@pytest.mark.parametrize("case", CASES, ids=named)
+@each_row("case", CASES, ids=named)
 def test_every_vector_however_far_stands_for_a_design_that_keeps_its_constraints(case):
     space, train, layout, rules = case
     generator = np.random.default_rng(5)
@@ -115,7 +116,7 @@ def test_every_vector_however_far_stands_for_a_design_that_keeps_its_constraints
             assert len(rays) == design.rays
 
 
-@pytest.mark.parametrize("case", CASES, ids=named)
+@each_row("case", CASES, ids=named)
 def test_projecting_twice_is_projecting_once(case):
     generator = np.random.default_rng(6)
     for model in models_of(*case)[::7]:
@@ -179,7 +180,7 @@ def test_rays_of_spread_sensors_are_parallel_or_meet_in_one_point(focus):
     assert spread < (0.05 if focus else 0.01)
 
 
-@pytest.mark.parametrize(("count", "rows"), [(n, r) for n in (1, 2, 5, 10) for r in range(1, n + 1)])
+@each_row(("count", "rows"), [(n, r) for n in (1, 2, 5, 10) for r in range(1, n + 1)])
 def test_tiles_are_equal_and_fill_their_rectangle(count, rows):
     low, high = np.array([-1.0, 2.0]), np.array([3.0, 2.5])
     found = tiles(low, high, count, rows)
@@ -209,8 +210,8 @@ def test_the_widest_cap_keeps_a_budget_that_one_bin_more_breaks():
     assert widest_bins(lambda width: True, widths, read_out) == math.inf
 
 
-@pytest.mark.parametrize("layout", ["grid", "distributed"])
-@pytest.mark.parametrize("limit", [0.004, 0.3, 2.0])
+@each_row("layout", ["grid", "distributed"])
+@each_row("limit", [0.004, 0.3, 2.0])
 def test_rays_within_a_bandwidth_cost_no_more_and_hardly_less(layout, limit):
     space = FREE if layout == "distributed" else FIXED
     generator = np.random.default_rng(2)
@@ -395,7 +396,7 @@ def request_of(name, task=None, **changes):
     return EvaluationRequest(**{**values, **changes})
 
 
-@pytest.mark.parametrize("name", [name for name in FOLLOWED if name != "density"])
+@each_row("name", [name for name in FOLLOWED if name != "density"])
 def test_every_kind_of_design_is_followed_and_what_is_found_keeps_its_constraints(name):
     # rays of a density at another number follow from samples, which cma does without
     evaluation = evaluate(request_of(name))
@@ -432,7 +433,7 @@ def candidate_of(name, settings=None):
     )
 
 
-@pytest.mark.parametrize("name", list(FOLLOWED))
+@each_row("name", list(FOLLOWED))
 def test_what_is_found_within_a_bandwidth_stays_within_it(name):
     source = candidate_of(name, CmaSettings(Budget(math.inf, 60)))
     for limit in (0.02, 0.5):

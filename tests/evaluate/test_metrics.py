@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from support.tables import each_row
 
 from lidardesign.errors import DataError
 from lidardesign.evaluate.metrics import (
@@ -126,7 +127,7 @@ def test_every_triangle_is_delaunay_on_the_sphere_even_over_more_than_half_a_tur
         assert not inside, "a return lies inside the circle of three others"
 
 
-@pytest.mark.parametrize(
+@each_row(
     "points",
     [
         np.zeros((0, 3)),

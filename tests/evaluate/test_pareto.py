@@ -6,8 +6,8 @@ import subprocess
 import sys
 from dataclasses import replace
 
-import pytest
 from evaluate.test_plots import make_evaluation
+from support.tables import each_row
 
 from lidardesign.evaluate.accuracy.settings import Ladder, Rung
 from lidardesign.evaluate.accuracy.sweeps import Accuracy
@@ -53,7 +53,7 @@ def test_the_front_is_what_no_other_rung_beats():
     assert [mark.beaten for mark in panels([twins])[0].marks] == [False, False]
 
 
-@pytest.mark.parametrize(
+@each_row(
     "rungs",
     [
         [Rung("a", 0.0, 0.0, 0.0), Rung("b", 0.0, 0.0, 0.0)],
@@ -62,7 +62,7 @@ def test_the_front_is_what_no_other_rung_beats():
         [Rung("a", math.inf, math.nan, 1.0), Rung("b", 0.5, 0.0, 1.0)],
     ],
 )
-@pytest.mark.parametrize("tolerance", [0.0, 0.02, math.inf])
+@each_row("tolerance", [0.0, 0.02, math.inf])
 def test_figures_without_a_logarithm_are_drawn_too(rungs, tolerance):
     ladder = make_ladder(rungs, tolerance=tolerance)
     (panel,) = panels([ladder])

@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from PIL import Image
+from support.tables import each_row
 
 from lidardesign.design.constraints.slack import ConstraintSlack
 from lidardesign.design.sensor import DesignSpec, Sensor
@@ -363,8 +364,8 @@ def test_nothing_draws_before_it_is_asked_to():
     assert done.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("span", [4.1, 20.0, 29.0, 31.0, 1e5])
-@pytest.mark.parametrize("low", [0.037, 1.0, 5.7])
+@each_row("span", [4.1, 20.0, 29.0, 31.0, 1e5])
+@each_row("low", [0.037, 1.0, 5.7])
 def test_a_logarithmic_axis_has_at_least_three_labels_at_round_places_inside_it(low, span):
     ticks = log_ticks([low * span, low])
     assert ticks == sorted(set(ticks))

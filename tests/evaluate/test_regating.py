@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.tables import each_row
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.check import check_design
@@ -76,8 +77,8 @@ def bins(design):
     return int(MODEL.bins(gates[:, 1] - gates[:, 0]).sum())
 
 
-@pytest.mark.parametrize("kind", [scan, table])
-@pytest.mark.parametrize(("start", "end"), [(1.0, 3.0), (1.4, 1.6), (0.2, 0.4), (0.1, 3.5), (2.5, 2.6)])
+@each_row("kind", [scan, table])
+@each_row(("start", "end"), [(1.0, 3.0), (1.4, 1.6), (0.2, 0.4), (0.1, 3.5), (2.5, 2.6)])
 def test_never_more_bandwidth_and_never_fewer_returns(kind, start, end):
     design = kind(gates_like(start, end))
     other = GATING(design, lay_out(design))
@@ -160,8 +161,8 @@ RULES = {
 }
 
 
-@pytest.mark.parametrize("kind", [scan, table])
-@pytest.mark.parametrize("name", RULES)
+@each_row("kind", [scan, table])
+@each_row("name", RULES)
 def test_constraints_are_kept(kind, name):
     rules = RULES[name]
     low, high = (1.7, 1.75) if name == "starts" else (1.45, 1.55)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from lidardesign_tasks.flatland import FlatlandTask
+from support.tables import each_row
 
 from lidardesign.errors import PluginError
 from lidardesign.evaluate.scene_scores import checked_residuals, gives_residuals
@@ -55,7 +56,7 @@ ANSWERS = {
 }
 
 
-@pytest.mark.parametrize("given", ANSWERS)
+@each_row("given", ANSWERS)
 def test_residuals_that_are_none_are_the_tasks_fault(seen, given):
     answer, words = ANSWERS[given]
     with pytest.raises(PluginError) as caught:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.tables import each_row
 
 from lidardesign.design.fit import fit
 from lidardesign.design.sensor import DesignSpec, Sensor
@@ -146,7 +147,7 @@ MALFORMED = {
 }
 
 
-@pytest.mark.parametrize("name", MALFORMED)
+@each_row("name", MALFORMED)
 def test_malformed_documents_are_refused_by_their_place(name):
     with pytest.raises(ConfigError) as caught:
         Reweighting.from_document(MALFORMED[name], "weighting of design d: factors")
@@ -260,7 +261,7 @@ NO_WEIGHTINGS = {
 }
 
 
-@pytest.mark.parametrize("name", NO_WEIGHTINGS)
+@each_row("name", NO_WEIGHTINGS)
 def test_what_is_no_weighting_is_refused_by_the_designs_name(name):
     with pytest.raises(ConfigError) as caught:
         Weighting.of(design_with(NO_WEIGHTINGS[name]))

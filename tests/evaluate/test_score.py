@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.tables import each_row
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import DesignSpec, Sensor
@@ -227,7 +228,7 @@ class BrokenTask(MissTask):
         return self.result
 
 
-@pytest.mark.parametrize(
+@each_row(
     "result",
     [
         ValueError("boom"),
@@ -275,7 +276,7 @@ def test_a_failure_has_the_worst_value_whatever_the_task_put_there():
     assert (row.value, row.failures) == (150.0, 0)
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("changes", "message"),
     [
         ({"test": []}, "no held-out scenes"),

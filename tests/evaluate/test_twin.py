@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from support.tables import each_row
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.check import check_design
@@ -62,7 +62,7 @@ def both(case):
     return replace(design, provenance={"seed": 5}), own, other, choices
 
 
-@pytest.mark.parametrize("case", CASES)
+@each_row("case", CASES)
 def test_a_twin_has_as_many_sensors_and_rays_and_keeps_the_same_constraints(case):
     design, _, other, _ = both(case)
     twin = fitted_twin(design, other, name="no-visibility")
@@ -79,7 +79,7 @@ def test_a_twin_has_as_many_sensors_and_rays_and_keeps_the_same_constraints(case
         assert len(rays) == (design.rays or 24)
 
 
-@pytest.mark.parametrize("case", CASES)
+@each_row("case", CASES)
 def test_a_twin_of_the_same_samples_is_the_design_itself(case):
     design, own, _, _ = both(case)
     twin = fitted_twin(design, own, name="again")
@@ -87,7 +87,7 @@ def test_a_twin_of_the_same_samples_is_the_design_itself(case):
     assert design_document(written[0]) == design_document(written[1])
 
 
-@pytest.mark.parametrize(("case", "limit"), [("grid", 0.0), ("grid", 0.5), ("grid", 9.0), ("scan", 0.0), ("scan", 0.3)])
+@each_row(("case", "limit"), [("grid", 0.0), ("grid", 0.5), ("grid", 9.0), ("scan", 0.0), ("scan", 0.3)])
 def test_a_twin_within_a_bandwidth_never_exceeds_it(case, limit):
     design, own, _, _ = both(case)
     calls = []

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from evaluate.test_score import MissTask
 from lidardesign_tasks.flatland import FlatlandConfig, FlatlandTask
+from support.tables import each_row
 
 from lidardesign import errors
 from lidardesign.design.sensor import DesignSpec, Sensor
@@ -123,8 +124,8 @@ def test_rays_arrive_to_the_last_bit(counts):
                 assert getattr(rays, name).tobytes() == getattr(other, name).tobytes()
 
 
-@pytest.mark.parametrize("name", detector_names())
-@pytest.mark.parametrize("choice", ["auto", "all", frozenset({"jitter", "footprint"})])
+@each_row("name", detector_names())
+@each_row("choice", ["auto", "all", frozenset({"jitter", "footprint"})])
 def test_planners_and_plans_arrive_whole(name, choice):
     detector = load_detector(name)
     for tolerance in (None, Tolerance(1e-3 / 3, 0.1)):
@@ -168,7 +169,7 @@ def test_an_outline_tells_scenes_apart_but_not_roundings():
     assert not messages.same_outline(messages.outline(base), messages.outline(renamed))
 
 
-@pytest.mark.parametrize("kind", ["ConfigError", "DataError", "PluginError", "NumericalError", "InfeasibleError"])
+@each_row("kind", ["ConfigError", "DataError", "PluginError", "NumericalError", "InfeasibleError"])
 def test_errors_arrive_whole_with_the_workers_traceback(kind):
     error = getattr(errors, kind)("found", where="here", allowed="this", hint="that")
     document, _ = messages.unpack(messages.pack(messages.error_as_document(error, "line 7")))
@@ -259,12 +260,12 @@ BAD = ("0", "-1", "1025", "1.5", "", "two", "tcp://", "tcp://host", "tcp://host:
 BAD += ("http://host:80", "tcp://host:80/x", "99999999999999999999", "tcp:// :80", "²")
 
 
-@pytest.mark.parametrize("text", GOOD)
+@each_row("text", GOOD)
 def test_workers_are_a_number_or_an_address(text):
     assert check_workers(text) == GOOD[text]
 
 
-@pytest.mark.parametrize("text", BAD)
+@each_row("text", BAD)
 def test_workers_that_are_neither_are_refused(text):
     with pytest.raises(ConfigError, match="--workers"):
         check_workers(text)

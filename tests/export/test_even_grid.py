@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.rigs import even, farthest_nearest, sensor
+from support.tables import each_row
 
 from lidardesign.design.layouts.grid import grid_tangent
 from lidardesign.design.sensor import DesignSpec, tangent_directions
@@ -30,8 +31,8 @@ def test_an_even_grid_is_found_again(columns, rows, left, width, low, height):
     assert found.distance_rad(azimuth, elevation).max() < 1e-6
 
 
-@pytest.mark.parametrize("columns", [1, 2, 3, 7, 360])
-@pytest.mark.parametrize("turn", [0.0, 0.4, np.pi, -2.9])
+@each_row("columns", [1, 2, 3, 7, 360])
+@each_row("turn", [0.0, 0.4, np.pi, -2.9])
 def test_a_whole_turn_is_found_wherever_it_begins(columns, turn):
     step = 2 * np.pi / columns
     wanted = even(columns, 3, (turn, turn + 2 * np.pi - step), (-0.2, 0.1))
@@ -80,7 +81,7 @@ def test_notes_count_the_rays_that_move():
     assert 0.15 < told < 0.3
 
 
-@pytest.mark.parametrize("seed", range(8))
+@each_row("seed", range(8))
 def test_a_mounts_rotation_is_its_sensors_frame(seed):
     generator = np.random.default_rng(seed)
     elevation = (np.pi / 2, -np.pi / 2)[seed] if seed < 2 else generator.uniform(-1.5, 1.5)

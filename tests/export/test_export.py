@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from support.tables import each_row
 
 from lidardesign.design.files import load_design
 from lidardesign.design.layouts.rays import lay_out
@@ -44,8 +45,8 @@ def read_npz(path):
         return dict(arrays)
 
 
-@pytest.mark.parametrize(("name", "read"), [("csv", read_csv), ("npz", read_npz)])
-@pytest.mark.parametrize("count", [0, 1, 37])
+@each_row(("name", "read"), [("csv", read_csv), ("npz", read_npz)])
+@each_row("count", [0, 1, 37])
 def test_a_ray_list_comes_back_to_the_last_bit(tmp_path, name, read, count):
     rays = lay_out(design(), count)
     path = tmp_path / "out"
@@ -95,7 +96,7 @@ def contents(path):
     return {str(file.relative_to(path)): file.read_bytes() for file in files}
 
 
-@pytest.mark.parametrize("name", EXPORTERS)
+@each_row("name", EXPORTERS)
 def test_every_format_is_written_whole_or_not_at_all(tmp_path, name):
     exporter = EXPORTERS[name]
     assert exporter.name == name
@@ -109,7 +110,7 @@ def test_every_format_is_written_whole_or_not_at_all(tmp_path, name):
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("name", EXPORTERS)
+@each_row("name", EXPORTERS)
 def test_a_file_is_never_written_over_a_folder_nor_a_folder_over_a_file(tmp_path, name):
     exporter, path = EXPORTERS[name], tmp_path / "taken"
     if exporter.folder:

@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from support.rigs import NASTY, even, farthest_nearest, read_sdf, rig, sdf_reader, spinning
+from support.tables import each_row
 
 from lidardesign.design.files import load_design
 from lidardesign.design.layouts.rays import lay_out
@@ -248,7 +249,7 @@ def test_xacro_mounts_the_sensors_on_a_robot(reader, exported, tmp_path):
     check_gazebo([found[f"left_{name}"] for name in NAMES], DESIGN, RAYS, URDF_DIGITS)
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@each_row("name", ROBOTS)
 def test_what_a_format_holds_comes_back(exported, name):
     path, notes = exported[name]
     found = EXPORTERS[name].rounding(DESIGN, RAYS, path)
@@ -282,7 +283,7 @@ def test_what_is_not_on_a_grid_is_counted_and_measured(exported, name):
     assert told < 0.3
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@each_row("name", ROBOTS)
 def test_a_gate_start_that_is_not_held_is_told(exported, name):
     told = [note for note in exported[name][1] if "gate start" in note]
     assert len(told) == (name in ("mjcf", "carla"))
@@ -293,7 +294,7 @@ def test_a_gate_start_that_is_not_held_is_told(exported, name):
         assert f"{RAYS.gate_m[RAYS.gate_m[:, 0] > 0, 0].min():.3g} to 1 m" in told[0]
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@each_row("name", ROBOTS)
 def test_a_format_holds_its_frame_rate_or_refuses_one(tmp_path, name):
     path = tmp_path / "out"
     if name == "mjcf":
@@ -309,7 +310,7 @@ def test_a_format_holds_its_frame_rate_or_refuses_one(tmp_path, name):
         assert found["time_s"].error < 1.01e-9
 
 
-@pytest.mark.parametrize("rate_hz", [np.nan, np.inf, 0.0, -1.0, 1e-320, 1e300])
+@each_row("rate_hz", [np.nan, np.inf, 0.0, -1.0, 1e-320, 1e300])
 def test_no_sensor_has_such_a_frame_rate(tmp_path, rate_hz):
     with pytest.raises(ConfigError, match=r"0\.001 to 1e"):
         EXPORTERS["sdf"].write(DESIGN, RAYS, tmp_path / "out", rate_hz)
@@ -327,7 +328,7 @@ def test_carla_fires_whole_numbers_of_points_per_second(tmp_path):
     assert found[0]["direction_rad"].error == pytest.approx(found[1]["direction_rad"].error)
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@each_row("name", ROBOTS)
 def test_no_rays_are_no_sensors(tmp_path, name):
     none = RAYS.subset(np.zeros(0, dtype=np.int64))
     path = tmp_path / "out"
@@ -336,7 +337,7 @@ def test_no_rays_are_no_sensors(tmp_path, name):
     assert all(estimate.error == 0 for estimate in EXPORTERS[name].rounding(DESIGN, none, path).values())
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@each_row("name", ROBOTS)
 def test_another_or_a_damaged_file_is_no_round_trip(exported, tmp_path, name):
     exporter = EXPORTERS[name]
     with pytest.raises(DataError):

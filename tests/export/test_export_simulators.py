@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.tables import each_row
 
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError, DataError
@@ -87,8 +88,8 @@ def written(tmp_path_factory):
     return found
 
 
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("name", TOLERANCES)
+@each_row("case", CASES)
+@each_row("name", TOLERANCES)
 def test_what_a_format_can_hold_comes_back_equal(written, name, case):
     path, _ = written[name, case]
     errors = EXPORTERS[name].rounding(DESIGN, CASES[case], path)
@@ -97,13 +98,13 @@ def test_what_a_format_can_hold_comes_back_equal(written, name, case):
     assert ("time_s" in errors) == ("time_s" in TOLERANCES[name])
 
 
-@pytest.mark.parametrize("name", TOLERANCES)
+@each_row("name", TOLERANCES)
 def test_every_format_says_that_it_does_not_hold_the_constraints(written, name):
     for case in CASES:
         assert any("constraints" in note for note in written[name, case][1])
 
 
-@pytest.mark.parametrize("name", MINE)
+@each_row("name", MINE)
 def test_names_of_files_are_plain_whatever_the_sensors_are_called(written, name):
     for case in CASES:
         path, _ = written[name, case]
@@ -136,7 +137,7 @@ def test_sensors_that_fire_nothing_are_left_out_and_told(tmp_path, name):
     assert errors["direction_rad"].error <= TOLERANCES[name]["direction_rad"]
 
 
-@pytest.mark.parametrize("name", MINE)
+@each_row("name", MINE)
 def test_damaged_exports_are_told_from_whole_ones(tmp_path, name):
     exporter, path = EXPORTERS[name], tmp_path / "out"
     exporter.write(DESIGN, CASES["mounted"], path)
@@ -291,8 +292,8 @@ def published_osi_message():
     return module.SensorViewConfiguration()
 
 
-@pytest.mark.parametrize("message", [own_osi_message, published_osi_message])
-@pytest.mark.parametrize("case", CASES)
+@each_row("message", [own_osi_message, published_osi_message])
+@each_row("case", CASES)
 def test_osi_is_read_by_protobuf_and_its_rays_are_ours(written, case, message):
     json_format = pytest.importorskip("google.protobuf.json_format", reason="protobuf is not installed")
     path, _ = written["osi", case]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.tables import each_row
 
 from lidardesign.design.galvo import SPEED_OF_LIGHT_M_PER_PS
 from lidardesign.design.layouts.rays import lay_out
@@ -29,7 +30,7 @@ def design(roll=0.0):
 RAYS = lay_out(design(), 37)
 
 
-@pytest.mark.parametrize("name", EXPORTERS)
+@each_row("name", EXPORTERS)
 def test_every_format_says_what_its_numbers_lose(tmp_path, name):
     path = tmp_path / "out"
     EXPORTERS[name].write(design(), RAYS, path)
@@ -42,8 +43,8 @@ def test_every_format_says_what_its_numbers_lose(tmp_path, name):
         )
 
 
-@pytest.mark.parametrize(("name", "read"), [("csv", read_csv), ("npz", read_npz)])
-@pytest.mark.parametrize("count", [0, 1, 37])
+@each_row(("name", "read"), [("csv", read_csv), ("npz", read_npz)])
+@each_row("count", [0, 1, 37])
 def test_ray_lists_are_read_as_they_were(tmp_path, name, read, count):
     rays = RAYS.subset(np.arange(count))
     EXPORTERS[name].write(design(), rays, tmp_path / "rays")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.tables import each_row
 
 from fuzz import campaign
 from fuzz.attempts import Fuzzer, Tally, attempt, not_finite
@@ -28,7 +29,7 @@ def caches(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
-@pytest.mark.parametrize("name", NAMES)
+@each_row("name", NAMES)
 def test_good_files_are_read_and_damaged_ones_read_or_refused(tmp_path, name):
     fuzzer = Fuzzer(target_of(name), tmp_path, seed=2026)
     good = fuzzer.seeds[:]
@@ -112,7 +113,7 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize("kind", FAULTS)
+@each_row("kind", FAULTS)
 def test_a_fault_is_found(kind):
     read, words = FAULTS[kind]
     _, fault = attempt(read, b"", Tally(), 1e-3 if kind == "a long time" else 10.0)

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 from support.command_line import caller, files_under, make_run
 from support.hard_cases import hard_case
+from support.tables import each_row
 
 import lidardesign.design.constraints.check as checker
 from lidardesign.design.bandwidth import split_budget
@@ -177,7 +178,7 @@ class TestContradictions:
             "nothing; a sampler that rejects would never return"
         )
 
-    @pytest.mark.parametrize("name", CONTRADICTIONS)
+    @each_row("name", CONTRADICTIONS)
     def test_what_is_named_conflicts_and_without_any_one_of_it_does_not(self, name):
         values, expected = CONTRADICTIONS[name]
         conflicts = conflicts_of(values, FACE)
@@ -195,7 +196,7 @@ class TestContradictions:
         if conflicts:
             assert_smallest(values, FACE, conflicts)
 
-    @pytest.mark.parametrize("name", BUDGETS)
+    @each_row("name", BUDGETS)
     def test_budgets_are_refused_with_all_that_makes_them_too_small(self, name):
         values, asked, expected = BUDGETS[name]
         conflicts = conflicts_of(values, FACE, **asked)
@@ -408,7 +409,7 @@ class TestBoundsHoldOnTheWrittenFile:
         free, after, within = clamp_and_mstep()
         assert free >= within > after + 0.1
 
-    @pytest.mark.parametrize("start", range(0, 40, 5))
+    @each_row("start", range(0, 40, 5))
     def test_random_files_are_kept_exactly_or_refused_with_what_stands_against_them(self, start):
         kept, reasons = 0, []
         for seed in range(start, start + 5):
@@ -524,15 +525,15 @@ class TestBudgetsThatDoNotDivide:
         assume((np.diff(remainders) > 1e-6).all())
         np.testing.assert_array_equal(split_budget(weights[order], rays), split_budget(weights, rays)[order])
 
-    @pytest.mark.parametrize("count", [0, 1, 2, 3, 4])
-    @pytest.mark.parametrize("layout", ["grid", "density", "distributed"])
+    @each_row("count", [0, 1, 2, 3, 4])
+    @each_row("layout", ["grid", "density", "distributed"])
     def test_layouts_take_any_number_of_rays(self, layout, count):
         design = DesignSpec("d", three_sensors(), layout=layout)
         rays = lay_out(design, count, drawn_from(design, 2000))
         assert len(rays) == count
         assert np.bincount(rays.sensor, minlength=3).tolist() == split_budget(design.weights, count).tolist()
 
-    @pytest.mark.parametrize("rays", [1, 2, 3, 4, 5])
+    @each_row("rays", [1, 2, 3, 4, 5])
     def test_a_fit_gives_every_sensor_a_ray_where_their_number_is_open(self, rays):
         for sensors in (None, "auto"):
             result = fit(SAMPLES, sensors=sensors, rays=rays, em_samples=1200, restarts=1)

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support import references
 from support.hard_cases import hard_case
+from support.tables import each_row
 
 from lidardesign.config import (
     FASTEST_PER_M,
@@ -183,8 +184,8 @@ class TestScenesOfAnyScale:
             f"products there is {squared * place:g} m^2"
         )
 
-    @pytest.mark.parametrize("way", WAYS)
-    @pytest.mark.parametrize(("scale", "offset"), [(1e-4, 0.0), (1e5, 0.0), (1.0, 1e7)])
+    @each_row("way", WAYS)
+    @each_row(("scale", "offset"), [(1e-4, 0.0), (1e5, 0.0), (1.0, 1e7)])
     def test_densities_over_meshes_scale_and_shift_with_the_scene(self, way, scale, offset):
         mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
 
@@ -241,8 +242,8 @@ class TestScenesOfAnyScale:
         np.testing.assert_allclose(unit, home, atol=atol)
         assert found == pytest.approx(ess, rel=10 * atol)
 
-    @pytest.mark.parametrize("layout", ["grid", "density", "distributed", "scan"])
-    @pytest.mark.parametrize(("scale", "offset", "atol"), [(1e-4, 0.0, 1e-12), (1e5, 0.0, 1e-12), (1.0, 1e7, 1e-7)])
+    @each_row("layout", ["grid", "density", "distributed", "scan"])
+    @each_row(("scale", "offset", "atol"), [(1e-4, 0.0, 1e-12), (1e5, 0.0, 1e-12), (1.0, 1e7, 1e-7)])
     def test_a_fitted_design_has_the_same_rays(self, layout, scale, offset, atol):
         rows = []
         for samples, factor, shift in (
@@ -287,8 +288,8 @@ class TestScenesFarAway:
         value.backward()
         return f"log(p* + 1e-10) is {value:.1f} from 7 sigma on, at 450 sigma with a gradient of {abs(distance.grad):g}"
 
-    @pytest.mark.parametrize("way", WAYS)
-    @pytest.mark.parametrize("kind", FAR_AWAY)
+    @each_row("way", WAYS)
+    @each_row("kind", FAR_AWAY)
     def test_values_are_finite_and_the_gradient_leads_to_the_scene(self, kind, way):
         target = build_target(FAR_AWAY[kind], SPACE, DensitySettings(field_resolution=16), way)
         values, gradient = target.log_density_and_gradient(points_near())
@@ -384,8 +385,8 @@ class TestSigmaAtBothEnds:
         assert caught.value.where == "density.sigma_m"
         assert "density.field_resolution" in caught.value.hint
 
-    @pytest.mark.parametrize("kind", MESHES)
-    @pytest.mark.parametrize(("share", "noted"), [(2 * UNRESOLVED_SHARE, True), (0.4, True), (0.8, False)])
+    @each_row("kind", MESHES)
+    @each_row(("share", "noted"), [(2 * UNRESOLVED_SHARE, True), (0.4, True), (0.8, False)])
     def test_sigma_below_half_a_step_is_noted(self, kind, share, noted):
         _, notes = prepared(kind, share * 0.02)
         assert any("below half the field's grid step" in note for note in notes) == noted
@@ -422,7 +423,7 @@ class TestSigmaAtBothEnds:
         point = DesignSpace((0, 0, 0, 0, 0, 1), (0, 0, 0, 0, 0, 1))
         assert prepared("ball", 100.0, point)[1] == []
 
-    @pytest.mark.parametrize(("key", "value"), [(key, value) for key, values in LIMITS.items() for value in values])
+    @each_row(("key", "value"), [(key, value) for key, values in LIMITS.items() for value in values])
     def test_what_would_overflow_is_refused_by_name(self, key, value):
         with pytest.raises(ConfigError, match=key.replace(".", r"\.")) as caught:
             resolve(load_task("flatland"), overrides=[f"{key}={value}"])
@@ -499,7 +500,7 @@ class TestThinOccludersAndAnyBeta:
         assert "density.visibility=raycast" in warning
         assert target.visibility.points == 1024
 
-    @pytest.mark.parametrize("beta", [1e-9, 1e-3, 1.0, 1e3, 1e6, FASTEST_PER_M])
+    @each_row("beta", [1e-9, 1e-3, 1.0, 1e3, 1e6, FASTEST_PER_M])
     def test_ray_casting_follows_the_closed_form_for_every_beta(self, beta):
         optics = Optics(0.01, beta, 1000.0, 0.01)
         scene = Scene((plate(0.2),))
@@ -521,8 +522,8 @@ class TestThinOccludersAndAnyBeta:
         assert ((found >= 0) & (found <= 1)).all()
         assert (np.diff(found) <= 0).all()
 
-    @pytest.mark.parametrize("beta", [1e-6, 1.0, 1e3, 1e9])
-    @pytest.mark.parametrize("thing", ["thin", "thick", "mesh"])
+    @each_row("beta", [1e-6, 1.0, 1e3, 1e9])
+    @each_row("thing", ["thin", "thick", "mesh"])
     def test_integrated_transmittance_is_a_share_that_rises_by_no_more_than_its_own_step(self, beta, thing):
         mesh = ball_of_triangles((1.0, 0.1, 0), 0.6)
         body = {"thin": plate(0.002), "thick": plate(0.3), "mesh": Body(mesh)}[thing]
@@ -590,8 +591,8 @@ class TestRaysThatStartInsideOrGraze:
         assert found[0] == 1.0
         assert found[-1] < 1e-100
 
-    @pytest.mark.parametrize("name", ["ball", "box", "capsule"])
-    @pytest.mark.parametrize("inward", [True, False])
+    @each_row("name", ["ball", "box", "capsule"])
+    @each_row("inward", [True, False])
     def test_on_a_surface_it_is_met_at_once(self, name, inward):
         ranges = np.linspace(0, 1, 101)
         found = cast(Scene((Body(SOLIDS[name]),)), rays_from((0.5, 0, 0), (-1.0 if inward else 1.0, 0, 0), ranges))
@@ -612,8 +613,8 @@ class TestRaysThatStartInsideOrGraze:
         )
         np.testing.assert_allclose(found, np.exp(-1000.0 * np.maximum(rays.ranges - 0.005, 0)), atol=0.01)
 
-    @pytest.mark.parametrize("way", WAYS)
-    @pytest.mark.parametrize("name", [*SOLIDS, "plane"])
+    @each_row("way", WAYS)
+    @each_row("name", [*SOLIDS, "plane"])
     def test_no_start_gives_a_value_or_gradient_that_is_no_number(self, name, way):
         shape = SOLIDS.get(name, Plane())
         starts = [(0, 0, 0), (0.5, 0, 0), (0.5, 0.5, 0.5), (0, 0, 0.5), (0.5, -1, 0), (0.2, 0.1, 0)]
@@ -639,7 +640,7 @@ class TestRaysThatStartInsideOrGraze:
         # d hit / d dip = h / sin^2, at most range^2 / h before the limit
         assert np.abs(np.diff(found)).max() <= (3.0 * 2.0**2 / 0.1 * np.diff(dip)).max()
 
-    @pytest.mark.parametrize("dip", [0.0, 1e-300, 1e-12, 1e-6, 0.01])
+    @each_row("dip", [0.0, 1e-300, 1e-12, 1e-6, 0.01])
     def test_the_derivative_of_a_grazing_hit_is_capped(self, dip):
         scene = Scene((Body(Plane(), "floor", "occluder"), Body(Sphere(0.1), poses=rigid(translation_m=(3.0, 0, 0.1)))))
         space = DesignSpace((0, 0, 0, -1, -0.5, 0), (0, 0, 0.1, 1, 0.5, 4))

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from support import references
 from support.command_line import caller
 from support.hard_cases import hard_case
+from support.tables import each_row
 from test_meshio import BOX_FACES, BOX_VERTICES, write_box
 
 from lidardesign.config import DensitySettings
@@ -78,8 +79,8 @@ class TestFilesWithoutAMesh:
         loaded = trimesh.load(io.BytesIO(bytes(84)), file_type="stl")
         return f"trimesh loads an STL file of no triangles without an error, as a {type(loaded).__name__} of 0 faces"
 
-    @pytest.mark.parametrize("suffix", SUFFIXES)
-    @pytest.mark.parametrize("content", GARBAGE.values(), ids=GARBAGE)
+    @each_row("suffix", SUFFIXES)
+    @each_row("content", GARBAGE.values(), ids=GARBAGE)
     def test_garbage_is_refused_with_the_name_of_the_file(self, tmp_path, suffix, content):
         write_box(tmp_path / "model.gltf")  # a good neighbour must not be read in its place
         path = tmp_path / f"bad{suffix}"
@@ -134,7 +135,7 @@ class TestPartsOfMeshesThatAreNone:
         with pytest.raises(DataError, match="away"):
             Mesh(BOX_VERTICES * scale, BOX_FACES)
 
-    @pytest.mark.parametrize("length", [0.0, -1.0, 1e-160, 1e10, 1e300, math.nan, math.inf])
+    @each_row("length", [0.0, -1.0, 1e-160, 1e10, 1e300, math.nan, math.inf])
     def test_bodies_of_absurd_sizes_are_refused_by_name(self, length):
         for make in (Sphere, lambda one: Box((1.0, one, 1.0)), lambda one: Capsule(one, 1.0)):
             with pytest.raises(DataError, match="has the length"):
@@ -151,7 +152,7 @@ class TestPartsOfMeshesThatAreNone:
         with pytest.raises(DataError, match="1 faces name vertices that do not exist"):
             check_mesh(BOX_VERTICES, np.vstack([BOX_FACES, [0, 1, index]]))
 
-    @pytest.mark.parametrize(
+    @each_row(
         ("vertices", "faces"),
         [
             (np.zeros((0, 3)), np.zeros((0, 3), int)),
@@ -278,8 +279,8 @@ class TestMeshesWithoutAnInside:
         first = [np.roll(face, -face.argmin()).tolist() for face in mesh.faces]
         assert first == [np.roll(face, -face.argmin()).tolist() for face in plain.faces]
 
-    @pytest.mark.parametrize("name", SOLIDS)
-    @pytest.mark.parametrize("made", ["as it is", "turned at random", "inside out"])
+    @each_row("name", SOLIDS)
+    @each_row("made", ["as it is", "turned at random", "inside out"])
     def test_signs_agree_with_the_parity_of_ray_crossings(self, name, made):
         vertices, faces = SOLIDS[name]
         faces = np.array(faces)
@@ -385,7 +386,7 @@ class TestSignConventions:
             f"the centre of a ball of 0.5 m is {found:+.2f} m where its faces are wound the other way"
         )
 
-    @pytest.mark.parametrize("way", WAYS)
+    @each_row("way", WAYS)
     def test_a_sphere_is_positive_outside_and_negative_inside(self, way):
         generator = np.random.default_rng(3)
         looking = generator.normal(size=(300, 3))
@@ -466,8 +467,8 @@ class TestQueriesAtSpecialPlaces:
             f"p / |p| at the centre is {slope}"
         )
 
-    @pytest.mark.parametrize("places", SPECIAL)
-    @pytest.mark.parametrize("shape", ["sphere", "table", "moving"])
+    @each_row("places", SPECIAL)
+    @each_row("shape", ["sphere", "table", "moving"])
     def test_values_and_gradients_are_finite(self, shape, places):
         body = {
             "sphere": Body(Sphere(0.5)),
@@ -581,8 +582,8 @@ class TestManyFacesAndManyQueries:
         parts = np.concatenate([field.distances(points[:100]), field.distances(points[100:])])
         assert whole.tobytes() == parts.tobytes()
 
-    @pytest.mark.parametrize("way", ["off", "quadrature", "raycast"])
-    @pytest.mark.parametrize("kind", ["mesh", "primitives"])
+    @each_row("way", ["off", "quadrature", "raycast"])
+    @each_row("kind", ["mesh", "primitives"])
     def test_densities_have_the_same_bits_for_any_chunk_size_and_order(self, monkeypatch, kind, way):
         shape = mesh_of(BALL) if kind == "mesh" else Sphere(0.5)
         before = Body(Box((0.05, 0.1, 0.1)), "before", "occluder", rigid(translation_m=(0.8, 0, 0)))

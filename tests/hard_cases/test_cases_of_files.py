@@ -13,6 +13,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from support.hard_cases import hard_case
+from support.tables import each_row
 
 from lidardesign.config import resolve
 from lidardesign.density.training.checkpoint import FORMAT, load_arrays, save_arrays
@@ -90,7 +91,7 @@ class TestYaml:
             f"last of repeated keys ({yaml.safe_load('{a: 1, a: 2}')})"
         )
 
-    @pytest.mark.parametrize("case", REFUSED)
+    @each_row("case", REFUSED)
     def test_it_is_refused_at_its_position_with_the_reason(self, tmp_path, monkeypatch, case):
         monkeypatch.chdir(tmp_path)
         text, position, words = REFUSED[case]
@@ -102,8 +103,8 @@ class TestYaml:
         assert len(str(refused.value)) < 1000
         assert [path.name for path in tmp_path.iterdir()] == ["input.yaml"], "a tag was executed"
 
-    @pytest.mark.parametrize("case", [name for name in REFUSED if "number" not in name and "unknown" not in name])
-    @pytest.mark.parametrize("reader", ["constraints", "design", "detector"])
+    @each_row("case", [name for name in REFUSED if "number" not in name and "unknown" not in name])
+    @each_row("reader", ["constraints", "design", "detector"])
     def test_every_reader_of_yaml_refuses_it(self, tmp_path, monkeypatch, reader, case):
         monkeypatch.chdir(tmp_path)
         (tmp_path / "input.yaml").write_bytes(REFUSED[case][0].encode())
@@ -118,7 +119,7 @@ class TestYaml:
             with pytest.raises(ConfigError, match="too large"):
                 readers(tmp_path)[reader]()
 
-    @pytest.mark.parametrize(
+    @each_row(
         ("text", "value"),
         [("1e-3", 1e-3), ("010", 10), ("no", "no"), ("1:30", "1:30"), ("2020-01-01", "2020-01-01"), ("0x10", "0x10")],
     )

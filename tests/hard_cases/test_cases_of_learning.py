@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import references
 from support.hard_cases import hard_case
+from support.tables import each_row
 from zuko.distributions import BoxUniform
 from zuko.transforms import MonotonicRQSTransform
 
@@ -64,7 +65,7 @@ class TestEdgesOfTheBox:
         lost = "NaN" if torch.isnan(log_slope).all() else "finite"
         return f"a last knot is {over:.0e} beyond the bound, the slope at inf is {lost}, log p at the upper edge {edge}"
 
-    @pytest.mark.parametrize("name", FLOWS)
+    @each_row("name", FLOWS)
     def test_edges_are_finite_and_only_the_outside_has_no_density(self, name):
         flow = flow_of(name)
         _, context = draw(flow, 2)
@@ -93,7 +94,7 @@ class TestEdgesOfTheBox:
             for there in (made(x), made.inv(x)):
                 assert (there.abs() <= 1).all()
 
-    @pytest.mark.parametrize("name", FLOWS)
+    @each_row("name", FLOWS)
     def test_gradients_at_the_edge_are_finite(self, name):
         flow = flow_of(name)
         _, context = draw(flow, 2)
@@ -142,8 +143,8 @@ class TestSteepSplines:
         assert back.abs().max() <= 1
         assert torch.isfinite(torch.autograd.grad(log_slope.sum(), x)[0]).all()
 
-    @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-    @pytest.mark.parametrize("scale", [10.0, 100.0, 1000.0])
+    @each_row("dtype", [torch.float32, torch.float64])
+    @each_row("scale", [10.0, 100.0, 1000.0])
     def test_densities_of_the_steepest_flows_stay_finite(self, scale, dtype):
         flow = flow_of("all six", scale=scale).to(dtype)
         base, _ = draw(flow.double(), 300)

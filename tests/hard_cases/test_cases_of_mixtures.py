@@ -11,6 +11,7 @@ from design.test_track import shelves
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.hard_cases import hard_case
+from support.tables import each_row
 
 from lidardesign.design.files import design_document
 from lidardesign.design.fit import fit
@@ -85,8 +86,8 @@ class TestSamplesThatDoNotFillTheirSpace:
             f"{determinant:g} and a log-likelihood of {-determinant / 2:g}; scikit-learn keeps dead ones of weight 0"
         )
 
-    @pytest.mark.parametrize("count", [1, 2, 5, 9])
-    @pytest.mark.parametrize("kind", KINDS)
+    @each_row("count", [1, 2, 5, 9])
+    @each_row("kind", KINDS)
     def test_components_stay_finite_and_positive_definite(self, kind, count):
         generator = np.random.default_rng(12)
         features = features_of(degenerate(kind, generator))
@@ -124,8 +125,8 @@ class TestSamplesThatDoNotFillTheirSpace:
             trace.log_likelihood, rel=SUMMED_NATS, abs=SUMMED_NATS
         )
 
-    @pytest.mark.parametrize("power", [-20, -10, 17])
-    @pytest.mark.parametrize("kind", ["one point", "three points", "collinear", "one range"])
+    @each_row("power", [-20, -10, 17])
+    @each_row("kind", ["one point", "three points", "collinear", "one range"])
     def test_floors_follow_the_scale_of_the_world(self, kind, power):
         factor = 2.0**power
         points = degenerate(kind, np.random.default_rng(3))
@@ -236,8 +237,8 @@ class TestSamplesFarFromEveryComponent:
             f"the log-likelihood of such a sample is {math.log(density + 1e-10):.1f} instead of {-0.5 * 60**2:g}"
         )
 
-    @pytest.mark.parametrize("sigmas", [60, 1e4, 1e8])
-    @pytest.mark.parametrize("count", [1, 2, 7])
+    @each_row("sigmas", [60, 1e4, 1e8])
+    @each_row("count", [1, 2, 7])
     def test_responsibilities_are_finite_and_rows_sum_to_one(self, sigmas, count):
         generator = np.random.default_rng(7)
         mixture = random_mixture(generator, count)
@@ -339,7 +340,7 @@ class TestDimensionsThatAreFixed:
         expected = -np.log(spread * math.sqrt(2 * math.pi * math.e)).sum() - 0.5 * math.log(1 - correlation**2)
         assert trace.log_likelihood == pytest.approx(expected, abs=1e-3)
 
-    @pytest.mark.parametrize("fixed", [(0,), (1,), (2,), (0, 2), (0, 1, 2)])
+    @each_row("fixed", [(0,), (1,), (2,), (0, 2), (0, 1, 2)])
     def test_fixed_axes_have_exactly_no_spread_in_the_written_design(self, fixed):
         low, high = list(WHOLE.low), list(WHOLE.high)
         for axis in fixed:

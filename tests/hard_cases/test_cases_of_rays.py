@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support import references
 from support.hard_cases import hard_case
+from support.tables import each_row
 
 from lidardesign.design.files import design_from_document
 from lidardesign.errors import ConfigError, LidardesignError
@@ -104,8 +105,8 @@ class TestRaysThroughEdgesAndVertices:
         alone = (triangles.run(np.zeros_like(vertices), vertices, limit)["primID"] < 0).mean()
         assert 0 < alone < 0.01
 
-    @pytest.mark.parametrize("start", STARTS)
-    @pytest.mark.parametrize("name", SOLIDS)
+    @each_row("start", STARTS)
+    @each_row("name", SOLIDS)
     def test_none_is_lost_and_all_are_met_where_they_aim(self, name, start):
         origins, directions, reach = aimed(SOLIDS[name], STARTS[start])
         found = SceneCaster(Scene((Body(mesh_of(SOLIDS[name])),))).first_hit(origins, directions)
@@ -245,8 +246,8 @@ class TestDirectionsThatAreNone:
             f"{found['tfar'][2]:.2f} for a direction of length 2.02"
         )
 
-    @pytest.mark.parametrize("case", BAD_DIRECTIONS)
-    @pytest.mark.parametrize("shape", ONE_OF_EACH)
+    @each_row("case", BAD_DIRECTIONS)
+    @each_row("shape", ONE_OF_EACH)
     def test_it_is_an_error_and_never_a_silent_miss(self, case, shape):
         caster = SceneCaster(Scene((Body(ONE_OF_EACH[shape]),)))
         with pytest.raises(ConfigError, match=r"rays.*not finite, or a direction has zero length"):
@@ -275,8 +276,8 @@ class TestDirectionsThatAreNone:
         (returns,) = simulate(Scene((Body(Sphere(0.5), poses=rigid(translation_m=(4.0, 0, 0))),)), ray)
         assert returns.range_m[0] == 3.5
 
-    @pytest.mark.parametrize("key", ["azimuth_rad", "elevation_rad"])
-    @pytest.mark.parametrize("value", [float("nan"), float("inf"), None, "north"])
+    @each_row("key", ["azimuth_rad", "elevation_rad"])
+    @each_row("value", [float("nan"), float("inf"), None, "north"])
     def test_a_design_whose_boresight_is_none_is_refused_with_its_place(self, key, value):
         with pytest.raises(LidardesignError, match=key):
             design_from_document(document(**{key: value}))

@@ -22,6 +22,7 @@ from lidardesign_tasks.arm_links import BALL
 from lidardesign_tasks.arm_motion import PENETRATION_M, POSITION_RESIDUAL_M, TRIES, Arm, RejectedError, draw_waypoints
 from lidardesign_tasks.arm_robot import load_robot
 from support.hard_cases import hard_case
+from support.tables import each_row
 from tasks.test_arm_robot import TOOL_M, mjcf, written
 
 from lidardesign.errors import DataError
@@ -81,7 +82,7 @@ class TestUnstableRollouts:
             f"steps of 0.5 s a ball on the floor sinks {1 - lowest:.1g} m into it, with {len(warnings) - said} warnings"
         )
 
-    @pytest.mark.parametrize("warning", WARNINGS, ids=lambda w: w.name)
+    @each_row("warning", WARNINGS, ids=lambda w: w.name)
     def test_any_warning_of_mujoco_rejects_the_motion(self, arm, warning):
         data = mujoco.MjData(arm.robot.model)
         arm._check_state(data)
@@ -89,8 +90,8 @@ class TestUnstableRollouts:
         with pytest.raises(RejectedError, match="warned"):
             arm._check_state(data)
 
-    @pytest.mark.parametrize("name", ["qpos", "qacc", "xpos"])
-    @pytest.mark.parametrize("value", [math.nan, math.inf])
+    @each_row("name", ["qpos", "qacc", "xpos"])
+    @each_row("value", [math.nan, math.inf])
     def test_numbers_that_are_not_finite_reject_the_motion(self, arm, name, value):
         data = mujoco.MjData(arm.robot.model)
         getattr(data, name).flat[0] = value
@@ -281,7 +282,7 @@ class TestFilesOutsideTheFolder:
                 read = mujoco.MjModel.from_xml_path(str(path))
         return f"MuJoCo reads {read.nbody - 1} body out of a file beside the model's folder without a word"
 
-    @pytest.mark.parametrize("case", OUTSIDE)
+    @each_row("case", OUTSIDE)
     def test_what_leads_out_of_the_folder_is_refused(self, tmp_path, case):
         (tmp_path / "model").mkdir()
         written(tmp_path, "<mujoco/>", "other.xml")

@@ -22,6 +22,7 @@ from lidardesign_tasks.warehouse import WarehouseTask
 from simulate.test_called_for import EVERYTHING, face_rays, heads
 from support.command_line import caller, make_run
 from support.hard_cases import hard_case
+from support.tables import each_row
 
 from lidardesign.density.training.training_data import refuse_blind_receiver
 from lidardesign.errors import ConfigError, DataError
@@ -266,7 +267,7 @@ class TestEffectsNotCalledFor:
             for name in ("outcome", "range_m", "body"):
                 assert getattr(planned, name).tobytes() == getattr(everything, name).tobytes()
 
-    @pytest.mark.parametrize("effect", ["footprint", "motion", "specular", "shadowing", "atmosphere"])
+    @each_row("effect", ["footprint", "motion", "specular", "shadowing", "atmosphere"])
     def test_effects_of_geometry_leave_a_plain_scene_as_geometry_has_it(self, effect):
         (head,) = heads()[:1]
         thin = Detector("thin", pulse_sigma_s=1e-12)

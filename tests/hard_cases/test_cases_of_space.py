@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support import references
 from support.hard_cases import hard_case
+from support.tables import each_row
 
 from lidardesign.config import DensitySettings, LearningSettings, RunConfig, resolve
 from lidardesign.density.flow.flow import DesignFlow
@@ -165,8 +166,8 @@ class TestElevationAtThePoles:
         for z in (-2.0, 1e-200, 1e200):
             assert angles(np.array([0.0, 0.0, z])) == (0.0, math.copysign(math.pi / 2, z))
 
-    @pytest.mark.parametrize("way", WAYS)
-    @pytest.mark.parametrize("measure", MEASURES)
+    @each_row("way", WAYS)
+    @each_row("measure", MEASURES)
     def test_values_and_gradients_are_finite_at_both_poles_in_both_charts(self, measure, way):
         space = DesignSpace(*BOTH_POLES, measure=measure)
         scene = Scene((Body(Plane(), "floor", poses=rigid(translation_m=(0, 0, -2.0))), *BALLS.bodies))
@@ -278,23 +279,23 @@ class TestRangesThatAreNone:
         space = DesignSpace(AROUND.low, (*AROUND.high[:5], 0.0))
         assert (space.sample(10, np.random.default_rng(10))[:, RANGE] == 0.0).all()
 
-    @pytest.mark.parametrize("value", TAUS.values(), ids=TAUS)
-    @pytest.mark.parametrize("side", ["low", "high"])
+    @each_row("value", TAUS.values(), ids=TAUS)
+    @each_row("side", ["low", "high"])
     def test_bounds_are_refused_by_name(self, side, value):
         low, high = list(AROUND.low), list(AROUND.high)
         (low if side == "low" else high)[RANGE] = value
         with pytest.raises(ConfigError, match=r"space\.range_m"):
             DesignSpace(tuple(low), tuple(high))
 
-    @pytest.mark.parametrize("text", ["[-0.1, 1]", "[0, .inf]", "[.nan, 1]", "-0.1", ".nan", "-.inf"])
+    @each_row("text", ["[-0.1, 1]", "[0, .inf]", "[.nan, 1]", "-0.1", ".nan", "-.inf"])
     def test_configurations_are_refused_by_name_and_place(self, tmp_path, text):
         (tmp_path / "config.yaml").write_text(f"space:\n  range_m: {text}\n", encoding="utf-8")
         with pytest.raises(ConfigError, match=r"space\.range_m") as caught:
             resolve(load_task("flatland"), config_file=tmp_path / "config.yaml")
         assert caught.value.where.startswith(f"{tmp_path / 'config.yaml'}:2:1")
 
-    @pytest.mark.parametrize("value", TAUS.values(), ids=TAUS)
-    @pytest.mark.parametrize("key", ["range_m", "gate_m.start", "gate_m.end", "spread.range_m"])
+    @each_row("value", TAUS.values(), ids=TAUS)
+    @each_row("key", ["range_m", "gate_m.start", "gate_m.end", "spread.range_m"])
     def test_design_files_are_refused_by_name(self, tmp_path, key, value):
         sensor = {
             "origin_m": {"mean": [0.0, 0.0, 0.0]},
@@ -325,8 +326,8 @@ class TestRangesThatAreNone:
         with pytest.raises(DataError, match="time_mean"):
             load_design(path)
 
-    @pytest.mark.parametrize("way", WAYS)
-    @pytest.mark.parametrize("value", TAUS.values(), ids=TAUS)
+    @each_row("way", WAYS)
+    @each_row("value", TAUS.values(), ids=TAUS)
     def test_the_target_density_refuses_points_by_name(self, way, value):
         points = AROUND.sample(3, np.random.default_rng(11))
         points[1, RANGE] = value
@@ -367,7 +368,7 @@ class TestFixedDimensions:
         assert np.isfinite(space.log_volume)
         assert space.to_unit(points).shape == (20, 6 - len(fixed))
 
-    @pytest.mark.parametrize("fixed", range(6))
+    @each_row("fixed", range(6))
     def test_gradients_of_the_free_dimensions_do_not_notice(self, fixed):
         generator = np.random.default_rng(12)
         low, high = list(AROUND.low), list(AROUND.high)
@@ -447,8 +448,8 @@ class TestBoundsThatCannotBe:
             inside = bool(np.nan <= 0.5 <= np.nan)
         return f"the log volume of [2, 1] is {volume}, and 'nan <= x <= nan' is {inside} for every x: an empty space"
 
-    @pytest.mark.parametrize("dimension", DIMENSIONS)
-    @pytest.mark.parametrize("case", BAD_BOUNDS)
+    @each_row("dimension", DIMENSIONS)
+    @each_row("case", BAD_BOUNDS)
     def test_the_error_names_the_line_and_the_dimension(self, tmp_path, dimension, case):
         value, words = BAD_BOUNDS[case]
         file = tmp_path / "config.yaml"
@@ -460,8 +461,8 @@ class TestBoundsThatCannotBe:
         assert words in str(caught.value)
         assert caught.value.exit_code == 2
 
-    @pytest.mark.parametrize("value", [1e12, 1e300])
-    @pytest.mark.parametrize("dimension", DIMENSIONS)
+    @each_row("value", [1e12, 1e300])
+    @each_row("dimension", DIMENSIONS)
     def test_bounds_absurdly_far_are_refused_too(self, dimension, value):
         low, high = list(AROUND.low), list(AROUND.high)
         low[DIMENSIONS.index(dimension)] = high[DIMENSIONS.index(dimension)] = value
@@ -469,9 +470,9 @@ class TestBoundsThatCannotBe:
         with pytest.raises(ConfigError, match=rf"space\.{dimension}: .*{words}"):
             DesignSpace(tuple(low), tuple(high))
 
-    @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-    @pytest.mark.parametrize("side", ["low", "high"])
-    @pytest.mark.parametrize("dimension", DIMENSIONS)
+    @each_row("value", [math.nan, math.inf, -math.inf])
+    @each_row("side", ["low", "high"])
+    @each_row("dimension", DIMENSIONS)
     def test_the_space_itself_refuses_them_by_name(self, dimension, side, value):
         bounds = {"low": list(AROUND.low), "high": list(AROUND.high)}
         bounds[side][DIMENSIONS.index(dimension)] = value

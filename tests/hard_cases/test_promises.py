@@ -25,6 +25,7 @@ from pydantic import ValidationError
 from support.command_line import caller, files_under, make_run
 from support.hard_cases import hard_case
 from support.small_runs import shifted
+from support.tables import each_row
 from test_registry import BROKEN, GOOD
 
 from lidardesign.cli.main import run as run_program
@@ -238,8 +239,8 @@ class TestNoNaNLeaves:
             mean = float(np.mean([1.0, math.nan]))
         return f"a NaN among scores makes their mean {mean}, and json.dumps writes {json.dumps(mean)}, which is no JSON"
 
-    @pytest.mark.parametrize("value", NOT_NUMBERS, ids=str)
-    @pytest.mark.parametrize("name", GIVEN)
+    @each_row("value", NOT_NUMBERS, ids=str)
+    @each_row("name", GIVEN)
     def test_what_is_no_number_is_refused_by_name(self, name, value):
         # of settings pydantic's own error, which the program gives with file and line
         with pytest.raises((LidardesignError, ValidationError)) as refused:

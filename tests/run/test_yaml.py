@@ -9,6 +9,7 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from support.tables import each_row
 
 from lidardesign.errors import ConfigError, NumericalError
 from lidardesign.run.yaml import MAX_DEPTH, dump_yaml, leaves, load_yaml, parse_yaml
@@ -63,14 +64,14 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize(("text", "value"), PLAIN)
+@each_row(("text", "value"), PLAIN)
 def test_plain_scalars_mean_what_they_look_like(text, value):
     read = parse_yaml(f"key: {text}", where="f").value["key"]
     assert read == value
     assert type(read) is type(value)
 
 
-@pytest.mark.parametrize("case", BAD)
+@each_row("case", BAD)
 def test_bad_yaml_is_refused_with_its_position(case):
     text, position, words = BAD[case]
     with pytest.raises(ConfigError) as caught:

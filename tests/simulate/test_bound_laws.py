@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from simulate.test_plan import CONSUMER, SINGLE, TIMED, decisions, grid
+from support.tables import each_row
 
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Ambient, Body, Box, Capsule, Medium, Scene, Sphere, rigid
@@ -111,7 +111,7 @@ def check_effect(name, bound, scene, detector, rays):
     assert added <= bound.lost + STANDARD_ERRORS * np.sqrt(max(bound.lost, 1 / returns) / returns)
 
 
-@pytest.mark.parametrize("seed", range(40))
+@each_row("seed", range(40))
 def test_no_effect_changes_more_than_its_bound(seed):
     scene, detector, rays = random_case(seed)
     found = decisions(Planner(detector).plan(scene, [rays]))
@@ -119,7 +119,7 @@ def test_no_effect_changes_more_than_its_bound(seed):
         check_effect(name, found[name].bound, scene, detector, rays)
 
 
-@pytest.mark.parametrize("seed", range(100, 130))
+@each_row("seed", range(100, 130))
 def test_planned_effects_err_as_all_do_within_the_tolerance(seed):
     scene, detector, rays = random_case(seed)
     tolerance = Tolerance(2 * Tolerance.of(detector).range_m, 0.01)

@@ -11,6 +11,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm, poisson
 from simulate.test_plan import CONSUMER, SINGLE, TIMED, decisions, grid, room
+from support.tables import each_row
 
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Rays
@@ -87,9 +88,9 @@ def replace_medium(scene, medium):
     return Scene(scene.bodies, scene.name, medium=medium)
 
 
-@pytest.mark.parametrize("mean", [0.0, 1e-9, 1e-3, 0.2, 1.0, 7.3, 100.0, 4e4])
-@pytest.mark.parametrize("bins", [1.0, 40.0, 3000.0])
-@pytest.mark.parametrize("allowed", [0.5, 0.01, 1e-6])
+@each_row("mean", [0.0, 1e-9, 1e-3, 0.2, 1.0, 7.3, 100.0, 4e4])
+@each_row("bins", [1.0, 40.0, 3000.0])
+@each_row("allowed", [0.5, 0.01, 1e-6])
 def test_a_return_needs_the_fewest_counts_that_background_rarely_reaches(mean, bins, allowed):
     needed = float(needed_counts(np.array([mean]), np.array([bins]), allowed)[0])
     rounding = 1 + 1e-6
@@ -106,8 +107,8 @@ def test_a_bin_holds_its_share_of_an_echo_on_its_edge():
     assert (share_in_bins(1, bin_m, 0.0), share_in_bins(3, bin_m, 0.0)) == (0.5, 1.0)
 
 
-@pytest.mark.parametrize("signal", [0.0, 3.0, 20.0, 80.0])
-@pytest.mark.parametrize("level", [0.01, 0.5, 4.0])
+@each_row("signal", [0.0, 3.0, 20.0, 80.0])
+@each_row("level", [0.01, 0.5, 4.0])
 def test_the_union_over_bins_bounds_how_often_another_bin_wins(signal, level):
     """Against drawn histograms: within four standard errors."""
     scene = facing_wall()
@@ -120,9 +121,9 @@ def test_the_union_over_bins_bounds_how_often_another_bin_wins(signal, level):
     assert wrong - 4 * math.sqrt(wrong * (1 - wrong) / draws) <= bounded <= 1
 
 
-@pytest.mark.parametrize("estimator", ["peak", "matched"])
-@pytest.mark.parametrize("signal", [1, 4, 30, 300, 10_000])
-@pytest.mark.parametrize("bins_per_sigma", [0.3, 1.0, 4.0])
+@each_row("estimator", ["peak", "matched"])
+@each_row("signal", [1, 4, 30, 300, 10_000])
+@each_row("bins_per_sigma", [0.3, 1.0, 4.0])
 def test_estimated_ranges_stray_no_further_than_bounded(estimator, signal, bins_per_sigma):
     """The highest bin and the mean of n photons, drawn 2000 times, after rounding is taken off."""
     sigma_m, draws, generator = metres(5e-11), 2000, np.random.default_rng(5)
@@ -142,7 +143,7 @@ def test_estimated_ranges_stray_no_further_than_bounded(estimator, signal, bins_
     assert rms * (1 - 4 / math.sqrt(2 * draws)) <= bounded + rounding
 
 
-@pytest.mark.parametrize("mean", [1e-3, 0.1, 1.0, 5.0, 40.0])
+@each_row("mean", [1e-3, 0.1, 1.0, 5.0, 40.0])
 def test_first_photons_are_early_by_no_more_than_bounded(mean):
     """E max of K normals for K Poisson and at least 1, by quadrature of the distribution of the first."""
     x = np.linspace(-9, 9, 20_001)
@@ -300,7 +301,7 @@ MOVERS = {
 }
 
 
-@pytest.mark.parametrize("shape", MOVERS.values(), ids=MOVERS)
+@each_row("shape", MOVERS.values(), ids=MOVERS)
 def test_what_flies_into_view_calls_for_motion(shape):
     """Nothing of the body is met when the frame begins; rays that it has reached by their time are, exactly."""
     still = rigid(Rotation.from_rotvec((0.3, math.pi / 2, 0.2)).as_matrix(), (0.7, -0.8, 0.0))
@@ -318,8 +319,8 @@ def test_what_flies_into_view_calls_for_motion(shape):
     assert "motion" in Planner(TIMED).plan(scene, [rays]).effects
 
 
-@pytest.mark.parametrize("place", [(4.8, 0, 0.3), (2, 0.01, 0), (0, 0, 0), (-1, 0.5, 0.2), (5, 1, 0)])
-@pytest.mark.parametrize("gate_m", [(0.1, 6.5), (2.5, 3.0)])
+@each_row("place", [(4.8, 0, 0.3), (2, 0.01, 0), (0, 0, 0), (-1, 0.5, 0.2), (5, 1, 0)])
+@each_row("gate_m", [(0.1, 6.5), (2.5, 3.0)])
 def test_haze_beside_a_fixed_receiver_is_bounded(place, gate_m):
     """Against what the effect counts: all haze, and the fullest cell per length."""
     receiver = Receiver(place, 0.0, 0.0, 3.1, 3.1, (0.0, 20.0))

@@ -17,6 +17,7 @@ from support.synthetic_light import (
     single_echoes,
     windows,
 )
+from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.simulate.detector.detection import PHOTONS_ONE_BY_ONE
@@ -41,7 +42,7 @@ def total_counts(expected, effects, **timing):
     return counts
 
 
-@pytest.mark.parametrize("expected", [0.2, 40.0, PHOTONS_ONE_BY_ONE - 1, PHOTONS_ONE_BY_ONE + 1, 1e5])
+@each_row("expected", [0.2, 40.0, PHOTONS_ONE_BY_ONE - 1, PHOTONS_ONE_BY_ONE + 1, 1e5])
 def test_counts_are_poisson_with_the_expected_mean(expected):
     totals = total_counts(expected, {"photon_noise", "quantisation"}).sum(axis=1)
     error = np.sqrt(expected / RAYS)
@@ -88,8 +89,8 @@ def ambient_counts(rays, start, end, per_metre, bin_s=BIN_S, effects=("ambient",
     return counted(windows(rays, start, end), no_echoes(), background(rays, per_metre), detector, effects)
 
 
-@pytest.mark.parametrize("width", [0.03, 0.3, 1.5])
-@pytest.mark.parametrize("per_metre", [1e-4, 2e-2, 5.0])
+@each_row("width", [0.03, 0.3, 1.5])
+@each_row("per_metre", [1e-4, 2e-2, 5.0])
 def test_ambient_counts_are_linear_in_the_gate(width, per_metre):
     rays = 1000
     counts, _ = ambient_counts(rays, 1.0, 1.0 + width, per_metre)
@@ -182,8 +183,8 @@ def test_false_alarms_in_even_light_are_as_rare_as_asked():
             assert invented.mean() <= allowed + STANDARD_ERRORS * np.sqrt(allowed / RAYS), per_metre
 
 
-@pytest.mark.parametrize("per_metre", [0.1, 2.0])
-@pytest.mark.parametrize(("dead_s", "repetition_hz"), [(1e-9, 1e6), (40e-9, 1e6), (40e-9, 20e6)])
+@each_row("per_metre", [0.1, 2.0])
+@each_row(("dead_s", "repetition_hz"), [(1e-9, 1e6), (40e-9, 1e6), (40e-9, 20e6)])
 def test_false_alarms_under_pile_up_are_as_rare_as_asked_of_a_detector_that_reckons_with_it(
     per_metre, dead_s, repetition_hz
 ):
@@ -381,8 +382,8 @@ def test_few_photons_are_lost_as_often_as_none_comes():
     assert abs(lost - np.exp(-1.5)) < STANDARD_ERRORS * np.sqrt(np.exp(-1.5) / RAYS)
 
 
-@pytest.mark.parametrize("estimator", ["peak", "matched"])
-@pytest.mark.parametrize("effects", [ALL, {"photon_noise"}, {"quantisation"}, {"jitter"}, {"pile_up"}, {"ambient"}])
+@each_row("estimator", ["peak", "matched"])
+@each_row("effects", [ALL, {"photon_noise"}, {"quantisation"}, {"jitter"}, {"pile_up"}, {"ambient"}])
 def test_ranges_lie_inside_their_gates_whatever_the_light(effects, estimator):
     rays = 300
     generator = np.random.default_rng(5)
@@ -516,7 +517,7 @@ class TestGatesThatDoNotFit:
 
 
 
-@pytest.mark.parametrize("seed", range(12))
+@each_row("seed", range(12))
 def test_any_detector_and_any_light_give_ranges_in_their_gates_or_none(seed):
     """Values from end to end of what detector files may hold; warnings are errors."""
     generator = np.random.default_rng(seed)

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
+from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, IDEAL, metres
@@ -75,8 +76,8 @@ def test_an_empty_file_is_an_ideal_detector(tmp_path):
     assert load(tmp_path, "name: ideal") == IDEAL
 
 
-@pytest.mark.parametrize("rays", [1, 7, 576])
-@pytest.mark.parametrize("emission", ["scanned", "flood"])
+@each_row("rays", [1, 7, 576])
+@each_row("emission", ["scanned", "flood"])
 def test_rays_share_all_light_and_no_more(tmp_path, emission, rays):
     photons = load(tmp_path, LIGHT.replace("scanned", emission)).photons
     sent = rays * photons.pulses(rays) * photons.emitted(rays) * photons.photon_energy_j
@@ -115,7 +116,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("case", BAD)
+@each_row("case", BAD)
 def test_bad_files_say_where_what_and_what_is_allowed(tmp_path, case):
     text, fragments = BAD[case]
     with pytest.raises(ConfigError) as caught:
@@ -156,7 +157,7 @@ STRANGE = ["-1", "0", "1e308", "-1e308", "1e-308", "x", "''", "~", "true", "[]",
 NEVER = set(STRANGE) - {"0", "1e-308"}
 
 
-@pytest.mark.parametrize("name", QUANTITIES)
+@each_row("name", QUANTITIES)
 def test_strange_values_of_any_quantity_are_refused_or_possible(tmp_path, name):
     others = [line for line in LIGHT.splitlines() if not re.match(rf"{name}(_[a-z0-9]+)?:", line)]
     for key in QUANTITIES[name].keys(name):

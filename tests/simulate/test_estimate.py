@@ -9,6 +9,7 @@ import pytest
 from scipy.special import pdtrc
 from scipy.stats import norm
 from support.references import first_photon_distribution
+from support.tables import each_row
 
 from lidardesign.simulate.detector.kernels import (
     alive_shares,
@@ -40,7 +41,7 @@ def pulse(size, centre, photons, sigma=SIGMA):
     return np.round(photons * np.diff(norm.cdf((edges - centre) / sigma))).astype(int)
 
 
-@pytest.mark.parametrize("mean", [1e-12, 0.3, 7.0, 900.0, 9e4])
+@each_row("mean", [1e-12, 0.3, 7.0, 900.0, 9e4])
 def test_tails_agree_with_scipy(mean):
     for extra in (0.5, 1.0, 3.0, 8.0):
         number = math.ceil(mean + extra * math.sqrt(mean) + 1e-9)
@@ -67,7 +68,7 @@ def test_the_pulse_s_shape_is_even_and_whole():
     assert np.array_equal(pulse_shape(1.0, 0.0, 10), [1.0])
 
 
-@pytest.mark.parametrize("centre", [12.5, 12.6, 12.9, 13.0, 40.2])
+@each_row("centre", [12.5, 12.6, 12.9, 13.0, 40.2])
 def test_the_matched_filter_finds_a_pulse_anywhere_in_a_bin(centre):
     # rounding to whole photons moves the pulse by about a thousandth of a bin
     assert found(pulse(60, centre, 1e5)) == pytest.approx(centre, abs=0.02)
@@ -156,7 +157,7 @@ def test_any_histogram_gives_a_place_inside_or_none(matched):
 class TestCorrected:
     """With a dead time that the detector reckons with."""
 
-    @pytest.mark.parametrize(("dead", "period"), [(0.5, 1e6), (4.0, 1e6), (50.0, 1e6), (50.0, 45.0), (130.0, 45.0)])
+    @each_row(("dead", "period"), [(0.5, 1e6), (4.0, 1e6), (50.0, 1e6), (50.0, 45.0), (130.0, 45.0)])
     def test_alive_shares_agree_with_a_naive_count_over_pulses(self, dead, period):
         counts = np.random.default_rng(1).poisson(3.0, 40)
         pulses = 10_000.0
@@ -171,8 +172,8 @@ class TestCorrected:
             naive.append(1 - blind / pulses)
         np.testing.assert_allclose(alive_shares(counts, pulses, dead, period), naive, rtol=1e-12)
 
-    @pytest.mark.parametrize("matched", [True, False])
-    @pytest.mark.parametrize("seed", range(5))
+    @each_row("matched", [True, False])
+    @each_row("seed", range(5))
     def test_without_blindness_it_agrees_with_the_uncorrected_search(self, matched, seed):
         generator = np.random.default_rng(seed)
         counts = generator.poisson(1.0, 80) + generator.poisson(pulse(80, 40.3, 60))
@@ -184,7 +185,7 @@ class TestCorrected:
         else:
             assert corrected == plain
 
-    @pytest.mark.parametrize("seed", range(5))
+    @each_row("seed", range(5))
     def test_what_pile_up_tilts_is_no_pulse(self, seed):
         """Even light that is counted once per pulse: exp(-l b)."""
         generator = np.random.default_rng(seed)
@@ -192,7 +193,7 @@ class TestCorrected:
         assert np.isfinite(found(counts))
         assert np.isnan(found_corrected(counts, dead=1e3, pulses=4000))
 
-    @pytest.mark.parametrize("seed", range(5))
+    @each_row("seed", range(5))
     def test_a_pulse_behind_the_tilt_is_found(self, seed):
         generator = np.random.default_rng(seed)
         arriving = np.full(200, 0.01) + 0.15 * np.diff(norm.cdf((np.arange(201) - 90.2) / SIGMA))

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from support.tables import each_row
 
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome, Rays
@@ -55,9 +56,9 @@ RAYS = {
 }
 
 
-@pytest.mark.parametrize("receiver", RECEIVERS.values(), ids=RECEIVERS)
-@pytest.mark.parametrize("rays", RAYS.values(), ids=RAYS)
-@pytest.mark.parametrize("name", ["single-photon", "consumer-8x8", "ideal"])
+@each_row("receiver", RECEIVERS.values(), ids=RECEIVERS)
+@each_row("rays", RAYS.values(), ids=RAYS)
+@each_row("name", ["single-photon", "consumer-8x8", "ideal"])
 def test_every_ray_has_one_outcome_and_a_range_in_its_gate_where_it_returns(receiver, rays, name):
     scene = Scene((BALL, FLOOR), ambient=Ambient(1e5), medium=Medium(0.3, 0.02), receiver=receiver)
     (returns,) = simulate(scene, rays, physics=Physics(load_detector(name), EVERYTHING))

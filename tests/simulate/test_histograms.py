@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.references import STANDARD_ERRORS
 from support.synthetic_light import PHOTON_EFFECTS
+from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Outcome, Rays
@@ -42,8 +43,8 @@ def captured(scene, rays, effects, detector=DETECTOR):
     return photon_histograms(scene, 0, rays, build_casters(scene)[0], Physics(detector, frozenset(effects)))
 
 
-@pytest.mark.parametrize(("distance", "tilt", "reflectance"), [(0.4, 0.0, 0.6), (0.4, 1.0, 0.6), (1.5, 0.5, 0.05)])
-@pytest.mark.parametrize("emission", ["scanned", "flood"])
+@each_row(("distance", "tilt", "reflectance"), [(0.4, 0.0, 0.6), (0.4, 1.0, 0.6), (1.5, 0.5, 0.05)])
+@each_row("emission", ["scanned", "flood"])
 def test_signal_counts_follow_the_radar_equation(distance, tilt, reflectance, emission):
     """N = E / (h c / lambda) * eta * A rho cos / (pi R^2), for each of a frame's shared pulses."""
     rays = rays_towards(np.tile([math.sin(tilt), 0.0, math.cos(tilt)], (50, 1)), (0.0, 5.0))

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.tables import each_row
 
 from lidardesign.errors import ConfigError, NumericalError
 from lidardesign.geometry.raycast import shared_caster
@@ -104,8 +105,8 @@ def histogram(path_m: np.ndarray, weight: np.ndarray, bins: PathBins) -> np.ndar
 
 
 @needs_simulator
-@pytest.mark.parametrize("receiver", [None, BISTATIC], ids=["co-located", "bistatic"])
-@pytest.mark.parametrize("name", SCENES)
+@each_row("receiver", [None, BISTATIC], ids=["co-located", "bistatic"])
+@each_row("name", SCENES)
 def test_every_ray_has_the_gain_and_the_time_of_the_direct_component(name, receiver):
     scene = replace(SCENES[name](), receiver=receiver)
     rays = rays_from((0, 0, 0), spiral(4000, 0.3))
@@ -130,8 +131,8 @@ def test_every_ray_has_the_gain_and_the_time_of_the_direct_component(name, recei
 
 
 @needs_simulator
-@pytest.mark.parametrize("emitter_m", [(0.0, 0.0, 0.0), (-0.02, -0.08, 0.05)], ids=["co-located", "elsewhere"])
-@pytest.mark.parametrize("name", SCENES)
+@each_row("emitter_m", [(0.0, 0.0, 0.0), (-0.02, -0.08, 0.05)], ids=["co-located", "elsewhere"])
+@each_row("name", SCENES)
 def test_the_transient_of_a_whole_view_has_the_same_peak_and_energy(name, emitter_m):
     """Forward: a spot light of 1 W and a camera of the simulator's, against our beams from the emitter."""
     receiver = Receiver((0, 0, 0), 0.0, 0.0, VIEW_RAD, VIEW_RAD, (0.0, 5.0))
@@ -154,8 +155,8 @@ def test_the_transient_of_a_whole_view_has_the_same_peak_and_energy(name, emitte
 
 
 @needs_simulator
-@pytest.mark.parametrize("shape", [Sphere(0.3), Box((0.2, 0.3, 0.25)), Capsule(0.2, 0.25), Plane()], ids=repr)
-@pytest.mark.parametrize("offset_m", [0.0, 1e5])
+@each_row("shape", [Sphere(0.3), Box((0.2, 0.3, 0.25)), Capsule(0.2, 0.25), Plane()], ids=repr)
+@each_row("offset_m", [0.0, 1e5])
 def test_every_shape_is_exported_where_it_is(shape, offset_m):
     place = np.array([1.5 + offset_m, 0.2, 0.1])
     scene = Scene((Body(shape, reflectance=0.6, poses=rigid(turned(2), place)),))
@@ -264,7 +265,7 @@ def test_bins_have_a_width_and_a_number(numbers):
         PathBins(*numbers)
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("name", "version"),
     [
         ("libLLVM-19.so", 19),

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from simulate.test_light_transport import needs_simulator, rays_from, spiral
+from support.tables import each_row
 
 from lidardesign.geometry.raycast import shared_caster
 from lidardesign.geometry.rays import Rays
@@ -73,9 +74,9 @@ def bounded(scene: Scene, rays: Rays, detector: Detector) -> Detours:
 
 
 @needs_simulator
-@pytest.mark.parametrize("receiver", [None, RECEIVER], ids=["co-located", "fixed"])
-@pytest.mark.parametrize("detector", [FLOOD, WIDE], ids=["flood", "scanned"])
-@pytest.mark.parametrize("scene", [ball, lambda receiver: Scene((corner().bodies[0],), receiver=receiver)])
+@each_row("receiver", [None, RECEIVER], ids=["co-located", "fixed"])
+@each_row("detector", [FLOOD, WIDE], ids=["flood", "scanned"])
+@each_row("scene", [ball, lambda receiver: Scene((corner().bodies[0],), receiver=receiver)])
 def test_convex_and_flat_bodies_alone_hear_no_detours(scene, detector, receiver):
     share, _ = shares(scene(receiver), into_the_corner(100), detector)
     assert not share.any()
@@ -152,9 +153,9 @@ def test_a_fixed_receiver_hears_a_beam_by_way_of_the_wall_as_an_integral_says():
 
 
 @needs_simulator
-@pytest.mark.parametrize("receiver", [None, RECEIVER], ids=["co-located", "fixed"])
-@pytest.mark.parametrize("detector", [FLOOD, WIDE], ids=["flood", "scanned"])
-@pytest.mark.parametrize("scene", [corner, room])
+@each_row("receiver", [None, RECEIVER], ids=["co-located", "fixed"])
+@each_row("detector", [FLOOD, WIDE], ids=["flood", "scanned"])
+@each_row("scene", [corner, room])
 def test_the_bound_holds_and_says_something(scene, detector, receiver):
     rays = into_the_corner()
     share, _ = shares(scene(receiver), rays, detector)

@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import chi2, norm
 from support.references import STANDARD_ERRORS, first_photon_distribution, naive_counts_with_dead_time
 from support.synthetic_light import PULSES, background, counted, counting_detector, no_echoes, single_echoes, windows
+from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.simulate.detector.detection import coates
@@ -90,7 +91,7 @@ def pulses_of(key, ray, arrived, pulses):
     return [min(int(uniform(np.uint64(key), ray, draw) * pulses), pulses - 1) for draw in draws]
 
 
-@pytest.mark.parametrize(("dead", "period"), [(3.0, 45.0), (30.0, 45.0), (44.0, 45.0), (100.5, 45.0), (1000.0, 45.0)])
+@each_row(("dead", "period"), [(3.0, 45.0), (30.0, 45.0), (44.0, 45.0), (100.5, 45.0), (1000.0, 45.0)])
 def test_dead_times_that_reach_across_pulses_agree_with_a_naive_loop_to_the_photon(dead, period):
     generator = np.random.default_rng(3)
     for ray in range(20):
@@ -104,8 +105,8 @@ def test_dead_times_that_reach_across_pulses_agree_with_a_naive_loop_to_the_phot
         assert np.array_equal(found, expected)
 
 
-@pytest.mark.parametrize("per_bin", [0.3, 3.0, 60.0])
-@pytest.mark.parametrize("dead", [0.4, 1.0, 2.5, 7.0, 100.0])
+@each_row("per_bin", [0.3, 3.0, 60.0])
+@each_row("dead", [0.4, 1.0, 2.5, 7.0, 100.0])
 def test_dead_times_within_pulses_agree_with_a_naive_loop_on_average(dead, per_bin):
     generator, pulses, repeats = np.random.default_rng(4), 50, 300 if per_bin < 10 else 60
     ours, naive = np.zeros((repeats, BINS)), np.zeros((repeats, BINS))
@@ -157,8 +158,8 @@ def test_photons_that_fall_into_the_same_pulse_are_counted_once():
     assert ours.var() == pytest.approx(naive.var() + 1 / 12, rel=0.15)
 
 
-@pytest.mark.parametrize(("alive", "pulses"), [(1, 10_000), (7, 10_000), (60, 10_000), (300, 10_000), (5, 40)])
-@pytest.mark.parametrize("photons", [33, 80, 400])
+@each_row(("alive", "pulses"), [(1, 10_000), (7, 10_000), (60, 10_000), (300, 10_000), (5, 40)])
+@each_row("photons", [33, 80, 400])
 def test_the_last_pulses_are_hit_as_often_as_they_should(alive, pulses, photons):
     """Few of many pulses are alive where gates begin brightly: less than one is hit per bin."""
     share = (np.arange(100_000) + 0.5) / 100_000

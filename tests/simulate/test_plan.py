@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Rays
@@ -63,7 +64,7 @@ def test_an_ideal_detector_calls_for_nothing_where_light_goes_straight_and_no_ra
         assert Planner().physics(plan, 0) is None
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("name", "scene", "detector", "reason"),
     [
         ("specular", room(ball={"specular": 0.4}), IDEAL, "ball"),
@@ -87,9 +88,9 @@ def test_each_effect_is_called_for_by_its_own_cause_with_its_reason(name, scene,
     assert decision.bound.range_m > tolerance.range_m or decision.bound.lost > tolerance.lost
 
 
-@pytest.mark.parametrize("detector", [TIMED, SINGLE, CONSUMER], ids=lambda detector: detector.name)
-@pytest.mark.parametrize("tolerance", [Tolerance(1e-4, 1e-3), Tolerance(3e-3, 0.05), Tolerance(0.2, 0.6)])
-@pytest.mark.parametrize("scene", [room(), room(**EVERYTHING)], ids=["plain", "everything"])
+@each_row("detector", [TIMED, SINGLE, CONSUMER], ids=lambda detector: detector.name)
+@each_row("tolerance", [Tolerance(1e-4, 1e-3), Tolerance(3e-3, 0.05), Tolerance(0.2, 0.6)])
+@each_row("scene", [room(), room(**EVERYTHING)], ids=["plain", "everything"])
 def test_all_that_is_skipped_stays_within_the_tolerance_together(detector, tolerance, scene):
     plan = Planner(detector, tolerance=tolerance).plan(scene, [grid()])
     skipped = [decision.bound for decision in plan.decisions if not decision.on and decision.missing is None]
@@ -169,7 +170,7 @@ def test_what_cannot_be_simulated_here_is_named_and_asking_for_it_is_refused(mon
         Planner(CONSUMER, parse_effects("multipath")).plan(scene, [grid()])
 
 
-@pytest.mark.parametrize("text", ["noise", "", "jitter,", "photon_noise,ambint", "Auto"])
+@each_row("text", ["noise", "", "jitter,", "photon_noise,ambint", "Auto"])
 def test_unknown_effects_are_refused_with_the_names_of_all(text):
     with pytest.raises(ConfigError) as caught:
         parse_effects(text)

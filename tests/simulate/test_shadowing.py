@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
+from support.tables import each_row
 
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Rays
@@ -106,8 +107,8 @@ def test_the_far_side_of_a_thin_plate_is_not_heard():
     assert not len(kept)
 
 
-@pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
-@pytest.mark.parametrize("shift", [0.0, 1000.0])
+@each_row("scale", [0.01, 1.0, 100.0])
+@each_row("shift", [0.0, 1000.0])
 def test_bodies_that_touch_do_not_hide_each_other_where_they_touch(scale, shift):
     # a floor, and on it a box and a meshed cube, all touching: each sees the receiver from all of its open faces
     made = trimesh.creation.box(extents=[1.0, 1.0, 1.0])

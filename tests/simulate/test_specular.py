@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
+from support.tables import each_row
 
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Rays
@@ -203,8 +204,8 @@ def test_a_fixed_receiver_hears_through_panes_on_both_ways():
     assert behind.gain == pytest.approx([0.9**4 * 0.5 * (3 / back_m) / (math.pi * back_m**2)], rel=1e-9)
 
 
-@pytest.mark.parametrize("radius_m", [1.0, 30.0, 1000.0])
-@pytest.mark.parametrize("height_m", [0.05, 1.0])
+@each_row("radius_m", [1.0, 30.0, 1000.0])
+@each_row("height_m", [0.05, 1.0])
 def test_beams_leave_large_meshes_for_good_however_near_they_start(radius_m, height_m):
     room = trimesh.creation.box(extents=[2 * radius_m] * 3)
     mesh = Mesh(np.array(room.vertices), np.array(room.faces), "unsigned")

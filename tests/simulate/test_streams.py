@@ -7,6 +7,7 @@ import pytest
 from scipy.special import ndtri
 from scipy.stats import chi2, kstest, poisson
 from support.references import STANDARD_ERRORS
+from support.tables import each_row
 
 from lidardesign.simulate.streams import (
     MOST_COUNTS,
@@ -38,8 +39,8 @@ def along_keys(key):
 DIRECTIONS = {"rows": along_rows, "draws": along_draws, "keys": along_keys}
 
 
-@pytest.mark.parametrize("direction", DIRECTIONS)
-@pytest.mark.parametrize("key", [0, 1, 2**63 - 1, 2**64 - 2**20])
+@each_row("direction", DIRECTIONS)
+@each_row("key", [0, 1, 2**63 - 1, 2**64 - 2**20])
 def test_numbers_are_uniform_along_rows_draws_and_keys(direction, key):
     values = DIRECTIONS[direction](key)
     counts = np.bincount((values * 256).astype(int), minlength=256)

@@ -11,6 +11,7 @@ import sys
 
 import numpy as np
 import pytest
+from support.tables import each_row
 
 from lidardesign.config import resolve
 from lidardesign.design.constraints.check import check_design
@@ -137,7 +138,7 @@ KEPT_AND_BROKEN = {
 }
 
 
-@pytest.mark.parametrize("name", KEPT_AND_BROKEN)
+@each_row("name", KEPT_AND_BROKEN)
 def test_the_second_reader_tells_kept_from_broken_bounds_as_the_program_does(name):
     kept, broken = KEPT_AND_BROKEN[name]
     design = hand_made()

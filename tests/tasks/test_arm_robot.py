@@ -13,6 +13,7 @@ from lidardesign_tasks import arm_engine
 from lidardesign_tasks.arm_engine import import_mink
 from lidardesign_tasks.arm_links import BALL
 from lidardesign_tasks.arm_robot import load_robot
+from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.scene import Box, Capsule, Mesh, Sphere
@@ -143,7 +144,7 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("case", REFUSED)
+@each_row("case", REFUSED)
 def test_a_model_that_cannot_be_used_is_refused_with_its_path(tmp_path, monkeypatch, case):
     text, message = REFUSED[case]
     folder = tmp_path / "model"

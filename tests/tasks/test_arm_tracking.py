@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from lidardesign_tasks.arm_tracking import filled_path, tracked_places
 from support.references import recursive_frechet
+from support.tables import each_row
 
 from lidardesign.evaluate.metrics import discrete_frechet_m
 from lidardesign.geometry.raycast import SceneCaster
@@ -22,7 +23,7 @@ def path(count, seed=0):
     return np.cumsum(np.random.default_rng(seed).normal(size=(count, 3)), axis=0)
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(1, 1), (1, 6), (6, 1), (2, 2), (9, 9), (5, 12), (12, 5), (50, 50)])
+@each_row(("rows", "columns"), [(1, 1), (1, 6), (6, 1), (2, 2), (9, 9), (5, 12), (12, 5), (50, 50)])
 def test_the_frechet_distance_agrees_with_its_recursive_definition(rows, columns):
     for seed in range(4):
         first, second = path(rows, seed), path(columns, seed + 100)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from lidardesign_tasks.emitter import EmitterTask
 from lidardesign_tasks.face import FaceTask
+from support.tables import each_row
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.target.target import build_target
@@ -312,7 +313,7 @@ def test_the_truth_is_what_both_places_see_where_the_emitter_is_fixed(heads):
 # the configuration
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("values", "message"),
     [
         ({"field_of_view_deg": (180.0, 50.0)}, "below 180 degrees"),

@@ -22,6 +22,7 @@ from lidardesign_tasks.meshes import MeshesConfig, MeshesTask
 from lidardesign_tasks.pose import rotation_matrix
 from lidardesign_tasks.surroundings import Surroundings
 from pydantic import ValidationError
+from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.meshio import Painted, check_mesh, load_mesh
@@ -128,7 +129,7 @@ def test_a_file_without_vertex_colours_is_refused(tmp_path, paint, words):
         load_mesh(save(mesh, tmp_path / "ball.ply"), painted=Painted("colours"))
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf, 1e9])
+@each_row("value", [0.0, -1.0, np.nan, np.inf, 1e9])
 def test_values_that_are_no_weights_are_refused_with_their_number(tmp_path, value):
     mesh = ball()
     weights = np.ones(len(mesh.vertices), dtype=np.float32)
@@ -250,7 +251,7 @@ def test_a_region_counts_its_weight_inside_and_nothing_more_beyond_its_edge(shap
     assert np.allclose(found, expected)
 
 
-@pytest.mark.parametrize(
+@each_row(
     "keys",
     [
         {"region_radius_m": 0.1},
@@ -267,7 +268,7 @@ def test_a_region_counts_its_weight_inside_and_nothing_more_beyond_its_edge(shap
         {"region_weight": 0},
     ],
 )
-@pytest.mark.parametrize("kind", [FaceConfig, EmitterConfig, MeshesConfig])
+@each_row("kind", [FaceConfig, EmitterConfig, MeshesConfig])
 def test_half_a_region_and_impossible_numbers_are_refused(kind, keys):
     with pytest.raises(ValidationError):
         kind(**keys)

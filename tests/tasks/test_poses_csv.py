@@ -16,6 +16,7 @@ from lidardesign_tasks.moving_surface import SURFACES
 from lidardesign_tasks.pose import rotation_matrix
 from lidardesign_tasks.poses_csv import COLUMNS, interpolated, read_poses, rotation_vector
 from pydantic import ValidationError
+from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.geometry.rays import Rays
@@ -40,7 +41,7 @@ def test_a_rotation_is_that_of_its_vector(values):
     assert np.linalg.norm(rotation_vector(rotation)) <= np.pi + EXACT
 
 
-@pytest.mark.parametrize("axis", [(1, 0, 0), (0, -1, 0), (0, 0, 1), (1, 1, 0), (-1, 2, 3)])
+@each_row("axis", [(1, 0, 0), (0, -1, 0), (0, 0, 1), (1, 1, 0), (-1, 2, 3)])
 def test_half_a_turn_has_an_axis_too(axis):
     vector = np.pi * np.array(axis) / np.linalg.norm(axis)
     found = rotation_vector(rotation_matrix(vector))
@@ -107,7 +108,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("case", BAD)
+@each_row("case", BAD)
 def test_a_file_that_cannot_be_used_is_refused_at_its_cell(tmp_path, monkeypatch, case):
     text, where, message = BAD[case]
     monkeypatch.chdir(tmp_path)

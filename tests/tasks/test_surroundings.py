@@ -17,6 +17,7 @@ from lidardesign_tasks.meshes import MeshesTask
 from lidardesign_tasks.surroundings import fog
 from lidardesign_tasks.warehouse import WarehouseTask
 from pydantic import ValidationError
+from support.tables import each_row
 
 from lidardesign.geometry.raycast import shared_caster
 from lidardesign.geometry.rays import Rays
@@ -54,7 +55,7 @@ def scene_of(name, folder, **changes):
     return task.scenes(task.Config(**given), "test", 0)[0]
 
 
-@pytest.mark.parametrize("name", FEW)
+@each_row("name", FEW)
 def test_by_default_a_scene_is_matt_and_rests_in_clear_air_in_the_light_of_a_room(name, folder):
     scene = scene_of(name, folder)
     assert scene.ambient == Ambient(300.0, "indoor")
@@ -64,7 +65,7 @@ def test_by_default_a_scene_is_matt_and_rests_in_clear_air_in_the_light_of_a_roo
         assert not any(body.velocity_m_s)
 
 
-@pytest.mark.parametrize("name", FEW)
+@each_row("name", FEW)
 def test_surroundings_reach_the_scene_and_leave_its_geometry_and_truth(name, folder):
     harsh = {**HARSH, **({"speed_m_s": 3.0} if name in MOVING else {})}
     calm, changed = scene_of(name, folder), scene_of(name, folder, **harsh)
@@ -109,7 +110,7 @@ def test_fog_leaves_a_fiftieth_of_a_contrast_at_its_visibility():
     assert medium.extinction_per_m / medium.backscatter_per_m_sr == pytest.approx(18.8)
 
 
-@pytest.mark.parametrize(
+@each_row(
     "wrong",
     [
         {"illuminance_lux": -1},

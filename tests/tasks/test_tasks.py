@@ -16,6 +16,7 @@ from lidardesign_tasks.flatland import FlatlandTask
 from lidardesign_tasks.meshes import MeshesTask
 from lidardesign_tasks.pose import jittered_pose
 from lidardesign_tasks.warehouse import WarehouseTask
+from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.geometry.rays import Outcome, Rays, Returns
@@ -294,8 +295,8 @@ def test_residuals_of_many_frames_or_positions_add_up_to_the_score(often):
         assert task.residuals(scene, blind).values.sum() == pytest.approx(task.metric.worst, rel=1e-9)
 
 
-@pytest.mark.parametrize("kind", [ArmTask, EmitterTask, FaceTask, FlatlandTask, MeshesTask, WarehouseTask])
-@pytest.mark.parametrize("values", [{"no_such_key": 1}, {"train": float("nan")}])
+@each_row("kind", [ArmTask, EmitterTask, FaceTask, FlatlandTask, MeshesTask, WarehouseTask])
+@each_row("values", [{"no_such_key": 1}, {"train": float("nan")}])
 def test_unknown_keys_and_values_that_are_no_numbers_are_refused(kind, values):
     with pytest.raises(ValueError, match="validation error"):
         kind.Config(**values)
@@ -374,10 +375,10 @@ def test_turning_the_up_axis_keeps_handedness(folders, up):
     assert np.ptp(mesh.bounds_m[:, 2]) == pytest.approx(height, rel=0.02)
 
 
-@pytest.mark.parametrize(
+@each_row(
     "origin", [None, (0.0, 0.0, 1.0), (-0.7, 0.7, 0.4), (0.0, 0.0, 0.0), (0.5, 0.0, -0.6)]
 )
-@pytest.mark.parametrize("box", [0.0, 0.1])
+@each_row("box", [0.0, 0.1])
 def test_the_derived_design_space_sees_the_whole_of_every_mesh(folders, origin, box):
     config = MeshesTask.Config(folder=str(folders / "one"), origin_m=origin, origin_box_m=box)
     space = MeshesTask().space(config)

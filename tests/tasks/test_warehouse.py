@@ -10,6 +10,7 @@ import pytest
 from lidardesign_tasks.warehouse import AISLE_M, PAPER_POSITIONS_M, WarehouseConfig, WarehouseTask
 from lidardesign_tasks.warehouse_shelf import LEVELS, SHELF_DEPTH_M, build_shelf
 from lidardesign_tasks.warehouse_truth import ON_FACE_M, BoxTruth, cut_scene, visible_boxes
+from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.raycast import SceneCaster
@@ -414,7 +415,7 @@ def test_a_space_from_which_no_box_can_be_seen_is_refused():
         TASK.scenes(SMALL, "train", 0, space=DesignSpace.from_dict(values))
 
 
-@pytest.mark.parametrize(
+@each_row(
     "values",
     [
         {"no_such_key": 1},

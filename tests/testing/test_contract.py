@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.plugins import GOOD
+from support.tables import each_row
 
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.registry import load_task
@@ -157,7 +158,7 @@ def mutants():
             yield pytest.param(law, replaced(group), group[0][2], id=f"{law}: {group[0][2]}")
 
 
-@pytest.mark.parametrize(("law", "source", "words"), list(mutants()))
+@each_row(("law", "source", "words"), list(mutants()))
 def test_a_task_that_breaks_a_law_is_told_so(law, source, words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
@@ -219,7 +220,7 @@ class Bent:
         return self.factor * self.field.gradient(points, weights)
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("law", "distance", "slope"),
     [
         ("fields are finite", lambda d: np.where(d < 0.5, np.nan, d), 1.0),

@@ -18,6 +18,7 @@ from support.docs_output import difference
 from support.docs_pages import blocks_of, commands_of
 from support.docs_session import COLUMNS
 from support.plugins import GOOD, install_plugins
+from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.testing.contract import LAWS
@@ -134,7 +135,7 @@ def test_the_command_writes_every_file_and_says_what_comes_next(lidardesign, tmp
     assert {Path(path).as_posix() for path in elsewhere["files"]} == {f"place/{path}" for path in written}
 
 
-@pytest.mark.parametrize(
+@each_row(
     "name", ["Landmark", "land-mark", "", "1st", "a__b", "../up", "a b", "x" * 31, "landmärke", "a\n"]
 )
 def test_a_name_that_is_no_name_is_refused_and_nothing_is_written(tmp_path, monkeypatch, name):
