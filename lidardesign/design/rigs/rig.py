@@ -34,6 +34,8 @@ CENTRING_ROUNDS = 8
 SHORTEST_MEAN = 1e-3
 # More sensors than any rig has; each takes a row in every table.
 MOST_SENSORS = 10_000
+# A million rays of twelve columns with all their digits.
+LARGEST_TABLE_BYTES = 256_000_000
 
 
 @dataclass(frozen=True)
@@ -115,62 +117,59 @@ def rig_design(rig: Rig, path: Path, reach_m: float | None) -> DesignSpec:
         )
     if unknown:
         notes.append(f"how far {unknown} of {total} rays are heard is not said; {reach_m:g} m, as far as any may be")
-    gated = [replace(one, gate_m=_closed(one.gate_m, reach_m)) for one in rig.sensors]
-    for one in gated:
-        _check_numbers(one, path)
-    names = _unique([one.name for one in gated])
-    sensors = tuple(_sensor(one, name, total) for one, name in zip(gated, names, strict=True))
-    provenance = {"source": path.name, "format": rig.kind, "notes": notes}
-    table = _table(gated)
-    return DesignSpec(path.stem, sensors, layout="fixed", rays=total, ray_table=table, provenance=provenance)
-
-
-def _closed(gate_m: np.ndarray, reach_m: float | None) -> np.ndarray:
-    """Gates with the reach where they have no end, and that start before it, shape (N, 2) [m]."""
-    if reach_m is None:
-        return gate_m
-    start, end = gate_m.T
-    return np.stack([start, np.where(np.isinf(end), np.maximum(reach_m, start), end)], axis=1)
+    gated = []
+    for one in rig.sensors:
+        start, end = one.gate_m.T
+        # gates without an end get the reach, and none ends before it starts
+        end = end if reach_m is None else np.where(np.isinf(end), np.maximum(reach_m, start), end)
+        gated.append(replace(one, gate_m=np.stack([start, end], axis=1)))
+        _check_numbers(gated[-1], path)
+    # sensors that share a name are numbered, and those whose name a design could not have
+    usable = [one.name if is_name(one.name) else f"sensor_{index + 1}" for index, one in enumerate(gated)]
+    often, taken, names = Counter(usable), set(usable), []
+    for name in usable:
+        chosen, number = name, 1
+        while often[name] > 1 and chosen in taken:
+            chosen, number = f"{name}_{number}", number + 1
+        taken.add(chosen)
+        names.append(chosen)
+    counts = [len(one.azimuth_rad) for one in gated]
+    before = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    places = [
+        first + np.arange(count) if one.order is None else one.order
+        for one, first, count in zip(gated, before, counts, strict=True)
+    ]
+    order = np.argsort(np.concatenate(places), kind="stable")
+    columns = ("origin_m", "azimuth_rad", "elevation_rad", "gate_m")
+    ordered = (np.concatenate([getattr(one, name) for one in gated])[order] for name in columns)
+    return DesignSpec(
+        path.stem,
+        tuple(_sensor(one, name, total) for one, name in zip(gated, names, strict=True)),
+        layout="fixed",
+        rays=total,
+        ray_table=Rays.from_angles(*ordered, sensor=np.repeat(np.arange(len(gated)), counts)[order]),
+        provenance={"source": path.name, "format": rig.kind, "notes": notes},
+    )
 
 
 def _check_numbers(one: RigSensor, path: Path) -> None:
     for name, values, low in (("place", one.origin_m, -FARTHEST_M), ("gate", one.gate_m, 0.0)):
         wrong = ~((values >= low) & (values <= FARTHEST_M))
         if wrong.any():
-            raise DataError(
-                f"a {name} of {one.name!r} is {values[wrong].flat[0]:g} m", where=str(path),
-                allowed=f"{low:g} to {FARTHEST_M:g} m",
-            )  # fmt: skip
+            found, allowed = f"a {name} of {one.name!r} is {values[wrong].flat[0]:g} m", f"{low:g} to {FARTHEST_M:g} m"
+            raise DataError(found, where=str(path), allowed=allowed)
     reversed_gates = one.gate_m[:, 1] < one.gate_m[:, 0]
     if reversed_gates.any():
         start, end = one.gate_m[reversed_gates][0]
         raise DataError(f"a gate of {one.name!r} starts at {start:g} m and ends at {end:g} m", where=str(path))
 
 
-def _unique(names: Sequence[str]) -> list[str]:
-    """The names, numbered where sensors share one or a design could not have it."""
-    usable = [name if is_name(name) else f"sensor_{index + 1}" for index, name in enumerate(names)]
-    often, taken, unique = Counter(usable), set(usable), []
-    for name in usable:
-        chosen, number = name, 1
-        while often[name] > 1 and chosen in taken:
-            chosen, number = f"{name}_{number}", number + 1
-        taken.add(chosen)
-        unique.append(chosen)
-    return unique
-
-
-def _table(sensors: Sequence[RigSensor]) -> Rays:
-    counts = [len(one.azimuth_rad) for one in sensors]
-    before = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    places = [
-        first + np.arange(count) if one.order is None else one.order
-        for one, first, count in zip(sensors, before, counts, strict=True)
-    ]
-    order = np.argsort(np.concatenate(places), kind="stable")
-    columns = ("origin_m", "azimuth_rad", "elevation_rad", "gate_m")
-    ordered = (np.concatenate([getattr(one, name) for one in sensors])[order] for name in columns)
-    return Rays.from_angles(*ordered, sensor=np.repeat(np.arange(len(sensors)), counts)[order])
+def number_of(text: str) -> float | None:
+    """The number that a cell holds; None where it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return None
 
 
 def _sensor(one: RigSensor, name: str, total: int) -> Sensor:

@@ -15,9 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
+from lidardesign.design.rigs.rig import LARGEST_TABLE_BYTES, number_of
 from lidardesign.design.sensor import DEFAULT_LEVEL, DesignSpec, Sensor
 from lidardesign.errors import DataError
 from lidardesign.numerics import COARSE_SLACK, SLACK
+from lidardesign.run.arrays import csv_rows
 from lidardesign.run.files import write_atomic
 from lidardesign.space import FULL_TURN
 
@@ -65,74 +67,48 @@ def read_sensor_csv(path: Path) -> DesignSpec:
 
 def _rows(path: Path) -> tuple[list[tuple[dict[str, float], str]], list[str]]:
     """Numbers by column name and the position of each row, with notes."""
-    try:
-        text = path.read_bytes().decode("utf-8-sig")
-    except OSError as error:
-        raise DataError(f"cannot be read: {error.strerror or error}", where=str(path)) from None
-    except UnicodeDecodeError:
-        raise DataError("is not UTF-8 text", where=str(path)) from None
-    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    lines = csv_rows(path, LARGEST_TABLE_BYTES)
     if not lines:
         raise DataError("is empty", where=str(path), allowed=f"rows of {len(COLUMNS)} columns")
-    names, body = _header(path, lines)
-    if not body:
+    first = [cell.strip() for cell in lines[0][1]]
+    if any(number_of(cell) is not None for cell in first):
+        names = COLUMNS if len(first) != len(COLUMNS) + 1 else (QUERY_COLUMN, *COLUMNS)
+    else:
+        names = tuple(first)
+        missing = [name for name in COLUMNS if name not in names]
+        unknown = [name for name in names if name not in (*COLUMNS, QUERY_COLUMN)]
+        repeated = sorted({name for name in names if names.count(name) > 1})
+        if missing or unknown or repeated:
+            wrong = {"missing columns": missing, "unknown or repeated": [*unknown, *repeated]}
+            found = "; ".join(f"{what}: {', '.join(columns)}" for what, columns in wrong.items() if columns)
+            raise DataError(found, where=f"{path}:{lines[0][0]}", allowed=", ".join(COLUMNS))
+        lines = lines[1:]
+    if not lines:
         raise DataError("has a header but no sensor", where=str(path))
-    rows = [(_numbers(path, number, line, names), f"{path}:{number}") for number, line in body]
+    rows = [(_numbers(f"{path}:{number}", cells, names), f"{path}:{number}") for number, cells in lines]
     notes: list[str] = []
     if QUERY_COLUMN in names:
         positions = sorted({row[QUERY_COLUMN] for row, _ in rows})
         if len(positions) > 1:
-            shown = ", ".join(f"{value:g}" for value in positions)
+            values = ", ".join(f"{value:g}" for value in positions)
             raise DataError(
-                f"describes {len(positions)} positions of a moving robot ({QUERY_COLUMN} = {shown})",
+                f"describes {len(positions)} positions of a moving robot ({QUERY_COLUMN} = {values})",
                 where=str(path), allowed="one position per file", hint="keep the rows of one position",
             )  # fmt: skip
         notes.append(f"{QUERY_COLUMN} = {positions[0]!r} was dropped")
     return rows, notes
 
 
-def _header(path: Path, lines: list[tuple[int, str]]) -> tuple[tuple[str, ...], list[tuple[int, str]]]:
-    """Column names, from the header where there is one, and the lines below it."""
-    first = _cells(lines[0][1])
-    if any(_is_number(cell) for cell in first):
-        names = COLUMNS if len(first) != len(COLUMNS) + 1 else (QUERY_COLUMN, *COLUMNS)
-        return names, lines
-    names = tuple(first)
-    missing = [name for name in COLUMNS if name not in names]
-    unknown = [name for name in names if name not in (*COLUMNS, QUERY_COLUMN)]
-    if missing or unknown or len(set(names)) != len(names):
-        repeated = sorted({name for name in names if names.count(name) > 1})
-        told = {"missing columns": missing, "unknown or repeated": [*unknown, *repeated]}
-        found = "; ".join(f"{what}: {', '.join(columns)}" for what, columns in told.items() if columns)
-        raise DataError(found, where=f"{path}:{lines[0][0]}", allowed=", ".join(COLUMNS))
-    return names, lines[1:]
-
-
-def _cells(line: str) -> list[str]:
-    return [cell.strip() for cell in next(csv.reader([line]))]
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def _numbers(path: Path, number: int, line: str, names: tuple[str, ...]) -> dict[str, float]:
-    cells = _cells(line)
+def _numbers(where: str, cells: list[str], names: tuple[str, ...]) -> dict[str, float]:
+    """The numbers of a row by column."""
     if len(cells) != len(names):
-        raise DataError(
-            f"{len(cells)} columns", where=f"{path}:{number}", allowed=f"{len(names)}: {', '.join(names)}"
-        )
+        raise DataError(f"{len(cells)} columns", where=where, allowed=f"{len(names)}: {', '.join(names)}")
     row = {}
-    for column, (name, cell) in enumerate(zip(names, cells, strict=True), 1):
-        low = 0.0 if name in NOT_NEGATIVE else -math.inf
-        value = float(cell) if _is_number(cell) else math.nan
-        if not (math.isfinite(value) and value >= low):
+    for column, (name, text) in enumerate(zip(names, cells, strict=True), 1):
+        low, value = 0.0 if name in NOT_NEGATIVE else -math.inf, number_of(text)
+        if value is None or not math.isfinite(value) or value < low:
             allowed = "a finite number" if math.isinf(low) else "a finite number of at least 0"
-            raise DataError(f"{name} is {cell!r}", where=f"{path}:{number}:{column}", allowed=allowed)
+            raise DataError(f"{name} is {text.strip()!r}", where=f"{where}:{column}", allowed=allowed)
         row[name] = value
     return row
 
@@ -167,34 +143,6 @@ def write_sensor_csv(design: DesignSpec, path: Path) -> list[str]:
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(COLUMNS)
-    for sensor in design.sensors:
-        writer.writerow([repr(float(value)) for value in _row(sensor)])
-    write_atomic(Path(path), buffer.getvalue())
-    return _losses(design)
-
-
-def _row(sensor: Sensor) -> list[float]:
-    horizontal, vertical = _unrolled(sensor)
-    cosine = math.cos(sensor.elevation_rad)
-    # towards a pole the azimuth covers the whole turn, and no standard deviation beyond a turn says more
-    azimuth_sigma = horizontal / cosine if horizontal < cosine * FULL_TURN else FULL_TURN
-    upper = np.asarray(sensor.origin_covariance_m2)[np.triu_indices(3)]
-    return [
-        *sensor.origin_m, sensor.azimuth_rad, sensor.elevation_rad, sensor.range_m, *upper,
-        azimuth_sigma, vertical, sensor.spread_range_m, sensor.weight,
-    ]  # fmt: skip
-
-
-def _unrolled(sensor: Sensor) -> tuple[float, float]:
-    """Spreads along azimuth and elevation of a sensor that is rolled about its boresight [rad]."""
-    horizontal, vertical = sensor.spread_horizontal_rad, sensor.spread_vertical_rad
-    if sensor.roll_rad == 0:
-        return horizontal, vertical
-    cosine, sine = math.cos(sensor.roll_rad), math.sin(sensor.roll_rad)
-    return math.hypot(cosine * horizontal, sine * vertical), math.hypot(sine * horizontal, cosine * vertical)
-
-
-def _losses(design: DesignSpec) -> list[str]:
     notes = ["names, ray counts, layout, constraints and provenance are not held; a reader takes level 0.95"]
     if design.level != DEFAULT_LEVEL:
         notes.append(f"the level {design.level:g} is not held: intervals are read back at {DEFAULT_LEVEL:g}")
@@ -205,6 +153,26 @@ def _losses(design: DesignSpec) -> list[str]:
     if any(sensor.coupling is not None for sensor in design.sensors):
         notes.append("couplings are not held: direction and range are read back as independent of the origin")
     for sensor in design.sensors:
-        if _unrolled(sensor)[0] >= math.cos(sensor.elevation_rad) * FULL_TURN and _unrolled(sensor)[0] > 0:
-            notes.append(f"{sensor.name} points at a pole: its azimuth spread was cut at a full turn")
+        azimuth_sigma, elevation_sigma = sensor.spread_horizontal_rad, sensor.spread_vertical_rad
+        if sensor.roll_rad != 0:
+            # the spreads along azimuth and elevation of a sensor that is rolled about its boresight
+            horizontal, vertical = azimuth_sigma, elevation_sigma
+            cosine, sine = math.cos(sensor.roll_rad), math.sin(sensor.roll_rad)
+            azimuth_sigma = math.hypot(cosine * horizontal, sine * vertical)
+            elevation_sigma = math.hypot(sine * horizontal, cosine * vertical)
+        cosine = math.cos(sensor.elevation_rad)
+        if azimuth_sigma >= cosine * FULL_TURN:
+            # towards a pole the azimuth covers the whole turn, and no standard deviation beyond a turn says more
+            if azimuth_sigma > 0:
+                notes.append(f"{sensor.name} points at a pole: its azimuth spread was cut at a full turn")
+            azimuth_sigma = FULL_TURN
+        else:
+            azimuth_sigma /= cosine
+        upper = np.asarray(sensor.origin_covariance_m2)[np.triu_indices(3)]
+        row = [
+            *sensor.origin_m, sensor.azimuth_rad, sensor.elevation_rad, sensor.range_m, *upper,
+            azimuth_sigma, elevation_sigma, sensor.spread_range_m, sensor.weight,
+        ]  # fmt: skip
+        writer.writerow([repr(float(value)) for value in row])
+    write_atomic(Path(path), buffer.getvalue())
     return notes
