@@ -20,7 +20,7 @@ from scipy.special import ndtri
 
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import sphere_exp, sphere_log
-from lidardesign.space import direction
+from lidardesign.space import angles, direction
 
 DEFAULT_LEVEL = 0.95
 # Beyond these an interval is next to nothing, or next to everything, of a normal distribution.
@@ -53,6 +53,13 @@ def boresight_frame(azimuth_rad: float, elevation_rad: float, roll_rad: float = 
     vertical = np.array([-sin_e * cos_a, -sin_e * sin_a, cos_e])
     sin_r, cos_r = math.sin(roll_rad), math.cos(roll_rad)
     return np.stack([forward, cos_r * horizontal + sin_r * vertical, cos_r * vertical - sin_r * horizontal])
+
+
+def boresight_of(frame: np.ndarray) -> tuple[float, float, float]:
+    """Azimuth, elevation and roll of a frame with the rows forward, horizontal, vertical; undoes `boresight_frame`."""
+    azimuth, elevation = (float(value) for value in angles(frame[0]))
+    upright = boresight_frame(azimuth, elevation)
+    return azimuth, elevation, math.atan2(float(frame[1] @ upright[2]), float(frame[1] @ upright[1]))
 
 
 def tangent_coordinates(frame: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -20,11 +20,12 @@ from lidardesign.design.sensor import (
     DesignSpec,
     Sensor,
     boresight_frame,
+    boresight_of,
     interval_factor,
 )
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Rays
-from lidardesign.space import angles, observed_point
+from lidardesign.space import observed_point
 
 Wanted = Callable[[np.ndarray], np.ndarray]
 
@@ -128,13 +129,6 @@ def _chosen(directions: np.ndarray, count: int, wanted: Wanted | None) -> np.nda
         return directions[first[thinned(directions[first], count)]]
     rest = other[thinned(directions[other], count - len(first))]
     return directions[np.sort(np.concatenate([first, rest]))]
-
-
-def boresight_of(frame: np.ndarray) -> tuple[float, float, float]:
-    """Azimuth, elevation and roll of a frame with the rows forward, horizontal, vertical; undoes `boresight_frame`."""
-    azimuth, elevation = (float(value) for value in angles(frame[0]))
-    upright = boresight_frame(azimuth, elevation)
-    return azimuth, elevation, math.atan2(float(frame[1] @ upright[2]), float(frame[1] @ upright[1]))
 
 
 def part_sensor(

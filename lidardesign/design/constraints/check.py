@@ -1,12 +1,9 @@
 """The independent checker: does a written design keep a written constraint file?
 
-It reads plain documents only and shares no code with the fit: intervals are recomputed from means and
-spreads, compared with the reported ones, and bounds are applied to both. `constraints` has the definitions.
-
-Part of the independent checker: no sensor is in an excluded box, by plain documents only.
-
-A box is broken where an interval of origins reaches into its interior along all three axes; boxes without volume
-have none. Rows are name, bound, value and whether the bound is kept, as `check.ConstraintCheck`.
+It reads plain documents only and shares no code with the fit: intervals are recomputed from means and spreads,
+compared with the reported ones, and bounds are applied to both; `document` has the definitions. An excluded box is
+broken where an interval of origins reaches into its interior along all three axes. A sensor that is to be a part is one
+where its field of view and range are the part's, and every ray that it fires is one of the part's pattern.
 """
 
 from __future__ import annotations
@@ -14,74 +11,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import NormalDist
 from typing import Any
 
 import numpy as np
 
-from lidardesign.design.snap.check import snap_rows
+from lidardesign.design.catalog.library import SUFFIX, load_library
+from lidardesign.design.catalog.part import Part
+from lidardesign.design.sensor import boresight_frame
+from lidardesign.errors import ConfigError
 from lidardesign.numerics import COARSE_SLACK, ROUNDING, SLACK
+from lidardesign.space import direction
 
-# Rounding of means, spreads and their product, as a share of the bound, or of a metre.
-
-Row = tuple[str, Any, Any, bool]
-
-
-def excluded_rows(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], z: float) -> list[Row]:
-    """The interval mean -+ z spread of a sensor's origin along each axis, against every excluded box."""
-    mean, covariance = sensor["origin_m"]["mean"], sensor["origin_m"]["covariance"]
-    reach = [z * math.sqrt(max(covariance[axis][axis], 0.0)) for axis in range(3)]
-    low, high = ([m + sign * r for m, r in zip(mean, reach, strict=True)] for sign in (-1, 1))
-    value = {"low_m": low, "high_m": high}
-    return [
-        (f"{name}.origin.exclude[{index}]", box, value, not _reaches_into(low, high, box))
-        for index, box in enumerate(_boxes(rules))
-    ]
-
-
-def excluded_starts(table: Mapping[str, Any], rules: Sequence[Mapping[str, Any]]) -> list[Row]:
-    """The rays of a table that start in a box that their own sensor's rules exclude."""
-    if not any(_boxes(own) for own in rules):
-        return []
-    starts = zip(table["origin_x_m"], table["origin_y_m"], table["origin_z_m"], rules, strict=True)
-    return [
-        (f"ray{ray}.origin.exclude[{index}]", box, start, False)
-        for ray, (*start, own) in enumerate(starts)
-        for index, box in enumerate(_boxes(own))
-        if _reaches_into(start, start, box)
-    ]
-
-
-def excluded_travel(
-    track: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]], rules: Mapping[str, Any]
-) -> list[Row]:
-    """The excluded boxes that sensors pass through on their way along a track."""
-    axis = ("x_m", "y_m", "z_m").index(track["dimension"])
-    rows: list[Row] = []
-    for sensor in sensors:
-        low, high = list(sensor["origin_m"]["mean"]), list(sensor["origin_m"]["mean"])
-        low[axis], high[axis] = track["knots_m"][0], track["knots_m"][-1]
-        value = {"low_m": low, "high_m": high}
-        for index, box in enumerate(_boxes(rules)):
-            row = (f"track.origin.exclude[{index}]", box, value, False)
-            if _reaches_into(low, high, box) and row not in rows:
-                rows.append(row)
-    return rows
-
-
-def _boxes(rules: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    return list((rules.get("origin") or {}).get("exclude") or [])
-
-
-def _reaches_into(low: Sequence[float], high: Sequence[float], box: Mapping[str, Any]) -> bool:
-    """Whether an interval of origins meets the interior of a box by more than rounding."""
-    return all(
-        bottom < top and end > bottom + _slack(bottom) and start < top - _slack(top)
-        for start, end, bottom, top in zip(low, high, box["low_m"], box["high_m"], strict=True)
-    )
-
-
-# Rounding of the checker's own conversions between radians and degrees, as a share of the bound.
 # A reported interval may differ from its mean and spread by this share (decimal digits in a file).
 AGREEMENT = COARSE_SLACK
 # The bandwidth model counts a width this share above whole bins as whole bins.
@@ -90,6 +32,7 @@ LIGHT_M_PER_S = 299792458.0
 # Places are told to the millimetre: an origin pinned so near to the only one that the space has is that one [m].
 SAME_PLACE_M = 1e-3
 PICOSECOND_S = 1e-12
+AXES = ("x_m", "y_m", "z_m")
 
 
 @dataclass(frozen=True)
@@ -126,29 +69,31 @@ def check_design(document: Mapping[str, Any], constraints: Any, space: Any = Non
     """
     rules = constraints.as_document() if hasattr(constraints, "as_document") else dict(constraints or {})
     bounds = space.as_dict() if hasattr(space, "as_dict") else space
-    level = float(document.get("level", 0.95))
-    z = NormalDist().inv_cdf((1 + level) / 2)
-    sensors = list(document["sensors"])
-    each = list(rules.get("each") or [])
-    checks = _count(rules, len(sensors))
-    for index, sensor in enumerate(sensors):
-        own = _over(rules, each[index]) if index < len(each) else rules
+    z = NormalDist().inv_cdf((1 + float(document.get("level", 0.95))) / 2)
+    sensors, each = list(document["sensors"]), list(rules.get("each") or [])
+    own_rules = [_over(rules, each[index]) if index < len(each) else rules for index in range(len(sensors))]
+    checks = _between("sensors", len(sensors), rules.get("sensors"))
+    wanted = _get(rules, "sensors", "count")
+    if wanted is not None:
+        checks.append(ConstraintCheck("sensors.count", wanted, len(sensors), wanted == len(sensors)))
+    for index, (sensor, own) in enumerate(zip(sensors, own_rules, strict=True)):
         name = str(sensor.get("name", index))
         checks += _consistency(name, sensor, z)
         checks += _origin(name, sensor, own, bounds) + _boresight(name, sensor, own, bounds)
-        checks += [ConstraintCheck(*row) for row in excluded_rows(name, sensor, own, z)]
-        checks += _intervals(name, sensor, own, z)
-        checks += [ConstraintCheck(*row) for row in snap_rows(name, index, document, own.get("snap"))]
+        checks += _excluded(name, sensor, own, z) + _intervals(name, sensor, own, z)
+        checks += _snap(name, index, document, own.get("snap"))
         if bounds is not None:
             checks += _inside_space(name, sensor, bounds)
-    checks += _table(document, rules)
+    if document.get("ray_table"):
+        checks += _table(document["ray_table"], own_rules)
     if document.get("track"):
-        checks += [ConstraintCheck(*row) for row in excluded_travel(document["track"], sensors, rules)]
+        checks += _excluded_travel(document["track"], sensors, rules)
         checks += _track(document["track"], rules, bounds)
-    return checks + _mounts(sensors, rules, each) + _budget(document, rules)
+    return checks + _mounts(sensors, own_rules) + _budget(document, rules.get("budget") or {})
 
 
 def _over(common: Mapping[str, Any], special: Mapping[str, Any] | None) -> dict[str, Any]:
+    """An entry of `each` over the common keys."""
     result = dict(common)
     for key, value in (special or {}).items():
         if isinstance(value, Mapping) and isinstance(result.get(key), Mapping):
@@ -165,34 +110,26 @@ def _get(values: Any, *keys: str) -> Any:
 
 
 def _slack(bound: float) -> float:
+    """Rounding of means, spreads, their product and conversions between radians and degrees."""
     return ROUNDING * max(abs(bound), 1.0)
 
 
-def _between(name: str, value: float, rules: Any) -> list[ConstraintCheck]:
-    """Checks of `min` and `max` where they are given."""
-    checks = []
+def _between(name: str, value: float, rules: Any, highest: float | None = None) -> list[ConstraintCheck]:
+    """Checks of `min` on a value and of `max` on it, or on a higher one, where they are given."""
+    checks, highest = [], value if highest is None else highest
     low, high = _get(rules, "min"), _get(rules, "max")
     if low is not None:
         checks.append(ConstraintCheck(f"{name}.min", low, value, bool(value >= low - _slack(low))))
     if high is not None:
-        checks.append(ConstraintCheck(f"{name}.max", high, value, bool(value <= high + _slack(high))))
-    return checks
-
-
-def _count(rules: Mapping[str, Any], found: int) -> list[ConstraintCheck]:
-    checks = _between("sensors", found, rules.get("sensors"))
-    wanted = _get(rules, "sensors", "count")
-    if wanted is not None:
-        checks.append(ConstraintCheck("sensors.count", wanted, found, wanted == found))
+        checks.append(ConstraintCheck(f"{name}.max", high, highest, bool(highest <= high + _slack(high))))
     return checks
 
 
 def _consistency(name: str, sensor: Mapping[str, Any], z: float) -> list[ConstraintCheck]:
-    """Reported intervals against means and spreads."""
-    spread = sensor["spread"]
-    pairs = []
-    for axis in ("horizontal", "vertical"):
-        pairs.append((f"field_of_view_rad.{axis}", sensor["field_of_view_rad"][axis], 2 * z * spread[f"{axis}_rad"]))
+    """Reported intervals against means and spreads; agreement is no news, a contradiction is."""
+    spread, view = sensor["spread"], sensor["field_of_view_rad"]
+    axes = ("horizontal", "vertical")
+    pairs = [(f"field_of_view_rad.{axis}", view[axis], 2 * z * spread[f"{axis}_rad"]) for axis in axes]
     start, end = sensor["gate_m"]["start"], sensor["gate_m"]["end"]
     mean = sensor.get("range_m")
     if mean is not None:
@@ -201,12 +138,11 @@ def _consistency(name: str, sensor: Mapping[str, Any], z: float) -> list[Constra
     elif start > 0:
         pairs.append(("gate_m.width", end - start, 2 * z * spread["range_m"]))
     size = max(abs(value) for _, *values in pairs for value in values)
-    checks = [
-        ConstraintCheck(f"{name}.{key}", expected, found, bool(abs(found - expected) <= AGREEMENT * max(size, SLACK)))
+    return [
+        ConstraintCheck(f"{name}.{key}", expected, found, False)
         for key, found, expected in pairs
+        if not abs(found - expected) <= AGREEMENT * max(size, SLACK)
     ]
-    # agreement is no news; a contradiction is
-    return [check for check in checks if not check.satisfied]
 
 
 def _origin(
@@ -223,45 +159,20 @@ def _origin(
     for key, test in tests.items():
         bound = _get(rules, "origin", key)
         if bound is not None:
-            meant = _meant(bound, space) if key == "fixed_m" else bound
+            meant = list(bound)
+            for axis, dimension in enumerate(AXES if key == "fixed_m" and space is not None else ()):
+                low, high = (float(end) for end in space[dimension])
+                if low == high and abs(meant[axis] - low) <= SAME_PLACE_M:
+                    meant[axis] = low
             kept = all(test(value, limit) for value, limit in zip(mean, meant, strict=True))
             checks.append(ConstraintCheck(f"{name}.origin.{key}", list(bound), list(mean), bool(kept)))
-    largest = _get(rules, "origin", "spread_m", "max")
     principal = np.sqrt(np.maximum(np.linalg.eigvalsh(np.array(covariance, dtype=np.float64)), 0.0))
     thickness, spread = float(principal[0]), float(principal[-1])
-    if largest is not None:
-        checks += _between(f"{name}.origin.spread_m", spread, {"max": largest})
+    largest = _get(rules, "origin", "spread_m", "max")
+    checks += _between(f"{name}.origin.spread_m", spread, {"max": largest})
     checks += _between(f"{name}.origin.thickness_m", thickness, _get(rules, "origin", "thickness_m"))
     if _get(rules, "origin", "fixed_m") is not None:
         checks.append(ConstraintCheck(f"{name}.origin.fixed_m.spread", 0.0, spread, spread == 0.0))
-    return checks
-
-
-def _meant(pinned: Sequence[float], space: Mapping[str, Any] | None) -> list[float]:
-    """A pinned origin, with the space's coordinate where that is fixed no further away than places are told."""
-    place = [float(value) for value in pinned]
-    for axis, key in enumerate(("x_m", "y_m", "z_m")):
-        low, high = (float(end) for end in (space or {}).get(key, (-math.inf, math.inf)))
-        if low == high and abs(place[axis] - low) <= SAME_PLACE_M:
-            place[axis] = low
-    return place
-
-
-def _mounts(
-    sensors: list[Mapping[str, Any]], rules: Mapping[str, Any], each: list[Mapping[str, Any]]
-) -> list[ConstraintCheck]:
-    """Every mounted sensor is at one of its mounts without any spread, and no other one is there."""
-    checks, taken = [], []
-    for index, sensor in enumerate(sensors):
-        mounts = _get(_over(rules, each[index]) if index < len(each) else rules, "origin", "mounts_m")
-        if not mounts:
-            continue
-        mean, name = list(sensor["origin_m"]["mean"]), str(sensor.get("name", index))
-        still = not np.any(sensor["origin_m"]["covariance"])
-        there = [mount for mount in mounts if all(abs(a - b) <= _slack(b) for a, b in zip(mean, mount, strict=True))]
-        kept = bool(there) and there[0] not in taken and still
-        taken += there[:1]
-        checks.append(ConstraintCheck(f"{name}.origin.mounts_m", mounts, mean, kept))
     return checks
 
 
@@ -290,63 +201,184 @@ def _boresight(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], s
 
 def _intervals(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], z: float) -> list[ConstraintCheck]:
     """Gate and field of view: the worse of the reported and the recomputed interval is checked."""
-    checks = []
-    spread = sensor["spread"]
+    values: dict[str, list[float]] = {}
+    spread, view = sensor["spread"], sensor["field_of_view_rad"]
     for axis in ("horizontal", "vertical"):
-        bounds = _get(rules, "field_of_view", f"{axis}_deg")
-        key = f"{name}.field_of_view.{axis}_deg"
-        both = [math.degrees(v) for v in (sensor["field_of_view_rad"][axis], 2 * z * spread[f"{axis}_rad"])]
-        checks += _worse(key, both, bounds)
-    start, end = sensor["gate_m"]["start"], sensor["gate_m"]["end"]
-    starts, ends, widths = [start], [end], [end - start]
+        both = (view[axis], 2 * z * spread[f"{axis}_rad"])
+        values[f"field_of_view.{axis}_deg"] = [math.degrees(angle) for angle in both]
+    gates = [(sensor["gate_m"]["start"], sensor["gate_m"]["end"])]
     mean = sensor.get("range_m")
     if mean is not None:
         half = z * spread["range_m"]
-        starts.append(max(mean - half, 0.0))
-        ends.append(mean + half)
-        widths.append(ends[1] - starts[1])
-    for key, values in (("start_m", starts), ("end_m", ends), ("width_m", widths)):
-        checks += _worse(f"{name}.gate.{key}", values, _get(rules, "gate", key))
+        gates.append((max(mean - half, 0.0), mean + half))
+    values["gate.start_m"] = [start for start, _ in gates]
+    values["gate.end_m"] = [end for _, end in gates]
+    values["gate.width_m"] = [end - start for start, end in gates]
+    checks = []
+    for key, found in values.items():
+        checks += _between(f"{name}.{key}", min(found), _get(rules, *key.split(".")), max(found))
     return checks
-
-
-def _worse(name: str, values: list[float], rules: Any) -> list[ConstraintCheck]:
-    low = _between(name, min(values), {"min": _get(rules, "min")})
-    return low + _between(name, max(values), {"max": _get(rules, "max")})
 
 
 def _inside_space(name: str, sensor: Mapping[str, Any], space: Mapping[str, Any]) -> list[ConstraintCheck]:
     """Gates and mean origins inside the design space; origins are listed where they are not."""
-    near, far = (float(v) for v in space["range_m"])
+    near, far = (float(end) for end in space["range_m"])
     start, end = float(sensor["gate_m"]["start"]), float(sensor["gate_m"]["end"])
     inside = start >= near - _slack(near) and end <= far + _slack(far)
     checks = [ConstraintCheck(f"{name}.space.range_m", [near, far], [start, end], bool(inside))]
-    for value, key in zip(sensor["origin_m"]["mean"], ("x_m", "y_m", "z_m"), strict=True):
-        low, high = (float(v) for v in space[key])
-        kept = low - _slack(low) <= value <= high + _slack(high)
-        if not kept:
+    for value, key in zip(sensor["origin_m"]["mean"], AXES, strict=True):
+        low, high = (float(end) for end in space[key])
+        if not low - _slack(low) <= value <= high + _slack(high):
             checks.append(ConstraintCheck(f"{name}.space.{key}", [low, high], value, False))
     return checks
 
 
-def _widths(document: Mapping[str, Any], budget: Mapping[str, Any]) -> list[tuple[float, int]] | None:
-    """Gate widths and how many rays have them, of a track where they cost most; None without a number of rays."""
-    table = document.get("ray_table")
-    if table:
-        pairs = zip(table["gate_start_m"], table["gate_end_m"], strict=True)
-        return [(end - start, 1) for start, end in pairs]
-    if document.get("track"):
-        return _dearest(document["track"], budget)
-    sensors = document["sensors"]
-    if any(sensor.get("rays") is None for sensor in sensors):
-        return None
-    return [(s["gate_m"]["end"] - s["gate_m"]["start"], int(s["rays"])) for s in sensors]
+def _mounts(
+    sensors: Sequence[Mapping[str, Any]], own_rules: Sequence[Mapping[str, Any]]
+) -> list[ConstraintCheck]:
+    """Every mounted sensor is at one of its mounts without any spread, and no other one is there."""
+    checks, taken = [], []
+    for index, (sensor, own) in enumerate(zip(sensors, own_rules, strict=True)):
+        mounts = _get(own, "origin", "mounts_m")
+        if not mounts:
+            continue
+        mean, name = list(sensor["origin_m"]["mean"]), str(sensor.get("name", index))
+        still = not np.any(sensor["origin_m"]["covariance"])
+        there = [mount for mount in mounts if all(abs(a - b) <= _slack(b) for a, b in zip(mean, mount, strict=True))]
+        kept = bool(there) and there[0] not in taken and still
+        taken += there[:1]
+        checks.append(ConstraintCheck(f"{name}.origin.mounts_m", mounts, mean, kept))
+    return checks
 
 
-def _dearest(track: Mapping[str, Any], budget: Mapping[str, Any]) -> list[tuple[float, int]]:
-    """Gate widths where a track needs most bins: widths are linear between knots, so bins change only where one
-    crosses a whole number, and one place between each two of these tells all."""
+def _excluded(name: str, sensor: Mapping[str, Any], rules: Mapping[str, Any], z: float) -> list[ConstraintCheck]:
+    """The interval mean -+ z spread of a sensor's origin along each axis, against every excluded box."""
+    mean, covariance = sensor["origin_m"]["mean"], sensor["origin_m"]["covariance"]
+    reach = [z * math.sqrt(max(covariance[axis][axis], 0.0)) for axis in range(3)]
+    low, high = ([m + sign * r for m, r in zip(mean, reach, strict=True)] for sign in (-1, 1))
+    value = {"low_m": low, "high_m": high}
+    return [
+        ConstraintCheck(f"{name}.origin.exclude[{index}]", box, value, not _reaches_into(low, high, box))
+        for index, box in enumerate(_boxes(rules))
+    ]
+
+
+def _excluded_travel(
+    track: Mapping[str, Any], sensors: Sequence[Mapping[str, Any]], rules: Mapping[str, Any]
+) -> list[ConstraintCheck]:
+    """The excluded boxes that sensors pass through on their way along a track."""
+    axis = AXES.index(track["dimension"])
+    checks: list[ConstraintCheck] = []
+    for sensor in sensors:
+        low, high = list(sensor["origin_m"]["mean"]), list(sensor["origin_m"]["mean"])
+        low[axis], high[axis] = track["knots_m"][0], track["knots_m"][-1]
+        for index, box in enumerate(_boxes(rules)):
+            check = ConstraintCheck(f"track.origin.exclude[{index}]", box, {"low_m": low, "high_m": high}, False)
+            if _reaches_into(low, high, box) and check not in checks:
+                checks.append(check)
+    return checks
+
+
+def _boxes(rules: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    return list(_get(rules, "origin", "exclude") or [])
+
+
+def _reaches_into(low: Sequence[float], high: Sequence[float], box: Mapping[str, Any]) -> bool:
+    """Whether an interval of origins meets the interior of a box by more than rounding; flat boxes have none."""
+    return all(
+        bottom < top and end > bottom + _slack(bottom) and start < top - _slack(top)
+        for start, end, bottom, top in zip(low, high, box["low_m"], box["high_m"], strict=True)
+    )
+
+
+def _table(table: Mapping[str, Any], own_rules: Sequence[Mapping[str, Any]]) -> list[ConstraintCheck]:
+    """The gates of explicit rays that break a gate bound of their sensor, and the rays that start in excluded boxes."""
+    owners = [own_rules[sensor] for sensor in table["sensor"]]
+    failed = []
+    for ray, (start, end, own) in enumerate(zip(table["gate_start_m"], table["gate_end_m"], owners, strict=True)):
+        for key, value in (("start_m", start), ("end_m", end), ("width_m", end - start)):
+            failed += [c for c in _between(f"ray{ray}.gate.{key}", value, _get(own, "gate", key)) if not c.satisfied]
+    if any(_boxes(own) for own in own_rules):
+        starts = zip(table["origin_x_m"], table["origin_y_m"], table["origin_z_m"], owners, strict=True)
+        failed += [
+            ConstraintCheck(f"ray{ray}.origin.exclude[{index}]", box, start, False)
+            for ray, (*start, own) in enumerate(starts)
+            for index, box in enumerate(_boxes(own))
+            if _reaches_into(start, start, box)
+        ]
+    return failed
+
+
+def _track(track: Mapping[str, Any], rules: Mapping[str, Any], space: Any) -> list[ConstraintCheck]:
+    """Gates and boresights at every knot; in between they are linear, and these bounds are convex.
+
+    Only broken bounds are listed, but for the ends of the track, which must lie in the design space.
+    """
+    failed = []
+    for knot in range(len(track["knots_m"])):
+        rows = (track[key][knot] for key in ("gate_start_m", "gate_end_m", "azimuth_rad", "elevation_rad"))
+        for ray, (start, end, azimuth, elevation) in enumerate(zip(*rows, strict=True)):
+            name = f"ray{ray}.knot{knot}"
+            aimed = {"boresight": {"azimuth_rad": azimuth, "elevation_rad": elevation}}
+            checks = _boresight(name, aimed, rules, space)
+            for key, value in (("start_m", start), ("end_m", end), ("width_m", end - start)):
+                checks += _between(f"{name}.gate.{key}", value, _get(rules, "gate", key))
+            if space is not None:
+                near, far = (float(value) for value in space["range_m"])
+                inside = start >= near - _slack(near) and end <= far + _slack(far)
+                checks.append(ConstraintCheck(f"{name}.space.range_m", [near, far], [start, end], bool(inside)))
+                low, high = (float(value) for value in space["elevation_rad"])
+                inside = low - _slack(low) <= elevation <= high + _slack(high)
+                checks.append(ConstraintCheck(f"{name}.space.elevation_rad", [low, high], elevation, bool(inside)))
+                low, high = (float(value) for value in space["azimuth_rad"])
+                past = (azimuth - low) % (2 * math.pi)
+                inside = past <= high - low + _slack(math.pi) or past >= 2 * math.pi - _slack(math.pi)
+                checks.append(ConstraintCheck(f"{name}.space.azimuth_rad", [low, high], azimuth, bool(inside)))
+            failed += [check for check in checks if not check.satisfied]
+    if space is None:
+        return failed
+    low, high = (float(value) for value in space[track["dimension"]])
+    first, last = track["knots_m"][0], track["knots_m"][-1]
+    inside = first >= low - _slack(low) and last <= high + _slack(high)
+    return [*failed, ConstraintCheck(f"track.space.{track['dimension']}", [low, high], [first, last], bool(inside))]
+
+
+def _budget(document: Mapping[str, Any], budget: Mapping[str, Any]) -> list[ConstraintCheck]:
+    """The number of rays, and their bandwidth: rays times whole bins times bits times frames [Mbit/s]."""
     bin_m = LIGHT_M_PER_S * budget.get("bin_ps", 100.0) * PICOSECOND_S / 2
+    widths = _widths(document, bin_m)
+    total = None if widths is None else sum(count for _, count in widths)
+    checks = []
+    declared = document.get("rays")
+    if declared is not None and total is not None and declared != total:
+        checks.append(ConstraintCheck("rays", declared, total, False))
+    if budget.get("rays") is not None:
+        found = total if total is not None else declared
+        checks.append(ConstraintCheck("budget.rays", budget["rays"], found, found == budget["rays"]))
+    limit = budget.get("bandwidth_mbps")
+    if limit is not None:
+        found = None
+        if widths is not None:
+            bins = sum(count * max(math.ceil(width / bin_m * (1 - BIN_ROUNDING)), 1) for width, count in widths)
+            found = bins * budget.get("bits_per_bin", 40.0) * budget.get("rate_hz", 10.0) / 1e6
+        kept = found is not None and found <= limit + _slack(limit)
+        checks.append(ConstraintCheck("budget.bandwidth_mbps", limit, found, kept))
+    return checks
+
+
+def _widths(document: Mapping[str, Any], bin_m: float) -> list[tuple[float, int]] | None:
+    """Gate widths and how many rays have them, of a track where they cost most; None without a number of rays.
+
+    Widths of a track are linear between knots, so bins change only where one crosses a whole number, and one place
+    between each two of these tells all.
+    """
+    table, track, sensors = document.get("ray_table"), document.get("track"), document["sensors"]
+    if table:
+        return [(end - start, 1) for start, end in zip(table["gate_start_m"], table["gate_end_m"], strict=True)]
+    if not track:
+        if any(sensor.get("rays") is None for sensor in sensors):
+            return None
+        return [(s["gate_m"]["end"] - s["gate_m"]["start"], int(s["rays"])) for s in sensors]
     width = np.array(track["gate_end_m"], dtype=np.float64) - np.array(track["gate_start_m"], dtype=np.float64)
     places = [width]
     for left, right in zip(width[:-1] / bin_m, width[1:] / bin_m, strict=True):
@@ -362,89 +394,71 @@ def _dearest(track: Mapping[str, Any], budget: Mapping[str, Any]) -> list[tuple[
     return [(float(width), 1) for width in every[bins.argmax()]]
 
 
-def _table(document: Mapping[str, Any], rules: Mapping[str, Any]) -> list[ConstraintCheck]:
-    """Gates of explicit rays keep the gate bounds of their sensor."""
-    table = document.get("ray_table")
-    if not table:
+def _snap(name: str, index: int, document: Mapping[str, Any], snap: Any) -> list[ConstraintCheck]:
+    """Whether a sensor is the part that it says to be; `snap` is what holds for it, None asks nothing."""
+    if snap is None:
         return []
-    each = list(rules.get("each") or [])
-    columns = zip(table["gate_start_m"], table["gate_end_m"], table["sensor"], strict=True)
-    failed = []
-    for ray, (start, end, sensor) in enumerate(columns):
-        own = _over(rules, each[sensor]) if sensor < len(each) else rules
-        for key, value in (("start_m", start), ("end_m", end), ("width_m", end - start)):
-            failed += [c for c in _between(f"ray{ray}.gate.{key}", value, _get(own, "gate", key)) if not c.satisfied]
-    owners = [_over(rules, each[sensor]) if sensor < len(each) else rules for sensor in table["sensor"]]
-    return failed + [ConstraintCheck(*row) for row in excluded_starts(table, owners)]
+    sensor = document["sensors"][index]
+    keys = snap if isinstance(snap, Mapping) else {}
+    named = keys.get("parts") or []
+    allowed = named or "the catalogue"
+    if sensor.get("part") is None:
+        kept = keys.get("otherwise") == "keep"
+        return [ConstraintCheck(f"{name}.snap", allowed, "a sensor of its own", kept)]
+    part = _admitted_part(str(sensor["part"]), named)
+    if part is None:
+        return [ConstraintCheck(f"{name}.snap", allowed, sensor["part"], False)]
+    wrong = _differences(part, index, sensor, document.get("ray_table"))
+    return [ConstraintCheck(f"{name}.snap", part.name, wrong or part.name, wrong is None)]
 
 
-def _track(track: Mapping[str, Any], rules: Mapping[str, Any], space: Any) -> list[ConstraintCheck]:
-    """Gates and boresights at every knot; in between they are linear, and these bounds are convex.
-
-    Only broken bounds are listed, but for the ends of the track, which must lie in the design space.
-    """
-    failed = []
-    for knot in range(len(track["knots_m"])):
-        rows = (track[key][knot] for key in ("gate_start_m", "gate_end_m", "azimuth_rad", "elevation_rad"))
-        for ray, (start, end, azimuth, elevation) in enumerate(zip(*rows, strict=True)):
-            name = f"ray{ray}.knot{knot}"
-            gate = {"start": start, "end": end}
-            aimed = {"azimuth_rad": azimuth, "elevation_rad": elevation}
-            origin = {"mean": [0.0, 0.0, 0.0]}
-            one = {"gate_m": gate, "boresight": aimed, "origin_m": origin}
-            found = _boresight(name, one, rules, space)
-            for key, value in (("start_m", start), ("end_m", end), ("width_m", end - start)):
-                found += _between(f"{name}.gate.{key}", value, _get(rules, "gate", key))
-            if space is not None:
-                found += _looks_inside(name, one, space)
-            failed += [check for check in found if not check.satisfied]
-    if space is None:
-        return failed
-    low, high = (float(value) for value in space[track["dimension"]])
-    first, last = track["knots_m"][0], track["knots_m"][-1]
-    inside = first >= low - _slack(low) and last <= high + _slack(high)
-    return [*failed, ConstraintCheck(f"track.space.{track['dimension']}", [low, high], [first, last], bool(inside))]
+def _admitted_part(name: str, named: Sequence[str]) -> Part | None:
+    """The part that a sensor names, if the constraints admit it."""
+    # an entry is a name or a path, with a mode behind it or not
+    entries: list[tuple[Path | None, str, str]] = []
+    for text in named:
+        path, mode = text.rsplit(":", 1) if f"{SUFFIX}:" in text else (text, "")
+        if path.endswith(SUFFIX) or Path(path).is_dir():
+            entries.append((Path(path), "", mode))
+        else:
+            entries.append((None, *text.partition(":")[::2]))
+    try:
+        library = load_library([path for path, _, _ in entries if path is not None])
+        part = library.part(name)
+    except ConfigError:
+        return None
+    stem = name.partition(":")[0]
+    file = Path(library.origins[stem])
+    for path, entry, mode in entries:
+        same = entry == stem if path is None else path in (file, file.parent)
+        if same and mode in ("", part.mode):
+            return part
+    return None if named else part
 
 
-def _looks_inside(name: str, ray: Mapping[str, Any], space: Mapping[str, Any]) -> list[ConstraintCheck]:
-    """The gate and the elevation of a ray inside the design space, and its azimuth on the circle."""
-    checks = []
-    near, far = (float(v) for v in space["range_m"])
-    start, end = ray["gate_m"]["start"], ray["gate_m"]["end"]
-    inside = start >= near - _slack(near) and end <= far + _slack(far)
-    checks.append(ConstraintCheck(f"{name}.space.range_m", [near, far], [start, end], bool(inside)))
-    low, high = (float(v) for v in space["elevation_rad"])
-    elevation = ray["boresight"]["elevation_rad"]
-    inside = low - _slack(low) <= elevation <= high + _slack(high)
-    checks.append(ConstraintCheck(f"{name}.space.elevation_rad", [low, high], elevation, bool(inside)))
-    low, high = (float(v) for v in space["azimuth_rad"])
-    past = (ray["boresight"]["azimuth_rad"] - low) % (2 * math.pi)
-    inside = past <= high - low + _slack(math.pi) or past >= 2 * math.pi - _slack(math.pi)
-    azimuth = ray["boresight"]["azimuth_rad"]
-    return [*checks, ConstraintCheck(f"{name}.space.azimuth_rad", [low, high], azimuth, bool(inside))]
+def _differences(part: Part, index: int, sensor: Mapping[str, Any], table: Mapping[str, Any] | None) -> str | None:
+    """What a sensor is that the part is not; None where both are the same."""
+    view = sensor["field_of_view_rad"]
+    for key, expected in zip(("horizontal", "vertical"), part.field_of_view_rad, strict=True):
+        if abs(view[key] - expected) > COARSE_SLACK:
+            return f"a {key} field of view of {view[key]:g} instead of {expected:g} rad"
+    (near, far), gate = part.range_m, sensor["gate_m"]
+    if gate["start"] < near - COARSE_SLACK or gate["end"] > far + COARSE_SLACK:
+        return f"a gate of {gate['start']:g} to {gate['end']:g} m, and the part measures {near:g} to {far:g} m"
+    if not table:
+        return "no explicit rays"
+    # loaded here because few designs are of parts
+    from scipy.spatial import cKDTree
 
-
-def _budget(document: Mapping[str, Any], rules: Mapping[str, Any]) -> list[ConstraintCheck]:
-    budget = rules.get("budget") or {}
-    widths = _widths(document, budget)
-    total = None if widths is None else sum(count for _, count in widths)
-    checks = []
-    declared = document.get("rays")
-    if declared is not None and total is not None and declared != total:
-        checks.append(ConstraintCheck("rays", declared, total, False))
-    if budget.get("rays") is not None:
-        found = total if total is not None else declared
-        checks.append(ConstraintCheck("budget.rays", budget["rays"], found, found == budget["rays"]))
-    limit = budget.get("bandwidth_mbps")
-    if limit is not None:
-        found = None if widths is None else _mbps(widths, budget)
-        kept = found is not None and found <= limit + _slack(limit)
-        checks.append(ConstraintCheck("budget.bandwidth_mbps", limit, found, kept))
-    return checks
-
-
-def _mbps(widths: list[tuple[float, int]], budget: Mapping[str, Any]) -> float:
-    """Rays times whole bins times bits times frames [Mbit/s]."""
-    bin_m = LIGHT_M_PER_S * budget.get("bin_ps", 100.0) * PICOSECOND_S / 2
-    bins = sum(count * max(math.ceil(width / bin_m * (1 - BIN_ROUNDING)), 1) for width, count in widths)
-    return bins * budget.get("bits_per_bin", 40.0) * budget.get("rate_hz", 10.0) / 1e6
+    own = np.flatnonzero(np.asarray(table["sensor"]) == index)
+    azimuth, elevation = (np.asarray(table[key], dtype=np.float64)[own] for key in ("azimuth_rad", "elevation_rad"))
+    aimed = sensor["boresight"]
+    frame = boresight_frame(aimed["azimuth_rad"], aimed["elevation_rad"], aimed.get("roll_rad") or 0.0)
+    local = direction(azimuth, elevation) @ (boresight_frame(*part.centre_rad).T @ frame).T
+    away, ray = cKDTree(part.directions).query(local)
+    starts = np.stack([np.asarray(table[f"origin_{axis}"], dtype=np.float64)[own] for axis in AXES], axis=1)
+    moved = np.abs(starts - np.asarray(sensor["origin_m"]["mean"])).max(axis=1, initial=0.0) > COARSE_SLACK
+    same = len(part.directions) - len(np.unique(part.directions, axis=0))
+    # rays that are none of its part's, or are fired from elsewhere or twice
+    strays = int(((away > COARSE_SLACK) | moved).sum()) + max(len(ray) - len(np.unique(ray)) - same, 0)
+    return f"{strays} rays that the part does not have" if strays else None

@@ -4,11 +4,9 @@ Rangefinders of one body that start at one place are one sensor, and so are thos
 name and whose sites are its rays, NAME_r0, NAME_r1, ..., as `export --format mjcf` writes them; these keep the starts
 of their gates in the rangefinders' user data. Rays stand where the model's bodies do when a simulation begins.
 
-The part of a MuJoCo model that says where its rangefinders are: a model of its own, without any other file.
-
-Bodies, frames, sites and their defaults are kept; shapes, joints, meshes, actuators and plugins are left out, so that
-MuJoCo compiles what is left from text alone, reads nothing from disk and runs nothing. Without joints bodies stand
-where the model puts them, which is where they are when a simulation begins.
+MuJoCo compiles only what says where rangefinders are, as a model of its own that reads nothing from disk and runs
+nothing: bodies, frames, sites and their defaults are kept; shapes, joints, meshes, actuators and plugins are left out.
+Without joints bodies stand where the model puts them, which is where they are when a simulation begins.
 """
 
 from __future__ import annotations
@@ -16,10 +14,10 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -41,7 +39,6 @@ KEPT = {
     "sensor": (),
     "rangefinder": ("name", "site", "cutoff", "user"),
 }
-CAMERA = "camera"
 MOST_INCLUDES = 100
 # MuJoCo takes seconds for a thousand copies with sensors, and four times as long for twice as many.
 MOST_COPIES = 1000
@@ -80,57 +77,51 @@ class _Copier:
             if depth >= DEEPEST:
                 raise DataError("is nested too deep, with what it includes", where=where, allowed=f"{DEEPEST} levels")
             if child.tag == "include":
-                included, file = _included(child, path, self.seen)
-                self.copy_children(included, target, file, depth=depth + 1, times=times)
+                file = self.included_file(child.attrib.get("file", ""), where)
+                self.copy_children(read_xml(file, ALLOWED), target, file, depth=depth + 1, times=times)
                 continue
             if child.tag == "attach":
                 raise DataError("attaches another model", where=where, allowed="one model, or <include>")
-            if child.tag == "rangefinder" and CAMERA in child.attrib:
+            if child.tag == "rangefinder" and "camera" in child.attrib:
                 allowed = "rangefinders of sites: one ray each"
                 raise DataError("has a rangefinder of a camera", where=where, allowed=allowed)
             if child.tag not in KEPT:
                 continue
-            kept = ElementTree.SubElement(
-                target, child.tag, {name: child.attrib[name] for name in KEPT[child.tag] if name in child.attrib}
-            )
-            inner = times * _count(child, where) if child.tag == "replicate" else times
+            kept = {name: child.attrib[name] for name in KEPT[child.tag] if name in child.attrib}
+            inner = times
+            if child.tag == "replicate":
+                count = child.attrib.get("count", "")
+                if not count.strip().isdecimal() or len(count) > len(str(MOST_COPIES)):
+                    allowed = f"a whole number up to {MOST_COPIES}"
+                    raise DataError(f"count is {count[:40]!r}", where=where, allowed=allowed)
+                inner *= int(count)
             self.copies += inner if inner > 1 else 0
             if self.copies > MOST_COPIES:
                 raise DataError("replicates too much", where=where, allowed=f"at most {MOST_COPIES} copies")
-            self.copy_children(child, kept, path, depth=depth + 1, times=inner)
+            copied = ElementTree.SubElement(target, child.tag, kept)
+            self.copy_children(child, copied, path, depth=depth + 1, times=inner)
+
+    def included_file(self, name: str, where: str) -> Path:
+        """An included file, which lies in the first file's folder, links followed, and is included once."""
+        folder = self.seen[0].parent
+        file = (folder / name).resolve()
+        if not name or not file.is_relative_to(folder):
+            raise DataError(
+                f"includes {name!r}, which is outside the model's folder", where=where,
+                hint="copy the file into the model's folder and name it from there",
+            )  # fmt: skip
+        if file in self.seen or len(self.seen) > MOST_INCLUDES:
+            allowed = f"each file once, at most {MOST_INCLUDES}"
+            raise DataError(f"includes {name!r} again", where=where, allowed=allowed)
+        self.seen.append(file)
+        return file
 
 
-def _count(element: ElementTree.Element, where: str) -> int:
-    text = element.attrib.get("count", "")
-    if not text.strip().isdecimal() or len(text) > len(str(MOST_COPIES)):
-        raise DataError(f"count is {text[:40]!r}", where=where, allowed=f"a whole number up to {MOST_COPIES}")
-    return int(text)
-
-
-def _included(element: ElementTree.Element, path: Path, seen: list[Path]) -> tuple[Element, Path]:
-    """The root of an included file, which lies in the first file's folder, links followed, and is included once."""
-    where = f"{path}:{element.line if isinstance(element, Element) else 1}"
-    name = element.attrib.get("file", "")
-    folder = seen[0].parent
-    found = (folder / name).resolve()
-    if not name or not found.is_relative_to(folder):
-        raise DataError(
-            f"includes {name!r}, which is outside the model's folder", where=where,
-            hint="copy the file into the model's folder and name it from there",
-        )  # fmt: skip
-    if found in seen or len(seen) > MOST_INCLUDES:
-        raise DataError(f"includes {name!r} again", where=where, allowed=f"each file once, at most {MOST_INCLUDES}")
-    seen.append(found)
-    return read_xml(found, ALLOWED), found
-
-
-KIND = "MuJoCo model"
 # Rays of one sensor that were written with few digits start within this of one another [m].
 SAME_PLACE_M = 1e-4
 # What is left of a sensor's name when its rays are counted: `front_r12` and `front_r13` are of `front`.
 EXPORTED = re.compile(r"_r\d+")
 COUNTED = re.compile(r"[\s_.-]+(r|ray)?[\s_.-]*\d*$|\d+$")
-NO_START = "when gates start is not said: a rangefinder is heard from 0 m on"
 
 
 @dataclass(frozen=True)
@@ -181,101 +172,84 @@ def read_mjcf(path: Path) -> Rig:
             "has no rangefinder", where=str(path), allowed="<sensor> with <rangefinder site=...>, one per ray"
         )
     groups = _groups(rays)
-    notes = [NO_START] if any(ray.start_m is None for ray in rays) else []
-    of_bodies = Counter(rays[group[0]].body for group in groups)
-    sensors = [_sensor([rays[index] for index in group], np.array(group), of_bodies) for group in groups]
-    return Rig(KIND, sensors, notes, "give the rangefinders a cutoff")
+    notes = []
+    if any(ray.start_m is None for ray in rays):
+        notes.append("when gates start is not said: a rangefinder is heard from 0 m on")
+    sensors_of_body = Counter(rays[group[0]].body for group in groups)
+    sensors = []
+    for group in groups:
+        own = [rays[index] for index in group]
+        azimuth, elevation = angles(np.array([ray.direction for ray in own]))
+        gates = np.array([[ray.start_m or 0.0, ray.cutoff_m] for ray in own])
+        name = _name(own, alone=sensors_of_body[own[0].body] == 1)
+        origin = np.array([ray.origin_m for ray in own])
+        sensors.append(RigSensor(name, origin, azimuth, elevation, gates, order=np.array(group)))
+    return Rig("MuJoCo model", sensors, notes, "give the rangefinders a cutoff")
 
 
-def _rays(model: ElementTree.Element, path: Path) -> list[_Ray]:
+def _rays(stripped: ElementTree.Element, path: Path) -> list[_Ray]:
     """The rangefinders of what is left of a model, in its order."""
     import mujoco
 
     try:
-        compiled = mujoco.MjModel.from_xml_string(ElementTree.tostring(model, encoding="unicode"))
+        model = mujoco.MjModel.from_xml_string(ElementTree.tostring(stripped, encoding="unicode"))
     except ValueError as error:
         reason = " ".join(str(error).split()) or "no reason given"
-        raise DataError(f"MuJoCo cannot read it: {reason}", where=str(path), allowed="an MJCF model") from None
-    data = mujoco.MjData(compiled)
-    mujoco.mj_kinematics(compiled, data)
-    kind = int(mujoco.mjtSensor.mjSENS_RANGEFINDER)
-    return [_ray(compiled, data, index) for index in np.flatnonzero(compiled.sensor_type == kind)]
-
-
-def _ray(model: Any, data: Any, index: int) -> _Ray:
-    site = int(model.sensor_objid[index])
-    body = int(model.site_bodyid[site])
-    return _Ray(
-        name=model.sensor(index).name or model.site(site).name,
-        site_name=model.site(site).name,
-        body=body,
-        body_name=model.body(body).name,
-        origin_m=np.array(data.site_xpos[site]),
-        direction=np.array(data.site_xmat[site]).reshape(3, 3)[:, 2],
-        cutoff_m=float(model.sensor_cutoff[index]) or np.inf,
-        user=tuple(float(value) for value in model.sensor_user[index]),
-    )
+        raise DataError(f"MuJoCo cannot read it: {reason}", where=str(path), allowed=ALLOWED) from None
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    rays = []
+    for index in np.flatnonzero(model.sensor_type == int(mujoco.mjtSensor.mjSENS_RANGEFINDER)):
+        site = int(model.sensor_objid[index])
+        body = int(model.site_bodyid[site])
+        rays.append(
+            _Ray(
+                name=model.sensor(int(index)).name or model.site(site).name,
+                site_name=model.site(site).name,
+                body=body,
+                body_name=model.body(body).name,
+                origin_m=np.array(data.site_xpos[site]),
+                direction=np.array(data.site_xmat[site]).reshape(3, 3)[:, 2],
+                cutoff_m=float(model.sensor_cutoff[index]) or np.inf,
+                user=tuple(float(value) for value in model.sensor_user[index]),
+            )
+        )
+    return rays
 
 
 def _groups(rays: Sequence[_Ray]) -> list[list[int]]:
-    """Rays by body and place, in order of appearance."""
+    """The rays of each sensor, by body and place, in order of appearance."""
     groups: list[list[int]] = []
-    firsts: dict[tuple[int, ...], list[list[int]]] = {}
+    # groups by the body and the cell of their first ray
+    near: dict[tuple[int, ...], list[list[int]]] = {}
     exported: dict[int, list[int]] = {}
     for index, ray in enumerate(rays):
         if ray.is_exported and ray.body in exported:
             exported[ray.body].append(index)
             continue
         cell = np.floor(ray.origin_m / SAME_PLACE_M).astype(np.int64)
-        near = _near(ray, cell, firsts, rays)
-        if near is None:
-            groups.append([index])
-            if ray.is_exported:
-                exported[ray.body] = groups[-1]
-            firsts.setdefault((ray.body, *cell.tolist()), []).append(groups[-1])
-        else:
-            near.append(index)
+        around = [(ray.body, *(cell + np.array(step) - 1).tolist()) for step in np.ndindex(3, 3, 3)]
+        candidates = (group for key in around for group in near.get(key, []))
+        same = (group for group in candidates if np.linalg.norm(rays[group[0]].origin_m - ray.origin_m) <= SAME_PLACE_M)
+        group = next(same, None)
+        if group is not None:
+            group.append(index)
+            continue
+        groups.append([index])
+        if ray.is_exported:
+            exported[ray.body] = groups[-1]
+        near.setdefault((ray.body, *cell.tolist()), []).append(groups[-1])
     return groups
 
 
-def _near(
-    ray: _Ray, cell: np.ndarray, firsts: dict[tuple[int, ...], list[list[int]]], rays: Sequence[_Ray]
-) -> list[int] | None:
-    """The group whose first ray starts where this one does, looked for in the cell and those around it."""
-    for step in np.ndindex(3, 3, 3):
-        key = (ray.body, *(cell + np.array(step) - 1).tolist())
-        for group in firsts.get(key, []):
-            if np.linalg.norm(rays[group[0]].origin_m - ray.origin_m) <= SAME_PLACE_M:
-                return group
-    return None
-
-
-def _sensor(own: Sequence[_Ray], order: np.ndarray, of_bodies: Mapping[int, int]) -> RigSensor:
-    """One sensor; `of_bodies` says how many each body has."""
-    azimuth, elevation = angles(np.array([ray.direction for ray in own]))
-    start = np.array([ray.start_m or 0.0 for ray in own])
-    end = np.array([ray.cutoff_m for ray in own])
-    return RigSensor(
-        name=_name(own, alone=of_bodies[own[0].body] == 1),
-        origin_m=np.array([ray.origin_m for ray in own]),
-        azimuth_rad=azimuth,
-        elevation_rad=elevation,
-        gate_m=np.stack([start, end], axis=1),
-        order=order,
-    )
-
-
 def _name(own: Sequence[_Ray], *, alone: bool) -> str:
-    """What the names of its rays have in common, or the name of the body that has no other sensor."""
+    """What the names of a sensor's rays have in common, or the name of the body that has no other sensor."""
     if own[0].is_exported:
         return own[0].body_name
     if len(own) == 1 and own[0].name:
         return own[0].name
-    common = COUNTED.sub("", _common([ray.name for ray in own]))
+    names = [ray.name for ray in own]
+    # what the first and the last in order share, all share
+    pairs = takewhile(lambda letters: letters[0] == letters[1], zip(min(names), max(names), strict=False))
+    common = COUNTED.sub("", "".join(letter for letter, _ in pairs))
     return common or (own[0].body_name if alone and own[0].body else "")
-
-
-def _common(names: Sequence[str]) -> str:
-    """The longest text that all names begin with."""
-    shortest = min(names, key=len)
-    return next((shortest[:i] for i in range(len(shortest)) if any(name[i] != shortest[i] for name in names)), shortest)

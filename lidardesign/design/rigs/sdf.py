@@ -3,10 +3,9 @@
 A scan fires `samples` rays from `min_angle` to `max_angle`, both ends included, in every of its rows from the lowest
 up; sensors look along their own +x.
 
-Where the links of an SDF file are: poses relative to frames, joints, links and nested models.
-
-A model is a scope of names. Within it a pose counts from the model's own frame unless `relative_to` names another;
-a joint's pose counts from its child link, and a frame's from what it is attached to.
+Links stand where poses relative to frames, joints, links and nested models put them. A model is a scope of names.
+Within it a pose counts from the model's own frame unless `relative_to` names another; a joint's pose counts from its
+child link, and a frame's from what it is attached to.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from lidardesign.design.rigs.rig import MOST_SENSORS, Aim, Rig, RigSensor
-from lidardesign.design.sensor import MOST_RAYS, boresight_frame
+from lidardesign.design.sensor import MOST_RAYS, boresight_frame, boresight_of
 from lidardesign.errors import DataError
 from lidardesign.geometry.rotation import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.run.xml import Element, numbers_of, read_xml
@@ -107,32 +106,27 @@ class Scope:
             raise DataError(message, where=self.where(asking), allowed=f"at most {LONGEST_CHAIN}")
         self.found[name] = None
         self.waiting.append(name)
-        pose = self._looked_up(name, asking)
+        outer, _, inner = name.partition(SEPARATOR)
+        model = self._named.get(("model", outer)) if inner else None
+        element = next((self._named[tag, name] for tag in NAMED if (tag, name) in self._named), None)
+        if model is not None:
+            pose = self.pose_of(outer, asking) @ self.within(model).pose_of(inner, asking)
+        elif element is not None:
+            pose = self._pose_of_element(element)
+        else:
+            allowed = "a link, frame, joint or model"
+            raise DataError(f"nothing is called {name!r}", where=self.where(asking), allowed=allowed)
         self.waiting.pop()
         self.found[name] = pose
         return pose
 
-    def _looked_up(self, name: str, asking: ElementTree.Element) -> np.ndarray:
-        outer, _, inner = name.partition(SEPARATOR)
-        if inner:
-            model = self._named.get(("model", outer))
-            if model is not None:
-                return self.pose_of(outer, asking) @ self.within(model).pose_of(inner, asking)
-        for tag, base in zip(NAMED, (None, None, "attached_to", "child"), strict=True):
-            element = self._named.get((tag, name))
-            if element is not None:
-                return self._pose_of_element(element, base)
-        raise DataError(
-            f"nothing is called {name!r}", where=self.where(asking), allowed="a link, frame, joint or model"
-        )
-
-    def _pose_of_element(self, element: ElementTree.Element, base: str | None) -> np.ndarray:
+    def _pose_of_element(self, element: ElementTree.Element) -> np.ndarray:
         """The pose of a link, model, frame or joint in this scope's frame."""
         usual = ""
-        if base == "attached_to":
-            usual = element.get(base, "")
-        elif base == "child":
-            usual = (element.findtext(base) or "").strip()
+        if element.tag == "frame":
+            usual = element.get("attached_to", "")
+        elif element.tag == "joint":
+            usual = (element.findtext("child") or "").strip()
         pose = self.placed(element, usual)
         placement = element.get("placement_frame") if element.tag == "model" else None
         if placement:
@@ -153,7 +147,7 @@ class Scope:
         if self.element.tag == "world":
             return np.eye(4)
         if self.parent is None:
-            return self._pose_of_element(self.element, None)
+            return self._pose_of_element(self.element)
         return self.parent.in_world() @ self.parent.pose_of(self.element.get("name", ""), self.element)
 
 
@@ -179,11 +173,10 @@ def pose_matrix(pose: ElementTree.Element, where: str) -> np.ndarray:
     return rigid(rotation_of_rpy(*(scale * value for value in values[3:])), values[:3])
 
 
-KIND = "SDF file"
-ALLOWED = "an SDF file"
 TYPES = ("gpu_lidar", "lidar", "gpu_ray", "ray")
 # Most angles of a scan [rad]: a turn, a little more for rounding.
 WIDEST = 1.001 * FULL_TURN
+INFINITE = ("inf", "infinity")
 
 
 @dataclass(frozen=True)
@@ -214,8 +207,13 @@ def read_sdf(path: Path) -> Rig:
     Raises:
         DataError: The file is no SDF, has no lidar, or an element of one cannot be used; with file and line.
     """
-    root = read_xml(path, ALLOWED)
-    _name_frames_as_later(root)
+    root = read_xml(path, "an SDF file")
+    version = [int(part) for part in root.get("version", "").split(".") if part.isdecimal()]
+    if version and version < [1, 7]:
+        # poses of these versions count from what `frame` names, which is called `relative_to` since
+        for pose in root.iter("pose"):
+            if "frame" in pose.attrib:
+                pose.attrib.setdefault("relative_to", pose.attrib["frame"])
     notes: dict[str, None] = {}
     sensors: list[RigSensor] = []
     longer: list[str] = []
@@ -228,7 +226,7 @@ def read_sdf(path: Path) -> Rig:
         if rays > MOST_RAYS or len(sensors) > MOST_SENSORS:
             allowed = f"at most {MOST_RAYS} rays of {MOST_SENSORS} sensors"
             raise DataError("has more rays or sensors than a design", where=scope.where(element), allowed=allowed)
-    if any(True for _ in root.iter("include")):
+    if root.find(".//include") is not None:
         notes["models that the file includes are not read; copy their lidars into it"] = None
     if not sensors:
         found = "has no lidar" + (": models that it includes are not read" if notes else "")
@@ -238,17 +236,7 @@ def read_sdf(path: Path) -> Rig:
         replace(sensor, name=full) if often[sensor.name] > 1 else sensor
         for sensor, full in zip(sensors, longer, strict=True)
     ]
-    return Rig(KIND, named, list(notes), "give <range> a <max>")
-
-
-def _name_frames_as_later(root: ElementTree.Element) -> None:
-    """Poses of versions before 1.7 count from what `frame` names, which is called `relative_to` since."""
-    version = [int(part) for part in root.get("version", "").split(".") if part.isdecimal()]
-    if not version or version >= [1, 7]:
-        return
-    for pose in root.iter("pose"):
-        if "frame" in pose.attrib:
-            pose.attrib.setdefault("relative_to", pose.attrib["frame"])
+    return Rig("SDF file", named, list(notes), "give <range> a <max>")
 
 
 def _lidars(root: ElementTree.Element, path: Path) -> Iterator[tuple[Scope, ElementTree.Element, ElementTree.Element]]:
@@ -293,7 +281,10 @@ def _sensor(scope: Scope, link: ElementTree.Element, element: ElementTree.Elemen
         if lidar.find(tag) is not None:
             notes[note] = None
     origin = np.tile(pose[:3, 3], (len(azimuth), 1))
-    return RigSensor(element.get("name", ""), origin, *world, gate, aim=_aim(pose[:3, :3], across, up))
+    # the boresight is in the middle of the scan, upright as the sensor is
+    boresight = boresight_of(boresight_frame(across.middle, up.middle) @ pose[:3, :3].T)
+    aim = Aim(*boresight, (math.cos(up.middle) * across.width, up.width))
+    return RigSensor(element.get("name", ""), origin, *world, gate, aim=aim)
 
 
 def _needed(element: ElementTree.Element, tag: str, scope: Scope) -> ElementTree.Element:
@@ -333,7 +324,8 @@ def _gate(element: ElementTree.Element, scope: Scope, notes: dict[str, None]) ->
     bounds = {"min": 0.0, "max": math.inf}
     for tag in bounds:
         child = element.find(tag)
-        if child is not None and not (tag == "max" and _is_infinite(child)):
+        infinite = tag == "max" and child is not None and (child.text or "").strip().lower().lstrip("+") in INFINITE
+        if child is not None and not infinite:
             bounds[tag] = numbers_of(child.text, 1, scope.where(child), tag)[0]
     if element.find("min") is None:
         notes["when gates start is not said: rays are heard from 0 m on"] = None
@@ -341,16 +333,3 @@ def _gate(element: ElementTree.Element, scope: Scope, notes: dict[str, None]) ->
         found = f"range from {bounds['min']:g} to {bounds['max']:g} m"
         raise DataError(found, where=scope.where(element), allowed="0 <= min <= max")
     return np.array([bounds["min"], bounds["max"]])
-
-
-def _is_infinite(element: ElementTree.Element) -> bool:
-    return (element.text or "").strip().lower().lstrip("+") in ("inf", "infinity")
-
-
-def _aim(rotation: np.ndarray, across: _Axis, up: _Axis) -> Aim:
-    """The boresight in the middle of a scan, upright as its sensor is, and the angles that the scan covers."""
-    middle = boresight_frame(across.middle, up.middle) @ rotation.T
-    azimuth, elevation = (float(angle) for angle in angles(middle[0]))
-    upright = boresight_frame(azimuth, elevation)
-    roll = math.atan2(float(middle[1] @ upright[2]), float(middle[1] @ upright[1]))
-    return Aim(azimuth, elevation, roll, (math.cos(up.middle) * across.width, up.width))

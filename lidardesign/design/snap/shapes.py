@@ -16,11 +16,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lidardesign.design.catalog.part import Part, to_angles, to_directions
-from lidardesign.design.catalog.placing import Pose, boresight_of
+from lidardesign.design.catalog.placing import Pose
 from lidardesign.design.mixture.bounds import Bounds
 from lidardesign.design.mixture.features import Axes
 from lidardesign.design.mixture.mixture import Mixture
-from lidardesign.design.sensor import boresight_frame
+from lidardesign.design.sensor import boresight_frame, boresight_of
 from lidardesign.space import RANGE, DesignSpace, angles, observed_point
 
 # A line scanner's field has no height; as a component it has this one, which a density can be fitted with.
