@@ -1,85 +1,98 @@
-"""From weighted samples of the density to a design that keeps its constraints."""
+"""From weighted samples of the density to a design that keeps its constraints, and how far its figures may be off."""
 
 from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from lidardesign.design.bandwidth import split_budget
-from lidardesign.design.constraints.budget import BandwidthBudget, fit_within_budget
+from lidardesign.design.constraints.budget import BandwidthBudget
 from lidardesign.design.constraints.check import ConstraintCheck, check_design
-from lidardesign.design.constraints.document import MOST_FITTED, Constraints, SensorRules
-from lidardesign.design.constraints.feasibility import check_feasible, most_rays
-from lidardesign.design.constraints.origins import is_mounted, most_mounted, placement_notes, snap_to_space
-from lidardesign.design.fit_result import FitResult, fit_estimates, likelihood_error
-from lidardesign.design.layouts.quantise import SAMPLES_PER_RAY
-from lidardesign.design.layouts.rays import Gates, make_ray_table, own_gates
-from lidardesign.design.layouts.scan import fit_scan, rays_of
-from lidardesign.design.layouts.track_fit import fit_track
-from lidardesign.design.mixture.bounds import bounds_of, groups
-from lidardesign.design.mixture.conditions import fixed_conditions
-from lidardesign.design.mixture.coupling import add_couplings
-from lidardesign.design.mixture.ensemble import (
-    Ensemble,
-    GroupSamples,
-    choose_mounts,
-    fit_parts,
-    heaviest_first,
-    sensors_of,
-)
-from lidardesign.design.mixture.features import Axes, Features
-from lidardesign.design.mixture.support import Retarget, Support, check_support, pin_samples, restrict_samples
-from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, DesignSpec, Layout, Sensor, interval_factor
-from lidardesign.design.snap.fit import SnappedDesign, fix_part_origins, snap_design
+from lidardesign.design.constraints.document import MOST_FITTED, Constraints
+from lidardesign.design.constraints.feasibility import check_feasible
+from lidardesign.design.constraints.origins import placement_notes, snap_to_space
+from lidardesign.design.files import design_document
+from lidardesign.design.layouts.layout import FittedDesign, Layout, likelihood_estimate, missing_samples
+from lidardesign.design.layouts.rays import LAYOUTS, gates_of, lay_out, layout_of, own_count
+from lidardesign.design.layouts.sensor_fit import FitRequest, fit_sensors
+from lidardesign.design.mixture.bounds import groups
+from lidardesign.design.mixture.conditions import conditioned, fixed_conditions
+from lidardesign.design.mixture.support import Retarget, Support
+from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, DesignSpec, Gates, LayoutName, Sensor
+from lidardesign.design.snap.fit import fix_part_origins, snap_design
 from lidardesign.design.snap.parts import wants_parts
 from lidardesign.errors import ConfigError
-from lidardesign.estimates import Estimate
-from lidardesign.numerics import systematic_draw
+from lidardesign.estimates import ROUNDING, Estimate, as_documents, effective_share_error
+from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.space import DIMENSIONS
-from lidardesign.task import random_generator
 
-DEFAULT_SENSORS = 4
 EM_SAMPLES = 20_000
 # Of 7 fits of 10 sensors the worst is then 0.005 nats below the best on held-out samples, with 4 seeds 0.03.
 RESTARTS = 12
-# `auto` tries up to this many sensors.
-MOST_SENSORS = 12
 ONE_PLACE = "every part is at one place: sensors were fixed at the middle of their origins, and fitted anew there"
-# It stops after this many counts in a row that gain less than one standard error.
-PATIENCE = 2
-HELD_OUT_SHARE = 1 / 3
+
+# A design is asked for at many places of a track; the samples and the design decide what a refit finds.
+_REFITS: WeakKeyDictionary[Samples, WeakKeyDictionary[DesignSpec, dict[tuple[int, int], DesignSpec]]]
+_REFITS = WeakKeyDictionary()
 
 
-@dataclass(frozen=True)
-class _Request:
-    """Everything that `fit` was asked for, with the defaults filled in."""
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """A fitted design and how good it is.
 
-    samples: Samples
-    constraints: Constraints
-    rules: tuple[SensorRules, ...]
-    seed: int
-    restarts: int
-    em_samples: int
-    level: float
-    retarget: Retarget | None
+    Arguments:
+        design: The design; its provenance is for the caller to fill.
+        log_likelihood: Weighted mean log density of the samples [nats].
+        admissible_mass: The share of the density inside the constraints; None with pinned origins.
+        ess: Effective share of the samples that were admitted, 0 to 1.
+        satisfied: Whether every constraint holds on the finished design.
+        constraints: The independent checks.
+        seconds: Wall time [s].
+        notes: What happened to sensors, one line each.
+        error_estimates: How far log_likelihood, ess and admissible_mass may be off, and the rays of sensors.
+        snap: What sensors lost that became parts, as plain values; None where none did.
+    """
 
-    @property
-    def interval(self) -> float:
-        """z, half an interval in standard deviations."""
-        return interval_factor(self.level)
+    design: DesignSpec
+    log_likelihood: float
+    admissible_mass: float | None
+    ess: float
+    satisfied: bool
+    constraints: list[ConstraintCheck]
+    seconds: float
+    notes: tuple[str, ...] = field(default=())
+    error_estimates: Mapping[str, Estimate] = field(default_factory=dict)
+    snap: Mapping[str, Any] | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The contract's JSON keys; the path of the design is for the caller to fill."""
+        snap = {} if self.snap is None else {"snap": dict(self.snap)}
+        return {
+            "design": self.design.name,
+            "sensors": [sensor.as_dict() for sensor in self.design.sensors],
+            "log_likelihood": self.log_likelihood,
+            "admissible_mass": self.admissible_mass,
+            "ess": self.ess,
+            "satisfied": self.satisfied,
+            "constraints": [check.as_dict() for check in self.constraints],
+            "seconds": self.seconds,
+            "error_estimates": as_documents(self.error_estimates),
+            **snap,
+        }
 
 
 def fit(
     samples: Samples,
     *,
     sensors: int | Literal["auto"] | None = None,
-    layout: Layout = "grid",
+    layout: LayoutName = "grid",
     rays: int | None = None,
     constraints: Constraints | None = None,
     seed: int = 0,
@@ -104,7 +117,8 @@ def fit(
         em_samples: Samples that the fit works on.
         level: The share of each marginal that intervals hold.
         name: The design's name.
-        gates: Whether explicit rays have their sensor's gate or their own; None is `own_gates` of the layout.
+        gates: Whether explicit rays have their sensor's gate or their own; None is the layout's
+            usual ones.
         retarget: log p* of design points (N, 6), needed where an origin is pinned that the density leaves free.
 
     Raises:
@@ -113,110 +127,45 @@ def fit(
     """
     started = time.perf_counter()
     constraints, moved = snap_to_space(Constraints() if constraints is None else constraints, samples.space)
-    _check_options(constraints, samples, sensors, layout, rays)
-    if samples.space.conditioned:
-        return _along_condition(samples, constraints, rays, level, seed, name)
-    request = _Request(samples, constraints, constraints.rules, seed, restarts, em_samples, level, retarget)
-    read_out = BandwidthBudget.of(constraints, rays)
-    supports, ensemble, design, snap = _made(request, read_out, sensors, layout, gates or own_gates(layout), name)
-    checks = _checked(design, constraints, samples)
-    score = Estimate(ensemble.log_likelihood, likelihood_error(ensemble, supports), "nats")
+    _check_options(constraints, samples, sensors, LAYOUTS[layout], rays)
+    request = FitRequest(
+        samples=samples,
+        constraints=constraints,
+        rules=constraints.rules,
+        budget=BandwidthBudget.of(constraints, rays),
+        sensors=sensors,
+        seed=seed,
+        restarts=restarts,
+        em_samples=em_samples,
+        level=level,
+        name=name,
+        gates=gates or LAYOUTS[layout].usual_gates,
+        retarget=retarget,
+    )
+    fitted = _fit_parts(request) if wants_parts(constraints.rules) else LAYOUTS[layout].fit(request)
+    design, supports = fitted.design, fitted.supports
+    with phase("checks"):
+        checks = check_design(design_document(design), constraints, samples.space)
+    masses = [support.mass for support in supports if support.mass is not None]
     return FitResult(
         design=design,
-        log_likelihood=score.value,
-        admissible_mass=_mass(supports),
+        log_likelihood=float(fitted.log_likelihood.value or 0.0),
+        # unknown where an origin is pinned
+        admissible_mass=float(max(masses)) if len(masses) == len(supports) else None,
         ess=sum(s.effective for s in supports) / max(sum(len(s.points) for s in supports), 1),
         satisfied=all(check.satisfied for check in checks),
         constraints=checks,
         seconds=time.perf_counter() - started,
-        notes=(*moved, *placement_notes(constraints.rules), *ensemble.notes, *(snap.notes if snap else ())),
-        error_estimates=fit_estimates(score, supports, samples, design.sensors),
-        snap=snap.report if snap else None,
+        notes=(*moved, *placement_notes(constraints.rules), *fitted.notes),
+        error_estimates=_error_estimates(fitted.log_likelihood, supports, samples, design.sensors),
+        snap=fitted.snap,
     )
-
-
-def _along_condition(
-    samples: Samples, constraints: Constraints, rays: int | None, level: float, seed: int, name: str
-) -> FitResult:
-    """A track: the rays of a scan for every value of the samples' condition."""
-    started = time.perf_counter()
-    fitted = fit_track(samples, rays=rays, constraints=constraints, level=level, seed=seed, name=name)
-    checks = _checked(fitted.design, constraints, samples)
-    score = Estimate(fitted.log_likelihood, fitted.log_likelihood_error, "nats")
-    return FitResult(
-        design=fitted.design,
-        log_likelihood=fitted.log_likelihood,
-        admissible_mass=fitted.admissible_mass,
-        ess=fitted.ess,
-        satisfied=all(check.satisfied for check in checks),
-        constraints=checks,
-        seconds=time.perf_counter() - started,
-        notes=placement_notes(constraints.rules),
-        error_estimates=fit_estimates(score, [fitted.support], samples, fitted.design.sensors),
-    )
-
-
-@phase("checks")
-def _checked(design: DesignSpec, constraints: Constraints, samples: Samples) -> list[ConstraintCheck]:
-    return check_design(_document(design), constraints, samples.space)
-
-
-def _solved(
-    request: _Request, read_out: BandwidthBudget, sensors: int | str | None, layout: Layout
-) -> tuple[list[Support], tuple[Sensor, ...], int | None, Ensemble]:
-    """Samples, sensors, rays per frame, and the fit that keeps its budget."""
-    space = request.samples.space
-    if layout == "scan":
-        request = replace(request, em_samples=max(request.em_samples, SAMPLES_PER_RAY * rays_of(read_out)))
-        supports = _supports(request, 1)
-        part = _features(request, supports, 1)[0]
-        beams, fit = fit_scan(part.features, space, request.rules, part.group, read_out, request.level, request.seed)
-        return supports, beams, len(beams), fit
-    supports, ensemble = _fitted(request, sensors, read_out.rays)
-    ensemble, total = fit_within_budget(ensemble, Ensemble.narrowed, lambda e: (e.widths_m, e.weights), read_out)
-    fitted = add_couplings(ensemble, sensors_of(ensemble, space, request.level))
-    if len(request.rules) == 1:
-        fitted = heaviest_first(fitted)
-    return supports, fitted, total, ensemble
-
-
-def _made(
-    request: _Request, read_out: BandwidthBudget, sensors: int | str | None, layout: Layout, gates: Gates, name: str
-) -> tuple[list[Support], Ensemble, DesignSpec, SnappedDesign | None]:
-    """Samples, what was fitted to them, and the design that it stands for."""
-    if wants_parts(request.rules):
-        supports, snap = _snapped(request, read_out, sensors, name)
-        return supports, snap.ensemble, snap.design, snap
-    if layout == "density" and gates == "ray" and read_out.rays is not None:
-        # the gates of rays keep the budget, not those of sensors
-        read_out = replace(read_out, limit_mbps=None)
-    supports, fitted, total, ensemble = _solved(request, read_out, sensors, layout)
-    return supports, ensemble, _design(fitted, layout, total, request, name, gates), None
-
-
-def _snapped(
-    request: _Request, read_out: BandwidthBudget, sensors: int | str | None, name: str
-) -> tuple[list[Support], SnappedDesign]:
-    """Samples, and the design of the parts that sensors become."""
-    constraints, space = request.constraints, request.samples.space
-    # the parts have gates of their own: the budget is theirs
-    free = replace(read_out, limit_mbps=None, rays=None)
-    supports, fitted, _, ensemble = _solved(request, free, sensors, "grid")
-    fixed = fix_part_origins(request.rules, fitted)
-    if fixed is not None:
-        supports, fitted, _, ensemble = _solved(replace(request, rules=fixed), free, len(fitted), "grid")
-    parts = snap_design(ensemble, constraints, space, read_out, level=request.level, seed=request.seed, name=name)
-    moved = () if fixed is None else (ONE_PLACE,)
-    design = replace(parts.design, at=fixed_conditions(space))
-    return supports, replace(parts, design=design, notes=(*moved, *parts.notes))
 
 
 def _check_options(
-    constraints: Constraints, samples: Samples, sensors: int | str | None, layout: str, rays: int | None
+    constraints: Constraints, samples: Samples, sensors: int | str | None, layout: Layout, rays: int | None
 ) -> None:
     """Options against each other and against the constraints, before anything is computed."""
-    if layout == "fixed":
-        raise ConfigError("the rays of real parts cannot be fitted", where="--layout fixed", hint="--layout grid")
     if isinstance(sensors, str) and sensors != "auto":
         raise ConfigError(f"{sensors!r} sensors", where="--sensors", allowed="a whole number, or auto")
     if isinstance(sensors, int) and not 1 <= sensors <= MOST_FITTED:
@@ -225,185 +174,164 @@ def _check_options(
         )
     if rays is not None and not 1 <= rays <= MOST_RAYS:
         raise ConfigError(f"{rays} rays", where="--rays", allowed=f"1 to {MOST_RAYS}")
-    if samples.space.conditioned and layout != "scan":
+    if samples.space.conditioned and not layout.one_sensor_per_ray:
         names = [DIMENSIONS[index] for index in samples.space.conditioned]
         raise ConfigError(
             f"the density has conditions ({', '.join(names)}), and only a scan has rays for all their values",
-            where=f"--layout {layout}",
+            where=f"--layout {layout.name}",
             hint=f"--layout scan, or {' '.join(f'--at {condition}=VALUE' for condition in names)}",
         )
-    if layout == "scan":
-        if wants_parts(constraints.rules):
-            raise ConfigError(
-                "every ray of a scan is a sensor of its own, and no part has a single steered ray",
-                where="snap",
-                hint="--layout grid --sensors N",
-            )
-        if is_mounted(constraints.rules):
-            raise ConfigError(
-                "the rays of a scan have origins of their own",
-                where="--layout scan",
-                hint="remove origin.mounts_m, or choose the layout density",
-            )
-        if constraints.each or any(v is not None for v in constraints.sensors.model_dump().values()):
-            raise ConfigError(
-                "every ray of a scan is a component of its own",
-                where="--layout scan",
-                hint="remove sensors and each from the constraints",
-            )
-        check_feasible(constraints, samples.space, rays=rays)
-        return
-    count = sensors if isinstance(sensors, int) else None
+    layout.check_constraints(constraints)
+    count = sensors if isinstance(sensors, int) and not layout.one_sensor_per_ray else None
     check_feasible(constraints, samples.space, sensors=count, rays=rays)
 
 
-def _sensor_counts(constraints: Constraints, sensors: int | str | None, rays: int | None) -> list[int]:
-    """The numbers of sensors to try: one where it is said, a range for `auto`; none without a ray if that can be."""
-    asked = constraints.sensors
-    if isinstance(sensors, int) or asked.count is not None:
-        return [sensors if isinstance(sensors, int) else int(asked.count or 1)]
-    low = max(asked.min or 1, len(constraints.each), 1)
-    mounted = most_mounted(constraints.rules)
-    high = max(MOST_SENSORS, mounted or 0) if asked.max is None else asked.max
-    for limit in (mounted, rays, most_rays(constraints)):
-        high = high if limit is None else min(high, limit)
-    if sensors == "auto":
-        return list(range(low, max(low, high) + 1))
-    usual = mounted or len(constraints.each) or DEFAULT_SENSORS
-    return [min(max(usual, low), max(low, high))]
-
-
-def _fitted(request: _Request, sensors: int | str | None, rays: int | None) -> tuple[list[Support], Ensemble]:
-    counts = _sensor_counts(request.constraints, sensors, rays)
-    if is_mounted(request.rules):
-        fixed, counts = choose_mounts(request.rules, request.samples, counts, request.retarget, request.seed)
-        request = replace(request, rules=fixed)
-    supports = _supports(request, counts[-1])
-    count = counts[0] if len(counts) == 1 else _chosen_count(request, supports, counts)
-    kept = supports if len(supports) == len(groups(request.rules, request.samples.space, count)) else None
-    supports = kept or _supports(request, count)
-    return supports, fit_parts(_features(request, supports, count), request.seed, request.restarts)
-
-
-@phase("support")
-def _supports(request: _Request, count: int) -> list[Support]:
-    """The samples of each group of sensors, refused where they are too few."""
-    found = []
-    members = groups(request.rules, request.samples.space, count)
-    for index, group in enumerate(members):
-        free = all(pin is None for pin in group.pins)
-        if free:
-            support = restrict_samples(request.samples, request.rules, group)
-        else:
-            generator = random_generator(request.seed, "pinned", index)
-            support = pin_samples(
-                request.samples, request.rules, group, request.retarget, request.em_samples, generator
-            )
-        mass = support.total if free else None
-        check_support(support, group, mass=mass, several=len(members) > 1)
-        found.append(replace(support, mass=mass))
-    return found
-
-
-def _mass(supports: list[Support]) -> float | None:
-    """The share of the density that the sensors may draw on; unknown where an origin is pinned."""
-    masses = [support.mass for support in supports]
-    return None if any(mass is None for mass in masses) else float(max(m for m in masses if m is not None))
-
-
-@phase("features")
-def _features(request: _Request, supports: list[Support], count: int) -> list[GroupSamples]:
-    """Features, bounds and shares of each group of sensors.
-
-    Pinned groups share by how much density each pinned origin sees; against groups with a free origin, whose
-    measure is another, they share by numbers of sensors.
-    """
+def _fit_parts(request: FitRequest) -> FittedDesign:
+    """Sensors, and the parts of the catalogue that they become."""
+    # the parts have gates of their own: the budget is theirs
+    free = replace(request, budget=replace(request.budget, limit_mbps=None, rays=None))
+    fitted = fit_sensors(free)
+    notes: tuple[str, ...] = ()
+    fixed = fix_part_origins(request.rules, fitted.sensors)
+    if fixed is not None:
+        fitted = fit_sensors(replace(free, rules=fixed, sensors=len(fitted.sensors)))
+        notes = (ONE_PLACE,)
     space = request.samples.space
-    members = groups(request.rules, space, count)
-    shares = np.array([len(group.sensors) for group in members], dtype=np.float64) / count
-    is_pinned = np.array([any(pin is not None for pin in group.pins) for group in members])
-    totals = np.array([support.total for support in supports])
-    if is_pinned.any():
-        shares[is_pinned] = shares[is_pinned].sum() * totals[is_pinned] / totals[is_pinned].sum()
-    parts = []
-    for index, (group, support) in enumerate(zip(members, supports, strict=True)):
-        points, weights = _thinned(support, request.em_samples, random_generator(request.seed, "em", index))
-        features = Features.of(points, weights, Axes.of(space, group.pins), space)
-        bounds = bounds_of(request.rules, space, group.sensors, request.interval)
-        parts.append(GroupSamples(group, float(shares[index]), features, bounds))
-    return parts
-
-
-def _thinned(support: Support, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """At most `count` samples: systematic resampling to equal weights where there are more."""
-    if len(support.points) <= count:
-        return support.points, support.weights
-    chosen = systematic_draw(support.weights, count, generator)
-    return support.points[generator.permutation(chosen)], np.ones(count)
-
-
-def _chosen_count(request: _Request, supports: list[Support], counts: list[int]) -> int:
-    """The smallest number of sensors within one standard error of the best held-out log-likelihood."""
-    scores: dict[int, tuple[float, float]] = {}
-    waiting, best = 0, -math.inf
-    for count in counts:
-        if len(groups(request.rules, request.samples.space, count)) != len(supports):
-            continue
-        train, test = _split(_features(request, supports, count), request.seed)
-        mean, error = fit_parts(train, request.seed, request.restarts).held_out(test)
-        scores[count] = mean, error
-        waiting = 0 if mean > best + error else waiting + 1
-        best = max(best, mean)
-        if waiting >= PATIENCE:
-            break
-    top = max(scores, key=lambda count: scores[count][0])
-    return min(count for count, (mean, _) in scores.items() if mean >= scores[top][0] - scores[top][1])
-
-
-def _split(parts: list[GroupSamples], seed: int) -> tuple[list[GroupSamples], list[GroupSamples]]:
-    """Samples for fitting and for judging, apart."""
-    train, test = [], []
-    for index, part in enumerate(parts):
-        draw = random_generator(seed, "held out", index).uniform(size=len(part.features))
-        held = draw < HELD_OUT_SHARE
-        train.append(replace(part, features=part.features.subset(~held)))
-        test.append(replace(part, features=part.features.subset(held)))
-    return train, test
-
-
-def _design(
-    sensors: tuple[Sensor, ...],
-    layout: Layout,
-    total: int | None,
-    request: _Request,
-    name: str,
-    gates: Gates,
-) -> DesignSpec:
-    if total is not None:
-        counts = split_budget(np.array([s.weight for s in sensors]), total)
-        sensors = tuple(replace(s, rays=int(n)) for s, n in zip(sensors, counts, strict=True))
-    design = DesignSpec(
-        name=name,
-        sensors=sensors,
-        layout=layout,
-        rays=total,
-        constraints=request.constraints.as_document(),
+    parts = snap_design(
+        fitted.ensemble,
+        request.constraints,
+        space,
+        request.budget,
         level=request.level,
-        at=fixed_conditions(request.samples.space),
+        seed=request.seed,
+        name=request.name,
     )
-    if total is None or (layout == "grid" and gates == "sensor"):
+    return FittedDesign(
+        replace(parts.design, at=fixed_conditions(space)),
+        likelihood_estimate(parts.ensemble, fitted.supports),
+        fitted.supports,
+        (*parts.ensemble.notes, *notes, *parts.notes),
+        parts.report,
+    )
+
+
+def fit_like(
+    design: DesignSpec,
+    samples: Samples,
+    *,
+    rays: int | None,
+    seed: int,
+    restarts: int = RESTARTS,
+    em_samples: int = EM_SAMPLES,
+    name: str | None = None,
+    retarget: Retarget | None = None,
+) -> DesignSpec:
+    """A design fitted to other samples as a given one was fitted to its own.
+
+    Arguments:
+        design: The design whose number of sensors, layout, constraints, level and gates are taken.
+        samples, rays, seed, restarts, em_samples, retarget: See `fit`.
+        name: The new design's name; None is that of the given one.
+    """
+    layout = layout_of(design)
+    return fit(
+        samples,
+        sensors=None if layout.one_sensor_per_ray else len(design.sensors),
+        layout=layout.fitted_as,
+        rays=rays,
+        constraints=Constraints.from_mapping(dict(design.constraints), where=f"constraints of {design.name}"),
+        seed=seed,
+        restarts=restarts,
+        em_samples=em_samples,
+        level=design.level,
+        name=name or design.name,
+        gates=gates_of(design, samples),
+        retarget=retarget,
+    ).design
+
+
+def refitted(
+    design: DesignSpec,
+    count: int | None,
+    samples: Samples | None,
+    *,
+    seed: int = 0,
+    at: Mapping[str, float] | None = None,
+    retarget: Retarget | None = None,
+) -> DesignSpec:
+    """The design that fires so many rays: itself, or fitted anew where every ray is a sensor of its own.
+
+    It keeps the design's constraints, but for the number of rays itself. Arguments are those of `lay_out`.
+
+    Raises:
+        ConfigError: There are no samples to fit to, or an origin is pinned.
+    """
+    if count in (None, 0) or not layout_of(design).one_sensor_per_ray or count == own_count(design):
         return design
-    if layout == "scan":
-        return design
-    table = make_ray_table(design, total, request.samples, gates, seed=request.seed)
-    counts = np.bincount(table.sensor, minlength=len(sensors))
-    sensors = tuple(replace(s, rays=int(n)) for s, n in zip(sensors, counts, strict=True))
-    return replace(design, sensors=sensors, ray_table=table)
+    if samples is None:
+        raise missing_samples(design, count, "sensor")
+    if design.track is None and samples.space.conditioned:
+        # where it was made: one refit then serves all places
+        samples = conditioned(samples, {**(at or {}), **design.at}, retarget)
+    fits = _REFITS.setdefault(samples, WeakKeyDictionary()).setdefault(design, {})
+    if (count, seed) not in fits:
+        document = {**design.constraints}
+        if "budget" in document:
+            document["budget"] = {key: value for key, value in document["budget"].items() if key != "rays"}
+        constraints = Constraints.from_mapping(document, where=f"constraints of {design.name}")
+        if any(pin is not None for group in groups(constraints.rules, samples.space, 1) for pin in group.pins):
+            raise ConfigError(
+                f"a scan from a pinned origin cannot be fitted anew to {count} rays without its target density",
+                where=design.name,
+                allowed=f"{own_count(design)} rays",
+                hint=f"lidardesign constrain RUN --layout scan --rays {count} with the same constraints",
+            )
+        fits[count, seed] = fit_like(replace(design, constraints=document), samples, rays=count, seed=seed)
+    return fits[count, seed]
 
 
-def _document(design: DesignSpec) -> dict[str, Any]:
-    """The written form that the checker reads."""
-    # files reads and writes all formats; only its document is needed here
-    from lidardesign.design.files import design_document
+def rays_at(
+    design: DesignSpec,
+    count: int,
+    samples: Samples | None,
+    *,
+    at: Mapping[str, float] | None = None,
+    retarget: Retarget | None = None,
+) -> Rays:
+    """The rays of a design at any number of rays, of a scan after another fit; arguments are those of `lay_out`."""
+    return lay_out(refitted(design, count, samples, at=at, retarget=retarget), count, samples, at=at, retarget=retarget)
 
-    return design_document(design)
+
+def _error_estimates(
+    log_likelihood: Estimate, supports: Sequence[Support], samples: Samples, sensors: Sequence[Sensor]
+) -> dict[str, Estimate]:
+    """Everything that a fit reports with an error, by name.
+
+    The admitted samples' ESS; the share of the density that they stand for where it is known; and how many of the rays a
+    sensor's weight would give to another one, as rays are whole, where they are not open.
+    """
+    sizes = np.array([len(support.points) for support in supports])
+    errors = np.array([effective_share_error(support.weights) for support in supports])
+    share = sum(support.effective for support in supports) / max(sizes.sum(), 1)
+    ess = Estimate(share, float(np.linalg.norm(sizes * errors)) / max(int(sizes.sum()), 1))
+    estimates = {"log_likelihood": log_likelihood, "ess": ess}
+    if all(support.mass is not None for support in supports):
+        widest = max(supports, key=lambda support: support.total)
+        estimates["admissible_mass"] = Estimate(widest.total, _mass_error(widest, samples))
+    counts = [sensor.rays for sensor in sensors]
+    if None not in counts:
+        rays = np.array(counts, dtype=np.float64)
+        wanted = rays.sum() * np.array([sensor.weight for sensor in sensors])
+        estimates["rays"] = Estimate(float(rays.sum()), float(np.abs(rays - wanted).sum() / 2), "rays", ROUNDING)
+    return estimates
+
+
+def _mass_error(support: Support, samples: Samples) -> float:
+    """The standard error of the share m of the density inside the constraints, of weights that sum to 1 in all.
+
+    sum over all samples of (w (inside - m))^2, by the sums of squares of the weights inside and outside.
+    """
+    inside = float(np.square(support.weights).sum())
+    everything = float(np.square(samples.weights).sum())
+    mass = support.total
+    return math.sqrt((1 - mass) ** 2 * inside + mass**2 * max(everything - inside, 0.0))

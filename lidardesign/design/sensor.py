@@ -27,17 +27,14 @@ DEFAULT_LEVEL = 0.95
 LEVELS = (0.01, 0.999999)
 # Returns of so many fill some 100 MB per scene; no scanner fires more in a frame.
 MOST_RAYS = 1_000_000
-Layout = Literal["grid", "density", "scan", "distributed", "fixed"]
+LayoutName = Literal["grid", "density", "scan", "distributed", "fixed"]
+# Whether every ray has its sensor's gate or its own.
+Gates = Literal["sensor", "ray"]
 
 
 def interval_factor(level: float) -> float:
     """The number of standard deviations on each side of the mean that hold `level` of a normal distribution."""
     return float(ndtri((1 + level) / 2))
-
-
-def fitted_layout(layout: Layout) -> Layout:
-    """The layout in which sensors like a design's are fitted: fixed rays are what they are, so `grid` for those."""
-    return "grid" if layout == "fixed" else layout
 
 
 def boresight_frame(azimuth_rad: float, elevation_rad: float, roll_rad: float = 0.0) -> np.ndarray:
@@ -242,11 +239,12 @@ class DesignSpec:
         level: The share of each marginal that intervals hold.
         track: The rays along a condition, where the design is for all its values.
         at: The condition values that the design is for, where it is for one, as {"x_m": 0.37}.
+        gates: Whether its rays have their sensor's gate or their own at any number of rays; None where its rays tell.
     """
 
     name: str
     sensors: tuple[Sensor, ...]
-    layout: Layout = "grid"
+    layout: LayoutName = "grid"
     rays: int | None = None
     ray_table: Rays | None = None
     constraints: dict[str, Any] = field(default_factory=dict)
@@ -254,6 +252,7 @@ class DesignSpec:
     level: float = DEFAULT_LEVEL
     track: Track | None = None
     at: Mapping[str, float] = field(default_factory=dict)
+    gates: Gates | None = None
 
     @property
     def weights(self) -> np.ndarray:

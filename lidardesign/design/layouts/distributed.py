@@ -1,10 +1,10 @@
 r"""Rays that start across their sensor's origin: a ray's direction and gate follow from where it starts.
 
 With samples of the density, each sample belongs to one sensor, by its own origin, direction and range. What
-its ray looks at (see `looks`) is quantised by Lloyd's cells, so that rays fill the observed volume evenly in
+its ray looks at (see `ray_features`) is quantised by Lloyd's cells, so that rays fill the observed volume evenly in
 the density's measure, and one real sample's ray is fired per cell. Not the mean ray: where something hangs
 above the target the directions that see it form a ring, and the mean of visible rays points through the
-middle. Then scene points go to the ray that passes nearest to them (see `lines`) and each cell takes the ray
+middle. Then scene points go to the ray that passes nearest to them (see `nearest_lines`) and each cell takes the ray
 that is near most of its points, so that rays are even over the whole volume, not only at its middle. Of the
 best tenth of a cell's rays the one with the highest target density is taken: it is hidden least.
 
@@ -16,24 +16,19 @@ gates open): cells' medoids 81 and 97.6 %, the highest density among the nearest
 of lines 88 and 99 %; random draws 83 and 96 %. With gates per ray 80 and 94.6 % of the frames are left at 2.9 and
 8.0 Mbit/s, with the sensors' gates 84 and 96 % at 4.0 and 10.1 Mbit/s. Without samples: 60 and 84 %.
 
-The joint region of a sensor with an extended origin: which samples it fires itself, from where they start.
+The joint region of a sensor with an extended origin says which samples it fires itself: it holds the origins inside
+the ellipsoid of the level and the directions inside the field of view. The gate is no part of it: a ray is fired at all
+ranges, and its gate is found from all that it could return. (With the gate, rays would get the central 95 % of a
+central 95 %.) Along pinned origin axes, where samples have measure zero, they are aimed anew at their scene points.
 
-The region holds the origins inside the ellipsoid of the level and the directions inside the field of view. The
-gate is no part of it: a ray is fired at all ranges, and its gate is found from all that it could return. (With
-the gate, rays would get the central 95 % of a central 95 %.) Along pinned origin axes, where samples have
-measure zero, they are aimed anew at their scene points, as in `membership`.
-
-Cells of rays: scene points by the ray that passes nearest to them, however far along it they are.
-
-A quantisation in which the centres are lines. With x a scene point and o + t v a ray, the squared distance is
-$|x - o|^2 - ((x - o) \cdot v)^2$. Rays are real samples' rays (a medoid for each cell, as in k-medoids; L. Kaufman
-and P. Rousseeuw 1987), so that they are rays that see something.
+Cells of lines: with x a scene point and o + t v a ray, the squared distance is $|x - o|^2 - ((x - o) \cdot v)^2$,
+however far along the ray the point lies. Rays are real samples' rays (a medoid for each cell, as in k-medoids;
+L. Kaufman and P. Rousseeuw 1987), so that they are rays that see something.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import chdtri, ndtri
@@ -43,11 +38,13 @@ from lidardesign.design.constraints.origins import box_around, free_boxes, insid
 from lidardesign.design.layouts.gates import SMALLEST_CELL, central_intervals, kept_gates
 from lidardesign.design.layouts.grid import field_on_sphere, low_discrepancy
 from lidardesign.design.layouts.quantise import lloyd, samples_for
-from lidardesign.design.layouts.shared_fields import FIELD_ROUNDING_RAD, SMALLEST_ANGLE_RAD, SMALLEST_LENGTH
+from lidardesign.design.layouts.fields import FIELD_ROUNDING_RAD, SMALLEST_ANGLE_RAD, SMALLEST_LENGTH
+from lidardesign.design.layouts.layout import Layout, shares_of
+from lidardesign.geometry.rays import DEFAULT_RATE_HZ, Rays, fire_times
 from lidardesign.design.mixture.bounds import Bounds, bounds_of
 from lidardesign.design.mixture.coupling import conditional_means, conditional_spreads, relative
 from lidardesign.design.mixture.features import Axes, Features, ray_features
-from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor, tangent_directions
+from lidardesign.design.sensor import DesignSpec, Gates, Sensor, interval_factor, tangent_directions
 from lidardesign.numerics import ROUNDING, SLACK, angle_over_sine, systematic_draw
 from lidardesign.samples import Samples
 from lidardesign.space import AZIMUTH, ELEVATION, FULL_TURN, RANGE, DesignSpace, aim, angles, direction, observed_point
@@ -188,45 +185,45 @@ NEAR_LINE_SHARE = 0.1
 LINE_ITERATIONS = 2
 
 
-@dataclass(frozen=True, eq=False)
-class Beams:
-    """The rays of one sensor.
+class DistributedLayout(Layout):
+    """Rays that start across the origins of each sensor, by the samples inside it or by its own Gaussian."""
 
-    Arguments:
-        origin_m: Shape (N, 3).
-        direction: Unit vectors, shape (N, 3).
-        gate_m: Shape (N, 2).
-    """
+    name = "distributed"
+    fitted_as = "distributed"
+    usual_gates = "ray"
+    ray_gates_need_samples = False
 
-    origin_m: np.ndarray
-    direction: np.ndarray
-    gate_m: np.ndarray
+    def needs_samples(self, spec: DesignSpec, count: int | None, gates: Gates) -> bool:
+        """See `Layout`: the sensors alone will do."""
+        return False
 
+    def uses_samples(self, spec: DesignSpec, count: int | None, gates: Gates) -> bool:
+        """See `Layout`."""
+        return True
 
-def distributed_beams(design: DesignSpec, shares: np.ndarray, samples: Samples | None, seed: int) -> list[Beams]:
-    """The rays of each sensor: by the samples inside it, by its Gaussian where there are fewer than rays.
-
-    Arguments:
-        design: G sensors.
-        shares: Rays of each sensor, shape (G,).
-        samples: Samples of the density that the sensors were fitted to; None lays out the Gaussians.
-        seed: For the quantisation.
-    """
-    constraints = Constraints.from_mapping(design.constraints, where=f"constraints of {design.name}")
-    space = _space_of(design) if samples is None else samples.space
-    members, fired = [np.zeros(0, dtype=np.int64)] * len(shares), [np.zeros((0, 6))] * len(shares)
-    if samples is not None:
-        members, fired = owned(design, samples.points, samples.weights, space, constraints)
-    beams = []
-    for index, (sensor, count) in enumerate(zip(design.sensors, shares, strict=True)):
-        bounds = bounds_of(constraints.rules, space, (index,), interval_factor(design.level))
-        if samples is None or count == 0 or len(np.unique(fired[index][:, :RANGE], axis=0)) < count:
-            box = _own_box(sensor, rules_of(constraints.rules, index), space)
-            beams.append(_gaussian_beams(sensor, int(count), bounds, box, space))
-            continue
-        generator = random_generator(seed, "distributed layout", index)
-        beams.append(_sampled_beams(sensor, int(count), bounds, samples, members[index], fired[index], generator))
-    return beams
+    def lay_out(self, spec: DesignSpec, count: int, samples: Samples | None, gates: Gates, seed: int) -> Rays:
+        """See `Layout`: by the Gaussian of a sensor that has fewer samples than rays."""
+        shares = shares_of(spec, count)
+        constraints = Constraints.from_mapping(spec.constraints, where=f"constraints of {spec.name}")
+        space = _space_of(spec) if samples is None else samples.space
+        members, fired = [np.zeros(0, dtype=np.int64)] * len(shares), [np.zeros((0, 6))] * len(shares)
+        if samples is not None:
+            members, fired = owned(spec, samples.points, samples.weights, space, constraints)
+        parts = []
+        for index, (sensor, own_count) in enumerate(zip(spec.sensors, shares, strict=True)):
+            bounds = bounds_of(constraints.rules, space, (index,), interval_factor(spec.level))
+            own, number = fired[index], int(own_count)
+            if samples is None or number == 0 or len(np.unique(own[:, :RANGE], axis=0)) < number:
+                box = _own_box(sensor, rules_of(constraints.rules, index), space)
+                parts.append(_gaussian_rays(sensor, number, bounds, box, space))
+            else:
+                generator = random_generator(seed, "distributed layout", index)
+                parts.append(_sampled_rays(sensor, number, bounds, samples, members[index], own, generator))
+        origin, looking, gate = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+        sensor = np.repeat(np.arange(len(shares)), shares)
+        if gates == "sensor":
+            gate = np.array([s.gate_m for s in spec.sensors])[sensor]
+        return Rays(origin, looking, gate, sensor, fire_times(count, DEFAULT_RATE_HZ))
 
 
 def _space_of(design: DesignSpec) -> DesignSpace:
@@ -253,7 +250,7 @@ def _own_box(sensor: Sensor, one: SensorRules, space: DesignSpace) -> np.ndarray
     return np.stack([low, high])
 
 
-def _sampled_beams(
+def _sampled_rays(
     sensor: Sensor,
     count: int,
     bounds: Bounds,
@@ -261,24 +258,17 @@ def _sampled_beams(
     members: np.ndarray,
     fired: np.ndarray,
     generator: np.random.Generator,
-) -> Beams:
-    """One real sample's ray per cell of what the samples inside a sensor look at."""
-    chosen, weights = _thinned(samples.weights[members], samples_for(count), generator)
-    if len(np.unique(fired[chosen, :RANGE], axis=0)) < count:
-        chosen, weights = np.arange(len(members)), samples.weights[members]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """One real sample's ray per cell of what the samples inside a sensor look at: origins, directions and gates."""
+    chosen, weights = np.arange(len(members)), samples.weights[members]
+    if len(members) > samples_for(count):
+        drawn, times = np.unique(systematic_draw(weights, samples_for(count), generator), return_counts=True)
+        if len(np.unique(fired[drawn, :RANGE], axis=0)) >= count:
+            chosen, weights = drawn, times.astype(np.float64)
     part = Features.of(fired[chosen], weights, Axes.of(samples.space), samples.space)
-    picked = _picked(part, samples.log_target[members[chosen]], count, generator)
-    rays = part.points[picked]
+    rays = part.points[_picked(part, samples.log_target[members[chosen]], count, generator)]
     looking = direction(rays[:, AZIMUTH], rays[:, ELEVATION])
-    return Beams(rays[:, :3].copy(), looking, _gates(part, rays[:, :3], looking, sensor, bounds))
-
-
-def _thinned(weights: np.ndarray, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Indices and weights: all, or fewer by systematic resampling, how often each was drawn being its weight."""
-    if len(weights) <= count:
-        return np.arange(len(weights)), weights
-    chosen, times = np.unique(systematic_draw(weights, count, generator), return_counts=True)
-    return chosen, times.astype(np.float64)
+    return rays[:, :3], looking, _gates(part, rays[:, :3], looking, sensor, bounds)
 
 
 def _picked(part: Features, log_target: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
@@ -339,8 +329,10 @@ def _gates(part: Features, origins: np.ndarray, looking: np.ndarray, sensor: Sen
     return gate
 
 
-def _gaussian_beams(sensor: Sensor, count: int, bounds: Bounds, box: np.ndarray, space: DesignSpace) -> Beams:
-    """Low-discrepancy points of a sensor's own Gaussian: origin, direction given origin, gate given both.
+def _gaussian_rays(
+    sensor: Sensor, count: int, bounds: Bounds, box: np.ndarray, space: DesignSpace
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Low-discrepancy points of a sensor's own Gaussian: origins, directions given origins, gates given both.
 
     Arguments:
         sensor: The component.
@@ -367,7 +359,7 @@ def _gaussian_beams(sensor: Sensor, count: int, bounds: Bounds, box: np.ndarray,
     empty = gate[:, 1] <= gate[:, 0]
     gate[empty] = sensor.gate_m
     gate = kept_gates(gate, sensor, bounds.take(np.zeros(count, dtype=np.int64)))
-    return Beams(rays[:, :3], direction(rays[:, AZIMUTH], rays[:, ELEVATION]), gate)
+    return rays[:, :3], direction(rays[:, AZIMUTH], rays[:, ELEVATION]), gate
 
 
 def normal_ball(unit: np.ndarray, level: float) -> np.ndarray:

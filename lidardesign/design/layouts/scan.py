@@ -1,4 +1,4 @@
-"""Scans: every ray is a component of its own, with its own origin, direction and gate.
+"""Scans: every ray is a sensor of its own, with its own origin, direction and gate.
 
 Samples are quantised into as many cells as there are rays, and each cell's mean ray is fired. What is
 quantised is where rays look, never how far: with the range among the features, one ray's samples fall apart
@@ -13,61 +13,165 @@ scenes as Chamfer distance, against the grid cropped to the training returns: fa
 range as a feature, 11.5 mm with directions (grid 12.0 mm, at twice the bandwidth); flatland at 30 rays 22.9 mm
 with the range, 7.6 mm with origins and directions, 3.8 mm with the mean surface (grid 3.3 mm); faces with
 origins free in a 10 cm box at 196 rays 25 mm with origins and directions, 11.3 mm with the mean surface.
+
+Of samples with a free condition, as the position of a robot that drives by, a scan is a track: rays for every value of
+it. Where they aim is said in `track_kmeans`: cells of what is observed, at every value of the condition. The gate of a
+ray is the central level of what its samples observe, projected onto it, over `GATE_REACH` knots on either side, inside
+the constraints at every knot and therefore in between. The kernel of knot p is its hat function, so the bandwidth is the
+distance of knots, and every sample counts once in all. Knots lie 0.1 m apart, over which what is seen of a scene hardly
+changes, or further where fewer samples than `SAMPLES_PER_CELL` would be left for each ray of a knot.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import replace
 
 import numpy as np
 
 from lidardesign.design.constraints.budget import BandwidthBudget, fit_within_budget
-from lidardesign.design.constraints.document import SensorRules
+from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.origins import free_boxes, is_mounted, origin_box
+from lidardesign.design.layouts.fields import members, ray_gates, rays_in_fields
 from lidardesign.design.layouts.gates import admissible_gates, central_intervals
-from lidardesign.design.layouts.quantise import lloyd
+from lidardesign.design.layouts.layout import FittedDesign, Layout, likelihood_estimate, missing_samples, shares_of
+from lidardesign.design.layouts.quantise import SAMPLES_PER_RAY, lloyd
+from lidardesign.design.layouts.sensor_fit import FitRequest, admitted_samples, group_samples
+from lidardesign.design.layouts.track import TRAVELLED, boresight_azimuth, interpolated
+from lidardesign.design.layouts.track_kmeans import Along, aimed_rays
 from lidardesign.design.mixture.bounds import Bounds, Group, bounds_of
+from lidardesign.design.mixture.conditions import fixed_conditions
 from lidardesign.design.mixture.em import EMResult, from_labels
 from lidardesign.design.mixture.ensemble import Ensemble, GroupSamples, sensors_of
-from lidardesign.design.mixture.features import Features, ray_features
+from lidardesign.design.mixture.features import Axes, Features, ray_features
 from lidardesign.design.mixture.mixture import Mixture, log_density
-from lidardesign.design.sensor import Sensor, interval_factor
-from lidardesign.errors import ConfigError
+from lidardesign.design.mixture.support import check_support, restrict_samples
+from lidardesign.design.sensor import DEFAULT_LEVEL, DesignSpec, Gates, Sensor, Track, interval_factor
+from lidardesign.design.snap.parts import wants_parts
+from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.estimates import Estimate
+from lidardesign.geometry.rays import Rays
+from lidardesign.numerics import SLACK
 from lidardesign.run.clock import phase
-from lidardesign.space import DesignSpace, direction, observed_point
+from lidardesign.samples import Samples
+from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace, angles, direction, observed_point
 from lidardesign.task import random_generator
 
 # More moves of the cells change their mean squared error by less than a percent.
 LLOYD_ITERATIONS = 15
 # A ray's cell of fewer samples has no shape; cells beyond that also cost more time than anybody waits.
 FEWEST_PER_RAY = 4
+# A track of 4.5 m has 45 spacings, whatever the division rounds to.
+KNOT_SPACING_M = 0.1
+# The ends of a 95 % interval are then each known from one sample in forty.
+SAMPLES_PER_CELL = 40
+# The gate at a knot is taken over so many knots on either side: its ends need more samples than a mean does.
+GATE_REACH = 2
+
+
+class ScanLayout(Layout):
+    """One ray along the boresight of each sensor."""
+
+    name = "scan"
+    fitted_as = "scan"
+    one_sensor_per_ray = True
+
+    def check_constraints(self, constraints: Constraints) -> None:
+        """See `Layout`."""
+        if wants_parts(constraints.rules):
+            raise ConfigError(
+                "every ray of a scan is a sensor of its own, and no part has a single steered ray",
+                where="snap",
+                hint="--layout grid --sensors N",
+            )
+        if is_mounted(constraints.rules):
+            raise ConfigError(
+                "the rays of a scan have origins of their own",
+                where="--layout scan",
+                hint="remove origin.mounts_m, or choose the layout density",
+            )
+        if constraints.each or any(v is not None for v in constraints.sensors.model_dump().values()):
+            raise ConfigError(
+                "every ray of a scan is a component of its own",
+                where="--layout scan",
+                hint="remove sensors and each from the constraints",
+            )
+
+    def own_count(self, spec: DesignSpec) -> int | None:
+        """See `Layout`."""
+        count = super().own_count(spec)
+        return len(spec.sensors) if count is None else count
+
+    def needs_samples(self, spec: DesignSpec, count: int | None, gates: Gates) -> bool:
+        """See `Layout`."""
+        return gates == "ray" or count != self.own_count(spec)
+
+    def fit(self, request: FitRequest) -> FittedDesign:
+        """See `Layout`; of samples with a free condition, a track."""
+        if request.samples.space.conditioned:
+            return fit_track(
+                request.samples,
+                rays=request.budget.rays,
+                constraints=request.constraints,
+                level=request.level,
+                seed=request.seed,
+                name=request.name,
+            )
+        count = request.budget.rays
+        if count is None:
+            raise ConfigError("a scan needs its number of rays", where="--layout scan", hint="give --rays N")
+        request = replace(request, em_samples=max(request.em_samples, SAMPLES_PER_RAY * count))
+        supports = admitted_samples(request, 1)
+        ensemble = _fit_cells(group_samples(request, supports, 1)[0], count, request)
+        sensors = sensors_of(ensemble, request.samples.space, request.level)
+        order = sorted(sensors, key=lambda s: (round(s.elevation_rad, 9), s.azimuth_rad, s.range_m))
+        design = DesignSpec(
+            name=request.name,
+            sensors=tuple(replace(sensor, name=f"s{index}", rays=1) for index, sensor in enumerate(order)),
+            layout=self.name,
+            rays=count,
+            constraints=request.constraints.as_document(),
+            level=request.level,
+            at=fixed_conditions(request.samples.space),
+        )
+        return FittedDesign(design, likelihood_estimate(ensemble, supports), supports, ensemble.notes)
+
+    def lay_out(self, spec: DesignSpec, count: int, samples: Samples | None, gates: Gates, seed: int) -> Rays:
+        """See `Layout`: at another number of rays than its own a scan has to be fitted anew, see `fit.refitted`."""
+        if count != self.own_count(spec):
+            raise missing_samples(spec, count, "sensor")
+        own = [sensor.rays for sensor in spec.sensors]
+        if count != len(own) and (None in own or sum(n or 0 for n in own) != count):
+            raise ConfigError(
+                f"{count} rays, but a scan of {len(spec.sensors)} sensors fires one ray of each",
+                where=spec.name,
+                allowed=f"{len(spec.sensors)} rays, or `rays` for every sensor",
+            )
+        tangents = [np.zeros((int(n), 2)) for n in shares_of(spec, count)]
+        if gates == "sensor":
+            return rays_in_fields(spec, tangents)
+        if samples is None:
+            raise missing_samples(spec, count, gates)
+        seen = members(spec, samples.points, samples.weights)
+        return rays_in_fields(spec, tangents, ray_gates(spec, tangents, seen, samples.space))
+
+
+class TrackLayout(ScanLayout):
+    """A scan whose rays vary along a condition; at one value of it, it is a scan with a table of rays."""
+
+    def own_count(self, spec: DesignSpec) -> int | None:
+        """See `Layout`."""
+        return len(spec.track.sensor) if spec.rays is None and spec.track is not None else super().own_count(spec)
 
 
 @phase("scan")
-def fit_scan(
-    features: Features,
-    space: DesignSpace,
-    rules: Sequence[SensorRules],
-    group: Group,
-    read_out: BandwidthBudget,
-    level: float,
-    seed: int,
-) -> tuple[tuple[Sensor, ...], Ensemble]:
-    """One sensor per ray, and the components that they are of, in another order.
-
-    Arguments:
-        features: Weighted samples.
-        space: The design space.
-        rules: What every ray keeps.
-        group: The pinned origin, if any.
-        read_out: The number of rays and the bandwidth budget.
-        level: The share that intervals hold.
-        seed: Root of the quantisation's stream.
+def _fit_cells(samples: GroupSamples, count: int, request: FitRequest) -> Ensemble:
+    """One component per ray, of the cells of what rays look at.
 
     Raises:
-        ConfigError: No number of rays is known, or more are asked for than the samples can tell apart.
+        ConfigError: More rays are asked for than the samples can tell apart.
     """
-    count = rays_of(read_out)
+    features = samples.features
     if count * FEWEST_PER_RAY > len(features):
         raise ConfigError(
             f"{count} rays from {len(features)} samples",
@@ -75,43 +179,28 @@ def fit_scan(
             allowed=f"at most {len(features) // FEWEST_PER_RAY} rays",
             hint="learn with more samples (learning.samples)",
         )
-    everyone = Group(group.pins, tuple(range(count)))
-    bounds = bounds_of(rules, space, everyone.sensors, interval_factor(level))
-    generator = random_generator(seed, "scan")
+    group = Group(samples.group.pins, tuple(range(count)))
+    bounds = bounds_of(request.rules, request.samples.space, group.sensors, interval_factor(request.level))
+    generator = random_generator(request.seed, "scan")
     _, labels = lloyd(ray_features(features), features.weights, count, generator, iterations=LLOYD_ITERATIONS)
-    part = GroupSamples(everyone, 1.0, features, bounds)
 
     def scan(limits: Bounds) -> Ensemble:
         mixture = from_labels(features, labels, limits).with_weights(np.full(count, 1.0 / count))
-        mixture = _with_gates(mixture, features, labels, limits, level)
+        mixture = _gates_of_cells(mixture, features, labels, limits, request.level)
         values = log_density(mixture, features)
         score = float(features.weights @ values)
+        part = GroupSamples(group, 1.0, features, bounds)
         return Ensemble((part,), (EMResult(mixture, score, (score,), values=values),))
 
-    fitted, _ = fit_within_budget(
+    return fit_within_budget(
         scan(bounds),
         lambda _, width_m: scan(bounds.narrowed(width_m)),
         lambda e: (e.widths_m, e.weights),
-        read_out,
-    )
-    sensors = sensors_of(fitted, space, level)
-    order = sorted(sensors, key=lambda s: (round(s.elevation_rad, 9), s.azimuth_rad, s.range_m))
-    named = tuple(replace(sensor, name=f"s{index}") for index, sensor in enumerate(order))
-    return named, fitted
+        request.budget,
+    )[0]
 
 
-def rays_of(read_out: BandwidthBudget) -> int:
-    """The number of rays of a scan, which nothing else can tell.
-
-    Raises:
-        ConfigError: It is not known.
-    """
-    if read_out.rays is None:
-        raise ConfigError("a scan needs its number of rays", where="--layout scan", hint="give --rays N")
-    return read_out.rays
-
-
-def _with_gates(mixture: Mixture, features: Features, labels: np.ndarray, bounds: Bounds, level: float) -> Mixture:
+def _gates_of_cells(mixture: Mixture, features: Features, labels: np.ndarray, bounds: Bounds, level: float) -> Mixture:
     """The components with gates that hold the level of what their cells observe, along their own rays."""
     axes, count = features.axes, len(mixture)
     if not axes.range:
@@ -125,3 +214,298 @@ def _with_gates(mixture: Mixture, features: Features, labels: np.ndarray, bounds
     wanted[effective == 0] = wanted[np.bincount(labels, features.weights, minlength=count).argmax()]
     centre, spread = admissible_gates(wanted, bounds)
     return replace(mixture, range_m=centre, spread_range_m=spread)
+
+
+@phase("track")
+def fit_track(
+    samples: Samples,
+    *,
+    rays: int | None = None,
+    constraints: Constraints | None = None,
+    level: float = DEFAULT_LEVEL,
+    seed: int = 0,
+    name: str = "design",
+    knots: int | None = None,
+) -> FittedDesign:
+    """Rays for every value of the one condition that the samples leave free.
+
+    Arguments:
+        samples: Weighted samples of the density, its condition uniform over its bounds.
+        rays: Rays per position; None takes the budget's.
+        constraints: Bounds that every ray keeps at every position; a bandwidth is that of the worst position.
+        level: The share of what a ray sees that its gate holds.
+        seed: Root of the quantisation's stream.
+        name: The design's name.
+        knots: How many; None chooses from the samples.
+
+    Raises:
+        ConfigError: The space has not just one condition that a sensor can travel along, or no number of rays.
+        InfeasibleError: Constraints that hold too little of the density or that no track keeps.
+    """
+    constraints = Constraints() if constraints is None else constraints
+    dimension = _travelled(samples.space)
+    read_out = BandwidthBudget.of(constraints, rays)
+    if read_out.rays is None:
+        raise ConfigError("a track needs its number of rays per position", where="--layout scan", hint="give --rays N")
+    group = Group((None, None, None), tuple(range(read_out.rays)))
+    ends = _ends(samples.space, constraints, dimension, level)
+    support = restrict_samples(samples, constraints.rules, group)
+    support = replace(support, mass=support.total)
+    check_support(support, group, mass=support.total, several=False)
+    places = _knots(*ends, support.effective, read_out.rays, knots)
+    used = support.weights > 0
+    along = Along.of(support.points[used], support.weights[used], places, dimension, samples.space)
+    bounds = bounds_of(constraints.rules, samples.space, group.sensors, interval_factor(level))
+    centres, labels = aimed_rays(along, read_out.rays, random_generator(seed, "track"))
+    azimuth, elevation = _admitted(centres, along, bounds)
+    track = _with_gates(along, labels, azimuth, elevation, bounds, level, read_out)
+    sensors, score, error = _sensors(along, labels, track, bounds, level)
+    design = DesignSpec(
+        name=name, sensors=sensors, layout="scan", rays=read_out.rays, constraints=constraints.as_document(),
+        level=level, track=track, at=fixed_conditions(samples.space),
+    )  # fmt: skip
+    return FittedDesign(design, Estimate(score, error, "nats"), [support])
+
+
+def _travelled(space: DesignSpace) -> int:
+    """The one condition that is free, which must be a coordinate of the origin, the others fixed.
+
+    Raises:
+        ConfigError: It is not so.
+    """
+    names = [DIMENSIONS[index] for index in space.conditioned]
+    if len(names) != 1 or names[0] not in TRAVELLED:
+        raise ConfigError(
+            f"no track along {', '.join(names) or 'no condition'}: a track follows one coordinate of the origin",
+            where="--layout scan",
+            hint="give --at " + " --at ".join(f"{name}=VALUE" for name in names) if names else None,
+        )
+    free = [DIMENSIONS[index] for index in range(3) if index in space.free and DIMENSIONS[index] != names[0]]
+    if free:
+        raise ConfigError(
+            f"rays along {names[0]} start at one place beside it, but {', '.join(free)} is free",
+            where="--layout scan",
+            hint=f"learn with --set space.{free[0]}=VALUE, or give --at {names[0]}=VALUE",
+        )
+    return space.conditioned[0]
+
+
+def _travel_spread(length_m: float, level: float) -> float:
+    """The standard deviation of an origin whose interval is its travel [m]."""
+    return length_m / (2 * interval_factor(level))
+
+
+def _ends(space: DesignSpace, constraints: Constraints, dimension: int, level: float) -> tuple[float, float]:
+    """From where to where the rays travel [m].
+
+    Raises:
+        InfeasibleError: The constraints hold the origin still.
+    """
+    one = constraints.rules[0]
+    name = DIMENSIONS[dimension]
+    low, high = _way(constraints, space, dimension)
+    if not low < high:
+        raise InfeasibleError(
+            f"the origin is fixed at {name}={low:g}, but a track follows {name}",
+            conflicts=["origin", "--layout scan"],
+            hint=f"give --at {name}={low:g} instead",
+        )
+    limit = one.origin.spread_m.max
+    spread = _travel_spread(high - low, level)
+    if limit is not None and spread > limit:
+        raise InfeasibleError(
+            f"a track from {low:g} to {high:g} m has a spread of {spread:.3g} m along {name}",
+            conflicts=["origin.spread_m.max", f"space.{name}"],
+            allowed=f"at most {limit:g} m",
+            hint="a shorter origin box, or --at",
+        )
+    return low, high
+
+
+def _way(constraints: Constraints, space: DesignSpace, dimension: int) -> tuple[float, float]:
+    """The one interval that the origin box and the excluded boxes leave along a dimension [m].
+
+    Raises:
+        InfeasibleError: Excluded boxes divide it.
+    """
+    one = constraints.rules[0]
+    low, high = (float(end[dimension]) for end in origin_box(one, space))
+    if not low < high:
+        return low, high
+    free = free_boxes(one, space)
+    pieces = sorted(zip(free.low_m[:, dimension], free.high_m[:, dimension], strict=True))
+    if len(pieces) > 1:
+        raise InfeasibleError(
+            f"the excluded boxes divide the track into {len(pieces)} pieces",
+            conflicts=["origin.exclude", "--layout scan"],
+            hint=f"one of the pieces, as origin.low_m or origin.high_m with {DIMENSIONS[dimension]} "
+            f"up to {pieces[0][1]:g} or from {pieces[-1][0]:g}",
+        )
+    return max(low, pieces[0][0]), min(high, pieces[0][1])
+
+
+def _knots(low: float, high: float, effective: float, rays: int, wanted: int | None) -> np.ndarray:
+    """Even knots from end to end, shape (P,) [m]."""
+    if wanted is not None:
+        if wanted < 2:
+            raise ConfigError(f"{wanted} knots", where="track", allowed="2 or more")
+        return np.linspace(low, high, wanted)
+    usual = math.ceil((high - low) / KNOT_SPACING_M - SLACK)
+    affordable = int(effective / (rays * SAMPLES_PER_CELL))
+    return np.linspace(low, high, max(min(usual, affordable), 1) + 1)
+
+
+def _admitted(centres: np.ndarray, along: Along, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuths, unrolled along the knots, and elevations inside their bounds, shape (P, N) each [rad]."""
+    azimuth, elevation = angles(centres)
+    space = along.space
+    if ELEVATION in space.free:
+        elevation = np.clip(elevation, bounds.elevation_low, bounds.elevation_high)
+    else:
+        elevation = np.full_like(elevation, space.low[ELEVATION])
+    if AZIMUTH not in space.free:
+        return np.full_like(azimuth, space.low[AZIMUTH]), elevation
+    bound = bounds.azimuth_half < math.pi
+    offset = azimuth - bounds.azimuth_centre
+    offset -= 2 * math.pi * np.round(offset / (2 * math.pi))
+    clipped = bounds.azimuth_centre + np.clip(offset, -bounds.azimuth_half, bounds.azimuth_half)
+    return np.where(bound, clipped, np.unwrap(azimuth, axis=0)), elevation
+
+
+def _with_gates(
+    along: Along,
+    labels: np.ndarray,
+    azimuth: np.ndarray,
+    elevation: np.ndarray,
+    bounds: Bounds,
+    level: float,
+    read_out: BandwidthBudget,
+) -> Track:
+    """The track with gates that hold the level of what each ray sees, inside bounds and within the bandwidth.
+
+    Raises:
+        InfeasibleError: Even the narrowest admitted gates exceed the bandwidth somewhere.
+    """
+    wanted = _wanted_gates(along, labels, azimuth, elevation, level)
+    knots, count = azimuth.shape
+
+    def track(limits: Bounds) -> Track:
+        if RANGE not in along.space.free:
+            gate = np.full((knots, count, 2), along.space.low[RANGE])
+            return Track(DIMENSIONS[along.dimension], along.knots, azimuth, elevation, gate, np.arange(count))
+        rows = limits.take(np.tile(np.arange(count), knots))
+        centre, spread = admissible_gates(wanted.reshape(-1, 2), rows)
+        half = limits.interval * spread
+        # half an ulp may take a gate that starts at 0 below it
+        gate = np.maximum(np.stack([centre - half, centre + half], axis=1), 0.0).reshape(knots, count, 2)
+        return Track(DIMENSIONS[along.dimension], along.knots, azimuth, elevation, gate, np.arange(count))
+
+    even = np.full(count, 1.0 / count)
+    fitted, _ = fit_within_budget(
+        track(bounds),
+        lambda _, width_m: track(bounds.narrowed(width_m)),
+        lambda t: (_worst_widths(t, read_out), even),
+        read_out,
+    )
+    return fitted
+
+
+def _worst_widths(track: Track, read_out: BandwidthBudget) -> np.ndarray:
+    """Gate widths that cost at least what any position does: the wider of two neighbouring knots, ray by ray."""
+    width = np.diff(track.gate_m, axis=2)[:, :, 0]
+    wider = np.maximum(width[:-1], width[1:])
+    return wider[read_out.model.bins(wider).sum(axis=1).argmax()]
+
+
+def _wanted_gates(
+    along: Along, labels: np.ndarray, azimuth: np.ndarray, elevation: np.ndarray, level: float
+) -> np.ndarray:
+    """Central intervals of what rays observe, projected onto them, smooth along the knots: (P, N, 2) [m]."""
+    knots, count = azimuth.shape
+    ray = direction(along.between(azimuth, labels), along.between(elevation, labels))
+    ahead = ((observed_point(along.points) - along.points[:, :3]) * ray).sum(axis=1)
+    wanted = np.full((knots, count, 2), np.nan)
+    for knot in range(knots):
+        chosen, weights = along.near(knot, GATE_REACH)
+        wanted[knot], _ = central_intervals(ahead[chosen], weights, labels[chosen], count, level)
+    return _bridged(wanted)
+
+
+def _bridged(gates: np.ndarray) -> np.ndarray:
+    """Gates of knots at which a ray sees nothing, from its other knots, or from all rays': (P, N, 2) [m]."""
+    knots, count, _ = gates.shape
+    places = np.arange(knots)
+    known = np.isfinite(gates[:, :, 0])
+    everything = np.nanmin(gates[:, :, 0]), np.nanmax(gates[:, :, 1])
+    filled = gates.copy()
+    for ray in range(count):
+        own = known[:, ray]
+        for end in range(2):
+            filled[:, ray, end] = np.interp(places, places[own], gates[own, ray, end]) if own.any() else everything[end]
+    return filled
+
+
+def _sensors(
+    along: Along, labels: np.ndarray, track: Track, bounds: Bounds, level: float
+) -> tuple[tuple[Sensor, ...], float, float]:
+    """One sensor per ray, the ray in the middle of its travel; the samples' log-likelihood and its error [nats]."""
+    middle = float(along.knots[0] + along.knots[-1]) / 2
+    seen = [knot for knot in range(len(along.knots)) if along.near(knot)[1].sum() > 0]
+    found = {knot: _components(along, labels, track, knot, bounds) for knot in seen}
+    values = {knot: log_density(rays, near) for knot, (_, rays, near) in found.items()}
+    score = sum(share * float(near.weights @ values[knot]) for knot, (share, _, near) in found.items())
+    # a sample between two knots counts at both
+    influence = np.zeros(len(along.points))
+    for knot, of_knot in values.items():
+        chosen, weights = along.near(knot)
+        influence[chosen] += weights * (of_knot - score)
+    error = float(np.linalg.norm(influence))
+    _, mixture, features = found[min(seen, key=lambda knot: abs(along.knots[knot] - middle))]
+    return _in_the_middle(track, middle, along, mixture, features.axes, level), score, error
+
+
+def _components(
+    along: Along, labels: np.ndarray, track: Track, knot: int, bounds: Bounds
+) -> tuple[float, Mixture, Features]:
+    """The share of the samples near a knot, the rays there as mixture components, and these samples."""
+    chosen, weights = along.near(knot)
+    space = along.space.at({track.dimension: float(along.knots[knot])})
+    features = Features.of(along.points[chosen], weights, Axes.of(space), space)
+    count = len(track.sensor)
+    mixture = from_labels(features, labels[chosen], bounds).with_weights(np.full(count, 1.0 / count))
+    start, end = track.gate_m[knot].T
+    mixture = replace(mixture, range_m=(start + end) / 2, spread_range_m=(end - start) / (2 * bounds.interval))
+    if features.axes.horizontal:
+        mixture = replace(mixture, azimuth_rad=track.azimuth_rad[knot])
+    if features.axes.vertical:
+        mixture = replace(mixture, elevation_rad=track.elevation_rad[knot])
+    return float(weights.sum()), mixture, features
+
+
+def _in_the_middle(
+    track: Track, middle: float, along: Along, mixture: Mixture, axes: Axes, level: float
+) -> tuple[Sensor, ...]:
+    azimuth, elevation, gate = interpolated(track, middle)
+    origin = np.array(along.space.low[:3])
+    origin[along.dimension] = middle
+    covariance = np.zeros((3, 3))
+    covariance[along.dimension, along.dimension] = _travel_spread(along.knots[-1] - along.knots[0], level) ** 2
+    count = len(track.sensor)
+    return tuple(
+        Sensor(
+            name=f"s{ray}",
+            weight=1.0 / count,
+            origin_m=origin,
+            origin_covariance_m2=covariance,
+            azimuth_rad=boresight_azimuth(azimuth[ray]),
+            elevation_rad=float(elevation[ray]),
+            roll_rad=float(mixture.roll_rad[ray]),
+            spread_horizontal_rad=float(mixture.spread_rad[ray, 0] * axes.angle_scale) if axes.horizontal else 0.0,
+            spread_vertical_rad=float(mixture.spread_rad[ray, 1]) if axes.vertical else 0.0,
+            range_m=float(gate[ray].mean()),
+            spread_range_m=float(gate[ray, 1] - gate[ray, 0]) / (2 * interval_factor(level)),
+            level=level,
+            rays=1,
+        )
+        for ray in range(count)
+    )
