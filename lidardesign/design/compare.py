@@ -16,7 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.design.bandwidth import Bandwidth, split_budget
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.layouts.layout import shares_of
+from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.space import RANGE, DesignSpace
 
@@ -145,9 +147,8 @@ def _counts(design: DesignSpec) -> np.ndarray | None:
     own = [sensor.rays for sensor in design.sensors]
     if None not in own:
         return np.array(own, dtype=np.int64)
-    if design.rays is not None:
-        return split_budget(design.weights, design.rays)
-    return np.ones(len(own), dtype=np.int64) if design.layout == "scan" else None
+    count = layout_of(design).own_count(design)
+    return None if count is None else shares_of(design, count)
 
 
 # In sizes of the space: the diagonal of its box of origins and its reach. Rigs of others may stand a bit beside.

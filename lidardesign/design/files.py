@@ -15,7 +15,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -29,6 +29,8 @@ from lidardesign.design.sensor import (
     MOST_RAYS,
     Coupling,
     DesignSpec,
+    Gates,
+    LayoutName,
     Sensor,
     Track,
     interval_factor,
@@ -103,7 +105,7 @@ def read_at(node: Node) -> Mapping[str, float]:
 
 SCHEMA_VERSION = 1
 SCHEMA_FILE = Path(__file__).with_name("design.schema.json")
-LAYOUTS = ("grid", "density", "scan", "distributed", "fixed")
+LAYOUTS = get_args(LayoutName)
 # A file of a hundred thousand explicit rays; the YAML reader's own limit is for settings.
 MAX_BYTES = 64_000_000
 # Eight numbers a ray stay below the number of values that the YAML reader accepts in one file.
@@ -116,7 +118,7 @@ WEIGHT_SUM_TOLERANCE = SLACK
 COVARIANCE_ROUNDING = SLACK
 
 REQUIRED = ("schema_version", "sensors")
-OPTIONAL = ("name", "layout", "level", "rays", "at", "ray_table", "track", "constraints", "provenance")
+OPTIONAL = ("name", "layout", "level", "rays", "at", "gates", "ray_table", "track", "constraints", "provenance")
 SENSOR_REQUIRED = ("origin_m", "boresight")
 SENSOR_OPTIONAL = (
     "name", "part", "weight", "field_of_view_rad", "gate_m", "range_m", "spread", "travel_m", "coupling", "rays",
@@ -151,6 +153,8 @@ def design_document(design: DesignSpec) -> dict[str, Any]:
         document["track"] = track_document(design.track)
     if design.at:
         document["at"] = {name: float(value) for name, value in design.at.items()}
+    if design.gates is not None and design.gates != design.table_gates:
+        document["gates"] = design.gates
     document["constraints"] = design.constraints
     document["provenance"] = design.provenance
     return document
@@ -281,6 +285,7 @@ def design_from_document(
         level=level,
         track=track,
         at=read_at(keys["at"]) if "at" in keys else {},
+        gates=keys["gates"].choice(get_args(Gates)) if "gates" in keys else None,  # type: ignore[arg-type]
     )
 
 

@@ -19,7 +19,7 @@ from lidardesign.design.constraints.origins import placement_notes, snap_to_spac
 from lidardesign.design.files import design_document
 from lidardesign.design.layouts.layout import FittedDesign, Layout, likelihood_estimate, missing_samples
 from lidardesign.design.layouts.rays import LAYOUTS, gates_of, lay_out, layout_of, own_count
-from lidardesign.design.layouts.sensor_fit import FitRequest, fit_sensors
+from lidardesign.design.layouts.sensor_fit import FitProblem, fit_sensors
 from lidardesign.design.mixture.bounds import groups
 from lidardesign.design.mixture.conditions import conditioned, fixed_conditions
 from lidardesign.design.mixture.support import Retarget, Support
@@ -128,7 +128,7 @@ def fit(
     started = time.perf_counter()
     constraints, moved = snap_to_space(Constraints() if constraints is None else constraints, samples.space)
     _check_options(constraints, samples, sensors, LAYOUTS[layout], rays)
-    request = FitRequest(
+    request = FitProblem(
         samples=samples,
         constraints=constraints,
         rules=constraints.rules,
@@ -186,7 +186,7 @@ def _check_options(
     check_feasible(constraints, samples.space, sensors=count, rays=rays)
 
 
-def _fit_parts(request: FitRequest) -> FittedDesign:
+def _fit_parts(request: FitProblem) -> FittedDesign:
     """Sensors, and the parts of the catalogue that they become."""
     # the parts have gates of their own: the budget is theirs
     free = replace(request, budget=replace(request.budget, limit_mbps=None, rays=None))
@@ -245,7 +245,7 @@ def fit_like(
         em_samples=em_samples,
         level=design.level,
         name=name or design.name,
-        gates=gates_of(design, samples),
+        gates=gates_of(design),
         retarget=retarget,
     ).design
 
@@ -307,8 +307,8 @@ def _error_estimates(
 ) -> dict[str, Estimate]:
     """Everything that a fit reports with an error, by name.
 
-    The admitted samples' ESS; the share of the density that they stand for where it is known; and how many of the rays a
-    sensor's weight would give to another one, as rays are whole, where they are not open.
+    The admitted samples' ESS; the share of the density that they stand for where it is known; and how many of the rays
+    that a sensor fires its weight would give to another one, as rays are whole, where they are not open.
     """
     sizes = np.array([len(support.points) for support in supports])
     errors = np.array([effective_share_error(support.weights) for support in supports])

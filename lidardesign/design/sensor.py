@@ -28,6 +28,8 @@ LEVELS = (0.01, 0.999999)
 # Returns of so many fill some 100 MB per scene; no scanner fires more in a frame.
 MOST_RAYS = 1_000_000
 LayoutName = Literal["grid", "density", "scan", "distributed", "fixed"]
+# Those in which sensors are fitted: the rays of real parts are what they are.
+FITTED_LAYOUTS: tuple[LayoutName, ...] = ("grid", "density", "scan", "distributed")
 # Whether every ray has its sensor's gate or its own.
 Gates = Literal["sensor", "ray"]
 
@@ -239,7 +241,8 @@ class DesignSpec:
         level: The share of each marginal that intervals hold.
         track: The rays along a condition, where the design is for all its values.
         at: The condition values that the design is for, where it is for one, as {"x_m": 0.37}.
-        gates: Whether its rays have their sensor's gate or their own at any number of rays; None where its rays tell.
+        gates: Whether its rays have their sensor's gate or their own at any number of rays; None where its table of
+            rays tells, or where it is as usual in its layout.
     """
 
     name: str
@@ -259,3 +262,14 @@ class DesignSpec:
         """Shares of the rays, shape (G,), summing to 1."""
         weights = np.array([sensor.weight for sensor in self.sensors], dtype=np.float64)
         return weights / weights.sum()
+
+    @property
+    def table_gates(self) -> Gates | None:
+        """The gates that two rays of one sensor in its table tell of; None without such two."""
+        table = self.ray_table
+        if table is None:
+            return None
+        _, first, sensor = np.unique(table.sensor, return_index=True, return_inverse=True)
+        if len(first) == len(sensor):
+            return None
+        return "ray" if (table.gate_m != table.gate_m[first[sensor]]).any() else "sensor"

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.layouts.rays import lay_out
+from lidardesign.design.fit import rays_at
+from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.evaluate.baselines.catalog import Density
@@ -65,7 +66,7 @@ class EvaluationRequest:
     equal_bandwidth: bool = True
     train: Sequence[Scene] = ()
     test: Sequence[Scene] = ()
-    lay_out: LayOut = lay_out
+    lay_out: LayOut = rays_at
     without_visibility: Callable[[], tuple[DesignSpec, Samples]] | None = None
     density: Callable[[], Density | None] | None = None
     cma: CmaSettings = field(default_factory=CmaSettings)
@@ -98,7 +99,7 @@ class EvaluationRequest:
 
 def pattern_size(design: DesignSpec) -> int | None:
     """The rays of a design's fixed pattern; None where a design can be laid out at any number."""
-    return len(design.ray_table.sensor) if design.layout == "fixed" and design.ray_table is not None else None
+    return layout_of(design).most_count(design)
 
 
 def can_fire(design: DesignSpec, count: int) -> bool:

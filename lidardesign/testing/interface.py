@@ -8,12 +8,11 @@ import numpy as np
 from pydantic import ValidationError
 
 from lidardesign.config import PRESETS, resolve
+from lidardesign.design.sensor import FITTED_LAYOUTS
 from lidardesign.errors import ConfigError
 from lidardesign.space import DesignSpace
 from lidardesign.testing.law import BrokenLawError, Held, Law, NotApplicable
 from lidardesign.testing.subject import Subject
-
-LAYOUTS = ("grid", "density", "scan", "distributed")
 
 
 def check_config(subject: Subject) -> Held:
@@ -76,7 +75,7 @@ def check_defaults(subject: Subject) -> Held:
     wrong = {
         "sensors": not _is_count(defaults.sensors),
         "rays": not _are_counts(defaults.rays),
-        "layout": defaults.layout not in LAYOUTS,
+        "layout": defaults.layout not in FITTED_LAYOUTS,
         "level": not _is_finite(defaults.level) or not 0 < defaults.level < 1,
     }
     for name, is_wrong in wrong.items():

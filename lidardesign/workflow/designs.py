@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lidardesign.design.files import design_text, save_design
-from lidardesign.design.fit_result import FitResult
+from lidardesign.design.fit import FitResult
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import WAIT_S, phase

@@ -8,10 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lidardesign.design.layouts.rays import gates_of, lay_out, own_count, refitted
+from lidardesign.design.fit import refitted
+from lidardesign.design.layouts.rays import lay_out, layout_of, own_count
 from lidardesign.design.layouts.track import placed
-from lidardesign.design.mixture.conditions import conditioned
-from lidardesign.design.mixture.support import Retarget
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError
 from lidardesign.estimates import Estimate, as_documents
@@ -19,7 +18,6 @@ from lidardesign.export.registry import EXPORTERS, Exporter
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
 from lidardesign.run.files import STDIO, is_input
-from lidardesign.samples import Samples
 from lidardesign.workflow.layouts import may_need_samples
 from lidardesign.workflow.plans import Plan, last_time
 from lidardesign.workflow.run_folder import CONFIGURATION, MANIFEST, Notes, RunFolder, folder_of, log_note, run_of
@@ -57,9 +55,7 @@ class DesignSource:
     @property
     def leaves_rays_open(self) -> bool:
         """Whether nothing in the design says how many rays it fires."""
-        design = self.specification
-        counted = all(sensor.rays is not None for sensor in design.sensors)
-        return design.rays is None and design.ray_table is None and not counted and design.layout != "scan"
+        return layout_of(self.specification).own_count(self.specification) is None
 
     def largest_budget(self) -> int:
         """The rays of a design that leaves them open: the largest number that its task is evaluated at.
@@ -109,23 +105,13 @@ class DesignSource:
         if count is not None and may_need_samples(design) and (self.leaves_rays_open or count != own_count(design)):
             run = self.opened_run()
             if run is not None:
-                samples, retarget = self._samples(run, at)
-            if design.layout == "scan":
-                design = refitted(design, count, samples, seed)
+                weighting = Weighting.of(design)
+                retarget = RunTarget(run, weighting=weighting)
+                samples = weighted_samples(run, weighting, retarget)
+        design = refitted(design, count, samples, seed=seed, at=at, retarget=retarget)
         count = 0 if may_stay_open else count
-        gates = gates_of(design, samples)
-        rays = lay_out(design, count, samples, gates=gates, seed=seed, at=at, retarget=retarget)
+        rays = lay_out(design, count, samples, seed=seed, at=at, retarget=retarget)
         return placed(design, at) if at or design.track is not None else design, rays
-
-    def _samples(self, run: RunFolder, at: Mapping[str, float]) -> tuple[Samples, Retarget]:
-        """The samples that the design follows from: of all conditions for a track, else of the design's own."""
-        design = self.specification
-        weighting = Weighting.of(design)
-        retarget = RunTarget(run, weighting=weighting)
-        samples = weighted_samples(run, weighting, retarget)
-        if design.track is None and samples.space.conditioned:
-            samples = conditioned(samples, {**at, **design.at}, retarget)
-        return samples, retarget
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +172,8 @@ class ExportRequest:
 
     def __post_init__(self) -> None:
         name = self.exporter.name
-        if self.rays is not None and name in WITHOUT_RAYS and self.source.specification.layout != "scan":
+        layout = layout_of(self.source.specification)
+        if self.rays is not None and name in WITHOUT_RAYS and not layout.one_sensor_per_ray:
             # of a scan another number of rays is another number of sensors
             raise ConfigError(f"{name} holds sensors, not rays", where="--rays", hint="leave it out")
         self.exporter.check_rate(self.rate_hz)

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from lidardesign.config import apply_override, parse_override
 from lidardesign.design.constraints.document import CATALOG, Constraints
 from lidardesign.design.constraints.feasibility import check_feasible
 from lidardesign.design.constraints.origins import is_mounted, snap_to_space
 from lidardesign.design.constraints.rig_constraints import moved_notes, rig_constraints, rig_notes
-from lidardesign.design.sensor import LEVELS, DesignSpec, fitted_layout
+from lidardesign.design.layouts.rays import LAYOUTS, layout_of
+from lidardesign.design.sensor import FITTED_LAYOUTS, LEVELS, DesignSpec, Gates
 from lidardesign.design.snap.parts import parts_of, wants_parts
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.manifest import verify
@@ -32,10 +33,6 @@ from lidardesign.workflow.run_folder import (
 )
 from lidardesign.workflow.weighting import Weighting
 
-LAYOUTS = ("grid", "density", "scan", "distributed")
-# In the others rays are sensors of their own, or leave their sensors' places.
-RIG_LAYOUTS = ("grid", "density")
-GATES = ("sensor", "ray")
 # Keys by which tasks are told where sensors may be.
 PLACE_KEYS = ("origin_m", "origin_box_m")
 
@@ -79,9 +76,9 @@ class FitOptions:
         if self.name is not None:
             check_name(self.name)
         if self.layout is not None:
-            check_choice(self.layout, "--layout", LAYOUTS)
+            check_choice(self.layout, "--layout", FITTED_LAYOUTS)
         if self.gates is not None:
-            check_choice(self.gates, "--gates", GATES)
+            check_choice(self.gates, "--gates", get_args(Gates))
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +146,7 @@ class FitRequest:
                 notes(note)
         rules = Constraints() if constraints is None else constraints
         layout = layout or _usual_layout(rules, base, run)
-        if options.sensors is not None and layout == "scan":
+        if options.sensors is not None and LAYOUTS[layout].one_sensor_per_ray:
             raise ConfigError(
                 f"{options.sensors} sensors of a scan, whose every ray is a sensor of its own",
                 where="--sensors",
@@ -158,7 +155,7 @@ class FitRequest:
         level = options.level if options.level is not None else base.level if base else defaults.level
         if not LEVELS[0] <= level <= LEVELS[1]:
             raise ConfigError(f"{level:g}", where="--level", allowed=f"{LEVELS[0]:g} to {LEVELS[1]:g}")
-        open_budget = layout == "grid" and options.gates != "ray"
+        open_budget = LAYOUTS[layout].leaves_rays_open(options.gates)
         return cls(
             run,
             options.name or ("fit" if asked is None else "constrained"),
@@ -223,7 +220,7 @@ class FitRequest:
         rays = "rays left open" if choices["rays"] is None else f"{choices['rays']} rays"
         counted = {None: "sensors as many as follow", "auto": "sensors as many as held-out likelihood says"}
         sensors = counted.get(choices["sensors"], f"{choices['sensors']} sensors")
-        sensors = "one sensor per ray" if choices["layout"] == "scan" else sensors
+        sensors = "one sensor per ray" if LAYOUTS[choices["layout"]].one_sensor_per_ray else sensors
         place = "".join(f", {key} = {value:g}" for key, value in self.at.items())
         how = f"layout {choices['layout']}, {rays}, level {choices['level']:g}{place}, seed {self.seed}"
         steps = [f"fit {sensors}, {how}"]
@@ -243,9 +240,10 @@ def _with_rig(
     """Constraints with those of a rig below them, the layout, and the rig's sensors' names; as asked without a rig."""
     if options.like is None:
         return asked, options.layout, ()
-    layout = options.layout or RIG_LAYOUTS[0]
-    if layout not in RIG_LAYOUTS:
-        raise ConfigError(f"{layout} beside --like", where="--layout", allowed=", ".join(RIG_LAYOUTS))
+    layout = options.layout or "grid"
+    if not LAYOUTS[layout].starts_at_sensors:
+        allowed = [name for name in FITTED_LAYOUTS if LAYOUTS[name].starts_at_sensors]
+        raise ConfigError(f"{layout} beside --like", where="--layout", allowed=", ".join(allowed))
     rig = read_design(Path(options.like), notes, reach_of([run]))
     own, space = Constraints() if asked is None else asked, run.config.space
     keys = [key for key in PLACE_KEYS if key in type(run.config.task).model_fields]
@@ -262,8 +260,8 @@ def _usual_layout(constraints: Constraints, base: DesignSpec | None, run: RunFol
     if wants_parts(constraints.rules):
         return "grid"
     if base is not None:
-        return fitted_layout(base.layout)
-    return check_choice(run.task.defaults.layout, f"defaults.layout of task {run.task.name}", LAYOUTS)
+        return layout_of(base).fitted_as
+    return check_choice(run.task.defaults.layout, f"defaults.layout of task {run.task.name}", FITTED_LAYOUTS)
 
 
 def _sensors(

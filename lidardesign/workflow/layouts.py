@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.design.layouts.rays import gates_of, lay_out
+from lidardesign.design.fit import rays_at
+from lidardesign.design.layouts.rays import gates_of, layout_of
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.geometry.rays import Rays
@@ -36,9 +37,8 @@ class Layouts:
     def __call__(
         self, design: DesignSpec, count: int, samples: Samples | None, *, at: Mapping[str, float] | None = None
     ) -> Rays:
-        """A design's rays at a number of rays, with a gate per ray where its own table has one per ray."""
-        gates = gates_of(design, samples)
-        return lay_out(design, count, samples, gates=gates, at=at, retarget=self.targets.get(design.name))
+        """A design's rays at a number of rays."""
+        return rays_at(design, count, samples, at=at, retarget=self.targets.get(design.name))
 
     @classmethod
     def of(cls, designs: Sequence[tuple[DesignSpec, RunFolder]]) -> Layouts:
@@ -69,7 +69,7 @@ class Layouts:
 
 def may_need_samples(design: DesignSpec) -> bool:
     """Whether another number of rays of a design may follow from samples of its run."""
-    return design.layout != "fixed" and (design.layout != "grid" or design.ray_table is not None)
+    return layout_of(design).uses_samples(design, None, gates_of(design))
 
 
 def twin_without_visibility(design: DesignSpec, run: RunFolder, layouts: Layouts) -> tuple[DesignSpec, Samples]:

@@ -13,8 +13,8 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.check import ConstraintCheck, check_design
 from lidardesign.design.constraints.origins import is_mounted
 from lidardesign.design.files import design_document
+from lidardesign.design.fit import FitResult
 from lidardesign.design.fit import fit as fit_samples
-from lidardesign.design.fit_result import FitResult
 from lidardesign.design.layouts.quantise import SAMPLES_PER_RAY
 from lidardesign.design.mixture.bounds import groups
 from lidardesign.design.mixture.conditions import MOVED_SAMPLES, at_condition, shown

@@ -252,14 +252,15 @@ def test_a_design_is_exported_with_the_rays_that_it_is_evaluated_with(lidardesig
 
 
 def test_a_scan_for_one_value_is_fitted_anew_once_for_all_places(lidardesign, run, monkeypatch):
-    from lidardesign.design.layouts import rays as rays_module
+    from lidardesign.design import fit as fit_module
     from lidardesign.samples import load_samples
 
     assert lidardesign("fit", run, "--at", "x_m=0.37", "--layout", "scan", "--rays", 4, "--name", "here").code == 0
     design, samples, fits = load_design(run / "designs" / "here.yaml"), load_samples(run), []
-    refit = rays_module._refit
-    monkeypatch.setattr(rays_module, "_refit", lambda *arguments: fits.append(1) or refit(*arguments))
-    first, *others = (lay_out(design, 7, samples, at={"x_m": x}, retarget=log_target) for x in (0.0, 0.37, 1.0))
+    refit = fit_module.fit_like
+    monkeypatch.setattr(fit_module, "fit_like", lambda *given, **named: fits.append(1) or refit(*given, **named))
+    places = ({"x_m": x} for x in (0.0, 0.37, 1.0))
+    first, *others = (fit_module.rays_at(design, 7, samples, at=at, retarget=log_target) for at in places)
     assert len(fits) == 1
     for other, x in zip(others, (0.37, 1.0), strict=True):
         np.testing.assert_array_equal(other.direction, first.direction)

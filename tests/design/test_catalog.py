@@ -33,8 +33,8 @@ from lidardesign.design.catalog.placing import (
 from lidardesign.design.catalog.statements import FIELDS, PartFile, Statement
 from lidardesign.design.files import SCHEMA_FILE, design_document, design_from_document, load_design, save_design
 from lidardesign.design.layouts.grid import grid_rows
-from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.sensor import boresight_frame, fitted_layout
+from lidardesign.design.layouts.rays import LAYOUTS, lay_out
+from lidardesign.design.sensor import boresight_frame
 from lidardesign.errors import ConfigError
 from lidardesign.run.validation import check_model
 from lidardesign.run.yaml import parse_yaml
@@ -503,8 +503,7 @@ def test_a_fixed_layout_needs_its_rays_and_is_fitted_anew_as_a_grid():
     del document["ray_table"]
     with pytest.raises(ConfigError, match="is fixed, but there is no ray_table"):
         design_from_document(document)
-    assert fitted_layout("fixed") == "grid"
-    assert fitted_layout("scan") == "scan"
+    assert {name: layout.fitted_as for name, layout in LAYOUTS.items() if name != layout.fitted_as} == {"fixed": "grid"}
 
 
 def test_a_part_in_a_run_is_constrained_as_a_grid_of_its_sensors_and_cannot_be_fitted(call, tmp_path):

@@ -19,7 +19,7 @@ from lidardesign.design.files import (
     load_design,
     save_design,
 )
-from lidardesign.design.layouts.rays import lay_out
+from lidardesign.design.layouts.rays import gates_of, lay_out
 from lidardesign.design.sensor import Coupling, DesignSpec, Sensor, interval_factor
 from lidardesign.errors import ConfigError, DataError, NumericalError
 from lidardesign.geometry.rays import Rays
@@ -101,6 +101,7 @@ def designs(draw):
     return DesignSpec(
         name=draw(words), sensors=chosen, rays=total, ray_table=table, level=level,
         layout=draw(st.sampled_from(["grid", "density", "scan", "distributed"])),
+        gates=None if table is not None else draw(st.sampled_from([None, "sensor", "ray"])),
         constraints={"gate": {"width_m": {"max": draw(length)}}},
         provenance={"command": draw(anything), "seed": 7},
     )  # fmt: skip
@@ -115,6 +116,17 @@ def same(first, second):
     if hasattr(first, "__dataclass_fields__"):
         return all(same(getattr(first, name), getattr(second, name)) for name in first.__dataclass_fields__)
     return first == second
+
+
+def test_gates_are_written_where_the_rays_do_not_tell_of_them():
+    sensor = load_design(EXAMPLE).sensors[0]
+    gates = np.array([[0.1, 0.2], [0.1, 0.3]])
+    zeros = np.zeros(2)
+    two = Rays.from_angles(np.zeros((2, 3)), zeros, zeros, gates, zeros)
+    for table, written in ((two, False), (two.subset(np.array([0])), True), (None, True)):
+        document = design_document(DesignSpec("d", (sensor,), gates="ray", ray_table=table))
+        assert ("gates" in document) == written
+        assert gates_of(design_from_document(document)) == "ray"
 
 
 @settings(max_examples=150, deadline=None)

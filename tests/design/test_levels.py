@@ -15,8 +15,8 @@ from support.command_line import caller, make_run
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import load_design
 from lidardesign.design.fit import fit
+from lidardesign.design.layouts.fields import seen_from
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.layouts.shared_fields import seen_from
 from lidardesign.design.sensor import DesignSpec, interval_factor
 from lidardesign.errors import InfeasibleError
 from lidardesign.space import observed_point

@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 from support.tables import each_row
 
 from lidardesign.design.bandwidth import split_budget
+from lidardesign.design.fit import rays_at, refitted
+from lidardesign.design.layouts.fields import log_density, members, seen_from
 from lidardesign.design.layouts.grid import grid_rows, grid_tangent
-from lidardesign.design.layouts.rays import gates_of, lay_out, make_ray_table, own_count, own_gates, refitted
-from lidardesign.design.layouts.shared_fields import log_density, members, seen_from
+from lidardesign.design.layouts.rays import LAYOUTS, gates_of, lay_out, own_count
 from lidardesign.design.sensor import (
     MOST_RAYS,
     DesignSpec,
@@ -23,7 +24,6 @@ from lidardesign.design.sensor import (
     tangent_directions,
 )
 from lidardesign.errors import ConfigError
-from lidardesign.run.clock import running
 from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace, angles, direction
 
@@ -280,23 +280,18 @@ def test_a_sensor_may_have_no_rays_of_its_own_number():
     assert np.bincount(lay_out(design).sensor, minlength=3).tolist() == [0, 2, 30]
 
 
+def table_of(design, count, samples=None, gates=None):
+    """The rays of a design as its file holds them."""
+    return lay_out(replace(design, ray_table=None), count, samples, gates=gates).as_angles()
+
+
 def test_a_design_was_made_for_the_number_that_it_names_then_for_that_of_its_table_then_of_its_sensors():
     own = tuple(replace(s, rays=n) for s, n in zip(three_sensors(), (1, 2, 30), strict=True))
-    table = make_ray_table(DesignSpec("d", own), 40)
+    table = table_of(DesignSpec("d", own), 40)
     assert own_count(DesignSpec("d", own, rays=7, ray_table=table)) == 7
     assert own_count(DesignSpec("d", own, ray_table=table)) == 40
     assert own_count(DesignSpec("d", own, layout="scan")) == 33
     assert own_count(DesignSpec("d", three_sensors(), layout="scan")) == 3
-
-
-def test_a_table_is_laid_out_anew_whatever_table_the_design_has_and_its_time_is_that_of_rays():
-    design = DesignSpec("d", three_sensors())
-    narrow = replace(design, sensors=three_sensors(spread_horizontal_rad=0.01))
-    old = replace(design, ray_table=make_ray_table(narrow, 40))
-    with running() as clock:
-        table = make_ray_table(old, 40)
-    np.testing.assert_array_equal(table.azimuth_rad, make_ray_table(design, 40).azimuth_rad)
-    assert list(clock.timings()) == ["rays", "other"]
 
 
 def test_a_design_without_a_number_of_rays_asks_for_one():
@@ -326,7 +321,7 @@ def test_more_rays_stand_where_the_density_is():
 def test_a_density_layout_needs_samples_unless_its_table_has_that_many_rays():
     design = DesignSpec("d", three_sensors(), layout="density", rays=40)
     samples = drawn_from(design)
-    kept = replace(design, ray_table=make_ray_table(design, 40, samples, "ray"))
+    kept = replace(design, ray_table=table_of(design, 40, samples, "ray"))
     direct, tabled = lay_out(design, 40, samples, gates="ray"), lay_out(kept)
     np.testing.assert_allclose(direct.direction, tabled.direction, atol=1e-15)
     assert (direct.gate_m == tabled.gate_m).all()
@@ -380,7 +375,7 @@ def test_rays_of_a_density_layout_follow_the_seed_and_their_order_does_not():
 
 def test_what_is_missing_is_said_with_the_number_of_rays_that_the_design_has():
     design = DesignSpec("d", three_sensors(), layout="density", rays=40)
-    kept = replace(design, ray_table=make_ray_table(design, 40, drawn_from(design)))
+    kept = replace(design, ray_table=table_of(design, 40, drawn_from(design)))
     words = r"41 rays in the layout `density`(.|\n)*40 rays(.|\n)*fit RUN --layout density --rays 41"
     with pytest.raises(ConfigError, match=words):
         lay_out(kept, 41)
@@ -412,18 +407,20 @@ def test_a_scan_of_another_number_of_rays_is_fitted_anew_and_keeps_its_constrain
     narrow = {"gate": {"width_m": {"max": 0.15}}, "budget": {"rays": 3}}
     design = DesignSpec("d", three_sensors(), layout="scan", constraints=narrow)
     samples = drawn_from(design)
-    rays = lay_out(design, 40, samples)
+    rays = rays_at(design, 40, samples)
     assert len(rays) == 40
     assert (np.ptp(rays.gate_m, axis=1) <= 0.15 + 1e-12).all()
     assert (rays.sensor == np.arange(40)).all()
-    assert (lay_out(design, 40, samples).direction == rays.direction).all()
+    assert (rays_at(design, 40, samples).direction == rays.direction).all()
+    with pytest.raises(ConfigError, match="--layout scan --rays 40"):
+        lay_out(design, 40, samples)
 
 
 def test_a_refit_is_remembered_by_number_and_seed():
     design, samples = DesignSpec("d", three_sensors(), layout="scan"), drawn_from(DesignSpec("d", three_sensors()), 600)
     first = refitted(design, 5, samples)
-    assert refitted(design, 5, samples, 0) is first
-    assert refitted(design, 5, samples, 1) is not first
+    assert refitted(design, 5, samples, seed=0) is first
+    assert refitted(design, 5, samples, seed=1) is not first
     assert refitted(design, 6, samples) is not first
     assert (first.name, len(first.sensors), first.level) == ("d", 5, design.level)
     with pytest.raises(ConfigError, match="5 rays in the layout `scan`"):
@@ -434,7 +431,7 @@ def test_a_scan_from_a_pinned_origin_is_not_fitted_anew_without_its_target():
     pinned = {"origin": {"fixed_m": [0.1, -0.2, 0.3]}, "budget": {"rays": 3}}
     design = DesignSpec("d", three_sensors(), layout="scan", constraints=pinned)
     with pytest.raises(ConfigError, match=r"pinned origin(.|\n)*4 rays(.|\n)*3 rays(.|\n)*--layout scan --rays 4"):
-        lay_out(design, 4, drawn_from(design, 600))
+        rays_at(design, 4, drawn_from(design, 600))
 
 
 def test_one_ray_is_not_a_scan_of_three_sensors():
@@ -477,7 +474,7 @@ def test_a_density_layout_asks_the_target_density_at_its_place_unless_its_table_
         lay_out(design, 30, samples, at={"x_m": 1.0})
     assert len(lay_out(design, 0, samples, at={"x_m": 1.0})) == 0
     rays = lay_out(design, 30, samples, at={"x_m": 1.0}, retarget=no_target)
-    table = make_ray_table(design, 30, drawn_from(design))
+    table = table_of(design, 30, drawn_from(design))
     kept = lay_out(replace(design, ray_table=table), 30, samples, at={"x_m": 1.0})
     assert len(rays) == len(kept) == 30
     np.testing.assert_array_equal(kept.origin_m[:, 0], 1.0)
@@ -496,7 +493,7 @@ def test_distributed_rays_are_laid_out_by_their_sensors_where_no_target_density_
 
 def test_a_table_of_another_number_of_rays_does_not_answer():
     design = DesignSpec("d", three_sensors(), layout="density", rays=30)
-    kept = replace(design, ray_table=make_ray_table(design, 30, drawn_from(design)))
+    kept = replace(design, ray_table=table_of(design, 30, drawn_from(design)))
     samples = along_rails(design)
     with pytest.raises(ConfigError, match="x_m"):
         lay_out(kept, 40, samples, at={"x_m": 1.0})
@@ -510,7 +507,7 @@ def test_a_scan_asks_the_target_density_for_other_rays_and_for_gates_of_their_ow
     for changes in ({"count": 5}, {"count": 3, "gates": "ray"}):
         with pytest.raises(ConfigError, match="x_m"):
             lay_out(design, samples=samples, at={"x_m": 1.0}, **changes)
-    assert len(lay_out(design, 5, samples, at={"x_m": 1.0}, retarget=no_target)) == 5
+    assert len(rays_at(design, 5, samples, at={"x_m": 1.0}, retarget=no_target)) == 5
 
 
 def tracked():
@@ -567,20 +564,23 @@ def test_rays_share_the_gate_of_their_sensor_unless_they_are_to_have_their_own(l
 )
 def test_a_table_tells_by_two_rays_of_one_sensor_whose_gates_its_rays_keep(layout, samples, wide, expected):
     design = DesignSpec("d", three_sensors())
-    table = make_ray_table(design, 30)
+    table = table_of(design, 30)
     gate = table.gate_m.copy()
     gate[list(wide), 1] += 0.1
     design = replace(design, layout=layout, ray_table=replace(table, gate_m=gate))
-    assert gates_of(design, drawn_from(design, 60) if samples else None) == expected
+    drawn = drawn_from(design, 60) if samples else None
+    by_gates = lay_out(replace(design, ray_table=None), 40, drawn, gates=expected)
+    np.testing.assert_array_equal(lay_out(design, 40, drawn).gate_m, by_gates.gate_m)
 
 
-def test_no_table_and_one_ray_of_each_sensor_tell_nothing_of_gates():
+def test_no_table_and_one_ray_of_each_sensor_tell_nothing_of_gates_but_the_design_may():
     design = DesignSpec("d", three_sensors())
-    samples = drawn_from(design, 60)
-    assert gates_of(design, samples) is None
-    single = replace(design, ray_table=make_ray_table(replace(design, layout="scan"), 3))
-    assert gates_of(single, samples) is None
-    assert (own_gates("distributed"), own_gates("grid"), own_gates("scan")) == ("ray", "sensor", "sensor")
+    single = replace(design, ray_table=table_of(replace(design, layout="scan"), 3))
+    usual = {"distributed": "ray", "grid": "sensor", "density": "sensor"}
+    assert {name: gates_of(replace(single, layout=name)) for name in usual} == usual
+    assert {name: gates_of(replace(design, layout=name)) for name in usual} == usual
+    assert gates_of(replace(single, gates="ray")) == gates_of(replace(design, gates="ray")) == "ray"
+    assert set(LAYOUTS) == {"grid", "density", "scan", "distributed", "fixed"}
 
 
 def test_distributed_rays_have_gates_of_their_own_or_of_their_sensor():

@@ -16,8 +16,8 @@ from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document
 from lidardesign.design.fit import fit
+from lidardesign.design.layouts.density import bandwidth_limit, shared_rays
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.layouts.shared_fields import bandwidth_limit, shared_rays
 from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor, tangent_coordinates
 from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace

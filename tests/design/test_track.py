@@ -20,11 +20,11 @@ from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import SCHEMA_FILE, design_document, design_from_document, load_design, save_design
 from lidardesign.design.fit import fit
-from lidardesign.design.layouts.along import Along, aimed_rays
 from lidardesign.design.layouts.quantise import lloyd
 from lidardesign.design.layouts.rays import lay_out
+from lidardesign.design.layouts.scan import fit_track
 from lidardesign.design.layouts.track import interpolated, placed, travels
-from lidardesign.design.layouts.track_fit import fit_track
+from lidardesign.design.layouts.track_kmeans import Along, aimed_rays
 from lidardesign.design.sensor import DesignSpec, Sensor, Track
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.run.yaml import dump_yaml, parse_yaml
@@ -230,7 +230,7 @@ def test_places_where_a_ray_sees_nothing_are_bridged():
 
 
 def test_every_update_of_the_cells_lowers_their_cost(monkeypatch):
-    from lidardesign.design.layouts import along as module
+    from lidardesign.design.layouts import track_kmeans as module
 
     costs = []
     cost = module._cost
@@ -611,6 +611,6 @@ def test_the_checked_bandwidth_is_that_of_the_dearest_position(widths):
 def test_the_error_of_a_tracks_likelihood_is_its_spread_over_other_samples():
     repeats = 24
     found = [fit_track(shelves(1500, seed), rays=2, knots=3) for seed in range(repeats)]
-    stated = np.mean([one.log_likelihood_error for one in found])
-    spread = np.std([one.log_likelihood for one in found])
+    stated = np.mean([one.log_likelihood.error for one in found])
+    spread = np.std([one.log_likelihood.value for one in found])
     assert stated == pytest.approx(spread, rel=4 / math.sqrt(2 * repeats))

@@ -208,8 +208,8 @@ class TestContradictions:
         def never(*_, **__):
             raise AssertionError("samples were asked for before the constraints")
 
-        for step in ("restrict_samples", "pin_samples", "choose_mounts", "fit_parts", "fit_scan"):
-            monkeypatch.setattr(f"lidardesign.design.fit.{step}", never)
+        for step in ("restrict_samples", "pin_samples", "choose_mounts", "fit_parts"):
+            monkeypatch.setattr(f"lidardesign.design.layouts.sensor_fit.{step}", never)
         samples = Samples(FACE.sample(10, np.random.default_rng(0)), np.zeros(10), np.zeros(10), FACE)
         files = [(values, {}) for values, _ in CONTRADICTIONS.values()]
         for values, asked in files if kind == "file" else [one[:2] for one in BUDGETS.values()]:

@@ -164,11 +164,12 @@ def _counts(designs: Sequence[DesignSpec], own: Sequence[int | None], run: RunFo
 
     Where a rig has fewer rays than the task's largest budget, its own number takes the place of those beyond it.
     """
-    from lidardesign.design.layouts.rays import own_count
+    from lidardesign.design.layouts.rays import layout_of
 
     if own[0] is not None and own[0] == own[1]:
         return [own[0]]
-    fixed = {design.name: own_count(design) for design in designs if design.layout == "fixed"}
+    sizes = {design.name: layout_of(design).most_count(design) for design in designs}
+    fixed = {name: size for name, size in sizes.items() if size is not None}
     usual = sorted(set(run.task.defaults.rays))
     if not fixed or min(fixed.values()) >= usual[-1]:
         return usual

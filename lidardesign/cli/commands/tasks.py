@@ -90,7 +90,10 @@ def _show_task(document: Mapping[str, Any], rich: RichConsole) -> None:
     rich.print(f"[bold]{escape(document['name'])}[/bold]: {escape(document['summary'])}")
     rich.print(f"metric: {escape(metric['name'])} \\[{escape(metric['unit'])}], {metric['better']} is better")
     # a scan has as many sensors as rays
-    sensors = "" if defaults["layout"] == "scan" else f"{defaults['sensors']} sensors, "
+    from lidardesign.design.layouts.rays import LAYOUTS
+
+    layout = LAYOUTS.get(defaults["layout"])
+    sensors = "" if layout is not None and layout.one_sensor_per_ray else f"{defaults['sensors']} sensors, "
     usual = f"{sensors}layout {defaults['layout']}, level {defaults['level']:g}"
     rich.print(f"defaults: {usual}, evaluated at {', '.join(map(str, defaults['rays']))} rays", markup=False)
     _show_keys(document["config"], "configuration (--set KEY=VALUE)", rich)

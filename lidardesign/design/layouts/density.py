@@ -23,7 +23,7 @@ from lidardesign.design.layouts.gates import Heard, gates_within
 from lidardesign.design.layouts.grid import field_on_sphere, grid_tangent
 from lidardesign.design.layouts.layout import FittedDesign, Layout, missing_samples, shares_of
 from lidardesign.design.layouts.quantise import lloyd, samples_for
-from lidardesign.design.layouts.sensor_fit import FitRequest
+from lidardesign.design.layouts.sensor_fit import FitProblem
 from lidardesign.design.mixture.bounds import bounds_of
 from lidardesign.design.sensor import (
     DesignSpec,
@@ -55,7 +55,7 @@ class DensityLayout(Layout):
         """See `Layout`."""
         return True
 
-    def fit(self, request: FitRequest) -> FittedDesign:
+    def fit(self, request: FitProblem) -> FittedDesign:
         """See `Layout`."""
         if request.gates == "ray" and request.budget.rays is not None:
             # the gates of rays keep the budget, not those of sensors

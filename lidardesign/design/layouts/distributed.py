@@ -35,16 +35,16 @@ from scipy.special import chdtri, ndtri
 
 from lidardesign.design.constraints.document import Constraints, SensorRules, rules_of
 from lidardesign.design.constraints.origins import box_around, free_boxes, inside_excluded, origin_box
+from lidardesign.design.layouts.fields import FIELD_ROUNDING_RAD, SMALLEST_ANGLE_RAD, SMALLEST_LENGTH
 from lidardesign.design.layouts.gates import SMALLEST_CELL, central_intervals, kept_gates
 from lidardesign.design.layouts.grid import field_on_sphere, low_discrepancy
-from lidardesign.design.layouts.quantise import lloyd, samples_for
-from lidardesign.design.layouts.fields import FIELD_ROUNDING_RAD, SMALLEST_ANGLE_RAD, SMALLEST_LENGTH
 from lidardesign.design.layouts.layout import Layout, shares_of
-from lidardesign.geometry.rays import DEFAULT_RATE_HZ, Rays, fire_times
+from lidardesign.design.layouts.quantise import lloyd, samples_for
 from lidardesign.design.mixture.bounds import Bounds, bounds_of
 from lidardesign.design.mixture.coupling import conditional_means, conditional_spreads, relative
 from lidardesign.design.mixture.features import Axes, Features, ray_features
 from lidardesign.design.sensor import DesignSpec, Gates, Sensor, interval_factor, tangent_directions
+from lidardesign.geometry.rays import DEFAULT_RATE_HZ, Rays, fire_times
 from lidardesign.numerics import ROUNDING, SLACK, angle_over_sine, systematic_draw
 from lidardesign.samples import Samples
 from lidardesign.space import AZIMUTH, ELEVATION, FULL_TURN, RANGE, DesignSpace, aim, angles, direction, observed_point
@@ -191,7 +191,8 @@ class DistributedLayout(Layout):
     name = "distributed"
     fitted_as = "distributed"
     usual_gates = "ray"
-    ray_gates_need_samples = False
+    starts_at_sensors = False
+    extends_origins = True
 
     def needs_samples(self, spec: DesignSpec, count: int | None, gates: Gates) -> bool:
         """See `Layout`: the sensors alone will do."""

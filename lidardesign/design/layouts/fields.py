@@ -151,7 +151,10 @@ class GridLayout(Layout):
 
 
 def rays_in_fields(spec: DesignSpec, tangents: Sequence[np.ndarray], gate_m: np.ndarray | None = None) -> Rays:
-    """Rays at angles (N, 2) [rad] in the tangent plane of each sensor, from its mean origin; gates are its own if None."""
+    """Rays at angles (N, 2) [rad] in the tangent plane of each sensor, from its mean origin.
+
+    Without gates (N, 2) [m], rays have those of their sensors.
+    """
     sensor = np.repeat(np.arange(len(tangents)), [len(tangent) for tangent in tangents])
     looking = [tangent_directions(s.frame, tangent) for s, tangent in zip(spec.sensors, tangents, strict=True)]
     origin = np.array([s.origin_m for s in spec.sensors], dtype=np.float64)[sensor]

@@ -12,8 +12,8 @@ import numpy as np
 
 from lidardesign.design.bandwidth import split_budget
 from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.layouts.sensor_fit import FitProblem, fit_sensors
 from lidardesign.design.layouts.track import placed
-from lidardesign.design.layouts.sensor_fit import FitRequest, fit_sensors
 from lidardesign.design.mixture.conditions import fixed_conditions
 from lidardesign.design.mixture.ensemble import Ensemble
 from lidardesign.design.mixture.mixture import log_density
@@ -53,7 +53,9 @@ class Layout(ABC):
         usual_gates: Whether rays have their sensor's gate or their own, where nothing else is said.
         one_sensor_per_ray: Whether every ray is a sensor of its own: another number of rays is another fit.
         follows_from_sensors: Whether the sensors alone say where rays go.
-        ray_gates_need_samples: Whether gates of single rays follow from samples alone.
+        starts_at_sensors: Whether rays start where their sensor stands.
+        extends_origins: Whether rays start across their sensor's origins; then they have gates of their own, without
+            samples too.
     """
 
     name: ClassVar[LayoutName]
@@ -61,7 +63,8 @@ class Layout(ABC):
     usual_gates: ClassVar[Gates] = "sensor"
     one_sensor_per_ray: ClassVar[bool] = False
     follows_from_sensors: ClassVar[bool] = True
-    ray_gates_need_samples: ClassVar[bool] = True
+    starts_at_sensors: ClassVar[bool] = True
+    extends_origins: ClassVar[bool] = False
 
     def check_constraints(self, constraints: Constraints) -> None:  # noqa: B027
         """Refuse constraints that sensors of this layout cannot have.
@@ -70,7 +73,7 @@ class Layout(ABC):
             ConfigError: See above.
         """
 
-    def fit(self, request: FitRequest) -> FittedDesign:
+    def fit(self, request: FitProblem) -> FittedDesign:
         """Sensors as a mixture of the samples, and their rays where the sensors alone do not say them.
 
         Raises:
@@ -86,7 +89,7 @@ class Layout(ABC):
             constraints=request.constraints.as_document(),
             level=request.level,
             at=fixed_conditions(request.samples.space),
-            gates=request.gates,
+            gates=None if request.gates == self.usual_gates else request.gates,
         )
         if fitted.rays is not None:
             counts = split_budget(np.array([sensor.weight for sensor in sensors]), fitted.rays)
@@ -99,7 +102,7 @@ class Layout(ABC):
         return FittedDesign(design, score, fitted.supports, fitted.ensemble.notes)
 
     @phase("rays")
-    def _ray_table(self, design: DesignSpec, request: FitRequest) -> Rays:
+    def _ray_table(self, design: DesignSpec, request: FitProblem) -> Rays:
         here = placed(design, design.at) if design.at else design
         return self.lay_out(here, design.rays, request.samples, request.gates, request.seed).as_angles()
 

@@ -77,18 +77,9 @@ def layout_of(design: DesignSpec) -> Layout:
     return LAYOUTS[design.layout] if design.track is None else TRACK
 
 
-def gates_of(design: DesignSpec, samples: Samples | None = None) -> Gates:
-    """The gates that a design's rays have at any number of rays: its own, else those that its rays tell of.
-
-    A table tells by two rays of one sensor. Gates per ray that follow from samples alone are the sensors' without any.
-    """
-    layout, table = layout_of(design), design.ray_table
-    gates = design.gates or layout.usual_gates
-    if design.gates is None and table is not None:
-        _, first, sensor = np.unique(table.sensor, return_index=True, return_inverse=True)
-        if len(first) < len(sensor):
-            gates = "ray" if (table.gate_m != table.gate_m[first[sensor]]).any() else "sensor"
-    return "sensor" if samples is None and layout.ray_gates_need_samples else gates
+def gates_of(design: DesignSpec) -> Gates:
+    """The gates that a design's rays have at any number of rays: as it says, else as its table tells, else as usual."""
+    return design.gates or design.table_gates or layout_of(design).usual_gates
 
 
 def own_count(design: DesignSpec) -> int:
@@ -124,7 +115,7 @@ def lay_out(
         count: Rays per frame; None takes the design's own number.
         samples: Samples of the density, where rays or their gates follow from them.
         gates: `sensor` gives each ray its sensor's gate; `ray` the interval of the ranges seen around it; None is
-            `gates_of` the design.
+            `gates_of` the design, its sensors' where there are no samples to find others by.
         rate_hz: Frames per second [Hz].
         seed: For the quantisation.
         at: Condition values, as {"x_m": 0.37}: a track gives its rays there, and any other design moves there as
@@ -145,7 +136,8 @@ def lay_out(
         rays = here.ray_table
     else:
         layout = layout_of(here)
-        gates = gates or gates_of(design, samples)
+        if gates is None:
+            gates = gates_of(design) if samples is not None or layout.extends_origins else "sensor"
         if samples is not None and samples.space.conditioned:
             needed = layout.needs_samples(here, total, gates)
             # where the sensors alone will do, samples that cannot be moved are left out

@@ -17,9 +17,9 @@ origins free in a 10 cm box at 196 rays 25 mm with origins and directions, 11.3 
 Of samples with a free condition, as the position of a robot that drives by, a scan is a track: rays for every value of
 it. Where they aim is said in `track_kmeans`: cells of what is observed, at every value of the condition. The gate of a
 ray is the central level of what its samples observe, projected onto it, over `GATE_REACH` knots on either side, inside
-the constraints at every knot and therefore in between. The kernel of knot p is its hat function, so the bandwidth is the
-distance of knots, and every sample counts once in all. Knots lie 0.1 m apart, over which what is seen of a scene hardly
-changes, or further where fewer samples than `SAMPLES_PER_CELL` would be left for each ray of a knot.
+the constraints at every knot and therefore in between. The kernel of knot p is its hat function, so the bandwidth is
+the distance of knots, and every sample counts once in all. Knots lie 0.1 m apart, over which what is seen of a scene
+hardly changes, or further where fewer samples than `SAMPLES_PER_CELL` would be left for each ray of a knot.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from lidardesign.design.layouts.fields import members, ray_gates, rays_in_fields
 from lidardesign.design.layouts.gates import admissible_gates, central_intervals
 from lidardesign.design.layouts.layout import FittedDesign, Layout, likelihood_estimate, missing_samples, shares_of
 from lidardesign.design.layouts.quantise import SAMPLES_PER_RAY, lloyd
-from lidardesign.design.layouts.sensor_fit import FitRequest, admitted_samples, group_samples
+from lidardesign.design.layouts.sensor_fit import FitProblem, admitted_samples, group_samples
 from lidardesign.design.layouts.track import TRAVELLED, boresight_azimuth, interpolated
 from lidardesign.design.layouts.track_kmeans import Along, aimed_rays
 from lidardesign.design.mixture.bounds import Bounds, Group, bounds_of
@@ -75,6 +75,7 @@ class ScanLayout(Layout):
     name = "scan"
     fitted_as = "scan"
     one_sensor_per_ray = True
+    starts_at_sensors = False
 
     def check_constraints(self, constraints: Constraints) -> None:
         """See `Layout`."""
@@ -106,7 +107,7 @@ class ScanLayout(Layout):
         """See `Layout`."""
         return gates == "ray" or count != self.own_count(spec)
 
-    def fit(self, request: FitRequest) -> FittedDesign:
+    def fit(self, request: FitProblem) -> FittedDesign:
         """See `Layout`; of samples with a free condition, a track."""
         if request.samples.space.conditioned:
             return fit_track(
@@ -165,7 +166,7 @@ class TrackLayout(ScanLayout):
 
 
 @phase("scan")
-def _fit_cells(samples: GroupSamples, count: int, request: FitRequest) -> Ensemble:
+def _fit_cells(samples: GroupSamples, count: int, request: FitProblem) -> Ensemble:
     """One component per ray, of the cells of what rays look at.
 
     Raises:

@@ -39,7 +39,7 @@ HELD_OUT_SHARE = 1 / 3
 
 
 @dataclass(frozen=True, eq=False)
-class FitRequest:
+class FitProblem:
     """Everything that a fit is asked for, with the defaults filled in.
 
     Arguments:
@@ -87,7 +87,7 @@ class FittedSensors(NamedTuple):
     supports: list[Support]
 
 
-def fit_sensors(request: FitRequest) -> FittedSensors:
+def fit_sensors(request: FitProblem) -> FittedSensors:
     """Sensors that keep the constraints and the budget."""
     counts = _sensor_counts(request)
     if is_mounted(request.rules):
@@ -100,11 +100,11 @@ def fit_sensors(request: FitRequest) -> FittedSensors:
     fitted = fit_parts(group_samples(request, supports, count), request.seed, request.restarts)
     ensemble, rays = fit_within_budget(fitted, Ensemble.narrowed, lambda e: (e.widths_m, e.weights), request.budget)
     sensors = add_couplings(ensemble, sensors_of(ensemble, request.samples.space, request.level))
-    sensors = sensors if len(request.rules) > 1 else heaviest_first(sensors)
+    sensors = sensors if request.constraints.each else heaviest_first(sensors)
     return FittedSensors(sensors, rays, ensemble, supports)
 
 
-def _sensor_counts(request: FitRequest) -> list[int]:
+def _sensor_counts(request: FitProblem) -> list[int]:
     """The numbers of sensors to try: one where it is said, a range for `auto`; none without a ray if that can be."""
     constraints, sensors = request.constraints, request.sensors
     asked = constraints.sensors
@@ -122,7 +122,7 @@ def _sensor_counts(request: FitRequest) -> list[int]:
 
 
 @phase("support")
-def admitted_samples(request: FitRequest, count: int) -> list[Support]:
+def admitted_samples(request: FitProblem, count: int) -> list[Support]:
     """The samples of each group of sensors, refused where they are too few."""
     supports = []
     members = groups(request.rules, request.samples.space, count)
@@ -142,7 +142,7 @@ def admitted_samples(request: FitRequest, count: int) -> list[Support]:
 
 
 @phase("features")
-def group_samples(request: FitRequest, supports: list[Support], count: int) -> list[GroupSamples]:
+def group_samples(request: FitProblem, supports: list[Support], count: int) -> list[GroupSamples]:
     """Features, bounds and shares of each group of sensors.
 
     Pinned groups share by how much density each pinned origin sees; against groups with a free origin, whose
@@ -168,7 +168,7 @@ def group_samples(request: FitRequest, supports: list[Support], count: int) -> l
     return parts
 
 
-def _best_count(request: FitRequest, supports: list[Support], counts: list[int]) -> int:
+def _best_count(request: FitProblem, supports: list[Support], counts: list[int]) -> int:
     """The smallest number of sensors within one standard error of the best held-out log-likelihood."""
     scores: dict[int, tuple[float, float]] = {}
     waiting, best = 0, -math.inf

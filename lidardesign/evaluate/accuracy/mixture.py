@@ -17,14 +17,16 @@ import numpy as np
 
 from lidardesign.config import FILE_NAME as CONFIG_FILE
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.fit import EM_SAMPLES, HELD_OUT_SHARE, RESTARTS
+from lidardesign.design.fit import EM_SAMPLES, RESTARTS
+from lidardesign.design.layouts.rays import layout_of
+from lidardesign.design.layouts.sensor_fit import HELD_OUT_SHARE
 from lidardesign.design.mixture.bounds import Bounds, bounds_of, groups
 from lidardesign.design.mixture.conditions import MOVED_SAMPLES, at_condition, shown
 from lidardesign.design.mixture.em import fit_mixture
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.mixture import log_density
 from lidardesign.design.mixture.support import LEAST_SAMPLES
-from lidardesign.design.sensor import DesignSpec, fitted_layout, interval_factor
+from lidardesign.design.sensor import DesignSpec, interval_factor
 from lidardesign.evaluate.accuracy.settings import Ladder, Rung, with_memory
 from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
 from lidardesign.numerics import effective_count, systematic_draw
@@ -48,7 +50,7 @@ BECAUSE = "log densities that are 0.01 nats lower have one ray in a hundred fewe
 
 def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
     """Two ladders for the fit of the first design whose sensors are Gaussian; none for scans."""
-    design = next((one for one in request.request.designs if one.layout != "scan" and one.track is None), None)
+    design = next((one for one in request.request.designs if not layout_of(one).one_sensor_per_ray), None)
     samples = None if design is None else _samples(request, design)
     if design is None or samples is None or effective_count(samples.weights) < LEAST_SAMPLES:
         return []
@@ -103,7 +105,7 @@ def _command_seconds(run: Path, design: DesignSpec) -> float | None:
     needed = [run / name for name in (CONFIG_FILE, MANIFEST_FILE, FILE_NAME)]
     if not all(path.exists() for path in needed):
         return None
-    options = ["--sensors", str(len(design.sensors)), "--layout", fitted_layout(design.layout)]
+    options = ["--sensors", str(len(design.sensors)), "--layout", layout_of(design).fitted_as]
     options += ["--level", str(design.level)]
     options += [] if design.rays is None else ["--rays", str(design.rays)]
     options += [option for name, value in design.at.items() for option in ("--at", f"{name}={value}")]

@@ -15,10 +15,9 @@ from lidardesign.density.target.target import Target
 from lidardesign.density.training.quality import Probes, draw_probes, measure
 from lidardesign.density.training.schedule import goal_of
 from lidardesign.density.training.snapshot_quality import Reached, load_flow, remeasured
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.fit import fit
-from lidardesign.design.layouts.rays import gates_of
-from lidardesign.design.sensor import DesignSpec, fitted_layout
+from lidardesign.design.fit import fit_like
+from lidardesign.design.layouts.rays import layout_of
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import LidardesignError
 from lidardesign.estimates import Estimate
 from lidardesign.evaluate.accuracy.probes import ERROR_OF, run_target
@@ -218,21 +217,16 @@ class _Judge:
             return None
 
     def _fitted(self, design: DesignSpec, samples: Samples) -> DesignSpec:
-        one_per_ray = design.layout == "scan" or design.track is not None
-        return fit(
+        is_open = design.ray_table is None and layout_of(design).leaves_rays_open(design.gates)
+        return fit_like(
+            design,
             samples,
-            sensors=None if one_per_ray else len(design.sensors),
-            layout=fitted_layout(design.layout),
-            rays=None if design.layout == "grid" and design.ray_table is None else self._rays,
-            constraints=Constraints.from_mapping(dict(design.constraints), where=f"constraints of {design.name}"),
+            rays=None if is_open else self._rays,
             seed=self._asked.seed,
             restarts=RESTARTS,
             em_samples=EM_SAMPLES,
-            level=design.level,
-            name=design.name,
-            gates=None if one_per_ray else gates_of(design, samples),
             retarget=self._retarget,
-        ).design
+        )
 
     def _score(self, scene: Scene, casters: Sequence[SceneCaster], positions: Positions) -> float:
         planner = self._asked.planner

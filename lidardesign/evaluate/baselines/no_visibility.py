@@ -14,10 +14,8 @@ from typing import Protocol
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.fit import fit
-from lidardesign.design.layouts.rays import gates_of
-from lidardesign.design.sensor import DesignSpec, fitted_layout
+from lidardesign.design.fit import fit_like
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.evaluate.baselines.candidates import Positions, mean_mbps
 from lidardesign.geometry.rays import Rays
 from lidardesign.samples import Samples
@@ -36,7 +34,7 @@ class LayOut(Protocol):
     def __call__(
         self, design: DesignSpec, count: int, samples: Samples | None, *, at: Mapping[str, float] | None = None
     ) -> Rays:
-        """As `lidardesign.design.layouts.rays.lay_out`."""
+        """As `lidardesign.design.fit.rays_at`."""
         ...
 
 
@@ -49,20 +47,9 @@ def fitted_twin(design: DesignSpec, samples: Samples, *, name: str, retarget: Lo
         name: Of the twin.
         retarget: log p* of the other density, where the fit needs it.
     """
-    one_per_ray = design.layout == "scan" or design.track is not None
     seed = design.provenance.get("seed", 0)
-    return fit(
-        samples,
-        sensors=None if one_per_ray else len(design.sensors),
-        layout=fitted_layout(design.layout),
-        rays=design.rays,
-        constraints=Constraints.from_mapping(dict(design.constraints), where=f"constraints of {design.name}"),
-        seed=seed if isinstance(seed, int) else 0,
-        level=design.level,
-        name=name,
-        gates=None if one_per_ray else gates_of(design, samples),
-        retarget=retarget,
-    ).design
+    seed = seed if isinstance(seed, int) else 0
+    return fit_like(design, samples, rays=design.rays, seed=seed, name=name, retarget=retarget)
 
 
 class TwinCandidate:

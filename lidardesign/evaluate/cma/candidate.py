@@ -18,6 +18,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints, Gate
 from lidardesign.design.files import design_document
+from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import MOST_RAYS, DesignSpec
 from lidardesign.evaluate.baselines.candidates import Positions, opened_gate, whole_range
 from lidardesign.evaluate.baselines.observed import TrainingViews, dense_points
@@ -40,8 +41,6 @@ TRACK_PLACES = 2
 MOST_RAYS_FACTOR = 4
 
 DEFAULT_SECONDS = 60.0
-# Layouts whose rays follow from the sensors alone.
-OWN_LAYOUTS = ("grid", "scan", "distributed")
 
 Show = Callable[[str, Progress], None]
 
@@ -203,7 +202,7 @@ class CmaCandidate:
 
     def _setting(self, amount: Amount) -> Setting:
         design = self.followed
-        layout = design.layout if design.layout in OWN_LAYOUTS else "grid"
+        layout = design.layout if layout_of(design).follows_from_sensors else "grid"
         space = self.space
         if space.conditioned:
             bolted = self.conditions[len(self.conditions) // 2] if design.track is None else {}
@@ -226,7 +225,7 @@ class CmaCandidate:
         if self.followed.track is not None:
             return self._tracks(setting, views, amount, document)
         count = len(self.followed.sensors)
-        if setting.layout == "scan":
+        if setting.one_sensor_per_ray:
             count = self._scan_rays(amount)
         return [SensorModel(setting, one, self.conditions, document) for one in starts(setting, views, count)]
 

@@ -65,7 +65,7 @@ class SensorCoordinates:
         """Names and widths of what one sensor's part of a vector holds."""
         axes, setting = self.setting.axes, self.setting
         spread = len(setting.spread_axes)
-        whole = setting.layout != "scan"
+        whole = not setting.one_sensor_per_ray
         both = axes.angular == 2
         columns = [
             ("origin", len(axes.origin)),
@@ -320,12 +320,12 @@ class SensorModel:
 
     def _design(self, figures: Figures, count: int) -> DesignSpec:
         setting = self.setting
-        scan = setting.layout == "scan"
+        scan = setting.one_sensor_per_ray
         shares = np.ones(len(figures)) if scan and count else split_budget(np.exp(figures.log_weight), count)
         return DesignSpec(
             name="cma",
             sensors=sensors_of(figures, setting, [int(share) for share in shares]),
-            layout=setting.layout,  # type: ignore[arg-type]
+            layout=setting.layout,
             rays=count,
             constraints=self._document,
             level=setting.level,
@@ -333,7 +333,7 @@ class SensorModel:
         )
 
     def _count(self, figures: Figures, amount: Amount) -> int:
-        if self.setting.layout == "scan":
+        if self.setting.one_sensor_per_ray:
             return len(figures)
         if amount.count is not None:
             return amount.count
@@ -351,14 +351,14 @@ class SensorModel:
         return narrowed(cap) if cap > 0 else figures
 
     def _fits(self, figures: Figures, count: int, read_out: BandwidthBudget) -> bool:
-        if self.setting.layout == "scan":
+        if self.setting.one_sensor_per_ray:
             shares = np.full(len(figures), int(count > 0))
             return read_out.model.mbps_of_widths(_widths(figures), shares) <= (read_out.limit_mbps or math.inf)
         return read_out.fits(_widths(figures), np.exp(figures.log_weight), count)
 
     def _raised(self, figures: Figures, design: DesignSpec, amount: Amount) -> DesignSpec:
         """More rays, where gates of their own leave bandwidth over."""
-        if self.setting.layout != "distributed":
+        if not self.setting.extends_origins:
             return design
         for _ in range(MOST_RAISES):
             spent = mean_mbps(self.laid_out(design), amount.bandwidth)

@@ -18,9 +18,10 @@ import numpy as np
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.constraints.origins import Boxes, Mount, box_around, mounts_of, nearest_admitted
 from lidardesign.design.layouts.gates import admissible_gates
+from lidardesign.design.layouts.rays import LAYOUTS
 from lidardesign.design.mixture.bounds import Bounds, bounds_of, clip_azimuth
 from lidardesign.design.mixture.features import Axes
-from lidardesign.design.sensor import Coupling, Sensor, boresight_frame, interval_factor
+from lidardesign.design.sensor import Coupling, LayoutName, Sensor, boresight_frame, interval_factor
 from lidardesign.numerics import ROUNDING, SLACK, TINY, clipped_eigenvalues, safe_divide
 from lidardesign.space import DesignSpace, angles, direction
 
@@ -140,9 +141,19 @@ class Setting:
     space: DesignSpace
     constraints: Constraints
     level: float
-    layout: str
+    layout: LayoutName
     at: Mapping[str, float]
     gates: bool = True
+
+    @property
+    def one_sensor_per_ray(self) -> bool:
+        """Whether every ray is a sensor of its own, without spreads and weights to vary."""
+        return LAYOUTS[self.layout].one_sensor_per_ray
+
+    @property
+    def extends_origins(self) -> bool:
+        """Whether rays start across the origins of their sensor."""
+        return LAYOUTS[self.layout].extends_origins
 
     @property
     def interval(self) -> float:
@@ -158,7 +169,7 @@ class Setting:
     def spread_axes(self) -> tuple[int, ...]:
         """The axes along which sensors' rays start at different places; none where all sensors are held still."""
         still = all(rules.origin.fixed_m is not None or rules.origin.mounts_m for rules in self.constraints.rules)
-        return () if self.layout != "distributed" or still else self.axes.origin
+        return () if still or not self.extends_origins else self.axes.origin
 
     def bounds(self, count: int) -> Bounds:
         """The bounds of the first sensors."""

@@ -53,7 +53,7 @@ def starts(setting: Setting, views: TrainingViews, count: int) -> list[Start]:
         count: The number of sensors; of a scan, of rays.
     """
     observed = views.hits(dense_points(setting.space))
-    if setting.layout == "scan":
+    if setting.one_sensor_per_ray:
         return scan_starts(setting, views, observed, count)
     if setting.spread_axes:
         found = [*_focused(setting, observed, count), *_parallel(setting, observed, count), *_even(setting, count)]

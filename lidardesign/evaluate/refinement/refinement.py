@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from lidardesign.design.fit_result import FitResult
+from lidardesign.design.fit import FitResult
 from lidardesign.errors import InfeasibleError, NumericalError
 from lidardesign.evaluate.baselines.candidates import Positions
 from lidardesign.evaluate.refinement.attention import Attention

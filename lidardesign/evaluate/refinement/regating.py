@@ -13,8 +13,9 @@ import numpy as np
 from scipy.special import ndtri
 
 from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.layouts.density import bandwidth_limit
 from lidardesign.design.layouts.gates import Heard, gates_within
-from lidardesign.design.layouts.shared_fields import bandwidth_limit
+from lidardesign.design.layouts.rays import gates_of, layout_of
 from lidardesign.design.mixture.bounds import bounds_of
 from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor
 from lidardesign.geometry.raycast import SceneCaster
@@ -98,20 +99,12 @@ def has_ray_gates(design: DesignSpec) -> bool:
     """Whether every ray of a design has a gate of its own, which does not move along a track."""
     if design.track is not None:
         return False
-    if design.layout == "scan":
-        return True
-    table = design.ray_table
-    if table is None:
-        return False
-    first = np.unique(table.sensor, return_index=True, return_inverse=True)
-    return bool((table.gate_m != table.gate_m[first[1]][first[2].reshape(-1)]).any())
+    return layout_of(design).one_sensor_per_ray or (design.ray_table is not None and gates_of(design) == "ray")
 
 
 def _with_gates(design: DesignSpec, gates: np.ndarray) -> DesignSpec:
-    if design.layout != "scan":
-        table = design.ray_table
-        assert table is not None
-        return replace(design, ray_table=replace(table, gate_m=gates))
+    if design.ray_table is not None and not layout_of(design).one_sensor_per_ray:
+        return replace(design, ray_table=replace(design.ray_table, gate_m=gates))
     factor = interval_factor(design.level)
     sensors = [_gated(sensor, gate, factor) for sensor, gate in zip(design.sensors, gates, strict=True)]
     return replace(design, sensors=tuple(sensors))
