@@ -298,3 +298,15 @@ def test_no_epsilon_stands_outside_numerics():
                 if isinstance(node, ast.Attribute) and node.attr in FLOAT_LIMITS:
                     bare.append(f"{name}:{node.lineno}: .{node.attr}")
     assert not bare
+
+
+def test_no_test_imports_another_test():
+    """What tests share is in tests/support, so that a test can be read, moved and dropped by itself."""
+    folder = ROOT / "tests"
+    imports = [
+        f"{path.relative_to(folder)}: {node.module}"
+        for path in folder.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").rpartition(".")[2].startswith("test_")
+    ]
+    assert not imports

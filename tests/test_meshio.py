@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from support.meshes import BOX_FACES, BOX_VERTICES, write_box
 from support.tables import each_row
 
 from lidardesign.errors import DataError
@@ -17,21 +18,6 @@ from lidardesign.meshio import (
     load_mesh,
     signed_volume_m3,
 )
-
-BOX_VERTICES = np.array([(x, y, z) for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
-BOX_SIDES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-BOX_FACES = np.array([(a, *pair) for a, b, c, d in BOX_SIDES for pair in ((b, c), (c, d))])
-
-
-def write_box(path, vertices=BOX_VERTICES, faces=BOX_FACES):
-    trimesh = pytest.importorskip("trimesh")
-    content = trimesh.Trimesh(vertices, faces, process=False).export(file_type=path.suffix[1:])
-    if isinstance(content, dict):
-        for name in content.keys() - {"model.gltf"}:
-            path.with_name(name).write_bytes(content[name])
-        content = content["model.gltf"]
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return path
 
 
 @each_row("suffix", SUFFIXES)

@@ -14,10 +14,10 @@ import h5py
 import numpy as np
 import pytest
 from support.command_line import caller, files_under, make_run, program
+from support.mistakes import GARBAGE, GOOD, check_one_clear_message
 
 from lidardesign.run.yaml import dump_yaml, load_yaml
 
-GARBAGE = bytes(range(256)) * 8
 CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
 OPEN = CORNERS + "f 1 2 3\nf 1 2 4\n"
 EMPTY_PLY = (
@@ -200,20 +200,6 @@ def make_models(folder):
     (folder / "truncated.h5").write_bytes(content[: len(content) // 2])
 
 
-GOOD = """\
-schema_version: 1
-layout: grid
-rays: 100
-sensors:
-- name: one
-  weight: 1.0
-  origin_m: {mean: [0.4, 0.0, 0.0]}
-  boresight: {azimuth_rad: 3.14, elevation_rad: 0.0}
-  field_of_view_rad: {horizontal: 0.2, vertical: 0.25}
-  gate_m: {start: 0.25, end: 0.4}
-"""
-
-
 @pytest.fixture(scope="module")
 def mistakes(tmp_path_factory):
     """A folder with everything that can be got wrong in it."""
@@ -233,18 +219,6 @@ def mistakes(tmp_path_factory):
 @pytest.fixture
 def lidardesign(capsys, tmp_path, monkeypatch):
     return caller(capsys, tmp_path, monkeypatch)
-
-
-def check_one_clear_message(result, code, words):
-    """The message is short, says what it must, is the same in JSON, and the exit code is right."""
-    assert result.code == code, result.err
-    document = result.json
-    assert document["schema_version"] == 1
-    assert document["exit_code"] == code
-    assert document["error"]["message"]
-    assert words in result.err
-    assert "Traceback" not in result.err
-    assert len(result.err.strip().splitlines()) <= 5, result.err
 
 
 @pytest.mark.parametrize(("arguments", "code", "words"), CASES, ids=[case[0] for case in CASES])

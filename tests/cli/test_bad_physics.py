@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from cli.test_bad_input import GARBAGE, GOOD, check_one_clear_message
 from lidardesign_tasks.emitter import winding_number
 from lidardesign_tasks.flatland import FlatlandTask
 from support.command_line import caller, files_under, make_run
+from support.mistakes import GARBAGE, GOOD, check_one_clear_message
 
 from lidardesign.cli.output import EXIT_INTERRUPTED, Output, describe_error
 from lidardesign.errors import PluginError

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from cli.test_conditions_cli import make_conditioned_run
 from lidardesign_tasks.flatland import FlatlandTask
 from support.command_line import caller, make_run
+from support.conditioned_runs import make_conditioned_run
 
 from lidardesign.errors import PluginError
 from lidardesign.space import DesignSpace

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from density.test_learn import BallTask, config_of, result_bytes
+from support.learning import BallTask, config_of, result_bytes
 
 from lidardesign.config import LearningSettings
 from lidardesign.density.learn import learn, make_trainer

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import trimesh
 from scipy.spatial.transform import Rotation
 from support import references
+from support.meshes import icosphere
 
 from lidardesign.density.fields import grids
 from lidardesign.density.fields.distance import BodyField, TableField, UnionField, build_field
@@ -19,11 +19,6 @@ from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, ri
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("LIDARDESIGN_CACHE", str(tmp_path / "cache"))
-
-
-def icosphere(radius=0.5, centre=(0.0, 0.0, 0.0), sign="solid"):
-    mesh = trimesh.creation.icosphere(subdivisions=5, radius=radius)
-    return Mesh(mesh.vertices + np.asarray(centre), mesh.faces, sign)
 
 
 def field_of(*scenes, resolution=48):

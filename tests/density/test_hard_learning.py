@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import pytest
 from support.command_line import caller
+from support.learning import interrupt_after_a_checkpoint
 
-import lidardesign.density.learn as density_learn
 from lidardesign.density.training import quality as measure
-from lidardesign.density.training import training
 
 SETTINGS = (
     "size=small", "train=2", "test=1", "frames=6", "learning.steps=40", "learning.batch=64", "learning.samples=1000",
@@ -27,25 +24,6 @@ def lidardesign(capsys, tmp_path, monkeypatch):
 def learn(lidardesign, out, *further):
     options = [word for setting in SETTINGS for word in ("--set", setting)]
     return lidardesign("learn", "arm", "--preset", "draft", "--out", out, *options, *further, "--json")
-
-
-def interrupt_after_a_checkpoint(monkeypatch, folder):
-    """Make learning stop as Ctrl-C does, once the folder has a checkpoint and more steps were made."""
-    learn_density, seen = density_learn.learn, SimpleNamespace(step=None)
-
-    def interrupted(*arguments, progress, **options):
-        def stop(now):
-            progress(now)
-            if (folder / "checkpoint.safetensors").exists():
-                seen.step = now.step if seen.step is None else seen.step
-                if now.step > seen.step:
-                    raise KeyboardInterrupt
-
-        return learn_density(*arguments, progress=stop, **options)
-
-    monkeypatch.setattr(density_learn, "learn", interrupted)
-    monkeypatch.setattr(training, "SNAPSHOT_STEPS", 7)
-    monkeypatch.setattr(training, "PROGRESS_STEPS", 2)
 
 
 @pytest.mark.slow

@@ -9,10 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from support.small_runs import shifted
+from support.learning import SPACE, BallTask, Interrupter, a_trainer, config_of, result_bytes
 from support.tables import each_row
 
-from lidardesign.config import DensitySettings, LearningSettings, RunConfig
 from lidardesign.density import learn as learning
 from lidardesign.density.learn import learn
 from lidardesign.density.target.prepare import prepare_target
@@ -23,61 +22,13 @@ from lidardesign.density.training.quality import log_density_of
 from lidardesign.density.training.training_data import prepare_ground
 from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.samples import load_samples
-from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
-from lidardesign.task import Defaults, Metric, TaskConfig
-
-SPACE = DesignSpace((0, 0, 0, -0.4, 0, 0.2), (0, 0, 0, 0.4, 0, 2.5))
-SMALL = {
-    "steps": 120, "batch": 48, "layers": 1, "hidden": 12, "bins": 8, "samples": 2000, "balance_proposals": 512,
-    "coverage_proposals": 512, "checkpoint_seconds": 1e-9,
-}  # fmt: skip
-
-
-class BallTask:
-    """One ball in front of the sensor."""
-
-    name, summary, api_version = "ball", "one ball", 1
-    Config = TaskConfig
-    metric = Metric("hits", "-", "higher", 0.0, 0.0)
-    defaults = Defaults()
-
-    def space(self, config):
-        return SPACE
-
-    def scenes(self, config, split, seed):
-        return [Scene((Body(Sphere(0.5), poses=rigid(translation_m=(1.5, 0, 0))),))]
-
-    def score(self, scene, returns):
-        raise NotImplementedError
-
-
-def config_of(space=SPACE, seed=3, **settings):
-    return RunConfig(
-        task_name="ball", seed=shifted(seed), preset="draft", task=TaskConfig(), space=space,
-        density=DensitySettings(sigma_m=0.05), learning=LearningSettings(**{**SMALL, **settings}),
-    )  # fmt: skip
-
-
-def result_bytes(run):
-    return (run / "flow.safetensors").read_bytes(), (run / "samples.npz").read_bytes()
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     run = tmp_path_factory.mktemp("finished")
     return run, learn(BallTask(), config_of(), run)
-
-
-class Interrupter:
-    """A progress callback that presses Ctrl-C at a step."""
-
-    def __init__(self, step):
-        self.step = step
-
-    def __call__(self, progress):
-        if progress.step == self.step:
-            raise KeyboardInterrupt
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(finished, tmp_path):
@@ -109,11 +60,6 @@ def test_proposals_on_the_faces_of_the_space_are_inside_the_flows_box(monkeypatc
     pool = prepare_ground(BallTask(), config_of()).pool
     assert SPACE.contains(points).all()
     assert float(pool.unit.abs().max()) == 1.0
-
-
-def a_trainer(run):
-    config = config_of()
-    return learning.make_trainer(prepare_ground(BallTask(), config), config, run, torch.device("cpu"))
 
 
 def test_weights_taken_back_to_the_start_forget_the_moments_of_later_steps(tmp_path):

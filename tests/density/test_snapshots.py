@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from density.test_learn import BallTask, Interrupter, config_of
 from hypothesis import given
 from hypothesis import strategies as st
+from support.learning import BallTask, Interrupter, config_of
 from support.tables import each_row
 
 from lidardesign.config import LearningSettings

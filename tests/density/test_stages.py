@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from density.test_learn import BallTask, Interrupter, config_of, result_bytes
+from support.learning import BallTask, Interrupter, config_of, result_bytes
 
 from lidardesign.config import save_run_config
 from lidardesign.density.learn import learn

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.special import chdtri
+from support.rings import CEILING, RING
 from support.tables import each_row
 
 from lidardesign.design.files import design_document, design_from_document
@@ -19,10 +19,8 @@ from lidardesign.design.layouts.grid import low_discrepancy
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.mixture.coupling import coupling_of
 from lidardesign.design.sensor import Sensor, tangent_directions
-from lidardesign.samples import Samples
-from lidardesign.space import DesignSpace, aim, angles, direction, observed_point
+from lidardesign.space import angles, observed_point
 
-CEILING = DesignSpace((-0.6, -0.6, 1.0, 0.0, -math.pi / 2, 0.2), (0.6, 0.6, 1.0, 2 * math.pi, -math.pi / 3, 1.2))
 SLOPES = np.array([[0.4, -0.2, 0.1], [0.3, 0.5, -0.3]])
 RANGE_SLOPES, ANGLE_SLOPES = np.array([0.2, -0.1, 0.3]), np.array([0.25, -0.4])
 
@@ -43,21 +41,6 @@ def planted(count=20_000, seed=0):
     return sensor, np.column_stack([x + sensor.origin_m, azimuth, elevation, r])
 
 
-def ring(count=12_000, seed=0):
-    """Samples from a ceiling of points in a box, with the steep rays blocked."""
-    generator = np.random.default_rng(seed)
-    scene = np.array([0.0, 0.0, 0.35]) + generator.uniform(-1, 1, (count, 3)) * [0.25, 0.3, 0.15]
-    polar = np.arccos(generator.uniform(math.cos(math.radians(29)), math.cos(math.radians(15)), count))
-    looking = direction(generator.uniform(0, 2 * math.pi, count), polar - math.pi / 2)
-    origin = scene - looking * ((scene[:, 2] - 1.0) / looking[:, 2])[:, None]
-    points = aim(origin, scene)
-    points = points[CEILING.contains(points)]
-    points[:, 2] = 1.0
-    level = np.zeros(len(points))
-    return Samples(points, level, level, CEILING)
-
-
-RING = ring()
 FITTED = fit(RING, sensors=3, layout="distributed", rays=120, em_samples=4000, restarts=2)
 
 

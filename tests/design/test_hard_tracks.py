@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from cli.test_conditions_cli import make_conditioned_run
 from support.command_line import caller
+from support.conditioned_runs import make_conditioned_run
 from support.tables import each_row
 
 from lidardesign.design.files import design_from_document

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from design.test_distributed import RING
-from design.test_rays import drawn_from, three_sensors
-from design.test_track import SAMPLES as AISLE_SAMPLES
+from support.aisles import SAMPLES as AISLE_SAMPLES
 from support.command_line import caller, make_run
+from support.designs import drawn_from, three_sensors
+from support.rings import RING
 
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import load_design

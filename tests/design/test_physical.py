@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support import references
+from support.designs import from_the_ceiling
 from support.tables import each_row
 
 from lidardesign.design.constraints.check import check_design
@@ -26,19 +27,8 @@ from lidardesign.simulate.simulate import simulate
 from lidardesign.space import DesignSpace, aim, angles, direction
 
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-CEILING = DesignSpace((-0.6, -0.5, 1.0, 0.0, -math.pi / 2, 0.2), (0.6, 0.7, 1.0, 2 * math.pi, -0.9, 1.3))
 SPHERE = DesignSpace((0, 0, 0, 0, -math.pi / 2, 0.1), (0, 0, 0, 2 * math.pi, math.pi / 2, 2.0))
 CUBE = DesignSpace((-1, -1, -1, 0, -math.pi / 2, 0.1), (1, 1, 1, 2 * math.pi, math.pi / 2, 3.0))
-
-
-def from_the_ceiling(count=6000, seed=0):
-    generator = np.random.default_rng(seed)
-    scene = np.array([0.1, 0.0, 0.3]) + generator.uniform(-1, 1, (count, 3)) * [0.2, 0.3, 0.1]
-    origin = np.column_stack([generator.uniform(-0.6, 0.6, count), generator.uniform(-0.5, 0.7, count), np.ones(count)])
-    points = aim(origin, scene)
-    points = points[CEILING.contains(points)]
-    log_weights = np.random.default_rng(1).normal(0, 0.3, len(points))
-    return Samples(points, np.zeros(len(points)), log_weights, CEILING)
 
 
 @pytest.mark.parametrize("layout", ["grid", "density", "distributed", "scan"])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.designs import SPACE, drawn_from, sensor, three_sensors
 from support.tables import each_row
 
 from lidardesign.design.bandwidth import split_budget
@@ -17,50 +18,15 @@ from lidardesign.design.layouts.rays import LAYOUTS, gates_of, lay_out, own_coun
 from lidardesign.design.sensor import (
     MOST_RAYS,
     DesignSpec,
-    Sensor,
     Track,
     interval_factor,
     tangent_coordinates,
-    tangent_directions,
 )
 from lidardesign.errors import ConfigError
 from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace, angles, direction
 
-SPACE = DesignSpace((-5, -5, -5, 0, -math.pi / 2, 0), (5, 5, 5, 2 * math.pi, math.pi / 2, 10))
 TURN = 0.7
-
-
-def sensor(name="s", weight=1.0, **changes):
-    values = {
-        "origin_m": np.array([0.1, -0.2, 0.3]), "origin_covariance_m2": np.zeros((3, 3)),
-        "azimuth_rad": 1.0, "elevation_rad": -0.3, "roll_rad": 0.2, "spread_horizontal_rad": 0.12,
-        "spread_vertical_rad": 0.06, "range_m": 1.0, "spread_range_m": 0.1, **changes,
-    }  # fmt: skip
-    return Sensor(name=name, weight=weight, **values)
-
-
-def three_sensors(**changes):
-    return (
-        sensor("a", 0.5, azimuth_rad=0.2, **changes),
-        sensor("b", 0.3, azimuth_rad=1.0, elevation_rad=0.9, **changes),
-        sensor("c", 0.2, azimuth_rad=2.5, spread_range_m=0.3, **changes),
-    )
-
-
-def drawn_from(design, count=6000, seed=0):
-    """Samples of the mixture itself, with random weights."""
-    generator = np.random.default_rng(seed)
-    parts = []
-    for component, n in zip(design.sensors, split_budget(design.weights, count), strict=True):
-        tangent = generator.normal(0, [0.12, 0.06], (n, 2))
-        azimuth, elevation = angles(tangent_directions(component.frame, tangent))
-        distance = np.abs(generator.normal(component.range_m, component.spread_range_m, n))
-        origin = np.tile(component.origin_m, (n, 1))
-        parts.append(np.column_stack([origin, azimuth, elevation, distance]))
-    points = np.concatenate(parts)
-    log_weights = generator.normal(0, 0.3, len(points))
-    return Samples(points, np.zeros(len(points)), log_weights, SPACE)
 
 
 def turned(design, samples, angle):

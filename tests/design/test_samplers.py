@@ -8,12 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from density.test_flow import FLOWS, draw, flow_of
-from design.test_mixture import POINT, features_of, random_mixture
-from design.test_mixture import drawn as drawn_from_mixture
-from design.test_rays import sensor
 from scipy.stats import chi2, norm
 from support.chi_square import UNLIKELY, counts_of_cells, mass_of_cells, p_value, pooled
+from support.designs import sensor
+from support.flows import FLOWS, draw, flow_of
+from support.mixtures import POINT, features_of, random_mixture
+from support.mixtures import drawn as drawn_from_mixture
 from support.tables import each_row
 
 from lidardesign.density.flow.objective import Coordinates

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.aisles import AISLE, SAMPLES, shelves
 from support.tables import each_row
 
 from lidardesign.design.bandwidth import Bandwidth
@@ -31,27 +32,9 @@ from lidardesign.run.yaml import dump_yaml, parse_yaml
 from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace, angles
 
-AISLE = DesignSpace(
-    (-0.5, 0.0, 0.0, -math.pi / 2, 0.0, 0.1), (4.0, 0.0, 0.0, -math.pi / 2, math.pi / 2, 5.0), condition=("x_m",),
-    measure="angles",
-)  # fmt: skip
 SCHEMA = json.loads(SCHEMA_FILE.read_text())
 
 
-def shelves(count=12_000, seed=0, space=AISLE):
-    """Two levels of a wall that comes nearer along the aisle; the upper one rises."""
-    generator = np.random.default_rng(seed)
-    points = np.zeros((count, 6))
-    x = points[:, 0] = generator.uniform(-0.5, 4.0, count)
-    upper = generator.uniform(size=count) < 0.5
-    height = np.where(upper, 0.9 + 0.1 * x, 0.2) + generator.uniform(0.0, 0.2, count)
-    wall = 1.2 - 0.05 * x + 0.03 * generator.standard_normal(count)
-    points[:, 3] = -math.pi / 2
-    points[:, 4], points[:, 5] = np.arctan2(height, wall), np.hypot(height, wall)
-    return Samples(points, np.zeros(count), np.zeros(count), space)
-
-
-SAMPLES = shelves()
 RULES = {
     "gate": {"start_m": {"min": 1.0}, "end_m": {"max": 1.9}, "width_m": {"min": 0.05, "max": 0.2}},
     "boresight": {"elevation_deg": {"min": 12, "max": 45}},

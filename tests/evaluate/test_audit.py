@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from evaluate.test_score import MissTask, design, make_request, scenes
-from simulate.test_plan import SINGLE
 from support.command_line import caller, make_run
+from support.planning import SINGLE
+from support.scoring import MissTask, design, make_request, scenes
 
 from lidardesign.errors import PluginError
 from lidardesign.evaluate.report.tables import audit_section, effects_section

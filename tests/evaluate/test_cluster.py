@@ -12,7 +12,7 @@ import warnings
 from dataclasses import replace
 
 import pytest
-from evaluate.test_workers import make_request, results
+from support.workers import make_request, results
 
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.score import evaluate

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from evaluate.test_score import design, make_request, scenes
 from support.references import STANDARD_ERRORS
+from support.scoring import design, make_request, scenes
 
 from lidardesign.evaluate.accuracy import held_out, mixture, physics
 from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest

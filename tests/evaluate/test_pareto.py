@@ -6,7 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 
-from evaluate.test_plots import make_evaluation
+from support.evaluations import make_evaluation
 from support.tables import each_row
 
 from lidardesign.evaluate.accuracy.settings import Ladder, Rung

@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from PIL import Image
+from support.evaluations import METRIC, make_evaluation
 from support.tables import each_row
 
 from lidardesign.design.constraints.slack import ConstraintSlack
@@ -35,13 +36,12 @@ from lidardesign.evaluate.figures.plots import pictures, write_plots
 from lidardesign.evaluate.figures.scene import OUTCOME_LOOKS, framed_points, opened, scene_picture, shaded, view_of
 from lidardesign.evaluate.figures.scene_figure import shown_in
 from lidardesign.evaluate.figures.scores import MOST_ROWS, curve_picture, phase_rows, shown_pairs
-from lidardesign.evaluate.results import EffectSummary, Evaluation, Paired, Row, csv_text, write_csv
+from lidardesign.evaluate.results import EffectSummary, Evaluation, Paired, csv_text, write_csv
 from lidardesign.geometry.rays import Outcome, Rays
 from lidardesign.samples import Samples
 from lidardesign.scene import Body, Box, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.plan import Tolerance
 from lidardesign.space import DesignSpace
-from lidardesign.task import Metric
 
 NASTY = "</text><script>alert(1)</script> & $x^2$ \"'"
 BALL = Scene(
@@ -53,33 +53,6 @@ BALL = Scene(
     NASTY,
 )
 SPACE = DesignSpace((0, 0, 0, -0.3, -0.3, 1.0), (0, 0, 0, 0.3, 0.3, 5.0))
-METRIC = Metric("Chamfer distance", "mm", "lower", worst=200.0, tolerance=0.1)
-
-
-def make_row(name, rays, value, baseline=False, matched_to=None):
-    return Row(
-        name,
-        rays,
-        value,
-        value * 0.9,
-        value * 1.1,
-        1,
-        rays * 0.01,
-        0.5,
-        np.array([value]),
-        baseline,
-        matched_to,
-        rays if matched_to else None,
-    )
-
-
-def make_evaluation(names=("first", "second"), rays=(36, 100, 576), value=30.0):
-    rows = [make_row(name, n, value / n**0.3 + i) for i, name in enumerate(names) for n in rays]
-    baselines = [make_row(name, n, 2 * value / n**0.3, True) for name in ("uniform", "bounding") for n in rays]
-    paired = [Paired(names[0], "uniform", n, -1.0, -2.0, 0.5) for n in rays]
-    matched = [make_row("uniform", n, value, True, names[0]) for n in rays]
-    bandwidth = [Paired(names[0], "uniform", n, 1.0, 0.5, 2.0, n) for n in rays]
-    return Evaluation(METRIC, 5, [*rows, *baselines], paired, matched, bandwidth, ["a note"])
 
 
 def make_sensor(name="s0"):

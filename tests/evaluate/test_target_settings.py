@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from density.test_fields import icosphere
-from density.test_learn import config_of
+from support.learning import config_of
+from support.meshes import icosphere
 
 from lidardesign.evaluate.accuracy.fields import FIELD_SHARE, RESOLUTIONS, fields_within
 from lidardesign.scene import Body, Scene, Sphere, rigid

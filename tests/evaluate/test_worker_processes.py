@@ -10,8 +10,8 @@ import time
 from dataclasses import replace
 
 import pytest
-from evaluate.test_workers import make_request, results, without_times
 from support.command_line import caller, make_run, program
+from support.workers import make_request, results, without_times
 
 from lidardesign.errors import ConfigError, NumericalError, PluginError
 from lidardesign.evaluate.score import evaluate

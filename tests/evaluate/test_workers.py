@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from evaluate.test_score import MissTask
-from lidardesign_tasks.flatland import FlatlandConfig, FlatlandTask
+from lidardesign_tasks.flatland import FlatlandTask
+from support.scoring import MissTask
 from support.tables import each_row
+from support.workers import SEED, make_request, results
 
 from lidardesign import errors
-from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.evaluate.scene_scores import ScenePass, SceneScores
-from lidardesign.evaluate.score import EvaluationRequest, evaluate
+from lidardesign.evaluate.score import evaluate
 from lidardesign.evaluate.workers import worker
 from lidardesign.evaluate.workers import worker as messages
 from lidardesign.evaluate.workers.pool import WorkerScorer, check_workers, workers_of
@@ -25,39 +25,6 @@ from lidardesign.simulate.detector.files import detector_names, load_detector
 from lidardesign.simulate.plan import Planner, Tolerance
 from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import Score
-
-SEED = 3
-
-
-def make_request(**changes):
-    """Flatland with six held-out scenes and one design."""
-    task, config = FlatlandTask(), FlatlandConfig(train=3, test=6)
-    space = task.space(config)
-    middle = np.array([0.5, 0.0, 0.0])
-    sensor = Sensor("s0", 1.0, middle, 0.01 * np.eye(3), math.pi / 2, 0.0, 0.0, 0.3, 0.01, 0.7, 0.1)
-    values = {
-        "task": task,
-        "config": config,
-        "space": space,
-        "seed": SEED,
-        "designs": [DesignSpec("aimed", (sensor,))],
-        "rays": (8, 16),
-        "train": task.scenes(config, "train", SEED),
-        "test": task.scenes(config, "test", SEED),
-    }
-    return EvaluationRequest(**{**values, **changes})
-
-
-def without_times(document):
-    """A document without what no second run repeats."""
-    if isinstance(document, dict):
-        return {key: without_times(value) for key, value in document.items() if "seconds" not in key}
-    return [without_times(value) for value in document] if isinstance(document, list) else document
-
-
-def results(evaluation):
-    rows = [*evaluation.rows, *evaluation.equal_bandwidth]
-    return without_times(evaluation.as_dict()), [row.per_scene.tolist() for row in rows]
 
 
 class ShuffledEngine:

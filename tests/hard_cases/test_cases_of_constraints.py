@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from design.test_constraints import CONTRADICTIONS, FACE, ROOM, SAMPLES
-from design.test_fit import FREE, MOVING, log_target
-from design.test_rays import drawn_from, three_sensors
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 from support.command_line import caller, files_under, make_run
+from support.constraints import CONTRADICTIONS, FACE, ROOM, SAMPLES
+from support.designs import drawn_from, three_sensors
+from support.fits import FREE, MOVING, log_target
 from support.hard_cases import hard_case
 from support.tables import each_row
 

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from density.test_learn import SMALL, BallTask
-from density.test_visibility import along_axis, both_ways, config_of, plate, transmittance_on, wall
-from design.test_physical import from_the_ceiling
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support import references
+from support.designs import from_the_ceiling
 from support.hard_cases import hard_case
+from support.learning import SMALL, BallTask
 from support.tables import each_row
+from support.visibility import along_axis, both_ways, config_of, plate, transmittance_on, wall
 
 from lidardesign.config import (
     FASTEST_PER_M,

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from support import references
 from support.command_line import caller
 from support.hard_cases import hard_case
+from support.meshes import BOX_FACES, BOX_VERTICES, write_box
 from support.tables import each_row
-from test_meshio import BOX_FACES, BOX_VERTICES, write_box
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields import grids

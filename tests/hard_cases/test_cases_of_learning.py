@@ -10,12 +10,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from density.test_flow import FLOWS, draw, flow_of
-from density.test_learn import SPACE, BallTask, Interrupter, a_trainer, config_of, result_bytes
 from hypothesis import given
 from hypothesis import strategies as st
 from support import references
+from support.flows import FLOWS, draw, flow_of
 from support.hard_cases import hard_case
+from support.learning import SPACE, BallTask, Interrupter, a_trainer, config_of, result_bytes
 from support.tables import each_row
 from zuko.distributions import BoxUniform
 from zuko.transforms import MonotonicRQSTransform

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 import pytest
-from design.test_mixture import POINT, WHOLE, Z, drawn, features_of, naive_log_density, random_mixture
-from design.test_track import shelves
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.aisles import shelves
 from support.hard_cases import hard_case
+from support.mixtures import POINT, WHOLE, Z, drawn, features_of, naive_log_density, random_mixture
 from support.tables import each_row
 
 from lidardesign.design.files import design_document

@@ -22,8 +22,8 @@ from lidardesign_tasks.arm_links import BALL
 from lidardesign_tasks.arm_motion import PENETRATION_M, POSITION_RESIDUAL_M, TRIES, Arm, RejectedError, draw_waypoints
 from lidardesign_tasks.arm_robot import load_robot
 from support.hard_cases import hard_case
+from support.robots import TOOL_M, mjcf, written
 from support.tables import each_row
-from tasks.test_arm_robot import TOOL_M, mjcf, written
 
 from lidardesign.errors import DataError
 

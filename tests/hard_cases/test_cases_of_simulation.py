@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluate.test_score import design, make_request, rows_by_key
 from hypothesis import given
 from hypothesis import strategies as st
 from lidardesign_tasks.arm import ArmTask
@@ -19,9 +18,10 @@ from lidardesign_tasks.face import FaceTask
 from lidardesign_tasks.flatland import FlatlandTask
 from lidardesign_tasks.meshes import MeshesTask
 from lidardesign_tasks.warehouse import WarehouseTask
-from simulate.test_called_for import EVERYTHING, face_rays, heads
 from support.command_line import caller, make_run
 from support.hard_cases import hard_case
+from support.heads import EVERYTHING, face_rays, heads
+from support.scoring import design, make_request, rows_by_key
 from support.tables import each_row
 
 from lidardesign.density.training.training_data import refuse_blind_receiver

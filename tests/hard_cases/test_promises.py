@@ -18,15 +18,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from density.test_hard_learning import interrupt_after_a_checkpoint
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
+from support.broken_plugins import BROKEN, GOOD
 from support.command_line import caller, files_under, make_run
 from support.hard_cases import hard_case
+from support.learning import interrupt_after_a_checkpoint
 from support.small_runs import shifted
 from support.tables import each_row
-from test_registry import BROKEN, GOOD
 
 from lidardesign.cli.main import run as run_program
 from lidardesign.config import DensitySettings, LearningSettings

@@ -6,9 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from simulate.test_bound_laws import SIMULATED, errors
-from simulate.test_bounds import counts, facing_wall
-from simulate.test_plan import SINGLE, grid
+from support.planning import SIMULATED, SINGLE, counts, errors, facing_wall, grid
 
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Ambient, Body, Box, Medium, Scene, rigid

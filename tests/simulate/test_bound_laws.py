@@ -9,19 +9,17 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from simulate.test_plan import CONSUMER, SINGLE, TIMED, decisions, grid
+from support.planning import CONSUMER, SIMULATED, SINGLE, TIMED, decisions, errors, grid
 from support.tables import each_row
 
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Ambient, Body, Box, Capsule, Medium, Scene, Sphere, rigid
 from lidardesign.simulate.effects.first_hits import FirstHits
-from lidardesign.simulate.physics import EFFECTS, Physics
+from lidardesign.simulate.physics import Physics
 from lidardesign.simulate.plan import Planner, Tolerance
 from lidardesign.simulate.simulate import simulate
 
 STANDARD_ERRORS = 4.0
-# one receiver for all rays and light by way of other surfaces have their own tests
-SIMULATED = frozenset(EFFECTS) - {"multipath", "shadowing"}
 
 
 def random_scene(generator):
@@ -81,17 +79,6 @@ def random_case(seed):
     start = generator.choice([0.1, 0.5, 1.0])
     rays = grid(24, 0.4, (start, start + generator.uniform(0.5, 3)))
     return random_scene(generator), random_detector(generator), rays
-
-
-def errors(scene, rays, physics, far_m):
-    """Mean square error of ranges of returns, their number, and the share of wrong returns."""
-    truth, found = simulate(scene, rays)[0], simulate(scene, rays, physics=physics)[0]
-    both = truth.returned & found.returned
-    off_m = (found.range_m - truth.range_m)[both]
-    near = np.abs(off_m) <= far_m
-    wrong = int((truth.returned != found.returned).sum() + (~near).sum())
-    square = float(np.mean(off_m[near] ** 2)) if near.any() else 0.0
-    return square, int(near.sum()), wrong / max(int(truth.returned.sum()), 1)
 
 
 def resolution_m(scene, detector, rays):

@@ -10,15 +10,15 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm, poisson
-from simulate.test_plan import CONSUMER, SINGLE, TIMED, decisions, grid, room
+from support.planning import CONSUMER, SINGLE, TIMED, counts, decisions, facing_wall, grid, room, sight
 from support.tables import each_row
 
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Ambient, Body, Box, Capsule, Medium, Mesh, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.detector.detector import metres
-from lidardesign.simulate.effects.expected_counts import Counts, estimate_error_m, needed_counts, share_in_bins
-from lidardesign.simulate.effects.first_hits import FirstHits, edge_probability
+from lidardesign.simulate.effects.expected_counts import estimate_error_m, needed_counts, share_in_bins
+from lidardesign.simulate.effects.first_hits import edge_probability
 from lidardesign.simulate.effects.motion import entered_rays, moving_tracer, point_velocities
 from lidardesign.simulate.effects.multipath import _detours, _moved_m
 from lidardesign.simulate.measure import followed_light
@@ -28,19 +28,6 @@ from lidardesign.simulate.plan import Planner
 
 def bound(name, scene, detector, rays=None):
     return decisions(Planner(detector).plan(scene, [grid() if rays is None else rays]))[name].bound
-
-
-def sight(scene, detector, rays=None, frame=0):
-    return FirstHits.of(scene, frame, detector, [grid() if rays is None else rays], SceneCaster(scene, frame))
-
-
-def counts(scene, detector, rays=None):
-    return Counts(sight(scene, detector, rays))
-
-
-def facing_wall(**body):
-    """A wall far wider than the view, 2 m ahead, met head-on by a narrow beam."""
-    return Scene((Body(Box((0.05, 50, 50)), "wall", poses=rigid(translation_m=(2.05, 0, 0)), **body),))
 
 
 def box_mesh():

@@ -6,45 +6,22 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from lidardesign_tasks.arm import ArmTask
-from lidardesign_tasks.face import FaceTask
-from lidardesign_tasks.flatland import FlatlandTask
 from scipy.spatial.transform import Rotation
+from support.heads import ARM, EVERYTHING, FACE, FLATLAND, face_rays, heads, rays_of
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.evaluate.baselines.candidates import even_placement, rays_at
 from lidardesign.evaluate.results import Audit, AuditRow
-from lidardesign.geometry.rays import Rays, fire_times
+from lidardesign.geometry.rays import fire_times
 from lidardesign.scene import Body, Box, rigid
 from lidardesign.simulate.detector.detector import Detector
 from lidardesign.simulate.detector.files import load_detector
-from lidardesign.simulate.physics import EFFECTS, Physics
+from lidardesign.simulate.physics import Physics
 from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import direction
 
 SINGLE_PHOTON = load_detector("single-photon")
-# Detours by matt surfaces are rendered by another program, and tested with it.
-EVERYTHING = frozenset(EFFECTS) - {"multipath"}
-FACE, ARM, FLATLAND = FaceTask(), ArmTask(), FlatlandTask()
-
-
-def rays_of(origin_m, looking, gate_m):
-    count = len(looking)
-    origins = np.broadcast_to(np.asarray(origin_m, dtype=float), (count, 3))
-    return Rays(origins, looking, np.tile(gate_m, (count, 1)), np.zeros(count), fire_times(count, 10.0))
-
-
-def face_rays():
-    """An even grid that the face fills, 0.4 m in front of it."""
-    turn = np.linspace(-0.28, 0.28, 14)
-    azimuth, elevation = map(np.ravel, np.meshgrid(math.pi + turn, turn))
-    return rays_of((0.4, 0.0, 0.0), direction(azimuth, elevation), (0.05, 1.05))
-
-
-def heads(*others, **surroundings):
-    config = FACE.Config(test=3, truth_points=1000, **surroundings)
-    return [replace(head, bodies=(*head.bodies, *others)) for head in FACE.scenes(config, "test", 0)]
 
 
 def plans(scenes, rays, detector):

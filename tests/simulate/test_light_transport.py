@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.tables import each_row
+from support.transients import needs_simulator, rays_from, spiral
 
 from lidardesign.errors import ConfigError, NumericalError
 from lidardesign.geometry.raycast import shared_caster
@@ -26,10 +27,6 @@ from lidardesign.simulate.effects.shadowing import visible_echoes
 from lidardesign.simulate.light import Beams, Echoes, direct_echoes
 from lidardesign.simulate.light_transport import process
 from lidardesign.simulate.light_transport.transport import Lights, PathBins, available, pixel_rays, render_transient
-
-needs_simulator = pytest.mark.skipif(
-    not available(), reason=f"the light-transport simulator cannot run here: {process.missing()}"
-)
 
 # float32 intersections against float64 ones: 1e-7 of lengths, some ten times that where surfaces are curved or grazed
 ENERGY, MOST_ENERGY = 1e-5, 5e-3
@@ -65,25 +62,6 @@ def face_scene() -> Scene:
 
 SCENES = {"plane": plane_scene, "sphere": sphere_scene, "face": face_scene}
 BISTATIC = Receiver((-0.01, 0.06, 0.02), -0.1, 0.0, VIEW_RAD, VIEW_RAD, (0.0, 5.0))
-
-
-def spiral(count: int, half_angle_rad: float, axis: tuple[float, ...] = (1.0, 0.0, 0.0)) -> np.ndarray:
-    """Directions even in solid angle in a cone, shape (count, 3)."""
-    number = np.arange(count)
-    ahead = 1 - (1 - math.cos(half_angle_rad)) * (number + 0.5) / count
-    turn, across = number * math.pi * (3 - math.sqrt(5)), np.sqrt(1 - ahead**2)
-    forward = np.asarray(axis) / np.linalg.norm(axis)
-    left = np.cross(np.eye(3)[np.abs(forward).argmin()], forward)
-    left /= np.linalg.norm(left)
-    up = np.cross(forward, left)
-    return ahead[:, None] * forward + across[:, None] * (np.cos(turn)[:, None] * left + np.sin(turn)[:, None] * up)
-
-
-def rays_from(origin_m: tuple[float, ...], direction: np.ndarray, far_m: float = 10.0) -> Rays:
-    count = len(direction)
-    zeros = np.zeros(count)
-    gate_m = np.tile([0.0, far_m], (count, 1))
-    return Rays(np.tile(np.asarray(origin_m, dtype=float), (count, 1)), direction, gate_m, zeros, zeros)
 
 
 def single_bounces(scene: Scene, rays: Rays) -> Echoes:
@@ -340,9 +318,13 @@ def test_the_simulator_runs_from_any_folder_and_is_imported_in_its_own_process_a
     code = (
         "import sys\n"
         f"sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
-        "from simulate.test_light_transport import *\n"
+        "import numpy as np\n"
+        "from lidardesign.scene import Body, Scene, Sphere, rigid\n"
+        "from lidardesign.simulate.light_transport.transport import Lights, PathBins, render_transient\n"
+        "from support.transients import rays_from, spiral\n"
+        "ball = Scene((Body(Sphere(0.12), poses=rigid(translation_m=(0.45, 0.01, 0.02))),))\n"
         "rays = rays_from((0, 0, 0), spiral(4, 0.1))\n"
-        "found = render_transient(sphere_scene(), 0, rays, Lights.flood(rays.origin_m[:1]), PathBins(0.1, 9))\n"
+        "found = render_transient(ball, 0, rays, Lights.flood(rays.origin_m[:1]), PathBins(0.1, 9))\n"
         "assert found.steady.all()\n"
         "assert not {'mitsuba', 'drjit', 'mitransient'} & set(sys.modules)\n"
     )

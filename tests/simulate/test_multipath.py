@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from simulate.test_light_transport import needs_simulator, rays_from, spiral
 from support.tables import each_row
+from support.transients import needs_simulator, rays_from, spiral
 
 from lidardesign.geometry.raycast import shared_caster
 from lidardesign.geometry.rays import Rays

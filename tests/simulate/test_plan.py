@@ -8,50 +8,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.planning import CONSUMER, SINGLE, TIMED, decisions, grid, room
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Ambient, Body, Box, Medium, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate import plan as plan_module
-from lidardesign.simulate.detector.detector import IDEAL, Detector
-from lidardesign.simulate.detector.files import load_detector
+from lidardesign.simulate.detector.detector import IDEAL
 from lidardesign.simulate.physics import EFFECTS
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
 from lidardesign.simulate.simulate import build_casters
-from lidardesign.space import direction
 from lidardesign.task import Metric
-
-SINGLE, CONSUMER = load_detector("single-photon"), load_detector("consumer-8x8")
-TIMED = Detector("timed", jitter_sigma_s=1e-11)
-
-
-def grid(side=12, half_rad=0.3, gate_m=(0.1, 4.0), rate_hz=10.0):
-    turn = np.linspace(-half_rad, half_rad, side)
-    azimuth, elevation = (angle.ravel() for angle in np.meshgrid(turn, turn))
-    count = len(azimuth)
-    time_s = np.arange(count) / (count * rate_hz)
-    looking = direction(azimuth, elevation)
-    return Rays(np.zeros((count, 3)), looking, np.tile(gate_m, (count, 1)), np.zeros(count), time_s)
-
-
-def room(ball=None, wall=None, **scene):
-    bodies = (
-        Body(Sphere(0.1), "ball", poses=rigid(translation_m=(0.5, 0, 0)), **(ball or {})),
-        Body(Box((0.05, 2, 2)), "wall", poses=rigid(translation_m=(2, 0, 0)), **(wall or {})),
-    )
-    return Scene(bodies, "room", **scene)
-
 
 EVERYTHING = {
     "ball": {"velocity_m_s": (0.0, 3.0, 0.0)},
     "ambient": Ambient(1e5),
     "medium": Medium(0.1, 0.01),
 }
-
-
-def decisions(plan):
-    return {decision.name: decision for decision in plan.decisions}
 
 
 def test_an_ideal_detector_calls_for_nothing_where_light_goes_straight_and_no_ray_is_cast(monkeypatch):
@@ -212,9 +185,14 @@ def test_costs_are_predicted_for_every_effect_and_grow_with_the_rays():
 
 def test_planning_imports_nothing_heavy():
     code = (
-        "import sys; from simulate.test_plan import *\n"
+        "import sys\n"
+        "from lidardesign.scene import Ambient, Medium\n"
+        "from lidardesign.simulate.detector.detector import IDEAL\n"
+        "from lidardesign.simulate.plan import Planner\n"
+        "from support.planning import CONSUMER, SINGLE, grid, room\n"
+        "bright = room({'velocity_m_s': (0.0, 3.0, 0.0)}, ambient=Ambient(1e5), medium=Medium(0.1, 0.01))\n"
         "for detector in (IDEAL, SINGLE, CONSUMER):\n"
-        "    Planner(detector).plan(room(**EVERYTHING), [grid()])\n"
+        "    Planner(detector).plan(bright, [grid()])\n"
         "heavy = {'mitsuba', 'drjit', 'torch', 'scipy.stats'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )

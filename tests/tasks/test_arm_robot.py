@@ -13,6 +13,7 @@ from lidardesign_tasks import arm_engine
 from lidardesign_tasks.arm_engine import import_mink
 from lidardesign_tasks.arm_links import BALL
 from lidardesign_tasks.arm_robot import load_robot
+from support.robots import PIECE, TOOL_M, mjcf, written
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
@@ -20,20 +21,6 @@ from lidardesign.scene import Box, Capsule, Mesh, Sphere
 
 REAL = Path(__file__).parents[3] / "shared" / "data" / "iiwa14" / "iiwa14.xml"
 needs_real = pytest.mark.skipif(not REAL.exists(), reason="the real arm's model is not at ../shared/data/iiwa14")
-TOOL_M = 0.15
-PIECE = '<body pos="0 0 .18"><joint axis="{axis}"/><geom type="capsule" size=".03" fromto="0 0 0 0 0 .18"/>'
-
-
-def mjcf(links=7, *, inside="", world="", piece=PIECE):
-    """A chain of hinges whose axes alternate."""
-    chain = "".join(piece.format(axis="0 0 1" if link % 2 == 0 else "0 1 0") for link in range(links))
-    return f"<mujoco>{inside}<worldbody>{world}{chain}{'</body>' * links}</worldbody></mujoco>"
-
-
-def written(folder, text, name="arm.xml"):
-    path = folder / name
-    path.write_text(text)
-    return path
 
 
 def frames_at(robot, joints):

@@ -14,7 +14,7 @@ from lidardesign_tasks.flatland import FlatlandTask
 from lidardesign_tasks.meshes import MeshesTask
 from lidardesign_tasks.surface import surface_score, with_visible_truth
 from lidardesign_tasks.warehouse import WarehouseTask
-from tasks.test_tasks import write_ball
+from support.meshes import write_ball
 
 from lidardesign.evaluate.baselines.candidates import rays_at
 from lidardesign.evaluate.scene_scores import checked_score, score_lists

@@ -16,6 +16,7 @@ from lidardesign_tasks.flatland import FlatlandTask
 from lidardesign_tasks.meshes import MeshesTask
 from lidardesign_tasks.pose import jittered_pose
 from lidardesign_tasks.warehouse import WarehouseTask
+from support.meshes import write_ball
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
@@ -42,14 +43,6 @@ CASES = {
     "one mesh": (MeshesTask, {"folder": "one", "truth_points": 800, "poses": 2}),
     "meshes behind an occluder": (MeshesTask, {"folder": "three", "occluders": "front", "truth_points": 800}),
 }
-
-
-def write_ball(path, radii, shift=(0.0, 0.0, 0.0)):
-    trimesh = pytest.importorskip("trimesh")
-    ball = trimesh.creation.icosphere(3)
-    content = trimesh.Trimesh(ball.vertices * radii + np.array(shift), ball.faces).export(file_type="stl")
-    path.parent.mkdir(exist_ok=True)
-    path.write_bytes(content)
 
 
 @pytest.fixture(scope="module")

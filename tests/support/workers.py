@@ -1,0 +1,44 @@
+"""Evaluations by workers, and what of them must not depend on who scored."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from lidardesign_tasks.flatland import FlatlandConfig, FlatlandTask
+
+from lidardesign.design.sensor import DesignSpec, Sensor
+from lidardesign.evaluate.score import EvaluationRequest
+
+SEED = 3
+
+
+def make_request(**changes):
+    """Flatland with six held-out scenes and one design."""
+    task, config = FlatlandTask(), FlatlandConfig(train=3, test=6)
+    space = task.space(config)
+    middle = np.array([0.5, 0.0, 0.0])
+    sensor = Sensor("s0", 1.0, middle, 0.01 * np.eye(3), math.pi / 2, 0.0, 0.0, 0.3, 0.01, 0.7, 0.1)
+    values = {
+        "task": task,
+        "config": config,
+        "space": space,
+        "seed": SEED,
+        "designs": [DesignSpec("aimed", (sensor,))],
+        "rays": (8, 16),
+        "train": task.scenes(config, "train", SEED),
+        "test": task.scenes(config, "test", SEED),
+    }
+    return EvaluationRequest(**{**values, **changes})
+
+
+def without_times(document):
+    """A document without what no second run repeats."""
+    if isinstance(document, dict):
+        return {key: without_times(value) for key, value in document.items() if "seconds" not in key}
+    return [without_times(value) for value in document] if isinstance(document, list) else document
+
+
+def results(evaluation):
+    rows = [*evaluation.rows, *evaluation.equal_bandwidth]
+    return without_times(evaluation.as_dict()), [row.per_scene.tolist() for row in rows]
