@@ -335,6 +335,11 @@ class Scene:
         medium: What fills the air; None: nothing.
         ambient: Light that the emitter did not send; None: darkness.
         receiver: A fixed detector that all rays' light is heard by; None: every ray is heard at its own origin.
+
+    Example:
+        >>> scene = run.scenes("test", seed=0)[0]
+        >>> scene.frames, any(body.is_target for body in scene.bodies)
+        (1, True)
     """
 
     bodies: tuple[Body, ...]

@@ -130,6 +130,13 @@ class Task(Protocol):
 
     A task may also give `notes(config, space) -> Sequence[str]`, what a user should know of a configuration before
     anything is learned of it: lengths that look like another unit, splits that share their objects.
+
+    Example:
+        >>> task = run.task
+        >>> task.name, task.metric.unit, task.metric.better
+        ('flatland', 'mm', 'lower')
+        >>> len(task.scenes(task.Config(test=4), "test", seed=0))
+        4
     """
 
     name: ClassVar[str]

@@ -33,7 +33,7 @@ class Outcome(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """An explicit ray list.
+    """An explicit list of rays, in the order in which they fire.
 
     Arguments:
         origin_m: Where rays start [m], shape (N, 3).
@@ -46,6 +46,17 @@ class Rays:
 
     Raises:
         ConfigError: Non-finite values, directions that are not unit vectors, reversed or negative gates.
+
+    Example:
+        >>> rays = Rays(
+        ...     origin_m=np.zeros((2, 3)),
+        ...     direction=np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
+        ...     gate_m=np.array([[0.5, 2.0], [0.5, 3.0]]),
+        ...     sensor=np.array([0, 0]),
+        ...     time_s=np.array([0.0, 0.05]),
+        ... )
+        >>> len(rays), rays.subset(np.array([1])).gate_m.tolist()
+        (2, [[0.5, 3.0]])
     """
 
     origin_m: np.ndarray

@@ -130,7 +130,7 @@ class Run(RunFolder):
             DataError: The density is too rough to fit to.
             InfeasibleError: Constraints that contradict each other, or hold too little of the density.
         """
-        options = FitOptions(
+        request = self.fit_request(
             sensors=sensors,
             constraints=constraints,
             rays=rays,
@@ -139,9 +139,14 @@ class Run(RunFolder):
             refine=refine,
             name=name,
             seed=seed,
+            notes=notes,
             **further,
         )
-        return Design.fitted(FitRequest.resolve(self, options, notes=notes), progress=progress, notes=notes)
+        return Design.fitted(request, progress=progress, notes=notes)
+
+    def fit_request(self, *, notes: Notes = log_note, **options: Any) -> FitRequest:
+        """What `fit` of the same choices would do, resolved: its `plan()` says it."""
+        return FitRequest.resolve(self, FitOptions(**options), notes=notes)
 
     def designs(self) -> list[Design]:
         """The designs that are saved in the run, by name."""

@@ -233,7 +233,17 @@ def rules_of(rules: Sequence[SensorRules], sensor: int) -> SensorRules:
 
 
 class Constraints(SensorConstraints):
-    """A whole constraint file; every key is optional."""
+    """What a design must keep to: fields of view, gates, places, rays and bandwidth; every key is optional.
+
+    Keys and units are those of a constraint file (docs/constraints.md): common to all sensors, or in `each` by sensor.
+
+    Example:
+        >>> narrow = Constraints.from_mapping({"gate": {"width_m": {"max": 0.1}}, "budget": {"rays": 64}})
+        >>> narrow.budget.rays
+        64
+        >>> narrow.as_document()["gate"]
+        {'width_m': {'max': 0.1}}
+    """
 
     sensors: SensorCount = SensorCount()
     budget: Budget = Budget()

@@ -1,0 +1,210 @@
+"""The package's own API: the script of its users, its nouns' examples, and what notebooks show."""
+
+from __future__ import annotations
+
+import doctest
+import shutil
+import subprocess
+import sys
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from support.small_runs import shifted
+
+import lidardesign
+from lidardesign.design.fit import fit
+from lidardesign.errors import ConfigError, DataError, InfeasibleError, ThresholdError
+from lidardesign.evaluate.refinement.refinement import Refiner
+
+SCRIPT = '''
+import lidardesign as ld
+
+run = ld.learn("face", preset="draft", out="runs/face", seed=0)        # or ld.open_run("runs/face")
+print(run.quality.ess, run.quality.kl_nats)
+points = run.density.sample(1000)                                      # and run.density.log_prob(points)
+
+free = run.fit(sensors=4, name="free")
+kept = run.fit(sensors=4, constraints={"gate": {"width_m": {"max": 0.1}}}, rays=576, name="kept")
+best = run.fit(sensors=10, rays=361, layout="density", gates="ray", refine=5, name="best")
+best.save(); best.export("rays.csv"); rays = best.rays(196)
+
+scores = run.evaluate([free, kept, best], rays=[196, 361], baselines=["bounding"])
+scores.rows, scores.paired, scores.to_csv("scores.csv"), scores.report("report.html")
+'''
+SMALL_FACE = {
+    "learning.steps": 60, "learning.batch": 128, "learning.samples": 10_000, "density.sigma_m": 0.04,
+    "truth_points": 300, "train": 2, "test": 1,
+}  # fmt: skip
+SMALL = {
+    "learning.steps": 60, "learning.batch": 128, "learning.samples": 10_000, "density.sigma_m": 0.05, "train": 3,
+    "test": 2,
+}  # fmt: skip
+NOUNS = ("Run", "Design", "Constraints", "Scores", "Rays", "Task", "Scene")
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("learned") / "flat"
+    lidardesign.learn("flatland", preset="draft", out=folder, seed=shifted(), settings=SMALL)
+    return folder
+
+
+@pytest.fixture
+def run(learned, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return lidardesign.open_run(shutil.copytree(learned, tmp_path / "flat"))
+
+
+def test_the_script_of_users_runs_as_it_stands(tmp_path, monkeypatch):
+    learn, refine = lidardesign.learn, Refiner.run
+    monkeypatch.setattr(Refiner, "run", lambda self, rounds, *start: refine(self, min(rounds, 1), *start))
+    monkeypatch.setitem(fit.__kwdefaults__, "restarts", 2)
+    monkeypatch.setitem(fit.__kwdefaults__, "em_samples", 4000)
+    monkeypatch.setattr(
+        lidardesign, "learn", lambda task, **choices: learn(task, **{**choices, "settings": SMALL_FACE}), raising=False
+    )
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec(compile(SCRIPT, "script", "exec"), names)
+    assert names["points"].shape == (1000, 6)
+    assert np.isfinite(names["run"].density.log_prob(names["points"])).all()
+    assert all(check.satisfied for check in names["kept"].result.constraints)
+    assert len(names["rays"]) == 196
+    assert {row.design for row in names["scores"].rows} >= {"free", "kept", "best", "bounding"}
+    for name in ("rays.csv", "scores.csv", "report.html", "runs/face/designs/best.yaml"):
+        assert (tmp_path / name).stat().st_size > 100
+    assert not (tmp_path / "runs" / "face" / "designs" / "free.yaml").exists()
+
+
+@pytest.mark.parametrize("name", NOUNS)
+def test_every_noun_has_an_example_that_runs(run, name):
+    noun = getattr(lidardesign, name)
+    assert len(noun.__doc__.splitlines()) < 60
+    names = {"lidardesign": lidardesign, "run": run, "folder": run.folder, "np": np, name: noun}
+    examples = doctest.DocTestParser().get_doctest(noun.__doc__, names, name, None, 0)
+    assert examples.examples
+    assert doctest.DocTestRunner().run(examples).failed == 0
+
+
+class Tables(HTMLParser):
+    """Counts the rows of tables."""
+
+    def __init__(self):
+        super().__init__()
+        self.tags = []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+
+
+def test_notebooks_show_tables_and_figures(run):
+    design = run.fit(sensors=2, rays=16, name="a-b")
+    scores = run.evaluate([design], rays=[16])
+    for noun, rows in ((run, 9), (design, 3), (scores, 5)):
+        page = Tables()
+        page.feed(noun._repr_html_())
+        assert page.tags.count("table") == 1
+        assert page.tags.count("tr") == rows, page.tags
+    assert len(design.figure(16).data) == 3
+    assert {trace.name for trace in scores.figure().data} >= {"a-b", "uniform"}
+    assert "bandwidth" in scores.figure("bandwidth").layout.xaxis.title.text.lower()
+
+
+def test_saved_designs_are_those_of_commands(run):
+    from lidardesign.cli.main import run as program
+
+    rules = {"gate": {"width_m": {"max": 0.3}}, "budget": {"rays": 16}}
+    mine = run.fit(sensors=2, constraints=rules, name="mine").save()
+    before = mine.read_bytes()
+    with pytest.raises(SystemExit) as ended:
+        program(
+            ["constrain", str(run.folder), "--sensors", "2", "--set", "gate.width_m.max=0.3", "--set", "budget.rays=16",
+             "--name", "mine", "--quiet"]
+        )  # fmt: skip
+    assert not ended.value.code
+    assert mine.read_bytes() == before
+    assert lidardesign.load_design(mine).run.folder == run.folder
+    assert [design.name for design in run.designs()] == ["mine"]
+
+
+def test_a_design_is_fitted_again_with_what_is_not_chosen_anew(run):
+    design = run.fit(sensors=2, rays=16, layout="density", level=0.8, name="first")
+    again = design.constrain(constraints={"gate": {"width_m": {"max": 0.3}}})
+    assert (again.name, again.specification.layout, again.specification.rays) == ("constrained", "density", 16)
+    assert again.specification.level == 0.8
+    assert max(end - start for start, end in (s.gate_m for s in again.specification.sensors)) <= 0.3 + 1e-12
+
+
+def test_designs_work_without_a_run_and_find_their_own(run, tmp_path):
+    design = run.fit(sensors=2, rays=16, name="away")
+    path = design.save(tmp_path / "elsewhere" / "away.yaml")
+    assert lidardesign.load_design(path).run.folder.resolve() == run.folder.resolve()
+    shutil.rmtree(run.folder)
+    alone = lidardesign.load_design(path)
+    assert alone.run is None
+    assert len(alone.rays()) == 16
+    assert alone.export(tmp_path / "rays.npz").rays == 16
+    assert alone.as_dict()["design"] == str(path)
+    with pytest.raises(DataError, match="the run of this design is not there"):
+        alone.constrain(constraints={})
+
+
+def test_notes_and_rounds_go_to_whoever_asks(run, caplog):
+    notes, rounds = [], []
+    run.fit(sensors=2, rays=12, refine=1, weights={"variation": 1.5}, progress=rounds.append, notes=notes.append)
+    assert rounds[0].number == 0
+    assert any("variation=1.5" in note for note in notes)
+    with caplog.at_level("INFO", "lidardesign"):
+        run.fit(sensors=2, rays=12, weights=["variation=1.5"])
+    assert "variation=1.5" in caplog.text
+
+
+def test_the_density_draws_the_same_points_for_the_same_seed(run):
+    density = run.density
+    assert np.array_equal(density.sample(50, seed=3), density.sample(50, seed=3))
+    assert not np.array_equal(density.sample(50, seed=3), density.sample(50, seed=4))
+    outside = density.sample(2)
+    outside[1, 5] = 1e6
+    assert np.isfinite(density.log_prob(outside)).tolist() == [True, False]
+    with pytest.raises(ConfigError, match="shape"):
+        density.log_prob(np.zeros(6))
+
+
+@pytest.mark.parametrize(
+    ("choices", "error"),
+    [
+        ({"layout": "spiral"}, ConfigError),
+        ({"name": "../elsewhere"}, ConfigError),
+        ({"constraints": {"gate": {"width": 1}}}, ConfigError),
+        ({"constraints": {"gate": {"start_m": {"min": 0.8}, "end_m": {"max": 0.5}}}}, InfeasibleError),
+        ({"sensers": 3}, TypeError),
+    ],
+)
+def test_choices_that_cannot_be_are_refused_with_the_errors_of_commands(run, choices, error):
+    with pytest.raises(error):
+        run.fit(**choices)
+
+
+def test_a_tolerance_that_is_missed_leaves_a_run(tmp_path):
+    with pytest.raises(ThresholdError):
+        lidardesign.learn(
+            "flatland",
+            preset="draft",
+            out=tmp_path / "run",
+            settings={**SMALL, "learning.steps": 8},
+            tolerance=0.02,
+        )
+    assert lidardesign.open_run(tmp_path / "run").quality.misplaced > 0.02
+
+
+def test_names_are_imported_when_they_are_used():
+    code = (
+        "import sys, lidardesign; assert not {'numpy', 'torch', 'pydantic'} & set(sys.modules); "
+        "lidardesign.open_run; assert not {'torch', 'plotly', 'matplotlib', 'rich', 'typer'} & set(sys.modules), "
+        "{'torch', 'plotly', 'matplotlib', 'rich', 'typer'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    assert set(lidardesign.__all__) <= set(dir(lidardesign))
+    with pytest.raises(AttributeError):
+        lidardesign.nothing  # noqa: B018 - the attribute is asked for
