@@ -116,6 +116,15 @@ Like = Annotated[
         show_default=False,
     ),
 ]
+SpaceOf = Annotated[
+    Path | None,
+    typer.Option(
+        "--in",
+        metavar="RUN",
+        help="Take the design space and the task of this run.",
+        show_default="the run that a design came from",
+    ),
+]
 Overrides = Annotated[
     list[str] | None,
     typer.Option(

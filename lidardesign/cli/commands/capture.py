@@ -16,13 +16,11 @@ from lidardesign.cli.tables.grids import print_table
 from lidardesign.errors import ConfigError, DataError, check_choice
 from lidardesign.run.clock import phase
 from lidardesign.run.files import is_input, is_there
-from lidardesign.workflow.run_folder import folder_of, read_design
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
-    from lidardesign.evaluate.captures.capture import Capture
-    from lidardesign.evaluate.captures.score import CaptureEvaluation, CaptureSettings
+    from lidardesign.evaluate.captures.score import CaptureEvaluation
     from lidardesign.geometry.rays import Rays
 
 ESTIMATORS = ("peak", "matched")
@@ -37,7 +35,6 @@ COLUMNS = {
     "bins_per_ray": "bins\nper ray",
     "photons_per_ray": "photons\nper ray",
 }
-
 
 EstimatorOption = Annotated[
     str,
@@ -95,108 +92,77 @@ def capture(
     debug: options.Debug = False,
 ) -> None:
     """Score designs by a captured scan: with their gates, without, and beside even rays."""
-    with command(json=json, quiet=quiet, debug=debug) as console:
-        claim_outputs(console, csv=csv)
-        _check_numbers(false_alarm, within_deg, outlier_mm)
+    with command(json=json, quiet=quiet, debug=debug) as output:
+        claim_outputs(output, csv=csv)
+        if not 0 < false_alarm < 1:
+            raise ConfigError(f"{false_alarm}", where="--false-alarm", allowed="above 0 and below 1")
+        if within_deg is not None and not (0 < within_deg <= 180):
+            raise ConfigError(f"{within_deg}", where="--within-deg", allowed="above 0, at most 180 degrees")
+        if not (math.isfinite(outlier_mm) and outlier_mm > 0):
+            raise ConfigError(f"{outlier_mm}", where="--outlier-mm", allowed="a finite number above 0")
         check_choice(estimator, "--estimator", ESTIMATORS)
         with phase("libraries"):
             from lidardesign.evaluate.captures.capture import load_capture
-            from lidardesign.evaluate.captures.score import evaluate_capture
+            from lidardesign.evaluate.captures.scan import Estimation, default_within_rad
+            from lidardesign.evaluate.captures.score import CaptureSettings, evaluate_capture, write_csv
 
         place = options.parse_at(at)
-        named = _named_apart([(path, _rays(path, rays, place, seed or 0, console)) for path in designs])
+        scanned = [_rays_and_run(path, rays, place, seed or 0, output) for path in designs]
+        named = list(zip(_distinct_names(designs), (listed for listed, _ in scanned), strict=True))
         with phase("capture"):
             captured = load_capture(file)
-        settings = _settings(captured, estimator, false_alarm, within_deg, outlier_mm, reference)
+        within_rad = default_within_rad(captured) if within_deg is None else math.radians(within_deg)
+        estimation = Estimation(estimator, false_alarm)  # type: ignore[arg-type]
+        settings = CaptureSettings(estimation, within_rad, outlier_mm / 1000.0, reference)
         with phase("scoring"):
-            found = evaluate_capture(captured, named, settings)
-        for note in found.notes:
-            console.note(f"note: {note}")
+            evaluation = evaluate_capture(captured, named, settings)
+        for note in evaluation.notes:
+            output.remark(note)
         if csv is not None:
-            from lidardesign.evaluate.captures.score import write_csv
-
             with phase("writing"), written_file(csv) as table:
-                write_csv(found, table)
-        for folder in _folders(designs):
-            keep_times(folder, "capture", console)
-        document = {"capture": str(file), **found.as_dict(), "files": [] if csv is None else [str(csv)]}
-        console.result(document, lambda rich: _show(document, found, rich))
+                write_csv(evaluation, table)
+        for folder in dict.fromkeys(folder for _, folder in scanned if folder is not None):
+            keep_times(folder, "capture", output)
+        document = {"capture": str(file), **evaluation.as_dict(), "files": [] if csv is None else [str(csv)]}
+        output.result(document, lambda rich: _show(document, evaluation, rich))
 
 
-def _check_numbers(false_alarm: float, within_deg: float | None, outlier_mm: float) -> None:
-    if not 0 < false_alarm < 1:
-        raise ConfigError(f"{false_alarm}", where="--false-alarm", allowed="above 0 and below 1")
-    if within_deg is not None and not (0 < within_deg <= 180):
-        raise ConfigError(f"{within_deg}", where="--within-deg", allowed="above 0, at most 180 degrees")
-    if not (math.isfinite(outlier_mm) and outlier_mm > 0):
-        raise ConfigError(f"{outlier_mm}", where="--outlier-mm", allowed="a finite number above 0")
-
-
-def _settings(
-    captured: Capture,
-    estimator: str,
-    false_alarm: float,
-    within_deg: float | None,
-    outlier_mm: float,
-    reference: Path | None,
-) -> CaptureSettings:
-    from lidardesign.evaluate.captures.scan import Estimation, default_within_rad
-    from lidardesign.evaluate.captures.score import CaptureSettings
-
-    within = default_within_rad(captured) if within_deg is None else math.radians(within_deg)
-    return CaptureSettings(Estimation(estimator, false_alarm), within, outlier_mm / 1000.0, reference)  # type: ignore[arg-type]
-
-
-def _rays(path: Path, count: int | None, at: dict[str, float], seed: int, console: Output) -> Rays:
-    """The rays of a design file, or of what was exported of it for a scanner, at least one."""
-    rays = _listed_rays(path, count, at, seed, console)
-    if not len(rays):
-        raise DataError("fires no ray", where=str(path), hint="give --rays N" if not count else None)
-    return rays
-
-
-def _listed_rays(path: Path, count: int | None, at: dict[str, float], seed: int, console: Output) -> Rays:
+def _rays_and_run(
+    path: Path, count: int | None, at: dict[str, float], seed: int, output: Output
+) -> tuple[Rays, Path | None]:
+    """The rays of a design file, or of what was exported of it for a scanner, at least one; and its run's folder."""
     from lidardesign.export.galvo import is_galvo_file, read_galvo
     from lidardesign.workflow.export import DesignSource
+    from lidardesign.workflow.run_folder import folder_of, read_design
 
+    folder = None
     if not is_there(path):
         raise DataError("no such design", where=str(path), hint="give design files or files of export --format galvo")
     if not is_input(path) and is_galvo_file(path):
         if count is not None or at:
-            raise ConfigError(
-                "holds its rays already",
-                where=str(path),
-                allowed="a design file with --rays and --at",
-                hint="leave them out",
-            )
-        return read_galvo(path)
-    source = DesignSource(read_design(path, console.remark), path=path)
-    return source.lay_out(count, at, seed, notes=console.remark)[1]
+            allowed = "a design file with --rays and --at"
+            raise ConfigError("holds its rays already", where=str(path), allowed=allowed, hint="leave them out")
+        rays = read_galvo(path)
+    else:
+        specification = read_design(path, output.remark)
+        rays = DesignSource(specification, path=path).lay_out(count, at, seed, notes=output.remark)[1]
+        folder = None if is_input(path) else folder_of(specification, path)
+    if not len(rays):
+        raise DataError("fires no ray", where=str(path), hint="give --rays N" if not count else None)
+    return rays, folder
 
 
-def _folders(designs: list[Path]) -> list[Path]:
-    """The folders of the runs that design files came from; an exported file names none."""
-    from lidardesign.design.files import load_design
-    from lidardesign.export.galvo import is_galvo_file
-
-    files = [path for path in designs if not (is_input(path) or is_galvo_file(path))]
-    found = [folder_of(load_design(path), path) for path in files]
-    return list(dict.fromkeys(folder for folder in found if folder is not None))
-
-
-def _named_apart(found: list[tuple[Path, Rays]]) -> list[tuple[str, Rays]]:
-    """Designs by their files' names; files that share one keep their folders."""
-    names = [path.name.removesuffix(".yaml").removesuffix(".csv").removesuffix(".galvo") for path, _ in found]
-    paths = [path.resolve() for path, _ in found]
+def _distinct_names(files: list[Path]) -> list[str]:
+    """The names of designs by their files; files that share one keep their folders."""
+    paths = [path.resolve() for path in files]
     twice = next((path for path in paths if paths.count(path) > 1), None)
     if twice is not None:
         raise ConfigError("is given twice", where=str(twice))
-    return [
-        (str(path) if names.count(name) > 1 else name, rays) for name, (path, rays) in zip(names, found, strict=True)
-    ]
+    names = [path.name.removesuffix(".yaml").removesuffix(".csv").removesuffix(".galvo") for path in files]
+    return [str(path) if names.count(name) > 1 else name for name, path in zip(names, files, strict=True)]
 
 
-def _show(document: dict[str, Any], found: CaptureEvaluation, rich: RichConsole) -> None:
+def _show(document: dict[str, Any], evaluation: CaptureEvaluation, rich: RichConsole) -> None:
     from rich.markup import escape
 
     start, end = document["window_m"]
@@ -205,20 +171,20 @@ def _show(document: dict[str, Any], found: CaptureEvaluation, rich: RichConsole)
         f"{end:.4g} m; estimator {document['estimator']}; pixels within {number(document['within_deg'], 3)} degrees",
         soft_wrap=True,
     )
-    rich.print(f"outliers: more than {number(document['outlier_mm'])} mm from {found.ranges_from}", soft_wrap=True)
-    if found.surface_from is not None:
-        rich.print(escape(f"Chamfer distance: to {found.surface_from}"), soft_wrap=True)
+    rich.print(f"outliers: more than {number(document['outlier_mm'])} mm from {evaluation.ranges_from}", soft_wrap=True)
+    if evaluation.surface_from is not None:
+        rich.print(escape(f"Chamfer distance: to {evaluation.surface_from}"), soft_wrap=True)
     text = ("design", "gate")
     lines = [[row["design"], row["gate"], *(number(row[name]) for name in COLUMNS)] for row in document["rows"]]
     print_table(None, (*text, *COLUMNS.values()), lines, rich, text=text)
-    rich.print(_shown_errors(found), soft_wrap=True)
+    rich.print(_standard_errors(evaluation), soft_wrap=True)
     for path in document["files"]:
         rich.print(f"wrote {escape(path)}", soft_wrap=True)
 
 
-def _shown_errors(found: CaptureEvaluation) -> str:
+def _standard_errors(evaluation: CaptureEvaluation) -> str:
     """The largest standard errors of the designs' figures, in one line."""
-    designs = [row.estimates() for row in found.rows if not row.baseline]
+    designs = [row.estimates() for row in evaluation.rows if not row.baseline]
     parts = []
     for name, words in (("outliers_percent", "outliers"), ("range_error_mm", "range errors")):
         known = [row[name] for row in designs if name in row]

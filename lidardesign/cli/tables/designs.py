@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -24,8 +23,6 @@ MAX_SHOWN = 20
 ERROR_DIGITS = 2
 # Relative errors below what `number` shows of a figure are left out.
 SMALLEST_ERROR = 1e-4
-# Several designs may be fitted to one run at once; each holds the lock for an instant.
-WAIT_S = 10.0
 SPACE_MARK = ".space."
 ORIGIN = "origin [m]"
 SENSOR_COLUMNS = (
@@ -202,17 +199,6 @@ def show_fit(document: dict[str, Any], design: DesignSpec, checks: Sequence[Any]
     if rays is not None and rays["error"] > 0:
         rich.print(f"whole rays: {number(rays['error'], 2)} of {rays['value']:.0f} are not where the weights say")
     rich.print(f"design: {escape(str(document['design']))}", soft_wrap=True)
-
-
-def write_design(design: DesignSpec, run: Path, path: Path) -> None:
-    """Write a design into its run, under the run's lock, and enter it in the manifest."""
-    from lidardesign.design.files import design_text
-    from lidardesign.run.lock import run_lock
-    from lidardesign.run.manifest import write_recorded
-
-    content = design_text(design, path).encode()
-    with run_lock(run, wait_s=WAIT_S):
-        write_recorded(run, path.relative_to(run).as_posix(), content)
 
 
 COLUMNS = ("sensor", "part", "loss\n[nats]", "field of view\n[deg]", "gate\n[m]", "rays", "Mbit/s")
