@@ -369,14 +369,13 @@ class Scores:
             command: What the page says that it was made by; this program's arguments by default.
             pictured: What `figure_data` gave, to be used again.
         """
+        from lidardesign.evaluate.report.contents import evaluation_report
         from lidardesign.evaluate.report.report import write_report
-        from lidardesign.workflow.evaluation_report import evaluation_report
 
         pictured = self.figure_data() if pictured is None else pictured
-        request = self.evaluation_request
-        write_report(
-            evaluation_report(self.evaluation, request, self.run, pictured, command or sys.argv), Path(path)
-        )
+        run, request = self.run, self.evaluation_request
+        page = evaluation_report(self.evaluation, request, run.folder, run.config, pictured, command or sys.argv)
+        write_report(page, Path(path))
         return Path(path)
 
     def figure(self, against: str = "rays") -> go.Figure:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
+from lidardesign.config import FILE_NAME, RunConfig
 from lidardesign.evaluate.figures.figure_data import Pictured
 from lidardesign.evaluate.report.report import Report
 from lidardesign.evaluate.report.tables import CommandTimes, Reproduction
@@ -15,7 +17,6 @@ from lidardesign.run.clock import phase
 from lidardesign.run.manifest import read_manifest, versions
 from lidardesign.space import observed_point
 from lidardesign.task import random_generator
-from lidardesign.workflow.run_folder import CONFIGURATION, RunFolder
 
 # Drawn in the 3D view of what the density observes: enough to see its shape, few enough to see through.
 DENSITY_POINTS = 3000
@@ -26,30 +27,35 @@ COMMAND = "evaluate"
 
 @phase("report")
 def evaluation_report(
-    evaluation: Evaluation, request: EvaluationRequest, run: RunFolder, pictured: Pictured, command: Sequence[str]
+    evaluation: Evaluation,
+    request: EvaluationRequest,
+    folder: Path,
+    config: RunConfig,
+    pictured: Pictured,
+    command: Sequence[str],
 ) -> Report:
     """Everything that the report of an evaluation is made of.
 
     Arguments:
         evaluation: The scores.
         request: What was asked for.
-        run: The run whose density the designs are of.
+        folder, config: The run whose density the designs are of.
         pictured: What is drawn beside the scores.
         command: The command line that makes the page again.
     """
-    manifest = read_manifest(run.folder)
+    manifest = read_manifest(folder)
     density = request.density() if request.density is not None else None
     points = None
     if density is not None:
-        points = observed_point(density.samples.resample(DENSITY_POINTS, random_generator(run.config.seed, STREAM)))
+        points = observed_point(density.samples.resample(DENSITY_POINTS, random_generator(config.seed, STREAM)))
     commands = [("The scores and this page", _line(command))]
     learned = manifest.get("command")
     if isinstance(learned, list) and learned:
         commands.insert(0, ("The run that was learned", _line(learned)))
     facts = [
-        ("task", run.task.name),
+        ("task", config.task_name),
         ("seed of the scenes", str(request.seed)),
-        ("seed of the run", str(run.config.seed)),
+        ("seed of the run", str(config.seed)),
         *((f"design {design.name}", _origin(design.provenance)) for design in request.designs),
         *((f"version of {name}", version) for name, version in versions().items()),
     ]
@@ -63,16 +69,16 @@ def evaluation_report(
         times.append(
             CommandTimes(title, str(entry.get("when", "")), seconds, memory if isinstance(memory, int) else None)
         )
-    config = run.folder / CONFIGURATION
+    settings = folder / FILE_NAME
     return Report(
         evaluation,
         pictured.shown,
-        title=f"{run.task.name}: {evaluation.metric.name} on {held_out(evaluation.scenes)}",
+        title=f"{config.task_name}: {evaluation.metric.name} on {held_out(evaluation.scenes)}",
         density=pictured.density,
         density_m=points,
         constraints=pictured.tightness,
         times=times,
-        reproduce=Reproduction(commands, facts, config.read_text(encoding="utf-8") if config.is_file() else ""),
+        reproduce=Reproduction(commands, facts, settings.read_text(encoding="utf-8") if settings.is_file() else ""),
     )
 
 
