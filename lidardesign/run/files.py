@@ -1,8 +1,6 @@
-"""Files that are either whole or absent: atomic writes and content hashes.
+"""Files that are either whole or absent, and standard input where a command is given `-` for a file.
 
-Which processes are still there: who left a lock or a temporary file behind is told from who is at work.
-
-Standard input where a command is given `-` for a file: read once, whoever asks for it again.
+Who left a temporary file behind is known from its name, and removed once that process is gone.
 """
 
 from __future__ import annotations
@@ -23,14 +21,6 @@ from pathlib import Path
 from lidardesign.errors import ConfigError, DataError, LidardesignError
 
 HOST_DIGITS = 8
-
-
-def started(pid: int) -> str | None:
-    """When a process started, in the kernel's ticks, so that a reused process id is told apart (Linux)."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
-    except (OSError, IndexError):
-        return None
 
 
 def is_gone(pid: int) -> bool:
