@@ -27,7 +27,7 @@ from lidardesign.estimates import HALF_INTERVAL, Estimate, as_documents
 from lidardesign.evaluate.statistics import paired_difference
 from lidardesign.run.files import write_atomic
 from lidardesign.simulate.physics import EFFECTS
-from lidardesign.simulate.plan import Choice, Decision, Plan, Tolerance
+from lidardesign.simulate.plan import Choice, Decision, EffectPlan, Tolerance
 from lidardesign.task import Metric
 
 if TYPE_CHECKING:
@@ -376,12 +376,12 @@ class EffectSummary:
         }
 
 
-def summaries(plans: Sequence[Plan]) -> list[EffectSummary]:
+def summaries(plans: Sequence[EffectPlan]) -> list[EffectSummary]:
     """One line per effect, in the order in which light meets them."""
     return [_summary([_decision(plan, name) for plan in plans], plans[0].tolerance) for name in EFFECTS]
 
 
-def _decision(plan: Plan, name: str) -> Decision:
+def _decision(plan: EffectPlan, name: str) -> Decision:
     return next(decision for decision in plan.decisions if decision.name == name)
 
 

@@ -26,7 +26,7 @@ from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
 from lidardesign.simulate.physics import Physics
-from lidardesign.simulate.plan import Plan, Planner
+from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.simulate.simulate import build_casters, simulate, simulate_many
 from lidardesign.task import Residuals, Score, Task
 
@@ -184,9 +184,9 @@ class ScenePass:
 
     fired: Callable[[int], Sequence[Positions]]
     planner: Planner
-    plans: Sequence[Plan] = ()
+    plans: Sequence[EffectPlan] = ()
 
-    def known(self, number: int) -> Plan | None:
+    def known(self, number: int) -> EffectPlan | None:
         """The plan of a scene, if it is known."""
         return self.plans[number] if self.plans else None
 
@@ -202,7 +202,7 @@ class SceneScores:
         second_casts: How often meshes had to be asked twice, in planning too.
     """
 
-    plan: Plan
+    plan: EffectPlan
     planning_seconds: float
     scores: Sequence[tuple[Score, float]]
     second_casts: SecondCasts = field(default_factory=SecondCasts)
@@ -239,7 +239,7 @@ def score_here(request: EvaluationRequest, scene_pass: ScenePass, progress: Prog
 
 
 def score_in_scene(
-    task: Task, scene: Scene, lists: Sequence[Positions], planner: Planner, known: Plan | None, seed: int
+    task: Task, scene: Scene, lists: Sequence[Positions], planner: Planner, known: EffectPlan | None, seed: int
 ) -> SceneScores:
     """Score sets of rays in one scene.
 

@@ -35,7 +35,7 @@ from lidardesign.evaluate.statistics import bootstrap_interval, paired_differenc
 from lidardesign.geometry.triangles import SecondCasts
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
-from lidardesign.simulate.plan import Plan, Planner
+from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.task import notes_of
 
 __all__ = [
@@ -68,7 +68,7 @@ class _Scored:
     """All entries under a planner's effects: their tallies, a plan per scene, and the time to plan [s]."""
 
     tallies: Mapping[tuple[Any, ...], _Tally]
-    plans: Sequence[Plan]
+    plans: Sequence[EffectPlan]
     planning_seconds: float
     second_casts: SecondCasts
 
@@ -129,7 +129,7 @@ def _audit(
     request: EvaluationRequest,
     entries: Sequence[Entry],
     rows: Sequence[Row],
-    plans: Sequence[Plan],
+    plans: Sequence[EffectPlan],
     progress: Progress | None,
 ) -> Audit:
     """The same entries under all effects that there are, with the same random numbers."""
@@ -149,7 +149,7 @@ def _score_all(
     entries: Sequence[Entry],
     planner: Planner,
     progress: Progress | None,
-    known: Sequence[Plan] = (),
+    known: Sequence[EffectPlan] = (),
 ) -> _Scored:
     """All scenes, here or by workers; plans that are known are not made again."""
     jobs = {entry.key: entry for entry in entries}

@@ -20,7 +20,7 @@ from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.even_grid import EvenGrid, grid_of, grid_sensor_losses
-from lidardesign.export.common.poses import Held, Mount, held_rounding, mounts
+from lidardesign.export.common.poses import Mount, ReadMount, mounts, mounts_rounding
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import HALF_DIGITS
 from lidardesign.run.files import write_atomic
@@ -61,7 +61,7 @@ def carla_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Esti
         found = [_held(one, document["fixed_delta_seconds"]) for one in document["sensors"]]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"holds no lidars: {error!r}", where=str(path)) from error
-    return held_rounding(rays, mounted, found, path)
+    return mounts_rounding(rays, mounted, found, path)
 
 
 def _refuse_slow_rates(mounted: Sequence[Mount], rate_hz: float) -> None:
@@ -140,7 +140,7 @@ def _axes(rotation: Mapping[str, float]) -> np.ndarray:
     )
 
 
-def _held(sensor: Mapping[str, Any], step_s: float) -> Held:
+def _held(sensor: Mapping[str, Any], step_s: float) -> ReadMount:
     """What a sensor of the file fires in one frame, in our own frame."""
     attributes = sensor["attributes"]
     rows = int(attributes["channels"])
@@ -151,7 +151,7 @@ def _held(sensor: Mapping[str, Any], step_s: float) -> Held:
     local = direction(np.tile(swept, rows), np.repeat(elevation, columns))
     location = np.array([sensor["transform"]["location"][axis] for axis in "xyz"])
     world = local @ _axes(sensor["transform"]["rotation"]).T @ MIRROR
-    return Held(MIRROR @ location, world, (math.nan, float(attributes["range"])))
+    return ReadMount(MIRROR @ location, world, (math.nan, float(attributes["range"])))
 
 
 def _losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:

@@ -93,7 +93,7 @@ def isaac_losses(design: DesignSpec, mounted: Sequence[Mount], rate_hz: float) -
 
 
 @dataclass(frozen=True, eq=False)
-class FoundSensor:
+class ReadSensor:
     """What was read back of one sensor: its pose, frames per second, and emitters.
 
     Arguments:
@@ -110,7 +110,7 @@ class FoundSensor:
 
 
 def profile_rounding(
-    rays: Rays, mounted: Sequence[Mount], found: Sequence[FoundSensor], path: Path
+    rays: Rays, mounted: Sequence[Mount], found: Sequence[ReadSensor], path: Path
 ) -> dict[str, Estimate]:
     """What the written numbers lose, ray by ray.
 
@@ -135,7 +135,7 @@ def profile_rounding(
     return rays_rounding(replace(rays, time_s=expected), found_rays, path)
 
 
-def found_emitters(values: Mapping[str, Any], ranges_m: Any) -> Emitters:
+def emitters_of_arrays(values: Mapping[str, Any], ranges_m: Any) -> Emitters:
     """The emitters of arrays by Isaac's names.
 
     Raises:
@@ -260,14 +260,14 @@ def _profile(mount: Mount, rays: Rays, rate_hz: int) -> dict[str, Any]:
     }
 
 
-def _read_profile(placed: dict[str, Any], folder: Path) -> FoundSensor:
+def _read_profile(placed: dict[str, Any], folder: Path) -> ReadSensor:
     profile = json.loads((folder / f"{placed['config']}.json").read_text(encoding="utf-8"))["profile"]
     ranges = [[one["min"], one["max"]] for one in profile["ranges"]]
-    return FoundSensor(
+    return ReadSensor(
         np.array(placed["translation_m"]),
         rotations_of_quaternions(np.array(placed["orientation_wxyz"])),
         profile["scanRateBaseHz"],
-        found_emitters(profile["emitterStates"][0], ranges),
+        emitters_of_arrays(profile["emitterStates"][0], ranges),
     )
 
 
@@ -410,15 +410,15 @@ def _prims(lines: Iterable[str]) -> list[dict[str, str]]:
     return found
 
 
-def _read_prim(values: Mapping[str, str]) -> FoundSensor:
+def _read_prim(values: Mapping[str, str]) -> ReadSensor:
     def array(name: str) -> list[Any]:
         return json.loads(values[name].replace("(", "[").replace(")", "]"))
 
     ranges = np.stack([array(f"{CORE}rangesMinM"), array(f"{CORE}rangesMaxM")], axis=1)
     state = {name: array(f"{STATE}{name}") for name in ("azimuthDeg", "elevationDeg", "fireTimeNs", "rangeId")}
-    return FoundSensor(
+    return ReadSensor(
         np.array(array("xformOp:translate")),
         rotations_of_quaternions(np.array(array("xformOp:orient"))),
         float(values[f"{CORE}scanRateBaseHz"]),
-        found_emitters(state, ranges),
+        emitters_of_arrays(state, ranges),
     )

@@ -18,7 +18,7 @@ from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.even_grid import EvenGrid, grid_of, grid_sensor_losses
 from lidardesign.export.common.names import identifier, renamed_note
-from lidardesign.export.common.poses import Held, Mount, held_rounding, mounts, quaternion
+from lidardesign.export.common.poses import Mount, ReadMount, mounts, mounts_rounding, quaternion
 from lidardesign.export.common.xml import element, number, numbers, read_xml, write_xml
 from lidardesign.geometry.rays import Rays
 from lidardesign.geometry.rotation import rotations_of_quaternions
@@ -43,7 +43,7 @@ def sdf_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estima
     """How far the rays that Gazebo fires are from the design's."""
     mounted = mounts(design, rays)
     found = read_xml(path, "sdf").findall(f"model/link[@name='{LINK}']/sensor")
-    return held_rounding(rays, mounted, [held(one, path) for one in found], path)
+    return mounts_rounding(rays, mounted, [read_sensor(one, path) for one in found], path)
 
 
 def sdf_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
@@ -102,7 +102,7 @@ def _axis(name: str, samples: int, bounds_rad: tuple[float, float]) -> Element:
     )
 
 
-def held(sensor: Element, path: Path, pose: np.ndarray | None = None) -> Held:
+def read_sensor(sensor: Element, path: Path, pose: np.ndarray | None = None) -> ReadMount:
     """What a <sensor> that `sensor_element` made holds, at its own pose or at a given one (6,).
 
     Raises:
@@ -121,4 +121,4 @@ def held(sensor: Element, path: Path, pose: np.ndarray | None = None) -> Held:
     except (ValueError, TypeError) as error:
         raise DataError(f"holds no such lidar: {error}", where=str(path)) from error
     grid = EvenGrid(columns, rows, (azimuth[0], azimuth[1]), (elevation[0], elevation[1]))
-    return Held(pose[:3], grid.directions() @ turn.T, (start, end))
+    return ReadMount(pose[:3], grid.directions() @ turn.T, (start, end))

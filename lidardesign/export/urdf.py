@@ -19,9 +19,9 @@ from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.names import identifier
-from lidardesign.export.common.poses import Held, Mount, held_rounding, mounts
+from lidardesign.export.common.poses import Mount, ReadMount, mounts, mounts_rounding
 from lidardesign.export.common.xml import element, numbers, read_xml, write_xml
-from lidardesign.export.sdf import held, sdf_losses, sensor_element
+from lidardesign.export.sdf import read_sensor, sdf_losses, sensor_element
 from lidardesign.geometry.rays import Rays
 
 # No sensor's link is called so: those end in _link. Nor its joint, for none has the name of the world.
@@ -42,8 +42,8 @@ def write_urdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Band
 def urdf_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """How far the rays of the described sensors are from the design's."""
     mounted = mounts(design, rays)
-    found = held_sensors(read_xml(path, "robot"), path)
-    return held_rounding(rays, mounted, found, path)
+    found = read_sensors(read_xml(path, "robot"), path)
+    return mounts_rounding(rays, mounted, found, path)
 
 
 def urdf_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
@@ -83,7 +83,7 @@ def mounted_parts(mount: Mount, rate_hz: float, *, parent: str, prefix: str = ""
     return [element("link", {"name": name}), joint, element("gazebo", {"reference": name}, [sensor])]
 
 
-def held_sensors(root: Element, path: Path) -> list[Held]:
+def read_sensors(root: Element, path: Path) -> list[ReadMount]:
     """What the joints and Gazebo sensors below an element hold, in their order.
 
     Raises:
@@ -99,7 +99,7 @@ def held_sensors(root: Element, path: Path) -> list[Held]:
         try:
             origin = next(joints[extension.attrib["reference"]].iterfind("origin"))
             values = f"{origin.attrib['xyz']} {origin.attrib['rpy']}".split()
-            found.append(held(extension[0], path, np.array(values, dtype=np.float64)))
+            found.append(read_sensor(extension[0], path, np.array(values, dtype=np.float64)))
         except (KeyError, StopIteration, IndexError, ValueError) as error:
             raise DataError(f"holds no joint for a sensor: {error!r}", where=str(path)) from error
     return found
@@ -129,4 +129,4 @@ def xacro_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Esti
     macro = next((part for part in read_xml(path, "robot") if part.tag == MACRO), None)
     if macro is None:
         raise DataError("holds no macro", where=str(path))
-    return held_rounding(rays, mounted, held_sensors(macro, path), path)
+    return mounts_rounding(rays, mounted, read_sensors(macro, path), path)

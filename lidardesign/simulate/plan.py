@@ -164,7 +164,7 @@ class Decision:
 
 
 @dataclass(frozen=True)
-class Plan:
+class EffectPlan:
     """What is simulated of a scene, the same for all lists of rays.
 
     Arguments:
@@ -209,7 +209,7 @@ class Planner:
         return self.tolerance or Tolerance.of(self.detector)
 
     @phase("planning")
-    def plan(self, scene: Scene, lists: Sequence[Rays], casters: Sequence[SceneCaster] | None = None) -> Plan:
+    def plan(self, scene: Scene, lists: Sequence[Rays], casters: Sequence[SceneCaster] | None = None) -> EffectPlan:
         """Which effects are on for lists of rays in a scene.
 
         Arguments:
@@ -227,18 +227,18 @@ class Planner:
         rays = sum(len(rays) for rays in lists) * scene.frames
         return self._decided(found, {name: predicted_seconds(name, self.detector, rays) for name in EFFECTS})
 
-    def chosen_from(self, plan: Plan) -> Plan:
+    def chosen_from(self, plan: EffectPlan) -> EffectPlan:
         """What this planner makes of the bounds in another's plan of the same rays, with the same detector."""
         found = {decision.name: decision.bound for decision in plan.decisions}
         return self._decided(found, {decision.name: decision.seconds for decision in plan.decisions})
 
-    def _decided(self, found: dict[str, Bound], seconds: dict[str, float]) -> Plan:
+    def _decided(self, found: dict[str, Bound], seconds: dict[str, float]) -> EffectPlan:
         missing = {name: _missing(name) for name in self._asked(found)}
         on = self._chosen(found, missing)
         decisions = (Decision(name, name in on, found[name], seconds[name], missing.get(name)) for name in EFFECTS)
-        return Plan(tuple(decisions), self.tolerated)
+        return EffectPlan(tuple(decisions), self.tolerated)
 
-    def physics(self, plan: Plan, seed: int) -> Physics | None:
+    def physics(self, plan: EffectPlan, seed: int) -> Physics | None:
         """What `simulate` takes for a plan; None where nothing is on."""
         return Physics(self.detector, plan.effects, seed) if plan.effects else None
 

@@ -3,38 +3,37 @@
 from __future__ import annotations
 
 from lidardesign.run.clock import peak_memory_bytes
-from lidardesign.testing.law import GIBIBYTE, BrokenLawError, Held, Law, NotApplicable
-from lidardesign.testing.subject import Subject
+from lidardesign.testing.law import GIBIBYTE, BrokenLawError, Law, LawHolds, NotApplicable, Subject
 
 MEBIBYTE = 2**20
 
 
-def check_random(subject: Subject) -> Held:
+def check_random(subject: Subject) -> LawHolds:
     """No global random state is drawn from or seeded."""
     if subject.watch.drawn:
         raise BrokenLawError(
             f"uses {', '.join(subject.watch.drawn)}",
             hint="draw from lidardesign.task.random_generator(seed, ...) and pass the generator on",
         )
-    return Held("Python's, numpy's and torch's random states are as they were")
+    return LawHolds("Python's, numpy's and torch's random states are as they were")
 
 
-def check_files(subject: Subject) -> Held:
+def check_files(subject: Subject) -> LawHolds:
     """Nothing is written but temporary files and caches."""
     found = subject.watch.found_written()
     if found:
         raise BrokenLawError(f"writes {', '.join(found)}", allowed="temporary files and the user's caches")
-    return Held("nothing but temporary files and caches")
+    return LawHolds("nothing but temporary files and caches")
 
 
-def check_surroundings(subject: Subject) -> Held:
+def check_surroundings(subject: Subject) -> LawHolds:
     """The working folder, the environment, the locale, signals and numpy's error settings stay."""
     if subject.watch.changed:
         raise BrokenLawError(f"changes {', '.join(subject.watch.changed)}", hint="put back what you change")
-    return Held("working folder, environment, locale, signals and numpy's error settings are as they were")
+    return LawHolds("working folder, environment, locale, signals and numpy's error settings are as they were")
 
 
-def check_time(subject: Subject) -> Held:
+def check_time(subject: Subject) -> LawHolds:
     """Every call of the task's code ends within the limit."""
     limit = subject.limits.seconds
     slow = [what for what, seconds in subject.seconds.items() if seconds > limit]
@@ -45,10 +44,10 @@ def check_time(subject: Subject) -> Held:
             hint="check fewer or smaller scenes (--set), or allow more (--seconds)",
         )
     said = ", ".join(f"{what} {seconds:.3f} s" for what, seconds in subject.seconds.items())
-    return Held(f"at most: {said}", {f"{what}_s": round(seconds, 4) for what, seconds in subject.seconds.items()})
+    return LawHolds(f"at most: {said}", {f"{what}_s": round(seconds, 4) for what, seconds in subject.seconds.items()})
 
 
-def check_memory(subject: Subject) -> Held | NotApplicable:
+def check_memory(subject: Subject) -> LawHolds | NotApplicable:
     """The process holds no more memory than the limit."""
     peak = peak_memory_bytes()
     if peak is None:
@@ -59,7 +58,7 @@ def check_memory(subject: Subject) -> Held | NotApplicable:
             allowed=f"{subject.limits.memory_bytes / GIBIBYTE:.2f} GiB",
             hint="check fewer or smaller scenes (--set), or allow more (--memory-mb)",
         )
-    return Held(f"the process held {peak / MEBIBYTE:.0f} MiB at most", {"peak_bytes": peak})
+    return LawHolds(f"the process held {peak / MEBIBYTE:.0f} MiB at most", {"peak_bytes": peak})
 
 
 _AFTER = ("scores are numbers", "residuals are places")

@@ -11,8 +11,7 @@ from lidardesign.errors import ConfigError, LidardesignError
 from lidardesign.registry import text_of
 from lidardesign.task import Task
 from lidardesign.testing import conduct, geometry, interface, scenes, scoring
-from lidardesign.testing.law import BrokenLawError, Finding, Law, Limits, NotApplicable, place_of, said
-from lidardesign.testing.subject import Subject
+from lidardesign.testing.law import BrokenLawError, Finding, Law, Limits, NotApplicable, Subject, error_words, place_of
 from lidardesign.testing.watch import Watch
 
 LAWS: tuple[Law, ...] = (*interface.LAWS, *scenes.LAWS, *geometry.LAWS, *scoring.LAWS, *conduct.LAWS)
@@ -58,7 +57,7 @@ class Contract:
         try:
             found = law.check(self.subject)
         except LidardesignError as error:
-            return Finding(*known, "fail", said(error), time.perf_counter() - started)
+            return Finding(*known, "fail", error_words(error), time.perf_counter() - started)
         except MemoryError:
             limit = self.subject.limits.memory_bytes
             return Finding(*known, "fail", f"needs more than {limit / 2**20:.0f} MiB", time.perf_counter() - started)

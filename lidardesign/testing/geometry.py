@@ -12,9 +12,8 @@ from lidardesign.density.fields.distance import Field, build_field
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Body, Mesh, Scene
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction
-from lidardesign.testing.law import BrokenLawError, Held, Law
+from lidardesign.testing.law import BrokenLawError, Law, LawHolds, Subject
 from lidardesign.testing.probing import rays_that_meet
-from lidardesign.testing.subject import Subject
 
 # So many rays are tried in each round, until so many have met a target.
 RAYS, ENOUGH, ROUNDS = 300, 150, 10
@@ -34,7 +33,7 @@ SLOPE_WITHIN = 0.15
 INSIDE_SHARE = 0.5
 
 
-class Seen(NamedTuple):
+class RaysAtTargets(NamedTuple):
     """Rays of a scene that meet a target first, N of them.
 
     Arguments:
@@ -58,7 +57,7 @@ class Seen(NamedTuple):
         return self.origin_m + range_m[:, None] * self.direction
 
 
-class Ground:
+class TargetFields:
     """The targets' fields of the scenes that are looked at, in one frame each, and rays that meet them.
 
     Arguments:
@@ -76,28 +75,28 @@ class Ground:
         self.step_m = _step_m(self.scenes, settings.field_resolution, padding_m)
         self.seen = [_seen(subject, number, scene) for number, scene in enumerate(self.scenes)]
 
-    def distance(self, seen: Seen, points: np.ndarray) -> np.ndarray:
+    def distance(self, seen: RaysAtTargets, points: np.ndarray) -> np.ndarray:
         """Distances to the targets of the rays' scene at points (N, 3), shape (N,) [m]."""
         return self.field.distances(points)[:, seen.number]
 
-    def slope(self, seen: Seen, points: np.ndarray) -> np.ndarray:
+    def slope(self, seen: RaysAtTargets, points: np.ndarray) -> np.ndarray:
         """Lengths of the gradients there, shape (N,)."""
         weights = np.zeros((len(points), self.field.columns))
         weights[:, seen.number] = 1.0
         return np.linalg.norm(self.field.gradient(points, weights), axis=1)
 
-    def tolerance_m(self, seen: Seen) -> np.ndarray:
+    def tolerance_m(self, seen: RaysAtTargets) -> np.ndarray:
         """What distances near the rays may be off by, shape (N,) [m]."""
         return STEPS_OFF * self.step_m + ROUNDING * seen.range_m
 
 
-_GROUNDS: WeakKeyDictionary[Subject, Ground] = WeakKeyDictionary()
+_GROUNDS: WeakKeyDictionary[Subject, TargetFields] = WeakKeyDictionary()
 
 
-def ground_of(subject: Subject) -> Ground:
+def target_fields(subject: Subject) -> TargetFields:
     """The fields and rays of a subject, made once."""
     if subject not in _GROUNDS:
-        _GROUNDS[subject] = Ground(subject)
+        _GROUNDS[subject] = TargetFields(subject)
     return _GROUNDS[subject]
 
 
@@ -136,7 +135,7 @@ def _step_m(scenes: list[Scene], resolution: int, padding_m: float) -> float:
     return (float(np.ptp(corners, axis=0).max()) + 2 * padding_m) / (resolution - 1)
 
 
-def _seen(subject: Subject, number: int, scene: Scene) -> Seen:
+def _seen(subject: Subject, number: int, scene: Scene) -> RaysAtTargets:
     """Rays from the design space towards points of a scene's targets, those that meet a target first."""
     generator, caster = np.random.default_rng([SEED, number]), SceneCaster(scene)
     rounds: list[np.ndarray] = []
@@ -145,41 +144,41 @@ def _seen(subject: Subject, number: int, scene: Scene) -> Seen:
     design = np.concatenate(rounds)
     solid = np.array([_is_solid(one) for one in scene.bodies], dtype=bool)[design[:, 6].astype(int)]
     looking = direction(design[:, AZIMUTH], design[:, ELEVATION])
-    return Seen(number, design[:, :3], looking, design[:, 7:], design[:, RANGE], solid, RAYS * len(rounds))
+    return RaysAtTargets(number, design[:, :3], looking, design[:, 7:], design[:, RANGE], solid, RAYS * len(rounds))
 
 
 def _is_solid(body: Body) -> bool:
     return not isinstance(body.shape, Mesh) or body.shape.sign != "unsigned"
 
 
-def check_reach(subject: Subject) -> Held:
+def check_reach(subject: Subject) -> LawHolds:
     """Rays of the design space meet targets in every scene that is looked at."""
-    counts = [len(seen.range_m) for seen in ground_of(subject).seen]
+    counts = [len(seen.range_m) for seen in target_fields(subject).seen]
     if not min(counts):
         name = subject.looked_at[counts.index(0)].name
         raise BrokenLawError(
             f"none of {RAYS * ROUNDS} rays from the design space to the targets of scene {name!r} meets one",
             hint="widen the angles or the range, move the origin, or check the units: all lengths are metres",
         )
-    share = sum(counts) / sum(seen.tried for seen in ground_of(subject).seen)
-    return Held(f"{share:.0%} of the rays towards targets meet one inside the design space", {"share": share})
+    share = sum(counts) / sum(seen.tried for seen in target_fields(subject).seen)
+    return LawHolds(f"{share:.0%} of the rays towards targets meet one inside the design space", {"share": share})
 
 
-def check_finite(subject: Subject) -> Held:
+def check_finite(subject: Subject) -> LawHolds:
     """Distances and their gradients are finite everywhere between sensors and targets."""
-    ground, generator, count = ground_of(subject), np.random.default_rng(SEED), 0
+    ground, generator, count = target_fields(subject), np.random.default_rng(SEED), 0
     for seen in ground.seen:
         points = seen.at(seen.range_m * generator.uniform(0.0, 1.2, len(seen.range_m)))
         bad = ~(np.isfinite(ground.distance(seen, points)) & np.isfinite(ground.slope(seen, points)))
         if bad.any():
             raise BrokenLawError(f"{bad.sum()} of {len(bad)} distances or gradients are NaN or infinite")
         count += len(points)
-    return Held(f"at {count} points", {"points": count})
+    return LawHolds(f"at {count} points", {"points": count})
 
 
-def check_sign(subject: Subject) -> Held:
+def check_sign(subject: Subject) -> LawHolds:
     """Distances are positive at sensors and in front of targets, and negative inside those that are solid."""
-    ground, generator = ground_of(subject), np.random.default_rng(SEED)
+    ground, generator = target_fields(subject), np.random.default_rng(SEED)
     inside: list[np.ndarray] = []
     for seen in ground.seen:
         tolerance, name = ground.tolerance_m(seen), ground.scenes[seen.number].name
@@ -199,13 +198,13 @@ def check_sign(subject: Subject) -> Held:
     if share < INSIDE_SHARE:
         raise BrokenLawError(f"only {share:.0%} of the points just below solid surfaces are inside")
     if not len(found):
-        return Held("nothing is in front of sensors or targets that should not be; no target has an inside")
-    return Held(f"{share:.0%} of {len(found)} points just below solid surfaces are inside", {"inside": share})
+        return LawHolds("nothing is in front of sensors or targets that should not be; no target has an inside")
+    return LawHolds(f"{share:.0%} of {len(found)} points just below solid surfaces are inside", {"inside": share})
 
 
-def check_slope(subject: Subject) -> Held:
+def check_slope(subject: Subject) -> LawHolds:
     """Gradients of distances have length 1 in front of targets."""
-    ground, generator = ground_of(subject), np.random.default_rng(SEED)
+    ground, generator = target_fields(subject), np.random.default_rng(SEED)
     slopes = []
     for seen in ground.seen:
         near = max(2 * ground.step_m, ground.sigma_m / 2)
@@ -218,13 +217,14 @@ def check_slope(subject: Subject) -> Held:
             f"only {share:.0%} of {len(off)} gradients are within {SLOPE_WITHIN} of length 1",
             hint="a mesh of separate sheets or in other units than metres? density.field_resolution refines grids",
         )
-    figures = {"share": share, "median_off": float(np.median(off))}
-    return Held(f"{share:.0%} of {len(off)} within {SLOPE_WITHIN}, half within {figures['median_off']:.1g}", figures)
+    median = float(np.median(off))
+    words = f"{share:.0%} of {len(off)} within {SLOPE_WITHIN}, half within {median:.1g}"
+    return LawHolds(words, {"share": share, "median_off": median})
 
 
-def check_agreement(subject: Subject) -> Held:
+def check_agreement(subject: Subject) -> LawHolds:
     """Distances are 0 where rays meet targets, and on the way there never more than what is left of it."""
-    ground, generator, worst_m = ground_of(subject), np.random.default_rng(SEED), 0.0
+    ground, generator, worst_m = target_fields(subject), np.random.default_rng(SEED), 0.0
     for seen in ground.seen:
         shares = generator.uniform(0.0, 1.0, len(seen.range_m))
         at_hit = np.abs(ground.distance(seen, seen.at(seen.range_m)))
@@ -240,7 +240,7 @@ def check_agreement(subject: Subject) -> Held:
             )
         worst_m = max(worst_m, float(off_m.max()))
     count = sum(len(seen.range_m) for seen in ground.seen)
-    return Held(f"{count} hits, at most {worst_m:.1g} m off", {"rays": count, "difference_m": worst_m})
+    return LawHolds(f"{count} hits, at most {worst_m:.1g} m off", {"rays": count, "difference_m": worst_m})
 
 
 LAWS = (

@@ -11,11 +11,10 @@ from lidardesign.config import PRESETS, resolve
 from lidardesign.design.sensor import FITTED_LAYOUTS
 from lidardesign.errors import ConfigError
 from lidardesign.space import DesignSpace
-from lidardesign.testing.law import BrokenLawError, Held, Law, NotApplicable
-from lidardesign.testing.subject import Subject
+from lidardesign.testing.law import BrokenLawError, Law, LawHolds, NotApplicable, Subject
 
 
-def check_config(subject: Subject) -> Held:
+def check_config(subject: Subject) -> LawHolds:
     """Unknown keys and NaN are refused, values come back from JSON as they were, every key says what it is."""
     kind, config = type(subject.config.task), subject.config.task
     with subject.calling("Config"):
@@ -33,7 +32,7 @@ def check_config(subject: Subject) -> Held:
         raise BrokenLawError(
             f"{mute[0]!r} has no description", hint="Field(default, description=...); `tasks show` prints it"
         )
-    return Held(f"{len(kind.model_fields)} keys", {"keys": len(kind.model_fields)})
+    return LawHolds(f"{len(kind.model_fields)} keys", {"keys": len(kind.model_fields)})
 
 
 def _takes(kind: type, values: dict[str, object]) -> bool:
@@ -44,7 +43,7 @@ def _takes(kind: type, values: dict[str, object]) -> bool:
     return True
 
 
-def check_metric(subject: Subject) -> Held:
+def check_metric(subject: Subject) -> LawHolds:
     """The metric has a name, a direction, a finite worst value and a tolerance above 0."""
     metric = subject.task.metric
     wrong = {
@@ -61,14 +60,14 @@ def check_metric(subject: Subject) -> Held:
                 allowed="a name, a unit, better='lower' or 'higher', a finite worst value, a tolerance above 0",
             )
     words = f"{metric.name} [{metric.unit}], {metric.better} is better, worst {metric.worst:g}"
-    return Held(words, {"worst": float(metric.worst), "tolerance": float(metric.tolerance)})
+    return LawHolds(words, {"worst": float(metric.worst), "tolerance": float(metric.tolerance)})
 
 
 def _is_finite(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def check_defaults(subject: Subject) -> Held:
+def check_defaults(subject: Subject) -> LawHolds:
     """Suggested sensors, rays, layout, level and settings are ones that the commands accept, in every preset."""
     defaults = subject.task.defaults
     allowed = "sensors and rays of 1 or more, a known layout, a level between 0 and 1"
@@ -92,7 +91,7 @@ def check_defaults(subject: Subject) -> Held:
         except ConfigError as error:
             raise BrokenLawError(f"preset {preset}: {error.message}", allowed=error.allowed) from error
     rays = ", ".join(map(str, defaults.rays))
-    return Held(f"layout {defaults.layout}, level {defaults.level:g}, evaluated at {rays} rays")
+    return LawHolds(f"layout {defaults.layout}, level {defaults.level:g}, evaluated at {rays} rays")
 
 
 def _as_yaml(value: object) -> str:
@@ -109,7 +108,7 @@ def _are_counts(values: object) -> bool:
     return isinstance(values, list | tuple) and len(values) > 0 and all(map(_is_count, values))
 
 
-def check_space(subject: Subject) -> Held:
+def check_space(subject: Subject) -> LawHolds:
     """`space` gives a DesignSpace, the same one every time, with a dimension to design."""
     with subject.calling("space"):
         first, again = (subject.task.space(subject.config.task) for _ in range(2))
@@ -122,15 +121,15 @@ def check_space(subject: Subject) -> Held:
     designed = len(set(subject.config.space.free) - set(subject.config.space.conditioned))
     if not designed:
         raise BrokenLawError("every dimension of the design space is fixed", hint="free at least one")
-    return Held(f"{designed} of 6 dimensions are designed", {"designed": designed})
+    return LawHolds(f"{designed} of 6 dimensions are designed", {"designed": designed})
 
 
-def check_conditions(subject: Subject) -> Held | NotApplicable:
+def check_conditions(subject: Subject) -> LawHolds | NotApplicable:
     """The condition values that designs are evaluated at lie in the design space, and each names every condition."""
     if not subject.config.space.conditioned:
         return NotApplicable("the density has no conditions")
     count = len(subject.conditions)
-    return Held(f"{count} values of {', '.join(subject.config.space.condition)}", {"values": count})
+    return LawHolds(f"{count} values of {', '.join(subject.config.space.condition)}", {"values": count})
 
 
 LAWS = (

@@ -22,7 +22,7 @@ from lidardesign import registry
 from lidardesign.config import resolve
 from lidardesign.errors import ConfigError, DataError, LidardesignError
 from lidardesign.registry import BEGUN, GRACE_SECONDS, START_SECONDS, UNHEARD, Apart, answer
-from lidardesign.testing.law import LOADS, Finding, Law, Limits, place_of, said
+from lidardesign.testing.law import LOADS, Finding, Law, Limits, error_words, place_of
 from lidardesign.testing.watch import Watch
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def check_apart(request: CheckRequest) -> Iterator[Finding]:
     try:
         offer = registry.offer_of(request.name)
     except registry.PluginError as error:
-        yield from _all_lost(0, said(error))
+        yield from _all_lost(0, error_words(error))
         return
     with tempfile.TemporaryDirectory(prefix="lidardesign-check-") as folder:
         child = Apart(CHILD, _as_document(request, offer, folder))
@@ -226,11 +226,11 @@ def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
     try:
         task, config = _loaded(request, watch)
     except registry.PluginError as error:
-        _tell(result, Finding(*LOADS, "fail", f"{said(error)}{place_of(error)}"))
+        _tell(result, Finding(*LOADS, "fail", f"{error_words(error)}{place_of(error)}"))
         return None
     except LidardesignError as error:
         if str(error.where).startswith("defaults of task"):
-            _tell(result, Finding(*LOADS, "fail", f"{error.where}: {said(error)}"))
+            _tell(result, Finding(*LOADS, "fail", f"{error.where}: {error_words(error)}"))
         else:
             _write(result, {"refused": error.as_dict()})
         return None
@@ -239,7 +239,7 @@ def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
         return None
     # not before: a plugin that fails to load is named without the libraries that the laws need
     from lidardesign.testing.contract import Contract
-    from lidardesign.testing.subject import Subject
+    from lidardesign.testing.law import Subject
 
     version = f"version {task.api_version} of the task interface"
     _tell(result, Finding(*LOADS, "pass", f"{version}, {type(task).__module__}", time.perf_counter() - started))

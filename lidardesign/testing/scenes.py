@@ -12,15 +12,14 @@ from lidardesign.scene import Scene
 from lidardesign.task import Split
 from lidardesign.testing.elsewhere import fingerprints_elsewhere
 from lidardesign.testing.fingerprint import fingerprint, geometry_fingerprint
-from lidardesign.testing.law import BrokenLawError, Held, Law, NotApplicable
-from lidardesign.testing.subject import Subject
+from lidardesign.testing.law import BrokenLawError, Law, LawHolds, NotApplicable, Subject
 
 # Training scenes are drawn with other seeds for refinement; so many further seeds are tried.
 FURTHER_SEEDS = 2
 SPLITS: tuple[Split, ...] = ("train", "test")
 
 
-def check_scenes(subject: Subject) -> Held:
+def check_scenes(subject: Subject) -> LawHolds:
     """Both splits have scenes, and their bodies are within the program's bounds."""
     counts = {split: len(subject.scenes(split)) for split in SPLITS}
     for split, count in counts.items():
@@ -28,15 +27,15 @@ def check_scenes(subject: Subject) -> Held:
             raise BrokenLawError(f"the split {split} has no scenes", allowed="1 or more")
     frames = max(scene.frames for split in SPLITS for scene in subject.scenes(split))
     moving = f", up to {frames} frames" if frames > 1 else ""
-    return Held(f"{counts['train']} to train on, {counts['test']} held out{moving}", {**counts, "frames": frames})
+    return LawHolds(f"{counts['train']} to train on, {counts['test']} held out{moving}", {**counts, "frames": frames})
 
 
-def check_repeatable(subject: Subject) -> Held:
+def check_repeatable(subject: Subject) -> LawHolds:
     """The same configuration, split and seed give the same scenes, to the bit."""
     for split in SPLITS:
         first, again = subject.scenes(split), subject.new_scenes(split, subject.config.seed)
         _compare(first, again, f"the second time the split {split}")
-    return Held("made twice, the same to the bit")
+    return LawHolds("made twice, the same to the bit")
 
 
 def _compare(first: Sequence[Scene], again: Sequence[Scene], when: str) -> None:
@@ -50,7 +49,7 @@ def _compare(first: Sequence[Scene], again: Sequence[Scene], when: str) -> None:
             )
 
 
-def check_seeds(subject: Subject) -> Held | NotApplicable:
+def check_seeds(subject: Subject) -> LawHolds | NotApplicable:
     """Another seed gives other training scenes: refinement, which needs residuals, trains on further ones."""
     first = {geometry_fingerprint(scene) for scene in subject.scenes("train")}
     other = {geometry_fingerprint(scene) for scene in subject.scenes("train", subject.config.seed + 1)}
@@ -60,10 +59,10 @@ def check_seeds(subject: Subject) -> Held | NotApplicable:
         if not gives_residuals(subject.task):
             return NotApplicable(f"{same}; without residuals, no further ones are drawn")
         raise BrokenLawError(f"{same}, but refinement draws further ones", hint="draw chance from the seed")
-    return Held(f"{shared} of {len(first)} training scenes are the same with another seed", {"shared": shared})
+    return LawHolds(f"{shared} of {len(first)} training scenes are the same with another seed", {"shared": shared})
 
 
-def check_disjoint(subject: Subject) -> Held:
+def check_disjoint(subject: Subject) -> LawHolds:
     """No held-out scene is trained on, whatever the seed of the training scenes."""
     held_out = {geometry_fingerprint(scene): scene.name for scene in subject.scenes("test")}
     seeds = range(subject.config.seed, subject.config.seed + FURTHER_SEEDS + 1)
@@ -75,10 +74,10 @@ def check_disjoint(subject: Subject) -> Held:
                     f"the training scene {scene.name!r} of seed {seed} is the held-out scene {name!r}",
                     hint="name the split where chance is drawn: random_generator(seed, self.name, split, index)",
                 )
-    return Held(f"{len(held_out)} held out, none met with {len(seeds)} seeds", {"seeds": len(seeds)})
+    return LawHolds(f"{len(held_out)} held out, none met with {len(seeds)} seeds", {"seeds": len(seeds)})
 
 
-def check_elsewhere(subject: Subject) -> Held | NotApplicable:
+def check_elsewhere(subject: Subject) -> LawHolds | NotApplicable:
     """A worker process makes the same scenes: nothing hangs on the order of sets or on what ran before."""
     kind = type(subject.task)
     if kind.__module__ == "__main__" or "<locals>" in kind.__qualname__ or find_spec(kind.__module__) is None:
@@ -92,10 +91,10 @@ def check_elsewhere(subject: Subject) -> Held | NotApplicable:
                 f"another process makes another scene {number} of the split {split}",
                 hint="do not use hash(), the order of sets, the time or the process in scenes",
             )
-    return Held("another process makes them the same to the bit")
+    return LawHolds("another process makes them the same to the bit")
 
 
-def check_picklable(subject: Subject) -> Held:
+def check_picklable(subject: Subject) -> LawHolds:
     """Scenes and the configuration survive pickling, which any engine of workers may do with them."""
     size = 0
     for scene in (*subject.looked_at, subject.config.task):
@@ -110,7 +109,7 @@ def check_picklable(subject: Subject) -> Held:
         if fingerprint(again) != fingerprint(scene):
             raise BrokenLawError(f"{scene!r:.80} is another one after pickling")
         size = max(size, len(content))
-    return Held(f"{size / 1000:.3g} kB at most", {"bytes": size})
+    return LawHolds(f"{size / 1000:.3g} kB at most", {"bytes": size})
 
 
 LAWS = (

@@ -8,9 +8,8 @@ from lidardesign.evaluate.scene_scores import checked_residuals, gives_residuals
 from lidardesign.geometry.rays import Returns
 from lidardesign.scene import Scene
 from lidardesign.testing.fingerprint import fingerprint
-from lidardesign.testing.law import BrokenLawError, Held, Law, NotApplicable
+from lidardesign.testing.law import BrokenLawError, Law, LawHolds, NotApplicable, Subject
 from lidardesign.testing.probing import full_rays, shuffled, with_noise, without_returns
-from lidardesign.testing.subject import Subject
 
 DENSE, SPARSE = 400, 12
 SEED = 20_253
@@ -34,7 +33,7 @@ def _scenes(subject: Subject) -> list[tuple[int, Scene]]:
     return list(enumerate(subject.looked_at))
 
 
-def check_number(subject: Subject) -> Held:
+def check_number(subject: Subject) -> LawHolds:
     """Returns of dense, of sparse and of random rays are scored by a finite number or fail."""
     values = []
     for number, scene in _scenes(subject):
@@ -44,10 +43,10 @@ def check_number(subject: Subject) -> Held:
             values.append(subject.score(scene, subject.returns(number, lists)).value)
     unit = subject.task.metric.unit
     words = f"{len(values)} scores from {min(values):.4g} to {max(values):.4g} {unit}"
-    return Held(words, {"least": min(values), "most": max(values)})
+    return LawHolds(words, {"least": min(values), "most": max(values)})
 
 
-def check_nothing(subject: Subject) -> Held:
+def check_nothing(subject: Subject) -> LawHolds:
     """No rays at all and rays that hear nothing are scored, and no better than returns are."""
     found = []
     for number, scene in _scenes(subject):
@@ -64,10 +63,10 @@ def check_nothing(subject: Subject) -> Held:
                 )
             found.append(score.failed)
     words = "counts as failed" if all(found) else "scored as a number" if not any(found) else "failed or a number"
-    return Held(words, {"failed": float(np.mean(found))})
+    return LawHolds(words, {"failed": float(np.mean(found))})
 
 
-def check_best(subject: Subject) -> Held:
+def check_best(subject: Subject) -> LawHolds:
     """Many exact returns from targets score at least as well as few, and better than none."""
     dense, sparse, none = [], [], []
     for number, scene in _scenes(subject):
@@ -85,10 +84,10 @@ def check_best(subject: Subject) -> Held:
             allowed=f"the first is the best ({metric.better} is better)",
             hint="check metric.better and what score() compares",
         )
-    return Held(said, figures)
+    return LawHolds(said, figures)
 
 
-def check_noise(subject: Subject) -> Held:
+def check_noise(subject: Subject) -> LawHolds:
     """Noise on ranges makes scores worse, or leaves those alone that do not depend on ranges."""
     exact, noisy = [], []
     for number, scene in _scenes(subject):
@@ -103,10 +102,10 @@ def check_noise(subject: Subject) -> Held:
     if min(losses) < -metric.tolerance:
         raise BrokenLawError(f"noise on the ranges makes the score better: {said}")
     figures = {"exact": value, "noisy": float(found[-1])}
-    return Held(said if max(losses) > 0 else f"{said}: ranges do not enter", figures)
+    return LawHolds(said if max(losses) > 0 else f"{said}: ranges do not enter", figures)
 
 
-def check_order(subject: Subject) -> Held:
+def check_order(subject: Subject) -> LawHolds:
     """The order in which rays are listed does not matter."""
     worst = 0.0
     for number, scene in _scenes(subject):
@@ -118,20 +117,20 @@ def check_order(subject: Subject) -> Held:
     if worst > limit:
         unit = subject.task.metric.unit
         raise BrokenLawError(f"rays in another order change the score by {worst:.3g} {unit}", allowed=f"{limit:.3g}")
-    return Held(f"changes by at most {worst:.1g} {subject.task.metric.unit}", {"difference": worst})
+    return LawHolds(f"changes by at most {worst:.1g} {subject.task.metric.unit}", {"difference": worst})
 
 
-def check_repeats(subject: Subject) -> Held:
+def check_repeats(subject: Subject) -> LawHolds:
     """The same returns have the same score every time, to the bit."""
     for number, scene in _scenes(subject):
         returns = _dense(subject, number)
         first, again = subject.score(scene, returns), subject.score(scene, returns)
         if fingerprint(first) != fingerprint(again):
             raise BrokenLawError(f"scene {scene.name!r}: {first.value!r}, then {again.value!r} for the same returns")
-    return Held("scored twice, the same to the bit")
+    return LawHolds("scored twice, the same to the bit")
 
 
-def check_untouched(subject: Subject) -> Held:
+def check_untouched(subject: Subject) -> LawHolds:
     """Scoring changes neither the scene nor the returns."""
     for number, scene in _scenes(subject):
         returns = _dense(subject, number)
@@ -142,10 +141,10 @@ def check_untouched(subject: Subject) -> Held:
     touched = subject.touched()
     if touched:
         raise BrokenLawError(f"score changed the scene {touched[0]!r}", hint=COPIES)
-    return Held(f"{len(subject.looked_at)} scenes and their returns are as they were")
+    return LawHolds(f"{len(subject.looked_at)} scenes and their returns are as they were")
 
 
-def check_residuals(subject: Subject) -> Held | NotApplicable:
+def check_residuals(subject: Subject) -> LawHolds | NotApplicable:
     """Residuals are places and values of 0 or more, also where nothing was heard."""
     if not gives_residuals(subject.task):
         return NotApplicable("the task gives no residuals: its designs cannot be refined")
@@ -155,7 +154,7 @@ def check_residuals(subject: Subject) -> Held | NotApplicable:
         for heard in (returns, without_returns(returns)):
             with subject.calling("residuals"):
                 count += len(checked_residuals(subject.task, scene, heard).values)
-    return Held(f"{count} places", {"places": count})
+    return LawHolds(f"{count} places", {"places": count})
 
 
 LAWS = (

@@ -597,14 +597,14 @@ def test_a_scan_that_cannot_be_is_refused(tmp_path, options):
 def test_what_is_written_for_gazebo_fires_as_it_is_read(tmp_path):
     from lidardesign.export.common.poses import mounts
     from lidardesign.export.common.xml import read_xml
-    from lidardesign.export.sdf import held
+    from lidardesign.export.sdf import read_sensor
 
     design = rig(3, counts=(9, 6), names=("a", "b"))
     rays = lay_out(design)
     path = tmp_path / "rig.sdf"
     EXPORTERS["sdf"].write(design, rays, path)
     found = lay_out(load_design(path))
-    fired = [held(one, path) for one in read_xml(path, "sdf").iter("sensor")]
+    fired = [read_sensor(one, path) for one in read_xml(path, "sdf").iter("sensor")]
     assert len(fired) == len(mounts(design, rays)) == 2
     np.testing.assert_allclose(found.direction, np.concatenate([one.direction for one in fired]), atol=1e-9)
 

@@ -17,7 +17,7 @@ from lidardesign.scene import Body, Medium, Mesh, Scene, Sphere
 from lidardesign.testing import BrokenLawError, Limits, check_task, contract_of
 from lidardesign.testing.contract import LAWS
 from lidardesign.testing.fingerprint import fingerprint, geometry_fingerprint
-from lidardesign.testing.geometry import ground_of
+from lidardesign.testing.geometry import target_fields
 from lidardesign.testing.watch import Watch
 
 METRIC = 'Metric("radius error", "mm", "lower", worst=100.0, tolerance=0.5)'
@@ -235,7 +235,7 @@ class Bent:
 def test_a_field_that_is_wrong_is_noticed(law, distance, slope):
     contract = contract_of(task_of(GOOD))
     assert contract.finding("targets are in reach").outcome == "pass"
-    ground = ground_of(contract.subject)
+    ground = target_fields(contract.subject)
     ground.field = Bent(ground.field, distance, slope)
     assert contract.finding(law).outcome == "fail"
 

@@ -23,7 +23,7 @@ from lidardesign.scene import Scene
 from lidardesign.simulate.detector.detector import Detector, check_windows
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.physics import EFFECTS, Physics
-from lidardesign.simulate.plan import Plan, Planner, predicted_seconds
+from lidardesign.simulate.plan import EffectPlan, Planner, predicted_seconds
 from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import conditions_of
 
@@ -69,7 +69,7 @@ class Bench:
         return [build_casters(scene) for scene in self.scenes]
 
     @cached_property
-    def plans(self) -> list[Plan]:
+    def plans(self) -> list[EffectPlan]:
         """Of every scene."""
         pairs = zip(self.scenes, self.casters, strict=True)
         return [self.planner.plan(scene, list(self.positions), casters) for scene, casters in pairs]

@@ -41,7 +41,7 @@ from lidardesign.numerics import COARSE_SLACK
 from lidardesign.registry import load_task, plugin_guard
 from lidardesign.scene import Mesh, Scene
 from lidardesign.simulate.detector.detector import Detector, Photons
-from lidardesign.simulate.plan import Bound, Decision, Plan, Planner, Tolerance
+from lidardesign.simulate.plan import Bound, Decision, EffectPlan, Planner, Tolerance
 from lidardesign.space import DesignSpace
 from lidardesign.task import Score, Task, scenes_of
 
@@ -242,10 +242,10 @@ def planner_from_document(document: dict[str, Any]) -> Planner:
     )
 
 
-def plan_from_document(document: dict[str, Any]) -> Plan:
+def plan_from_document(document: dict[str, Any]) -> EffectPlan:
     """The inverse of `dataclasses.asdict` for a plan."""
     decisions = (Decision(**{**one, "bound": Bound(**one["bound"])}) for one in document["decisions"])
-    return Plan(tuple(decisions), Tolerance(**document["tolerance"]))
+    return EffectPlan(tuple(decisions), Tolerance(**document["tolerance"]))
 
 
 def scores_as_document(found: SceneScores) -> dict[str, Any]:

@@ -228,7 +228,7 @@ def gate_losses(mounted: Sequence[Mount]) -> list[str]:
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
+class ReadMount:
     """What was read back of one mount: its place, unit vectors of its rays (M, 3), its gate; NaN is not held."""
 
     origin_m: np.ndarray
@@ -236,7 +236,9 @@ class Held:
     gate_m: tuple[float, float]
 
 
-def held_rounding(rays: Rays, mounted: Sequence[Mount], found: Sequence[Held], path: Path) -> dict[str, Estimate]:
+def mounts_rounding(
+    rays: Rays, mounted: Sequence[Mount], found: Sequence[ReadMount], path: Path
+) -> dict[str, Estimate]:
     """The largest differences from what one place, one gate and other rays make of a sensor's.
 
     A direction is off by the angle to the nearest ray that its sensor fires.
