@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from support.tables import each_row
 
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.origins import box_around, free_boxes, inside_excluded, nearest_admitted, origin_box
+from lidardesign.design.constraints.origins import box_around, free_boxes, inside_excluded, nearest_in_boxes, origin_box
 from lidardesign.design.mixture.bounds import Bounds, Floors, bounds_of
 from lidardesign.design.mixture.em import run_em, seed_mixture
 from lidardesign.design.mixture.features import Axes, Features
@@ -146,7 +146,7 @@ def test_the_nearest_place_is_in_the_nearest_box():
     low, high = np.maximum(free.low_m, low), np.minimum(free.high_m, high)
     points = np.array([[2.9, 3.0, 3.5], [2.5, 2.1, 3.0], [1.0, 1.0, 1.0], [7.0, 3.0, 3.0]])
     expected = [[3.0, 3.0, 3.5], [2.5, 2.0, 3.0], [1.0, 1.0, 1.0], [6.0, 3.0, 3.0]]
-    np.testing.assert_array_equal(nearest_admitted(points, low, high), expected)
+    np.testing.assert_array_equal(nearest_in_boxes(points, low, high), expected)
     around = box_around(np.array([1.8, 3.0, 3.0]), np.array([0.1, 2.0, 2.0]), free)
     assert around[1][0] == 2.0
 

@@ -58,12 +58,18 @@ class Library:
             )
         return Part.of_file(stem, file, mode or None, self.origins[stem])
 
+    def in_modes(self, name: str, mode: str = "") -> list[Part]:
+        """A part in one mode, or in all that it has.
+
+        Raises:
+            ConfigError: There is no such part or mode.
+        """
+        modes = [mode] if mode else self.part(name).modes
+        return [self.part(f"{name}:{one}") for one in modes] or [self.part(name)]
+
     def every_mode(self) -> list[Part]:
         """All parts in all their modes, by name."""
-        return [self.part(f"{name}:{mode}" if mode else name) for name in self.names for mode in self._modes(name)]
-
-    def _modes(self, name: str) -> list[str]:
-        return list(self.files[name].modes) or [""]
+        return [part for name in self.names for part in self.in_modes(name)]
 
 
 def load_library(own: Sequence[Path] = ()) -> Library:

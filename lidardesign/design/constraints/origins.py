@@ -134,7 +134,7 @@ def box_around(mean_m: np.ndarray, reach_m: np.ndarray, boxes: Boxes) -> tuple[n
     return boxes.low_m[best], boxes.high_m[best]
 
 
-def nearest_admitted(origins_m: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def nearest_in_boxes(origins_m: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """The nearest point of any of M boxes, given by corners (M, 3), to each of some origins (N, 3): shape (N, 3)."""
     clipped = np.clip(origins_m[:, None], low, high)
     away = np.square(clipped - origins_m[:, None]).sum(axis=2)

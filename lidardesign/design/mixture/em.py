@@ -1,4 +1,4 @@
-"""Expectation maximisation with restarts: the loop, its seeds, and what happens to components that die."""
+"""Expectation maximisation with restarts: the loop, its seeds, and components that lose their samples."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lidardesign.design.constraints.origins import nearest_admitted
+from lidardesign.design.constraints.origins import nearest_in_boxes
 from lidardesign.design.layouts.quantise import lloyd
 from lidardesign.design.mixture.bounds import Bounds, Floors, clip_azimuth
 from lidardesign.design.mixture.features import Features
@@ -146,10 +146,10 @@ def seed_mixture(features: Features, bounds: Bounds, generator: np.random.Genera
     part = features.subset(np.sort(chosen)) if len(chosen) < len(features) else features
     embedding = np.ascontiguousarray(part.embedding)
     _, labels = lloyd(embedding, part.weights, len(bounds), generator, iterations=SEED_LLOYD_ITERATIONS)
-    return from_labels(part, _matched(part, labels, bounds), bounds)
+    return from_labels(part, _match_cells(part, labels, bounds), bounds)
 
 
-def _matched(features: Features, labels: np.ndarray, bounds: Bounds) -> np.ndarray:
+def _match_cells(features: Features, labels: np.ndarray, bounds: Bounds) -> np.ndarray:
     """Labels renumbered so that each cell has the component whose bounds it violates least."""
     count = len(bounds)
     cost = np.zeros((count, count))
@@ -161,7 +161,9 @@ def _matched(features: Features, labels: np.ndarray, bounds: Bounds) -> np.ndarr
         one = bounds.take(np.full(count, component))
         turned = wrap_angle(clip_azimuth(azimuth, one) - azimuth) / features.angular_scale
         tilted = (np.clip(elevation, one.elevation_low, one.elevation_high) - elevation) / features.angular_scale
-        moved = _nearest_origins(means[:, :3], bounds, component) - means[:, :3]
+        low = np.maximum(bounds.origin_low[component], bounds.free_low[component])
+        high = np.maximum(np.minimum(bounds.origin_high[component], bounds.free_high[component]), low)
+        moved = nearest_in_boxes(means[:, :3], low, high) - means[:, :3]
         reach = np.clip(means[:, 5], one.start_low, one.end_high) - means[:, 5]
         unit = features.scale.max() if len(features.scale) else 1.0
         cost[component] = np.square(turned) + np.square(tilted) + (np.square(moved).sum(1) + np.square(reach)) / unit**2
@@ -174,13 +176,6 @@ def _matched(features: Features, labels: np.ndarray, bounds: Bounds) -> np.ndarr
     renumbered = np.empty(count, dtype=np.int64)
     renumbered[cell] = component
     return renumbered[labels]
-
-
-def _nearest_origins(origins_m: np.ndarray, bounds: Bounds, component: int) -> np.ndarray:
-    """The nearest mean origins that a component's bounds admit, (N, 3) to (N, 3) [m]."""
-    low = np.maximum(bounds.origin_low[component], bounds.free_low[component])
-    high = np.maximum(np.minimum(bounds.origin_high[component], bounds.free_high[component]), low)
-    return nearest_admitted(origins_m, low, high)
 
 
 def fit_mixture(
@@ -202,17 +197,13 @@ def fit_mixture(
     """
     if start is None:
         start = _best_seed(features, bounds, generator, 1 if len(bounds) == 1 else max(restarts, 1))
-    trace = _revived(run_em(start, features, bounds), features, bounds, generator)
-    return replace(trace, notes=(*_shared_notes(features, len(bounds)), *trace.notes))
-
-
-def _shared_notes(features: Features, count: int) -> tuple[str, ...]:
-    """A line where there are fewer different samples than components: some then share one."""
-    for part in (features.points[: max(count, FEW_SAMPLES)], features.points):
+    result = _revive(run_em(start, features, bounds), features, bounds, generator)
+    for part in (features.points[: max(len(bounds), FEW_SAMPLES)], features.points):
         different = len(np.unique(part, axis=0))
-        if different >= count:
-            return ()
-    return (f"fewer different samples ({different}) than sensors ({count}): some sensors share one",)
+        if different >= len(bounds):
+            return result
+    shared = f"fewer different samples ({different}) than sensors ({len(bounds)}): some sensors share one"
+    return replace(result, notes=(shared, *result.notes))
 
 
 def _best_seed(features: Features, bounds: Bounds, generator: np.random.Generator, restarts: int) -> Mixture:
@@ -234,23 +225,23 @@ def dead_components(mixture: Mixture, features: Features) -> np.ndarray:
     return mixture.weights * effective_count(features.weights) < min(DEAD_SAMPLES, len(features) / len(mixture))
 
 
-def _revived(trace: EMResult, features: Features, bounds: Bounds, generator: np.random.Generator) -> EMResult:
+def _revive(result: EMResult, features: Features, bounds: Bounds, generator: np.random.Generator) -> EMResult:
     """Give dead components half of the heaviest one's samples and go on, where the likelihood gains."""
     notes: list[str] = []
     for _ in range(MOST_REVIVALS):
-        dead = np.flatnonzero(dead_components(trace.mixture, features))
+        dead = np.flatnonzero(dead_components(result.mixture, features))
         if not len(dead):
             break
-        labels = responsibilities(trace.mixture, features).argmax(axis=1)
+        labels = responsibilities(result.mixture, features).argmax(axis=1)
         for component in dead:
             inside = np.flatnonzero(labels == np.bincount(labels, features.weights).argmax())
             part = features.subset(inside)
             _, halves = lloyd(np.ascontiguousarray(part.embedding), part.weights, 2, generator, iterations=2)
             labels[inside[halves == 1]] = component
         again = run_em(from_labels(features, labels, bounds), features, bounds)
-        if again.log_likelihood < trace.log_likelihood:
+        if again.log_likelihood < result.log_likelihood:
             notes.append(f"{len(dead)} of {len(bounds)} sensors explain almost no samples")
             break
         notes.append(f"restarted {len(dead)} of {len(bounds)} sensors that had lost their samples")
-        trace = again
-    return replace(trace, notes=tuple(notes))
+        result = again
+    return replace(result, notes=tuple(notes))

@@ -1,6 +1,10 @@
-r"""The constrained M-step: each block of parameters at its best inside the bounds.
+r"""The constrained M-step: each block of parameters at its best inside its `Bounds`.
 
-Origin, range, and angular spreads with roll are exact maximisers of the expected log-likelihood Q inside
+`maximise` joins the blocks: `_fit_origins` (with `origin_step`) keeps origins in their boxes, `fit_gate` keeps the
+bounds on the start, end and width of gates, `_fit_directions` turns boresights inside theirs, and `fit_field` keeps
+fields of view.
+
+Origin, gate, and angular spreads with roll are exact maximisers of the expected log-likelihood Q inside
 their bounds (an origin between excluded boxes is at least no worse than before, see `origin_step`). The boresight
 moves by the weighted mean of the tangent coordinates along the sphere (exponential map); that is exact in the
 flat limit, so `em` accepts it only where the log-likelihood does not fall and otherwise keeps the boresight, which
@@ -42,25 +46,26 @@ def maximise(
     """
     alive = statistics.mass > SMALLEST_MASS
     mass = np.where(alive, statistics.mass, 1.0)
-    origin, covariance = _origin(mixture, statistics.phi / mass[:, None], features, bounds, floors)
-    mean, spread = _range(mixture, statistics.phi / mass[:, None], features, bounds, floors)
-    azimuth, elevation, roll, angular = _direction(
-        mixture, statistics.tangent / mass[:, None, None], features, bounds, floors, step
-    )
+    phi, tangent = statistics.phi / mass[:, None], statistics.tangent / mass[:, None, None]
+    origin, covariance = _fit_origins(mixture, phi, features, bounds, floors)
+    azimuth, elevation, roll, angular = _fit_directions(mixture, tangent, features, bounds, floors, step)
+    mean, spread = mixture.range_m, mixture.spread_range_m
+    if features.axes.range:
+        scale, first = features.scale[-1], phi[:, features.axes.linear]
+        variance = np.maximum(phi[:, -1] - np.square(first), 0.0) * scale**2
+        mean, spread = fit_gate(features.centre[-1] + scale * first, variance, bounds, floors.range_m)
     weights = np.maximum(statistics.mass, SMALLEST_WEIGHT)
-    fresh = Mixture(weights / weights.sum(), origin, covariance, azimuth, elevation, roll, angular, mean, spread)
-    return fresh if alive.all() else _keep_dead(mixture, fresh, alive)
-
-
-def _keep_dead(old: Mixture, fresh: Mixture, alive: np.ndarray) -> Mixture:
-    rows = {}
-    for name in fresh.__dataclass_fields__:
-        new, kept = getattr(fresh, name), getattr(old, name)
-        rows[name] = new if name == "weights" else np.where(alive.reshape(-1, *[1] * (new.ndim - 1)), new, kept)
+    result = Mixture(weights / weights.sum(), origin, covariance, azimuth, elevation, roll, angular, mean, spread)
+    if alive.all():
+        return result
+    rows = {"weights": result.weights}
+    for name in [name for name in result.__dataclass_fields__ if name != "weights"]:
+        new = getattr(result, name)
+        rows[name] = np.where(alive.reshape(-1, *[1] * (new.ndim - 1)), new, getattr(mixture, name))
     return Mixture(**rows)
 
 
-def _origin(
+def _fit_origins(
     mixture: Mixture, phi: np.ndarray, features: Features, bounds: Bounds, floors: Floors
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean origins in their boxes and covariances with bounded eigenvalues, (K, 3) and (K, 3, 3)."""
@@ -94,17 +99,6 @@ def _origin(
     origin[:, axes] = point
     covariance[np.ix_(range(len(mixture)), axes, axes)] = best
     return origin, covariance
-
-
-def _range(
-    mixture: Mixture, phi: np.ndarray, features: Features, bounds: Bounds, floors: Floors
-) -> tuple[np.ndarray, np.ndarray]:
-    if not features.axes.range:
-        return mixture.range_m, mixture.spread_range_m
-    scale, column = features.scale[-1], features.axes.linear
-    first = phi[:, column]
-    variance = np.maximum(phi[:, -1] - np.square(first), 0.0) * scale**2
-    return fit_gate(features.centre[-1] + scale * first, variance, bounds, floors.range_m)
 
 
 def fit_gate(mean: np.ndarray, variance: np.ndarray, bounds: Bounds, floor: float) -> tuple[np.ndarray, np.ndarray]:
@@ -151,7 +145,7 @@ def fit_gate(mean: np.ndarray, variance: np.ndarray, bounds: Bounds, floor: floa
     return means[best], spreads[best]
 
 
-def _direction(
+def _fit_directions(
     mixture: Mixture,
     tangent: np.ndarray,
     features: Features,
@@ -163,11 +157,19 @@ def _direction(
     axes = features.axes
     if not axes.angular:
         return mixture.azimuth_rad, mixture.elevation_rad, mixture.roll_rad, mixture.spread_rad
-    wanted = step * tangent[:, :, 0]
-    azimuth, elevation = _moved(mixture, wanted, bounds, (axes.horizontal, axes.vertical))
-    level = frames(azimuth, elevation, np.zeros(len(mixture)))
-    taken, turn = _displacement(mixture.frames, level)
     mean = tangent[:, :, 0]
+    azimuth, elevation = _move_boresights(mixture, step * mean, bounds, (axes.horizontal, axes.vertical))
+    old, new = mixture.frames, frames(azimuth, elevation, np.zeros(len(mixture)))
+    # tangent coordinates of the new boresights in the old frames
+    local = np.einsum("kij,kj->ki", old, new[:, 0])
+    taken = sphere_log(local)
+    # parallel transport along the geodesic is the rotation that takes one boresight to the other (Rodrigues:
+    # R x = x - (f + f')(f' . x) / (1 + f . f') + ... on vectors orthogonal to f); `turn` expresses transported axes
+    # in those of the new frame
+    total = old[:, 0] + new[:, 0]
+    along = np.einsum("kij,kj->ki", old[:, 1:], new[:, 0]) / (1 + local[:, :1])
+    transported = old[:, 1:] - along[:, :, None] * total[:, None]
+    turn = np.einsum("kij,kmj->kim", new[:, 1:], transported)
     moment = tangent[:, :, 1:] - mean[:, :, None] * taken[:, None] - taken[:, :, None] * mean[:, None]
     moment = moment + taken[:, :, None] * taken[:, None]
     moment = turn @ moment @ np.swapaxes(turn, 1, 2)
@@ -176,7 +178,7 @@ def _direction(
     return azimuth, elevation, roll, spread
 
 
-def _moved(
+def _move_boresights(
     mixture: Mixture, wanted: np.ndarray, bounds: Bounds, used: tuple[bool, bool]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Azimuth and elevation after a tangent step (K, 2) in rolled axes, projected into the boresight boxes.
@@ -208,33 +210,14 @@ def _moved(
     high[:, 1] = np.where(bounds.elevation_high >= math.pi / 2, np.inf, high[:, 1])
     step = box_quadratic_minimum(precision, east_north, np.minimum(low, high), high)
     step = step * np.array(used, dtype=np.float64)
-    forward = exponential(frames(mixture.azimuth_rad, mixture.elevation_rad, np.zeros(len(mixture))), step)
+    level = frames(mixture.azimuth_rad, mixture.elevation_rad, np.zeros(len(mixture)))
+    forward = np.einsum("kj,kji->ki", sphere_exp(step), level)
     azimuth = np.arctan2(forward[:, 1], forward[:, 0]) if used[0] else mixture.azimuth_rad
     elevation = np.arctan2(forward[:, 2], np.hypot(forward[:, 0], forward[:, 1])) if used[1] else mixture.elevation_rad
     still = (step == 0).all(axis=1)
     azimuth = clip_azimuth(np.where(still, mixture.azimuth_rad, azimuth), bounds)
     elevation = np.where(still, mixture.elevation_rad, elevation)
     return azimuth, np.clip(elevation, bounds.elevation_low, bounds.elevation_high)
-
-
-def exponential(level: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Unit vectors reached from boresights along tangent steps (east, north): (K, 3, 3), (K, 2) to (K, 3)."""
-    return np.einsum("kj,kji->ki", sphere_exp(step), level)
-
-
-def _displacement(old: np.ndarray, new: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Tangent coordinates of new boresights in old frames, (K, 2), and the turn from transported to new axes.
-
-    Parallel transport along the geodesic is the rotation that takes one boresight to the other; `turn`
-    (K, 2, 2) expresses transported axes in the new frame's axes.
-    """
-    local = np.einsum("kij,kj->ki", old, new[:, 0])
-    taken = sphere_log(local)
-    # Rodrigues: R x = x - (f + f')(f' . x) / (1 + f . f') + ... on vectors orthogonal to f
-    total = old[:, 0] + new[:, 0]
-    along = np.einsum("kij,kj->ki", old[:, 1:], new[:, 0]) / (1 + local[:, :1])
-    transported = old[:, 1:] - along[:, :, None] * total[:, None]
-    return taken, np.einsum("kij,kmj->kim", new[:, 1:], transported)
 
 
 def fit_field(

@@ -203,31 +203,18 @@ def expect(mixture: Mixture, features: Features) -> Statistics:
         exponent *= weights / norm
         phi += exponent @ features.phi[:, part].T
         if axes.angular:
-            _add_tangent(tangent, exponent, horizontal, vertical, ratio)
-    return Statistics(total, phi[:, 0], phi, _unscale(tangent, mixture))
-
-
-def _add_tangent(
-    tangent: np.ndarray,
-    responsibility: np.ndarray,
-    horizontal: np.ndarray,
-    vertical: np.ndarray,
-    work: np.ndarray,
-) -> None:
-    """Add the sums of one block: first and second moments of the scaled tangent coordinates."""
-    np.multiply(responsibility, horizontal, out=work)
-    tangent[:, 0, 0] += work.sum(axis=1)
-    tangent[:, 0, 1] += np.einsum("kn,kn->k", work, horizontal)
-    tangent[:, 0, 2] += np.einsum("kn,kn->k", work, vertical)
-    np.multiply(responsibility, vertical, out=work)
-    tangent[:, 1, 0] += work.sum(axis=1)
-    tangent[:, 1, 2] += np.einsum("kn,kn->k", work, vertical)
-
-
-def _unscale(tangent: np.ndarray, mixture: Mixture) -> np.ndarray:
+            # first and second moments of the scaled tangent coordinates
+            np.multiply(exponent, horizontal, out=ratio)
+            tangent[:, 0, 0] += ratio.sum(axis=1)
+            tangent[:, 0, 1] += np.einsum("kn,kn->k", ratio, horizontal)
+            tangent[:, 0, 2] += np.einsum("kn,kn->k", ratio, vertical)
+            np.multiply(exponent, vertical, out=ratio)
+            tangent[:, 1, 0] += ratio.sum(axis=1)
+            tangent[:, 1, 2] += np.einsum("kn,kn->k", ratio, vertical)
     tangent[:, 1, 1] = tangent[:, 0, 2]
     unit = math.sqrt(2.0) * mixture.spread_rad
-    return tangent * unit[:, :, None] * np.concatenate([np.ones((len(unit), 1)), unit], axis=1)[:, None, :]
+    tangent = tangent * unit[:, :, None] * np.concatenate([np.ones((count, 1)), unit], axis=1)[:, None, :]
+    return Statistics(total, phi[:, 0], phi, tangent)
 
 
 def log_density(mixture: Mixture, features: Features) -> np.ndarray:

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.constraints.origins import Boxes, Mount, box_around, mounts_of, nearest_admitted
+from lidardesign.design.constraints.origins import Boxes, Mount, box_around, mounts_of, nearest_in_boxes
 from lidardesign.design.layouts.gates import admissible_gates
 from lidardesign.design.layouts.rays import LAYOUTS
 from lidardesign.design.mixture.bounds import Bounds, bounds_of, clip_azimuth
@@ -54,7 +54,7 @@ def admitted_origins(origins: np.ndarray, bounds: Bounds, constraints: Constrain
     for row in range(len(moved)):
         free = bounds.free_low[row], bounds.free_high[row]
         if np.isfinite(free[0]).any() or np.isfinite(free[1]).any():
-            boxed = nearest_admitted(moved[row : row + 1], *free)
+            boxed = nearest_in_boxes(moved[row : row + 1], *free)
             moved[row] = np.clip(boxed[0], bounds.origin_low[row], bounds.origin_high[row])
     return _mounted(moved, constraints)
 
