@@ -288,10 +288,13 @@ def test_losses_are_what_the_mixture_loses_by_each_part_alone():
 
 def fitted_ensemble(sensors=2):
     """A fit of the samples, as snapping is given it."""
-    from lidardesign.design import fit as module
+    from lidardesign.design.layouts.sensor_fit import FitProblem, fit_sensors
 
-    request = module._Request(samples(), Constraints(), Constraints().rules, 1, 4, 20_000, 0.95, None)
-    return module._solved(request, BandwidthBudget.of(Constraints(), None), sensors, "grid")[3]
+    budget = BandwidthBudget.of(Constraints(), None)
+    request = FitProblem(
+        samples(), Constraints(), Constraints().rules, budget, sensors, 1, 4, 20_000, 0.95, "parts", "sensor", None
+    )
+    return fit_sensors(request).ensemble
 
 
 def test_refitting_poses_never_lowers_the_likelihood_and_keeps_the_shapes_and_shares():
