@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
     from lidardesign.cli.output import Output
-    from lidardesign.workflow.plans import Plan
+    from lidardesign.workflow.plans import RequestPlan
 
 DryRun = Annotated[
     bool,
@@ -25,7 +25,7 @@ DryRun = Annotated[
 BYTES_PER_MEGABYTE = 1e6
 
 
-def show_plan(plan: Plan, output: Output) -> None:
+def show_plan(plan: RequestPlan, output: Output) -> None:
     """Give a plan as the result of its command.
 
     Raises:

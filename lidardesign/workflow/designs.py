@@ -28,9 +28,8 @@ from lidardesign.workflow.refine import fit_design
 from lidardesign.workflow.run_folder import Notes, RunFolder, log_note, need_run, relative_folder
 
 if TYPE_CHECKING:
-    import plotly.graph_objects as go
-
     from lidardesign.evaluate.refinement.refinement import Round
+    from lidardesign.evaluate.report.notebook import Figure
 
 
 class Design(DesignSource):
@@ -165,7 +164,7 @@ class Design(DesignSource):
         target = export_target(self.path, out, exporter)
         return ExportRequest(self, exporter, target, rays, at or {}, rate_hz, seed).write(notes=notes)
 
-    def figure(self, count: int | None = None) -> go.Figure:
+    def figure(self, count: int | None = None) -> Figure:
         """Its sensors in space, with fields of view and gates; with a number of rays these, too (plotly)."""
         from lidardesign.evaluate.report.notebook import design_figure
 

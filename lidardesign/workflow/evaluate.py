@@ -28,7 +28,7 @@ from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
 from lidardesign.task import judged_by_keys
 from lidardesign.workflow.designs import Design, html_table
 from lidardesign.workflow.layouts import Layouts, learned_density, twin_without_visibility
-from lidardesign.workflow.plans import Plan, last_time
+from lidardesign.workflow.plans import RequestPlan, last_time
 from lidardesign.workflow.run_folder import (
     CONFIGURATION,
     MANIFEST,
@@ -43,10 +43,9 @@ from lidardesign.workflow.run_folder import (
 )
 
 if TYPE_CHECKING:
-    import plotly.graph_objects as go
-
     from lidardesign.evaluate.cma.candidate import Show
     from lidardesign.evaluate.figures.figure_data import Pictured
+    from lidardesign.evaluate.report.notebook import Figure
 
 Progress = Callable[[int, int, str], None]
 
@@ -191,7 +190,7 @@ class ScoreRequest:
             options,
         )
 
-    def plan(self, outputs: Mapping[str, Path | None] | None = None) -> Plan:
+    def plan(self, outputs: Mapping[str, Path | None] | None = None) -> RequestPlan:
         """What the evaluation would do.
 
         Arguments:
@@ -219,7 +218,7 @@ class ScoreRequest:
         written = [
             f"{path}/" if option == "--plots" else path for option, path in (outputs or {}).items() if path is not None
         ]
-        return Plan(
+        return RequestPlan(
             THIS,
             [
                 f"score {listed} in the held-out scenes of task {run.task.name}, with {', '.join(map(str, counts))} "
@@ -378,7 +377,7 @@ class Scores:
         write_report(page, Path(path))
         return Path(path)
 
-    def figure(self, against: str = "rays") -> go.Figure:
+    def figure(self, against: str = "rays") -> Figure:
         """The scores with their intervals against "rays" or "bandwidth" (plotly)."""
         from lidardesign.evaluate.report.notebook import scores_figure
 

@@ -19,7 +19,7 @@ from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
 from lidardesign.run.files import STDIO, is_input
 from lidardesign.workflow.layouts import may_need_samples
-from lidardesign.workflow.plans import Plan, last_time
+from lidardesign.workflow.plans import RequestPlan, last_time
 from lidardesign.workflow.run_folder import CONFIGURATION, MANIFEST, Notes, RunFolder, folder_of, log_note, run_of
 from lidardesign.workflow.weighting import RunTarget, Weighting, weighted_samples
 
@@ -178,7 +178,7 @@ class ExportRequest:
             raise ConfigError(f"{name} holds sensors, not rays", where="--rays", hint="leave it out")
         self.exporter.check_rate(self.rate_hz)
 
-    def plan(self) -> Plan:
+    def plan(self) -> RequestPlan:
         """What the export would do.
 
         Raises:
@@ -195,7 +195,7 @@ class ExportRequest:
         content = "its sensors" if count is None else f"its {count} rays"
         place = "".join(f" at {key} = {value:g}" for key, value in self.at.items())
         run = [] if source.folder is None else [source.folder / CONFIGURATION, source.folder / MANIFEST]
-        return Plan(
+        return RequestPlan(
             "export",
             [
                 f"write {content}{place} as {exporter.name}: {exporter.summary}",

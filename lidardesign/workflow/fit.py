@@ -18,7 +18,7 @@ from lidardesign.design.snap.parts import parts_of, wants_parts
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.manifest import verify
 from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml
-from lidardesign.workflow.plans import Plan, last_time
+from lidardesign.workflow.plans import RequestPlan, last_time
 from lidardesign.workflow.run_folder import (
     CONFIGURATION,
     MANIFEST,
@@ -183,7 +183,7 @@ class FitRequest:
         asked = None if self.constraints is None else self.constraints.budget.rays
         return self.choices.get("rays") or asked or budgets[len(budgets) // 2]
 
-    def plan(self) -> Plan:
+    def plan(self) -> RequestPlan:
         """What the fit would do.
 
         Raises:
@@ -206,7 +206,7 @@ class FitRequest:
             "refine": self.refine,
             "constraints": None if self.constraints is None else self.constraints.as_document(),
         }
-        return Plan(
+        return RequestPlan(
             self.command,
             self._steps(settings["constraints"]),
             [*self.files, *(run.folder / name for name in (CONFIGURATION, MANIFEST, SAMPLES))],

@@ -22,7 +22,7 @@ from lidardesign.run.manifest import note, read_manifest, start_manifest
 from lidardesign.run.yaml import dump_yaml, leaves, load_yaml, parse_yaml
 from lidardesign.task import Task, notes_of
 from lidardesign.workflow.learning_budget import GOAL, Goal, Learner, checked_goal, resumed_goal
-from lidardesign.workflow.plans import EarlierRun, Plan, last_time
+from lidardesign.workflow.plans import EarlierRun, RequestPlan, last_time
 from lidardesign.workflow.run_folder import CONFIGURATION, MANIFEST, SAMPLES, Notes, log_note, settings_texts
 
 if TYPE_CHECKING:
@@ -144,7 +144,7 @@ class LearnRequest:
         with plugin_guard(self.task.name):
             return notes_of(self.task, self.settings.task, self.settings.space)
 
-    def plan(self) -> Plan:
+    def plan(self) -> RequestPlan:
         """What learning would do."""
         settings = self.settings
         learning, goal = settings.learning, self.goal
@@ -166,7 +166,7 @@ class LearnRequest:
             reads += sorted(path for path in self.folder.iterdir() if path.is_file() and not path.name.startswith("."))
         # as other runs' files have it
         document = parse_yaml(dump_yaml(settings.as_document()), where=CONFIGURATION).mapping
-        return Plan(
+        return RequestPlan(
             "learn",
             steps,
             reads,

@@ -100,8 +100,8 @@ def resumed_goal(asked: Goal, run: Path) -> Goal:
         ConfigError: Another one is asked for.
         DataError: The manifest's word of it is damaged.
     """
-    found = read_manifest(run).get(GOAL) or {}
-    stored = Goal(found.get("tolerance"), found.get("time_budget_s"))
+    recorded = read_manifest(run).get(GOAL) or {}
+    stored = Goal(recorded.get("tolerance"), recorded.get("time_budget_s"))
     if not all(isinstance(value, float | int | None) for value in stored.as_dict().values()):
         raise DataError(f"the manifest's {GOAL!r} is damaged", where=str(run / FILE_NAME), hint=DAMAGED_HINT)
     if asked.is_none or asked == stored:

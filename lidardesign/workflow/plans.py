@@ -27,7 +27,7 @@ class EarlierRun:
 
 
 @dataclass(frozen=True)
-class Plan:
+class RequestPlan:
     """What a request would do.
 
     Arguments:

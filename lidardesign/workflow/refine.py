@@ -143,7 +143,7 @@ def _check_effective_samples(samples: Samples, run: RunFolder, hint: str) -> Non
 
 
 @dataclass(frozen=True, eq=False)
-class FittedDesign:
+class FitOutcome:
     """What a request came to.
 
     Arguments:
@@ -157,7 +157,7 @@ class FittedDesign:
 
 def fit_design(
     request: FitRequest, *, progress: Callable[[Round], None] | None = None, notes: Notes = log_note
-) -> FittedDesign:
+) -> FitOutcome:
     """Fit the design of a request, refine it if asked to, and check it; nothing is written.
 
     Arguments:
@@ -190,7 +190,7 @@ def fit_design(
     with phase("writing"):
         checks = check_written(design, request)
     satisfied = all(check.satisfied for check in checks)
-    return FittedDesign(replace(result, design=design, constraints=checks, satisfied=satisfied), document)
+    return FitOutcome(replace(result, design=design, constraints=checks, satisfied=satisfied), document)
 
 
 def check_written(design: DesignSpec, request: FitRequest) -> list[ConstraintCheck]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import plotly.graph_objects as go
+from plotly.graph_objects import Figure, Scatter3d
 
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import check_choice
@@ -16,9 +16,9 @@ from lidardesign.geometry.rays import Rays
 MOST_DRAWN_RAYS = 2000
 
 
-def design_figure(design: DesignSpec, rays: Rays | None = None) -> go.Figure:
+def design_figure(design: DesignSpec, rays: Rays | None = None) -> Figure:
     """The sensors of a design with their fields of view and gates; rays are drawn inside their gates."""
-    figure = go.Figure()
+    figure = Figure()
     for sensor in design.sensors:
         _add_lines(figure, frustum_lines(sensor), sensor.name)
     if rays is not None:
@@ -30,12 +30,12 @@ def design_figure(design: DesignSpec, rays: Rays | None = None) -> go.Figure:
     return figure.update_layout(title={"text": design.name}, scene={"aspectmode": "data", **axes})
 
 
-def scores_figure(evaluation: Evaluation, against: str = "rays") -> go.Figure:
+def scores_figure(evaluation: Evaluation, against: str = "rays") -> Figure:
     """Scores with their intervals against numbers of rays, or against bandwidth."""
     check_choice(against, "against", ("rays", "bandwidth"))
-    return go.Figure(curve_figure(evaluation, against)).update_layout(showlegend=True)
+    return Figure(curve_figure(evaluation, against)).update_layout(showlegend=True)
 
 
-def _add_lines(figure: go.Figure, points_m: np.ndarray, name: str) -> None:
+def _add_lines(figure: Figure, points_m: np.ndarray, name: str) -> None:
     x, y, z = points_m.T
-    figure.add_trace(go.Scatter3d(x=x, y=y, z=z, mode="lines", name=name))
+    figure.add_trace(Scatter3d(x=x, y=y, z=z, mode="lines", name=name))
