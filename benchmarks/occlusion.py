@@ -70,7 +70,8 @@ def curves(run_folder: Path, layout: str, sensors: int, rays: Sequence[int], see
     from lidardesign import open_run
     from lidardesign.design.constraints.document import Constraints
     from lidardesign.design.fit import fit
-    from lidardesign.evaluate.score import EvaluationRequest, evaluate
+    from lidardesign.evaluate.request import EvaluationRequest
+    from lidardesign.evaluate.score import evaluate
     from lidardesign.samples import load_samples
     from lidardesign.workflow.layouts import TWIN_NAME, Layouts, twin_without_visibility
     from lidardesign.workflow.weighting import RunTarget

@@ -33,7 +33,7 @@ class Tally:
 
 def request_of(run: Any, designs: list[Any], options: Any) -> Any:
     """What to evaluate, with the detector and what the scenes call for."""
-    from lidardesign.evaluate.score import EvaluationRequest
+    from lidardesign.evaluate.request import EvaluationRequest
     from lidardesign.samples import load_samples
     from lidardesign.simulate.detector.files import load_detector
     from lidardesign.simulate.plan import Planner
@@ -156,7 +156,7 @@ def measure(run_folder: Path, options: Any) -> None:
     """Fit, simulate and print."""
     from lidardesign import open_run
     from lidardesign.design.files import load_design
-    from lidardesign.evaluate.entries import entries_of
+    from lidardesign.evaluate.score import entries_of
 
     run = open_run(run_folder)
     paths = [fitted(run_folder, f"sunlight-{n}", "--sensors", str(n))[0] for n in options.sensors]

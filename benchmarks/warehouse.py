@@ -68,7 +68,8 @@ def miss_rates(run_folder: Path, designs: list[Path], x_m: float, rays: int) -> 
     """Mean miss rate [%] on the held-out shelves seen from one position, by design and baseline."""
     from lidardesign import open_run
     from lidardesign.design.files import load_design
-    from lidardesign.evaluate.score import EvaluationRequest, evaluate
+    from lidardesign.evaluate.request import EvaluationRequest
+    from lidardesign.evaluate.score import evaluate
     from lidardesign.samples import load_samples
     from lidardesign.task import scenes_of
     from lidardesign.workflow.layouts import Layouts

@@ -32,7 +32,7 @@ from lidardesign.design.files import load_design
 from lidardesign.design.layouts.grid import field_on_sphere
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import DesignSpec, Sensor, tangent_directions
-from lidardesign.evaluate.figures.canvas import looks, picture
+from lidardesign.evaluate.figures.canvas import picture, picture_style
 from lidardesign.evaluate.figures.density import field_picture, marginals_picture
 from lidardesign.evaluate.figures.density_views import density_view
 from lidardesign.evaluate.figures.scene import OUTCOME_LOOKS, View, shaded, view_of
@@ -327,7 +327,7 @@ def main() -> None:
     figure = overview(side, front, samples, design, rays, simulate(head, rays)[0], scores)
     save(figure, options.out / "overview.png", colours=COLOURS)
     view = density_view(samples, head, [replace(design, name="10 sensors")])
-    with looks():
+    with picture_style():
         save_smaller(picture(marginals_picture(view), "png"), options.out / "idea-marginals.png")
         save_smaller(picture(field_picture(view), "png"), options.out / "idea-field.png")
     for name in ("overview", "idea-marginals", "idea-field"):

@@ -274,26 +274,12 @@ def _stereographic(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return 2 * across / np.where(seen, scale, 1.0)[:, None], seen
 
 
-def sample_surface(
-    vertices: np.ndarray, faces: np.ndarray, count: int, generator: np.random.Generator
-) -> np.ndarray:
-    """Points uniform in area on a triangle mesh, shape (count, 3) [m], in the order of its faces."""
-    return sample_triangles(vertices, faces, count, generator)[0]
-
-
 def surface_cloud(
     vertices: np.ndarray, faces: np.ndarray, count: int, generator: np.random.Generator
 ) -> SurfaceCloud:
     """A triangle mesh as area-uniform points with their triangles."""
     points, chosen = sample_triangles(vertices, faces, count, generator)
     return SurfaceCloud(points, vertices[faces[chosen]])
-
-
-def visible_surface_points(
-    scene: Scene, space: DesignSpace, count: int, generator: np.random.Generator, *, frame: int = 0
-) -> np.ndarray:
-    """Area-uniform points on targets that some admissible ray sees, (count, 3) [m]: `visible_surface`."""
-    return visible_surface(scene, space, count, generator, frame=frame).points
 
 
 def visible_surface(

@@ -15,14 +15,15 @@ from lidardesign.design.fit import rays_at
 from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, PluginError
+from lidardesign.evaluate.baselines.candidates import Positions
 from lidardesign.evaluate.baselines.catalog import Density
 from lidardesign.evaluate.baselines.no_visibility import LayOut
 from lidardesign.evaluate.baselines.simple import baseline_of, is_baseline
 from lidardesign.evaluate.cma.candidate import CmaSettings
-from lidardesign.evaluate.scene_scores import Scorer, score_here
+from lidardesign.evaluate.scene_scores import ScenePass, Scorer, score_here
 from lidardesign.samples import Samples
 from lidardesign.scene import Scene
-from lidardesign.simulate.plan import Planner
+from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.space import DesignSpace
 from lidardesign.task import Task
 
@@ -95,6 +96,12 @@ class EvaluationRequest:
             baseline_of(name, where="--baseline")
         if any(count < 1 for count in self.rays):
             raise ConfigError(f"{min(self.rays)} rays", where="--rays", allowed="1 or more")
+
+    def scene_pass(
+        self, fired: Callable[[int], Sequence[Positions]], planner: Planner, plans: Sequence[EffectPlan] = ()
+    ) -> ScenePass:
+        """Sets of rays in the held-out scenes: see `ScenePass`."""
+        return ScenePass(self.task, self.config, self.space, self.seed, self.test, fired, planner, plans)
 
 
 def pattern_size(design: DesignSpec) -> int | None:

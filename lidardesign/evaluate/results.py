@@ -1,15 +1,8 @@
-"""What an evaluation found: one row per design or baseline and number of rays, and paired differences.
+"""What an evaluation found: rows, paired differences, the effects that were simulated, and an audit of their plan.
 
 A mean over scenes says little where scenes differ more than designs do. Differences are therefore taken scene
-by scene, and their intervals are the ones that tell two designs apart.
-
-The audit of a plan: every row under all effects and under the planned ones, scene by scene.
-
-Both have the same random numbers: every effect draws from a stream of its own, so what differs is what was skipped.
-
-What was simulated over all held-out scenes, and why: the plans of all scenes as one line per effect.
-
-The rows of an evaluation as a CSV table with units in its headers.
+by scene, and their intervals are the ones that tell two designs apart. The audit has every row under all effects and
+under the planned ones with the same random numbers: what differs is what was skipped.
 """
 
 from __future__ import annotations
@@ -24,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lidardesign.estimates import HALF_INTERVAL, Estimate, as_documents
+from lidardesign.evaluate.accuracy.settings import Accuracy
 from lidardesign.evaluate.statistics import paired_difference
 from lidardesign.run.files import write_atomic
 from lidardesign.simulate.physics import EFFECTS
@@ -31,7 +25,6 @@ from lidardesign.simulate.plan import Choice, Decision, EffectPlan, Tolerance
 from lidardesign.task import Metric
 
 if TYPE_CHECKING:
-    from lidardesign.evaluate.accuracy.sweeps import Accuracy
     from lidardesign.evaluate.cma.candidate import Record
 
 
@@ -215,6 +208,13 @@ def worse_than_threshold(evaluation: Evaluation, limit: float) -> list[Row]:
     """
     sign = 1.0 if evaluation.metric.better == "lower" else -1.0
     return [row for row in evaluation.rows if not row.baseline and sign * row.value > sign * limit]
+
+
+def verdict(evaluation: Evaluation, pair: Paired) -> str:
+    """`better` or `worse` where the paired interval of a excludes zero, `open` where it does not."""
+    sign = 1.0 if evaluation.metric.better == "lower" else -1.0
+    low, high = sorted((sign * pair.ci_low, sign * pair.ci_high))
+    return "better" if high < 0 else "worse" if low > 0 else "open"
 
 
 @dataclass(frozen=True)

@@ -13,27 +13,23 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import Any
 
 import numpy as np
 
 from lidardesign.errors import PluginError
 from lidardesign.evaluate.baselines.candidates import Positions
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Rays, Returns
+from lidardesign.geometry.rays import Returns
 from lidardesign.geometry.triangles import SecondCasts
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
 from lidardesign.simulate.physics import Physics
 from lidardesign.simulate.plan import EffectPlan, Planner
-from lidardesign.simulate.simulate import build_casters, simulate, simulate_many
+from lidardesign.simulate.simulate import build_casters, simulate_many
+from lidardesign.space import DesignSpace
 from lidardesign.task import Residuals, Score, Task
-
-if TYPE_CHECKING:
-    from lidardesign.evaluate.baselines.candidates import Positions
-    from lidardesign.evaluate.request import EvaluationRequest
-
 
 # Rays times frames that are traced together: their returns take 24 bytes each.
 MOST_RETURNS = 4_000_000
@@ -88,11 +84,6 @@ def _groups(jobs: Sequence[Positions], frames: int) -> Iterator[list[Positions]]
         size += returns
     if group:
         yield group
-
-
-def score_scene(task: Task, scene: Scene, rays: Rays, casters: Sequence[SceneCaster]) -> Score:
-    """The checked score of one list of rays in one scene; see `checked_score`."""
-    return checked_score(task, scene, simulate(scene, rays, casters=casters))
 
 
 @phase("metric")
@@ -177,11 +168,20 @@ class ScenePass:
     """Sets of rays to be scored in all held-out scenes.
 
     Arguments:
+        task: Whose score is taken.
+        config, space: The task's configuration and the design space: with the seed, they make the scenes.
+        seed: Root of the scenes and of the effects' random streams.
+        scenes: The held-out scenes.
         fired: The sets of rays that are fired in a scene, by its number.
         planner: How their effects are chosen.
         plans: The plan of every scene where it is known already; empty: they are made.
     """
 
+    task: Task
+    config: Any
+    space: DesignSpace
+    seed: int
+    scenes: Sequence[Scene]
     fired: Callable[[int], Sequence[Positions]]
     planner: Planner
     plans: Sequence[EffectPlan] = ()
@@ -208,33 +208,26 @@ class SceneScores:
     second_casts: SecondCasts = field(default_factory=SecondCasts)
 
 
-class Scorer(Protocol):
-    """Scores all held-out scenes of a request, in their order."""
-
-    def __call__(
-        self, request: EvaluationRequest, scene_pass: ScenePass, progress: Progress | None
-    ) -> Sequence[SceneScores]:
-        """As `score_here`."""
-        ...
+# Scores all held-out scenes of a pass, in their order.
+Scorer = Callable[[ScenePass, Progress | None], Sequence[SceneScores]]
 
 
-def score_here(request: EvaluationRequest, scene_pass: ScenePass, progress: Progress | None) -> list[SceneScores]:
+def score_here(scenes: ScenePass, progress: Progress | None) -> list[SceneScores]:
     """Score scene by scene in this process, so that only one scene's casters are held at a time.
 
     Arguments:
-        request: Whose held-out scenes, task and seed are taken.
-        scene_pass: What is fired, and under which effects.
+        scenes: The scenes, what is fired there, and under which effects.
         progress: Called with the scenes done, all scenes, and the name of the scene.
     """
     found = []
-    for number, scene in enumerate(request.test):
+    total = len(scenes.scenes)
+    for number, scene in enumerate(scenes.scenes):
         if progress:
-            progress(number, len(request.test), scene.name)
-        lists = scene_pass.fired(number)
-        known = scene_pass.known(number)
-        found.append(score_in_scene(request.task, scene, lists, scene_pass.planner, known, request.seed))
+            progress(number, total, scene.name)
+        sets, known = scenes.fired(number), scenes.known(number)
+        found.append(score_in_scene(scenes.task, scene, sets, scenes.planner, known, scenes.seed))
     if progress:
-        progress(len(request.test), len(request.test), "")
+        progress(total, total, "")
     return found
 
 

@@ -44,7 +44,7 @@ from lidardesign.workflow.run_folder import (
 
 if TYPE_CHECKING:
     from lidardesign.evaluate.cma.candidate import Show
-    from lidardesign.evaluate.figures.figure_data import Pictured
+    from lidardesign.evaluate.figures.scene_figure import FigureData
     from lidardesign.evaluate.report.notebook import Figure
 
 Progress = Callable[[int, int, str], None]
@@ -332,7 +332,8 @@ class Scores:
         if (request.config, request.seed) != (run.config.task, run.config.seed):
             request = replace(request, train=run.scenes("train", run.config.seed))
         with phase("accuracy"):
-            from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest, measure_accuracy
+            from lidardesign.evaluate.accuracy.probes import AccuracyRequest
+            from lidardesign.evaluate.accuracy.sweeps import measure_accuracy
 
             asked = AccuracyRequest(run.config, run.folder, request, self.evaluation)
             accuracy = measure_accuracy(asked, progress=progress)
@@ -344,23 +345,23 @@ class Scores:
         write_csv(self.evaluation, Path(path))
         return Path(path)
 
-    def figure_data(self) -> Pictured:
+    def figure_data(self) -> FigureData:
         """What pictures and reports draw beside the scores."""
-        from lidardesign.evaluate.figures.figure_data import pictured_of
+        from lidardesign.evaluate.figures.scene_figure import figure_data
 
         # what the clock counts under this command's name up to now
         times = {**self.run.command_times(), THIS: self.clock.timings()}
-        return pictured_of(self.evaluation, self.evaluation_request, times)
+        return figure_data(self.evaluation, self.evaluation_request, times)
 
     @phase("writing")
-    def plots(self, folder: Path | str, pictured: Pictured | None = None) -> list[Path]:
+    def plots(self, folder: Path | str, pictured: FigureData | None = None) -> list[Path]:
         """Write pictures for papers into a folder, as PNG and SVG."""
         from lidardesign.evaluate.figures.plots import write_plots
 
         return write_plots(self.evaluation, Path(folder), self.figure_data() if pictured is None else pictured)
 
     @phase("writing")
-    def report(self, path: Path | str, command: Sequence[str] = (), pictured: Pictured | None = None) -> Path:
+    def report(self, path: Path | str, command: Sequence[str] = (), pictured: FigureData | None = None) -> Path:
         """Write one HTML page: tables, curves, a 3D view, and how to get the same figures again.
 
         Arguments:

@@ -33,10 +33,9 @@ from lidardesign.workflow.run_folder import Notes, RunFolder, log_note, provenan
 from lidardesign.workflow.weighting import KEY, RunTarget, Weighting
 
 if TYPE_CHECKING:
-    from lidardesign.evaluate.refinement.attention import Attention
     from lidardesign.evaluate.refinement.refinement import Refinement, Round, Shape, Trial
     from lidardesign.evaluate.refinement.regating import Gating
-    from lidardesign.evaluate.refinement.reweighting import Reweighting
+    from lidardesign.evaluate.refinement.reweighting import Attention, Reweighting
 
 # The share of the training scenes whose residuals are looked at; the others judge.
 LOOK_SHARE = 0.6
@@ -262,7 +261,7 @@ def _refined(
 
 def _attention(fitter: Fitter, start: Reweighting | None) -> Attention:
     """Anchors over the density, or those of an earlier refinement, which then goes on."""
-    from lidardesign.evaluate.refinement.attention import Attention, anchors_for
+    from lidardesign.evaluate.refinement.reweighting import Attention, anchors_for
 
     run, seed = fitter.request.run, fitter.request.seed
     places = observed_point(fitter.base.resample(ANCHOR_POOL, random_generator(seed, "anchor places")))

@@ -285,13 +285,16 @@ def test_what_evaluate_prints_is_valid_and_complete(evaluation):
 
 
 def test_the_rungs_of_accuracy_are_those_of_the_schema():
-    from lidardesign.evaluate.accuracy.settings import Ladder, Rung
+    from lidardesign.evaluate.accuracy.settings import Measurement, Sweep
 
-    rungs = [Rung("4", 0.1, 0.01, 2.0, values={"gap_mm": 1.0}), Rung("8", 0.0, 0.0, 4.0, 5, True, True)]
-    ladder = Ladder("knob", "gap", "mm", "the finest", 0.5, "it is small", "work", rungs)
+    measurements = [
+        Measurement("4", 0.1, 0.01, 2.0, values={"gap_mm": 1.0}),
+        Measurement("8", 0.0, 0.0, 4.0, 5, True, True),
+    ]
+    sweep = Sweep("knob", "gap", "mm", "the finest", 0.5, "it is small", "work", measurements)
     schema = schema_of("evaluate")
     one = {"$ref": "#/$defs/rung", "$defs": schema["$defs"]}
-    for row in ladder.as_rows():
+    for row in sweep.as_rows():
         jsonschema.Draft202012Validator(one).validate(row)
 
 

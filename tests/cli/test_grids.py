@@ -9,7 +9,7 @@ from rich.console import Console
 from support.tables import each_row
 
 from lidardesign.cli.tables.grids import print_table
-from lidardesign.evaluate.verdicts import plain
+from lidardesign.evaluate.report.tables import plain_number
 
 HEADINGS = ("design", "rays", "difference (95 % interval)", "seconds")
 LINES = (["free", "196", "-0.013 (-0.021 to -0.004)", "1.4, 2.6"], ["(own)", "36", "0.002 (-0.010 to 0.012)", "3, 3"])
@@ -53,4 +53,4 @@ def test_wide_terminals_have_one_line_per_row():
      (1.7e-7, 2, "<0.0001"), (1.0, 2, "1"), (1.5, 2, "1.5")],
 )  # fmt: skip
 def test_figures_have_no_exponents(value, digits, shown):
-    assert plain(value, digits) == shown
+    assert plain_number(value, digits) == shown

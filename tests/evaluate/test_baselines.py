@@ -10,13 +10,11 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.layouts.grid import low_discrepancy
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines import simple as baselines
-from lidardesign.evaluate.baselines.candidates import Layout, even_placement, opened_gate
-from lidardesign.evaluate.baselines.observed import unrolled
+from lidardesign.evaluate.baselines.candidates import Layout, even_placement, opened_gate, unrolled
 from lidardesign.evaluate.baselines.simple import (
     Baselines,
     Family,
     baseline_of,
-    build_baseline,
     is_baseline,
 )
 from lidardesign.scene import Body, Box, Scene, Sphere, rigid
@@ -33,6 +31,11 @@ FROZEN = DesignSpace((0, 0, 0, 0, 0, 3), (0, 0, 0, 0, 0, 3))
 
 # the others need a design, a density or a part
 BUILT = ["uniform", "random", "bounding", "occupancy"]
+
+
+def build_baseline(name, space, train, count, seed, judge=None):
+    """A baseline at so many rays, for a space without conditions."""
+    return Baselines(space, train, seed, judge).positions(name, count)[0]
 
 
 def balls(centre, radius=0.4, jitter=0.05, count=3):

@@ -17,8 +17,15 @@ from lidardesign.design.catalog.placing import Pose, part_rays
 from lidardesign.design.sensor import boresight_frame
 from lidardesign.design.snap.shapes import PartShape, gate_inside, in_view, shapes_of, worth_firing
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.baselines.catalog import Density, part_notes, split_argument
-from lidardesign.evaluate.baselines.part_poses import CLUTTER, PosedPart, ScenePoints, places
+from lidardesign.evaluate.baselines.catalog import (
+    CLUTTER,
+    Density,
+    PosedPart,
+    ScenePoints,
+    part_notes,
+    places,
+    split_argument,
+)
 from lidardesign.evaluate.baselines.simple import Baselines, baseline_of
 from lidardesign.numerics import effective_count
 from lidardesign.samples import Samples

@@ -21,8 +21,7 @@ from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document
 from lidardesign.design.sensor import DesignSpec, Sensor, Track, tangent_coordinates
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.baselines.candidates import mean_mbps, whole_range
-from lidardesign.evaluate.baselines.observed import TrainingViews, dense_points
+from lidardesign.evaluate.baselines.candidates import TrainingViews, dense_points, mean_mbps, whole_range
 from lidardesign.evaluate.cma.candidate import CmaCandidate, CmaSettings
 from lidardesign.evaluate.cma.models import Amount, SensorModel, widest_bins
 from lidardesign.evaluate.cma.objective import OutOfTimeError, TrainingObjective
@@ -30,7 +29,8 @@ from lidardesign.evaluate.cma.search import Budget, Search
 from lidardesign.evaluate.cma.sensor_parameters import Setting, exp_matrix, log_matrix
 from lidardesign.evaluate.cma.starts import starts, tiles
 from lidardesign.evaluate.cma.track import TrackFigures, TrackModel, Way
-from lidardesign.evaluate.score import EvaluationRequest, evaluate
+from lidardesign.evaluate.request import EvaluationRequest
+from lidardesign.evaluate.score import evaluate
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.simulate.plan import Planner
 from lidardesign.space import AZIMUTH, ELEVATION, DesignSpace

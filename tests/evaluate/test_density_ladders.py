@@ -1,4 +1,4 @@
-"""The ladders of a density: errors against closed forms and exact references, falling rung by rung."""
+"""The sweeps of a density: errors against closed forms and exact references, falling measurement by measurement."""
 
 from __future__ import annotations
 
@@ -31,10 +31,11 @@ from lidardesign.density.training.snapshot_quality import (
     in_arithmetic,
 )
 from lidardesign.errors import NumericalError
-from lidardesign.evaluate.accuracy import fields, precision, scenes, visibility
+from lidardesign.evaluate.accuracy import fields, visibility
+from lidardesign.evaluate.accuracy import steps as precision
+from lidardesign.evaluate.accuracy import steps as scenes
 from lidardesign.evaluate.accuracy.fields import ExactField, InterpolatedField, fresh_table
-from lidardesign.evaluate.accuracy.probes import draw_probes, few_columns, with_frames
-from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
+from lidardesign.evaluate.accuracy.probes import AccuracyRequest, draw_probes, few_columns, with_frames
 from lidardesign.evaluate.accuracy.visibility import LOG_OPAQUE, opaque_target
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.registry import load_task
@@ -170,7 +171,7 @@ class TestOpaque:
         assert target.log_density(np.array([[0, 0, 0, 0.0, 0, 3.0]]))[0] == pytest.approx(LOG_OPAQUE, rel=1e-3)
 
 
-class TestVisibilityLadder:
+class TestVisibilitySweep:
     @pytest.fixture(scope="class")
     @staticmethod
     def cases():
@@ -186,24 +187,24 @@ class TestVisibilityLadder:
 
     @pytest.mark.parametrize("kind", [Box, Mesh])
     def test_ray_casting_is_chosen_where_thin_plates_hide_things(self, cases, kind):
-        ladder = visibility.visibility_ladder(cases[kind], 64, "raycast")
-        off, quadrature, cast = ladder.rungs
-        assert ladder.falls
-        assert ladder.chosen is cast is ladder.default
+        sweep = visibility.visibility_sweep(cases[kind], 64, "raycast")
+        off, quadrature, cast = sweep.measurements
+        assert sweep.falls
+        assert sweep.chosen is cast is sweep.default
         assert off.error > 0.05 > quadrature.error or off.error > quadrature.error > cast.error
         assert cast.error < 0.02
 
     @pytest.mark.parametrize("kind", [Box, Mesh])
     def test_midpoints_fall_towards_the_integral(self, cases, kind):
-        ladder = visibility.points_ladder(cases[kind], 64)
-        assert ladder.falls
-        assert [rung.setting for rung in ladder.rungs] == ["16", "32", "64", "128", "256"]
-        assert ladder.default.setting == "64"
-        assert ladder.rungs[-1].error < ladder.rungs[0].error / 2
+        sweep = visibility.points_sweep(cases[kind], 64)
+        assert sweep.falls
+        assert [measurement.setting for measurement in sweep.measurements] == ["16", "32", "64", "128", "256"]
+        assert sweep.default.setting == "64"
+        assert sweep.measurements[-1].error < sweep.measurements[0].error / 2
 
-    def test_the_points_of_a_refined_quadrature_are_a_rung(self, cases):
-        ladder = visibility.points_ladder(cases[Mesh], 100)
-        assert ladder.default.setting == "100"
+    def test_the_points_of_a_refined_quadrature_are_a_measure(self, cases):
+        sweep = visibility.points_sweep(cases[Mesh], 100)
+        assert sweep.default.setting == "100"
 
     def test_where_nothing_is_seen_there_is_nothing_to_choose(self, monkeypatch):
         monkeypatch.setattr(visibility, "PROBES", 512)
@@ -275,7 +276,7 @@ class TestComparedFields:
         assert np.array_equal(found, table.table[inner])
 
 
-class TestFieldLadders:
+class TestFieldSweeps:
     @pytest.fixture(scope="class")
     @staticmethod
     def case():
@@ -287,25 +288,25 @@ class TestFieldLadders:
 
     def test_errors_fall_with_resolution(self, case, monkeypatch):
         monkeypatch.setattr(fields, "RESOLUTIONS", (12, 24, 48))
-        ladder = fields.resolution_ladder(case)
-        assert ladder.falls
-        errors = [rung.values["distance_error_mm"] for rung in ladder.rungs]
+        sweep = fields.resolution_sweep(case)
+        assert sweep.falls
+        errors = [measurement.values["distance_error_mm"] for measurement in sweep.measurements]
         # trilinear interpolation errs with the square of the step
         assert errors[0] > 2.5 * errors[1] > 6 * errors[2]
-        assert ladder.rungs[0].error > ladder.rungs[2].error
-        assert ladder.default.setting == "24"
-        assert ladder.rungs[1].memory_bytes == case.target.field.table.nbytes // 2 * 3
+        assert sweep.measurements[0].error > sweep.measurements[2].error
+        assert sweep.default.setting == "24"
+        assert sweep.measurements[1].memory_bytes == case.target.field.table.nbytes // 2 * 3
 
     def test_resolutions_that_take_long_are_left_out_beyond_the_runs_own(self, case, monkeypatch):
         monkeypatch.setattr(fields, "RESOLUTIONS", (8, 12, 48))
         monkeypatch.setattr(fields, "LONGEST_SECONDS", 0.0)
-        ladder = fields.resolution_ladder(case)
-        assert [rung.setting for rung in ladder.rungs] == ["8", "12", "24"]
-        assert "48 and more points would take long" in ladder.note
+        sweep = fields.resolution_sweep(case)
+        assert [measurement.setting for measurement in sweep.measurements] == ["8", "12", "24"]
+        assert "48 and more points would take long" in sweep.note
 
     def test_splines_err_less_than_lines_and_lines_less_than_steps(self, case):
-        ladder = fields.interpolation_ladder(case)
-        nearest, trilinear, tricubic, exact = ladder.rungs
+        sweep = fields.interpolation_sweep(case)
+        nearest, trilinear, tricubic, exact = sweep.measurements
         assert nearest.error > trilinear.error > tricubic.error > exact.error == 0
         assert trilinear.default
         assert exact.reference
@@ -316,13 +317,13 @@ class TestFieldLadders:
         poses = np.stack([rigid(translation_m=(2.0, y, 0)) for y in (-0.1, 0.0, 0.1)])
         scene = Scene((Body(ball_mesh(0.3), poses=poses),))
         case = fields.Case.of([scene], SPACE, DensitySettings(sigma_m=0.02, field_resolution=48), 0, "off")
-        ladder = fields.resolution_ladder(case)
-        assert ladder.rungs[0].error > ladder.rungs[1].error
-        assert ladder.rungs[1].memory_bytes == case.target.field.bodies.grids.values.nbytes
+        sweep = fields.resolution_sweep(case)
+        assert sweep.measurements[0].error > sweep.measurements[1].error
+        assert sweep.measurements[1].memory_bytes == case.target.field.bodies.grids.values.nbytes
 
     def test_primitives_need_no_field(self):
         request = SimpleNamespace(config=None, request=SimpleNamespace(train=[hidden_wall((1.5, 0, 0))]))
-        assert fields.ladders(request) == []
+        assert fields.sweeps(request) == []
 
 
 class TestDrawnScenes:
@@ -417,35 +418,35 @@ class TestGradients:
         assert np.isfinite(gradient(steps.flow, loss, 0, 1.0)).all()
 
 
-class TestPrecisionLadder:
+class TestPrecisionSweep:
     def test_a_float64_flow_finds_its_samples_densities_again(self, steps):
         drawn = Drawn.of(steps.flow, 500, 0)
         assert drawn.log_densities(steps.flow) == pytest.approx(drawn.log_prob, abs=1e-8)
         assert drawn.round_trip_nats(steps.flow) < 1e-8
 
     def test_rounding_is_far_below_the_noise_of_a_batch(self, steps, monkeypatch):
-        monkeypatch.setattr(precision, "BATCHES", 4)
+        monkeypatch.setattr(precision, "DTYPE_BATCHES", 4)
         monkeypatch.setattr(precision, "SAMPLES", 500)
-        ladder = precision.steps_ladder(steps, 0)
-        rough, exact = ladder.rungs
+        sweep = precision.dtype_sweep(steps, 0)
+        rough, exact = sweep.measurements
         assert (rough.setting, exact.setting) == ("float32", "float64")
         assert rough.default
         assert exact.reference
-        assert 0 < rough.error < ladder.tolerance
+        assert 0 < rough.error < sweep.tolerance
         assert 0 < rough.values["densities_misplaced"] < 1e-3
         assert exact.values["densities_misplaced"] < 1e-9
 
 
-class TestScenesLadder:
+class TestScenesSweep:
     def test_more_scenes_err_less(self, steps, monkeypatch):
         monkeypatch.setattr(scenes, "POWERS", (1, 4))
-        monkeypatch.setattr(scenes, "BATCHES", 8)
-        ladder = scenes.scenes_ladder(steps, 0)
-        assert [rung.setting for rung in ladder.rungs] == ["1", "2", "4", "6"]
-        assert ladder.falls
-        assert ladder.rungs[0].error > ladder.rungs[2].error > ladder.rungs[3].error == 0
-        assert ladder.default.setting == "2"
-        assert ladder.rungs[3].reference
+        monkeypatch.setattr(scenes, "FRAMES_BATCHES", 8)
+        sweep = scenes.frames_sweep(steps, 0)
+        assert [measurement.setting for measurement in sweep.measurements] == ["1", "2", "4", "6"]
+        assert sweep.falls
+        assert sweep.measurements[0].error > sweep.measurements[2].error > sweep.measurements[3].error == 0
+        assert sweep.default.setting == "2"
+        assert sweep.measurements[3].reference
 
     def test_settings_beyond_all_scenes_are_all_scenes(self):
         assert scenes.counts(50, 50) == [4, 16, 50]
@@ -453,7 +454,7 @@ class TestScenesLadder:
 
 
 class TestRuns:
-    """The ladders of a run from its folder, as `evaluate --accuracy` asks for them."""
+    """The sweeps of a run from its folder, as `evaluate --accuracy` asks for them."""
 
     SMALL = (
         "learning.steps=4", "learning.batch=32", "learning.layers=1", "learning.hidden=8", "learning.bins=4",
@@ -475,22 +476,24 @@ class TestRuns:
         return AccuracyRequest(config, place, asked, None)
 
     @pytest.mark.parametrize("module", [visibility, fields, precision, scenes])
-    def test_have_ladders_whose_errors_fall(self, request_of, module, monkeypatch):
+    def test_have_sweeps_whose_errors_fall(self, request_of, module, monkeypatch):
         monkeypatch.setattr(visibility, "PROBES", 2048)
         monkeypatch.setattr(visibility, "BODY_PROBES", 256)
         monkeypatch.setattr(visibility, "REFERENCE_POINTS", 128)
         monkeypatch.setattr(visibility, "POINTS", (16, 32))
         for number in (precision, scenes):
             monkeypatch.setattr(number, "BATCHES", 4)
-        found = module.ladders(request_of)
+        found = module.sweeps(request_of)
         assert len(found) == {visibility: 2, fields: 0, precision: 1, scenes: 1}[module]
-        for ladder in found:
-            assert ladder.falls
-            assert all(rung.seconds > 0 and rung.uncertainty >= 0 for rung in ladder.rungs)
-            assert ladder.as_rows()
+        for sweep in found:
+            assert sweep.falls
+            assert all(measurement.seconds > 0 and measurement.uncertainty >= 0 for measurement in sweep.measurements)
+            assert sweep.as_rows()
 
     def test_the_same_run_gives_the_same_errors(self, request_of, monkeypatch):
-        monkeypatch.setattr(precision, "BATCHES", 3)
+        monkeypatch.setattr(precision, "DTYPE_BATCHES", 3)
         again = AccuracyRequest(request_of.config, request_of.run, request_of.request, None)
-        first, second = (precision.ladders(request)[0] for request in (request_of, again))
-        assert [rung.error for rung in first.rungs] == [rung.error for rung in second.rungs]
+        first, second = (precision.dtype_sweeps(request)[0] for request in (request_of, again))
+        assert [measurement.error for measurement in first.measurements] == [
+            measurement.error for measurement in second.measurements
+        ]

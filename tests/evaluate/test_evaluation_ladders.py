@@ -1,4 +1,4 @@
-"""Ladders of the fit, of effects and of held-out scenes: their errors are what the program itself would show."""
+"""Sweeps of the fit, of effects and of held-out scenes: their errors are what the program itself would show."""
 
 import math
 from dataclasses import replace
@@ -9,7 +9,7 @@ from support.references import STANDARD_ERRORS
 from support.scoring import design, make_request, scenes
 
 from lidardesign.evaluate.accuracy import held_out, mixture, physics
-from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
+from lidardesign.evaluate.accuracy.probes import AccuracyRequest
 from lidardesign.evaluate.results import Evaluation, Row
 from lidardesign.evaluate.score import evaluate
 from lidardesign.samples import Samples
@@ -34,34 +34,34 @@ def of_scores(own, rival, tmp_path):
 def test_half_widths_fall_with_the_root_of_the_number_of_scenes(tmp_path):
     generator = np.random.default_rng(3)
     own, rival = generator.normal(0, 3, 400), np.zeros(400)
-    (ladder,) = held_out.ladders(of_scores(own, rival, tmp_path))
-    assert [rung.setting for rung in ladder.rungs] == ["5", "10", "20", "50", "100", "200", "400"]
-    for rung in ladder.rungs[2:]:
-        closed_form = 1.96 * 3 / math.sqrt(int(rung.setting))
+    (sweep,) = held_out.sweeps(of_scores(own, rival, tmp_path))
+    assert [measurement.setting for measurement in sweep.measurements] == ["5", "10", "20", "50", "100", "200", "400"]
+    for measurement in sweep.measurements[2:]:
+        closed_form = 1.96 * 3 / math.sqrt(int(measurement.setting))
         # resamples of n scenes spread by (n - 1) / n less, and a thousand of them know their ends to 3 %
-        allowed = STANDARD_ERRORS * rung.uncertainty + closed_form * (0.03 + 1 / int(rung.setting))
-        assert rung.error == pytest.approx(closed_form, abs=allowed)
-        assert rung.seconds == pytest.approx((2.0 + 3.0) * int(rung.setting) / 400)
-    assert ladder.falls
-    assert ladder.default is ladder.rungs[-1]
+        allowed = STANDARD_ERRORS * measurement.uncertainty + closed_form * (0.03 + 1 / int(measurement.setting))
+        assert measurement.error == pytest.approx(closed_form, abs=allowed)
+        assert measurement.seconds == pytest.approx((2.0 + 3.0) * int(measurement.setting) / 400)
+    assert sweep.falls
+    assert sweep.default is sweep.measurements[-1]
 
 
 def test_the_number_of_scenes_that_the_tolerance_takes_is_said(tmp_path):
     generator = np.random.default_rng(3)
-    (ladder,) = held_out.ladders(of_scores(generator.normal(0, 3, 40), np.zeros(40), tmp_path))
-    needed = int(ladder.note.split(" ")[0].replace(",", ""))
-    assert needed == math.ceil(40 * (ladder.rungs[-1].error / METRIC.tolerance) ** 2)
-    (sure,) = held_out.ladders(of_scores(generator.normal(0, 1e-3, 40), np.zeros(40), tmp_path))
+    (sweep,) = held_out.sweeps(of_scores(generator.normal(0, 3, 40), np.zeros(40), tmp_path))
+    needed = int(sweep.note.split(" ")[0].replace(",", ""))
+    assert needed == math.ceil(40 * (sweep.measurements[-1].error / METRIC.tolerance) ** 2)
+    (sure,) = held_out.sweeps(of_scores(generator.normal(0, 1e-3, 40), np.zeros(40), tmp_path))
     assert sure.note == ""
     assert sure.chosen.setting == "5"
 
 
-def test_equal_differences_leave_no_width_and_one_scene_no_ladder(tmp_path):
-    (ladder,) = held_out.ladders(of_scores(np.ones(12), np.zeros(12), tmp_path))
-    assert [(rung.error, rung.uncertainty) for rung in ladder.rungs] == [(0.0, 0.0)] * 3
-    assert held_out.ladders(of_scores([1.0], [0.0], tmp_path)) == []
+def test_equal_differences_leave_no_width_and_one_scene_no_sweep(tmp_path):
+    (sweep,) = held_out.sweeps(of_scores(np.ones(12), np.zeros(12), tmp_path))
+    assert [(measurement.error, measurement.uncertainty) for measurement in sweep.measurements] == [(0.0, 0.0)] * 3
+    assert held_out.sweeps(of_scores([1.0], [0.0], tmp_path)) == []
     alone = Evaluation(METRIC, 2, [make_row("own", [1.0, 2.0])], [])
-    assert held_out.ladders(AccuracyRequest(None, tmp_path, make_request(), alone)) == []
+    assert held_out.sweeps(AccuracyRequest(None, tmp_path, make_request(), alone)) == []
 
 
 def test_the_spread_of_normal_values_is_known_to_the_textbook_error():
@@ -100,30 +100,30 @@ def of_fit(tmp_path, sensors=2, **changes):
 
 
 def test_more_samples_lose_less_likelihood_and_the_best_fit_loses_nothing(short, tmp_path):
-    samples, seeds = mixture.ladders(of_fit(tmp_path))
-    assert [rung.setting for rung in samples.rungs] == ["100", "400", "2,000"]
+    samples, seeds = mixture.sweeps(of_fit(tmp_path))
+    assert [measurement.setting for measurement in samples.measurements] == ["100", "400", "2,000"]
     assert samples.default.setting == "2,000"
-    assert [rung.setting for rung in seeds.rungs] == ["1", "12"]
+    assert [measurement.setting for measurement in seeds.measurements] == ["1", "12"]
     assert seeds.default.setting == "12"
-    assert all(rung.error >= 0 for rung in (*samples.rungs, *seeds.rungs))
+    assert all(measurement.error >= 0 for measurement in (*samples.measurements, *seeds.measurements))
     assert samples.falls
     # of n samples, a fit with p parameters loses p / 2n (Akaike 1974); these two sensors have 13
-    assert samples.rungs[0].error == pytest.approx(13 / 200, rel=0.6)
-    assert samples.rungs[0].error > 3 * samples.rungs[-1].error
+    assert samples.measurements[0].error == pytest.approx(13 / 200, rel=0.6)
+    assert samples.measurements[0].error > 3 * samples.measurements[-1].error
 
 
 def test_errors_of_fits_repeat_to_the_last_bit(short, tmp_path):
-    first, second = (mixture.ladders(of_fit(tmp_path)) for _ in range(2))
-    assert [rung.error for ladder in first for rung in ladder.rungs] == [
-        rung.error for ladder in second for rung in ladder.rungs
+    first, second = (mixture.sweeps(of_fit(tmp_path)) for _ in range(2))
+    assert [measurement.error for sweep in first for measurement in sweep.measurements] == [
+        measurement.error for sweep in second for measurement in sweep.measurements
     ]
 
 
-def test_one_sensor_has_no_ladder_of_seeds_and_scans_have_none(short, tmp_path):
-    assert [ladder.knob for ladder in mixture.ladders(of_fit(tmp_path, sensors=1))] == ["samples of the fit"]
-    assert mixture.ladders(of_fit(tmp_path, layout="scan")) == []
+def test_one_sensor_has_no_sweep_of_seeds_and_scans_have_none(short, tmp_path):
+    assert [sweep.knob for sweep in mixture.sweeps(of_fit(tmp_path, sensors=1))] == ["samples of the fit"]
+    assert mixture.sweeps(of_fit(tmp_path, layout="scan")) == []
     without = of_fit(tmp_path)
-    assert mixture.ladders(replace(without, request=replace(without.request, samples={}))) == []
+    assert mixture.sweeps(replace(without, request=replace(without.request, samples={}))) == []
 
 
 def of_light(detector, choice="auto", **changes):
@@ -148,61 +148,65 @@ def with_footprint(request, count):
 
 def test_changes_of_effects_are_those_of_evaluations_under_them():
     asked = of_light("single-photon")
-    ladder = next(one for one in physics.ladders(asked) if one.knob == "effects")
-    there = [rung.setting.removeprefix("without ") for rung in ladder.rungs if rung.setting.startswith("without")]
+    sweep = next(one for one in physics.sweeps(asked) if one.knob == "effects")
+    there = [
+        measurement.setting.removeprefix("without ")
+        for measurement in sweep.measurements
+        if measurement.setting.startswith("without")
+    ]
     assert {"footprint", "photon_noise", "jitter", "quantisation"} <= set(there)
     full, none = scored(asked.request, there), scored(asked.request, ())
-    for rung in ladder.rungs:
-        if rung.setting == "none":
-            assert rung.error == pytest.approx(abs((none - full).mean()))
-        elif rung.setting == "without footprint":
+    for measurement in sweep.measurements:
+        if measurement.setting == "none":
+            assert measurement.error == pytest.approx(abs((none - full).mean()))
+        elif measurement.setting == "without footprint":
             left = scored(asked.request, [name for name in there if name != "footprint"])
-            assert rung.values["change_left_out"] == pytest.approx(abs((left - full).mean()))
+            assert measurement.values["change_left_out"] == pytest.approx(abs((left - full).mean()))
             alone = scored(asked.request, ["footprint"])
-            assert rung.values["change_alone"] == pytest.approx(abs((alone - none).mean()))
-            assert rung.error == max(rung.values["change_left_out"], rung.values["change_alone"])
-    assert ladder.rungs[-1].setting == "all"
-    assert ladder.rungs[-1].reference
-    assert ladder.tolerance == pytest.approx(asked.request.task.metric.tolerance / len(there))
+            assert measurement.values["change_alone"] == pytest.approx(abs((alone - none).mean()))
+            assert measurement.error == max(measurement.values["change_left_out"], measurement.values["change_alone"])
+    assert sweep.measurements[-1].setting == "all"
+    assert sweep.measurements[-1].reference
+    assert sweep.tolerance == pytest.approx(asked.request.task.metric.tolerance / len(there))
 
 
 def test_the_settings_that_the_evaluation_has_are_marked():
-    footprint, effects = physics.ladders(of_light("single-photon"))
+    footprint, effects = physics.sweeps(of_light("single-photon"))
     assert footprint.default.setting == "7"
     assert effects.default is not None
-    _, nothing = physics.ladders(of_light("single-photon", "none"))
+    _, nothing = physics.sweeps(of_light("single-photon", "none"))
     assert nothing.default.setting == "none"
 
 
 def test_where_the_detector_asks_for_nothing_another_one_stands_in_and_no_setting_is_the_runs():
-    for ladder in physics.ladders(of_light("ideal")):
-        assert "measured by single-photon" in ladder.note
-        assert ladder.default is None
+    for sweep in physics.sweeps(of_light("ideal")):
+        assert "measured by single-photon" in sweep.note
+        assert sweep.default is None
 
 
 def test_the_finest_footprint_is_the_reference_and_bounded_by_what_it_takes(monkeypatch):
-    footprint, _ = physics.ladders(of_light("single-photon"))
-    assert [rung.setting for rung in footprint.rungs] == ["1", "4", "7", "16", "64", "256"]
-    assert footprint.rungs[-1].reference
-    assert footprint.rungs[-1].error == 0
+    footprint, _ = physics.sweeps(of_light("single-photon"))
+    assert [measurement.setting for measurement in footprint.measurements] == ["1", "4", "7", "16", "64", "256"]
+    assert footprint.measurements[-1].reference
+    assert footprint.measurements[-1].error == 0
     single, finest = (with_footprint(of_light("single-photon").request, count) for count in (1, 256))
-    assert footprint.rungs[0].error == pytest.approx(np.abs(single - finest).mean())
+    assert footprint.measurements[0].error == pytest.approx(np.abs(single - finest).mean())
     monkeypatch.setattr(physics, "MOST_THIN_RAYS", 20 * 25 * 4)
-    footprint, _ = physics.ladders(of_light("single-photon"))
-    assert [rung.setting for rung in footprint.rungs] == ["1", "4", "7", "16"]
+    footprint, _ = physics.sweeps(of_light("single-photon"))
+    assert [measurement.setting for measurement in footprint.measurements] == ["1", "4", "7", "16"]
 
 
-def test_gates_beyond_what_the_stand_in_hears_have_no_ladders():
+def test_gates_beyond_what_the_stand_in_hears_have_no_sweeps():
     far = make_request([design("far", range_m=18.0)], space=DesignSpace((0,) * 6, (0, 0, 0, 0.5, 0.5, 40.0)))
-    assert physics.ladders(AccuracyRequest(None, None, far, None)) == []
+    assert physics.sweeps(AccuracyRequest(None, None, far, None)) == []
 
 
 def test_a_single_scene_says_that_its_uncertainty_is_unknown():
     asked = of_light("single-photon")
     alone = replace(asked, request=replace(asked.request, test=asked.request.test[:1]))
-    assert all("in 1 scene, so that differences" in ladder.note for ladder in physics.ladders(alone))
+    assert all("in 1 scene, so that differences" in sweep.note for sweep in physics.sweeps(alone))
 
 
 def test_without_designs_nothing_is_measured():
     asked = of_light("single-photon")
-    assert physics.ladders(replace(asked, request=replace(asked.request, designs=[]))) == []
+    assert physics.sweeps(replace(asked, request=replace(asked.request, designs=[]))) == []

@@ -14,16 +14,19 @@ from lidardesign.evaluate.metrics import (
     chamfer_m,
     delaunay_surface,
     ray_spacing,
-    sample_surface,
     surface_cloud,
     triangle_distance_m,
-    visible_surface_points,
+    visible_surface,
 )
-from lidardesign.geometry.surface import sample_body
+from lidardesign.geometry.surface import sample_body, sample_triangles
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, angles
 
 STANDARD_ERRORS = 4  # the tolerance of every sampled mean below
+
+
+def visible_surface_points(*arguments, **options):
+    return visible_surface(*arguments, **options).points
 
 
 def generator(seed=0):
@@ -113,7 +116,7 @@ def test_the_triangles_of_returns_tile_what_was_seen():
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
     assert area == pytest.approx(1.44)
-    np.testing.assert_allclose(sample_surface(vertices, faces, 100, generator())[:, 0], 1.0)
+    np.testing.assert_allclose(sample_triangles(vertices, faces, 100, generator())[0][:, 0], 1.0)
 
 
 def test_every_triangle_is_delaunay_on_the_sphere_even_over_more_than_half_a_turn():
@@ -217,8 +220,8 @@ def test_the_spacing_of_rays_is_that_of_their_grid_and_of_different_directions_a
 def test_points_on_a_mesh_are_uniform_in_area_and_repeatable():
     vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 3], [2, 0, 3]])
     faces = np.array([[0, 1, 2], [0, 3, 4]])  # areas 0.5 and 3
-    points = sample_surface(vertices, faces, 7000, generator())
-    np.testing.assert_array_equal(points, sample_surface(vertices, faces, 7000, generator()))
+    points = sample_triangles(vertices, faces, 7000, generator())[0]
+    np.testing.assert_array_equal(points, sample_triangles(vertices, faces, 7000, generator())[0])
     on_second = points[points[:, 2] > 0]
     assert len(on_second) == pytest.approx(6000, abs=2)  # places along the area are stratified
     spread = STANDARD_ERRORS * on_second.std(axis=0) / math.sqrt(len(on_second))

@@ -1,4 +1,4 @@
-"""Pictures of error against seconds: every rung has its place, whatever its figures and its name are."""
+"""Pictures of error against seconds: every measurement has its place, whatever its figures and its name are."""
 
 import itertools
 import math
@@ -9,71 +9,70 @@ from dataclasses import replace
 from support.evaluations import make_evaluation
 from support.tables import each_row
 
-from lidardesign.evaluate.accuracy.settings import Ladder, Rung
-from lidardesign.evaluate.accuracy.sweeps import Accuracy
-from lidardesign.evaluate.figures.canvas import looks, picture
-from lidardesign.evaluate.figures.figure_data import Pictured
+from lidardesign.evaluate.accuracy.settings import Accuracy, Measurement, Sweep
+from lidardesign.evaluate.figures.canvas import picture, picture_style
 from lidardesign.evaluate.figures.pareto import label_places, panels, pareto_picture
 from lidardesign.evaluate.figures.plots import ACCURACY, pictures
+from lidardesign.evaluate.figures.scene_figure import FigureData
 from lidardesign.evaluate.report.figures import accuracy_tables, pareto_figure, pareto_height_px
 
 NASTY = "</script><img src=x onerror=alert(1)>$x^2"
 
 
-def make_ladder(rungs=None, knob="density.points", tolerance=0.02, unit="", note=""):
-    rungs = rungs or [
-        Rung("16", 0.2, 0.02, 0.01),
-        Rung("slow", 0.25, 0.02, 0.05),
-        Rung("64", 0.015, 0.002, 0.04, 2_000_000, default=True),
-        Rung("256", 0.0, 0.0, 0.2, reference=True),
+def make_sweep(measurements=None, knob="density.points", tolerance=0.02, unit="", note=""):
+    measurements = measurements or [
+        Measurement("16", 0.2, 0.02, 0.01),
+        Measurement("slow", 0.25, 0.02, 0.05),
+        Measurement("64", 0.015, 0.002, 0.04, 2_000_000, default=True),
+        Measurement("256", 0.0, 0.0, 0.2, reference=True),
     ]
-    return Ladder(knob, "what is wrong", unit, "the finest", tolerance, "a reason", "one step", rungs, note)
+    return Sweep(knob, "what is wrong", unit, "the finest", tolerance, "a reason", "one step", measurements, note)
 
 
-def drawn(ladders):
-    with looks():
-        return picture(pareto_picture(ladders), "svg")
+def drawn(sweeps):
+    with picture_style():
+        return picture(pareto_picture(sweeps), "svg")
 
 
 def test_every_rung_stands_inside_its_panel():
-    (panel,) = panels([make_ladder()])
+    (panel,) = panels([make_sweep()])
     for mark in panel.marks:
         assert panel.seconds[0] < mark.x < panel.seconds[1]
         assert panel.errors[0] <= mark.low <= mark.y <= mark.high <= panel.errors[1]
-    assert panel.errors[0] < panel.ladder.tolerance < panel.errors[1]
+    assert panel.errors[0] < panel.sweep.tolerance < panel.errors[1]
     assert [mark.on_edge for mark in panel.marks] == [False, False, False, True]
     assert [mark.chosen for mark in panel.marks] == [False, False, True, False]
 
 
 def test_the_front_is_what_no_other_rung_beats():
-    (panel,) = panels([make_ladder()])
-    assert [mark.rung.setting for mark in panel.front] == ["16", "64", "256"]
+    (panel,) = panels([make_sweep()])
+    assert [mark.measurement.setting for mark in panel.front] == ["16", "64", "256"]
     assert [mark.beaten for mark in panel.marks] == [False, True, False, False]
-    twins = make_ladder([Rung("a", 0.1, 0, 1.0), Rung("b", 0.1, 0, 1.0)])
+    twins = make_sweep([Measurement("a", 0.1, 0, 1.0), Measurement("b", 0.1, 0, 1.0)])
     assert [mark.beaten for mark in panels([twins])[0].marks] == [False, False]
 
 
 @each_row(
-    "rungs",
+    "measurements",
     [
-        [Rung("a", 0.0, 0.0, 0.0), Rung("b", 0.0, 0.0, 0.0)],
-        [Rung("a", 1e-30, 0.0, 1e-9), Rung("b", 1e9, 1e9, 1e6)],
-        [Rung("a", 0.5, 5.0, 1.0), Rung("b", 0.5, 0.0, 1.0)],
-        [Rung("a", math.inf, math.nan, 1.0), Rung("b", 0.5, 0.0, 1.0)],
+        [Measurement("a", 0.0, 0.0, 0.0), Measurement("b", 0.0, 0.0, 0.0)],
+        [Measurement("a", 1e-30, 0.0, 1e-9), Measurement("b", 1e9, 1e9, 1e6)],
+        [Measurement("a", 0.5, 5.0, 1.0), Measurement("b", 0.5, 0.0, 1.0)],
+        [Measurement("a", math.inf, math.nan, 1.0), Measurement("b", 0.5, 0.0, 1.0)],
     ],
 )
 @each_row("tolerance", [0.0, 0.02, math.inf])
-def test_figures_without_a_logarithm_are_drawn_too(rungs, tolerance):
-    ladder = make_ladder(rungs, tolerance=tolerance)
-    (panel,) = panels([ladder])
+def test_figures_without_a_logarithm_are_drawn_too(measurements, tolerance):
+    sweep = make_sweep(measurements, tolerance=tolerance)
+    (panel,) = panels([sweep])
     ends = (*panel.seconds, *panel.errors, *(value for mark in panel.marks for value in (mark.x, mark.y, mark.low)))
     assert all(math.isfinite(value) and value > 0 for value in ends)
-    assert drawn([ladder]).startswith(b"<?xml")
+    assert drawn([sweep]).startswith(b"<?xml")
 
 
 def test_settings_that_would_meet_are_written_above_each_other():
-    rungs = [Rung(f"without effect {i}", 0.1 * (1 + i / 100), 0.0, 1.0 + i / 100) for i in range(6)]
-    (panel,) = panels([make_ladder(rungs)])
+    measurements = [Measurement(f"without effect {i}", 0.1 * (1 + i / 100), 0.0, 1.0 + i / 100) for i in range(6)]
+    (panel,) = panels([make_sweep(measurements)])
     height, line = 100.0, 9.0
     spread = math.log(panel.errors[1] / panel.errors[0])
     places = [
@@ -85,30 +84,30 @@ def test_settings_that_would_meet_are_written_above_each_other():
 
 
 def test_ladders_of_one_rung_have_tables_and_no_panel():
-    single = make_ladder([Rung("40", 0.3, 0.1, 2.0, default=True)])
+    single = make_sweep([Measurement("40", 0.3, 0.1, 2.0, default=True)])
     assert panels([single]) == []
     assert pareto_picture([single]) is None
     assert "40 (run)" in accuracy_tables([single])
 
 
 def test_the_same_ladders_give_the_same_bytes():
-    assert drawn([make_ladder(), make_ladder()]) == drawn([make_ladder(), make_ladder()])
+    assert drawn([make_sweep(), make_sweep()]) == drawn([make_sweep(), make_sweep()])
 
 
 def test_plots_hold_the_picture_where_accuracy_was_measured():
-    evaluation = replace(make_evaluation(), accuracy=Accuracy([make_ladder()], {"visibility": 1.0}))
-    assert pictures(make_evaluation(), Pictured())[ACCURACY]() is None
-    with looks():
-        assert len(pictures(evaluation, Pictured())[ACCURACY]().axes) == 1
+    evaluation = replace(make_evaluation(), accuracy=Accuracy([make_sweep()], {"visibility": 1.0}))
+    assert pictures(make_evaluation(), FigureData())[ACCURACY]() is None
+    with picture_style():
+        assert len(pictures(evaluation, FigureData())[ACCURACY]().axes) == 1
 
 
 def test_figures_have_one_pair_of_axes_per_ladder_with_all_its_rungs():
-    ladders = [make_ladder(), make_ladder(knob="second", unit="mm"), make_ladder(knob="third")]
-    figure = pareto_figure(ladders)
+    sweeps = [make_sweep(), make_sweep(knob="second", unit="mm"), make_sweep(knob="third")]
+    figure = pareto_figure(sweeps)
     assert {name for name in figure["layout"] if name.startswith("xaxis")} == {"xaxis", "xaxis2", "xaxis3"}
     marks = [trace for trace in figure["data"] if trace["mode"] == "markers"]
     assert [len(trace["x"]) for trace in marks] == [4, 4, 4]
-    assert pareto_height_px(ladders) == 2 * pareto_height_px(ladders[:1])
+    assert pareto_height_px(sweeps) == 2 * pareto_height_px(sweeps[:1])
     domains = [figure["layout"][f"yaxis{name}"]["domain"] for name in ("", "2", "3")]
     assert domains[0] == domains[1]
     assert 0 <= domains[2][0] < domains[2][1] < domains[0][0] < domains[0][1] <= 1
@@ -118,20 +117,20 @@ def test_plotly_knows_every_property_of_the_figure():
     import plotly.graph_objects as go
 
     # unknown properties raise
-    drawn = go.Figure(pareto_figure([make_ladder(), make_ladder(knob="second")]))
+    drawn = go.Figure(pareto_figure([make_sweep(), make_sweep(knob="second")]))
     assert {trace.mode for trace in drawn.data} >= {"markers"}
 
 
 def test_no_name_becomes_markup():
-    rungs = [Rung(NASTY, 0.1, 0.0, 1.0), Rung("b", 0.01, 0.0, 2.0)]
-    ladder = make_ladder(rungs, knob=NASTY, unit=NASTY, note=NASTY)
-    assert "<img" not in accuracy_tables([ladder])
-    assert "<img" not in str(pareto_figure([ladder]))
-    assert b"<img" not in drawn([ladder])
+    measurements = [Measurement(NASTY, 0.1, 0.0, 1.0), Measurement("b", 0.01, 0.0, 2.0)]
+    sweep = make_sweep(measurements, knob=NASTY, unit=NASTY, note=NASTY)
+    assert "<img" not in accuracy_tables([sweep])
+    assert "<img" not in str(pareto_figure([sweep]))
+    assert b"<img" not in drawn([sweep])
 
 
 def test_tables_name_what_to_choose_and_what_the_run_does():
-    text = accuracy_tables([make_ladder(note="in 3 scenes")])
+    text = accuracy_tables([make_sweep(note="in 3 scenes")])
     assert "64 (run)" in text
     assert text.count("to choose</td>") == 1
     assert "Note: in 3 scenes." in text

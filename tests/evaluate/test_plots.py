@@ -17,25 +17,27 @@ from support.tables import each_row
 
 from lidardesign.design.constraints.slack import ConstraintSlack
 from lidardesign.design.sensor import DesignSpec, Sensor
-from lidardesign.evaluate.figures.bounds import constraints_picture
 from lidardesign.evaluate.figures.canvas import (
+    COLOURS,
     COLUMN_INCHES,
     DOTS_PER_INCH,
     LOOK,
     PAGE_INCHES,
     SMALL_POINTS,
-    looks,
+    axis_titles,
+    log_ticks,
+    logarithmic,
     picture,
+    picture_style,
     plain_label,
+    series,
     write_pictures,
 )
-from lidardesign.evaluate.figures.curves import COLOURS, axis_titles, log_ticks, logarithmic, series
 from lidardesign.evaluate.figures.density_views import density_view
-from lidardesign.evaluate.figures.figure_data import Pictured, tightness_of
 from lidardesign.evaluate.figures.plots import pictures, write_plots
 from lidardesign.evaluate.figures.scene import OUTCOME_LOOKS, framed_points, opened, scene_picture, shaded, view_of
-from lidardesign.evaluate.figures.scene_figure import shown_in
-from lidardesign.evaluate.figures.scores import MOST_ROWS, curve_picture, phase_rows, shown_pairs
+from lidardesign.evaluate.figures.scene_figure import FigureData, constraint_slack_of, scene_figure
+from lidardesign.evaluate.figures.scores import MOST_ROWS, constraints_picture, curve_picture, drawn_pairs, phase_rows
 from lidardesign.evaluate.results import EffectSummary, Evaluation, Paired, csv_text, write_csv
 from lidardesign.geometry.rays import Outcome, Rays
 from lidardesign.samples import Samples
@@ -70,7 +72,7 @@ def make_rays(count=25):
 
 def make_shown(names=("first",)):
     designs = [DesignSpec(name, (make_sensor(),)) for name in names]
-    return shown_in(BALL, designs, [{}], lambda design, at: design, lambda design, at: make_rays())
+    return scene_figure(BALL, designs, [{}], lambda design, at: design, lambda design, at: make_rays())
 
 
 def make_pictured(names=("first",)):
@@ -82,7 +84,7 @@ def make_pictured(names=("first",)):
         ConstraintSlack(f"field of view {NASTY}", 20.0, 30.0, "s0", -10.0, -0.5, 1, 0, 1),
     ]
     times = {"learn": {"scenes": 1.0, "learning": 9.0, "learning/target": 5.0, "other": 0.5}}
-    return Pictured(make_shown(names), view, dict.fromkeys(names, bounds), times)
+    return FigureData(make_shown(names), view, dict.fromkeys(names, bounds), times)
 
 
 def make_effect(name, range_m, scenes_on):
@@ -140,7 +142,7 @@ def test_the_same_evaluation_gives_the_same_bytes(written, tmp_path):
     names = (NASTY, "second")
     drawing = pictures(make_evaluation(names), make_pictured(names))
     for stem in ("score_against_rays", "density_field"):
-        with looks():
+        with picture_style():
             again = write_pictures(drawing[stem](), tmp_path, stem)
         for path in again:
             assert path.read_bytes() == (written[0].parent / path.name).read_bytes()
@@ -160,7 +162,7 @@ def test_settings_of_the_user_neither_change_pictures_nor_are_changed():
 
 
 def drawn(evaluation, against="rays"):
-    with looks():
+    with picture_style():
         return picture(curve_picture(evaluation, against), "svg")
 
 
@@ -178,8 +180,8 @@ def test_any_finite_score_can_be_drawn(value):
 
 def test_what_there_is_nothing_to_draw_for_is_no_picture():
     evaluation = Evaluation(METRIC, 5, make_evaluation().rows, [])
-    with looks():
-        empty = [stem for stem, draw in pictures(evaluation, Pictured()).items() if draw() is None]
+    with picture_style():
+        empty = [stem for stem, draw in pictures(evaluation, FigureData()).items() if draw() is None]
     assert empty == [
         "scene",
         "density_marginals",
@@ -232,7 +234,7 @@ def test_planes_are_seen_from_their_front_only():
 def test_a_room_is_cut_open_where_its_walls_hide_the_sensors():
     room = Scene((Body(Box((6.0, 6.0, 6.0)), "room", "both"),), "room")
     design = DesignSpec("inside", (make_sensor(),))
-    shown = shown_in(room, [design], [{}], lambda design, at: design, lambda design, at: make_rays())
+    shown = scene_figure(room, [design], [{}], lambda design, at: design, lambda design, at: make_rays())
     view = view_of(shown.directions, framed_points(shown, 0, 0))
     image, cut = opened(shown, 0, 0, view, 60)
     assert cut
@@ -247,7 +249,7 @@ def test_a_detector_of_its_own_has_a_mark(written):
     across, up = view.project(np.array([0.0, 0.5, 0.0]))
     assert left < across < right
     assert bottom < up < top
-    with looks():
+    with picture_style():
         names = [text.get_text() for text in scene_picture(shown).legends[0].get_texts()]
         assert "detector" in names
     assert ">detector<" not in written[1].read_text(encoding="utf-8")
@@ -259,7 +261,7 @@ def test_a_flat_world_is_seen_from_above():
 
 
 def test_many_differences_are_thinned_and_the_picture_says_so():
-    few, told = shown_pairs(make_evaluation())
+    few, told = drawn_pairs(make_evaluation())
     assert len(few) == 3
     assert "most rays" not in told
     names = tuple(f"d{i}" for i in range(30))
@@ -267,7 +269,7 @@ def test_many_differences_are_thinned_and_the_picture_says_so():
     pairs = [
         Paired(name, other, n, -1.0, -2.0, 0.5) for name in names for other in ("uniform", "d0") for n in (36, 576)
     ]
-    many, told = shown_pairs(Evaluation(METRIC, 5, evaluation.rows, pairs))
+    many, told = drawn_pairs(Evaluation(METRIC, 5, evaluation.rows, pairs))
     assert len(many) <= MOST_ROWS
     assert {pair.rays for pair in many} == {576}
     assert {pair.b for pair in many} == {"uniform"}
@@ -283,11 +285,11 @@ def test_phases_add_up_to_the_time_of_the_command():
 
 
 def test_a_design_without_constraints_has_no_bounds_to_draw():
-    free = tightness_of(DesignSpec("free", (make_sensor(),)), SPACE)
+    free = constraint_slack_of(DesignSpec("free", (make_sensor(),)), SPACE)
     assert {one.name.split(".")[0] for one in free} == {"space"}
     assert constraints_picture({"free": free}) is None
     bound = DesignSpec("bound", (make_sensor(),), constraints={"gate": {"width_m": {"max": 1.0}}})
-    (row,) = [one for one in tightness_of(bound, SPACE) if one.name == "gate.width_m.max"]
+    (row,) = [one for one in constraint_slack_of(bound, SPACE) if one.name == "gate.width_m.max"]
     assert row.room == pytest.approx(1.0 - 2 * 1.959964 * 0.2, abs=1e-5)
 
 

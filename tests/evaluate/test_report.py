@@ -22,7 +22,7 @@ from support.report_pages import (
 )
 
 from lidardesign.design.sensor import DesignSpec
-from lidardesign.evaluate.figures.curves import series
+from lidardesign.evaluate.figures.canvas import series
 from lidardesign.evaluate.figures.drawing import (
     FEWEST_STEPS,
     MOST_FACES,
@@ -35,22 +35,30 @@ from lidardesign.evaluate.figures.drawing import (
     round_steps,
     thinned,
 )
-from lidardesign.evaluate.figures.scene_figure import MOST_RAY_STEPS, MOST_STEPS, Shown
+from lidardesign.evaluate.figures.scene_figure import MOST_RAY_STEPS, MOST_STEPS, SceneFigure
 from lidardesign.evaluate.report.figures import curve_figure, marginal_figure, plane_figure
 from lidardesign.evaluate.report.markup import asset, script_safe
 from lidardesign.evaluate.report.report import report_html, write_report
-from lidardesign.evaluate.report.tables import CommandTimes, constraints_table, number, times_tables
+from lidardesign.evaluate.report.tables import (
+    CommandTimes,
+    constraints_table,
+    four_digits,
+    number,
+    rows_table,
+    summary_sentences,
+    table,
+    times_tables,
+)
 from lidardesign.evaluate.report.view import (
     MOST_BODIES,
     MOST_SENSORS,
     OUTCOMES,
     drawn_bodies,
-    told,
     view_bounds,
     view_document,
+    view_notes,
 )
-from lidardesign.evaluate.results import Evaluation, leading_detail
-from lidardesign.evaluate.verdicts import figure, rows_table, summary_sentences, table, verdict
+from lidardesign.evaluate.results import Evaluation, leading_detail, verdict
 from lidardesign.geometry.rays import Outcome
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.task import Metric
@@ -227,7 +235,7 @@ def test_a_verdict_needs_an_interval_that_excludes_zero_and_the_metrics_directio
 
 
 def test_figures_have_four_digits():
-    assert [figure(v) for v in (0.1152, 39.1, 1234.0, 0.0)] == ["0.1152", "39.10", "1234", "0.000"]
+    assert [four_digits(v) for v in (0.1152, 39.1, 1234.0, 0.0)] == ["0.1152", "39.10", "1234", "0.000"]
 
 
 @pytest.mark.parametrize(
@@ -317,7 +325,7 @@ def test_long_scenes_and_many_rays_are_thinned_evenly_and_the_page_says_so():
     assert (len(shown.places), shown.all_places) == (MOST_STEPS, 60)
     assert (shown.frames[0], shown.frames[-1]) == (0, 199)
     assert sum(one.outcome.size for one in shown.designs) <= MOST_RAY_STEPS
-    text = " ".join(told(shown))
+    text = " ".join(view_notes(shown))
     for part in (f"{len(shown.frames)} of 200 frames", "25 of 60 positions", "of 600 rays of plain are drawn"):
         assert part in text
 
@@ -351,10 +359,10 @@ def test_very_many_bodies_are_drawn_coarser_and_the_largest_first():
     balls = tuple(Body(Sphere(0.1 + 0.001 * i), f"b{i}", "both") for i in range(MOST_BODIES + 10))
     scene = Scene(balls, "many")
     assert round_steps(scene) == FEWEST_STEPS < round_steps(make_scene()) == STEPS
-    kept = drawn_bodies(Shown(scene, (0,), ({},), ()))
+    kept = drawn_bodies(SceneFigure(scene, (0,), ({},), ()))
     assert [body.name for body in kept] == [f"b{i}" for i in range(10, MOST_BODIES + 10)]
     floor = Body(Plane(), "floor", "both")
-    assert drawn_bodies(Shown(Scene((*balls, floor), "more"), (0,), ({},), ()))[-1] is floor
+    assert drawn_bodies(SceneFigure(Scene((*balls, floor), "more"), (0,), ({},), ()))[-1] is floor
 
 
 def test_a_page_of_twenty_designs_in_a_large_scene_stays_small():
@@ -381,7 +389,7 @@ def test_the_share_of_a_scene_that_is_drawn_bounds_all_its_meshes_together():
     assert drawn_share(scene) == pytest.approx(MOST_FACES / (5 * len(sheet.faces)))
     drawn = sum(len(body_triangles(body, 1, np.zeros((2, 3)), drawn_share(scene))[1]) for body in scene.bodies)
     assert 0.1 * MOST_FACES < drawn <= MOST_FACES + 5
-    assert any("triangles of the meshes are drawn" in line for line in told(make_shown(scene=scene)))
+    assert any("triangles of the meshes are drawn" in line for line in view_notes(make_shown(scene=scene)))
 
 
 def test_where_rays_of_a_sensor_start_is_drawn_where_it_spreads():

@@ -10,7 +10,8 @@ from support.tables import each_row
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.errors import ConfigError, DataError, PluginError
-from lidardesign.evaluate.score import evaluate, worse_than_threshold
+from lidardesign.evaluate.results import worse_than_threshold
+from lidardesign.evaluate.score import evaluate
 from lidardesign.space import DesignSpace
 from lidardesign.task import Metric, Score
 

@@ -1,4 +1,4 @@
-"""The ladder of training: what a run had reached at its snapshots, and what runs of other presets beside it reach."""
+"""The sweep of training: what a run had reached at its snapshots, and what runs of other presets beside it reach."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from lidardesign.errors import DataError, NumericalError
 from lidardesign.evaluate import score
 from lidardesign.evaluate.accuracy import sweeps as accuracy
 from lidardesign.evaluate.accuracy import training
-from lidardesign.evaluate.accuracy.probes import run_target
-from lidardesign.evaluate.accuracy.sweeps import Accuracy, AccuracyRequest
+from lidardesign.evaluate.accuracy.probes import AccuracyRequest, run_target
+from lidardesign.evaluate.accuracy.settings import Accuracy
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import note, read_manifest, record, start_manifest
@@ -72,46 +72,46 @@ def request_for(run, designs=()):
 
 
 @pytest.fixture(scope="module")
-def ladders(runs):
-    return training.ladders(request_for(runs, [fit(load_samples(runs), sensors=2, restarts=1).design]))
+def sweeps(runs):
+    return training.sweeps(request_for(runs, [fit(load_samples(runs), sensors=2, restarts=1).design]))
 
 
-def test_every_snapshot_and_the_flow_itself_are_rungs_with_errors_and_seconds(ladders):
-    steps = ladders[0]
+def test_every_snapshot_and_the_flow_itself_are_measurements_with_errors_and_seconds(sweeps):
+    steps = sweeps[0]
     assert steps.knob == "learning.steps"
-    assert [rung.setting for rung in steps.rungs] == ["32", "40", "48", "64"]
-    assert [rung.default for rung in steps.rungs] == [False] * 3 + [True]
-    assert all(0 < rung.error < 1 and 0 < rung.uncertainty < 0.1 for rung in steps.rungs)
-    seconds = [rung.seconds for rung in steps.rungs]
+    assert [measurement.setting for measurement in steps.measurements] == ["32", "40", "48", "64"]
+    assert [measurement.default for measurement in steps.measurements] == [False] * 3 + [True]
+    assert all(0 < measurement.error < 1 and 0 < measurement.uncertainty < 0.1 for measurement in steps.measurements)
+    seconds = [measurement.seconds for measurement in steps.measurements]
     assert seconds == sorted(seconds)
     assert steps.falls
 
 
-def test_rungs_carry_ess_kl_coverage_and_the_score_of_a_quick_fit(ladders):
-    values = ladders[0].rungs[-1].values
+def test_measurements_carry_ess_kl_coverage_and_the_score_of_a_quick_fit(sweeps):
+    values = sweeps[0].measurements[-1].values
     assert {"ess", "kl_nats", "coverage", "ess_error", "kl_nats_error"} <= values.keys()
     assert any(name.startswith("score") for name in values)
     differences = [v for name, v in values.items() if name.endswith("difference_error")]
     assert differences == [0.0]
-    assert "quick fits" in ladders[0].note
+    assert "quick fits" in sweeps[0].note
 
 
-def test_runs_of_other_presets_are_rungs_and_runs_of_other_densities_are_not(ladders):
-    presets = ladders[1]
+def test_runs_of_other_presets_are_measurements_and_runs_of_other_densities_are_not(sweeps):
+    presets = sweeps[1]
     assert presets.knob == "preset"
-    assert [rung.setting for rung in presets.rungs] == ["draft", "standard"]
-    assert [rung.default for rung in presets.rungs] == [True, False]
-    assert presets.rungs[0].error == ladders[0].rungs[-1].error
+    assert [measurement.setting for measurement in presets.measurements] == ["draft", "standard"]
+    assert [measurement.default for measurement in presets.measurements] == [True, False]
+    assert presets.measurements[0].error == sweeps[0].measurements[-1].error
 
 
-def test_errors_repeat_within_their_uncertainty_on_other_samples_and_probes(runs, ladders):
+def test_errors_repeat_within_their_uncertainty_on_other_samples_and_probes(runs, sweeps):
     request = request_for(runs)
     config, target = request.config, run_target(request)
     probes = draw_probes(target, list(request.request.train), 8192, random_generator(99, "others"))
     again = remeasured(runs, config, target, probes, count=8192, seed=99)
-    for rung, reached in zip(ladders[0].rungs, again, strict=True):
+    for measurement, reached in zip(sweeps[0].measurements, again, strict=True):
         found = reached.misplaced
-        assert abs(found.value - rung.error) < 4 * np.hypot(found.error, rung.uncertainty)
+        assert abs(found.value - measurement.error) < 4 * np.hypot(found.error, measurement.uncertainty)
 
 
 def test_a_snapshot_is_measured_as_the_flow_that_was_learned(runs):
@@ -137,26 +137,29 @@ def test_progress_that_is_none_is_told(runs, tmp_path, text):
         seconds_at(tmp_path / "run", [20])
 
 
-def test_stages_of_a_tolerance_are_a_ladder_of_their_own(runs, tmp_path, ladders):
+def test_stages_of_a_tolerance_are_a_sweep_of_their_own(runs, tmp_path, sweeps):
     goal = ToleranceGoal(0.4, 64, (Stage(32, 0.6, 0.01, 1.0), Stage(64, 0.3, 0.01, 2.0)))
     shutil.copytree(runs, tmp_path / "run")
     request = request_for(tmp_path / "run")
     note(tmp_path / "run", goal=goal.as_dict())
-    found = training._stages_ladder(request)
-    assert [(rung.setting, rung.error) for rung in found[0].rungs] == [("32", 0.6), ("64", 0.3)]
+    found = training._stages_sweep(request)
+    assert [(measurement.setting, measurement.error) for measurement in found[0].measurements] == [
+        ("32", 0.6),
+        ("64", 0.3),
+    ]
     assert "tolerance of 0.4" in found[0].note
 
 
-def test_runs_beside_this_one_that_cannot_be_measured_are_left_out(runs, tmp_path, ladders):
+def test_runs_beside_this_one_that_cannot_be_measured_are_left_out(runs, tmp_path, sweeps):
     place = tmp_path / "runs"
     shutil.copytree(runs.parent, place)
     manifest = read_manifest(place / "longer")
     note(place / "longer", learn=None)
-    assert "preset" not in [ladder.knob for ladder in training.ladders(request_for(place / "mine"))]
+    assert "preset" not in [sweep.knob for sweep in training.sweeps(request_for(place / "mine"))]
     note(place / "longer", learn=manifest["learn"])
     weights = {"weights": np.zeros(3)}
     save_arrays(place / "longer", "flow.safetensors", weights, {})
-    assert "preset" not in [ladder.knob for ladder in training.ladders(request_for(place / "mine"))]
+    assert "preset" not in [sweep.knob for sweep in training.sweeps(request_for(place / "mine"))]
 
 
 @pytest.fixture
@@ -179,7 +182,7 @@ def test_accuracy_of_a_damaged_run_is_refused_before_anything_is_evaluated(fitte
 
 
 @pytest.mark.parametrize("judged", [("--seed", "7"), ("--set", "train=2")])
-def test_ladders_are_those_of_the_scenes_that_were_learned_whatever_designs_are_judged_by(
+def test_sweeps_are_those_of_the_scenes_that_were_learned_whatever_designs_are_judged_by(
     fitted, lidardesign, judged, monkeypatch
 ):
     asked = []
@@ -297,7 +300,7 @@ def test_a_time_budget_writes_its_steps_into_the_configuration(lidardesign, tmp_
 def test_what_was_scored_is_written_before_accuracy_is_measured(fitted, lidardesign, monkeypatch):
     def interrupted(*_, **__):
         assert "one" in Path("rows.csv").read_text(encoding="utf-8")
-        raise NumericalError("interrupted", where="a ladder")
+        raise NumericalError("interrupted", where="a sweep")
 
     monkeypatch.setattr(accuracy, "measure_accuracy", interrupted)
     done = lidardesign("evaluate", "run", "--rays", "8", "--accuracy", "--csv", "rows.csv", "--json")

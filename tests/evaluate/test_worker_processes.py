@@ -8,14 +8,14 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from multiprocessing.context import SpawnProcess
 
 import pytest
 from support.command_line import caller, make_run, program
-from support.workers import make_request, results, without_times
+from support.workers import make_request, random_rays, results, without_times
 
 from lidardesign.errors import ConfigError, NumericalError, PluginError
 from lidardesign.evaluate.score import evaluate
-from lidardesign.evaluate.workers import processes as worker_processes
 from lidardesign.evaluate.workers.pool import WorkerScorer
 from lidardesign.evaluate.workers.processes import MOST_TRIES, Processes
 from lidardesign.registry import load_task
@@ -24,17 +24,17 @@ from lidardesign.registry import load_task
 @pytest.fixture
 def pool():
     """Starts worker processes; all are gone afterwards."""
-    started = []
+    engines = []
 
     def start(count):
-        started.append(Processes(count))
-        return started[-1]
+        engines.append(Processes(count))
+        return engines[-1]
 
     yield start
-    for one in started:
-        known = [process._popen for process in one._running]
-        one.close()
-        assert all(popen.poll() is not None for popen in known)
+    for engine in engines:
+        known = list(engine._running)
+        engine.close()
+        assert not any(process.is_alive() for process in known)
 
 
 def test_processes_score_as_this_one_does_though_some_are_lost(pool):
@@ -44,50 +44,62 @@ def test_processes_score_as_this_one_does_though_some_are_lost(pool):
     with WorkerScorer(engine) as scorer:
         scorer.prepare(request)
         assert results(evaluate(replace(request, scorer=scorer))) == expected
-        first = [process._popen for process in engine._running]
+        first = list(engine._running)
+        assert len(first) == 2
         # one that is lost between two passes, and one in the middle of one
         first[0].kill()
 
         def kill_once(done, total, name):
             if done == 2:
-                first[1].kill()
+                engine._running[1].kill()
 
         assert results(evaluate(replace(request, scorer=scorer), progress=kill_once)) == expected
-        assert not {popen.pid for popen in first} & {process._popen.pid for process in engine._running}
+        assert not {process.pid for process in first} & {process.pid for process in engine._running}
 
 
-def test_a_scene_that_kills_its_workers_is_named(pool, tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(tmp_path)
-    source = "import os, sys\ndef main():\n    sys.stdin.buffer.read(1)\n    os.kill(os.getpid(), 9)\n"
-    (tmp_path / "deadly.py").write_text(source)
-    monkeypatch.setattr("lidardesign.evaluate.workers.processes.WORKER", "deadly")
-    with pytest.raises(NumericalError, match=f"held-out scene 0 was ended by SIGKILL, {MOST_TRIES} times"):
-        list(pool(1).answers([b"one", b"two"]))
+@pytest.mark.parametrize(
+    ("end", "how"), [("os.kill(os.getpid(), 9)", "was ended by SIGKILL"), ("os._exit(7)", "ended with exit code 7")]
+)
+def test_a_scene_that_kills_its_workers_is_named(install, pool, end, how):
+    task = install(f"import os\n{BROKEN}".replace('raise RuntimeError("the map of test 1 is lost")', end))
+    request = make_request(task=task)
+    scenes = request.scene_pass(lambda number: [(random_rays(3, number),)], request.planner)
+    with (
+        WorkerScorer(pool(1)) as scorer,
+        pytest.raises(NumericalError, match=f"the worker of held-out scene 1 {how}, {MOST_TRIES} times"),
+    ):
+        scorer(scenes, None)
 
 
 def test_a_system_that_allows_fewer_processes_leaves_none(monkeypatch):
-    started = []
+    started, start = [], SpawnProcess.start
 
-    def limited(*arguments, **options):
+    def limited(self):
         if len(started) == 1:
             raise BlockingIOError(11, "Resource temporarily unavailable")
-        started.append(subprocess.Popen(*arguments, **options))
-        return started[-1]
+        start(self)
+        started.append(self)
 
-    monkeypatch.setattr(worker_processes, "subprocess", Limited(limited))
+    monkeypatch.setattr(SpawnProcess, "start", limited)
     with pytest.raises(ConfigError, match="only 1 of 3 processes could be started: Resource"):
-        Processes(3)
-    assert started[0].poll() is not None
+        WorkerScorer(Processes(3)).prepare(make_request())
+    assert not started[0].is_alive()
 
 
-class Limited:
-    """The module `subprocess` with another `Popen`."""
-
-    def __init__(self, popen):
-        self.Popen = popen
-
-    def __getattr__(self, name):
-        return getattr(subprocess, name)
+def test_a_script_is_not_run_again_by_its_workers(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "print('begun', flush=True)\n"
+        "from support.workers import make_request\n"
+        "from lidardesign.evaluate.workers.pool import workers_of\n"
+        "with workers_of(2, 2) as scorer:\n"
+        "    request = make_request()\n"
+        "    scorer.prepare(request)\n"
+        "    print(len(scorer(request.scene_pass(lambda number: [], request.planner), None)))\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.split() == ["begun", "6"]
 
 
 BROKEN = """
@@ -105,18 +117,28 @@ class BrokenTask(FlatlandTask):
 
 
 @pytest.fixture
-def broken(tmp_path, monkeypatch):
-    """An installed task whose score fails in the second held-out scene."""
-    folder = tmp_path / "site"
-    (folder / "broken-1.0.dist-info").mkdir(parents=True)
-    (folder / "broken_task.py").write_text(BROKEN)
-    (folder / "broken-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
-    (folder / "broken-1.0.dist-info" / "entry_points.txt").write_text(
-        "[lidardesign.tasks]\nbroken = broken_task:BrokenTask\n"
-    )
-    monkeypatch.syspath_prepend(folder)
-    yield load_task("broken")
+def install(tmp_path, monkeypatch):
+    """Installs a task by its source."""
+
+    def installed(source):
+        folder = tmp_path / "site"
+        (folder / "broken-1.0.dist-info").mkdir(parents=True)
+        (folder / "broken_task.py").write_text(source)
+        (folder / "broken-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
+        (folder / "broken-1.0.dist-info" / "entry_points.txt").write_text(
+            "[lidardesign.tasks]\nbroken = broken_task:BrokenTask\n"
+        )
+        monkeypatch.syspath_prepend(folder)
+        return load_task("broken")
+
+    yield installed
     sys.modules.pop("broken_task", None)
+
+
+@pytest.fixture
+def broken(install):
+    """An installed task whose score fails in the second held-out scene."""
+    return install(BROKEN)
 
 
 def test_what_a_plugin_prints_and_raises_in_a_worker_arrives_whole(broken, pool, capfd):
@@ -188,9 +210,10 @@ def wait_until(condition, seconds=60.0):
 def test_workers_end_with_the_program_however_it_ends(run, number):
     ended = program("evaluate", run, "--rays", 20_000, "--set", "test=50", "--workers", 2, text=True)
     try:
-        assert wait_until(lambda: len(children(ended.pid)) == 2 or ended.poll() is not None)
+        # two workers, and what keeps account of the semaphores that they share
+        assert wait_until(lambda: len(children(ended.pid)) == 3 or ended.poll() is not None)
         workers = children(ended.pid)
-        assert len(workers) == 2
+        assert len(workers) == 3
         # past the imports of the workers, in the middle of the scenes
         time.sleep(2.0)
         ended.send_signal(number)

@@ -3,23 +3,31 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from multiprocessing.reduction import ForkingPickler
 
 import numpy as np
 import pytest
 from lidardesign_tasks.flatland import FlatlandTask
 from support.scoring import MissTask
 from support.tables import each_row
-from support.workers import SEED, make_request, results
+from support.workers import SEED, make_request, random_rays, results
 
 from lidardesign import errors
-from lidardesign.errors import ConfigError, PluginError
-from lidardesign.evaluate.scene_scores import ScenePass, SceneScores
+from lidardesign.errors import ConfigError, LidardesignError, PluginError
+from lidardesign.evaluate.scene_scores import SceneScores
 from lidardesign.evaluate.score import evaluate
 from lidardesign.evaluate.workers import worker
-from lidardesign.evaluate.workers import worker as messages
 from lidardesign.evaluate.workers.pool import WorkerScorer, check_workers, workers_of
-from lidardesign.geometry.rays import Rays
+from lidardesign.evaluate.workers.worker import (
+    SceneFailure,
+    SceneJob,
+    make_scenes,
+    same_outline,
+    scene_outline,
+    score_job,
+)
 from lidardesign.scene import Body, Mesh, Scene, Sphere, rigid
 from lidardesign.simulate.detector.files import detector_names, load_detector
 from lidardesign.simulate.plan import Planner, Tolerance
@@ -28,128 +36,117 @@ from lidardesign.task import Score
 
 
 class ShuffledEngine:
-    """Answers all questions in this process, in a random order."""
+    """Does all jobs in this process, in a random order."""
 
     def __init__(self, seed):
         self._generator = np.random.default_rng(seed)
-        self.closed = False
+        self._threads, self._waiting = ThreadPoolExecutor(1), []
+        self.closed, self.asked = False, 0
 
-    def prepare(self, message):
-        document, _ = messages.unpack(worker.answer(message))
-        assert document == {}
+    def prepare(self, source):
+        make_scenes(source)
 
-    def answers(self, questions):
-        asked = list(questions)
-        for number in self._generator.permutation(len(asked)):
-            yield int(number), worker.answer(asked[number])
+    def at_once(self):
+        return 100
+
+    def submit(self, job):
+        future = Future()
+        self.asked += 1
+        self._waiting.append((future, job))
+        self._threads.submit(self._answer)
+        return future
+
+    def _answer(self):
+        future, job = self._waiting.pop(self._generator.integers(len(self._waiting)))
+        future.set_result(score_job(arrived(job)))
+
+    def check(self):
+        pass
 
     def close(self):
+        self._threads.shutdown()
         self.closed = True
 
 
-class OrderedEngine(ShuffledEngine):
-    """Answers the last of two questions first, and counts them."""
+class BackwardEngine(ShuffledEngine):
+    """Does the last of two jobs first."""
 
-    asked = 0
+    def at_once(self):
+        return 2
 
-    def answers(self, questions):
-        waiting = []
-        for number, message in enumerate(questions):
-            self.asked += 1
-            waiting.append((number, message))
-            if len(waiting) == 2:
-                number, message = waiting.pop()
-                yield number, worker.answer(message)
-        for number, message in waiting:
-            yield number, worker.answer(message)
-
-
-def random_rays(count, seed):
-    generator = np.random.default_rng(seed)
-    directions = generator.normal(size=(count, 3))
-    return Rays(
-        generator.normal(size=(count, 3)),
-        directions / np.linalg.norm(directions, axis=1, keepdims=True),
-        np.sort(generator.random((count, 2)), axis=1),
-        generator.integers(0, 9, count),
-        generator.random(count),
-    )
+    def submit(self, job):
+        future = Future()
+        self.asked += 1
+        self._waiting.append((future, job))
+        if len(self._waiting) == 2:
+            for other, asked in reversed(self._waiting):
+                other.set_result(score_job(asked))
+            self._waiting.clear()
+        return future
 
 
-@pytest.mark.parametrize("counts", [[[3]], [[2, 2], [0, 0], [5, 5]], [[0]], []])
-def test_rays_arrive_to_the_last_bit(counts):
-    lists = [
-        tuple(random_rays(n, 10 * i + j) for j, n in enumerate(positions)) for i, positions in enumerate(counts)
-    ]
-    found, arrays = messages.rays_as_arrays(lists)
-    document, arrived = messages.unpack(messages.pack({"counts": found}, **arrays))
-    again = messages.rays_from_arrays(document["counts"], arrived)
-    assert [[len(rays) for rays in positions] for positions in again] == counts
-    for positions, others in zip(lists, again, strict=True):
-        for rays, other in zip(positions, others, strict=True):
-            for name in messages.RAY_FIELDS:
-                assert getattr(rays, name).tobytes() == getattr(other, name).tobytes()
+def arrived(thing):
+    """What an executor makes of something on the way to a worker, or back."""
+    return ForkingPickler.loads(ForkingPickler.dumps(thing))
 
 
 @each_row("name", detector_names())
 @each_row("choice", ["auto", "all", frozenset({"jitter", "footprint"})])
-def test_planners_and_plans_arrive_whole(name, choice):
-    detector = load_detector(name)
-    for tolerance in (None, Tolerance(1e-3 / 3, 0.1)):
-        planner = Planner(detector, choice, tolerance)
-        arrived, _ = messages.unpack(messages.pack(messages.planner_as_document(planner)))
-        assert messages.planner_from_document(arrived) == planner
+def test_jobs_and_scores_arrive_to_the_last_bit(name, choice):
+    request = make_request(planner=Planner(load_detector(name), choice, Tolerance(1e-3 / 3, 0.1)))
     scene = Scene((Body(Sphere(0.4), poses=rigid(translation_m=(2, 0, 0))),))
-    plan = Planner(detector).plan(scene, [random_rays(5, 0)], build_casters(scene))
-    found = SceneScores(plan, 0.1 / 3, [(Score(1 / 3, False, {"seen": np.float32(0.1), "n": 3}), 0.25)])
-    arrived, _ = messages.unpack(messages.pack(messages.scores_as_document(found)))
-    again = messages.scores_from_document(arrived)
-    assert again.plan == plan
-    assert again.planning_seconds == found.planning_seconds
-    assert again.scores == [(Score(1 / 3, False, {"seen": float(np.float32(0.1)), "n": 3.0}), 0.25)]
-
-
-def test_details_that_are_not_finite_arrive_as_they_are():
-    plan = Planner().plan(make_request().test[0], [], [])
-    found = SceneScores(plan, 0.0, [(Score(5.0, True, {"a": math.nan, "b": -math.inf}), 0.0)])
-    arrived, _ = messages.unpack(messages.pack(messages.scores_as_document(found)))
-    details = messages.scores_from_document(arrived).scores[0][0].details
-    assert math.isnan(details["a"])
-    assert details["b"] == -math.inf
+    plan = Planner(load_detector(name)).plan(scene, [random_rays(5, 0)], build_casters(scene))
+    sets = [(random_rays(2, 1), random_rays(2, 2)), (random_rays(0, 3),)]
+    job = SceneJob.of(request.scene_pass(lambda number: sets, request.planner, [plan]), 0)
+    again = arrived(job)
+    assert (again.source, again.number, again.outline) == (job.source, job.number, job.outline)
+    assert (again.planner, again.plan) == (job.planner, job.plan)
+    for positions, others in zip(job.sets, again.sets, strict=True):
+        for rays, other in zip(positions, others, strict=True):
+            for field in ("origin_m", "direction", "gate_m", "sensor", "time_s"):
+                assert getattr(rays, field).tobytes() == getattr(other, field).tobytes()
+    details = {"seen": np.float32(0.1), "n": 3, "far": -math.inf}
+    scores = arrived(SceneScores(plan, 0.1 / 3, [(Score(1 / 3, False, details), 0.25)]))
+    assert (scores.plan, scores.planning_seconds) == (plan, 0.1 / 3)
+    assert scores.scores == [(Score(1 / 3, False, details), 0.25)]
 
 
 def test_an_outline_tells_scenes_apart_but_not_roundings():
     request = make_request()
     mesh = Mesh(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, 2]]), "unsigned")
     base = Scene((Body(mesh), Body(Sphere(0.3), "ball")), "mixed")
-    assert messages.same_outline(messages.outline(base), messages.outline(base))
+    assert same_outline(scene_outline(base), scene_outline(base))
     for scene in request.test[1:]:
-        assert not messages.same_outline(messages.outline(request.test[0]), messages.outline(scene))
+        assert not same_outline(scene_outline(request.test[0]), scene_outline(scene))
 
     def moved(by_m):
         shifted = Mesh(mesh.vertices + np.array([by_m, 0, 0]), mesh.faces, "unsigned")
-        return messages.outline(Scene((Body(shifted), Body(Sphere(0.3), "ball")), "mixed"))
+        return scene_outline(Scene((Body(shifted), Body(Sphere(0.3), "ball")), "mixed"))
 
-    assert messages.same_outline(messages.outline(base), moved(1e-12))
-    assert not messages.same_outline(messages.outline(base), moved(1e-3))
+    assert same_outline(scene_outline(base), moved(1e-12))
+    assert not same_outline(scene_outline(base), moved(1e-3))
     renamed = replace(base, name="other")
-    assert not messages.same_outline(messages.outline(base), messages.outline(renamed))
+    assert not same_outline(scene_outline(base), scene_outline(renamed))
 
 
 @each_row("kind", ["ConfigError", "DataError", "PluginError", "NumericalError", "InfeasibleError"])
 def test_errors_arrive_whole_with_the_workers_traceback(kind):
-    error = getattr(errors, kind)("found", where="here", allowed="this", hint="that")
-    document, _ = messages.unpack(messages.pack(messages.error_as_document(error, "line 7")))
-    with pytest.raises(type(error)) as raised:
-        messages.raise_from_document(document)
-    assert raised.value.as_dict() == error.as_dict()
-    assert "line 7" in str(raised.value.__cause__)
+    def failing():
+        raise getattr(errors, kind)("found", where="here", allowed="this", hint="that")
+
+    with pytest.raises(LidardesignError) as first:
+        failing()
+    with pytest.raises(type(first.value)) as raised:
+        arrived(SceneFailure.of(first.value)).reraise()
+    assert raised.value.as_dict() == first.value.as_dict()
+    assert str(raised.value) == str(first.value)
+    assert "in failing" in str(raised.value.__cause__)
 
 
 @pytest.mark.parametrize(("error", "kind"), [(MemoryError("full"), MemoryError), (KeyError("x"), RuntimeError)])
 def test_errors_of_other_kinds_keep_their_name(error, kind):
     with pytest.raises(kind, match=type(error).__name__):
-        messages.raise_from_document(messages.error_as_document(error, ""))
+        arrived(SceneFailure.of(error)).reraise()
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -189,10 +186,10 @@ def test_the_first_scenes_error_is_raised_and_no_further_scene_is_begun(monkeypa
         return Score(1.0)
 
     monkeypatch.setattr(FlatlandTask, "score", score)
-    engine = OrderedEngine(0)
-    fired = ScenePass(lambda number: [(random_rays(3, number),)], Planner())
+    engine = BackwardEngine(0)
+    scenes = make_request().scene_pass(lambda number: [(random_rays(3, number),)], Planner())
     with WorkerScorer(engine) as scorer, pytest.raises(PluginError, match="no score of test 2"):
-        scorer(make_request(), fired, None)
+        scorer(scenes, None)
     assert engine.asked < 6
 
 
@@ -205,16 +202,16 @@ def test_scenes_that_a_worker_makes_otherwise_are_refused():
 
 def test_a_worker_of_another_version_is_refused(monkeypatch):
     request = make_request()
-    asked = worker.preparation(request)
+    job = SceneJob.of(request.scene_pass(lambda number: [], Planner()), 0)
+    make_scenes.cache_clear()
     monkeypatch.setattr(worker, "__version__", "9.9")
-    document, _ = messages.unpack(worker.answer(asked))
     with pytest.raises(ConfigError, match=r"has lidardesign 9\.9"):
-        messages.raise_from_document(document["error"])
+        score_job(job).reraise()
 
 
 def test_a_task_that_is_not_installed_is_refused_before_any_worker_is_asked():
     class Engine(ShuffledEngine):
-        def prepare(self, message):
+        def prepare(self, source):
             raise AssertionError("asked")
 
     for task in (type("Other", (FlatlandTask,), {})(), MissTask()):

@@ -31,7 +31,6 @@ from lidardesign.evaluate.metrics import (
     chamfer_m,
     delaunay_surface,
     discrete_frechet_m,
-    sample_surface,
     visible_surface,
 )
 from lidardesign.evaluate.scene_scores import checked_score
@@ -39,6 +38,7 @@ from lidardesign.evaluate.score import evaluate
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome, Rays, gate_outcomes
 from lidardesign.geometry.receiver import path_of_range, path_windows, range_of_path
+from lidardesign.geometry.surface import sample_triangles
 from lidardesign.scene import Body, Box, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.detector.detector import IDEAL, Detector
 from lidardesign.simulate.detector.files import load_detector
@@ -238,7 +238,7 @@ class TestEmptyReturns:
         with pytest.raises(ValueError, match="without points"):
             SurfaceCloud(nothing, np.zeros((0, 3, 3)))
         with pytest.raises(ValueError, match="without faces"):
-            sample_surface(points, np.zeros((0, 3), dtype=int), 10, np.random.default_rng(0))
+            sample_triangles(points, np.zeros((0, 3), dtype=int), 10, np.random.default_rng(0))
         assert delaunay_surface(nothing, np.zeros(3)) is None
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lidardesign.design.sensor import DesignSpec, Sensor
-from lidardesign.evaluate.score import EvaluationRequest
+from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, Score, TaskConfig

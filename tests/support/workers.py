@@ -8,7 +8,8 @@ import numpy as np
 from lidardesign_tasks.flatland import FlatlandConfig, FlatlandTask
 
 from lidardesign.design.sensor import DesignSpec, Sensor
-from lidardesign.evaluate.score import EvaluationRequest
+from lidardesign.evaluate.request import EvaluationRequest
+from lidardesign.geometry.rays import Rays
 
 SEED = 3
 
@@ -42,3 +43,15 @@ def without_times(document):
 def results(evaluation):
     rows = [*evaluation.rows, *evaluation.equal_bandwidth]
     return without_times(evaluation.as_dict()), [row.per_scene.tolist() for row in rows]
+
+
+def random_rays(count, seed):
+    generator = np.random.default_rng(seed)
+    directions = generator.normal(size=(count, 3))
+    return Rays(
+        generator.normal(size=(count, 3)),
+        directions / np.linalg.norm(directions, axis=1, keepdims=True),
+        np.sort(generator.random((count, 2)), axis=1),
+        generator.integers(0, 9, count),
+        generator.random(count),
+    )

@@ -15,7 +15,8 @@ from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import load_design, save_design
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.evaluate.score import EvaluationRequest, evaluate
+from lidardesign.evaluate.request import EvaluationRequest
+from lidardesign.evaluate.score import evaluate
 from lidardesign.export.registry import EXPORTERS
 from lidardesign.registry import load_task
 from lidardesign.run.manifest import start_manifest

@@ -105,7 +105,7 @@ def _show_effects(document: Entry, rich: RichConsole) -> None:
     """What was simulated and why; one line where nothing is called for."""
     from rich.markup import escape
 
-    from lidardesign.evaluate.verdicts import plain
+    from lidardesign.evaluate.report.tables import plain_number
 
     detector, effects = escape(document["detector"]), document["effects"]
     if not any(effect["on"] or effect["bound"] or effect["lost"] for effect in effects):
@@ -116,8 +116,8 @@ def _show_effects(document: Entry, rich: RichConsole) -> None:
     title = f"effects with the detector {detector}; all that are skipped may change {allowed} together"
     lines = []
     for effect in effects:
-        bounds = [plain(MILLIMETRES * effect["bound"], 3), plain(effect["lost"], 2)]
-        cost = plain(effect["seconds"], 2, tiny=SHORT_S)
+        bounds = [plain_number(MILLIMETRES * effect["bound"], 3), plain_number(effect["lost"], 2)]
+        cost = plain_number(effect["seconds"], 2, tiny=SHORT_S)
         lines.append([_words(effect["name"]), _where_on(effect), *bounds, cost, effect["reason"]])
     headings = ("effect", "on", "range [mm]", "returns", "cost [s]", "reason")
     print_table(title, headings, lines, rich, text=("effect", "on", "reason"), wraps=True)

@@ -11,8 +11,7 @@ from lidardesign.run.clock import INSIDE, OTHER
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
-    from lidardesign.evaluate.accuracy.settings import Ladder, Rung
-    from lidardesign.evaluate.accuracy.sweeps import Accuracy
+    from lidardesign.evaluate.accuracy.settings import Accuracy, Measurement, Sweep
 
 # Phases of a smaller share are left to --json; `other` shows what they took.
 LEAST_SHARE = 0.005
@@ -38,40 +37,43 @@ def show_times(timings: Mapping[str, float], memory_bytes: int | None, rich: Ric
 
 
 def show_accuracy(accuracy: Accuracy, rich: RichConsole) -> None:
-    """Print every ladder, the roughest rung first, and the verdict on each."""
+    """Print every sweep, the roughest measurement first, and the verdict on each."""
     from rich.markup import escape
 
-    for ladder in accuracy.ladders:
-        _show_ladder(ladder, rich)
+    for sweep in accuracy.sweeps:
+        _show_sweep(sweep, rich)
     taken = sum(accuracy.seconds.values())
     rich.print(f"accuracy measured in {taken:.0f} s; [bold]*[/bold] is what to choose, (run) what this run does")
-    off = [ladder for ladder in accuracy.ladders if ladder.default is not None and ladder.chosen is not ladder.default]
-    for ladder in off:
-        rich.print(f"note: {escape(ladder.knob)}: {escape(ladder.verdict)}")
+    off = [sweep for sweep in accuracy.sweeps if sweep.default is not None and sweep.chosen is not sweep.default]
+    for sweep in off:
+        rich.print(f"note: {escape(sweep.knob)}: {escape(sweep.verdict)}")
 
 
-def _show_ladder(ladder: Ladder, rich: RichConsole) -> None:
+def _show_sweep(sweep: Sweep, rich: RichConsole) -> None:
     from rich.markup import escape
 
-    unit = f" [{ladder.unit}]" if ladder.unit else ""
-    title = f"{ladder.knob}: {ladder.error_of}{unit}, against {ladder.against}; seconds of {ladder.work}"
-    further = list(dict.fromkeys(name for rung in ladder.rungs for name in rung.values))
-    lines = [(*_cells(rung, ladder), *(_figure(rung.values.get(name)) for name in further)) for rung in ladder.rungs]
+    unit = f" [{sweep.unit}]" if sweep.unit else ""
+    title = f"{sweep.knob}: {sweep.error_of}{unit}, against {sweep.against}; seconds of {sweep.work}"
+    further = list(dict.fromkeys(name for measurement in sweep.measurements for name in measurement.values))
+    lines = [
+        (*_cells(measurement, sweep), *(_figure(measurement.values.get(name)) for name in further))
+        for measurement in sweep.measurements
+    ]
     # a sentence, which wraps like those below the table
     rich.print(f"[italic]{escape(title)}[/italic]")
     print_table(None, ("setting", "error", "+-", "seconds", "memory", *further), lines, rich, text=("setting",))
-    rich.print(f"{escape(ladder.verdict)}; tolerance {ladder.tolerance:.3g}{escape(unit)}: {escape(ladder.because)}")
-    if ladder.note:
-        rich.print(f"note: {escape(ladder.note)}")
+    rich.print(f"{escape(sweep.verdict)}; tolerance {sweep.tolerance:.3g}{escape(unit)}: {escape(sweep.because)}")
+    if sweep.note:
+        rich.print(f"note: {escape(sweep.note)}")
     rich.print()
 
 
-def _cells(rung: Rung, ladder: Ladder) -> tuple[str, ...]:
-    marks = (" *" if rung is ladder.chosen else "") + (" (run)" if rung.default else "")
-    error = "reference" if rung.reference else _figure(rung.error)
-    spread = "" if rung.reference else _figure(rung.uncertainty)
-    memory = "" if rung.memory_bytes is None else f"{rung.memory_bytes / MEBIBYTE:.0f} MiB"
-    return rung.setting + marks, error, spread, _figure(rung.seconds), memory
+def _cells(measurement: Measurement, sweep: Sweep) -> tuple[str, ...]:
+    marks = (" *" if measurement is sweep.chosen else "") + (" (run)" if measurement.default else "")
+    error = "reference" if measurement.reference else _figure(measurement.error)
+    spread = "" if measurement.reference else _figure(measurement.uncertainty)
+    memory = "" if measurement.memory_bytes is None else f"{measurement.memory_bytes / MEBIBYTE:.0f} MiB"
+    return measurement.setting + marks, error, spread, _figure(measurement.seconds), memory
 
 
 def _figure(value: float | None) -> str:

@@ -6,7 +6,7 @@ Distances by other means than learning's, to compare it with: exact queries, nea
 
 All give distances alone, without gradients, in the form of `fields.Field`.
 
-Settings of a target from its quick ladder: the coarsest distance fields that misplace little enough of its mass.
+Settings of a target from its quick sweep: the coarsest distance fields that misplace little enough of its mass.
 
 What is visible is found exactly (by ray casting, or not at all where nothing is in the way), and primitives have exact
 distances: fields of meshes are what a target's accuracy costs time and memory for.
@@ -33,13 +33,13 @@ from lidardesign.evaluate.accuracy.probes import (
     BECAUSE,
     ERROR_OF,
     TOLERANCE,
+    AccuracyRequest,
     Probes,
     draw_probes,
     few_columns,
     run_visibility,
 )
-from lidardesign.evaluate.accuracy.settings import Ladder, Rung, timed
-from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
+from lidardesign.evaluate.accuracy.settings import Measurement, Sweep, timed
 from lidardesign.numerics import logsumexp
 from lidardesign.run.clock import phase
 from lidardesign.scene import Body, Mesh, Scene, inverse_rigid
@@ -191,7 +191,6 @@ class InterpolatedField:
         return inner
 
 
-LABEL = "distance fields"
 RESOLUTIONS = (16, 24, 32, 48, 64, 96, 128)
 # The more scenes, the more their errors average out; so many can be built anew at every resolution.
 COLUMNS = 12
@@ -273,7 +272,7 @@ class Case:
         )
 
 
-def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
+def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     """Resolution and interpolation; empty where no target is a mesh, or no ray meets one."""
     scenes, config = list(request.request.train), request.config
     if not any(isinstance(body.shape, Mesh) for scene in scenes for body in scene.bodies if body.is_target):
@@ -282,14 +281,14 @@ def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
     case = Case.of(scenes, config.space, config.density, config.seed, visibility)
     if case is None:
         return []
-    found = [resolution_ladder(case)]
-    return [*found, interpolation_ladder(case)] if isinstance(case.target.field, TableField) else found
+    found = [resolution_sweep(case)]
+    return [*found, interpolation_sweep(case)] if isinstance(case.target.field, TableField) else found
 
 
-def resolution_ladder(case: Case) -> Ladder:
+def resolution_sweep(case: Case) -> Sweep:
     """Grid points along the longest side of a field, against exact distances."""
-    rungs, left_out = _resolution_rungs(case)
-    return Ladder(
+    measurements, left_out = _resolution_measurements(case)
+    return Sweep(
         knob="density.field_resolution",
         error_of=ERROR_OF,
         unit="",
@@ -297,33 +296,33 @@ def resolution_ladder(case: Case) -> Ladder:
         tolerance=TOLERANCE,
         because=BECAUSE,
         work="building the field of one scene",
-        rungs=rungs,
+        measurements=measurements,
         note=_part(case, f"memory is that of all scenes' fields{left_out}"),
     )
 
 
-def _resolution_rungs(case: Case) -> tuple[list[Rung], str]:
-    """The rungs that do not take too long beyond the run's own, and what the first one that would is called."""
-    rungs: list[Rung] = []
+def _resolution_measurements(case: Case) -> tuple[list[Measurement], str]:
+    """The measurements that do not take too long beyond the run's own, and what the first one that would is called."""
+    measurements: list[Measurement] = []
     for count in sorted({*RESOLUTIONS, case.settings.field_resolution}):
-        if count > case.settings.field_resolution and _predicted_s(case, rungs[-1], count) > LONGEST_SECONDS:
-            return rungs, f"; {count} and more points would take long to measure"
-        rungs.append(_resolution_rung(case, count))
-    return rungs, ""
+        if count > case.settings.field_resolution and _predicted_s(case, measurements[-1], count) > LONGEST_SECONDS:
+            return measurements, f"; {count} and more points would take long to measure"
+        measurements.append(_resolution_measure(case, count))
+    return measurements, ""
 
 
-def _predicted_s(case: Case, last: Rung, resolution: int) -> float:
+def _predicted_s(case: Case, last: Measurement, resolution: int) -> float:
     """What building the fields at a resolution will take, growing like their volume [s]."""
     return last.seconds * (resolution / int(last.setting)) ** 3 * len(case.few)
 
 
-def _resolution_rung(case: Case, resolution: int) -> Rung:
+def _resolution_measure(case: Case, resolution: int) -> Measurement:
     started = time.perf_counter()
     field = fresh(case.few, case.scenes, resolution, case.settings)
     seconds = (time.perf_counter() - started) / len(case.few)
     error, uncertainty, values = case.errors(field)
     default = resolution == case.settings.field_resolution
-    return Rung(str(resolution), error, uncertainty, seconds, _bytes(field, case), default, values=values)
+    return Measurement(str(resolution), error, uncertainty, seconds, _bytes(field, case), default, values=values)
 
 
 def _bytes(field: Field, case: Case) -> int:
@@ -339,7 +338,7 @@ def _meshes(scenes: list[Scene]) -> int:
     return len({shape.content_hash for shape in shapes if isinstance(shape, Mesh)})
 
 
-def interpolation_ladder(case: Case) -> Ladder:
+def interpolation_sweep(case: Case) -> Sweep:
     """How distances between grid points are found, at the run's own resolution."""
     table, points = case.target.field, case.observed[:TIMED_POINTS]
     exact = ExactField(case.few, lambda body: body.is_target)
@@ -347,7 +346,7 @@ def interpolation_ladder(case: Case) -> Ladder:
     ways = {
         name: table if name == DEFAULT_ORDER else InterpolatedField.of(table, order) for name, order in ORDERS.items()
     }
-    return Ladder(
+    return Sweep(
         knob="interpolation of fields",
         error_of=ERROR_OF,
         unit="",
@@ -355,18 +354,18 @@ def interpolation_ladder(case: Case) -> Ladder:
         tolerance=TOLERANCE,
         because=BECAUSE,
         work=f"distances of {len(points)} points in {table.columns} scenes",
-        rungs=[
-            *(_way_rung(case, name, field, points) for name, field in ways.items()),
-            Rung("exact", 0.0, 0.0, seconds, memory, reference=True, values={"distance_error_mm": 0.0}),
+        measurements=[
+            *(_way_measure(case, name, field, points) for name, field in ways.items()),
+            Measurement("exact", 0.0, 0.0, seconds, memory, reference=True, values={"distance_error_mm": 0.0}),
         ],
         note=_part(case, f"with {case.settings.field_resolution} grid points along the longest side"),
     )
 
 
-def _way_rung(case: Case, name: str, field: Field, points: np.ndarray) -> Rung:
+def _way_measure(case: Case, name: str, field: Field, points: np.ndarray) -> Measurement:
     _, seconds, memory = timed(lambda: field.distances(points))
     error, uncertainty, values = case.errors(field)
-    return Rung(name, error, uncertainty, seconds, memory, name == DEFAULT_ORDER, values=values)
+    return Measurement(name, error, uncertainty, seconds, memory, name == DEFAULT_ORDER, values=values)
 
 
 def fresh(few: list[Scene], scenes: list[Scene], resolution: int, settings: DensitySettings) -> Field:
@@ -403,7 +402,7 @@ class FieldChoice:
 
 @phase("fields")
 def fields_within(scenes: list[Scene], config: RunConfig, tolerance: float, *, fixed: bool) -> FieldChoice:
-    """The coarsest fields that misplace at most a fifth of a tolerance, the finest of the ladder where none does.
+    """The coarsest fields that misplace at most a fifth of a tolerance, the finest of the sweep where none does.
 
     Arguments:
         scenes: The training scenes.

@@ -7,13 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lidardesign.evaluate.accuracy.settings import Ladder, Rung
-from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
+from lidardesign.evaluate.accuracy.probes import AccuracyRequest
+from lidardesign.evaluate.accuracy.settings import Measurement, Sweep
 from lidardesign.evaluate.results import Evaluation, Row
 from lidardesign.evaluate.statistics import bootstrap_interval
 from lidardesign.task import random_generator
 
-LABEL = "held-out scenes"
 RIVAL = "bounding"
 # Numbers of scenes that are tried where there are more.
 COUNTS = (5, 10, 20, 50, 100, 200)
@@ -22,14 +21,14 @@ DRAWS = 32
 RESAMPLES = 1000
 
 
-def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
-    """One ladder: the first design at its largest number of rays against `bounding`; none with fewer than 2 scenes."""
+def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
+    """One sweep: the first design at its largest number of rays against `bounding`; none with fewer than 2 scenes."""
     pair = _pair(request.evaluation)
     if pair is None or len(pair[0].per_scene) < 2:
         return []
     design, rival = pair
     differences = np.asarray(design.per_scene, dtype=np.float64) - np.asarray(rival.per_scene, dtype=np.float64)
-    return [_ladder(differences, design, request)]
+    return [_sweep(differences, design, request)]
 
 
 def _pair(evaluation: Evaluation) -> tuple[Row, Row] | None:
@@ -43,12 +42,12 @@ def _pair(evaluation: Evaluation) -> tuple[Row, Row] | None:
     return None
 
 
-def _ladder(differences: np.ndarray, design: Row, request: AccuracyRequest) -> Ladder:
+def _sweep(differences: np.ndarray, design: Row, request: AccuracyRequest) -> Sweep:
     metric, total = request.evaluation.metric, len(differences)
     seconds = _seconds(request.evaluation) / total
     counts = [count for count in COUNTS if count < total]
-    rungs = [_rung(differences, count, seconds, request.request.seed) for count in (*counts, total)]
-    return Ladder(
+    measurements = [_measure(differences, count, seconds, request.request.seed) for count in (*counts, total)]
+    return Sweep(
         knob="held-out scenes",
         error_of=f"half-width of the 95 % interval of {design.design} minus {RIVAL} at {design.rays} rays",
         unit=metric.unit,
@@ -56,8 +55,8 @@ def _ladder(differences: np.ndarray, design: Row, request: AccuracyRequest) -> L
         tolerance=metric.tolerance,
         because="the task's own tolerance: smaller differences do not matter to it",
         work="simulating and scoring all rows in so many scenes",
-        rungs=rungs,
-        note=_note(rungs[-1].error, metric.tolerance, metric.unit, total),
+        measurements=measurements,
+        note=_note(measurements[-1].error, metric.tolerance, metric.unit, total),
     )
 
 
@@ -67,7 +66,7 @@ def _seconds(evaluation: Evaluation) -> float:
     return evaluation.planning_seconds + sum(taken)
 
 
-def _rung(differences: np.ndarray, count: int, seconds: float, seed: int) -> Rung:
+def _measure(differences: np.ndarray, count: int, seconds: float, seed: int) -> Measurement:
     """The mean half-width over sets of so many scenes; over the one set where all are taken."""
     total = len(differences)
     generator = random_generator(seed, "held-out ladder", count)
@@ -78,7 +77,7 @@ def _rung(differences: np.ndarray, count: int, seconds: float, seed: int) -> Run
     sign = np.sign(differences.mean())
     agree = np.mean([sign * one.low > 0 and sign * one.high > 0 for one in intervals])
     drawn = halves.std(ddof=1) / math.sqrt(draws) if draws > 1 else 0.0
-    return Rung(
+    return Measurement(
         setting=str(count),
         error=float(halves.mean()),
         uncertainty=math.hypot(float(halves.mean()) * relative_error_of_spread(differences), float(drawn)),

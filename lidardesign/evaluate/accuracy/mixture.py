@@ -27,14 +27,13 @@ from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.mixture import log_density
 from lidardesign.design.mixture.support import LEAST_SAMPLES
 from lidardesign.design.sensor import DesignSpec, interval_factor
-from lidardesign.evaluate.accuracy.settings import Ladder, Rung, with_memory
-from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
+from lidardesign.evaluate.accuracy.probes import AccuracyRequest
+from lidardesign.evaluate.accuracy.settings import Measurement, Sweep, with_memory
 from lidardesign.numerics import effective_count, systematic_draw
 from lidardesign.run.manifest import FILE_NAME as MANIFEST_FILE
 from lidardesign.samples import FILE_NAME, Samples, load_samples
 from lidardesign.task import random_generator
 
-LABEL = "samples and seeds of the fit"
 SAMPLE_COUNTS = (1000, 2000, 5000, 10_000, 20_000)
 RESTART_COUNTS = (1, 2, 4, 8, 12)
 # Each setting is fitted so often, on other splits and with other seeds; more often where luck decides more. Fits take
@@ -48,8 +47,8 @@ TOLERANCE_NATS = 0.01
 BECAUSE = "log densities that are 0.01 nats lower have one ray in a hundred fewer everywhere"
 
 
-def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
-    """Two ladders for the fit of the first design whose sensors are Gaussian; none for scans."""
+def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
+    """Two sweeps for the fit of the first design whose sensors are Gaussian; none for scans."""
     design = next((one for one in request.request.designs if not layout_of(one).one_sensor_per_ray), None)
     samples = None if design is None else _samples(request, design)
     if design is None or samples is None or effective_count(samples.weights) < LEAST_SAMPLES:
@@ -69,22 +68,22 @@ def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
     whole = _command_seconds(request.run, design)
     # what the command does besides is the same for all settings
     besides = 0.0 if whole is None else max(whole - bench.seconds(usual, RESTARTS), 0.0)
-    of_samples = [bench.rung(one, RESTARTS, besides, default=one == usual) for one in counts]
-    of_restarts = [bench.rung(usual, one, besides, default=one == RESTARTS) for one in restarts]
-    named = [replace(rung, setting=f"{count:,}") for rung, count in zip(of_samples, counts, strict=True)]
+    of_samples = [bench.measure(one, RESTARTS, besides, default=one == usual) for one in counts]
+    of_restarts = [bench.measure(usual, one, besides, default=one == RESTARTS) for one in restarts]
+    named = [replace(measurement, setting=f"{count:,}") for measurement, count in zip(of_samples, counts, strict=True)]
     work = "expectation maximisation" if whole is None else "the command `fit`, from its start to its end"
-    found = [_ladder("samples of the fit", f"{RESTARTS} seeds", named, design, work)]
+    found = [_sweep("samples of the fit", f"{RESTARTS} seeds", named, design, work)]
     if not restarts:
         return found
-    named = [replace(rung, setting=str(count)) for rung, count in zip(of_restarts, restarts, strict=True)]
-    return [*found, _ladder("seeds of the fit", f"{usual:,} samples", named, design, work)]
+    named = [replace(measurement, setting=str(count)) for measurement, count in zip(of_restarts, restarts, strict=True)]
+    return [*found, _sweep("seeds of the fit", f"{usual:,} samples", named, design, work)]
 
 
-def _ladder(knob: str, beside: str, rungs: Sequence[Rung], design: DesignSpec, work: str) -> Ladder:
+def _sweep(knob: str, beside: str, measurements: Sequence[Measurement], design: DesignSpec, work: str) -> Sweep:
     fitted = f"{len(design.sensors)} sensors, as {design.name} has"
     where = f", at {shown(design.at)}" if design.at else ""
     held = ", without its constraints" if design.constraints else ""
-    return Ladder(
+    return Sweep(
         knob=knob,
         error_of="log density of held-out samples that is lost",
         unit="nats",
@@ -92,7 +91,7 @@ def _ladder(knob: str, beside: str, rungs: Sequence[Rung], design: DesignSpec, w
         tolerance=TOLERANCE_NATS,
         because=BECAUSE,
         work=work,
-        rungs=rungs,
+        measurements=measurements,
         note=f"{fitted}{where}{held}, with {beside}",
     )
 
@@ -226,13 +225,13 @@ class FitBench:
         """The median time of a setting's fits [s]."""
         return float(np.median([one.seconds for _, one in self._of(count, restarts)]))
 
-    def rung(self, count: int, restarts: int, besides: float, *, default: bool) -> Rung:
+    def measure(self, count: int, restarts: int, besides: float, *, default: bool) -> Measurement:
         """A setting, once all settings have been fitted; `besides`: what a fit takes besides [s]."""
         lost = np.array(self.lost(count, restarts))
         fits = [one for _, one in self._of(count, restarts)]
         maximising = self.seconds(count, restarts)
         memory = [one.memory_bytes for one in fits if one.memory_bytes is not None]
-        return Rung(
+        return Measurement(
             "",
             error=float(lost.mean()),
             uncertainty=float(lost.std(ddof=1) / math.sqrt(len(lost))),

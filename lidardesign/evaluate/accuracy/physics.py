@@ -12,8 +12,8 @@ import numpy as np
 
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.accuracy.settings import Ladder, Rung, timed, with_memory
-from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
+from lidardesign.evaluate.accuracy.probes import AccuracyRequest
+from lidardesign.evaluate.accuracy.settings import Measurement, Sweep, timed, with_memory
 from lidardesign.evaluate.baselines.candidates import Positions
 from lidardesign.evaluate.scene_scores import score_lists
 from lidardesign.geometry.raycast import SceneCaster
@@ -27,7 +27,6 @@ from lidardesign.simulate.plan import EffectPlan, Planner, predicted_seconds
 from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import conditions_of
 
-LABEL = "effects of light"
 # Measured where the evaluation's own detector asks for nothing.
 STAND_IN = "single-photon"
 FOOTPRINT_RAYS = (1, 4, 16, 64, 256)
@@ -87,8 +86,8 @@ class Bench:
         return np.array([self.score(number, effects, measuring) for number in range(len(self.scenes))])
 
 
-def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
-    """The footprint's ladder where beams have a width, and that of the effects that the scenes have."""
+def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
+    """The footprint's sweep where beams have a width, and that of the effects that the scenes have."""
     if not request.request.designs:
         return []
     design, own = request.request.designs[0], request.request.planner.detector
@@ -155,7 +154,7 @@ def _mean(values: np.ndarray) -> tuple[float, float]:
     return float(values.mean()), float(spread / math.sqrt(len(values)))
 
 
-def _footprint(bench: Bench, note: str, own: Detector) -> Ladder:
+def _footprint(bench: Bench, note: str, own: Detector) -> Sweep:
     detector, metric = bench.planner.detector, bench.request.request.task.metric
     most = MOST_THIN_RAYS // max(bench.rays * len(bench.scenes), 1)
     counts = sorted({count for count in FOOTPRINT_RAYS if count <= max(most, 1)} | {detector.footprint_rays})
@@ -165,13 +164,13 @@ def _footprint(bench: Bench, note: str, own: Detector) -> Ladder:
     planned = bench.plans[0].effects - {"multipath"} | {"footprint"}
     # what is compiled when it is first called is no part of any setting's time
     bench.score(0, planned, detector)
-    rungs = []
+    measurements = []
     for count in counts:
         error, uncertainty = _mean(np.abs(alone[count] - alone[counts[-1]]))
         changed = replace(detector, footprint_rays=count)
         _, seconds, memory = timed(lambda changed=changed: bench.score(0, planned, changed))
-        rungs.append(
-            Rung(
+        measurements.append(
+            Measurement(
                 str(count),
                 error,
                 uncertainty,
@@ -181,7 +180,7 @@ def _footprint(bench: Bench, note: str, own: Detector) -> Ladder:
                 reference=count == counts[-1],
             )
         )
-    return Ladder(
+    return Sweep(
         knob="footprint_rays",
         error_of=f"change of a scene's {metric.name}, of the beams' width alone, mean over scenes",
         unit=metric.unit,
@@ -189,13 +188,13 @@ def _footprint(bench: Bench, note: str, own: Detector) -> Ladder:
         tolerance=metric.tolerance,
         because="the task's own tolerance: smaller differences do not matter to it",
         work="simulating and scoring one scene with all effects that it calls for",
-        rungs=rungs,
+        measurements=measurements,
         note=note,
     )
 
 
-def _effects(bench: Bench, note: str, own: Detector) -> list[Ladder]:
-    """One ladder: nothing, every effect left out in turn, and all that there are; empty where there is none."""
+def _effects(bench: Bench, note: str, own: Detector) -> list[Sweep]:
+    """One sweep: nothing, every effect left out in turn, and all that there are; empty where there is none."""
     present = {one.name for plan in bench.plans for one in plan.decisions if one.bound.range_m or one.bound.lost}
     rays, detector = bench.rays * len(bench.scenes), bench.planner.detector
     dear = {name for name in present if predicted_seconds(name, detector, rays) > MOST_SECONDS}
@@ -206,7 +205,7 @@ def _effects(bench: Bench, note: str, own: Detector) -> list[Ladder]:
         note += f"; without {', '.join(sorted(dear))}, which take{'s' if len(dear) == 1 else ''} too long here"
     metric = bench.request.request.task.metric
     return [
-        Ladder(
+        Sweep(
             knob="effects",
             error_of=f"change of the mean {metric.name} where an effect is left out of all or alone, whichever is more",
             unit=metric.unit,
@@ -214,7 +213,7 @@ def _effects(bench: Bench, note: str, own: Detector) -> list[Ladder]:
             tolerance=metric.tolerance / len(there),
             because=f"an equal share of the task's tolerance for each of {len(there)} effects: changes add up",
             work="simulating and scoring one scene",
-            rungs=_effect_rungs(bench, there, marks=detector is own),
+            measurements=_effect_measurements(bench, there, marks=detector is own),
             note=note,
         )
     ]
@@ -249,7 +248,7 @@ def _summed(rows: Sequence[tuple[float, float, int | None]]) -> _Pass:
     return _Pass(np.array(values), float(np.median(seconds)), max(known, default=None))
 
 
-def _effect_rungs(bench: Bench, there: Sequence[str], *, marks: bool) -> list[Rung]:
+def _effect_measurements(bench: Bench, there: Sequence[str], *, marks: bool) -> list[Measurement]:
     """The roughest first; `marks`: the one that the evaluation itself has taken is its default."""
     everything, count = frozenset(there), len(bench.scenes)
     planned = [plan.effects & everything for plan in bench.plans]
@@ -269,17 +268,17 @@ def _effect_rungs(bench: Bench, there: Sequence[str], *, marks: bool) -> list[Ru
         }
         for name in there
     }
-    rungs = [_rung(name, found[name], full, changes.get(name, {})) for name in settings if name != "all"]
-    rungs.sort(key=lambda rung: -rung.error)
-    rungs.append(replace(_rung("all", full, full, {}), reference=True))
+    measurements = [_measure(name, found[name], full, changes.get(name, {})) for name in settings if name != "all"]
+    measurements.sort(key=lambda measurement: -measurement.error)
+    measurements.append(replace(_measure("all", full, full, {}), reference=True))
     taken = next(name for name, choice in settings.items() if choice == planned)
-    return [replace(rung, default=marks and rung.setting == taken) for rung in rungs]
+    return [replace(measurement, default=marks and measurement.setting == taken) for measurement in measurements]
 
 
-def _rung(setting: str, found: _Pass, full: _Pass, changes: Mapping[str, tuple[float, float]]) -> Rung:
+def _measure(setting: str, found: _Pass, full: _Pass, changes: Mapping[str, tuple[float, float]]) -> Measurement:
     """A setting with its error and uncertainty; `changes`: of the metric where an effect is left out or alone."""
     error = max(changes.values(), default=_paired(found.values, full.values))
     values = {f"change_{name}": change for name, (change, _) in changes.items()}
     if changes:
         values["seconds_saved"] = full.seconds - found.seconds
-    return Rung(setting, *error, found.seconds, found.memory_bytes, values=values)
+    return Measurement(setting, *error, found.seconds, found.memory_bytes, values=values)

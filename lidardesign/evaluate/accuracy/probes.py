@@ -1,19 +1,22 @@
-"""What the ladders of a density are measured on: its scenes, and weighted points that know nothing of the flow."""
+"""What the sweeps of a density are measured on: its scenes, and weighted points that know nothing of the flow."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from lidardesign.config import RunConfig
 from lidardesign.density.fields.distance import scene_columns
 from lidardesign.density.target.prepare import prepare_target
 from lidardesign.density.target.target import Target
 from lidardesign.density.training.independent import independent_points
 from lidardesign.density.training.quality import misplaced_share
-from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
+from lidardesign.evaluate.request import EvaluationRequest
+from lidardesign.evaluate.results import Evaluation
 from lidardesign.run.manifest import read_manifest
 from lidardesign.scene import Body, Scene
 from lidardesign.task import random_generator
@@ -26,6 +29,23 @@ ERROR_OF = "share of the density's mass in the wrong place"
 FRAMES_OF_FEW = 4
 # Few draws at a time: each call chooses from candidates of its own, which many draws would exhaust.
 DRAWN_AT_ONCE = 4096
+
+@dataclass(frozen=True, eq=False)
+class AccuracyRequest:
+    """What sweeps are measured on.
+
+    Arguments:
+        config: The run's configuration.
+        run: The run's folder.
+        request: The evaluation's request: task, scenes, designs, samples, layouts, planner, seed.
+        evaluation: What the evaluation found.
+    """
+
+    config: RunConfig
+    run: Path
+    request: EvaluationRequest
+    evaluation: Evaluation
+
 
 _TARGETS: WeakKeyDictionary[AccuracyRequest, Target] = WeakKeyDictionary()
 

@@ -1,7 +1,7 @@
-"""Ladders: what a numerical choice costs at each of its settings, in error and in seconds.
+"""Sweeps: what a numerical choice costs at each of its settings, in error and in seconds.
 
-A ladder has one rung per setting, the roughest first. Each rung's error is taken against a closed form or the finest
-rung, and has an uncertainty of its own; the cheapest rung inside the ladder's tolerance is the one to choose.
+A sweep has one measurement per setting, the roughest first. Its error is taken against a closed form or the finest
+setting, and has an uncertainty of its own; the cheapest setting inside the sweep's tolerance is the one to choose.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lidardesign.numerics import TINY
 
 Value = TypeVar("Value")
 
-# Rungs whose times differ by less than this ratio cost the same: timings of one machine repeat no better.
+# Measurements whose times differ by less than this ratio cost the same: timings of one machine repeat no better.
 SAME_COST = 1.2
 # Errors that differ by less than so many standard errors of their difference do not differ.
 STANDARD_ERRORS = 2.0
@@ -32,18 +32,18 @@ _RESET_PEAK = "5"
 
 
 @dataclass(frozen=True)
-class Rung:
+class Measurement:
     """One setting of a numerical choice.
 
     Arguments:
         setting: As a user would write it, for example "64" or "raycast".
-        error: Against the ladder's reference, in the ladder's unit; 0 for the reference itself.
+        error: Against the sweep's reference, in the sweep's unit; 0 for the reference itself.
         uncertainty: Standard error of `error`, in the same unit.
-        seconds: Median time of the ladder's work at this setting [s].
+        seconds: Median time of the sweep's work at this setting [s].
         memory_bytes: The most memory that the work took beyond what was there before; None where it was not measured.
         default: Whether the run uses this setting.
-        reference: Whether errors are taken against this rung.
-        values: Further figures of the rung by name, with their unit in the name.
+        reference: Whether errors are taken against this measurement.
+        values: Further figures of the measurement by name, with their unit in the name.
     """
 
     setting: str
@@ -57,7 +57,7 @@ class Rung:
 
 
 @dataclass(frozen=True)
-class Ladder:
+class Sweep:
     """All settings of one numerical choice that were measured.
 
     Arguments:
@@ -68,7 +68,7 @@ class Ladder:
         tolerance: Errors up to this one do not matter, for the reason in `because`.
         because: Why the tolerance is what it is.
         work: What the seconds are the time of.
-        rungs: The roughest first, 1 or more.
+        measurements: The roughest first, 1 or more.
         note: What a reader should know, one line, or "".
     """
 
@@ -79,38 +79,44 @@ class Ladder:
     tolerance: float
     because: str
     work: str
-    rungs: Sequence[Rung]
+    measurements: Sequence[Measurement]
     note: str = ""
 
     @property
-    def chosen(self) -> Rung:
-        """The cheapest rung inside the tolerance, uncertainty included; of rungs that cost the same, the most accurate.
+    def chosen(self) -> Measurement:
+        """The cheapest inside the tolerance, uncertainty included; of those that cost the same, the most accurate.
 
         What the run does already stays where it is inside the tolerance and nothing there is cheaper by more than can
-        be told. Where no rung is inside the tolerance, the most accurate one.
+        be told. Where no measurement is inside the tolerance, the most accurate one.
         """
-        inside = [rung for rung in self.rungs if rung.error + rung.uncertainty <= self.tolerance]
+        inside = [
+            measurement
+            for measurement in self.measurements
+            if measurement.error + measurement.uncertainty <= self.tolerance
+        ]
         if not inside:
-            return min(self.rungs, key=lambda rung: (rung.error, rung.seconds))
-        least = min(rung.seconds for rung in inside)
-        cheap = [rung for rung in inside if rung.seconds <= SAME_COST * least]
-        found = min(cheap, key=lambda rung: (not rung.default, rung.error, rung.seconds))
-        return next((rung for rung in inside if rung.default and _no_worse(rung, found)), found)
+            return min(self.measurements, key=lambda measurement: (measurement.error, measurement.seconds))
+        least = min(measurement.seconds for measurement in inside)
+        cheap = [measurement for measurement in inside if measurement.seconds <= SAME_COST * least]
+        found = min(cheap, key=lambda measurement: (not measurement.default, measurement.error, measurement.seconds))
+        return next(
+            (measurement for measurement in inside if measurement.default and _no_worse(measurement, found)), found
+        )
 
     @property
-    def default(self) -> Rung | None:
-        """The rung that the run uses, where it is among those measured."""
-        return next((rung for rung in self.rungs if rung.default), None)
+    def default(self) -> Measurement | None:
+        """The measurement that the run uses, where it is among those measured."""
+        return next((measurement for measurement in self.measurements if measurement.default), None)
 
     @property
     def falls(self) -> bool:
-        """Whether errors fall from rung to rung, within their own uncertainty."""
-        pairs = zip(self.rungs, self.rungs[1:], strict=False)
+        """Whether errors fall from measurement to measurement, within their own uncertainty."""
+        pairs = zip(self.measurements, self.measurements[1:], strict=False)
         return all(finer.error <= rougher.error + _sure_difference(finer, rougher) for rougher, finer in pairs)
 
     @property
     def verdict(self) -> str:
-        """How the chosen rung compares with the run's own setting, in one line; whether chance had a part in it."""
+        """How the chosen setting compares with the run's own, in one line; whether chance had a part in it."""
         chance = "" if self.falls else "; but errors do not fall here: by chance, perhaps"
         return self._comparison + chance
 
@@ -132,34 +138,48 @@ class Ladder:
         return f"{chosen.setting} suffices, {ratio:.2g} times cheaper than {default.setting}, the setting of this run"
 
     def as_rows(self) -> list[dict[str, Any]]:
-        """The contract's JSON form: one object per rung."""
+        """The contract's JSON form: one object per measurement."""
         chosen = self.chosen
         return [
             {
                 "knob": self.knob,
-                "setting": rung.setting,
-                "error": rung.error,
-                "uncertainty": rung.uncertainty,
+                "setting": measurement.setting,
+                "error": measurement.error,
+                "uncertainty": measurement.uncertainty,
                 "unit": self.unit,
-                "seconds": rung.seconds,
-                "memory_bytes": rung.memory_bytes,
+                "seconds": measurement.seconds,
+                "memory_bytes": measurement.memory_bytes,
                 "tolerance": self.tolerance,
-                "chosen": rung is chosen,
-                "default": rung.default,
-                "reference": rung.reference,
-                "values": dict(rung.values),
+                "chosen": measurement is chosen,
+                "default": measurement.default,
+                "reference": measurement.reference,
+                "values": dict(measurement.values),
             }
-            for rung in self.rungs
+            for measurement in self.measurements
         ]
 
 
-def _no_worse(rung: Rung, other: Rung) -> bool:
-    """Whether a rung costs the same as another one, or less, and errs no more, as far as can be told."""
-    return rung.seconds <= SAME_COST * other.seconds and rung.error - other.error <= _sure_difference(rung, other)
+@dataclass(frozen=True, eq=False)
+class Accuracy:
+    """All sweeps, and the time that each module of them took [s]."""
+
+    sweeps: Sequence[Sweep]
+    seconds: dict[str, float]
+
+    def as_rows(self) -> list[dict[str, Any]]:
+        """The contract's `accuracy` list."""
+        return [row for sweep in self.sweeps for row in sweep.as_rows()]
 
 
-def _sure_difference(first: Rung, second: Rung) -> float:
-    """Errors of two rungs that differ by less than this do not differ."""
+def _no_worse(measurement: Measurement, other: Measurement) -> bool:
+    """Whether a measurement costs the same as another one, or less, and errs no more, as far as can be told."""
+    return measurement.seconds <= SAME_COST * other.seconds and measurement.error - other.error <= _sure_difference(
+        measurement, other
+    )
+
+
+def _sure_difference(first: Measurement, second: Measurement) -> float:
+    """Errors of two measurements that differ by less than this do not differ."""
     return STANDARD_ERRORS * math.hypot(first.uncertainty, second.uncertainty)
 
 

@@ -20,9 +20,8 @@ from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import LidardesignError
 from lidardesign.estimates import Estimate
-from lidardesign.evaluate.accuracy.probes import ERROR_OF, run_target
-from lidardesign.evaluate.accuracy.settings import Ladder, Rung
-from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
+from lidardesign.evaluate.accuracy.probes import ERROR_OF, AccuracyRequest, run_target
+from lidardesign.evaluate.accuracy.settings import Measurement, Sweep
 from lidardesign.evaluate.baselines.candidates import Positions
 from lidardesign.evaluate.scene_scores import score_lists
 from lidardesign.geometry.raycast import SceneCaster
@@ -33,7 +32,6 @@ from lidardesign.scene import Scene
 from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import conditions_of, random_generator
 
-LABEL = "training"
 # A misplaced share of a tenth is then known to 5 %.
 SAMPLES = 8192
 PROBES = 8192
@@ -42,7 +40,7 @@ BECAUSE = (
     "a tenth of the rays in the wrong place is at worst a tenth fewer rays: 5 % of an error that falls like their root"
 )
 AGAINST = "the target density"
-# A quick fit shows what a density's errors are worth in the metric; a careful one would take the ladder's time.
+# A quick fit shows what a density's errors are worth in the metric; a careful one would take the sweep's time.
 SCORED_SCENES = 8
 RESTARTS = 2
 EM_SAMPLES = 4000
@@ -52,58 +50,58 @@ STEPS_NOTE = (
 )
 
 
-def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
+def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     """The run's own snapshots; the stages of a tolerance, and runs of other presets beside it, where there are any."""
     seed, target = request.config.seed, run_target(request)
     generator = random_generator(seed, "accuracy", "training")
     probes = draw_probes(target, list(request.request.train), PROBES, generator)
     reached = remeasured(request.run, request.config, target, probes, count=SAMPLES, seed=seed)
-    found = [_steps_ladder(request, reached), *_stages_ladder(request)]
-    return [*found, *_preset_ladder(request, reached[-1], target, probes)]
+    found = [_steps_sweep(request, reached), *_stages_sweep(request)]
+    return [*found, *_preset_sweep(request, reached[-1], target, probes)]
 
 
-def _steps_ladder(request: AccuracyRequest, reached: Sequence[Reached]) -> Ladder:
+def _steps_sweep(request: AccuracyRequest, reached: Sequence[Reached]) -> Sweep:
     judge = _Judge(request, reached[-1].samples)
     scores = [judge.scores(one.samples) for one in reached]
-    rungs = [
-        _rung(str(one.step), _around(one), one.seconds, judge.values(own, scores[-1]), default=one is reached[-1])
+    measurements = [
+        _measure(str(one.step), _around(one), one.seconds, judge.values(own, scores[-1]), default=one is reached[-1])
         for one, own in zip(reached, scores, strict=True)
     ]
-    notes = [STEPS_NOTE] if len(rungs) > 1 else ["this run kept no snapshots; learned again, it keeps some"]
-    return _ladder("learning.steps", "learning up to there", rungs, "; ".join([*notes, *judge.notes]))
+    notes = [STEPS_NOTE] if len(measurements) > 1 else ["this run kept no snapshots; learned again, it keeps some"]
+    return _sweep("learning.steps", "learning up to there", measurements, "; ".join([*notes, *judge.notes]))
 
 
 def _around(reached: Reached) -> dict[str, Estimate]:
-    """The figures of a rung, its error with the jitter from step to step."""
+    """The figures of a measurement, its error with the jitter from step to step."""
     return {**reached.estimates, "misplaced": reached.misplaced}
 
 
-def _stages_ladder(request: AccuracyRequest) -> Sequence[Ladder]:
+def _stages_sweep(request: AccuracyRequest) -> Sequence[Sweep]:
     """What `learn --tolerance` measured on its way to this run, if it was."""
     goal = goal_of(request.run)
     if goal is None or len(goal.stages) < 2:
         return []
-    rungs = [
-        Rung(str(stage.steps), stage.misplaced, stage.error, stage.seconds, default=stage is goal.stages[-1])
+    measurements = [
+        Measurement(str(stage.steps), stage.misplaced, stage.error, stage.seconds, default=stage is goal.stages[-1])
         for stage in goal.stages
     ]
     note = f"measured when the run was learned to a tolerance of {goal.tolerance:g}"
-    return [_ladder("learning.steps, each anew", "learning and measuring", rungs, note)]
+    return [_sweep("learning.steps, each anew", "learning and measuring", measurements, note)]
 
 
-def _preset_ladder(request: AccuracyRequest, own: Reached, target: Target, probes: Probes) -> Sequence[Ladder]:
+def _preset_sweep(request: AccuracyRequest, own: Reached, target: Target, probes: Probes) -> Sequence[Sweep]:
     """Runs of other presets against the same target, in the order of effort; empty where none lies beside this one."""
     config, seconds = request.config, _seconds(request.run)
-    beside = [_rung_beside(run, other, target, probes, config.seed) for run, other in _presets(request)]
-    rungs = [rung for rung in beside if rung is not None]
-    if not rungs or seconds is None:
+    beside = [_measurement_beside(run, other, target, probes, config.seed) for run, other in _presets(request)]
+    measurements = [measurement for measurement in beside if measurement is not None]
+    if not measurements or seconds is None:
         return []
-    rungs.append(_rung(config.preset, own.estimates, seconds, {}, default=True))
-    rungs.sort(key=lambda rung: PRESETS.index(rung.setting))
-    return [_ladder("preset", "the whole of learn", rungs, PRESET_NOTE)]
+    measurements.append(_measure(config.preset, own.estimates, seconds, {}, default=True))
+    measurements.sort(key=lambda measurement: PRESETS.index(measurement.setting))
+    return [_sweep("preset", "the whole of learn", measurements, PRESET_NOTE)]
 
 
-def _rung_beside(run: Path, config: RunConfig, target: Target, probes: Probes, seed: int) -> Rung | None:
+def _measurement_beside(run: Path, config: RunConfig, target: Target, probes: Probes, seed: int) -> Measurement | None:
     """Another run; None where it cannot be measured: this run's figures do not depend on what lies beside it."""
     try:
         seconds, learned = _seconds(run), load_flow(run, FLOW, config, target, seed)
@@ -111,7 +109,7 @@ def _rung_beside(run: Path, config: RunConfig, target: Target, probes: Probes, s
         return None
     if seconds is None:
         return None
-    return _rung(config.preset, measure(learned, probes, SAMPLES).estimates, seconds, {}, default=False)
+    return _measure(config.preset, measure(learned, probes, SAMPLES).estimates, seconds, {}, default=False)
 
 
 def _presets(request: AccuracyRequest) -> list[tuple[Path, RunConfig]]:
@@ -145,13 +143,13 @@ def _seconds(run: Path) -> float | None:
     return float(found) if isinstance(found, float | int) else None
 
 
-def _rung(
+def _measure(
     setting: str, estimates: Mapping[str, Estimate], seconds: float, further: Mapping[str, float], *, default: bool
-) -> Rung:
+) -> Measurement:
     misplaced = estimates["misplaced"]
     values = {name: estimates[name].value for name in ("ess", "kl_nats", "coverage")}
     errors = {f"{name}_error": estimates[name].error or 0.0 for name in values}
-    return Rung(
+    return Measurement(
         setting,
         misplaced.value,
         misplaced.error or 0.0,
@@ -161,8 +159,8 @@ def _rung(
     )
 
 
-def _ladder(knob: str, work: str, rungs: Sequence[Rung], note: str) -> Ladder:
-    return Ladder(knob, ERROR_OF, "", AGAINST, TOLERANCE, BECAUSE, work, rungs, note)
+def _sweep(knob: str, work: str, measurements: Sequence[Measurement], note: str) -> Sweep:
+    return Sweep(knob, ERROR_OF, "", AGAINST, TOLERANCE, BECAUSE, work, measurements, note)
 
 
 class _Judge:
@@ -199,7 +197,7 @@ class _Judge:
         return np.array([self._score(scene, casters, positions) for scene, casters in self._scenes])
 
     def values(self, scores: np.ndarray | None, last: np.ndarray | None) -> dict[str, float]:
-        """The mean score, and its standard error beside the last rung's, on the same scenes."""
+        """The mean score, and its standard error beside the last measurement's, on the same scenes."""
         if scores is None or last is None:
             return {}
         apart = scores - last

@@ -32,14 +32,14 @@ from lidardesign.evaluate.accuracy.probes import (
     BECAUSE,
     ERROR_OF,
     TOLERANCE,
+    AccuracyRequest,
     Probes,
     draw_probes,
     few_columns,
     run_target,
     run_visibility,
 )
-from lidardesign.evaluate.accuracy.settings import Ladder, Rung, timed
-from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
+from lidardesign.evaluate.accuracy.settings import Measurement, Sweep, timed
 from lidardesign.scene import Mesh, Scene
 from lidardesign.space import DesignSpace
 
@@ -100,7 +100,6 @@ def _opaque(log_values: np.ndarray) -> np.ndarray:
     return np.where(log_values < 0, LOG_OPAQUE, 0.0)
 
 
-LABEL = "visibility"
 POINTS = (16, 32, 64, 128, 256)
 REFERENCE_POINTS = 512
 # Errors of cheap ways, of the quadrature on a common table, and of that over bodies one by one.
@@ -173,13 +172,13 @@ class Case:
         field = one_way(self.integrated.visibility).field
         return replace(self.integrated, visibility=_heard(Quadrature(field, points), self.scenes))
 
-    def rung(self, setting: str, target: Target, exact: np.ndarray, *, default: bool) -> Rung:
+    def measure(self, setting: str, target: Target, exact: np.ndarray, *, default: bool) -> Measurement:
         """A target's error at as many probes as there are exact values (N,), and its time for a batch."""
         probes, batch = self.probes.first(len(exact)), self.probes.points[: self.batch]
         target.log_density_and_gradient(batch[:WARM_UP_PROBES])
         _, seconds, memory = timed(lambda: target.log_density_and_gradient(batch))
         error, uncertainty = probes.misplaced(target.log_density(probes.points), exact)
-        return Rung(setting, error, uncertainty, seconds, memory, default=default)
+        return Measurement(setting, error, uncertainty, seconds, memory, default=default)
 
     @property
     def work(self) -> str:
@@ -187,7 +186,7 @@ class Case:
         return f"log p* with its gradient at {min(self.batch, len(self.probes.points))} design points"
 
 
-def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
+def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     """Ways against opaque geometry, and points of the quadrature against many; empty where no ray sees a target."""
     scenes, config = list(request.request.train), request.config
     few = affordable_scenes(scenes)
@@ -198,12 +197,12 @@ def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
     part = _part(few, scenes)
     unused = "" if default == "quadrature" else f"this run's visibility is {default}"
     return [
-        replace(visibility_ladder(case, points, default), note=part),
-        replace(points_ladder(case, points if default == "quadrature" else None), note=_joined(unused, part)),
+        replace(visibility_sweep(case, points, default), note=part),
+        replace(points_sweep(case, points if default == "quadrature" else None), note=_joined(unused, part)),
     ]
 
 
-def visibility_ladder(case: Case, points: int, default: str) -> Ladder:
+def visibility_sweep(case: Case, points: int, default: str) -> Sweep:
     """No visibility, the quadrature with its own points, and ray casting.
 
     Arguments:
@@ -212,25 +211,32 @@ def visibility_ladder(case: Case, points: int, default: str) -> Ladder:
         default: off, quadrature or raycast: what the run uses.
     """
     exact, quadrature = case.exact, case.quadrature(points)
-    rungs = [
-        case.rung("off", case.off, exact, default=default == "off"),
-        case.rung("quadrature", quadrature, exact[: case.few], default=default == "quadrature"),
-        case.rung("raycast", case.cast, exact, default=default == "raycast"),
+    measurements = [
+        case.measure("off", case.off, exact, default=default == "off"),
+        case.measure("quadrature", quadrature, exact[: case.few], default=default == "quadrature"),
+        case.measure("raycast", case.cast, exact, default=default == "raycast"),
     ]
-    return Ladder(
-        "density.visibility", ERROR_OF, "", "opaque geometry, by exact first hits", TOLERANCE, BECAUSE, case.work, rungs
+    return Sweep(
+        "density.visibility",
+        ERROR_OF,
+        "",
+        "opaque geometry, by exact first hits",
+        TOLERANCE,
+        BECAUSE,
+        case.work,
+        measurements,
     )
 
 
-def points_ladder(case: Case, default: int | None) -> Ladder:
+def points_sweep(case: Case, default: int | None) -> Sweep:
     """Midpoints of the quadrature against many of them; `default` is what the run uses, None without quadrature."""
     probes = case.probes.first(case.few).points
     exact = case.quadrature(REFERENCE_POINTS).log_density(probes)
-    rungs = [
-        case.rung(str(count), case.quadrature(count), exact, default=count == default)
+    measurements = [
+        case.measure(str(count), case.quadrature(count), exact, default=count == default)
         for count in sorted({*POINTS, *([default] if default else [])})
     ]
-    return Ladder(
+    return Sweep(
         knob="density.quadrature_points",
         error_of=ERROR_OF,
         unit="",
@@ -238,7 +244,7 @@ def points_ladder(case: Case, default: int | None) -> Ladder:
         tolerance=TOLERANCE,
         because=BECAUSE,
         work=case.work,
-        rungs=rungs,
+        measurements=measurements,
     )
 
 

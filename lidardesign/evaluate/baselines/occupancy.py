@@ -17,8 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidardesign.evaluate.baselines.candidates import Layout, Spot, central, opened_gate
-from lidardesign.evaluate.baselines.observed import spread_frames
+from lidardesign.evaluate.baselines.candidates import Layout, Spot, central, opened_gate, spread_frames
 from lidardesign.geometry.surface import sample_body
 from lidardesign.numerics import TINY
 from lidardesign.scene import Scene

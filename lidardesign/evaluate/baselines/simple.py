@@ -36,21 +36,29 @@ import numpy as np
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.candidates import (
+    DENSE_RAYS,
     RAY_AXES,
     Candidate,
     Layout,
+    Observed,
     Positions,
     Spot,
+    TrainingViews,
     central,
+    dense_points,
     even_placement,
     opened_gate,
     whole_range,
 )
-from lidardesign.evaluate.baselines.catalog import FAMILY, Density, part_candidates, scene_points, split_argument
-from lidardesign.evaluate.baselines.observed import DENSE_RAYS, Observed, TrainingViews, dense_points
+from lidardesign.evaluate.baselines.catalog import (
+    FAMILY,
+    Density,
+    ScenePoints,
+    part_candidates,
+    scene_points,
+    split_argument,
+)
 from lidardesign.evaluate.baselines.occupancy import occupancy
-from lidardesign.evaluate.baselines.part_poses import ScenePoints
-from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
 from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace, direction
@@ -218,21 +226,6 @@ class Baselines:
 
 def _keyed(name: str, options: Sequence[Option]) -> list[tuple[tuple[str, str, int], Option]]:
     return [((name, one.candidate.name, len(one.positions[0])), one) for one in options]
-
-
-def build_baseline(
-    name: str,
-    space: DesignSpace,
-    train_scenes: Sequence[Scene],
-    count: int,
-    seed: int,
-    judge: Judge | None = None,
-) -> Rays:
-    """One baseline at exactly `count` rays, for a space without conditions.
-
-    `Baselines` builds many without tracing the scenes anew.
-    """
-    return Baselines(space, train_scenes, seed, judge).positions(name, count)[0]
 
 
 def _uniform(source: Baselines, argument: str) -> list[Candidate]:

@@ -20,8 +20,7 @@ from lidardesign.design.constraints.document import Constraints, Gate
 from lidardesign.design.files import design_document
 from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import MOST_RAYS, DesignSpec
-from lidardesign.evaluate.baselines.candidates import Positions, opened_gate, whole_range
-from lidardesign.evaluate.baselines.observed import TrainingViews, dense_points
+from lidardesign.evaluate.baselines.candidates import Positions, TrainingViews, dense_points, opened_gate, whole_range
 from lidardesign.evaluate.cma.models import Amount, Model, SensorModel
 from lidardesign.evaluate.cma.objective import TrainingObjective
 from lidardesign.evaluate.cma.search import Budget, Found, Progress, Search

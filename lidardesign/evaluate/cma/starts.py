@@ -19,8 +19,18 @@ from scipy.spatial import cKDTree
 
 from lidardesign.design.layouts.grid import low_discrepancy
 from lidardesign.design.sensor import Coupling, Sensor, boresight_frame
-from lidardesign.evaluate.baselines.candidates import RAY_AXES, Spot, central, even_placement, opened_gate, whole_range
-from lidardesign.evaluate.baselines.observed import Observed, TrainingViews, dense_points, unrolled
+from lidardesign.evaluate.baselines.candidates import (
+    RAY_AXES,
+    Observed,
+    Spot,
+    TrainingViews,
+    central,
+    dense_points,
+    even_placement,
+    opened_gate,
+    unrolled,
+    whole_range,
+)
 from lidardesign.evaluate.baselines.simple import bounding, parallel_angles
 from lidardesign.evaluate.cma.models import with_gate
 from lidardesign.evaluate.cma.sensor_parameters import NARROWEST_RAD, Setting, admitted_origins

@@ -1,4 +1,4 @@
-"""Pictures for papers: one size of paper, one look, and files that come out the same every time.
+"""Pictures for papers: one size of paper, one look, curves, and files that come out the same every time.
 
 Figures are drawn at the size at which they are printed, a column or a page wide, so that letters are as large on paper
 as stated here. Each is written as PNG and as SVG. In the SVG, letters are text (any script that the reader's fonts
@@ -8,17 +8,21 @@ have, to be searched and edited); what would take very many lines is an embedded
 from __future__ import annotations
 
 import io
+import math
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
+from lidardesign.evaluate.results import Evaluation, Row
 from lidardesign.run.files import write_atomic
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
 
 COLUMN_INCHES, PAGE_INCHES = 3.5, 7.1
 DOTS_PER_INCH = 300
@@ -60,7 +64,7 @@ LOOK: dict[str, Any] = {
 
 
 @contextmanager
-def looks() -> Iterator[None]:
+def picture_style() -> Iterator[None]:
     """Draw in the look of all pictures; the settings before are there again afterwards."""
     from matplotlib import style
 
@@ -132,3 +136,83 @@ def plain_label(text: str, longest: int = LONGEST_LABEL) -> str:
     shown = "".join(letter if letter.isprintable() else " " for letter in text)
     shown = shown if len(shown) <= longest else f"{shown[: longest - 1]}…"
     return f" {shown}" if shown.startswith("_") else shown
+
+
+Against = Literal["rays", "bandwidth"]
+
+# Okabe and Ito 2008, without yellow (too faint on white) and with black kept for text.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+GREYS = ("#555555", "#808080", "#222222", "#999999", "#6b6b6b")
+MARKERS = ("o", "s", "^", "D", "v", "P")
+BASELINE_MARKERS = ("x", "+", "*", "1", "d")
+DASHES = ("solid", "dashed", "dashdot", "dotted")
+# Labels of a logarithmic axis: at these times every power of ten, the few where the values span more than the factor.
+FEW_MANTISSAS, MANY_MANTISSAS, WIDE_FACTOR = (1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0), 30.0
+TICK_MARGIN = 1.2
+MANY_DECADES = 4.0  # a range of values wider than this factor is easier to read on a logarithmic axis
+
+
+@dataclass(frozen=True)
+class Series:
+    """One curve.
+
+    Arguments:
+        name: Of the design or baseline.
+        rows: By growing number of rays.
+        colour, marker, dash: Distinct in more than colour; baselines are grey, with open markers and dashes.
+        baseline: Whether it is a baseline.
+    """
+
+    name: str
+    rows: tuple[Row, ...]
+    colour: str
+    marker: str
+    dash: str
+    baseline: bool
+
+
+def series(evaluation: Evaluation) -> list[Series]:
+    """One series per name, in the order of the rows."""
+    found: list[Series] = []
+    for name in dict.fromkeys(row.design for row in evaluation.rows):
+        rows = tuple(sorted((row for row in evaluation.rows if row.design == name), key=lambda row: row.rays))
+        kind = sum(other.baseline == rows[0].baseline for other in found)
+        found.append(_styled(name, rows, kind))
+    return found
+
+
+def _styled(name: str, rows: tuple[Row, ...], index: int) -> Series:
+    if rows[0].baseline:
+        grey, marker = GREYS[index % len(GREYS)], BASELINE_MARKERS[index % len(BASELINE_MARKERS)]
+        return Series(name, rows, grey, marker, DASHES[1 + index % (len(DASHES) - 1)], baseline=True)
+    dash = DASHES[index // len(COLOURS) % len(DASHES)]
+    return Series(
+        name, rows, COLOURS[index % len(COLOURS)], MARKERS[index % len(MARKERS)], dash, baseline=False
+    )
+
+
+def position(row: Row, against: Against) -> float:
+    """Where a row stands on the horizontal axis: rays per frame or position, or Mbit/s."""
+    return float(row.rays) if against == "rays" else row.bandwidth_mbps
+
+
+def logarithmic(values: Sequence[float]) -> bool:
+    """Whether values span so much that a logarithmic axis shows them better."""
+    positive = [value for value in values if value > 0]
+    return len(positive) == len(values) > 1 and max(positive) > MANY_DECADES * min(positive)
+
+
+def log_ticks(values: Sequence[float]) -> list[float]:
+    """Round places to label on a logarithmic axis that holds some values: more to a decade where it has few of them."""
+    low, high = min(values), max(values)
+    mantissas = FEW_MANTISSAS if high > WIDE_FACTOR * low else MANY_MANTISSAS
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    ticks = [mantissa * 10.0**decade for decade in decades for mantissa in mantissas]
+    return [tick for tick in ticks if low / TICK_MARGIN <= tick <= high * TICK_MARGIN]
+
+
+def axis_titles(evaluation: Evaluation, against: Against) -> tuple[str, str]:
+    """Titles of the horizontal and the vertical axis, with their units."""
+    metric = evaluation.metric
+    across = "rays" if against == "rays" else "bandwidth [Mbit/s]"
+    return across, f"{metric.name} [{metric.unit}], {metric.better} is better"

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidardesign.evaluate.figures.canvas import (
+    COLOURS,
+    DASHES,
     INK,
     PAGE_INCHES,
     SMALL_POINTS,
@@ -16,7 +18,6 @@ from lidardesign.evaluate.figures.canvas import (
     plain_axes,
     plain_label,
 )
-from lidardesign.evaluate.figures.curves import COLOURS, DASHES
 from lidardesign.evaluate.figures.density_views import DensityView, Marginal, PlaneDensity
 
 if TYPE_CHECKING:
@@ -129,7 +130,7 @@ def _draw_plane(axes: Axes, plane: PlaneDensity, width_inches: float) -> None:
     across, up = plane.edges
     extent = (across[0], across[-1], up[0], up[-1])
     axes.imshow(_bodies(plane), extent=extent, origin="lower", interpolation="nearest")
-    most = shown_most(plane.heights)
+    most = most_shown(plane.heights)
     shown = np.ma.masked_less(plane.heights, FAINTEST * most)
     drawn = axes.imshow(
         shown, extent=extent, origin="lower", interpolation="nearest", cmap=field_colours(), vmin=0.0, vmax=most
@@ -147,7 +148,7 @@ def _draw_plane(axes: Axes, plane: PlaneDensity, width_inches: float) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def shown_most(heights: np.ndarray) -> float:
+def most_shown(heights: np.ndarray) -> float:
     """Where the colours end: a few cells beyond, where a heavy sample lies, would leave all others pale."""
     return float(np.quantile(heights[heights > 0], MOST_SHARE)) if (heights > 0).any() else 1.0
 

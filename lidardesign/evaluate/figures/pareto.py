@@ -1,4 +1,4 @@
-"""Error against seconds, one panel per ladder, on logarithmic axes: what the pictures have in common, and the picture.
+"""Error against seconds, one panel per sweep, on logarithmic axes: what the pictures have in common, and the picture.
 
 A line joins the settings that no other one beats in both; those that are beaten are pale. The tolerance is a dashed
 line, the run's own setting has a ring, the one to choose has another colour. A reference, whose error is nothing,
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from lidardesign.evaluate.accuracy.settings import Ladder, Rung
+from lidardesign.evaluate.accuracy.settings import Measurement, Sweep
 from lidardesign.evaluate.figures.canvas import (
     LETTERS_POINTS,
     PAGE_INCHES,
@@ -50,19 +50,19 @@ MARGIN_INCHES = 0.75
 
 @dataclass(frozen=True)
 class Mark:
-    """A rung in a panel.
+    """A measurement in a panel.
 
     Arguments:
-        rung: The rung.
+        measurement: The measurement.
         x: Its seconds.
         y: Its error, or the panel's lower edge.
         low, high: Ends of its error bar, one standard error each way, within the panel.
         on_edge: Whether its error is too small to show.
         chosen: Whether it is the one to choose.
-        beaten: Whether another rung is both faster and more accurate.
+        beaten: Whether another measurement is both faster and more accurate.
     """
 
-    rung: Rung
+    measurement: Measurement
     x: float
     y: float
     low: float
@@ -74,15 +74,15 @@ class Mark:
 
 @dataclass(frozen=True)
 class Panel:
-    """A ladder as it is drawn.
+    """A sweep as it is drawn.
 
     Arguments:
-        ladder: The ladder.
-        marks: Its rungs, the roughest first.
+        sweep: The sweep.
+        marks: Its measurements, the roughest first.
         seconds, errors: Ends of both axes.
     """
 
-    ladder: Ladder
+    sweep: Sweep
     marks: tuple[Mark, ...]
     seconds: tuple[float, float]
     errors: tuple[float, float]
@@ -90,7 +90,7 @@ class Panel:
     @property
     def shows_tolerance(self) -> bool:
         """Whether the tolerance has a place on the axis."""
-        return self.errors[0] <= self.ladder.tolerance <= self.errors[1]
+        return self.errors[0] <= self.sweep.tolerance <= self.errors[1]
 
     @property
     def front(self) -> list[Mark]:
@@ -100,25 +100,32 @@ class Panel:
     @property
     def error_title(self) -> str:
         """The vertical axis: what the error is, with its unit."""
-        return f"error [{self.ladder.unit}]" if self.ladder.unit else "error [share]"
+        return f"error [{self.sweep.unit}]" if self.sweep.unit else "error [share]"
 
 
-def panels(ladders: Sequence[Ladder]) -> list[Panel]:
-    """One panel per ladder that has two rungs or more."""
-    return [_panel(ladder) for ladder in ladders if len(ladder.rungs) > 1]
+def panels(sweeps: Sequence[Sweep]) -> list[Panel]:
+    """One panel per sweep that has two measurements or more."""
+    return [_panel(sweep) for sweep in sweeps if len(sweep.measurements) > 1]
 
 
-def _panel(ladder: Ladder) -> Panel:
-    seconds = [rung.seconds for rung in ladder.rungs if rung.seconds > 0] or [1.0]
-    errors = _error_axis(ladder)
-    chosen = ladder.chosen
-    marks = tuple(_mark(rung, min(seconds), errors, rung is chosen, _beaten(rung, ladder)) for rung in ladder.rungs)
-    return Panel(ladder, marks, _spanned(min(seconds), max(seconds)), errors)
+def _panel(sweep: Sweep) -> Panel:
+    seconds = [measurement.seconds for measurement in sweep.measurements if measurement.seconds > 0] or [1.0]
+    errors = _error_axis(sweep)
+    chosen = sweep.chosen
+    marks = tuple(
+        _mark(measurement, min(seconds), errors, measurement is chosen, _beaten(measurement, sweep))
+        for measurement in sweep.measurements
+    )
+    return Panel(sweep, marks, _spanned(min(seconds), max(seconds)), errors)
 
 
-def _error_axis(ladder: Ladder) -> tuple[float, float]:
-    known = [rung.error for rung in ladder.rungs if rung.error > 0 and math.isfinite(rung.error)]
-    tolerance = [ladder.tolerance] if ladder.tolerance > 0 and math.isfinite(ladder.tolerance) else []
+def _error_axis(sweep: Sweep) -> tuple[float, float]:
+    known = [
+        measurement.error
+        for measurement in sweep.measurements
+        if measurement.error > 0 and math.isfinite(measurement.error)
+    ]
+    tolerance = [sweep.tolerance] if sweep.tolerance > 0 and math.isfinite(sweep.tolerance) else []
     largest = max([*known, *tolerance], default=1.0)
     shown = [error for error in [*known, *tolerance] if error >= SHOWN_SHARE * largest]
     low, high = _spanned(min(shown, default=1.0), largest)
@@ -133,12 +140,14 @@ def _spanned(low: float, high: float) -> tuple[float, float]:
     return low / factor, high * factor
 
 
-def _beaten(rung: Rung, ladder: Ladder) -> bool:
-    """Whether another rung is at least as good in seconds and in error, and better in one of them."""
+def _beaten(measurement: Measurement, sweep: Sweep) -> bool:
+    """Whether another measurement is at least as good in seconds and in error, and better in one of them."""
     return any(
-        other.seconds <= rung.seconds and other.error <= rung.error and (other.seconds, other.error) != own
-        for own in [(rung.seconds, rung.error)]
-        for other in ladder.rungs
+        other.seconds <= measurement.seconds
+        and other.error <= measurement.error
+        and (other.seconds, other.error) != own
+        for own in [(measurement.seconds, measurement.error)]
+        for other in sweep.measurements
     )
 
 
@@ -149,19 +158,30 @@ def has_fine_ticks(ends: tuple[float, float]) -> bool:
     return high < FINE_TICKS_SPAN * low or powers < 2
 
 
-def _mark(rung: Rung, least_seconds: float, errors: tuple[float, float], chosen: bool, beaten: bool) -> Mark:
+def _mark(
+    measurement: Measurement, least_seconds: float, errors: tuple[float, float], chosen: bool, beaten: bool
+) -> Mark:
     low, high = errors
-    on_edge = rung.error <= low
+    on_edge = measurement.error <= low
     # what has no finite error stands on the upper edge
-    y = low if on_edge else rung.error if math.isfinite(rung.error) else high
-    uncertainty = rung.uncertainty if math.isfinite(rung.uncertainty) else 0.0
+    y = low if on_edge else measurement.error if math.isfinite(measurement.error) else high
+    uncertainty = measurement.uncertainty if math.isfinite(measurement.uncertainty) else 0.0
     ends = max(y - uncertainty, low), min(y + uncertainty, high)
-    return Mark(rung, max(rung.seconds, least_seconds), y, min(ends[0], y), max(ends[1], y), on_edge, chosen, beaten)
+    return Mark(
+        measurement,
+        max(measurement.seconds, least_seconds),
+        y,
+        min(ends[0], y),
+        max(ends[1], y),
+        on_edge,
+        chosen,
+        beaten,
+    )
 
 
-def pareto_picture(ladders: Sequence[Ladder]) -> Figure | None:
+def pareto_picture(sweeps: Sequence[Sweep]) -> Figure | None:
     """All panels, a page wide; None where there is nothing to draw."""
-    shown = panels(ladders)
+    shown = panels(sweeps)
     if not shown:
         return None
     columns = min(COLUMNS, len(shown))
@@ -177,14 +197,14 @@ def _draw(axes: Axes, panel: Panel) -> None:
     front = panel.front
     _dress(axes, panel)
     if panel.shows_tolerance:
-        axes.axhline(panel.ladder.tolerance, color=TOLERANCE, linestyle="dashed", linewidth=1.1, zorder=1.5)
+        axes.axhline(panel.sweep.tolerance, color=TOLERANCE, linestyle="dashed", linewidth=1.1, zorder=1.5)
     axes.plot([mark.x for mark in front], [mark.y for mark in front], color=LINE, alpha=PALE, linewidth=1.3, zorder=2)
     for mark in panel.marks:
         _draw_mark(axes, mark)
     places = label_places(panel, POINTS * (PANEL_INCHES[1] - MARGIN_INCHES), LINE_POINTS)
     for mark, (across, up, side) in zip(panel.marks, places, strict=True):
         axes.annotate(
-            plain_label(mark.rung.setting, LONGEST_SETTING),
+            plain_label(mark.measurement.setting, LONGEST_SETTING),
             (mark.x, mark.y),
             xytext=(across, up),
             textcoords="offset points",
@@ -209,7 +229,7 @@ def _dress(axes: Axes, panel: Panel) -> None:
         else:
             # on axes of one or two powers of ten there would be names at all ticks, which do not fit
             label_powers(axis)
-    axes.set_title(plain_label(panel.ladder.knob, 48), fontsize=LETTERS_POINTS, loc="left", color="#222222")
+    axes.set_title(plain_label(panel.sweep.knob, 48), fontsize=LETTERS_POINTS, loc="left", color="#222222")
     axes.set_xlabel("seconds")
     axes.set_ylabel(plain_label(panel.error_title, 40))
     axes.tick_params(labelsize=SMALL_POINTS)
@@ -225,7 +245,7 @@ def _draw_mark(axes: Axes, mark: Mark) -> None:
     look = {"linestyle": "none", "clip_on": False, "zorder": 4}
     shape = "v" if mark.on_edge else "o"
     axes.plot(mark.x, mark.y, marker=shape, markersize=4.5, color=colour, alpha=alpha, markeredgewidth=0, **look)
-    if mark.rung.default:
+    if mark.measurement.default:
         axes.plot(mark.x, mark.y, marker="o", markersize=8.5, color="none", markeredgecolor="#222222", **look)
 
 

@@ -9,12 +9,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lidardesign.evaluate.figures.bounds import constraints_picture, effects_picture
-from lidardesign.evaluate.figures.canvas import looks, write_pictures
+from lidardesign.evaluate.figures.canvas import picture_style, write_pictures
 from lidardesign.evaluate.figures.density import field_picture, marginals_picture
-from lidardesign.evaluate.figures.figure_data import Pictured
 from lidardesign.evaluate.figures.scene import scene_picture
-from lidardesign.evaluate.figures.scores import curve_picture, differences_picture, times_picture
+from lidardesign.evaluate.figures.scene_figure import FigureData
+from lidardesign.evaluate.figures.scores import (
+    constraints_picture,
+    curve_picture,
+    differences_picture,
+    effects_picture,
+    times_picture,
+)
 from lidardesign.evaluate.results import Evaluation
 
 if TYPE_CHECKING:
@@ -25,26 +30,26 @@ RAYS, BANDWIDTH, DIFFERENCES = "score_against_rays", "score_against_bandwidth", 
 CONSTRAINTS, EFFECTS, ACCURACY, TIMES = "constraints", "effects", "accuracy", "times"
 
 
-def write_plots(evaluation: Evaluation, directory: Path, pictured: Pictured | None = None) -> list[Path]:
+def write_plots(evaluation: Evaluation, directory: Path, pictured: FigureData | None = None) -> list[Path]:
     """Write all pictures that there is something to draw for; returns the files, in the order of the report.
 
     The folder is made where it is missing.
     """
     written: list[Path] = []
-    with looks():
-        for stem, draw in pictures(evaluation, pictured or Pictured()).items():
+    with picture_style():
+        for stem, draw in pictures(evaluation, pictured or FigureData()).items():
             figure = draw()
             if figure is not None:
                 written += write_pictures(figure, Path(directory), stem)
     return written
 
 
-def pictures(evaluation: Evaluation, pictured: Pictured) -> dict[str, Callable[[], Figure | None]]:
+def pictures(evaluation: Evaluation, pictured: FigureData) -> dict[str, Callable[[], Figure | None]]:
     """What draws each picture, by the stem of its files; None comes back where there is nothing to draw."""
     from lidardesign.evaluate.figures.pareto import pareto_picture
 
     shown, density = pictured.shown, pictured.density
-    ladders = evaluation.accuracy.ladders if evaluation.accuracy is not None else ()
+    sweeps = evaluation.accuracy.sweeps if evaluation.accuracy is not None else ()
     return {
         SCENE: lambda: scene_picture(shown) if shown is not None and shown.designs else None,
         MARGINALS: lambda: marginals_picture(density) if density is not None and density.marginals else None,
@@ -54,6 +59,6 @@ def pictures(evaluation: Evaluation, pictured: Pictured) -> dict[str, Callable[[
         DIFFERENCES: lambda: differences_picture(evaluation) if evaluation.paired else None,
         CONSTRAINTS: lambda: constraints_picture(pictured.tightness),
         EFFECTS: lambda: effects_picture(evaluation.effects),
-        ACCURACY: lambda: pareto_picture(ladders),
+        ACCURACY: lambda: pareto_picture(sweeps),
         TIMES: lambda: times_picture(pictured.times),
     }

@@ -17,7 +17,7 @@ import numpy as np
 from lidardesign.design.sensor import Sensor
 from lidardesign.evaluate.figures.canvas import INK, PAGE_INCHES, SMALL_POINTS, SOFT, new_figure, plain_label
 from lidardesign.evaluate.figures.drawing import body_triangles, frustum_lines
-from lidardesign.evaluate.figures.scene_figure import Shown, ShownDesign
+from lidardesign.evaluate.figures.scene_figure import DrawnDesign, SceneFigure
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome
 from lidardesign.numerics import EPSILON_FLOAT32, HALF_DIGITS
@@ -228,7 +228,7 @@ LARGEST_PANEL = 4.6
 FEW_PLACES = 30
 
 
-def scene_picture(shown: Shown) -> Figure:
+def scene_picture(shown: SceneFigure) -> Figure:
     """The scene with each design at the middle of its positions and frames, a page wide; one panel per design."""
     designs = shown.designs[:MOST_DESIGNS]
     place, step = len(shown.places) // 2, len(shown.frames) // 2
@@ -253,7 +253,7 @@ def scene_picture(shown: Shown) -> Figure:
     return figure
 
 
-def opened(shown: Shown, place: int, step: int, view: View, pixels: int) -> tuple[Shaded, bool]:
+def opened(shown: SceneFigure, place: int, step: int, view: View, pixels: int) -> tuple[Shaded, bool]:
     """The scene as it is seen, and whether what stands before the sensors is cut away, as walls that hide them."""
     frame = shown.frames[step]
     image = shaded(shown.scene, frame, view, pixels)
@@ -265,7 +265,7 @@ def opened(shown: Shown, place: int, step: int, view: View, pixels: int) -> tupl
     return shaded(shown.scene, frame, nearer, pixels), True
 
 
-def framed_points(shown: Shown, place: int, step: int) -> np.ndarray:
+def framed_points(shown: SceneFigure, place: int, step: int) -> np.ndarray:
     """What the picture must hold: where rays start and end, and bodies that are not far beyond, shape (K, 3) [m]."""
     receiver = shown.scene.receiver
     ends = [np.zeros((0, 3)) if receiver is None else np.array([receiver.origin_m])]
@@ -316,7 +316,7 @@ def _scale_bar(axes: Axes, view: View) -> None:
     axes.annotate(text, (start, height), (0, 3), textcoords="offset points", fontsize=SMALL_POINTS, color=INK, zorder=6)
 
 
-def _draw_design(axes: Axes, one: ShownDesign, place: int, step: int, image: Shaded, view: View) -> None:
+def _draw_design(axes: Axes, one: DrawnDesign, place: int, step: int, image: Shaded, view: View) -> None:
     rays, outcome, ends = one.rays[place], one.outcome[place, step], one.ends_m[place, step]
     keep = np.unique(np.linspace(0, len(rays) - 1, min(len(rays), MOST_RAYS)).astype(int))
     slack = SLACK_SHARE * (view.window[1] - view.window[0])
@@ -401,7 +401,7 @@ def _legend(figure: Figure, kinds: Sequence[int], *, receiver: bool) -> None:
     figure.legend(handles, names, loc="outside lower center", **look)
 
 
-def _told(shown: Shown, place: int, step: int) -> str:
+def _told(shown: SceneFigure, place: int, step: int) -> str:
     """Which scene it is, when and where."""
     told = f"held-out scene {plain_label(shown.scene.name)}"
     if shown.scene.frames > 1:

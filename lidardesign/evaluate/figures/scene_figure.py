@@ -1,26 +1,36 @@
-"""What the 3D view of the report shows: designs at the robot's positions, and what becomes of their rays in time.
+"""What figures show beside the scores: designs in a scene and what becomes of their rays, the density, constraints.
 
-So many rays, positions and frames are kept as a page can hold; which are left out is said in `Shown`.
+As many rays, positions and frames are kept as a page can hold; `SceneFigure` says which are left out.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lidardesign.design.constraints.check import check_design
+from lidardesign.design.constraints.slack import SPACE_MARK, ConstraintSlack, constraint_slack
+from lidardesign.design.files import design_document
+from lidardesign.design.layouts.track import placed
 from lidardesign.design.sensor import DesignSpec
+from lidardesign.evaluate.figures.density_views import DensityView, density_view
+from lidardesign.evaluate.request import EvaluationRequest, fired_numbers, pattern_size
+from lidardesign.evaluate.results import Evaluation
+from lidardesign.evaluate.score import ordered_conditions
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome, Rays, gate_outcomes
 from lidardesign.scene import Scene
 from lidardesign.simulate.simulate import build_casters, simulate_many
+from lidardesign.space import DesignSpace
 
 if TYPE_CHECKING:
     from lidardesign.simulate.plan import Planner
+
 
 MOST_STEPS = 25  # positions, and frames, that a slider goes through
 MOST_RAYS = 2000  # drawn per design
@@ -32,7 +42,7 @@ Conditions = Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
-class ShownDesign:
+class DrawnDesign:
     """A design with its rays at each of P positions and T frames; N rays are drawn.
 
     Arguments:
@@ -60,7 +70,7 @@ class ShownDesign:
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class SceneFigure:
     """A scene with designs in it.
 
     Arguments:
@@ -75,7 +85,7 @@ class Shown:
     scene: Scene
     frames: tuple[int, ...]
     places: tuple[Conditions, ...]
-    designs: tuple[ShownDesign, ...]
+    designs: tuple[DrawnDesign, ...]
     physics: bool = False
     all_places: int = 1
 
@@ -85,7 +95,7 @@ class Shown:
         return np.concatenate([np.zeros((0, 3)), *(rays.direction for one in self.designs for rays in one.rays)])
 
 
-def shown_in(
+def scene_figure(
     scene: Scene,
     designs: Sequence[DesignSpec],
     places: Sequence[Conditions],
@@ -94,7 +104,7 @@ def shown_in(
     *,
     planner: Planner | None = None,
     seed: int = 0,
-) -> Shown:
+) -> SceneFigure:
     """Put designs into a scene.
 
     Arguments:
@@ -116,8 +126,8 @@ def shown_in(
         keep = np.array(_spread(len(rays[0]), budget), dtype=np.int64)
         at = tuple(placed(design, where) for where in chosen)
         drawn = tuple(one.subset(keep) for one in rays)
-        found.append(ShownDesign(design, at, drawn, length_m[..., keep], outcome[..., keep], len(rays[0])))
-    return Shown(scene, frames, chosen, tuple(found), planner is not None, len(places))
+        found.append(DrawnDesign(design, at, drawn, length_m[..., keep], outcome[..., keep], len(rays[0])))
+    return SceneFigure(scene, frames, chosen, tuple(found), planner is not None, len(places))
 
 
 def _spread(count: int, most: int) -> tuple[int, ...]:
@@ -171,3 +181,65 @@ def _first_hits(rays: Sequence[Rays], casters: Sequence[SceneCaster]) -> tuple[n
             length_m[place, step] = np.minimum(range_m, one.gate_m[:, 1])
             outcome[place, step] = gate_outcomes(range_m, one.gate_m)
     return length_m, outcome
+
+
+@dataclass(frozen=True, eq=False)
+class FigureData:
+    """What is drawn beside the scores.
+
+    Arguments:
+        shown: The designs in a scene.
+        density: The learned density, where the run has its samples.
+        tightness: How tight each design's constraints are, by its name.
+        times: Where the time of each command went, as a clock tells it.
+    """
+
+    shown: SceneFigure | None = None
+    density: DensityView | None = None
+    tightness: Mapping[str, Sequence[ConstraintSlack]] = field(default_factory=dict)
+    times: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+
+def figure_data(
+    evaluation: Evaluation, request: EvaluationRequest, times: Mapping[str, Mapping[str, float]]
+) -> FigureData:
+    """Everything that can be drawn of an evaluation's designs, in its first held-out scene."""
+    return FigureData(
+        scene_figure_of(request, physics=any(effect.on for effect in evaluation.effects)),
+        density_of(request),
+        {design.name: constraint_slack_of(design, request.space) for design in request.designs},
+        times,
+    )
+
+
+def scene_figure_of(request: EvaluationRequest, *, physics: bool) -> SceneFigure:
+    """The designs in the first held-out scene, with the physics that it calls for or by geometry alone."""
+
+    most = max(fired_numbers(request.designs, request.rays))
+
+    def laid_out(design: DesignSpec, at: Conditions) -> Rays:
+        count = design.rays or pattern_size(design) or most
+        return request.lay_out(design, count, request.samples.get(design.name), at=at)
+
+    return scene_figure(
+        request.test[0],
+        request.designs,
+        ordered_conditions(request),
+        placed,
+        laid_out,
+        planner=request.planner if physics else None,
+        seed=request.seed,
+    )
+
+
+def density_of(request: EvaluationRequest) -> DensityView | None:
+    """Views of what was learned; None where no run left samples."""
+    density = request.density() if request.density is not None else None
+    return None if density is None else density_view(density.samples, request.test[0], request.designs)
+
+
+def constraint_slack_of(design: DesignSpec, space: DesignSpace) -> list[ConstraintSlack]:
+    """How tight each constraint of a design is, by the independent checker; the bounds of its space last."""
+    checks = check_design(design_document(design), design.constraints, space)
+    found = constraint_slack(checks, [sensor.name for sensor in design.sensors])
+    return sorted(found, key=lambda one: one.name.startswith(SPACE_MARK))

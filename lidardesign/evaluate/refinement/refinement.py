@@ -19,9 +19,8 @@ import numpy as np
 from lidardesign.design.fit import FitResult
 from lidardesign.errors import InfeasibleError, NumericalError
 from lidardesign.evaluate.baselines.candidates import Positions
-from lidardesign.evaluate.refinement.attention import Attention
 from lidardesign.evaluate.refinement.regating import has_ray_gates
-from lidardesign.evaluate.refinement.reweighting import Reweighting
+from lidardesign.evaluate.refinement.reweighting import Attention, Reweighting
 from lidardesign.evaluate.scene_scores import checked_residuals, checked_score
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Returns

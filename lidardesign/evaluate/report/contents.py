@@ -7,12 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from lidardesign.config import FILE_NAME, RunConfig
-from lidardesign.evaluate.figures.figure_data import Pictured
+from lidardesign.evaluate.figures.scene_figure import FigureData
 from lidardesign.evaluate.report.report import Report
-from lidardesign.evaluate.report.tables import CommandTimes, Reproduction
+from lidardesign.evaluate.report.tables import CommandTimes, Reproduction, held_out_scenes
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.results import Evaluation
-from lidardesign.evaluate.verdicts import held_out
 from lidardesign.run.clock import phase
 from lidardesign.run.manifest import read_manifest, versions
 from lidardesign.space import observed_point
@@ -31,7 +30,7 @@ def evaluation_report(
     request: EvaluationRequest,
     folder: Path,
     config: RunConfig,
-    pictured: Pictured,
+    pictured: FigureData,
     command: Sequence[str],
 ) -> Report:
     """Everything that the report of an evaluation is made of.
@@ -73,7 +72,7 @@ def evaluation_report(
     return Report(
         evaluation,
         pictured.shown,
-        title=f"{config.task_name}: {evaluation.metric.name} on {held_out(evaluation.scenes)}",
+        title=f"{config.task_name}: {evaluation.metric.name} on {held_out_scenes(evaluation.scenes)}",
         density=pictured.density,
         density_m=points,
         constraints=pictured.tightness,

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from lidardesign.evaluate.accuracy.settings import Ladder, Rung
-from lidardesign.evaluate.figures.curves import Against, Series, axis_titles, log_ticks, logarithmic, position, series
+from lidardesign.evaluate.accuracy.settings import Measurement, Sweep
+from lidardesign.evaluate.figures.canvas import Against, Series, axis_titles, log_ticks, logarithmic, position, series
 from lidardesign.evaluate.figures.density_views import Marginal, PlaneDensity
 from lidardesign.evaluate.figures.pareto import (
     CHOSEN,
@@ -31,9 +31,9 @@ from lidardesign.evaluate.figures.pareto import (
     label_places,
     panels,
 )
+from lidardesign.evaluate.report.tables import plain_number, table
 from lidardesign.evaluate.report.view import encoded
 from lidardesign.evaluate.results import Evaluation
-from lidardesign.evaluate.verdicts import plain, table
 
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 14, "color": "#1f2933"}
 SYMBOLS = {
@@ -235,14 +235,14 @@ RING = "#222222"
 BYTES_PER_MB = 1e6
 
 
-def pareto_height_px(ladders: Sequence[Ladder]) -> int:
+def pareto_height_px(sweeps: Sequence[Sweep]) -> int:
     """The height that the figure needs [px]."""
-    return ROW_PX * math.ceil(len(panels(ladders)) / COLUMNS)
+    return ROW_PX * math.ceil(len(panels(sweeps)) / COLUMNS)
 
 
-def pareto_figure(ladders: Sequence[Ladder]) -> dict[str, Any]:
-    """All panels, two beside each other; hovering tells what a rung is."""
-    shown = panels(ladders)
+def pareto_figure(sweeps: Sequence[Sweep]) -> dict[str, Any]:
+    """All panels, two beside each other; hovering tells what a measurement is."""
+    shown = panels(sweeps)
     rows = math.ceil(len(shown) / COLUMNS)
     layout: dict[str, Any] = {
         "font": {**FONT, "size": 12},
@@ -288,10 +288,12 @@ def _marks(panel: Panel) -> dict[str, Any]:
         "cliponaxis": False,
         "marker": {
             "symbol": ["triangle-down" if mark.on_edge else "circle" for mark in marks],
-            "size": [13 if mark.rung.default else 9 for mark in marks],
+            "size": [13 if mark.measurement.default else 9 for mark in marks],
             "color": colours,
-            "opacity": [PALE if mark.beaten and not (mark.chosen or mark.rung.default) else 1.0 for mark in marks],
-            "line": {"color": RING, "width": [2.5 if mark.rung.default else 0 for mark in marks]},
+            "opacity": [
+                PALE if mark.beaten and not (mark.chosen or mark.measurement.default) else 1.0 for mark in marks
+            ],
+            "line": {"color": RING, "width": [2.5 if mark.measurement.default else 0 for mark in marks]},
         },
         "error_y": {
             "type": "data",
@@ -302,7 +304,7 @@ def _marks(panel: Panel) -> dict[str, Any]:
             "width": 0,
             "color": LINE,
         },
-        "customdata": [_told(mark, panel.ladder) for mark in marks],
+        "customdata": [_told(mark, panel.sweep) for mark in marks],
         "hovertemplate": "%{customdata}<extra></extra>",
     }
 
@@ -312,7 +314,7 @@ def _settings(panel: Panel, name: str) -> list[dict[str, Any]]:
     places = label_places(panel, ROW_PX - ABOVE_PX - BELOW_PX, LINE_PX)
     return [
         {
-            "text": html.escape(mark.rung.setting),
+            "text": html.escape(mark.measurement.setting),
             "xref": f"x{name}",
             "yref": f"y{name}",
             "x": math.log10(mark.x),
@@ -330,14 +332,18 @@ def _settings(panel: Panel, name: str) -> list[dict[str, Any]]:
     ]
 
 
-def _told(mark: Mark, ladder: Ladder) -> str:
-    rung, unit = mark.rung, html.escape(ladder.unit)
-    error = "the reference" if rung.reference else f"error {rung.error:.3g} &#177; {rung.uncertainty:.1g} {unit}"
-    lines = [f"<b>{html.escape(rung.setting)}</b>", error, f"{rung.seconds:.3g} s"]
-    if rung.memory_bytes is not None:
-        lines.append(f"{rung.memory_bytes / BYTES_PER_MB:.3g} MB")
+def _told(mark: Mark, sweep: Sweep) -> str:
+    measurement, unit = mark.measurement, html.escape(sweep.unit)
+    error = (
+        "the reference"
+        if measurement.reference
+        else f"error {measurement.error:.3g} &#177; {measurement.uncertainty:.1g} {unit}"
+    )
+    lines = [f"<b>{html.escape(measurement.setting)}</b>", error, f"{measurement.seconds:.3g} s"]
+    if measurement.memory_bytes is not None:
+        lines.append(f"{measurement.memory_bytes / BYTES_PER_MB:.3g} MB")
     lines += ["the one to choose"] if mark.chosen else []
-    lines += ["the run's own"] if rung.default else []
+    lines += ["the run's own"] if measurement.default else []
     return "<br>".join(line.strip() for line in lines)
 
 
@@ -370,7 +376,7 @@ def _ticks(ends: tuple[float, float]) -> dict[str, Any]:
 
 def _title(panel: Panel, name: str) -> dict[str, Any]:
     return {
-        "text": f"<b>{html.escape(panel.ladder.knob)}</b>",
+        "text": f"<b>{html.escape(panel.sweep.knob)}</b>",
         "xref": f"x{name} domain",
         "yref": f"y{name} domain",
         "x": 0,
@@ -385,7 +391,7 @@ def _title(panel: Panel, name: str) -> dict[str, Any]:
 
 def _tolerance(panel: Panel) -> dict[str, Any]:
     """A dashed line across the panel; a trace, because shapes vanish behind grid lines in the same place."""
-    limit = panel.ladder.tolerance
+    limit = panel.sweep.tolerance
     return {
         "x": list(panel.seconds),
         "y": [limit, limit],
@@ -395,29 +401,42 @@ def _tolerance(panel: Panel) -> dict[str, Any]:
     }
 
 
-def accuracy_tables(ladders: Sequence[Ladder]) -> str:
-    """Every ladder with all its rungs, what its figures mean and its verdict."""
-    return "".join(_table(ladder) for ladder in ladders)
+def accuracy_tables(sweeps: Sequence[Sweep]) -> str:
+    """Every sweep with all its measurements, what its figures mean and its verdict."""
+    return "".join(_table(sweep) for sweep in sweeps)
 
 
-def _table(ladder: Ladder) -> str:
-    unit = f" [{ladder.unit}]" if ladder.unit else ""
-    limit = f"{ladder.tolerance:.3g} {ladder.unit}".rstrip()
+def _table(sweep: Sweep) -> str:
+    unit = f" [{sweep.unit}]" if sweep.unit else ""
+    limit = f"{sweep.tolerance:.3g} {sweep.unit}".rstrip()
     about = (
-        f"Error: {ladder.error_of}, against {ladder.against}. Tolerance: {limit}, {ladder.because}. Seconds: "
-        f"{ladder.work}." + (f" Note: {ladder.note}." if ladder.note else "")
+        f"Error: {sweep.error_of}, against {sweep.against}. Tolerance: {limit}, {sweep.because}. Seconds: "
+        f"{sweep.work}." + (f" Note: {sweep.note}." if sweep.note else "")
     )
     headings = ("setting", f"error{unit}", "standard error", "seconds", "MB", "verdict")
-    chosen = ladder.chosen
-    lines = [(_cells(rung), "better" if rung is chosen else "open", False) for rung in ladder.rungs]
+    chosen = sweep.chosen
+    lines = [
+        (_cells(measurement), "better" if measurement is chosen else "open", False)
+        for measurement in sweep.measurements
+    ]
     words = {"better": "to choose", "open": ""}
-    return f"<h3>{html.escape(ladder.knob)}: {html.escape(ladder.verdict)}</h3><p>{html.escape(about)}</p>" + table(
-        headings, lines, text_columns=1, words=words, caption=f"Settings of {ladder.knob}."
+    return f"<h3>{html.escape(sweep.knob)}: {html.escape(sweep.verdict)}</h3><p>{html.escape(about)}</p>" + table(
+        headings, lines, text_columns=1, words=words, caption=f"Settings of {sweep.knob}."
     )
 
 
-def _cells(rung: Rung) -> list[str]:
+def _cells(measurement: Measurement) -> list[str]:
     """The setting, its error and uncertainty, seconds and memory; the last cell is for the verdict."""
-    memory = "" if rung.memory_bytes is None else plain(rung.memory_bytes / BYTES_PER_MB, 3, tiny=1.0)
-    error = ("reference", "") if rung.reference else (f"{rung.error:.3g}", f"{rung.uncertainty:.2g}")
-    return [rung.setting + (" (run)" if rung.default else ""), *error, f"{rung.seconds:.3g}", memory, ""]
+    memory = (
+        "" if measurement.memory_bytes is None else plain_number(measurement.memory_bytes / BYTES_PER_MB, 3, tiny=1.0)
+    )
+    error = (
+        ("reference", "") if measurement.reference else (f"{measurement.error:.3g}", f"{measurement.uncertainty:.2g}")
+    )
+    return [
+        measurement.setting + (" (run)" if measurement.default else ""),
+        *error,
+        f"{measurement.seconds:.3g}",
+        memory,
+        "",
+    ]

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from lidardesign.design.constraints.slack import ConstraintSlack
-from lidardesign.evaluate.accuracy.settings import Ladder
-from lidardesign.evaluate.figures.curves import DASHES, Series, series
+from lidardesign.evaluate.accuracy.settings import Sweep
+from lidardesign.evaluate.figures.canvas import DASHES, Series, series
 from lidardesign.evaluate.figures.density_views import DensityView
-from lidardesign.evaluate.figures.scene_figure import Shown
+from lidardesign.evaluate.figures.scene_figure import SceneFigure
 from lidardesign.evaluate.report.figures import (
     FONT,
     MOST_DESIGNS,
@@ -33,21 +33,19 @@ from lidardesign.evaluate.report.tables import (
     CommandTimes,
     Reproduction,
     audit_section,
+    bandwidth_table,
     constraints_table,
     effects_section,
+    held_out_scenes,
+    paired_table,
     reproduction,
+    rows_table,
+    sensors_table,
+    summary_sentences,
     times_tables,
 )
 from lidardesign.evaluate.report.view import view_section
 from lidardesign.evaluate.results import Evaluation
-from lidardesign.evaluate.verdicts import (
-    bandwidth_table,
-    held_out,
-    paired_table,
-    rows_table,
-    sensors_table,
-    summary_sentences,
-)
 from lidardesign.run.files import write_atomic
 
 RAYS_ID, BANDWIDTH_ID, ACCURACY_ID = "curve-rays", "curve-bandwidth", "accuracy-figure"
@@ -70,7 +68,7 @@ class Report:
     """
 
     evaluation: Evaluation
-    shown: Shown
+    shown: SceneFigure
     title: str
     density: DensityView | None = None
     density_m: np.ndarray | None = None
@@ -102,7 +100,7 @@ def _parts(report: Report) -> list[tuple[str, str, str]]:
     looks = {curve.name: curve for curve in series(evaluation)}
     looks = {name: replace(look, dash=DASHES[index % len(DASHES)]) for index, (name, look) in enumerate(looks.items())}
     shown = [looks[one.design.name] for one in report.shown.designs]
-    ladders = evaluation.accuracy.ladders if evaluation.accuracy else ()
+    sweeps = evaluation.accuracy.sweeps if evaluation.accuracy else ()
     result = paragraphs(summary_sentences(evaluation)) + paragraphs(evaluation.notes, "note")
     return [
         ("result", "Result", result),
@@ -115,7 +113,7 @@ def _parts(report: Report) -> list[tuple[str, str, str]]:
         ("constraints", "Constraints and how tight each is", _constraints(report.constraints)),
         ("physics", "Physics", effects_section(evaluation) if evaluation.effects else ""),
         ("audit", "Audit of the physics", audit_section(evaluation, evaluation.audit) if evaluation.audit else ""),
-        ("accuracy", "What accuracy costs", _accuracy(ladders)),
+        ("accuracy", "What accuracy costs", _accuracy(sweeps)),
         ("sensors", "Sensors", _sensors(report.shown)),
         ("time", "Where the time went", times_tables(report.times)),
         ("reproduce", "How to reproduce this", reproduction(report.reproduce)),
@@ -128,7 +126,7 @@ def _curves(evaluation: Evaluation) -> str:
         switch(curve.name, picture=swatch(curve.colour, curve.dash, curve.marker), curve=str(index))
         for index, curve in enumerate(series(evaluation))
     )
-    scenes = f"over {held_out(evaluation.scenes)}"
+    scenes = f"over {held_out_scenes(evaluation.scenes)}"
     return (
         f'<fieldset><legend>Curves shown</legend><div class="curves-shown">{legend}</div></fieldset>'
         + figure(curve_figure(evaluation, "rays"), RAYS_ID, CURVE_PX, f"Score against rays per frame: means {scenes}, "
@@ -182,26 +180,26 @@ def _constraints(found: Mapping[str, Sequence[ConstraintSlack]]) -> str:
     return "".join(constraints_table(name, bounds) for name, bounds in found.items())
 
 
-def _sensors(shown: Shown) -> str:
+def _sensors(shown: SceneFigure) -> str:
     parts = []
     for one in shown.designs:
         parts.append(folded(sensors_table(one.design), len(one.design.sensors), f"Sensors of {one.design.name}"))
     return "".join(parts)
 
 
-def _accuracy(ladders: Sequence[Ladder]) -> str:
-    """The figure of all ladders, how to read it, and their tables."""
-    if not ladders:
+def _accuracy(sweeps: Sequence[Sweep]) -> str:
+    """The figure of all sweeps, how to read it, and their tables."""
+    if not sweeps:
         return "<p>It was not measured: <code>lidardesign evaluate --accuracy</code> does, in some minutes.</p>"
     read = (
         "Error against seconds on this machine, one panel per numerical choice. Orange is the cheapest setting inside "
         "the tolerance (dashed), a ring the one of this run; pale settings are beaten in both; triangles on the lower "
         "edge have no error to show, references among them."
     )
-    height = pareto_height_px(ladders)
-    picture = figure(pareto_figure(ladders), ACCURACY_ID, height, "Error against seconds") if height else ""
+    height = pareto_height_px(sweeps)
+    picture = figure(pareto_figure(sweeps), ACCURACY_ID, height, "Error against seconds") if height else ""
     wide = f'<div class="scroll" tabindex="0"><div class="panels">{picture}</div></div>'
-    return f"<p>{read}</p>{wide}{accuracy_tables(ladders)}"
+    return f"<p>{read}</p>{wide}{accuracy_tables(sweeps)}"
 
 
 def _plotly_source() -> str:

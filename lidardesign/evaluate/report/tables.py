@@ -1,7 +1,4 @@
-"""The report's tables beside the scores: constraints and how tight each is, where the time went, how to reproduce.
-
-The report's tables about physics: what was simulated and why, and what skipping the rest changes.
-"""
+"""The report's tables and sentences: who is better and by how much, constraints, effects, times, how to reproduce."""
 
 from __future__ import annotations
 
@@ -12,10 +9,211 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from lidardesign.design.constraints.slack import ConstraintSlack
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.evaluate.report.markup import definitions
-from lidardesign.evaluate.results import Audit, AuditRow, EffectSummary, Evaluation
-from lidardesign.evaluate.verdicts import TINY, figure, plain, table
+from lidardesign.evaluate.results import (
+    Audit,
+    AuditRow,
+    EffectSummary,
+    Evaluation,
+    Paired,
+    Row,
+    leading_detail,
+    verdict,
+)
 from lidardesign.run.clock import INSIDE, OTHER
+
+MOST_SENSORS = 60  # listed in a table
+TINY = 1e-4  # from here on the limit is shown
+VERDICTS = {"better": "better", "worse": "worse", "open": "not clear"}
+
+
+def four_digits(value: float) -> str:
+    """A number with four digits for people."""
+    return f"{value:#.4g}".removesuffix(".")
+
+
+def plain_number(value: float, digits: int, tiny: float = TINY) -> str:
+    """A number of at least 0 without an exponent; what is tiny as its upper limit."""
+    if 0 < value < tiny:
+        return f"<{tiny:g}"
+    rounded = float(f"{value:.{digits}g}")
+    return f"{rounded:,.0f}" if rounded >= 10 ** (digits - 1) else f"{rounded:g}"
+
+
+def held_out_scenes(scenes: int) -> str:
+    """How many held-out scenes, in words."""
+    return "1 held-out scene" if scenes == 1 else f"{scenes} held-out scenes"
+
+
+def summary_sentences(evaluation: Evaluation) -> list[str]:
+    """One sentence per design at the largest number of rays, against each baseline."""
+    metric = evaluation.metric
+    sentences = [
+        f"{metric.name} in {metric.unit}, {metric.better} is better, mean over {held_out_scenes(evaluation.scenes)}. "
+        f"A scene in which too few rays return counts as {metric.worst:g} {metric.unit}."
+    ]
+    values = {(row.design, row.rays): row.value for row in evaluation.rows}
+    baselines = {row.design for row in evaluation.rows if row.baseline}
+    for name in dict.fromkeys(row.design for row in evaluation.rows if not row.baseline):
+        most = max(row.rays for row in evaluation.rows if row.design == name)
+        pairs = [p for p in evaluation.paired if p.a == name and p.rays == most and p.b in baselines]
+        told = ", ".join(_comparison(evaluation, pair, values[pair.b, most]) for pair in pairs)
+        sentences.append(
+            f"{name} with {most} rays: {four_digits(values[name, most])} {metric.unit}"
+            + (f"; {told}." if told else ".")
+        )
+    return sentences
+
+
+def rows_table(evaluation: Evaluation) -> str:
+    """All rows at equal rays."""
+    unit = evaluation.metric.unit
+    headings = ["design", "rays", f"{evaluation.metric.name} [{unit}]", "95 % interval", "failures"]
+    detail = leading_detail(evaluation.rows)
+    headings += [] if detail is None else [_words(detail)]
+    caption = f"Means over {held_out_scenes(evaluation.scenes)}; seconds are those of simulating and scoring all."
+    headings += ["Mbit/s", "seconds"]
+    return table(headings, _grouped(evaluation.rows, detail), text_columns=1, caption=caption)
+
+
+def paired_table(evaluation: Evaluation) -> str:
+    """All paired differences, with a verdict in words."""
+    if not evaluation.paired:
+        return "<p>There is nothing to compare with.</p>"
+    headings = ["a", "b", "rays", f"a - b [{evaluation.metric.unit}]", "95 % interval", "a is"]
+    lines = [
+        (
+            [pair.a, pair.b, str(pair.rays), four_digits(pair.difference), _interval(pair), ""],
+            verdict(evaluation, pair),
+            bool(index and pair.a != evaluation.paired[index - 1].a),
+        )
+        for index, pair in enumerate(evaluation.paired)
+    ]
+    caption = "Differences scene by scene at equal numbers of rays, with their 95 % bootstrap intervals over scenes."
+    return table(headings, lines, text_columns=2, caption=caption)
+
+
+def bandwidth_table(evaluation: Evaluation) -> str:
+    """Each design against baselines that were given as many rays as fit in its bandwidth."""
+    unit = evaluation.metric.unit
+    headings = ["design", "baseline", "rays", "its rays", "Mbit/s", f"design [{unit}]", f"baseline [{unit}]"]
+    own = {(row.design, row.rays): row for row in evaluation.rows if not row.baseline}
+    lines = []
+    for index, (row, pair) in enumerate(
+        zip(evaluation.equal_bandwidth, evaluation.paired_bandwidth, strict=True)
+    ):
+        mine = own[pair.a, pair.rays]
+        cells = [pair.a, pair.b, str(pair.rays), str(row.rays), four_digits(mine.bandwidth_mbps)]
+        cells += [
+            four_digits(mine.value),
+            four_digits(row.value),
+            f"{four_digits(pair.difference)} ({_interval(pair)})",
+            "",
+        ]
+        lines.append(
+            (
+                cells,
+                verdict(evaluation, pair),
+                bool(index and row.design == evaluation.equal_bandwidth[0].design),
+            )
+        )
+    caption = "Each design against baselines with as many rays (their rays) as fit in its bandwidth."
+    headings += ["difference (95 % interval)", "design is"]
+    return table(headings, lines, text_columns=2, caption=caption)
+
+
+def sensors_table(design: DesignSpec) -> str:
+    """A design's sensors in degrees and metres."""
+    headings = [
+        "sensor",
+        "share",
+        "origin [m]",
+        "azimuth, elevation [deg]",
+        "field of view [deg]",
+        "gate [m]",
+    ]
+    lines = []
+    for sensor, weight in zip(design.sensors[:MOST_SENSORS], design.weights, strict=False):
+        horizontal, vertical = (math.degrees(angle) for angle in sensor.field_of_view_rad)
+        start, end = sensor.gate_m
+        # adding zero takes the sign from a rounded -0
+        looks = [round(math.degrees(angle), 1) + 0.0 for angle in (sensor.azimuth_rad, sensor.elevation_rad)]
+        cells = [
+            sensor.name,
+            f"{weight:.3f}",
+            " ".join(f"{round(value, 3) + 0.0:.3f}" for value in sensor.origin_m),
+            ", ".join(f"{angle:.1f}" for angle in looks),
+            f"{horizontal:.1f} x {vertical:.1f}",
+            f"{start:.3f} to {end:.3f}",
+        ]
+        lines.append((cells, "", False))
+    rest = len(design.sensors) - MOST_SENSORS
+    caption = f"Sensors of {design.name}: shares of the rays, and intervals that hold {100 * design.level:g} % of each."
+    listed = table(headings, lines, text_columns=1, caption=caption)
+    return listed + (f"<p>and {rest} more.</p>" if rest > 0 else "")
+
+
+def _comparison(evaluation: Evaluation, pair: Paired, other: float) -> str:
+    word = verdict(evaluation, pair)
+    if word == "open":
+        return f"no clear difference from {pair.b} ({four_digits(other)})"
+    share = f"{abs(pair.difference) / abs(other):.0%} " if other else ""
+    return f"{share}{word} than {pair.b} ({four_digits(other)})"
+
+
+def _interval(item: Row | Paired) -> str:
+    return f"{four_digits(item.ci_low)} to {four_digits(item.ci_high)}"
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _grouped(rows: Sequence[Row], detail: str | None) -> list[tuple[list[str], str, bool]]:
+    lines = []
+    for index, row in enumerate(rows):
+        cells = [row.design, str(row.rays), four_digits(row.value), _interval(row), str(row.failures)]
+        if detail is not None:
+            cells.append(four_digits(row.details[detail]) if detail in row.details else "-")
+        cells += [four_digits(row.bandwidth_mbps), f"{row.seconds:.2f}"]
+        lines.append((cells, "", bool(index and row.design != rows[index - 1].design)))
+    return lines
+
+
+def table(
+    headings: Sequence[str],
+    lines: Sequence[tuple[list[str], str, bool]],
+    *,
+    text_columns: int,
+    words: Mapping[str, str] = VERDICTS,
+    caption: str = "",
+) -> str:
+    """An HTML table; a line is its cells, a verdict for the last cell (in `words`), and whether a group begins."""
+    head = "".join(
+        f'<th{" class=text" if column < text_columns else ""} scope="col">{html.escape(heading)}</th>'
+        for column, heading in enumerate(headings)
+    )
+    body = "".join(_line(cells, word, words, first, text_columns) for cells, word, first in lines)
+    title = html.escape(caption)
+    named = f' role="region" aria-label="{title}"' if title else ""
+    told = f"<caption><span>{title}</span></caption>" if title else ""
+    return (
+        f'<div class="scroll" tabindex="0"{named}><table>{told}<thead><tr>{head}</tr></thead><tbody>{body}</tbody>'
+        "</table></div>"
+    )
+
+
+def _line(cells: list[str], word: str, words: Mapping[str, str], first: bool, text_columns: int) -> str:
+    shown = [
+        f"<td{' class=name' if column < text_columns else ''}>{html.escape(cell)}</td>"
+        for column, cell in enumerate(cells)
+    ]
+    shown[0] = f'<th scope="row" class="name">{html.escape(cells[0])}</th>'
+    if word:
+        shown[-1] = f'<td class="{word}">{words[word]}</td>'
+    return f"<tr{' class=first' if first else ''}>{''.join(shown)}</tr>"
+
 
 # Phases of a smaller share of their command are left out; `other` has what they took.
 LEAST_SHARE = 0.005
@@ -234,8 +432,8 @@ def _starts(rows: Sequence[AuditRow], index: int) -> bool:
 
 def _effect_cells(effect: EffectSummary) -> list[str]:
     shown = [_words(effect.name), _simulated(effect), effect.reason]
-    bounds = (plain(MILLIMETRES * effect.range_m, 3), plain(effect.lost, 2))
-    return [*shown, *bounds, plain(effect.seconds, 2, tiny=SHORT_S)]
+    bounds = (plain_number(MILLIMETRES * effect.range_m, 3), plain_number(effect.lost, 2))
+    return [*shown, *bounds, plain_number(effect.seconds, 2, tiny=SHORT_S)]
 
 
 def _simulated(effect: EffectSummary) -> str:
@@ -246,13 +444,9 @@ def _simulated(effect: EffectSummary) -> str:
 
 def _audit_cells(row: AuditRow) -> list[str]:
     name = row.design if row.matched_to is None else f"{row.design} (bandwidth of {row.matched_to})"
-    cells = [name, str(row.rays), figure(row.planned), figure(row.everything), f"{row.difference:.2g}"]
+    cells = [name, str(row.rays), four_digits(row.planned), four_digits(row.everything), f"{row.difference:.2g}"]
     return [*cells, f"{row.ci_low:.2g} to {row.ci_high:.2g}", *_times(row), ""]
 
 
 def _times(row: AuditRow) -> list[str]:
     return [f"{row.seconds:.2f}", f"{row.seconds_everything:.2f}"]
-
-
-def _words(name: str) -> str:
-    return name.replace("_", " ")

@@ -19,7 +19,7 @@ import numpy as np
 
 from lidardesign.design.layouts.grid import field_on_sphere
 from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor
-from lidardesign.evaluate.figures.curves import Series
+from lidardesign.evaluate.figures.canvas import Series
 from lidardesign.evaluate.figures.drawing import (
     MOST_FACES,
     SMALLEST_SPREAD_M,
@@ -30,7 +30,7 @@ from lidardesign.evaluate.figures.drawing import (
     round_steps,
     scene_bounds,
 )
-from lidardesign.evaluate.figures.scene_figure import Shown, ShownDesign
+from lidardesign.evaluate.figures.scene_figure import DrawnDesign, SceneFigure
 from lidardesign.evaluate.report.markup import embedded, swatch, switch
 from lidardesign.geometry.rays import Outcome
 from lidardesign.numerics import EPSILON_FLOAT32
@@ -54,7 +54,7 @@ OUTCOMES = (
 DASHES = {"solid": "solid", "dashed": "dash", "dashdot": "dashdot", "dotted": "dot"}
 
 
-def view_document(shown: Shown, looks: Sequence[Series], density_m: np.ndarray | None = None) -> dict[str, Any]:
+def view_document(shown: SceneFigure, looks: Sequence[Series], density_m: np.ndarray | None = None) -> dict[str, Any]:
     """The document of a view.
 
     Arguments:
@@ -89,7 +89,7 @@ def encoded(values: np.ndarray, kind: str) -> str:
     return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode("ascii")
 
 
-def drawn_bodies(shown: Shown) -> list[Body]:
+def drawn_bodies(shown: SceneFigure) -> list[Body]:
     """The bodies that are drawn: the largest, where there are very many."""
     bodies = list(shown.scene.bodies)
     if len(bodies) <= MOST_BODIES:
@@ -108,7 +108,7 @@ def _size(body: Body) -> float:
     return float(max(lengths, default=np.inf))
 
 
-def view_bounds(shown: Shown) -> np.ndarray:
+def view_bounds(shown: SceneFigure) -> np.ndarray:
     """The box that is drawn, shape (2, 3) [m]: scene, sensors, and their rays as far as they stay near."""
     rays = [one for design in shown.designs for one in design.rays]
     each = [scene_bounds(shown.scene, frame, rays) for frame in {shown.frames[0], shown.frames[-1]}]
@@ -122,7 +122,7 @@ def view_bounds(shown: Shown) -> np.ndarray:
     return np.stack([low, high])
 
 
-def _shells(one: ShownDesign) -> list[np.ndarray]:
+def _shells(one: DrawnDesign) -> list[np.ndarray]:
     """Gates and origins that are drawn, at the first and the last position."""
     if len(one.design.sensors) > MOST_SENSORS:
         return []
@@ -176,14 +176,14 @@ def _resting(bodies: Sequence[Body], target: bool, bounds: np.ndarray, share: fl
     return _mesh(vertices, np.concatenate([np.zeros((0, 3), dtype=np.int64), *moved]))
 
 
-def _moving(body: Body, shown: Shown, bounds: np.ndarray, share: float, steps: int) -> dict[str, Any]:
+def _moving(body: Body, shown: SceneFigure, bounds: np.ndarray, share: float, steps: int) -> dict[str, Any]:
     """A body in its own frame, with the upper three rows of its pose at every frame that is shown."""
     poses = np.stack([body.pose(frame) for frame in shown.frames])
     vertices, faces = own_triangles(body, poses[0], bounds, share, steps)
     return {"target": body.is_target, "poses": encoded(poses[:, :3], "<f4"), **_mesh(vertices, faces)}
 
 
-def _design(one: ShownDesign, look: Series) -> dict[str, Any]:
+def _design(one: DrawnDesign, look: Series) -> dict[str, Any]:
     few = len(one.design.sensors) <= MOST_SENSORS
     first = one.rays[0]
     return {
@@ -233,7 +233,7 @@ CAMERA = (
 OF_SOLID = ("up", "down", "above")
 
 
-def view_section(shown: Shown, looks: Sequence[Series], density_m: np.ndarray | None) -> str:
+def view_section(shown: SceneFigure, looks: Sequence[Series], density_m: np.ndarray | None) -> str:
     """Everything of the view; `looks` are the designs' colours and dashes, `density_m` (K, 3) observed points."""
     document = view_document(shown, looks, density_m)
     stage = (
@@ -246,14 +246,14 @@ def view_section(shown: Shown, looks: Sequence[Series], density_m: np.ndarray | 
         (_sliders(shown), _outcomes(shown), _layers(shown, density_m is not None), _designs(shown, looks))
     )
     return (
-        f"{''.join(f'<p>{html.escape(text)}</p>' for text in told(shown))}"
+        f"{''.join(f'<p>{html.escape(text)}</p>' for text in view_notes(shown))}"
         f'<noscript><p class="note">The view needs JavaScript; all figures stand in the tables too.</p></noscript>'
         f'<div class="view">{stage}<div class="controls" role="group" aria-label="What is shown">{controls}</div></div>'
         f'<p id="view-status" role="status" aria-live="polite"></p>{embedded(document, id="view-data")}'
     )
 
 
-def told(shown: Shown) -> list[str]:
+def view_notes(shown: SceneFigure) -> list[str]:
     """Which scene is shown, how to read it, and what is left out."""
     how = (
         f"Held-out scene {shown.scene.name}. Lines run from where each ray starts to its first hit, or to the end of "
@@ -276,12 +276,12 @@ def told(shown: Shown) -> list[str]:
     return [how, *([further[0].upper() + further[1:] + "."] if further else [])]
 
 
-def place_labels(shown: Shown) -> list[str]:
+def place_labels(shown: SceneFigure) -> list[str]:
     """What each position is called."""
     return [", ".join(f"{name} = {value:.4g}" for name, value in place.items()) for place in shown.places]
 
 
-def frame_labels(shown: Shown) -> list[str]:
+def frame_labels(shown: SceneFigure) -> list[str]:
     """What each frame is called."""
     rate_hz, frames = shown.scene.frame_rate_hz, shown.scene.frames
     return [f"frame {frame + 1} of {frames}, {frame / rate_hz:.2f} s" for frame in shown.frames]
@@ -295,7 +295,7 @@ def _camera_buttons(flat: bool) -> str:
     return f'<div class="buttons" role="group" aria-label="Camera">{buttons}{save}</div>'
 
 
-def _sliders(shown: Shown) -> str:
+def _sliders(shown: SceneFigure) -> str:
     """One slider over positions, one over frames, where there is more than one."""
     names = " and ".join(shown.places[0]) or "position"
     found = ""
@@ -314,7 +314,7 @@ def _sliders(shown: Shown) -> str:
     return found
 
 
-def _outcomes(shown: Shown) -> str:
+def _outcomes(shown: SceneFigure) -> str:
     """One switch per outcome that any ray has, with the look of its rays and how many are drawn."""
     there = {int(code) for one in shown.designs for code in np.unique(one.outcome)} | {int(Outcome.RETURN)}
     switches = "".join(
@@ -325,7 +325,7 @@ def _outcomes(shown: Shown) -> str:
     return _group("Rays", switches)
 
 
-def _layers(shown: Shown, density: bool) -> str:
+def _layers(shown: SceneFigure, density: bool) -> str:
     occluders = any(not body.is_target for body in shown.scene.bodies)
     layers = [switch("scene", picture=swatch("#c9b8a8", None), layer="scene")]
     layers += [switch("occluders", picture=swatch("#6b7280", None), layer="occluders")] if occluders else []
@@ -337,7 +337,7 @@ def _layers(shown: Shown, density: bool) -> str:
     return _group("Shown", "".join(layers))
 
 
-def _designs(shown: Shown, looks: Sequence[Series]) -> str:
+def _designs(shown: SceneFigure, looks: Sequence[Series]) -> str:
     """A switch per design, and one per sensor inside of it."""
     parts = []
     for number, (one, look) in enumerate(zip(shown.designs, looks, strict=True)):
@@ -347,7 +347,7 @@ def _designs(shown: Shown, looks: Sequence[Series]) -> str:
     return _group("Designs", "".join(parts)) if parts else ""
 
 
-def _sensors(one: ShownDesign, number: int) -> str:
+def _sensors(one: DrawnDesign, number: int) -> str:
     sensors = one.design.sensors
     if len(sensors) > MOST_SENSORS:
         return f'<p class="sensors">{len(sensors)} sensors, drawn by their rays</p>'

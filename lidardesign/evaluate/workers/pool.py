@@ -9,31 +9,46 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from typing import Any, Protocol
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from typing import Protocol
 
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.scene_scores import Progress, ScenePass, SceneScores
-from lidardesign.evaluate.workers import worker as messages
-from lidardesign.evaluate.workers.worker import preparation, question
+from lidardesign.evaluate.workers.worker import SceneFailure, SceneJob, SceneSource
 from lidardesign.registry import load_task
 
 ADDRESS = re.compile(r"tcp://(\[[0-9a-fA-F:]+\]|[^\s:/\[\]]+):(\d{1,5})")
 MOST_PROCESSES = 1024
 ALLOWED = f"a whole number from 1 to {MOST_PROCESSES}, or tcp://HOST:PORT of a dask scheduler"
 MOST_PORT = 65_535
+# How often somebody looks whether there is still a worker, while none answers.
+LOOK_SECONDS = 2.0
 
 
 class Engine(Protocol):
-    """What hands messages to workers."""
+    """What hands jobs to workers."""
 
-    def prepare(self, message: bytes) -> None:
-        """Tell workers something ahead."""
+    def prepare(self, source: SceneSource) -> None:
+        """Have workers make scenes ahead."""
         ...
 
-    def answers(self, questions: Iterable[bytes]) -> Iterator[tuple[int, bytes]]:
-        """The number and the answer of each message, as they come."""
+    def at_once(self) -> int:
+        """How many jobs it takes at a time."""
+        ...
+
+    def submit(self, job: SceneJob) -> Future[SceneScores | SceneFailure]:
+        """Hand a job over."""
+        ...
+
+    def check(self) -> None:
+        """Raise where no answer can come any more."""
+        ...
+
+    def lost(self, error: Exception, numbers: Sequence[int]) -> None:
+        """Raise what became of the jobs of these scenes, or be ready to have them again."""
         ...
 
     def close(self) -> None:
@@ -45,7 +60,7 @@ class WorkerScorer:
     """Scores scenes with workers; a context that ends them.
 
     Arguments:
-        engine: What hands messages to them.
+        engine: What hands jobs to them.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -70,49 +85,50 @@ class WorkerScorer:
                 where="workers",
                 hint="workers load a task by its entry point; without workers any task will do",
             )
-        self._engine.prepare(preparation(request))
+        self._engine.prepare(SceneSource.of(request))
 
-    def __call__(
-        self, request: EvaluationRequest, scene_pass: ScenePass, progress: Progress | None
-    ) -> Sequence[SceneScores]:
+    def __call__(self, scenes: ScenePass, progress: Progress | None) -> Sequence[SceneScores]:
         """As `score_here`; of several errors, that of the first scene is raised."""
-        total = len(request.test)
+        total = len(scenes.scenes)
         found: dict[int, SceneScores] = {}
-        failed: dict[int, dict[str, Any]] = {}
+        failed: dict[int, SceneFailure] = {}
         if progress:
-            progress(0, total, request.test[0].name)
-        asked = _Asked(request, scene_pass)
-        with contextlib.closing(self._engine.answers(asked)) as answers:
-            for number, reply in answers:
-                document, _ = messages.unpack(reply)
-                if "error" in document:
-                    failed[number] = document["error"]
-                    # scenes are asked about in order, so those before it are done or under way
-                    asked.stop()
+            progress(0, total, scenes.scenes[0].name)
+        # scenes are asked about in order: those before one that failed are done or under way
+        waiting = deque(range(total))
+        running: dict[Future[SceneScores | SceneFailure], int] = {}
+        # scenes that were asked about when a worker died: each is asked about alone, to know which one it was
+        suspects: set[int] = set()
+        while waiting or running:
+            while waiting and len(running) < (1 if suspects else self._engine.at_once()):
+                number = waiting.popleft()
+                running[self._engine.submit(SceneJob.of(scenes, number))] = number
+            done, _ = wait(running, LOOK_SECONDS, FIRST_COMPLETED)
+            if not done:
+                self._engine.check()
+            for future in sorted(done, key=running.get):
+                try:
+                    answer = future.result()
+                except Exception as error:
+                    # an answer is no error: whatever was lost with its worker, and all that was asked with it
+                    lost = sorted(running.values())
+                    self._engine.lost(error, [running[future], *(one for one in lost if one != running[future])])
+                    suspects.update(lost)
+                    waiting.extendleft(reversed(lost))
+                    running.clear()
+                    break
+                number = running.pop(future)
+                suspects.discard(number)
+                if isinstance(answer, SceneFailure):
+                    failed[number] = answer
+                    waiting.clear()
                 else:
-                    found[number] = messages.scores_from_document(document)
+                    found[number] = answer
                 if progress:
-                    progress(len(found), total, request.test[number].name)
+                    progress(len(found), total, scenes.scenes[number].name)
         if failed:
-            messages.raise_from_document(failed[min(failed)])
+            failed[min(failed)].reraise()
         return [found[number] for number in range(total)]
-
-
-class _Asked:
-    """The messages of a pass, made one by one until it is stopped."""
-
-    def __init__(self, request: EvaluationRequest, scene_pass: ScenePass) -> None:
-        self._request, self._pass, self._stopped = request, scene_pass, False
-
-    def stop(self) -> None:
-        """Make no more."""
-        self._stopped = True
-
-    def __iter__(self) -> Iterator[bytes]:
-        for number in range(len(self._request.test)):
-            if self._stopped:
-                return
-            yield question(self._request, self._pass, number)
 
 
 def check_workers(text: str) -> int | str:
@@ -143,15 +159,13 @@ def workers_of(wanted: int | str, most: int) -> Iterator[WorkerScorer | None]:
     if isinstance(wanted, int) and min(wanted, most) == 1:
         yield None
         return
-    with WorkerScorer(_engine(wanted, most)) as scorer:
-        yield scorer
-
-
-def _engine(wanted: int | str, most: int) -> Engine:
     if isinstance(wanted, str):
         from lidardesign.evaluate.workers.cluster import Cluster
 
-        return Cluster(wanted)
-    from lidardesign.evaluate.workers.processes import Processes
+        engine: Engine = Cluster(wanted)
+    else:
+        from lidardesign.evaluate.workers.processes import Processes
 
-    return Processes(min(wanted, most))
+        engine = Processes(min(wanted, most))
+    with WorkerScorer(engine) as scorer:
+        yield scorer

@@ -1,175 +1,143 @@
-"""Workers as processes of this machine: started, asked in turn, replaced when they die, ended with the program."""
+"""Workers as processes of this machine: started together, replaced when one dies, ended with the program."""
 
 from __future__ import annotations
 
 import contextlib
-import queue
+import multiprocessing
+import os
 import signal
-import subprocess
 import sys
 import threading
-from collections import deque
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+import types
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 
 from lidardesign.errors import ConfigError, NumericalError
-from lidardesign.evaluate.workers.worker import receive, send
+from lidardesign.evaluate.scene_scores import SceneScores
+from lidardesign.evaluate.workers.worker import SceneFailure, SceneJob, SceneSource, make_scenes, score_job
 
-WORKER = "lidardesign.evaluate.workers.worker"
 # A scene whose worker dies so many times is the cause of it.
 MOST_TRIES = 3
-# A process that dies closes its pipe just before it is gone.
-LAST_BREATH_S = 1.0
-
-
-@dataclass(eq=False)
-class _Job:
-    """A message to be answered; without a number nobody waits for the answer."""
-
-    number: int | None
-    message: bytes
-    tries: int = 0
-
-
-@dataclass(eq=False)
-class _Process:
-    """A running worker and what it was asked and did not answer yet."""
-
-    events: queue.SimpleQueue[tuple[_Process, bytes | None]]
-    jobs: deque[_Job] = field(default_factory=deque)
-
-    def __post_init__(self) -> None:
-        # modules are found where this process finds them, and a folder's own files are not mistaken for libraries
-        code = f"import sys; sys.path[:] = {sys.path!r}; from {WORKER} import main; main()"
-        self._popen = subprocess.Popen(
-            [sys.executable, "-c", code],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            # a terminal's Ctrl-C is for this process, which ends its workers
-            start_new_session=True,
-        )
-        threading.Thread(target=self._read, daemon=True).start()
-
-    def ask(self, job: _Job) -> None:
-        """Hand a message over; that it died is told by an event."""
-        self.jobs.append(job)
-        with contextlib.suppress(OSError):
-            send(self._popen.stdin, job.message)
-
-    def end(self) -> None:
-        """End it, at the latest a moment later."""
-        self._popen.kill()
-        self._popen.wait()
-        with contextlib.suppress(OSError):
-            self._popen.stdin.close()
-
-    def died_of(self) -> str:
-        """How it ended, as it closed its pipe."""
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._popen.wait(LAST_BREATH_S)
-        self.end()
-        code = self._popen.returncode
-        return f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-
-    def _read(self) -> None:
-        with self._popen.stdout as pipe:
-            while (reply := receive(pipe)) is not None:
-                self.events.put((self, reply))
-        self.events.put((self, None))
+# Jobs beyond what runs, so that no worker waits for this process.
+AHEAD = 1
+# Exit code where the process that asks has gone.
+EXIT_ALONE = 1
 
 
 class Processes:
-    """Worker processes of this machine; they start at once and load libraries while this process goes on.
+    """Worker processes of this machine, of one thread each.
 
     Arguments:
         count: How many, at least 1.
-
-    Raises:
-        ConfigError: The system does not allow so many.
     """
 
     def __init__(self, count: int) -> None:
-        self._events: queue.SimpleQueue[tuple[_Process, bytes | None]] = queue.SimpleQueue()
-        self._running: list[_Process] = []
+        self._count = count
+        self._source: SceneSource | None = None
+        self._executor: ProcessPoolExecutor | None = None
+        self._running: list[multiprocessing.process.BaseProcess] = []
+        self._deaths: Counter[int] = Counter()
+
+    def prepare(self, source: SceneSource) -> None:
+        """Start all processes, which load libraries and make the scenes while this one goes on.
+
+        Raises:
+            ConfigError: The system does not allow so many.
+        """
+        self.close()
+        self._source = source
+        spawn = multiprocessing.get_context("spawn")
+        self._executor = ProcessPoolExecutor(self._count, spawn, initializer=_begin, initargs=(source,))
+        others = multiprocessing.active_children()
         try:
-            for _ in range(count):
-                self._running.append(_Process(self._events))
+            for _ in range(self._count):
+                # a process is started where none is idle, and none is before it has its scenes
+                with _undisturbed():
+                    self._executor.submit(os.getpid)
         except OSError as error:
+            self._running = [one for one in multiprocessing.active_children() if one not in others]
             started = len(self._running)
             self.close()
             raise ConfigError(
-                f"only {started} of {count} processes could be started: {error.strerror}", where="--workers"
+                f"only {started} of {self._count} processes could be started: {error.strerror}", where="--workers"
             ) from error
+        self._running = [one for one in multiprocessing.active_children() if one not in others]
 
-    def prepare(self, message: bytes) -> None:
-        """Tell every worker something whose answer nobody waits for."""
-        for process in self._running:
-            process.ask(_Job(None, message))
+    def at_once(self) -> int:
+        """How many jobs it takes at a time."""
+        return self._count + AHEAD
 
-    def answers(self, questions: Iterable[bytes]) -> Iterator[tuple[int, bytes]]:
-        """The number and the answer of each message, as they come.
+    def submit(self, job: SceneJob) -> Future[SceneScores | SceneFailure]:
+        """Hand a job over."""
+        if self._executor is None or self._source != job.source:
+            self.prepare(job.source)
+        try:
+            return self._executor.submit(score_job, job)
+        except BrokenProcessPool:
+            # one was lost while nothing was asked
+            self.prepare(job.source)
+            return self._executor.submit(score_job, job)
+
+    def check(self) -> None:
+        """Lost processes are told by their jobs."""
+
+    def lost(self, error: Exception, numbers: Sequence[int]) -> None:
+        """Replace all processes after one died while these scenes were asked about; they can be asked about again.
 
         Raises:
-            NumericalError: The workers of one message died, one after the other.
+            NumericalError: It was one scene alone, and not for the first time.
         """
-        waiting = _Waiting(questions)
-        while True:
-            for process in self._running:
-                if not any(job.number is not None for job in process.jobs) and (job := waiting.take()):
-                    process.ask(job)
-            if not any(process.jobs for process in self._running):
-                return
-            waiting.prefetch()
-            process, reply = self._events.get()
-            if process not in self._running:
-                continue
-            if reply is None:
-                self._replace(process, waiting)
-                continue
-            job = process.jobs.popleft()
-            if job.number is not None:
-                yield job.number, reply
+        if not isinstance(error, BrokenProcessPool):
+            raise error
+        running, source = self._running, self._source
+        self._executor.shutdown(wait=True)
+        # the others were ended by SIGTERM then
+        codes = [process.exitcode for process in running if process.exitcode != -signal.SIGTERM] or [-signal.SIGTERM]
+        self._deaths.update(numbers)
+        if len(numbers) == 1 and self._deaths[numbers[0]] >= MOST_TRIES:
+            code = codes[0]
+            how = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+            raise NumericalError(
+                f"the worker of held-out scene {numbers[0]} {how}, {MOST_TRIES} times",
+                where="--workers",
+                hint="fewer workers need less memory; --workers 1 needs no second process",
+            ) from error
+        self.prepare(source)
 
     def close(self) -> None:
         """End all of them, whatever they are doing."""
-        while self._running:
-            self._running.pop().end()
-
-    def _replace(self, process: _Process, waiting: _Waiting) -> None:
-        """A new worker for one that died; what it was asked waits for the next that is free."""
-        self._running.remove(process)
-        how = process.died_of()
-        for job in process.jobs:
-            if job.number is None:
-                continue
-            job.tries += 1
-            if job.tries == MOST_TRIES:
-                raise NumericalError(
-                    f"the worker of held-out scene {job.number} {how}, {MOST_TRIES} times",
-                    where="--workers",
-                    hint="fewer workers need less memory; --workers 1 needs no second process",
-                )
-            waiting.again(job)
-        self._running.append(_Process(self._events))
+        for process in self._running:
+            process.kill()
+        if self._executor is not None:
+            self._executor.shutdown(wait=True, cancel_futures=True)
+        self._running, self._executor = [], None
 
 
-class _Waiting:
-    """Questions that no worker has: those that a lost one leaves, then the next ones, made when they are needed."""
+def _begin(source: SceneSource) -> None:
+    """Begin a worker: its output is for people, it ends with the process that asks, and its scenes are there."""
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    # what goes wrong here does so again, and is told, where a scene is asked about
+    with contextlib.suppress(Exception):
+        make_scenes(source)
 
-    def __init__(self, questions: Iterable[bytes]) -> None:
-        self._rest = enumerate(questions)
-        self._ready: deque[_Job] = deque()
 
-    def take(self) -> _Job | None:
-        """The next one, or None where there is none left."""
-        self.prefetch()
-        return self._ready.popleft() if self._ready else None
+def _end_with_parent() -> None:
+    """End at once where the process that asks has gone, in the middle of a scene too."""
+    multiprocessing.parent_process().join()
+    os._exit(EXIT_ALONE)
 
-    def prefetch(self) -> None:
-        """Have the next one ready before somebody is free to take it."""
-        if not self._ready and (following := next(self._rest, None)):
-            self._ready.append(_Job(*following))
 
-    def again(self, job: _Job) -> None:
-        """Take one back."""
-        self._ready.appendleft(job)
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """What is started in here never sees a terminal's Ctrl-C, and does not run the user's script again."""
+    script = sys.modules["__main__"]
+    sys.modules["__main__"] = types.ModuleType("__main__")
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        sys.modules["__main__"] = script

@@ -1,4 +1,4 @@
-"""What float32 costs learning: in the gradients of its steps, and what it would cost densities, always float64."""
+"""What the gradients of learning lose by float32, and by a few scenes and frames that stand for all."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from lidardesign.density.training.snapshot_quality import (
     Drawn,
     Loss,
     Steps,
+    beside_noise,
     each_beside_noise,
     gradient,
     in_arithmetic,
     load_flow,
 )
-from lidardesign.evaluate.accuracy.probes import draw_probes, run_target
-from lidardesign.evaluate.accuracy.settings import Ladder, Rung, timed
-from lidardesign.evaluate.accuracy.sweeps import AccuracyRequest
+from lidardesign.evaluate.accuracy.probes import AccuracyRequest, draw_probes, run_target
+from lidardesign.evaluate.accuracy.settings import Measurement, Sweep, timed
+from lidardesign.task import random_generator
 
-LABEL = "arithmetic"
 # Errors of a tenth of the noise add a hundredth to its variance.
-TOLERANCE = 0.1
-BECAUSE = "it adds a hundredth to the variance that gradients have anyway"
-BATCHES = 10
+DTYPE_TOLERANCE = 0.1
+DTYPE_BECAUSE = "it adds a hundredth to the variance that gradients have anyway"
+DTYPE_BATCHES = 10
 POOL = 8192
 SAMPLES = 16_384
 # Of a normal sample: standard deviation over median deviation, and the median's standard error over the mean's.
@@ -38,10 +38,10 @@ MEDIAN_DEVIATION, MEDIAN_ERROR = 1.4826, 1.2533
 _STEPS: WeakKeyDictionary[AccuracyRequest, Steps | None] = WeakKeyDictionary()
 
 
-def ladders(request: AccuracyRequest) -> Sequence[Ladder]:
-    """One ladder; empty where no ray meets a target."""
+def dtype_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
+    """One sweep; empty where no ray meets a target."""
     steps = run_steps(request)
-    return [] if steps is None else [steps_ladder(steps, request.config.seed)]
+    return [] if steps is None else [dtype_sweep(steps, request.config.seed)]
 
 
 def run_steps(request: AccuracyRequest) -> Steps | None:
@@ -62,7 +62,7 @@ def _steps(request: AccuracyRequest) -> Steps | None:
     return Steps(flow, target, config.learning, pool)
 
 
-def steps_ladder(steps: Steps, seed: int) -> Ladder:
+def dtype_sweep(steps: Steps, seed: int) -> Sweep:
     """The error of a step's gradient in float32, the larger of both kinds of steps.
 
     The target is the same in any arithmetic, so only the flow's part of a step is timed.
@@ -70,39 +70,42 @@ def steps_ladder(steps: Steps, seed: int) -> Ladder:
     kinds = {"pathwise": steps.pathwise(), "balancing": steps.balancing()}
     exact = {name: _gradients("float64", steps, loss, seed) for name, loss in kinds.items()}
     drawn = Drawn.of(steps.flow, SAMPLES, seed)
-    return Ladder(
+    return Sweep(
         knob="learning.dtype",
         error_of="error of a step's gradient beside the noise of its batch, median over batches",
         unit="",
         against="float64",
-        tolerance=TOLERANCE,
-        because=BECAUSE,
+        tolerance=DTYPE_TOLERANCE,
+        because=DTYPE_BECAUSE,
         work=f"the flow's part of a path-wise and a balancing step of {steps.settings.batch} design points",
-        rungs=[_rung(dtype, steps, kinds, exact, drawn, seed) for dtype in DTYPES],
+        measurements=[_dtype_measure(dtype, steps, kinds, exact, drawn, seed) for dtype in DTYPES],
         note=f"densities are always float64; their figures are those of {SAMPLES} samples in either",
     )
 
 
 def _gradients(dtype: str, steps: Steps, loss: Loss, seed: int) -> list[np.ndarray]:
     flow = in_arithmetic(steps.flow, dtype)
-    return [gradient(flow, loss, number, steps.settings.clip_norm) for number in range(seed, seed + BATCHES)]
+    return [gradient(flow, loss, number, steps.settings.clip_norm) for number in range(seed, seed + DTYPE_BATCHES)]
 
 
-def _rung(
+def _dtype_measure(
     dtype: str, steps: Steps, kinds: dict[str, Loss], exact: dict[str, list[np.ndarray]], drawn: Drawn, seed: int
-) -> Rung:
+) -> Measurement:
     flow, alone = in_arithmetic(steps.flow, dtype), steps.without_target()
     both, clip_norm = (alone.pathwise(), alone.balancing()), steps.settings.clip_norm
     _, seconds, memory = timed(lambda: [gradient(flow, loss, seed, clip_norm) for loss in both])
     default, values = dtype == steps.settings.dtype, _densities(dtype, steps, drawn)
     if dtype == "float64":
-        return Rung(dtype, 0.0, 0.0, seconds, memory, default, reference=True, values=values)
+        return Measurement(dtype, 0.0, 0.0, seconds, memory, default, reference=True, values=values)
     found = {name: each_beside_noise(_gradients(dtype, steps, loss, seed), exact[name]) for name, loss in kinds.items()}
     for name, shares in found.items():
         # a leaked sample near a silhouette has a gradient without bounds, which any rounding may turn over
-        values |= {f"{name}_error": float(np.median(shares)), f"{name}_beyond": float((shares > TOLERANCE).mean())}
+        values |= {
+            f"{name}_error": float(np.median(shares)),
+            f"{name}_beyond": float((shares > DTYPE_TOLERANCE).mean()),
+        }
     error, uncertainty = max(_median(shares) for shares in found.values())
-    return Rung(dtype, error, uncertainty, seconds, memory, default, values=values)
+    return Measurement(dtype, error, uncertainty, seconds, memory, default, values=values)
 
 
 def _median(values: np.ndarray) -> tuple[float, float]:
@@ -124,3 +127,65 @@ def _densities(dtype: str, steps: Steps, drawn: Drawn) -> dict[str, float]:
         "densities_round_trip_nats": drawn.round_trip_nats(flow),
         "densities_seconds": seconds,
     }
+
+
+# The error of few scenes is noise like that of few design points; half as much adds a quarter to its variance.
+FRAMES_TOLERANCE = 0.5
+FRAMES_BECAUSE = "it adds a quarter to the variance that gradients have anyway, as a batch a fifth smaller would"
+POWERS = (4, 16, 64, 256)
+# Batches, and how often scenes are drawn for each. Few batches have most of the error, so many are better than draws.
+FRAMES_BATCHES, DRAWS = 32, 1
+
+
+def frames_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
+    """One sweep; empty for a few scenes, or where no ray meets a target."""
+    steps = run_steps(request)
+    if steps is None or steps.target.columns <= POWERS[0]:
+        return []
+    return [frames_sweep(steps, request.config.seed)]
+
+
+def frames_sweep(steps: Steps, seed: int) -> Sweep:
+    """The error of a path-wise step's gradient when a few scenes and frames, drawn anew each time, stand for all."""
+    steps_flow = in_arithmetic(steps.flow, steps.settings.dtype)
+    seeds = range(seed, seed + FRAMES_BATCHES)
+    exact = [gradient(steps_flow, steps.pathwise(), number, steps.settings.clip_norm) for number in seeds]
+    default = min(steps.settings.frames, steps.target.columns)
+    measurements = [
+        _frames_measure(count, steps, exact, seeds, default) for count in counts(steps.target.columns, default)
+    ]
+    return Sweep(
+        knob="learning.frames",
+        error_of="error of a step's gradient beside the noise of its batch",
+        unit="",
+        against="all scenes and frames",
+        tolerance=FRAMES_TOLERANCE,
+        because=FRAMES_BECAUSE,
+        work=f"the gradient of a path-wise step of {steps.settings.batch} design points",
+        measurements=measurements,
+        note=f"at sigma {steps.sigma_m:.3g} m, the middle of the annealing",
+    )
+
+
+def counts(columns: int, default: int) -> list[int]:
+    """How many scenes and frames are tried: powers of four up to all of them, and the run's own number."""
+    return sorted({*(count for count in POWERS if count < columns), default, columns})
+
+
+def _frames_measure(
+    count: int, steps: Steps, exact: list[np.ndarray], seeds: Sequence[int], default: int
+) -> Measurement:
+    columns, flow = steps.target.columns, in_arithmetic(steps.flow, steps.settings.dtype)
+    generator = random_generator(seeds[0], "scenes", count)
+
+    def drawn(number: int) -> np.ndarray:
+        chosen = np.sort(generator.permutation(columns)[:count])
+        target = steps.target if count == columns else steps.target.drawn(chosen)
+        return gradient(flow, steps.pathwise(target), number, steps.settings.clip_norm)
+
+    _, seconds, memory = timed(lambda: drawn(seeds[0]))
+    if count == columns:
+        return Measurement(str(count), 0.0, 0.0, seconds, memory, default == count, reference=True)
+    found = [np.stack([drawn(number) for _ in range(DRAWS)]) for number in seeds]
+    error, uncertainty = beside_noise(found, exact)
+    return Measurement(str(count), error, uncertainty, seconds, memory, default == count)
