@@ -18,6 +18,13 @@ Seed = Annotated[
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no notes.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
 
+DryRun = Annotated[
+    bool,
+    typer.Option(
+        "--dry-run",
+        help="Check everything that can be checked at once, say what would be done, read and written, and do nothing.",
+    ),
+]
 Name = Annotated[str, typer.Option("--name", metavar="NAME", help="Name of the design: RUN/designs/NAME.yaml.")]
 Layout = Annotated[
     str | None,

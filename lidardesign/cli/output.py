@@ -20,11 +20,13 @@ from lidardesign.cli.environment import TerminatedError
 from lidardesign.cli.tables.times import show_times
 from lidardesign.errors import ConfigError, DataError, LidardesignError
 from lidardesign.run.clock import Clock, keep_timings, peak_memory_bytes, running
-from lidardesign.run.files import offered_input
+from lidardesign.run.files import STDIO, offered_input
 
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
     from rich.progress import Progress
+
+    from lidardesign.workflow.plans import RequestPlan
 
 SCHEMA_VERSION = 1
 EXIT_SYSTEM = 3
@@ -33,6 +35,7 @@ EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
 EXIT_TERMINATED = 143
 PLAIN_WIDTH = 120
+BYTES_PER_MEGABYTE = 1e6
 NUMBA_CACHE = "numba/core/caching.py"
 NO_MEMORY = "can't allocate memory"
 DISK_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
@@ -280,3 +283,33 @@ def keep_times(run: Path, name: str, output: Output, *, wait_s: float = SHORT_WA
     except (ConfigError, DataError, OSError) as error:
         message = error.message if isinstance(error, ConfigError | DataError) else error.strerror or error
         output.note(f"note: the times of {name} are not kept in {run}: {message}")
+
+
+def show_plan(plan: RequestPlan, output: Output) -> None:
+    """Give what `--dry-run` says as the result of a command: what it would do, read and write.
+
+    Raises:
+        DataError: What would be written could not be.
+    """
+    plan.check_writable()
+    document = plan.as_dict()
+    lines = [f"{document['command']} would", *(f"  {step}" for step in document["steps"])]
+    for entry in document["reads"]:
+        size = entry["bytes"]
+        large = size is not None and size >= BYTES_PER_MEGABYTE
+        text = "" if size is None else f" ({size / BYTES_PER_MEGABYTE:.1f} MB)" if large else f" ({size:,} bytes)"
+        lines.append(f"read   {'standard input' if entry['path'] == STDIO else entry['path']}{text}")
+    for entry in document["writes"]:
+        replaces = " (replaced)" if entry["replaces"] else ""
+        lines.append(f"write  {'standard output' if entry['path'] == STDIO else entry['path']}{replaces}")
+    if not document["writes"]:
+        lines.append("write  nothing")
+    if document["before"]:
+        lines.append(f"time   {document['before']['of']} took {document['before']['seconds']:.1f} s")
+    lines.append("nothing was done: leave out --dry-run to do it")
+
+    def show(rich: RichConsole) -> None:
+        for line in lines:
+            rich.print(line, soft_wrap=True, markup=False)
+
+    output.result(document, show, show_costs=False)

@@ -9,8 +9,7 @@ import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.commands.fit import run_fit
-from lidardesign.cli.dry_run import DryRun, show_plan
-from lidardesign.cli.output import command
+from lidardesign.cli.output import command, show_plan
 from lidardesign.run.clock import phase
 
 Target = Annotated[
@@ -40,7 +39,7 @@ def constrain(
     refine: options.Refine = None,
     like: options.Like = None,
     name: options.Name = "constrained",
-    dry_run: DryRun = False,
+    dry_run: options.DryRun = False,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,

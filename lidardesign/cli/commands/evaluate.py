@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.dry_run import DryRun, show_plan
-from lidardesign.cli.output import Output, command, keep_times
+from lidardesign.cli.output import Output, command, keep_times, show_plan
 from lidardesign.cli.streams import claim_outputs, is_output, written_file
 from lidardesign.cli.tables.designs import number
 from lidardesign.cli.tables.scores import show_evaluation
@@ -171,7 +170,7 @@ def evaluate(
     fail_above: FailAbove = None,
     workers: Workers = "1",
     accuracy: WithAccuracy = False,
-    dry_run: DryRun = False,
+    dry_run: options.DryRun = False,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,

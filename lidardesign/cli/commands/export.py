@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.dry_run import DryRun, show_plan
-from lidardesign.cli.output import Output, command, keep_times
+from lidardesign.cli.output import Output, command, keep_times, show_plan
 from lidardesign.cli.streams import claim_stdout, note_new_folders, written_file
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
@@ -48,7 +47,7 @@ def export(
         ),
     ] = None,
     list_formats: Annotated[bool, typer.Option("--list", help="List the formats.")] = False,
-    dry_run: DryRun = False,
+    dry_run: options.DryRun = False,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,

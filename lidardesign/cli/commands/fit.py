@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.dry_run import DryRun, show_plan
-from lidardesign.cli.output import Output, command, keep_times
+from lidardesign.cli.output import Output, command, keep_times, show_plan
 from lidardesign.cli.tables.designs import number, show_fit
 from lidardesign.run.clock import WAIT_S, phase
 
@@ -33,7 +32,7 @@ def fit(
     refine: options.Refine = None,
     like: options.Like = None,
     name: options.Name = "fit",
-    dry_run: DryRun = False,
+    dry_run: options.DryRun = False,
     seed: options.Seed = None,
     json: options.Json = False,
     quiet: options.Quiet = False,

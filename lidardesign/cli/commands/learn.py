@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.dry_run import DryRun, show_plan
-from lidardesign.cli.output import Output, command, keep_times
+from lidardesign.cli.output import Output, command, keep_times, show_plan
 from lidardesign.run.clock import WAIT_S, phase
 
 if TYPE_CHECKING:
@@ -63,7 +62,7 @@ def learn(
     ] = False,
     tolerance: Tolerance = None,
     time_budget: TimeBudget = None,
-    dry_run: DryRun = False,
+    dry_run: options.DryRun = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
     debug: options.Debug = False,

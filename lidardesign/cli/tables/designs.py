@@ -1,35 +1,24 @@
-"""Writing and showing the designs that `fit` and `constrain` make.
-
-The table that `constrain --set snap=catalog` prints: what every sensor became, and what it lost.
-"""
+"""What `show`, `fit` and `constrain` print of designs: sensors, tracks, constraints, and parts that sensors became."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     import numpy as np
     from rich.console import Console as RichConsole
+    from rich.table import Table
 
     from lidardesign.design.constraints.check import ConstraintCheck
     from lidardesign.design.sensor import DesignSpec, Sensor, Track
 
-
-MAX_SHOWN = 20
+MOST_ROWS = 20
 ERROR_DIGITS = 2
 # Relative errors below what `number` shows of a figure are left out.
 SMALLEST_ERROR = 1e-4
 SPACE_MARK = ".space."
-ORIGIN = "origin [m]"
-SENSOR_COLUMNS = (
-    "sensor", "weight", "rays", ORIGIN, "azimuth\n[deg]", "elevation\n[deg]", "field of view\n[deg]", "gate [m]",
-)  # fmt: skip
-
-TRACK_COLUMNS = ("ray", "azimuth\n[deg]", "elevation\n[deg]", "gate start\n[m]", "gate end\n[m]", "gate width\n[m]")
 
 
 def number(value: Any, digits: int = 4) -> str:
@@ -55,10 +44,9 @@ def with_error(estimate: dict[str, Any]) -> str:
 def show_design(design: DesignSpec, rich: RichConsole) -> None:
     """Print a design's sensors as a table, with angles in degrees; a place that all share stands above it."""
     from rich.markup import escape
-    from rich.table import Table
 
     if design.track is not None:
-        show_track(design, design.track, rich)
+        _show_track(design, design.track, rich)
         return
     rays = f"{design.rays} rays per frame" if design.rays else "rays per frame left open"
     sensors = "1 sensor" if len(design.sensors) == 1 else f"{len(design.sensors)} sensors"
@@ -69,51 +57,69 @@ def show_design(design: DesignSpec, rich: RichConsole) -> None:
     together = len(set(places)) == 1
     if together:
         title += f"\nall at {places[0]} m"
-    table = Table(title=title, title_justify="left")
-    for heading in SENSOR_COLUMNS:
-        if heading != ORIGIN or not together:
-            justify = "left" if heading == SENSOR_COLUMNS[0] else "right"
-            table.add_column(escape(heading), justify=justify, overflow="fold")
-    for sensor, place in list(zip(design.sensors, places, strict=True))[:MAX_SHOWN]:
-        cells = _cells(sensor)
-        table.add_row(*(cells if together else [*cells[:3], place, *cells[3:]]))
+    origin = () if together else ("origin [m]",)
+    angles = ("azimuth\n[deg]", "elevation\n[deg]", "field of view\n[deg]")
+    table = _table(title, ("sensor",), ("weight", "rays", *origin, *angles, "gate [m]"))
+    for sensor, place in list(zip(design.sensors, places, strict=True))[:MOST_ROWS]:
+        horizontal, vertical = sensor.field_of_view_rad
+        start, end = sensor.gate_m
+        table.add_row(
+            escape(sensor.name),
+            f"{sensor.weight:.3f}",
+            number(sensor.rays),
+            *(() if together else (place,)),
+            f"{math.degrees(sensor.azimuth_rad):.2f}",
+            f"{math.degrees(sensor.elevation_rad):.2f}",
+            f"{math.degrees(horizontal):.2f} x {math.degrees(vertical):.2f}",
+            f"{start:.3f} - {end:.3f}",
+        )
     rich.print(table)
-    if len(design.sensors) > MAX_SHOWN:
-        rich.print(f"... and {len(design.sensors) - MAX_SHOWN} more sensors; --json lists all")
+    if len(design.sensors) > MOST_ROWS:
+        rich.print(f"... and {len(design.sensors) - MOST_ROWS} more sensors; --json lists all")
 
 
-def show_track(design: DesignSpec, track: Track, rich: RichConsole) -> None:
+def _table(title: str, texts: Sequence[str], figures: Sequence[str]) -> Table:
+    """A table whose cells wrap: columns of text on the left, figures to their right."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    for heading in texts:
+        table.add_column(escape(heading), justify="left", overflow="fold")
+    for heading in figures:
+        table.add_column(escape(heading), justify="right", overflow="fold")
+    return table
+
+
+def _show_track(design: DesignSpec, track: Track, rich: RichConsole) -> None:
     """Print the rays of a track as a table: from where to where each looks and listens over its travel."""
     from numpy import degrees
     from rich.markup import escape
-    from rich.table import Table
 
     from lidardesign.design.layouts.track import travels
 
     first, last = travels(track)
     title = f"{escape(design.name)}: {len(track.sensor)} rays at every {track.dimension} from {first:g} to {last:g}"
     title += f" (travel {last - first:g} m, {len(track.knots)} knots)\nsensors in the middle of their travel"
-    table = Table(title=title + f", at {_place(design.sensors[0])} m", title_justify="left")
-    for heading in TRACK_COLUMNS:
-        justify = "left" if heading == TRACK_COLUMNS[0] else "right"
-        table.add_column(escape(heading), justify=justify, overflow="fold")
-    for ray, sensor in list(enumerate(track.sensor))[:MAX_SHOWN]:
+    headings = ("azimuth\n[deg]", "elevation\n[deg]", "gate start\n[m]", "gate end\n[m]", "gate width\n[m]")
+    table = _table(title + f", at {_place(design.sensors[0])} m", ("ray",), headings)
+    for ray, sensor in list(enumerate(track.sensor))[:MOST_ROWS]:
         gate = track.gate_m[:, ray]
         table.add_row(
             escape(design.sensors[sensor].name),
-            _reach(degrees(track.azimuth_rad[:, ray]), 2),
-            _reach(degrees(track.elevation_rad[:, ray]), 2),
-            _reach(gate[:, 0], 3),
-            _reach(gate[:, 1], 3),
-            _reach(gate[:, 1] - gate[:, 0], 3),
+            _span(degrees(track.azimuth_rad[:, ray]), 2),
+            _span(degrees(track.elevation_rad[:, ray]), 2),
+            _span(gate[:, 0], 3),
+            _span(gate[:, 1], 3),
+            _span(gate[:, 1] - gate[:, 0], 3),
         )
     rich.print(table)
-    if len(track.sensor) > MAX_SHOWN:
-        rich.print(f"... and {len(track.sensor) - MAX_SHOWN} more rays; --json lists all")
+    if len(track.sensor) > MOST_ROWS:
+        rich.print(f"... and {len(track.sensor) - MOST_ROWS} more rays; --json lists all")
     rich.print(f"--at {track.dimension}=VALUE shows the rays at one place")
 
 
-def _reach(values: np.ndarray, decimals: int) -> str:
+def _span(values: np.ndarray, decimals: int) -> str:
     """The smallest and the largest value; one where they look the same."""
     low, high = (f"{round(float(v), decimals) + 0.0:.{decimals}f}" for v in (values.min(), values.max()))
     return low if low == high else f"{low} .. {high}"
@@ -126,23 +132,6 @@ def _place(sensor: Sensor) -> str:
     return f"{place}, travel {travel:.3f}" if travel > 0 else place
 
 
-def _cells(sensor: Sensor) -> list[str]:
-    """What a sensor's row shows, but for its place."""
-    from rich.markup import escape
-
-    horizontal, vertical = sensor.field_of_view_rad
-    start, end = sensor.gate_m
-    return [
-        escape(sensor.name),
-        f"{sensor.weight:.3f}",
-        number(sensor.rays),
-        f"{math.degrees(sensor.azimuth_rad):.2f}",
-        f"{math.degrees(sensor.elevation_rad):.2f}",
-        f"{math.degrees(horizontal):.2f} x {math.degrees(vertical):.2f}",
-        f"{start:.3f} - {end:.3f}",
-    ]
-
-
 def show_constraints(checks: Sequence[ConstraintCheck], rich: RichConsole) -> None:
     """Print a table of constraints: bound, value and whether it holds.
 
@@ -151,8 +140,6 @@ def show_constraints(checks: Sequence[ConstraintCheck], rich: RichConsole) -> No
     from rich.markup import escape
     from rich.table import Column, Table
 
-    if not checks:
-        return
     from lidardesign.design.constraints.slack import is_tight
 
     # names are needed whole, to loosen what they name
@@ -188,8 +175,7 @@ def show_fit(document: dict[str, Any], design: DesignSpec, checks: Sequence[Any]
 
     show_design(design, rich)
     if "snap" in document:
-
-        show_snap(document["snap"], rich)
+        _show_snap(document["snap"], rich)
     show_constraints(checks, rich)
     figures = {"log-likelihood": "log_likelihood", "ESS": "ess", "admissible mass": "admissible_mass"}
     estimates = document["error_estimates"]
@@ -201,44 +187,30 @@ def show_fit(document: dict[str, Any], design: DesignSpec, checks: Sequence[Any]
     rich.print(f"design: {escape(str(document['design']))}", soft_wrap=True)
 
 
-COLUMNS = ("sensor", "part", "loss\n[nats]", "field of view\n[deg]", "gate\n[m]", "rays", "Mbit/s")
-
-
-def show_snap(snap: Mapping[str, Any], rich: RichConsole) -> None:
+def _show_snap(snap: Mapping[str, Any], rich: RichConsole) -> None:
     """Print which part every sensor became; of each figure what was fitted, then what the part has."""
     from rich.markup import escape
-    from rich.table import Table
 
-    table = Table(title="sensors as parts of the catalogue: fitted > part", title_justify="left")
-    for heading in COLUMNS:
-        justify = "left" if heading in COLUMNS[:2] else "right"
-        table.add_column(escape(heading), justify=justify, overflow="fold")
+    headings = ("loss\n[nats]", "field of view\n[deg]", "gate\n[m]", "rays", "Mbit/s")
+    table = _table("sensors as parts of the catalogue: fitted > part", ("sensor", "part"), headings)
+
+    def both(figures: Mapping[str, Any], text: Callable[[Any], str]) -> str:
+        fitted, part = text(figures["fitted"]), text(figures["part"])
+        return fitted if fitted == part else f"{fitted} > {part}"
+
     for row in snap["sensors"]:
         name = "stays a sensor" if row["part"] is None else row["part"] + (", turned" if row["turned"] else "")
         table.add_row(
             escape(row["sensor"]),
             escape(name),
             f"{row['loss_nats']:.3f}",
-            _both(row["field_of_view_rad"], _field),
-            _both(row["gate_m"], _gate),
-            _both(row["rays"], str),
-            _both(row["bandwidth_mbps"], number),
+            both(row["field_of_view_rad"], lambda angles: " x ".join(f"{math.degrees(a):.1f}" for a in angles)),
+            both(row["gate_m"], lambda gate: " - ".join(f"{end:.2f}" for end in gate)),
+            both(row["rays"], str),
+            both(row["bandwidth_mbps"], number),
         )
     rich.print(table)
     fitted, parts = (snap["log_likelihood"][key] for key in ("fitted", "parts"))
     rich.print(
         f"log-likelihood as fitted {number(fitted)}, as parts {number(parts)} nats; losses are of one sensor alone"
     )
-
-
-def _both(figures: Mapping[str, Any], text: Any) -> str:
-    fitted, part = text(figures["fitted"]), text(figures["part"])
-    return fitted if fitted == part else f"{fitted} > {part}"
-
-
-def _field(angles_rad: list[float]) -> str:
-    return " x ".join(f"{math.degrees(angle):.1f}" for angle in angles_rad)
-
-
-def _gate(gate_m: list[float]) -> str:
-    return " - ".join(f"{end:.2f}" for end in gate_m)
