@@ -18,7 +18,6 @@ from lidardesign.design.mixture.em import run_em, seed_mixture
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.m_step import fit_gate
 from lidardesign.design.mixture.origin_step import (
-    IntervalBoxes,
     OriginLimits,
     best_origins,
     improved,
@@ -164,7 +163,7 @@ def box_of(free_low, free_high, low=-4.0, high=4.0, most=np.inf):
     count = len(free_low)
     low, high = np.maximum(free_low, low), np.minimum(free_high, high)
     variances = (np.full(count, value) for value in (1e-12, most, np.inf))
-    return IntervalBoxes(low, high, free_low, free_high, Z, *variances)
+    return OriginLimits(low, high, free_low, free_high, Z, *variances)
 
 
 def assert_inside(point, covariance, box):

@@ -35,7 +35,7 @@ def show(
         with phase("libraries"):
             from lidardesign.design.compare import outside_notes, readout_of
             from lidardesign.design.constraints.check import check_design
-            from lidardesign.design.constraints.slack import is_tight, room_left
+            from lidardesign.design.constraints.slack import room_of
             from lidardesign.design.files import design_document, track_document
             from lidardesign.design.layouts.track import placed
             from lidardesign.workflow.run_folder import RunFolder, reach_of, read_design, run_of
@@ -56,6 +56,7 @@ def show(
             output.remark(line)
         specification = placed(specification, condition) if condition else specification
         readout = readout_of(specification)
+        rooms = [room_of(check) for check in checks]
         document = {
             "design": str(design),
             "name": specification.name,
@@ -66,7 +67,10 @@ def show(
             "sensors": [sensor.as_dict() for sensor in specification.sensors],
             "track": track_document(specification.track) if specification.track is not None else None,
             "constraints": specification.constraints,
-            "checks": [{**check.as_dict(), "room": room_left(check), "tight": is_tight(check)} for check in checks],
+            "checks": [
+                {**check.as_dict(), "room": left.room, "tight": left.is_tight}
+                for check, left in zip(checks, rooms, strict=True)
+            ],
             "bandwidth": readout.as_dict(),
             "provenance": specification.provenance,
         }

@@ -140,7 +140,7 @@ def show_constraints(checks: Sequence[ConstraintCheck], rich: RichConsole) -> No
     from rich.markup import escape
     from rich.table import Column, Table
 
-    from lidardesign.design.constraints.slack import is_tight
+    from lidardesign.design.constraints.slack import room_of
 
     # names are needed whole, to loosen what they name
     name = Column("constraint", overflow="fold")
@@ -149,7 +149,7 @@ def show_constraints(checks: Sequence[ConstraintCheck], rich: RichConsole) -> No
         if SPACE_MARK in check.name and check.satisfied:
             continue
         holds = "yes" if check.satisfied else "[bold]no[/bold]"
-        holds += ", tight" if check.satisfied and is_tight(check) else ""
+        holds += ", tight" if check.satisfied and room_of(check).is_tight else ""
         bound, value = (escape(number(figure, 6)) for figure in (check.bound, check.value))
         table.add_row(escape(check.name), bound, value, _left(check), holds)
     if table.row_count:
@@ -158,9 +158,9 @@ def show_constraints(checks: Sequence[ConstraintCheck], rich: RichConsole) -> No
 
 def _left(check: ConstraintCheck) -> str:
     """How far a value is inside its bound, with the share of the bound that this is."""
-    from lidardesign.design.constraints.slack import room_left, share_left
+    from lidardesign.design.constraints.slack import room_of
 
-    room, share = room_left(check), share_left(check)
+    room, share = room_of(check)
     if room is None or room < 0:
         return "-"
     # what is left below the rounding of the checks themselves is nothing

@@ -1,4 +1,4 @@
-"""Where a sensor's origin may be: its box, minus the boxes that constraints exclude.
+"""Where sensors may stand: origin boxes less excluded boxes, mounts, and the places that a design space fixes.
 
 What is left is not convex, so it is described by its maximal boxes: a box avoids the interiors of all excluded boxes
 just where it lies in one of the maximal boxes between them. So an interval of origins, which is a box of its own, is
@@ -9,10 +9,6 @@ it would otherwise balance on an edge of the origin box, half of it outside, to 
 the mean alone keeps to the origin box, and its interval, which may be longer, has the excluded boxes beyond to avoid.
 Along axes on which the origin box is thin there is no freedom: an excluded box that does not hold the coordinate there
 is not in the way.
-
-Mounting points in a constraint file: which sensors have them, and whether there are enough for all.
-
-Where sensors are asked to stand and where a design space lets them: two numbers for one place are one.
 """
 
 from __future__ import annotations
@@ -31,6 +27,11 @@ from lidardesign.space import DIMENSIONS, DesignSpace
 PINNED_BOX_M = SLACK
 # Gaps between excluded boxes narrower than this, in metres and relative to coordinates, leave no place.
 SMALLEST_GAP = HALF_DIGITS
+# An origin that is pinned no further than this from where the space fixes it is meant to be there [m]: tables, robot
+# models and drawings say places to the millimetre, and no sensor is mounted more exactly.
+SAME_PLACE_M = 1e-3
+
+Mount = tuple[float, float, float]
 
 
 class Boxes(NamedTuple):
@@ -111,20 +112,16 @@ def _without(
     if not lows:
         return Boxes(old[:, :3], -old[:, 3:])
     fresh = np.concatenate([np.concatenate(lows), -np.concatenate(highs)], axis=1)
-    fresh = fresh[_roomy(Boxes(fresh[:, :3], -fresh[:, 3:]), low, high, axes)]
+    # those that leave next to no room inside [low, high] along some axis are none
+    size = np.maximum(np.maximum(np.abs(low), np.abs(high)), 1.0)
+    needed = np.minimum(SMALLEST_GAP * size, (high - low) / 2)
+    room = np.minimum(-fresh[:, 3:], high) - np.maximum(fresh[:, :3], low)
+    fresh = fresh[(room > needed)[:, axes].all(axis=1)]
     # no old box lies in a fresh one, which is part of another old box
     fresh = np.unique(fresh, axis=0)
     holds = (np.concatenate([old, fresh])[None] <= fresh[:, None]).all(axis=2)
     corners = np.concatenate([old, fresh[holds.sum(axis=1) == 1]])
     return Boxes(corners[:, :3], -corners[:, 3:])
-
-
-def _roomy(boxes: Boxes, low: np.ndarray, high: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Which boxes leave room inside [low, high] along some axes, shape (M,) bool."""
-    size = np.maximum(np.maximum(np.abs(low), np.abs(high)), 1.0)
-    needed = np.minimum(SMALLEST_GAP * size, (high - low) / 2)
-    room = np.minimum(boxes.high_m, high) - np.maximum(boxes.low_m, low)
-    return (room > needed)[:, axes].all(axis=1)
 
 
 def box_around(mean_m: np.ndarray, reach_m: np.ndarray, boxes: Boxes) -> tuple[np.ndarray, np.ndarray]:
@@ -139,9 +136,6 @@ def nearest_in_boxes(origins_m: np.ndarray, low: np.ndarray, high: np.ndarray) -
     clipped = np.clip(origins_m[:, None], low, high)
     away = np.square(clipped - origins_m[:, None]).sum(axis=2)
     return np.take_along_axis(clipped, away.argmin(axis=1)[:, None, None], axis=1)[:, 0]
-
-
-Mount = tuple[float, float, float]
 
 
 def mounts_of(rules: SensorRules) -> list[Mount]:
@@ -211,20 +205,10 @@ def placement_notes(rules: Sequence[SensorRules]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(notes))
 
 
-# An origin that is pinned no further than this from where the space fixes it is meant to be there [m]: tables, robot
-# models and drawings say places to the millimetre, and no sensor is mounted more exactly.
-SAME_PLACE_M = 1e-3
-
-
-def fixed_axes(space: DesignSpace) -> list[int]:
-    """The axes of origins on which the design space leaves one place."""
-    return [axis for axis in range(3) if axis not in space.free]
-
-
 def snap_place_to_space(origin_m: Sequence[float], space: DesignSpace) -> list[float]:
     """An origin (3,) [m], with those coordinates of the space that it differs from by less than anyone mounts."""
     place = [float(value) for value in origin_m]
-    for axis in fixed_axes(space):
+    for axis in {0, 1, 2} - set(space.free):
         if abs(place[axis] - space.low[axis]) <= SAME_PLACE_M:
             place[axis] = float(space.low[axis])
     return place

@@ -7,7 +7,7 @@ anything of where sensors are, the rig says nothing of it. Where sensors look is
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -62,21 +62,14 @@ def rig_constraints(
     like = [_of_sensor(sensor, space) for sensor in rig.sensors]
     # entries beyond the rig's sensors stay: there are then too many, which is found where all contradictions are
     like += [{} for _ in each[len(like) :]]
-    own_places = [merged(shared, entry) for entry in each]
-    _check_places(rig, space, [_placed(one) for one in own_places], hint)
-    result["each"] = [_under(one, entry) for one, entry in zip(like, own_places, strict=True)]
+    wanted = [merged(shared, entry) for entry in each]
+    placed = [any(key in entry.get("origin", {}) for key in PLACES) for entry in wanted]
+    _check_places(rig, space, placed, hint)
+    for bounds, own_place in zip(like, placed, strict=True):
+        if own_place:
+            bounds.pop("origin", None)
+    result["each"] = [merged(bounds, entry) for bounds, entry in zip(like, wanted, strict=True)]
     return Constraints.from_mapping(result, where=f"--like {rig.name}")
-
-
-def _under(like: Mapping[str, Any], asked: Mapping[str, Any]) -> dict[str, Any]:
-    """A rig's bounds on a sensor below those that were asked for it."""
-    base = {key: value for key, value in like.items() if not (_placed(asked) and key == "origin")}
-    return merged(base, asked)
-
-
-def _placed(asked: Mapping[str, Any]) -> bool:
-    """Whether a user says where a sensor may be."""
-    return any(key in asked.get("origin", {}) for key in PLACES)
 
 
 def _check_places(rig: DesignSpec, space: DesignSpace, placed: Sequence[bool], hint: str | None) -> None:
@@ -97,7 +90,16 @@ def _check_places(rig: DesignSpec, space: DesignSpace, placed: Sequence[bool], h
 
 
 def _of_sensor(sensor: Sensor, space: DesignSpace) -> dict[str, Any]:
-    bounds: dict[str, Any] = {"origin": _place(sensor, space)}
+    """A sensor's place, a point or the box of its origins, open along conditions; its field of view and its gate."""
+    low, high = _box(sensor)
+    place = snap_place_to_space(sensor.origin_m, space)
+    moving = [axis for axis in range(3) if DIMENSIONS[axis] in space.condition]
+    bounds: dict[str, Any] = {"origin": {"fixed_m": place}}
+    if moving or (low != high).any():
+        low, high = np.minimum(low, place), np.maximum(high, place)
+        for axis in moving:
+            low[axis], high[axis] = space.low[axis], space.high[axis]
+        bounds["origin"] = {key: [float(v) for v in corner] for key, corner in (("low_m", low), ("high_m", high))}
     widths = dict(zip(("horizontal_deg", "vertical_deg"), map(math.degrees, sensor.field_of_view_rad), strict=True))
     if max(widths.values()) > SMALLEST_FIELD_DEG:
         narrow = {axis: {"max": max(width, SMALLEST_FIELD_DEG)} for axis, width in widths.items() if width < 360}
@@ -106,19 +108,6 @@ def _of_sensor(sensor: Sensor, space: DesignSpace) -> dict[str, Any]:
     if end - start > SLACK:
         bounds["gate"] = {"width_m": {"max": end - start}}
     return bounds
-
-
-def _place(sensor: Sensor, space: DesignSpace) -> dict[str, Any]:
-    """Where a sensor is: a point, or the box of its origins, open along conditions."""
-    low, high = _box(sensor)
-    place = snap_place_to_space(sensor.origin_m, space)
-    moving = [axis for axis in range(3) if DIMENSIONS[axis] in space.condition]
-    if not moving and (low == high).all():
-        return {"fixed_m": place}
-    low, high = np.minimum(low, place), np.maximum(high, place)
-    for axis in moving:
-        low[axis], high[axis] = space.low[axis], space.high[axis]
-    return {"low_m": [float(value) for value in low], "high_m": [float(value) for value in high]}
 
 
 def _box(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from lidardesign.design.constraints.check import ConstraintCheck
 
@@ -55,6 +55,23 @@ class ConstraintSlack:
         return "broken" if self.broken else "at the bound" if self.tight else "kept"
 
 
+class Room(NamedTuple):
+    """How far a value is inside its bound; both are None without a distance.
+
+    Arguments:
+        room: In the bound's unit; negative beyond the bound.
+        share: As a share of the bound, of an interval of its width; None of a bound of 0.
+    """
+
+    room: float | None
+    share: float | None
+
+    @property
+    def is_tight(self) -> bool:
+        """Whether next to nothing of the bound is left."""
+        return self.room is not None and (self.room <= 0 if self.share is None else self.share <= TIGHT_SHARE)
+
+
 def constraint_slack(checks: Iterable[ConstraintCheck], sensors: Sequence[str]) -> list[ConstraintSlack]:
     """How tight each bound is, in the order in which the checker comes to them.
 
@@ -62,62 +79,49 @@ def constraint_slack(checks: Iterable[ConstraintCheck], sensors: Sequence[str]) 
         checks: What the checker found on a design.
         sensors: The names of the design's sensors.
     """
-    groups: dict[tuple[str, str], list[tuple[str, ConstraintCheck]]] = {}
+    groups: dict[tuple[str, str], list[tuple[str, ConstraintCheck, Room]]] = {}
     # the longest name first: one sensor's name may begin with another's
     names = sorted(sensors, key=len, reverse=True)
     for check in checks:
         owner = next((name for name in names if check.name.startswith(f"{name}.")), "")
         key = check.name.removeprefix(f"{owner}.") if owner else check.name
-        groups.setdefault((key, repr(check.bound)), []).append((owner, check))
-    return [_told(key, group) for (key, _), group in groups.items()]
+        groups.setdefault((key, repr(check.bound)), []).append((owner, check, room_of(check)))
+    rows = []
+    for (key, _), group in groups.items():
+        # the first broken one that is furthest beyond, else the closest
+        order = [(check.satisfied, math.inf if room.room is None else room.room) for _, check, room in group]
+        owner, check, (room, share) = group[order.index(min(order))]
+        tight = sum(check.satisfied and room.is_tight for _, check, room in group)
+        broken = sum(not check.satisfied for _, check, _ in group)
+        rows.append(ConstraintSlack(key, check.bound, check.value, owner, room, share, len(group), tight, broken))
+    return rows
 
 
-def room_of(check: ConstraintCheck) -> tuple[float | None, float | None]:
-    """How far a value is inside its bound, in the bound's unit and as a share of it; None without a distance."""
+def room_of(check: ConstraintCheck) -> Room:
+    """How far the value of a check is inside its bound."""
     bound, value = _numbers(check.bound), _numbers(check.value)
+    # room and what it is a share of, at every end
+    ends: list[tuple[float, float]] = []
     if not bound or not value:
-        return None, None
+        return Room(None, None)
     if check.name.endswith(UPPER_ENDS) and len(bound) == len(value):
-        return _nearest([(limit - found, abs(limit)) for limit, found in zip(bound, value, strict=True)])
-    if check.name.endswith(LOWER_ENDS) and len(bound) == len(value):
-        return _nearest([(found - limit, abs(limit)) for limit, found in zip(bound, value, strict=True)])
-    if check.name.endswith(".boresight.azimuth_deg"):
-        return _on_circle(bound[0], bound[1], value[0])
-    if f".{SPACE_MARK}" in check.name and len(bound) == 2:
+        ends = [(limit - found, abs(limit)) for limit, found in zip(bound, value, strict=True)]
+    elif check.name.endswith(LOWER_ENDS) and len(bound) == len(value):
+        ends = [(found - limit, abs(limit)) for limit, found in zip(bound, value, strict=True)]
+    elif check.name.endswith(".boresight.azimuth_deg"):
         low, high = bound
-        return _nearest([(value[0] - low, high - low), (high - value[-1], high - low)])
-    return None, None
-
-
-def room_left(check: ConstraintCheck) -> float | None:
-    """How far the value is inside its bound, in the bound's unit; negative beyond it, None without a distance."""
-    return room_of(check)[0]
-
-
-def share_left(check: ConstraintCheck) -> float | None:
-    """The room left as a share of the bound; None without a bound of some size."""
-    return room_of(check)[1]
-
-
-def is_tight(check: ConstraintCheck) -> bool:
-    """Whether next to nothing of a bound is left."""
-    return _is_tight(*room_of(check))
-
-
-def _on_circle(low: float, high: float, value: float) -> tuple[float, float | None]:
-    """Room of an azimuth between two others [deg]."""
-    width = high - low if high - low >= FULL_TURN_DEG else (high - low) % FULL_TURN_DEG
-    past = (value - low) % FULL_TURN_DEG
-    inside = min(past, width - past)
-    # outside, the nearer end counts
-    room = inside if inside >= 0 else -min(past - width, FULL_TURN_DEG - past)
-    return room, room / width if width else None
-
-
-def _nearest(rooms: list[tuple[float, float]]) -> tuple[float, float | None]:
-    """The smallest room, and its share of the bound that it is to."""
-    room, scale = min(rooms)
-    return room, room / scale if scale else None
+        width = high - low if high - low >= FULL_TURN_DEG else (high - low) % FULL_TURN_DEG
+        past = (value[0] - low) % FULL_TURN_DEG
+        inside = min(past, width - past)
+        # outside, the nearer end counts
+        ends = [(inside if inside >= 0 else -min(past - width, FULL_TURN_DEG - past), width)]
+    elif f".{SPACE_MARK}" in check.name and len(bound) == 2:
+        low, high = bound
+        ends = [(value[0] - low, high - low), (high - value[-1], high - low)]
+    if not ends:
+        return Room(None, None)
+    room, scale = min(ends)
+    return Room(room, room / scale if scale else None)
 
 
 def _numbers(value: Any) -> list[float]:
@@ -125,22 +129,3 @@ def _numbers(value: Any) -> list[float]:
     values = value if isinstance(value, list | tuple) else [value]
     plain = all(isinstance(one, int | float) and not isinstance(one, bool) for one in values)
     return [float(one) for one in values] if plain and all(math.isfinite(one) for one in values) else []
-
-
-def _told(key: str, group: Sequence[tuple[str, ConstraintCheck]]) -> ConstraintSlack:
-    rooms = [room_of(check) for _, check in group]
-
-    def closeness(index: int) -> tuple[bool, float]:
-        room = rooms[index][0]
-        return group[index][1].satisfied, math.inf if room is None else room
-
-    first = min(range(len(group)), key=closeness)
-    owner, check = group[first]
-    room, share = rooms[first]
-    tight = [one for one, (_, kept) in zip(rooms, group, strict=True) if kept.satisfied and _is_tight(*one)]
-    broken = sum(not kept.satisfied for _, kept in group)
-    return ConstraintSlack(key, check.bound, check.value, owner, room, share, len(group), len(tight), broken)
-
-
-def _is_tight(room: float | None, share: float | None) -> bool:
-    return room is not None and (room <= 0 if share is None else share <= TIGHT_SHARE)

@@ -5,8 +5,6 @@ between them (see `origins`). Where the best parameters without this bound keep 
 component moves to the best place in one of a few of these boxes, or goes on from where it was, and keeps its old
 parameters where it cannot gain, so that the likelihood never falls.
 
-The best origin of a component whose interval lies in one given box.
-
 With S the scatter of a component's samples about their mean m, the best mean x and covariance C minimise
 $f = \log |C| + \mathrm{tr}(C^{-1} (S + (m - x)(m - x)^T))$ with x -+ z sigma in the box [L, H] along every axis. Two
 steps alternate, each exact, so that they end where nothing can be gained:
@@ -36,17 +34,24 @@ AXIS_ROUNDS = 1
 FORCE_ROUNDS = 6
 # What rounding may leave of a narrow box counts as this wide, so that its inverse has a finite square [m].
 SMALLEST_WIDTH_M = SQUARABLE
+# Alternations between mean and covariance; each is exact, three reach rounding where both bind.
+ALTERNATIONS = 3
+# So many boxes are tried for each component, those in which the axes lose least one by one; of so many that a rough
+# measure leaves.
+BOXES_TRIED = 2
+BOXES_SCORED = 8
 
 
-class IntervalBoxes(NamedTuple):
-    """Bounds on J origins along n free axes.
+class OriginLimits(NamedTuple):
+    """Bounds on N origins along n free axes.
 
     Arguments:
-        low, high: Box of the mean [m], shape (J, n).
-        free_low, free_high: Box of the interval [m], may be infinite, shape (J, n).
+        low, high: The box of the mean [m], shape (N, n).
+        free_low, free_high: Boxes one of which holds the interval [m], may be infinite, shape (N, M, n); of limits
+            `inside` given boxes the one that does, shape (N, n).
         interval: Standard deviations on each side of the mean.
-        least, most: Bounds on the variance along every direction [m^2], shape (J,).
-        thinnest: The largest admitted variance along the thinnest direction [m^2], shape (J,).
+        least, most: Bounds on the variance along every direction [m^2], shape (N,).
+        thinnest: The largest admitted variance along the thinnest direction [m^2], shape (N,).
     """
 
     low: np.ndarray
@@ -62,6 +67,19 @@ class IntervalBoxes(NamedTuple):
     def sides(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Both boxes' corners, that of the interval first."""
         return self.free_low, self.free_high, self.low, self.high
+
+    def take(self, rows: np.ndarray) -> OriginLimits:
+        """The limits of some origins."""
+        return OriginLimits(*(value if isinstance(value, float) else value[rows] for value in self))
+
+    def inside(self, boxes: np.ndarray) -> OriginLimits:
+        """One row per origin and box of `boxes` (N, B), origin by origin."""
+        rows = np.repeat(np.arange(len(boxes)), boxes.shape[1])
+        free_low, free_high = (side[rows, boxes.ravel()] for side in (self.free_low, self.free_high))
+        low = np.maximum(self.low[rows], free_low)
+        high = np.maximum(np.minimum(self.high[rows], free_high), low)
+        bounds = self.least[rows], self.most[rows], self.thinnest[rows]
+        return OriginLimits(low, high, free_low, free_high, self.interval, *bounds)
 
 
 def moments_about(mean: np.ndarray, scatter: np.ndarray, point: np.ndarray) -> np.ndarray:
@@ -82,7 +100,7 @@ def variances(covariance: np.ndarray) -> np.ndarray:
 
 
 def improved(
-    mean: np.ndarray, scatter: np.ndarray, box: IntervalBoxes, point: np.ndarray, covariance: np.ndarray
+    mean: np.ndarray, scatter: np.ndarray, box: OriginLimits, point: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Means (J, n) and covariances (J, n, n) whose intervals lie in their boxes, better than those they start from.
 
@@ -105,7 +123,7 @@ def improved(
     return point, covariance
 
 
-def projected(mean: np.ndarray, scatter: np.ndarray, box: IntervalBoxes) -> tuple[np.ndarray, np.ndarray]:
+def projected(mean: np.ndarray, scatter: np.ndarray, box: OriginLimits) -> tuple[np.ndarray, np.ndarray]:
     """The samples' own moments with one axis after the other moved to its best inside the box, the worst first.
 
     The other axes keep their regressions on it.
@@ -123,7 +141,7 @@ def projected(mean: np.ndarray, scatter: np.ndarray, box: IntervalBoxes) -> tupl
     return point, covariance
 
 
-def independent_axes(mean: np.ndarray, variance: np.ndarray, box: IntervalBoxes) -> tuple[np.ndarray, np.ndarray]:
+def independent_axes(mean: np.ndarray, variance: np.ndarray, box: OriginLimits) -> tuple[np.ndarray, np.ndarray]:
     """Inverse standard deviations p, and p times the shift from the mean, of axes as if independent, (J, n) each."""
     zero, one = np.zeros_like(variance), np.ones_like(variance)
     return _best_axis((variance, one, zero, zero), mean, box.sides, box)
@@ -164,7 +182,7 @@ def _narrowed(covariance: np.ndarray, most: np.ndarray) -> np.ndarray:
 
 
 def _scaled(
-    mean: np.ndarray, scatter: np.ndarray, box: IntervalBoxes, point: np.ndarray, covariance: np.ndarray
+    mean: np.ndarray, scatter: np.ndarray, box: OriginLimits, point: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The best means and standard deviations inside the box, with the correlations of a covariance."""
     deviations = np.sqrt(variances(covariance))
@@ -188,7 +206,7 @@ def _best_axis(
     form: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
     mean: np.ndarray,
     sides: tuple[np.ndarray, ...],
-    box: IntervalBoxes,
+    box: OriginLimits,
 ) -> tuple[np.ndarray, np.ndarray]:
     r"""The p and e that minimise $-2 \log p + a p^2 + 2 b p + q e^2 + 2 c e$ inside the bounds, of one shape.
 
@@ -212,7 +230,9 @@ def _best_axis(
     bent = signs * np.where(np.isfinite(slopes), slopes, 0.0)
     first = np.concatenate([square[None], square + shift_square * np.square(bent)])
     second = np.concatenate([linear[None], linear + (shift_square * signs * offsets + shift_linear) * bent])
-    roots = _stationary(first, second)
+    # the positive root of first p^2 + second p = 1, without cancellation
+    root = np.sqrt(np.square(second) + 4 * first)
+    roots = np.where(second > 0, 2 / (root + np.abs(second)), (root - second) / (2 * first))
     steep, flat = slopes[::2], slopes[1::2]
     crossing = np.isfinite(steep) & (steep > flat)
     corners = np.where(crossing, box.interval / np.where(crossing, steep - flat, 1.0), roots[0])
@@ -226,61 +246,12 @@ def _best_axis(
     return np.take_along_axis(precision, best, axis=0)[0], np.take_along_axis(shift, best, axis=0)[0]
 
 
-def _least_precision(slopes: np.ndarray, box: IntervalBoxes) -> np.ndarray:
+def _least_precision(slopes: np.ndarray, box: OriginLimits) -> np.ndarray:
     """The smallest p that the largest variance admits and at which the lower lines lie below the upper ones."""
     widths = np.maximum(slopes[[0, 0, 1]] + slopes[[2, 3, 2]], SMALLEST_WIDTH_M)
     factors = box.interval * np.reshape([2.0, 1.0, 1.0], (3, *[1] * (slopes.ndim - 1)))
     narrowest = 1 / np.sqrt(box.most).reshape(-1, *[1] * (slopes.ndim - 2))
     return np.maximum((factors / widths).max(axis=0), narrowest)
-
-
-def _stationary(square: np.ndarray, linear: np.ndarray) -> np.ndarray:
-    """The positive root of a p^2 + b p = 1, without cancellation."""
-    root = np.sqrt(np.square(linear) + 4 * square)
-    return np.where(linear > 0, 2 / (root + np.abs(linear)), (root - linear) / (2 * square))
-
-
-# Alternations between mean and covariance; each is exact, three reach rounding where both bind.
-ALTERNATIONS = 3
-# So many boxes are tried for each component, those in which the axes lose least one by one; of so many that a rough
-# measure leaves.
-BOXES_TRIED = 2
-BOXES_SCORED = 8
-# Parameters keep bounds up to this share of a standard deviation, by rounding.
-
-
-class OriginLimits(NamedTuple):
-    """Bounds on N origins along n free axes.
-
-    Arguments:
-        low, high: The box of the mean [m], shape (N, n).
-        free_low, free_high: Boxes one of which holds the interval [m], shape (N, M, n).
-        interval: Standard deviations on each side of the mean.
-        least, most: Bounds on the variance along every direction [m^2], shape (N,).
-        thinnest: The largest admitted variance along the thinnest direction [m^2], shape (N,).
-    """
-
-    low: np.ndarray
-    high: np.ndarray
-    free_low: np.ndarray
-    free_high: np.ndarray
-    interval: float
-    least: np.ndarray
-    most: np.ndarray
-    thinnest: np.ndarray
-
-    def take(self, rows: np.ndarray) -> OriginLimits:
-        """The limits of some origins."""
-        return OriginLimits(*(value if isinstance(value, float) else value[rows] for value in self))
-
-    def inside(self, boxes: np.ndarray) -> IntervalBoxes:
-        """One row per origin and box of `boxes` (N, B), origin by origin."""
-        rows = np.repeat(np.arange(len(boxes)), boxes.shape[1])
-        free_low, free_high = (side[rows, boxes.ravel()] for side in (self.free_low, self.free_high))
-        low = np.maximum(self.low[rows], free_low)
-        high = np.maximum(np.minimum(self.high[rows], free_high), low)
-        bounds = self.least[rows], self.most[rows], self.thinnest[rows]
-        return IntervalBoxes(low, high, free_low, free_high, self.interval, *bounds)
 
 
 def best_origins(
@@ -366,7 +337,15 @@ def _promising(mean: np.ndarray, scatter: np.ndarray, limits: OriginLimits) -> n
     count, many = limits.free_low.shape[:2]
     boxes = np.broadcast_to(np.arange(many), (count, many))
     if many > BOXES_SCORED:
-        boxes = _lowest(_rough_losses(mean, variances(scatter), limits), BOXES_SCORED)
+        # about what each box costs: the shift that makes room for a spread that fits
+        centre, own = mean[:, None], variances(scatter)[:, None]
+        widest = (limits.free_high - limits.free_low) / (2 * limits.interval)
+        reach = limits.interval * np.minimum(np.sqrt(own), widest)
+        lowest = np.maximum(limits.free_low + reach, limits.low[:, None])
+        highest = np.minimum(limits.free_high - reach, limits.high[:, None])
+        shifted = own + np.square(np.maximum(np.maximum(lowest - centre, centre - highest), 0.0))
+        taken = np.minimum(shifted, np.square(widest))
+        boxes = _lowest((np.log(taken / own) + shifted / taken).sum(axis=2), BOXES_SCORED)
     scored = boxes.shape[1]
     if scored <= BOXES_TRIED:
         return boxes
@@ -379,15 +358,3 @@ def _promising(mean: np.ndarray, scatter: np.ndarray, limits: OriginLimits) -> n
 def _lowest(losses: np.ndarray, wanted: int) -> np.ndarray:
     """The columns of the smallest entries in each row, (N, M) to (N, wanted), the first where they tie."""
     return np.argsort(losses, axis=1, kind="stable")[:, :wanted]
-
-
-def _rough_losses(mean: np.ndarray, variance: np.ndarray, limits: OriginLimits) -> np.ndarray:
-    """About what each box costs: the shift that makes room for a spread that fits, (N, n) to (N, M)."""
-    centre, own = mean[:, None], variance[:, None]
-    widest = (limits.free_high - limits.free_low) / (2 * limits.interval)
-    reach = limits.interval * np.minimum(np.sqrt(own), widest)
-    lowest = np.maximum(limits.free_low + reach, limits.low[:, None])
-    highest = np.minimum(limits.free_high - reach, limits.high[:, None])
-    shifted = own + np.square(np.maximum(np.maximum(lowest - centre, centre - highest), 0.0))
-    taken = np.minimum(shifted, np.square(widest))
-    return (np.log(taken / own) + shifted / taken).sum(axis=2)

@@ -43,7 +43,7 @@ class SnappedDesign:
 
 
 @dataclass(frozen=True, eq=False)
-class _Placed:
+class _PlacedPart:
     """One sensor as it was fitted and as the part that it becomes."""
 
     fitted: Sensor
@@ -74,7 +74,7 @@ def snap_design(
     ensemble: Ensemble,
     constraints: Constraints,
     space: DesignSpace,
-    read_out: BandwidthBudget,
+    budget: BandwidthBudget,
     *,
     level: float,
     seed: int,
@@ -86,7 +86,7 @@ def snap_design(
         ensemble: The fit, its origins without spread where a sensor becomes a part.
         constraints: What the fit and the parts keep.
         space: The design space.
-        read_out: Rays and bandwidth.
+        budget: Rays and bandwidth.
         level: The share that intervals hold.
         seed: Root of the random streams.
         name: The design's name.
@@ -95,47 +95,49 @@ def snap_design(
         InfeasibleError: Constraints that no part, or no choice of parts, keeps.
         ConfigError: A part that is not there; more rays than a design file holds.
     """
-    before = sensors_of(ensemble, space, level)
-    options = part_options(constraints.rules, space, [sensor.range_m for sensor in before])
-    if (read_out.rays or 0) > MOST_TABLE_RAYS:
-        raise ConfigError(f"{read_out.rays} rays of parts", where="--rays", allowed=f"at most {MOST_TABLE_RAYS}")
-    choices = nearest_parts(ensemble, options, read_out.rays, seed)
+    rules, before = constraints.rules, sensors_of(ensemble, space, level)
+    options = part_options(rules, space, [sensor.range_m for sensor in before])
+    if (budget.rays or 0) > MOST_TABLE_RAYS:
+        raise ConfigError(f"{budget.rays} rays of parts", where="--rays", allowed=f"at most {MOST_TABLE_RAYS}")
+    choices = nearest_parts(ensemble, options, budget.rays, seed)
     fitted_widths = np.array([sensor.gate_m[1] - sensor.gate_m[0] for sensor in before])
-    choices = affordable(choices, options, ensemble.weights, fitted_widths, read_out)
-    snaps = [rules_of(constraints.rules, index).snap for index in range(len(before))]
+    choices = affordable(choices, options, ensemble.weights, fitted_widths, budget)
+    snaps = [rules_of(rules, index).snap for index in range(len(before))]
     refitted = fit_part_poses(ensemble, choices, [snap is not None and snap.pose == "fitted" for snap in snaps])
-    placed = _placed(before, sensors_of(refitted, space, level), choices, ensemble)
+    # every sensor with its part at the pose that its component has
+    features = {sensor: part.features for part in ensemble.parts for sensor in part.group.sensors}
+    placed = []
+    for index, (fitted, sensor, choice) in enumerate(
+        zip(before, sensors_of(refitted, space, level), choices, strict=True)
+    ):
+        one = _PlacedPart(fitted, sensor, choice, None, features[index])
+        if choice.shape is not None:
+            aimed = (sensor.origin_m, sensor.azimuth_rad, sensor.elevation_rad, sensor.roll_rad)
+            one = _move_to(one, choice.shape.pose(*aimed, features[index].axes))
+        placed.append(one)
     if not constraints.each:
         order = sorted(range(len(placed)), key=lambda i: -round(placed[i].sensor.weight, 9))
-        placed = [_renamed(placed[old], f"s{new}") for new, old in enumerate(order)]
+        placed = [
+            replace(placed[old], sensor=replace(placed[old].sensor, name=f"s{new}")) for new, old in enumerate(order)
+        ]
         options = [options[old] for old in order]
-    placed = _apart(placed, constraints.rules)
-    counts = _counts(placed, read_out)
+    placed = _interleave_alike(placed, rules)
+    counts = _ray_counts(placed, budget)
     design = _design(placed, counts, constraints, level, name)
+    notes = []
+    for sensor, option in zip(design.sensors, options, strict=True):
+        if option.lacking:
+            notes.append(f"{sensor.name} stays a sensor of its own: no part keeps {', '.join(option.lacking)}")
+        if sensor.rays == 0:
+            notes.append(f"{sensor.name} sees too little of the density to have one of {design.rays} rays")
     report = {
         "log_likelihood": {"fitted": ensemble.log_likelihood, "parts": refitted.log_likelihood},
-        "sensors": _rows(placed, options, counts, read_out),
+        "sensors": _report_rows(placed, options, counts, budget),
     }
-    return SnappedDesign(design, refitted, report, _notes(design, options))
+    return SnappedDesign(design, refitted, report, tuple(notes))
 
 
-def _placed(
-    before: Sequence[Sensor], after: Sequence[Sensor], choices: Sequence[PartChoice], ensemble: Ensemble
-) -> list[_Placed]:
-    """Every sensor with its part at the pose that its component has."""
-    features = {sensor: part.features for part in ensemble.parts for sensor in part.group.sensors}
-    found = []
-    for index, (fitted, sensor, choice) in enumerate(zip(before, after, choices, strict=True)):
-        pose, shape = None, choice.shape
-        if shape is not None:
-            aimed = (sensor.origin_m, sensor.azimuth_rad, sensor.elevation_rad, sensor.roll_rad)
-            pose = shape.pose(*aimed, features[index].axes)
-        one = _Placed(fitted, sensor, choice, pose, features[index])
-        found.append(one if pose is None else _at(one, pose))
-    return found
-
-
-def _at(one: _Placed, pose: Pose) -> _Placed:
+def _move_to(one: _PlacedPart, pose: Pose) -> _PlacedPart:
     """A part at a pose, as a sensor."""
     shape, old = one.choice.shape, one.sensor
     if shape is None:
@@ -149,7 +151,7 @@ def _at(one: _Placed, pose: Pose) -> _Placed:
     return replace(one, sensor=sensor, pose=pose)
 
 
-def _apart(placed: Sequence[_Placed], rules: Sequence[SensorRules]) -> list[_Placed]:
+def _interleave_alike(placed: Sequence[_PlacedPart], rules: Sequence[SensorRules]) -> list[_PlacedPart]:
     """Parts of a kind that stand and look alike fire between each other's rays, where they may turn that far."""
     found = list(placed)
     alike: list[list[int]] = []
@@ -171,11 +173,11 @@ def _apart(placed: Sequence[_Placed], rules: Sequence[SensorRules]) -> list[_Pla
         if len(group) > 1 and first.choice.shape is not None and first.pose is not None:
             poses = interleaved(first.choice.shape.part, first.pose, len(group))
             for index, pose in zip(group, poses, strict=True):
-                found[index] = _at(placed[index], pose)
+                found[index] = _move_to(placed[index], pose)
     return found
 
 
-def _look_alike(one: _Placed, other: _Placed) -> bool:
+def _look_alike(one: _PlacedPart, other: _PlacedPart) -> bool:
     """Whether two parts are of one kind, at one place, and look less than half a cell apart."""
     shape, poses = one.choice.shape, (one.pose, other.pose)
     if shape is None or other.choice.shape is None or poses[0] is None or poses[1] is None:
@@ -188,11 +190,7 @@ def _look_alike(one: _Placed, other: _Placed) -> bool:
     return bool(np.array_equal(poses[0].origin_m, poses[1].origin_m)) and cosine >= math.cos(cell / 2)
 
 
-def _renamed(one: _Placed, name: str) -> _Placed:
-    return replace(one, sensor=replace(one.sensor, name=name))
-
-
-def _counts(placed: Sequence[_Placed], read_out: BandwidthBudget) -> np.ndarray:
+def _ray_counts(placed: Sequence[_PlacedPart], budget: BandwidthBudget) -> np.ndarray:
     """Rays of every sensor, shape (G,)."""
     weights = np.array([one.sensor.weight for one in placed])
     choices = [one.choice for one in placed]
@@ -200,19 +198,19 @@ def _counts(placed: Sequence[_Placed], read_out: BandwidthBudget) -> np.ndarray:
     useful = np.array(
         [0 if one.pose is None else useful_rays(one.choice, one.pose, one.seen) for one in placed], dtype=np.int64
     )
-    if read_out.rays is None:
-        return counts_of(useful, weights, widths, read_out)
-    most = np.array([read_out.rays if c.shape is None else min(c.shape.part.rays, read_out.rays) for c in choices])
+    if budget.rays is None:
+        return counts_of(useful, weights, widths, budget)
+    most = np.array([budget.rays if c.shape is None else min(c.shape.part.rays, budget.rays) for c in choices])
     first = np.where(useful > 0, np.minimum(useful, most), most)
-    counts = useful_split(weights, read_out.rays, first, most)
-    if read_out.limit_mbps is not None and read_out.model.mbps_of_widths(widths, counts) > read_out.limit_mbps:
+    counts = useful_split(weights, budget.rays, first, most)
+    if budget.limit_mbps is not None and budget.model.mbps_of_widths(widths, counts) > budget.limit_mbps:
         # so the parts were found affordable
-        counts = useful_split(weights, read_out.rays, most, most)
+        counts = useful_split(weights, budget.rays, most, most)
     return counts
 
 
 def _design(
-    placed: Sequence[_Placed], counts: np.ndarray, constraints: Constraints, level: float, name: str
+    placed: Sequence[_PlacedPart], counts: np.ndarray, constraints: Constraints, level: float, name: str
 ) -> DesignSpec:
     # what a part weighs is what it fires
     total = int(counts.sum())
@@ -237,8 +235,8 @@ def _design(
     )
 
 
-def _rows(
-    placed: Sequence[_Placed], options: Sequence[PartOptions], counts: np.ndarray, read_out: BandwidthBudget
+def _report_rows(
+    placed: Sequence[_PlacedPart], options: Sequence[PartOptions], counts: np.ndarray, budget: BandwidthBudget
 ) -> list[dict[str, Any]]:
     """What every sensor was, what it became, and what that costs alone; in the order of the design."""
     weights = np.array([one.fitted.weight for one in placed])
@@ -250,7 +248,7 @@ def _rows(
         if shape is not None:
             loss = one.choice.losses[option.shapes.index(shape)]
         mbps = [
-            read_out.model.mbps_of_widths(np.diff(sensor.gate_m), int(rays))
+            budget.model.mbps_of_widths(np.diff(sensor.gate_m), int(rays))
             for sensor, rays in ((one.fitted, share), (one.sensor, n))
         ]
         rows.append(
@@ -260,7 +258,10 @@ def _rows(
                 "product": None if shape is None else shape.part.product,
                 "turned": shape is not None and shape.turned,
                 "loss_nats": loss,
-                "field_of_view_rad": {"fitted": _field(one.fitted), "part": _field(one.sensor)},
+                "field_of_view_rad": {
+                    "fitted": [float(angle) for angle in one.fitted.field_of_view_rad],
+                    "part": [float(angle) for angle in one.sensor.field_of_view_rad],
+                },
                 "gate_m": {"fitted": list(one.fitted.gate_m), "part": list(one.sensor.gate_m)},
                 "rays": {
                     "fitted": int(share), "part": int(n), "pattern": None if shape is None else shape.part.rays
@@ -269,17 +270,3 @@ def _rows(
             }
         )  # fmt: skip
     return rows
-
-
-def _field(sensor: Sensor) -> list[float]:
-    return [float(angle) for angle in sensor.field_of_view_rad]
-
-
-def _notes(design: DesignSpec, options: Sequence[PartOptions]) -> tuple[str, ...]:
-    notes = []
-    for sensor, option in zip(design.sensors, options, strict=True):
-        if option.lacking:
-            notes.append(f"{sensor.name} stays a sensor of its own: no part keeps {', '.join(option.lacking)}")
-        if sensor.rays == 0:
-            notes.append(f"{sensor.name} sees too little of the density to have one of {design.rays} rays")
-    return tuple(notes)

@@ -65,7 +65,7 @@ def affordable(
     options: Sequence[PartOptions],
     weights: np.ndarray,
     widths_m: np.ndarray,
-    read_out: BandwidthBudget,
+    budget: BandwidthBudget,
 ) -> list[PartChoice]:
     """Choices whose parts have the rays that are asked for, inside the bandwidth that there is.
 
@@ -76,41 +76,41 @@ def affordable(
         options: What each may become.
         weights: Shares of the rays, shape (G,).
         widths_m: Gates of the fitted sensors, for those that stay as they are, shape (G,).
-        read_out: Number of rays and bandwidth.
+        budget: Number of rays and bandwidth.
 
     Raises:
         InfeasibleError: No change helps any more.
     """
     chosen = list(choices)
-    while (lack := _lack(chosen, weights, widths_m, read_out)) > (0, 0):
+    while (lack := _lack(chosen, weights, widths_m, budget)) > (0, 0):
         changes = []
         for sensor, one in enumerate(options):
             for index, shape in enumerate(one.shapes):
                 other = [*chosen[:sensor], replace(chosen[sensor], shape=shape), *chosen[sensor + 1 :]]
-                left = _lack(other, weights, widths_m, read_out)
+                left = _lack(other, weights, widths_m, budget)
                 gain = lack[0] - left[0] if lack[0] else lack[1] - left[1]
                 if left < lack:
                     changes.append((chosen[sensor].losses[index] / gain, sensor, index, other))
         if not changes:
-            raise _refused(chosen, lack, read_out)
+            raise _refused(chosen, lack, budget)
         chosen = min(changes, key=lambda change: change[:3])[3]
     return chosen
 
 
 def _lack(
-    chosen: Sequence[PartChoice], weights: np.ndarray, widths_m: np.ndarray, read_out: BandwidthBudget
+    chosen: Sequence[PartChoice], weights: np.ndarray, widths_m: np.ndarray, budget: BandwidthBudget
 ) -> tuple[int, int]:
     """Rays that the parts lack, and bins that they need beyond the bandwidth."""
     most = np.array([ANY if one.shape is None else one.shape.part.rays for one in chosen])
-    if read_out.rays is not None and np.minimum(most, read_out.rays).sum() < read_out.rays:
-        return read_out.rays - int(np.minimum(most, read_out.rays).sum()), 0
-    if read_out.limit_mbps is None:
+    if budget.rays is not None and np.minimum(most, budget.rays).sum() < budget.rays:
+        return budget.rays - int(np.minimum(most, budget.rays).sum()), 0
+    if budget.limit_mbps is None:
         return 0, 0
-    bins = read_out.model.bins(np.array(gate_widths(chosen, widths_m)))
+    bins = budget.model.bins(np.array(gate_widths(chosen, widths_m)))
     counts = np.ones(len(chosen), dtype=np.int64)
-    if read_out.rays is not None:
-        counts = capped_split(weights, read_out.rays, most)
-    allowed = int(read_out.limit_mbps / read_out.model.mbps_of_widths(np.zeros(1), 1))
+    if budget.rays is not None:
+        counts = capped_split(weights, budget.rays, most)
+    allowed = int(budget.limit_mbps / budget.model.mbps_of_widths(np.zeros(1), 1))
     return 0, max(int(counts @ bins) - allowed, 0)
 
 
@@ -122,20 +122,20 @@ def gate_widths(chosen: Sequence[PartChoice], widths_m: np.ndarray) -> list[floa
     ]
 
 
-def _refused(chosen: Sequence[PartChoice], lack: tuple[int, int], read_out: BandwidthBudget) -> InfeasibleError:
-    name = "budget.rays" if "budget.rays" in read_out.names else "--rays"
+def _refused(chosen: Sequence[PartChoice], lack: tuple[int, int], budget: BandwidthBudget) -> InfeasibleError:
+    name = "budget.rays" if "budget.rays" in budget.names else "--rays"
     if lack[0]:
         return InfeasibleError(
-            f"the parts found have {(read_out.rays or 0) - lack[0]} rays, {lack[0]} fewer than asked for",
+            f"the parts found have {(budget.rays or 0) - lack[0]} rays, {lack[0]} fewer than asked for",
             conflicts=[name, "snap"],
             hint="fewer rays, more sensors, or parts with more rays",
         )
-    needed = (read_out.limit_mbps or 0.0) + lack[1] * read_out.model.mbps_of_widths(np.zeros(1), 1)
-    count = len(chosen) if read_out.rays is None else read_out.rays
+    needed = (budget.limit_mbps or 0.0) + lack[1] * budget.model.mbps_of_widths(np.zeros(1), 1)
+    count = len(chosen) if budget.rays is None else budget.rays
     return InfeasibleError(
         f"{count} rays of the parts found need about {needed:g} Mbit/s: their ranges cannot be narrowed",
-        conflicts=[BANDWIDTH, *([] if read_out.rays is None else [name]), "snap"],
-        allowed=f"at most {read_out.limit_mbps:g} Mbit/s",
+        conflicts=[BANDWIDTH, *([] if budget.rays is None else [name]), "snap"],
+        allowed=f"at most {budget.limit_mbps:g} Mbit/s",
         hint="fewer rays, fewer sensors, or more bandwidth",
     )
 
@@ -159,14 +159,14 @@ def useful_rays(choice: PartChoice, pose: Pose, seen: Features) -> int:
     return max(int(wanted.sum()), 1)
 
 
-def counts_of(useful: np.ndarray, weights: np.ndarray, widths_m: np.ndarray, read_out: BandwidthBudget) -> np.ndarray:
+def counts_of(useful: np.ndarray, weights: np.ndarray, widths_m: np.ndarray, budget: BandwidthBudget) -> np.ndarray:
     """Rays of every sensor where none are asked for: what parts have to tell, as far as the bandwidth pays for it.
 
     Arguments:
         useful: Rays of each part that look at something; 0 for sensors that stay as they are, which have their share.
         weights: Shares of the rays, shape (G,).
         widths_m: Gate widths, shape (G,).
-        read_out: The bandwidth.
+        budget: The bandwidth.
     """
     of_parts = useful > 0
     counts = useful.astype(np.int64)
@@ -174,11 +174,11 @@ def counts_of(useful: np.ndarray, weights: np.ndarray, widths_m: np.ndarray, rea
         share = max(float(weights[of_parts].sum()), SMALLEST_SHARE)
         counts[~of_parts] = np.maximum(np.round(counts.sum() / share * weights[~of_parts]), 1)
     share = min(1.0, MOST_TABLE_RAYS / int(counts.sum()))
-    if read_out.limit_mbps is not None:
-        cost = read_out.model.mbps_of_widths(widths_m, counts)
-        share = min(share, read_out.limit_mbps / cost)
+    if budget.limit_mbps is not None:
+        cost = budget.model.mbps_of_widths(widths_m, counts)
+        share = min(share, budget.limit_mbps / cost)
     fewer = np.maximum(np.floor(counts * share).astype(np.int64), 1)
-    while read_out.limit_mbps is not None and read_out.model.mbps_of_widths(widths_m, fewer) > read_out.limit_mbps:
-        dearest = np.where(fewer > 1, fewer * read_out.model.bins(widths_m), -1).argmax()
+    while budget.limit_mbps is not None and budget.model.mbps_of_widths(widths_m, fewer) > budget.limit_mbps:
+        dearest = np.where(fewer > 1, fewer * budget.model.bins(widths_m), -1).argmax()
         fewer[dearest] -= 1
     return fewer
