@@ -61,23 +61,6 @@ def test_a_capsule_without_length_is_a_sphere_but_never_negative():
         Capsule(1.0, -0.1)
 
 
-BAD_MESHES = {
-    "no faces": (TRIANGLE, np.zeros((0, 3), int), "needs"),
-    "flat vertices": (TRIANGLE[:, :2], [[0, 1, 2]], "needs"),
-    "not a number": (TRIANGLE * np.nan, [[0, 1, 2]], "NaN"),
-    "beyond the vertices": (TRIANGLE, [[0, 1, 3]], "name vertex 3"),
-    "negative": (TRIANGLE, [[0, 1, -1]], "name vertex -1"),
-    "wrapped around": (TRIANGLE, np.array([[0, 1, 2**32 + 2]]), "name vertex 4294967298"),
-}
-
-
-@each_row("case", BAD_MESHES)
-def test_meshes_that_cannot_be_are_refused(case):
-    vertices, faces, message = BAD_MESHES[case]
-    with pytest.raises(DataError, match=message):
-        Mesh(vertices, faces)
-
-
 def test_a_scene_needs_a_target_and_one_number_of_frames():
     with pytest.raises(DataError, match="no target"):
         Scene((Body(Sphere(1.0), role="occluder"),))

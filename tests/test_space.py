@@ -10,9 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support import references
-from support.tables import each_row
 
-from lidardesign.errors import ConfigError
 from lidardesign.space import AZIMUTH, ELEVATION, DesignSpace, aim, angles, direction, observed_point
 
 LOW, HIGH = (-1.0, 0.0, 2.0, -0.5, -1.2, 0.1), (1.0, 3.0, 2.0, 2.5, 0.9, 4.0)
@@ -143,28 +141,3 @@ def test_a_space_survives_its_own_dictionary(measure):
     assert DesignSpace.from_dict(space.as_dict()) == space
     one_number = DesignSpace.from_dict({**space.as_dict(), "z_m": 2.0})
     assert one_number == space
-
-
-def replaced(values, index, value):
-    return tuple(value if i == index else old for i, old in enumerate(values))
-
-
-BAD_BOUNDS = {
-    "too few": (LOW[:5], HIGH, {}, "6 bounds"),
-    "reversed": (replaced(LOW, 0, 2.0), HIGH, {}, r"space\.x_m: the lower bound 2.0 is above"),
-    "not a number": (replaced(LOW, 1, math.nan), HIGH, {}, r"space\.y_m: .*not finite"),
-    "infinite": (LOW, replaced(HIGH, 5, math.inf), {}, r"space\.range_m: .*not finite"),
-    "more than a turn": (LOW, replaced(HIGH, 3, 6.0), {}, r"space\.azimuth_rad: .*full turn"),
-    "beyond the pole": (LOW, replaced(HIGH, 4, 1.6), {}, r"space\.elevation_rad: .*leaves the sphere"),
-    "below the pole": (replaced(LOW, 4, -1.6), HIGH, {}, r"space\.elevation_rad: .*leaves the sphere"),
-    "behind the sensor": (replaced(LOW, 5, -0.1), HIGH, {}, r"space\.range_m: .*negative"),
-    "unknown condition": (LOW, HIGH, {"condition": ("yaw",)}, r"space\.condition: unknown dimension 'yaw'"),
-    "unknown measure": (LOW, HIGH, {"measure": "degrees"}, r"space\.measure: unknown measure 'degrees'"),
-}
-
-
-@each_row("case", BAD_BOUNDS)
-def test_bounds_that_cannot_be_are_refused_by_name(case):
-    low, high, options, message = BAD_BOUNDS[case]
-    with pytest.raises(ConfigError, match=message):
-        DesignSpace(low, high, **options)

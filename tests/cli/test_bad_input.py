@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import json
 import os
-import signal
-import time
-from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from support.command_line import caller, files_under, make_run, program
+from support.command_line import caller, files_under, make_run
 from support.mistakes import GARBAGE, GOOD, check_one_clear_message
 
 from lidardesign.run.yaml import dump_yaml, load_yaml
@@ -278,21 +274,6 @@ def test_a_design_whose_numbers_are_not_finite_is_refused(mistakes, lidardesign,
         check_one_clear_message(lidardesign("show", "wrong.yaml", "--json"), 2, "wrong.yaml:6:11")
 
 
-def test_constraints_that_hold_almost_nothing_say_how_much(mistakes, lidardesign, monkeypatch):
-    monkeypatch.chdir(mistakes)
-    error = lidardesign("constrain", "run", "--set", "gate.end_m.max=0.02", "--json").json["error"]
-    assert error["kind"] == "infeasible"
-    assert 0 <= error["admissible_mass"] < 0.01
-    assert f"{error['admissible_mass']:.3g} of the density" in error["message"]
-
-
-def test_contradictory_constraints_name_both_sides(mistakes, lidardesign, monkeypatch):
-    monkeypatch.chdir(mistakes)
-    arguments = ("--set", "gate.start_m.min=0.8", "--set", "gate.end_m.max=0.5", "--json")
-    error = lidardesign("constrain", "run", *arguments).json["error"]
-    assert {"gate.start_m.min", "gate.end_m.max"} <= set(error["conflicts"])
-
-
 COMMANDS = {
     "fit": ("fit", "run", "--sensors", "1"),
     "constrain": ("constrain", "run", "--set", "budget.rays=20"),
@@ -326,109 +307,3 @@ def test_evaluate_says_when_a_file_cannot_be_written(lidardesign, tmp_path):
         result = lidardesign("evaluate", "run", "--rays", "16", option, place, "--json")
         check_one_clear_message(result, 3, "taken")
     assert (tmp_path / "taken").read_text() == "a file"
-
-
-SMALL = ["learning.steps=200", "learning.batch=64", "learning.samples=1000", "learning.coverage_proposals=256"]
-FREQUENT = ["learning.balance_proposals=256", "learning.checkpoint_seconds=0.05", "train=3"]
-RESULTS = ("flow.safetensors", "samples.npz")
-# a process whose files may not grow beyond a size behaves like one on a disk that becomes full
-# Python writes byte code in part without noticing where the disk is full, and would leave it broken for all others
-SMALL_DISK = (
-    "import resource, sys; sys.dont_write_bytecode = True; "
-    "resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))"
-)
-# what a process has imported in the end
-TELLING = (
-    "import atexit, sys; "
-    "atexit.register(lambda: print(*(f'{name} is imported' for name in sys.modules), sep='\\n', file=sys.stderr))"
-)
-
-
-def settings_of(*settings):
-    return [word for setting in settings for word in ("--set", setting)]
-
-
-def finish(process):
-    out, err = process.communicate(timeout=240)
-    return process.returncode, out.decode(), err.decode()
-
-
-@pytest.mark.slow
-def test_a_disk_that_fills_during_learning_is_one_message_and_a_folder_that_says_what_it_is(tmp_path):
-    settings = settings_of(*SMALL, *FREQUENT)
-    arguments = ["learn", "flatland", "--preset", "draft", "--out", "run", *settings]
-    code, out, err = finish(program(*arguments, "--json", cwd=tmp_path, before=SMALL_DISK))
-    assert code == 3, err
-    assert "File too large" in json.loads(out)["error"]["message"]
-    assert "Traceback" not in err
-    left = files_under(tmp_path)
-    assert not [name for name in left if name.endswith((".tmp", ".lock", *RESULTS))]
-    if left:
-        code, out, err = finish(program("fit", "run", cwd=tmp_path))
-        assert code == 3
-        assert "--resume" in err
-
-
-@pytest.mark.slow
-def test_an_interrupted_run_is_resumed_to_the_bytes_of_a_straight_one(lidardesign, tmp_path):
-    settings = settings_of(*SMALL, *FREQUENT)
-    arguments = ["learn", "flatland", "--preset", "draft", *settings]
-    code, out, err = finish(program(*arguments, "--out", "straight", "--json", cwd=tmp_path, before=TELLING))
-    assert code == 0, err
-    assert "torch is imported" in err
-    assert "torch._dynamo is imported" not in err  # as long to import as torch itself, and never used
-    assert {"run", "task", "seconds", "steps", "ess", "kl_nats", "log_z", "coverage"} <= set(json.loads(out))
-    interrupted = program(*arguments, "--out", "stopped", "--json", cwd=tmp_path)
-    deadline = time.monotonic() + 120
-    while not (tmp_path / "stopped" / "checkpoint.safetensors").exists() and time.monotonic() < deadline:
-        time.sleep(0.005)
-    interrupted.send_signal(signal.SIGINT)
-    code, out, err = finish(interrupted)
-    assert code == 130, err
-    assert json.loads(out)["error"]["kind"] == "interrupted"
-    assert not (tmp_path / "stopped" / "samples.npz").exists()
-    refused = lidardesign("fit", "stopped")
-    assert refused.code == 3
-    assert "--resume" in refused.err
-    resumed = [*arguments, "--out", "stopped", "--resume", "--json"]
-    checkpoint = tmp_path / "stopped" / "checkpoint.safetensors"
-    content = checkpoint.read_bytes()
-    for damaged, words in ((content[:-50], "truncated"), (flipped(content), "SHA-256")):
-        checkpoint.write_bytes(damaged)
-        refused = lidardesign(*resumed)
-        assert (refused.code, refused.json["exit_code"]) == (3, 3), refused.err
-        assert words in refused.err
-    checkpoint.write_bytes(content)
-    code, _, err = finish(program(*resumed, cwd=tmp_path))
-    assert code == 0, err
-    for name in RESULTS:
-        assert (tmp_path / "stopped" / name).read_bytes() == (tmp_path / "straight" / name).read_bytes()
-
-
-@pytest.mark.slow
-def test_two_processes_never_learn_into_one_folder(tmp_path):
-    arguments = ["learn", "flatland", "--preset", "draft", "--out", "run", *settings_of("learning.steps=100000")]
-    first = program(*arguments, "--json", cwd=tmp_path)
-    deadline = time.monotonic() + 120
-    while not (tmp_path / "run" / "config.yaml").exists() and time.monotonic() < deadline:
-        time.sleep(0.01)
-    before = (tmp_path / "run" / "config.yaml").read_bytes()
-    for further, words in (((), "not empty"), (("--resume",), "is writing this run")):
-        code, _, err = finish(program(*arguments, *further, cwd=tmp_path))
-        assert code == 2
-        assert words in err
-    assert first.poll() is None
-    assert (tmp_path / "run" / "config.yaml").read_bytes() == before
-    first.send_signal(signal.SIGTERM)
-    assert finish(first)[0] == 143
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs the device /dev/full")
-def test_an_export_to_a_full_device_says_so(tmp_path):
-    (tmp_path / "good.yaml").write_text(GOOD)
-    arguments = ("export", "good.yaml", "--format", "csv", "--out", "/dev/full")
-    code, out, err = finish(program(*arguments, cwd=tmp_path))
-    assert (code, out) == (3, "")
-    assert "No space left on device" in err
-    with contextlib.suppress(FileNotFoundError):
-        assert not list(tmp_path.glob("*.tmp"))

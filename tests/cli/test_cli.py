@@ -250,14 +250,6 @@ def test_no_visibility_needs_a_design_whose_run_is_there(lidardesign, flat):
     assert "no design to fit anew" in result.err
 
 
-def test_the_same_seed_writes_the_same_design(lidardesign, flat):
-    texts = []
-    for seed in (1, 1):
-        lidardesign("fit", flat, "--sensors", 2, "--seed", seed)
-        texts.append((flat / "designs" / "fit.yaml").read_text())
-    assert texts[0] == texts[1]
-
-
 def test_a_damaged_run_is_noticed_before_anything_is_written(lidardesign, flat):
     samples = flat / "samples.npz"
     samples.write_bytes(samples.read_bytes()[:-100])

@@ -115,28 +115,6 @@ def test_a_run_that_cannot_be_written_is_still_read(lidardesign, flat, tmp_path)
     assert (tmp_path / "rays.csv").is_file()
 
 
-def test_evaluations_give_half_of_every_interval(lidardesign, flat):
-    lidardesign(f"fit {flat} --sensors 2 --rays 20 --name one")
-    document = lidardesign(f"evaluate {flat} --rays 20 --set test=4 --json").json
-    for entry in document["rows"] + document["paired"]:
-        assert entry["half_width"] == pytest.approx((entry["ci_high"] - entry["ci_low"]) / 2)
-    estimates = document["error_estimates"]
-    assert estimates["one at 20 rays"]["error"] == document["rows"][0]["half_width"]
-    assert estimates["one at 20 rays"]["unit"] == document["metric"]["unit"]
-    assert "one - bounding at 20 rays" in estimates
-
-
-def test_exports_say_what_their_numbers_lose(lidardesign, flat, tmp_path):
-    lidardesign(f"fit {flat} --sensors 2 --rays 20 --name one")
-    design = flat / "designs" / "one.yaml"
-    exact = lidardesign(f"export {design} --format csv --out {tmp_path}/rays.csv")
-    assert "read back: exact" in exact.out
-    found = lidardesign(f"export {design} --format csv --out {tmp_path}/rays.csv --json").json["error_estimates"]
-    assert {name: one["error"] for name, one in found.items()} == dict.fromkeys(
-        ("origin_m", "direction_rad", "gate_m", "time_s"), 0.0
-    )
-
-
 def test_tables_are_for_people_who_did_not_ask_for_quiet(lidardesign, flat):
     loud = lidardesign(f"fit {flat} --sensors 2 --name one")
     assert TITLE in loud.out

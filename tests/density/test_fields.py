@@ -11,9 +11,9 @@ from support import references
 from support.meshes import icosphere
 
 from lidardesign.density.fields import grids
-from lidardesign.density.fields.distance import BodyField, TableField, UnionField, build_field
+from lidardesign.density.fields.distance import BodyField, UnionField, build_field
 from lidardesign.errors import ConfigError
-from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
+from lidardesign.scene import Body, Box, Capsule, Plane, Scene, Sphere, rigid
 
 
 @pytest.fixture(autouse=True)
@@ -121,16 +121,6 @@ def test_meshes_and_primitives_of_one_scene_are_united():
     np.testing.assert_allclose(field.distances(np.array([[2.0, 0.0, 0.5]]))[:, 0], 0.3, atol=1e-6)
     gradient = field.gradient(np.array([[2.0, 0.0, 0.5]]), np.ones((1, 1)))
     np.testing.assert_allclose(gradient, [[0.0, 0.0, 1.0]], atol=1e-6)
-
-
-def test_a_surface_without_an_inside_is_never_negative_and_has_a_shell():
-    half = icosphere(sign="unsigned")
-    open_half = Mesh(half.vertices, half.faces[half.vertices[half.faces].mean(axis=1)[:, 2] > 0], "unsigned")
-    field = field_of(Scene((Body(open_half),)))
-    points = np.random.default_rng(8).uniform(-0.55, 0.55, (1000, 3))
-    assert isinstance(field, TableField)
-    assert field.distances(points).min() >= 0
-    assert field.shell_m[0] == pytest.approx(field.grid.step)
 
 
 def test_a_cached_grid_has_the_same_bytes_and_a_damaged_one_is_built_again(tmp_path):

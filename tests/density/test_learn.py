@@ -10,14 +10,11 @@ import numpy as np
 import pytest
 import torch
 from support.learning import SPACE, BallTask, Interrupter, a_trainer, config_of, result_bytes
-from support.tables import each_row
 
 from lidardesign.density import learn as learning
 from lidardesign.density.learn import learn
 from lidardesign.density.target.prepare import prepare_target
-from lidardesign.density.training import training
 from lidardesign.density.training import training_data as ground
-from lidardesign.density.training.checkpoint import save_arrays
 from lidardesign.density.training.quality import log_density_of
 from lidardesign.density.training.training_data import prepare_ground
 from lidardesign.errors import ConfigError, DataError, PluginError
@@ -167,45 +164,6 @@ def test_a_conditioned_dimension_stays_uniform(tmp_path):
 def test_entropy_is_annealed_away_without_harm(tmp_path):
     result = learn(BallTask(), config_of(entropy=0.5), tmp_path)
     assert math.isfinite(result.kl_nats)
-
-
-def damage_truncate(path):
-    path.write_bytes(path.read_bytes()[:-100])
-
-
-def damage_flip(path):
-    content = bytearray(path.read_bytes())
-    content[-50] ^= 1
-    path.write_bytes(bytes(content))
-
-
-def damage_pickle(path):
-    path.write_bytes(b"\x80\x04\x95" + bytes(500))
-
-
-def damage_foreign(path):
-    save_arrays(path.parent, path.name, {"flow.other": np.zeros(3), "generator": np.zeros(8, np.uint8)}, {"step": 1})
-
-
-def damage_missing(path):
-    path.unlink()
-
-
-@each_row("damage", [damage_truncate, damage_flip, damage_pickle, damage_foreign, damage_missing])
-def test_a_damaged_checkpoint_is_a_data_error_that_names_it(tmp_path, damage):
-    with pytest.raises(KeyboardInterrupt):
-        learn(BallTask(), config_of(), tmp_path, progress=Interrupter(60))
-    damage(tmp_path / training.CHECKPOINT)
-    with pytest.raises(DataError, match="checkpoint") as caught:
-        learn(BallTask(), config_of(), tmp_path, resume=True)
-    assert caught.value.exit_code == 3
-
-
-def test_a_checkpoint_of_another_size_of_flow_is_a_data_error(tmp_path):
-    with pytest.raises(KeyboardInterrupt):
-        learn(BallTask(), config_of(), tmp_path, progress=Interrupter(60))
-    with pytest.raises(DataError, match="another flow"):
-        learn(BallTask(), config_of(hidden=24), tmp_path, resume=True)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")

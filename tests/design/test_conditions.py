@@ -6,8 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from support.tables import each_row
 
 from lidardesign.design.mixture.conditions import at_condition, conditioned, fixed_conditions
@@ -110,15 +108,6 @@ def test_every_sample_has_the_value_exactly_and_the_space_fixes_it():
     assert fixed_conditions(found.space) == {"x_m": 0.37}
     assert fixed_conditions(AISLE) == {}
     np.testing.assert_array_equal(SAMPLES.points[:3, 0], learned().points[:3, 0])
-
-
-@given(seed=st.integers(0, 2**31), value=st.floats(0.0, 4.0))
-def test_the_same_generator_gives_the_same_samples(seed, value):
-    one, other = (
-        at_condition(SAMPLES, {"x_m": value}, log_target, 200, np.random.default_rng(seed)) for _ in range(2)
-    )
-    np.testing.assert_array_equal(one.points, other.points)
-    np.testing.assert_array_equal(one.log_prob, other.log_prob)
 
 
 def test_the_first_samples_are_no_nearer_than_the_last():

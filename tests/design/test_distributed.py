@@ -133,13 +133,6 @@ def test_a_distributed_design_is_read_back_to_the_last_bit():
         np.testing.assert_array_equal(one.coupling.direction_per_m, other.coupling.direction_per_m)
 
 
-def test_the_same_call_gives_the_same_rays():
-    first, second = (lay_out(without_table(FITTED.design), 90, RING, seed=3) for _ in range(2))
-    np.testing.assert_array_equal(first.origin_m, second.origin_m)
-    np.testing.assert_array_equal(first.direction, second.direction)
-    np.testing.assert_array_equal(first.gate_m, second.gate_m)
-
-
 def test_no_ray_of_a_blocked_cone_is_fired():
     rays = lay_out(without_table(FITTED.design), 400, RING)
     assert np.degrees(np.arccos(-rays.direction[:, 2])).min() > 14.9

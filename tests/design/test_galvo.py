@@ -163,11 +163,6 @@ def test_stops_in_a_column_or_a_row_are_toured_along_it():
         assert abs(np.diff(tour)).sum() == 8
 
 
-def test_tours_are_the_same_every_time():
-    points = np.random.default_rng(6).uniform(-15, 15, (300, 2))
-    np.testing.assert_array_equal(short_tour(points), short_tour(points.copy()))
-
-
 # --- the file
 
 

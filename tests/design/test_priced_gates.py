@@ -159,11 +159,6 @@ def test_bounds_on_gates_are_kept(seed, edge, width, kind, limit):
         assert bins(gates) <= limit
 
 
-def test_the_same_is_found_twice():
-    one, two = (gates_within(hearing(3, 20), free(20), 0.95, MODEL, 60) for _ in range(2))
-    assert one.tobytes() == two.tobytes()
-
-
 @given(st.integers(0, 1000))
 def test_the_order_of_returns_and_rays_does_not_matter(seed):
     heard, generator = hearing(seed, 9), np.random.default_rng(seed)

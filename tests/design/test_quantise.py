@@ -77,13 +77,6 @@ def test_no_cell_is_empty_while_there_are_enough_distinct_points(points, count, 
         assert cost(features, weights, centres) == 0
 
 
-def test_the_same_generator_gives_the_same_bits_and_another_need_not():
-    features, weights = cloud(8)
-    first, second, other = (lloyd(features, weights, 9, np.random.default_rng(s))[0] for s in (4, 4, 5))
-    assert (first == second).all()
-    assert not (first == other).all()
-
-
 @pytest.mark.parametrize(("scale", "shift"), [(1e-6, 0.0), (1e6, 0.0), (1.0, 1e7)])
 def test_the_cells_do_not_depend_on_the_unit_or_the_place_of_the_origin(scale, shift):
     features, weights = cloud(9)

@@ -80,12 +80,6 @@ def quiet():
     return replace(SINGLE.photons, dark_hz=0.0)
 
 
-def test_the_same_seed_gives_the_same_scores_and_another_seed_others():
-    first, again, other = (sunlit(task=RangeTask(), seed=seed) for seed in (3, 3, 4))
-    assert values(first) == values(again)
-    assert values(first)["aimed", 9, None] != values(other)["aimed", 9, None]
-
-
 def test_an_audit_pairs_every_row_and_passes_where_nothing_that_matters_is_skipped():
     evaluation = sunlit(audit=True)
     audit, rows = evaluation.audit, [*evaluation.rows, *evaluation.equal_bandwidth]

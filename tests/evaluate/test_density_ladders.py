@@ -489,11 +489,3 @@ class TestRuns:
             assert sweep.falls
             assert all(measurement.seconds > 0 and measurement.uncertainty >= 0 for measurement in sweep.measurements)
             assert sweep.as_rows()
-
-    def test_the_same_run_gives_the_same_errors(self, request_of, monkeypatch):
-        monkeypatch.setattr(precision, "DTYPE_BATCHES", 3)
-        again = AccuracyRequest(request_of.config, request_of.run, request_of.request, None)
-        first, second = (precision.dtype_sweeps(request)[0] for request in (request_of, again))
-        assert [measurement.error for measurement in first.measurements] == [
-            measurement.error for measurement in second.measurements
-        ]

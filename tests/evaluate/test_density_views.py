@@ -203,12 +203,3 @@ def test_silhouettes_cover_the_area_of_what_stands_there():
     assert others.sum() * cell == pytest.approx(0.24, rel=0.05)
     up, across = np.argwhere(others).mean(axis=0) * 0.005 - 1.0
     assert (across, up) == (pytest.approx(0.2, abs=0.02), pytest.approx(0.1, abs=0.02))
-
-
-def test_the_same_samples_give_the_same_view():
-    first, second = (density_view(even(ANYWHERE), BALL, [DesignSpec("d", (make_sensor(),))]) for _ in range(2))
-    for one, other in zip(first.marginals, second.marginals, strict=True):
-        assert np.array_equal(one.heights, other.heights)
-        assert np.array_equal(one.designs["d"], other.designs["d"])
-    for one, other in zip(first.planes, second.planes, strict=True):
-        assert np.array_equal(one.heights, other.heights)

@@ -112,13 +112,6 @@ def test_more_samples_lose_less_likelihood_and_the_best_fit_loses_nothing(short,
     assert samples.measurements[0].error > 3 * samples.measurements[-1].error
 
 
-def test_errors_of_fits_repeat_to_the_last_bit(short, tmp_path):
-    first, second = (mixture.sweeps(of_fit(tmp_path)) for _ in range(2))
-    assert [measurement.error for sweep in first for measurement in sweep.measurements] == [
-        measurement.error for sweep in second for measurement in sweep.measurements
-    ]
-
-
 def test_one_sensor_has_no_sweep_of_seeds_and_scans_have_none(short, tmp_path):
     assert [sweep.knob for sweep in mixture.sweeps(of_fit(tmp_path, sensors=1))] == ["samples of the fit"]
     assert mixture.sweeps(of_fit(tmp_path, layout="scan")) == []

@@ -90,10 +90,6 @@ def test_ladders_of_one_rung_have_tables_and_no_panel():
     assert "40 (run)" in accuracy_tables([single])
 
 
-def test_the_same_ladders_give_the_same_bytes():
-    assert drawn([make_sweep(), make_sweep()]) == drawn([make_sweep(), make_sweep()])
-
-
 def test_plots_hold_the_picture_where_accuracy_was_measured():
     evaluation = replace(make_evaluation(), accuracy=Accuracy([make_sweep()], {"visibility": 1.0}))
     assert pictures(make_evaluation(), FigureData())[ACCURACY]() is None

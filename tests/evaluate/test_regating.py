@@ -192,12 +192,6 @@ def test_a_budget_may_be_used_up():
     assert returns(other) > returns(design)
 
 
-def test_the_same_is_found_twice():
-    design = table(gates_like(1.0, 2.0))
-    one, two = (lay_out(GATING(design, lay_out(design))).gate_m for _ in range(2))
-    assert one.tobytes() == two.tobytes()
-
-
 def test_which_designs_have_gates_of_single_rays():
     per_ray = table(gates_like(1.0, 2.0))
     assert has_ray_gates(per_ray)

@@ -16,7 +16,7 @@ from scipy.optimize import linprog
 from support.command_line import caller, files_under, make_run
 from support.constraints import CONTRADICTIONS, FACE, ROOM, SAMPLES
 from support.designs import drawn_from, three_sensors
-from support.fits import FREE, MOVING, log_target
+from support.fits import MOVING, log_target
 from support.hard_cases import hard_case
 from support.tables import each_row
 
@@ -34,8 +34,8 @@ from lidardesign.design.mixture.ensemble import admitted_mixture
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.mixture import log_density
 from lidardesign.design.mixture.support import LEAST_MASS
-from lidardesign.design.sensor import MOST_RAYS, DesignSpec, interval_factor
-from lidardesign.errors import ConfigError, InfeasibleError
+from lidardesign.design.sensor import DesignSpec, interval_factor
+from lidardesign.errors import InfeasibleError
 from lidardesign.evaluate.metrics import DRAW_ROUNDS
 from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
@@ -447,18 +447,6 @@ class TestBoundsHoldOnTheWrittenFile:
         assert check_design(design_document(result.design), values, ROOM)
         assert result.satisfied
 
-    def test_a_fixed_origin_and_mounts_are_met_exactly(self):
-        mounts = [[0.02, 0.03, -0.01], [-0.04, 0.0, 0.02], [0.0, 0.05, 0.0]]
-        for origin, count in (({"fixed_m": mounts[0]}, 2), ({"mounts_m": mounts}, 2)):
-            values = {"origin": origin, "sensors": {"count": count}, "budget": {"rays": 11}}
-            rules = Constraints.from_mapping(values)
-            result = fit(MOVING, constraints=rules, em_samples=1500, restarts=1, retarget=log_target)
-            written = json.loads(json.dumps(design_document(result.design)))
-            assert [check for check in check_design(written, values, FREE) if not check.satisfied] == []
-            for sensor in written["sensors"]:
-                assert sensor["origin_m"]["mean"] in mounts
-                assert not np.any(sensor["origin_m"]["covariance"])
-
     def test_the_checker_shares_no_code_with_the_fit(self):
         # parts have to be looked up, and angles mean what they mean: data and conventions, nothing of the fit
         parts = {f"lidardesign.design.catalog.{name}" for name in ("library", "part")}
@@ -482,33 +470,6 @@ class TestBudgetsThatDoNotDivide:
     def broke():
         shares = [int(weight * 100) for weight in [1 / 7] * 7]
         return f"int(w n) splits 100 rays among 7 equal sensors into {shares[0]} each, {sum(shares)} in all"
-
-    @given(weights, st.integers(0, MOST_RAYS))
-    def test_the_sum_is_exact_and_no_share_is_a_whole_ray_off(self, weights, count):
-        weights = np.array(weights)
-        shares = split_budget(weights, count)
-        assert int(shares.sum()) == count
-        assert (shares >= 0).all()
-        assert (shares[weights == 0] == 0).all()
-        quotas = weights / weights.max()
-        quotas = quotas / math.fsum(quotas) * count
-        # remainders are compared to nine decimals
-        assert np.abs(shares - quotas).max() < 1 + 1e-8
-
-    @given(st.integers(1, 40), st.integers(0, 500), st.floats(1e-300, 1e300))
-    def test_equal_weights_differ_by_a_ray_at_most_and_the_first_ones_have_it(self, count, rays, weight):
-        shares = split_budget(np.full(count, weight), rays)
-        assert shares.tolist() == [rays // count + (i < rays % count) for i in range(count)]
-
-    @given(weights, st.integers(0, 10_000), st.floats(1e-9, 1e9))
-    def test_the_same_weights_give_the_same_shares_in_any_unit(self, weights, rays, unit):
-        weights = np.array(weights)
-        first = split_budget(weights, rays)
-        np.testing.assert_array_equal(first, split_budget(weights, rays))
-        # a unit changes quotas by a few roundings: shares may differ where remainders tie within them
-        other = split_budget(weights * unit, rays)
-        assert np.abs(first - other).max() <= 1
-        np.testing.assert_array_equal(first, split_budget(weights * 2.0**20, rays))
 
     @given(st.permutations(range(6)), st.integers(0, 400))
     def test_the_order_of_sensors_matters_only_between_equal_ones(self, order, rays):
@@ -544,15 +505,6 @@ class TestBudgetsThatDoNotDivide:
         ):
             with pytest.raises(InfeasibleError, match="2 rays for 3 sensors"):
                 fit(SAMPLES, constraints=Constraints.from_mapping(values), **asked)
-
-    def test_a_budget_of_no_rays_is_no_budget(self):
-        with pytest.raises(ConfigError, match="0 rays"):
-            fit(SAMPLES, rays=0)
-        with pytest.raises(ConfigError, match=r"budget\.rays"):
-            Constraints.from_mapping({"budget": {"rays": 0}})
-        for bad in (-1, 2.5, math.nan, math.inf, MOST_RAYS + 1):
-            with pytest.raises(ConfigError, match="whole number"):
-                split_budget(np.ones(3), bad)
 
     def test_a_whole_fit_repeats_its_shares(self):
         documents = [

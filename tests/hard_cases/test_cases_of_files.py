@@ -91,18 +91,6 @@ class TestYaml:
             f"last of repeated keys ({yaml.safe_load('{a: 1, a: 2}')})"
         )
 
-    @each_row("case", REFUSED)
-    def test_it_is_refused_at_its_position_with_the_reason(self, tmp_path, monkeypatch, case):
-        monkeypatch.chdir(tmp_path)
-        text, position, words = REFUSED[case]
-        (tmp_path / "input.yaml").write_bytes(text.encode())
-        with pytest.raises(ConfigError) as refused:
-            readers(tmp_path)["configuration"]()
-        assert f"input.yaml{position}" in refused.value.where
-        assert words in str(refused.value)
-        assert len(str(refused.value)) < 1000
-        assert [path.name for path in tmp_path.iterdir()] == ["input.yaml"], "a tag was executed"
-
     @each_row("case", [name for name in REFUSED if "number" not in name and "unknown" not in name])
     @each_row("reader", ["constraints", "design", "detector"])
     def test_every_reader_of_yaml_refuses_it(self, tmp_path, monkeypatch, reader, case):
@@ -118,15 +106,6 @@ class TestYaml:
         for reader in ("configuration", "constraints", "detector"):
             with pytest.raises(ConfigError, match="too large"):
                 readers(tmp_path)[reader]()
-
-    @each_row(
-        ("text", "value"),
-        [("1e-3", 1e-3), ("010", 10), ("no", "no"), ("1:30", "1:30"), ("2020-01-01", "2020-01-01"), ("0x10", "0x10")],
-    )
-    def test_scalars_mean_what_they_look_like(self, text, value):
-        found = parse_yaml(f"a: {text}", where="f").value["a"]
-        assert found == value
-        assert type(found) is type(value)
 
     def test_a_small_number_in_scientific_notation_is_a_number_of_the_configuration(self, tmp_path):
         (tmp_path / "input.yaml").write_text("density: {sigma_m: 1e-3}\n")

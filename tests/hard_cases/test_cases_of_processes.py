@@ -29,7 +29,6 @@ from lidardesign.config import load_run_config, save_run_config
 from lidardesign.density.training.schedule import with_steps
 from lidardesign.errors import PluginError
 from lidardesign.run import lock
-from lidardesign.run.files import remove_stray_temporaries
 from lidardesign.run.lock import run_lock
 from lidardesign.run.manifest import note, start_manifest
 from lidardesign.task import Score
@@ -170,18 +169,6 @@ class TestKillsFullDisksAndTwoWriters:
             "cannot be locked: Permission denied", "cannot be locked: Read-only file system",
         )  # fmt: skip
         assert files_under(run) == before
-
-    def test_what_a_killed_writer_left_anywhere_in_a_run_is_removed_by_the_next(self, tmp_path, lidardesign):
-        run = make_run(tmp_path / "run", count=1000)
-        assert lidardesign("fit", run, "--sensors", 1).code == 0
-        strays = [run / f".samples.npz.{GONE}.0a.tmp", run / "designs" / f".fit.yaml.{GONE}.0a.tmp"]
-        for stray in strays:
-            stray.write_bytes(b"half")
-        owner = {"pid": GONE, "host": socket.gethostname()}
-        (run / lock.FILE_NAME).write_text(json.dumps(owner))
-        assert lidardesign("fit", run, "--sensors", 1).code == 0
-        assert not [name for name in files_under(run) if name.endswith((".tmp", ".lock"))]
-        assert remove_stray_temporaries(run) == []
 
     def test_a_second_writer_is_told_who_writes_and_changes_nothing(self, tmp_path, lidardesign, monkeypatch):
         monkeypatch.setattr("lidardesign.workflow.designs.WAIT_S", 0.05)

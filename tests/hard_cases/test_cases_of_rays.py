@@ -161,18 +161,6 @@ class TestRaysThroughEdgesAndVertices:
             assert np.isinf(found.range_m).all()
             assert caster.second_casts == SecondCasts(500, 500, 0)
 
-    def test_neither_order_nor_chunks_of_rays_change_a_bit(self):
-        caster = SceneCaster(Scene((Body(mesh_of(BALL)),)))
-        origins, directions, _ = aimed(BALL, STARTS["inside"])
-        whole = caster.first_hit(origins, directions)
-        assert caster.second_casts.found > 0
-        order = np.random.default_rng(1).permutation(len(origins))
-        shuffled = caster.first_hit(origins[order], directions[order])
-        parts = [caster.first_hit(origins[rows], directions[rows]) for rows in (slice(0, 7), slice(7, None))]
-        for name in ("range_m", "body", "normal"):
-            assert getattr(shuffled, name).tobytes() == getattr(whole, name)[order].tobytes()
-            assert np.concatenate([getattr(part, name) for part in parts]).tobytes() == getattr(whole, name).tobytes()
-
     def test_how_many_had_slipped_is_counted_and_told(self):
         origins, directions, _ = aimed(BALL, STARTS["centre"])
         count = len(origins)

@@ -25,7 +25,7 @@ from support.scoring import design, make_request, rows_by_key
 from support.tables import each_row
 
 from lidardesign.density.training.training_data import refuse_blind_receiver
-from lidardesign.errors import ConfigError, DataError
+from lidardesign.errors import DataError
 from lidardesign.evaluate.metrics import (
     SurfaceCloud,
     chamfer_m,
@@ -43,7 +43,7 @@ from lidardesign.scene import Body, Box, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.detector.detector import IDEAL, Detector
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.physics import EFFECTS, Physics
-from lidardesign.simulate.plan import Planner, parse_effects
+from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import DesignSpace, direction
 from lidardesign.task import conditions_of
@@ -134,18 +134,6 @@ class TestHitsAtTheEdgesOfGates:
         # as gates move outwards a ray is late, then returns, then is hidden
         rank = np.select([outcomes == Outcome.AFTER_GATE, outcomes == Outcome.RETURN], [0, 1], 2)
         assert (np.diff(rank[:, np.isfinite(first)], axis=0) >= 0).all()
-
-    @given(seed=st.integers(0, 1000), pieces=st.integers(1, 5))
-    def test_neither_order_nor_chunks_of_rays_change_an_outcome(self, seed, pieces):
-        generator = np.random.default_rng(seed)
-        origins, directions = random_rays(60, seed)
-        rays = rays_of(origins, directions, np.sort(generator.uniform(0, 4, (60, 2)), axis=1))
-        (whole,) = simulate(FLOOR_AND_BALL, rays)
-        order = generator.permutation(60)
-        for rows in np.array_split(order, pieces):
-            (part,) = simulate(FLOOR_AND_BALL, rays.subset(rows))
-            for name in ("outcome", "range_m", "body"):
-                assert getattr(part, name).tobytes() == getattr(whole, name)[rows].tobytes()
 
     def test_the_rule_is_documented(self):
         assert "start included, end not" in (DOCUMENTS / "design-file.md").read_text(encoding="utf-8")
@@ -275,21 +263,6 @@ class TestEffectsNotCalledFor:
         (measured,) = simulate(head, face_rays(), physics=Physics(thin, frozenset({effect})))
         for name in ("outcome", "range_m", "body"):
             assert getattr(alone, name).tobytes() == getattr(measured, name).tobytes()
-
-    @pytest.mark.parametrize(("given", "meant"), [("fog", None), ("multipaths", "multipath"), ("Motion", "motion")])
-    def test_an_unknown_effect_is_an_error_that_lists_all_names(self, given, meant):
-        ways = (
-            lambda: parse_effects(given),
-            lambda: parse_effects(f"motion,{given}"),
-            lambda: Physics(IDEAL, frozenset({"motion", given})),
-            lambda: Planner(choice=frozenset({given})),
-        )
-        for way in ways:
-            with pytest.raises(ConfigError, match=f"unknown effect '{given}'") as caught:
-                way()
-            assert caught.value.exit_code == 2
-            assert all(name in caught.value.allowed for name in EFFECTS)
-            assert meant is None or meant in caught.value.hint
 
     def test_the_command_line_lists_them_too(self, capsys, tmp_path, monkeypatch):
         make_run(tmp_path / "run", 200)

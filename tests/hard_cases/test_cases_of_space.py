@@ -15,17 +15,15 @@ from support import references
 from support.hard_cases import hard_case
 from support.tables import each_row
 
-from lidardesign.config import DensitySettings, LearningSettings, RunConfig, resolve
+from lidardesign.config import DensitySettings, resolve
 from lidardesign.density.flow.flow import DesignFlow
 from lidardesign.density.flow.objective import Coordinates
 from lidardesign.density.target.target import MINIMUM_POLE_COSINE, build_target
-from lidardesign.density.training.training_data import prepare_ground
 from lidardesign.design.files import load_design, save_design
 from lidardesign.design.fit import fit
 from lidardesign.design.rigs.sensor_csv import COLUMNS
 from lidardesign.design.sensor import boresight_frame, tangent_directions
 from lidardesign.errors import ConfigError, DataError, NumericalError
-from lidardesign.numerics import circular_mean
 from lidardesign.registry import load_task
 from lidardesign.run.yaml import dump_yaml
 from lidardesign.samples import Samples
@@ -40,7 +38,6 @@ from lidardesign.space import (
     direction,
     observed_point,
 )
-from lidardesign.task import TaskConfig
 
 TURN = 2 * math.pi
 BOTH_POLES = ((-1.0, -1, -1, 0, -math.pi / 2, 0.0), (1.0, 1, 1, TURN, math.pi / 2, 4.0))
@@ -119,12 +116,6 @@ class TestAzimuthAcrossTheSeam:
         assert space.contains(positive).all()
         np.testing.assert_allclose(space.to_unit(positive), space.to_unit(points), atol=1e-14)
 
-    def test_means_are_those_of_directions(self):
-        assert circular_mean(np.radians([350.0, 10.0])) == pytest.approx(0.0, abs=1e-15)
-        angle = np.random.default_rng(4).normal(0, 0.1, 4000)
-        found = circular_mean(np.mod(angle, TURN))
-        assert min(found, TURN - found) < references.STANDARD_ERRORS * 0.1 / math.sqrt(4000)
-
     def test_a_sensor_that_looks_across_the_seam_is_the_one_that_looks_elsewhere(self):
         tangent = np.random.default_rng(5).normal(0, [0.1, 0.05], (4000, 2))
         sensors = []
@@ -154,17 +145,6 @@ class TestElevationAtThePoles:
             f"d elevation / d sin(elevation) is {slope} at a pole, and log cos(elevation), -inf there, is {cosine:.3g} "
             "in float32"
         )
-
-    @given(azimuths, st.sampled_from([-1.0, 1.0]))
-    def test_the_direction_is_straight_whatever_the_azimuth(self, azimuth, pole):
-        x, y, z = direction(azimuth, pole * math.pi / 2)
-        # cos of the float64 nearest to pi/2 is 6e-17
-        assert math.hypot(x, y) <= np.finfo(float).eps
-        assert z == pole
-
-    def test_straight_vectors_have_an_azimuth_of_zero(self):
-        for z in (-2.0, 1e-200, 1e200):
-            assert angles(np.array([0.0, 0.0, z])) == (0.0, math.copysign(math.pi / 2, z))
 
     @each_row("way", WAYS)
     @each_row("measure", MEASURES)
@@ -335,10 +315,6 @@ class TestRangesThatAreNone:
             build_target([BALLS], AROUND, SETTINGS, way).log_density(points)
 
 
-def config_of(space: DesignSpace) -> RunConfig:
-    return RunConfig("flatland", 0, "draft", TaskConfig(), space, SETTINGS, LearningSettings())
-
-
 @hard_case(
     "4",
     "Lower bound = upper bound",
@@ -415,13 +391,6 @@ class TestFixedDimensions:
         )
         assert np.isfinite(values).all()
         assert np.isfinite(gradient).all()
-
-    @pytest.mark.parametrize("condition", [(), ("x_m",)])
-    def test_with_nothing_left_to_learn_learning_is_refused(self, condition):
-        low, high = (0.1, 0, 0, 1, 0, 2), (0.1 + bool(condition), 0, 0, 1, 0, 2)
-        with pytest.raises(ConfigError, match="every dimension of the design space is fixed") as caught:
-            prepare_ground(load_task("flatland"), config_of(DesignSpace(low, high, condition=condition)))
-        assert caught.value.exit_code == 2
 
 
 BAD_BOUNDS = {

@@ -21,7 +21,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
-from support.broken_plugins import BROKEN, GOOD
 from support.command_line import caller, files_under, make_run
 from support.hard_cases import hard_case
 from support.learning import interrupt_after_a_checkpoint
@@ -429,15 +428,6 @@ class TestNoFileRunsCode:
             load_arrays(tmp_path, "checkpoint.safetensors")
         assert not mark.exists()
 
-    @pytest.mark.parametrize("name", ["scan.npz", "scan.mat", "rays.csv"])
-    def test_captures_and_tables_of_pickles_are_refused(self, lidardesign, flat, tmp_path, name):
-        mark, path = tmp_path / "ran", tmp_path / name
-        path.write_bytes(pickle.dumps(Payload(mark)))
-        assert lidardesign("fit", flat, "--name", "one").code == 0
-        design = flat / "designs" / "one.yaml"
-        given = (path, design) if name.startswith("scan") else (design, path)
-        self.refused(lidardesign("capture", *given), mark)
-
     @pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "glb", "off"])
     def test_meshes_of_pickles_are_refused(self, lidardesign, tmp_path, suffix):
         mark, folder = tmp_path / "ran", tmp_path / "scans"
@@ -452,29 +442,6 @@ class TestNoFileRunsCode:
         mark = tmp_path / "ran"
         setting = f"learning.rate={text.format(mark=mark)}"
         self.refused(lidardesign("learn", "flatland", "--set", setting, "--out", tmp_path / "new"), mark)
-
-
-@pytest.fixture(scope="module")
-def beside_broken_plugins(tmp_path_factory):
-    """A function that runs the program beside the plugins of another distribution, one good and many broken."""
-    site = tmp_path_factory.mktemp("site")
-    info = site / "strangers-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: strangers\nVersion: 1.0\n")
-    sources = {**{name: source for name, (source, _) in BROKEN.items()}, "good": GOOD}
-    for name, source in sources.items():
-        (site / f"plugin_{name}.py").write_text(source)
-    entries = "".join(f"{name} = plugin_{name}:GoodTask\n" for name in sources)
-    (info / "entry_points.txt").write_text(f"[lidardesign.tasks]\n{entries}")
-
-    def call(*arguments):
-        path = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")]))
-        return subprocess.run(
-            [sys.executable, "-m", "lidardesign", *map(str, arguments)],
-            env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True, check=False,
-        )  # fmt: skip
-
-    return call
 
 
 @hard_case(
@@ -494,29 +461,6 @@ class TestABrokenPluginAffectsOnlyItself:
             return (
                 f"a loop over entry points that loads them ends with exit {left.code} after {len(loaded)} of 3 plugins"
             )
-
-    def test_all_tasks_are_listed_and_the_broken_ones_with_their_reasons(self, beside_broken_plugins):
-        done = beside_broken_plugins("tasks", "list", "--json")
-        assert done.returncode == 0, done.stderr
-        errors = {entry["name"]: entry["error"] for entry in strict(done.stdout)["tasks"]}
-        assert {"arm", "emitter", "face", "flatland", "meshes", "warehouse", "good"} <= {
-            name for name, error in errors.items() if error is None
-        }
-        for name, (_, reason) in BROKEN.items():
-            assert reason in errors[name]
-
-    def test_a_shipped_task_works_beside_them(self, beside_broken_plugins, flat):
-        done = beside_broken_plugins("fit", flat, "--sensors", 1, "--json")
-        assert done.returncode == 0, done.stderr
-        assert strict(done.stdout)["satisfied"] is True
-
-    @pytest.mark.parametrize("name", ["leaves", "missing_import"])
-    def test_using_a_broken_one_names_it_and_exits_6(self, beside_broken_plugins, tmp_path, name):
-        done = beside_broken_plugins("learn", name, "--out", tmp_path / "run", "--json")
-        assert done.returncode == 6
-        assert name in strict(done.stdout)["error"]["message"] + strict(done.stdout)["error"].get("where", "")
-        assert "Traceback" not in done.stderr
-        assert not (tmp_path / "run").exists()
 
 
 # figures that are exact by what they are: counts, bounds and settings that were asked for, times that were measured
@@ -668,14 +612,6 @@ class TestDesignsKeepTheirConstraints:
             checks = check_design(load_yaml(written).value, rules, space)
             assert checks or not rules
             assert all(check.satisfied for check in checks), [check.name for check in checks if not check.satisfied]
-
-    def test_what_cannot_be_kept_exits_4_and_writes_nothing(self, lidardesign, flat):
-        for rules in ("gate.start_m.min=9", "budget.rays=1", "boresight.azimuth_deg={min: 250, max: 260}"):
-            arguments = ("--set", rules, "--sensors", 3, "--name", "never", "--json")
-            done = lidardesign("constrain", flat, *arguments)
-            assert done.code == 4, (rules, done.err)
-            assert strict(done.out)["error"]["kind"] == "infeasible"
-            assert not (flat / "designs" / "never.yaml").exists()
 
     def test_a_fit_that_broke_a_constraint_would_be_found_out_on_what_it_writes(self, lidardesign, flat, monkeypatch):
         dump = yaml_module.dump_yaml

@@ -224,19 +224,6 @@ def test_scenes_without_jitter_are_refused():
         TASK.scenes(TASK.Config(jitter_m=0, size="small"), "train", 0)
 
 
-def test_scenes_are_the_same_for_the_same_seed_and_differ_for_another(config, scenes):
-    again, other = TASK.scenes(config, "train", 0), TASK.scenes(config, "train", 1)
-    for first, second, third in zip(scenes["train"], again, other, strict=True):
-        for body, same in zip(first.bodies, second.bodies, strict=True):
-            np.testing.assert_array_equal(body.poses, same.poses)
-        assert np.abs(first.truth["ball_m"] - third.truth["ball_m"]).max() > 1e-3
-
-
-def test_training_and_held_out_trajectories_are_disjoint(scenes):
-    for train in scenes["train"]:
-        assert all(np.abs(train.truth["ball_m"] - test.truth["ball_m"]).max() > 1e-3 for test in scenes["test"])
-
-
 def test_more_trajectories_keep_the_first_ones(scenes):
     (alone,) = TASK.scenes(TASK.Config(size="small", train=1), "train", 0)
     np.testing.assert_array_equal(alone.truth["ball_m"], scenes["train"][0].truth["ball_m"])

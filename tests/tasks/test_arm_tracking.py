@@ -57,11 +57,6 @@ def test_repeated_points_do_not_change_the_frechet_distance():
     assert discrete_frechet_m(np.repeat(first, 3, axis=0), second) == discrete_frechet_m(first, second)
 
 
-def test_a_path_without_points_has_no_frechet_distance():
-    with pytest.raises(ValueError, match="without points"):
-        discrete_frechet_m(np.zeros((0, 3)), path(3))
-
-
 def ball_scene(places):
     poses = np.stack([rigid(translation_m=place) for place in places])
     screen = Body(Sphere(0.1), "screen", "occluder", rigid(translation_m=(0.0, 0.0, 0.3)))
