@@ -108,10 +108,9 @@ def main() -> None:
         run = learned("arm", Path(folder), options, robot_settings(options.robot))
         designs, fits = [], []
         for sensors in options.sensors:
-            words = ("--sensors", str(sensors), "--rays", str(max(options.rays)))
-            path, fit = fitted(run, f"benchmark-{sensors}", *words)
-            designs.append(path)
-            fits.append([sensors, fit["seconds"], fit["log_likelihood"], fit["ess"]])
+            design = fitted(run, f"benchmark-{sensors}", sensors=sensors, rays=max(options.rays))
+            designs.append(design.path)
+            fits.append([sensors, design.result.seconds, design.result.log_likelihood, design.result.ess])
         words = ["evaluate", *designs, "--json"]
         for name in FURTHER:
             words += ["--baseline", name]

@@ -139,8 +139,9 @@ def measure(run_folder: Path, options: Any, folder: Path) -> None:
     from lidardesign import open_run
 
     run = open_run(run_folder)
-    words = ("--rays", str(laboratory.RAYS), "--sensors")
-    designs = [fitted(run_folder, f"sensors-{count}", *words, str(count))[0] for count in laboratory.SENSORS]
+    designs = [
+        fitted(run_folder, f"sensors-{count}", sensors=count, rays=laboratory.RAYS).path for count in laboratory.SENSORS
+    ]
     figures: Figures = {}
     for scene in run.scenes("test", run.config.seed)[: options.heads]:
         add_head(figures, scene, run, designs, options, folder)

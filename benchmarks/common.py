@@ -177,23 +177,25 @@ def learned(task: str, folder: Path, options: Any, settings: Mapping[str, Any]) 
         settings: Keys that the benchmark itself sets; `--set` comes after them.
 
     Raises:
-        SystemExit: Learning failed, or a run is given together with what only learning could heed.
+        SystemExit: A run is given together with what only learning could heed.
     """
     if options.run is not None:
         if options.preset or options.set or settings:
             sys.exit("--run takes a run as it is: leave out what is said about learning and about the arm")
         return options.run
-    words = ["learn", task, "--preset", options.preset or "standard", "--out", folder / "run", "--json"]
-    for setting in [*(f"{key}={value}" for key, value in settings.items()), *options.set]:
-        words += ["--set", setting]
-    run_process(lidardesign(*words)).document()
-    return folder / "run"
+    from lidardesign import learn
+
+    chosen = [*(f"{key}={value}" for key, value in settings.items()), *options.set]
+    return learn(task, preset=options.preset or "standard", out=folder / "run", settings=chosen).folder
 
 
-def fitted(run: Path, name: str, *words: str) -> tuple[Path, dict[str, Any]]:
-    """The file of a design that is fitted to a run, and what `fit` printed."""
-    found = run_process(lidardesign("fit", run, "--name", name, "--json", *words)).document()
-    return run / "designs" / f"{name}.yaml", found
+def fitted(run: Path, name: str, **choices: Any) -> Any:
+    """A design that is fitted to a run and saved there."""
+    from lidardesign import open_run
+
+    design = open_run(run).fit(name=name, **choices)
+    design.save()
+    return design
 
 
 def without_traceback(main: Callable[[], None]) -> None:

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from common import fitted, installed, learned, lidardesign, parser, report, run_options, run_process, without_traceback
+from common import fitted, installed, learned, parser, report, run_options, without_traceback
 
 DESIGNS = 20
 WIDTHS = {"1440": (1440, 900), "390": (390, 844)}
@@ -38,14 +38,15 @@ STEP = """async () => {
 
 def made_pages(options: Any, folder: Path) -> list[Path]:
     """Reports of one design and of many on a draft run."""
+    from lidardesign import open_run
+
     options.preset = options.preset or "draft"
     run = learned("face", folder, options, {})
-    designs = [fitted(run, f"benchmark-{index}", "--sensors", str(2 + index % 9))[0] for index in range(DESIGNS)]
+    designs = [fitted(run, f"benchmark-{index}", sensors=2 + index % 9).path for index in range(DESIGNS)]
     pages = []
     for count in (1, DESIGNS):
         page = folder / f"designs-{count}.html"
-        words = ["--set", "test=2", "--rays", "400", "--report", page, "--json"]
-        run_process(lidardesign("evaluate", *designs[:count], *words)).document()
+        open_run(run).evaluate(designs[:count], settings={"test": 2}, rays=[400]).report(page)
         pages.append(page)
     return pages
 

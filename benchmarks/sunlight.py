@@ -155,12 +155,11 @@ def main() -> None:
 def measure(run_folder: Path, options: Any) -> None:
     """Fit, simulate and print."""
     from lidardesign import open_run
-    from lidardesign.design.files import load_design
     from lidardesign.evaluate.score import entries_of
 
     run = open_run(run_folder)
-    paths = [fitted(run_folder, f"sunlight-{n}", "--sensors", str(n))[0] for n in options.sensors]
-    request = request_of(run, [load_design(path) for path in paths], options)
+    designs = [fitted(run_folder, f"sunlight-{n}", sensors=n).specification for n in options.sensors]
+    request = request_of(run, designs, options)
     entries = entries_of(request)
     tallies, called = [Tally() for _ in entries], set()
     for scene in request.test:

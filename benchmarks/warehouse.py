@@ -64,10 +64,9 @@ def verdicts(found: dict[str, Any]) -> list[str]:
     ]
 
 
-def miss_rates(run_folder: Path, designs: list[Path], x_m: float, rays: int) -> dict[str, float]:
+def miss_rates(run_folder: Path, designs: list[Any], x_m: float, rays: int) -> dict[str, float]:
     """Mean miss rate [%] on the held-out shelves seen from one position, by design and baseline."""
     from lidardesign import open_run
-    from lidardesign.design.files import load_design
     from lidardesign.evaluate.request import EvaluationRequest
     from lidardesign.evaluate.score import evaluate
     from lidardesign.samples import load_samples
@@ -76,7 +75,7 @@ def miss_rates(run_folder: Path, designs: list[Path], x_m: float, rays: int) -> 
 
     run = open_run(run_folder)
     config = run.config
-    loaded = [load_design(path) for path in designs]
+    loaded = [design.specification for design in designs]
     samples = load_samples(run.folder)
     space = config.space.at({"x_m": x_m})
     train, test = (scenes_of(run.task, config.task, split, config.seed, space) for split in ("train", "test"))
@@ -119,14 +118,13 @@ def divergence_nats(run_folder: Path, x_m: float, log_likelihood: float) -> floa
     return float(moved.weights @ moved.log_target - log_volume) - log_likelihood
 
 
-def position_row(run: Path, track: Path, x_m: float, rays: int) -> list[object]:
+def position_row(run: Path, track: Any, x_m: float, rays: int) -> list[object]:
     """One row: the fit at a position, and what it and the others miss there."""
-    words = ("--at", f"x_m={x_m}", "--layout", "scan", "--rays", str(rays))
-    path, found = fitted(run, f"benchmark-at-{x_m:g}", *words)
-    missed = miss_rates(run, [path, track], x_m, rays)
-    figures = [missed[name] for name in (path.stem, track.stem, "uniform", "bounding")]
-    divergence = divergence_nats(run, x_m, found["log_likelihood"])
-    return [x_m, found["ess"], found["log_likelihood"], divergence, *figures]
+    design = fitted(run, f"benchmark-at-{x_m:g}", at={"x_m": x_m}, layout="scan", rays=rays)
+    missed = miss_rates(run, [design, track], x_m, rays)
+    figures = [missed[name] for name in (design.name, track.name, "uniform", "bounding")]
+    divergence = divergence_nats(run, x_m, design.result.log_likelihood)
+    return [x_m, design.result.ess, design.result.log_likelihood, divergence, *figures]
 
 
 def position_verdict(rows: list[list[Any]]) -> str:
@@ -154,14 +152,14 @@ def main() -> None:
     options = made.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         run = learned("warehouse", Path(folder), options, {})
-        track, fit = fitted(run, "benchmark-track", "--rays", str(options.fit_rays))
-        words = ["evaluate", track, "--json"]
+        track = fitted(run, "benchmark-track", rays=options.fit_rays)
+        words = ["evaluate", track.path, "--json"]
         for rays in options.rays:
             words += ["--rays", str(rays)]
         results = [run_process(lidardesign(*words)) for _ in range(options.rounds)]
         found = results[0].document()
         positions = [position_row(run, track, x_m, options.fit_rays) for x_m in options.at]
-        lines = [*verdicts(found), f"fit of the track: {fit['seconds']:.1f} s", refusal(run)]
+        lines = [*verdicts(found), f"fit of the track: {track.result.seconds:.1f} s", refusal(run)]
     if set(options.at) & set(PAPER_M) and set(options.at) - set(PAPER_M):
         lines.insert(2, position_verdict(positions))
     missed = f"{found['metric']['name']} {found['metric']['unit']}"

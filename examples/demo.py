@@ -6,7 +6,6 @@ python examples/demo.py [--out FOLDER] [--task TASK]
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import shlex
 import shutil
@@ -14,6 +13,8 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+
+import lidardesign
 
 CONSTRAINTS = """\
 # a sensor that one can buy: 20 degrees at most, a gate of 10 cm, 576 rays in all
@@ -90,14 +91,8 @@ def main() -> None:
     )
     print(f"\nDone in {time.perf_counter() - started:.0f} s.")
     print(f"The report with curves and a 3D view: {os.path.relpath(folder / 'report.html')}")
-    print(f"How well the density was learned: {json.dumps(learned(run))}")
-
-
-def learned(run: Path) -> dict[str, float]:
-    """What the run's manifest says about the quality of the learned density."""
-    manifest = json.loads((run / "manifest.json").read_text(encoding="utf-8"))
-    figures = manifest.get("learn", {})
-    return {key: round(figures[key], 3) for key in ("ess", "kl_nats", "coverage") if key in figures}
+    quality = lidardesign.open_run(run).quality
+    print(f"How well the density was learned: ESS {quality.ess:.3f}, coverage {quality.coverage:.3f}")
 
 
 if __name__ == "__main__":

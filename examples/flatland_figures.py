@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -26,7 +25,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Wedge
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-from lidardesign.config import RunConfig, load_run_config
+import lidardesign
+from lidardesign.config import RunConfig
 from lidardesign.density.target.target import Target, build_target
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.samples import Samples, load_samples
@@ -209,17 +209,6 @@ def box(across: tuple, angles: tuple, gate: tuple, colour: str) -> Poly3DCollect
     return Poly3DCollection(faces, facecolors=colour, edgecolors=colour, linewidths=0.7, alpha=0.40)
 
 
-def learn(run: Path, settings: list[str]) -> None:
-    """A draft run of flatland."""
-    program = "import sys; from lidardesign.cli.main import run; sys.exit(run())"
-    words = ["learn", "flatland", "--preset", "draft", "--out", str(run), "--quiet"]
-    for setting in settings:
-        words += ["--set", setting]
-    code = subprocess.run([sys.executable, "-c", program, *words], check=False).returncode
-    if code:
-        sys.exit(code)
-
-
 def main() -> None:
     """Draw all three into a folder."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -228,14 +217,14 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="passed to learn; repeatable")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        run = options.run or Path(folder) / "run"
         if options.run is None:
-            learn(run, options.set)
-        task, config = load_run_config(run)
-        if task.name != "flatland":
-            sys.exit(f"{run} is a run of {task.name}; these figures are of flatland")
-        samples = load_samples(run)
-    scenes = list(task.scenes(config.task, "train", config.seed))
+            run = lidardesign.learn("flatland", preset="draft", out=Path(folder) / "run", settings=options.set)
+        else:
+            run = lidardesign.open_run(options.run)
+        if run.task.name != "flatland":
+            sys.exit(f"{run.folder} is a run of {run.task.name}; these figures are of flatland")
+        config, samples = run.config, load_samples(run.folder)
+        scenes = run.scenes("train", config.seed)
     target = build_target(scenes, config.space, config.density, "raycast")
     figures = {
         "scene_point": single_point_figure(config),
