@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,9 +15,8 @@ if TYPE_CHECKING:
 
 Entry = dict[str, Any]
 MILLIMETRES = 1000.0
-# Differences of an audit are shown to hundredths of what is tolerated, and to so many decimals where nothing is.
-FINER = 2
 SHORT_S = 0.01
+# Of the differences of an audit that tolerates none.
 DECIMALS = 4
 
 
@@ -34,9 +33,15 @@ def show_evaluation(document: dict[str, Any], written: Sequence[Path], rich: Ric
     against = [pair for pair in document["paired"] if pair["b"] not in designs]
     unit = escape(metric["unit"])
     title = f"difference to each baseline \\[{unit}], scene by scene, with its 95 % interval"
-    _show_grid(against, title, ("a", "rays"), "b", _difference, rich)
+    cells = [
+        f"{number(pair['difference'], 3)} ({number(pair['ci_low'], 3)} to {number(pair['ci_high'], 3)})"
+        for pair in against
+    ]
+    _show_grid(title, [(pair["a"], pair["rays"], pair["b"]) for pair in against], cells, rich)
+    matched = document["equal_bandwidth"]
     title = f"baselines with as much bandwidth as the design: value \\[{unit}] (rays)"
-    _show_grid(document["equal_bandwidth"], title, ("matched_to", "matched_rays"), "design", _value, rich)
+    cells = [f"{number(row['value'])} ({row['rays']})" for row in matched]
+    _show_grid(title, [(row["matched_to"], row["matched_rays"], row["design"]) for row in matched], cells, rich)
     _show_effects(document, rich)
     if "audit" in document:
         _show_audit(document, rich)
@@ -74,31 +79,18 @@ def _show_errors(document: Entry, rich: RichConsole) -> None:
     )
 
 
-def _show_grid(
-    entries: Sequence[Entry],
-    title: str,
-    keys: tuple[str, str],
-    column: str,
-    cell: Callable[[Entry], str],
-    rich: RichConsole,
-) -> None:
-    """One line per design and number of rays, one column per baseline."""
-    if not entries:
+def _show_grid(title: str, places: Sequence[tuple[str, int, str]], cells: Sequence[str], rich: RichConsole) -> None:
+    """One line per design and number of rays, one column per baseline; places have these three."""
+    if not places:
         return
-    columns = list(dict.fromkeys(entry[column] for entry in entries))
-    lines: dict[tuple[Any, ...], dict[str, str]] = {}
-    for entry in entries:
-        lines.setdefault(tuple(entry[key] for key in keys), {})[entry[column]] = cell(entry)
-    rows = [[name, str(rays), *(line.get(other, "-") for other in columns)] for (name, rays), line in lines.items()]
+    columns = list(dict.fromkeys(column for _, _, column in places))
+    lines: dict[tuple[str, int], dict[str, str]] = {}
+    for (design, rays, column), cell in zip(places, cells, strict=True):
+        lines.setdefault((design, rays), {})[column] = cell
+    rows = [
+        [design, str(rays), *(line.get(column, "-") for column in columns)] for (design, rays), line in lines.items()
+    ]
     print_table(title, ("design", "rays", *columns), rows, rich)
-
-
-def _difference(pair: Entry) -> str:
-    return f"{number(pair['difference'], 3)} ({number(pair['ci_low'], 3)} to {number(pair['ci_high'], 3)})"
-
-
-def _value(row: Entry) -> str:
-    return f"{number(row['value'])} ({row['rays']})"
 
 
 def _show_effects(document: Entry, rich: RichConsole) -> None:
@@ -118,15 +110,13 @@ def _show_effects(document: Entry, rich: RichConsole) -> None:
     for effect in effects:
         bounds = [plain_number(MILLIMETRES * effect["bound"], 3), plain_number(effect["lost"], 2)]
         cost = plain_number(effect["seconds"], 2, tiny=SHORT_S)
-        lines.append([_words(effect["name"]), _where_on(effect), *bounds, cost, effect["reason"]])
+        if effect["on"]:
+            on = "yes" if effect["scenes_on"] == 1 else f"in {100 * effect['scenes_on']:.0f} %"
+        else:
+            on = "no" if effect["missing"] is None else "missing"
+        lines.append([_words(effect["name"]), on, *bounds, cost, effect["reason"]])
     headings = ("effect", "on", "range [mm]", "returns", "cost [s]", "reason")
     print_table(title, headings, lines, rich, text=("effect", "on", "reason"), wraps=True)
-
-
-def _where_on(effect: Entry) -> str:
-    if not effect["on"]:
-        return "no" if effect["missing"] is None else "missing"
-    return "yes" if effect["scenes_on"] == 1 else f"in {100 * effect['scenes_on']:.0f} %"
 
 
 def _words(name: str) -> str:
@@ -145,7 +135,9 @@ def _show_audit(document: Entry, rich: RichConsole) -> None:
     planned, everything = f"planned\n[{unit}]", f"all effects\n[{unit}]"
     moves = "difference (95 % interval)"
     headings = ("design", "bandwidth\nof", "rays", planned, everything, moves, "seconds\nof both")
-    decimals = _decimals(audit["tolerance"])
+    # as many as show hundredths of what is tolerated
+    tolerance = audit["tolerance"]
+    decimals = max(0, 2 - math.floor(math.log10(tolerance))) if tolerance > 0 else DECIMALS
     lines = []
     for row in audit["rows"]:
         # adding zero takes the sign from a rounded -0
@@ -156,8 +148,3 @@ def _show_audit(document: Entry, rich: RichConsole) -> None:
         matched = row.get("matched_to", "-")
         lines.append([row["design"], matched, str(row["rays"]), *scores, f"{moved} ({low} to {high})", times])
     print_table(escape(title), headings, lines, rich, text=headings[:2])
-
-
-def _decimals(tolerance: float) -> int:
-    """As many decimals as tell hundredths of a tolerance."""
-    return max(0, FINER - math.floor(math.log10(tolerance))) if tolerance > 0 else DECIMALS
