@@ -108,8 +108,7 @@ def trace_each(
             caster.trace(origins[begin:end], directions[begin:end], limit_m[begin:end])
             for caster, begin, end in zip(casters, starts[:-1], starts[1:], strict=True)
         ]
-        columns = zip(*((part.range_m, part.body, part.normal) for part in parts), strict=True)
-        return Hits(*(np.concatenate(column) for column in columns))
+        return Hits.joined(parts)
     return _traced_at_rest(resting, starts, origins, directions, limit_m)
 
 
@@ -155,7 +154,7 @@ class _AtRest:
     def trace(
         self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None
     ) -> Hits:
-        hits = _no_hits(len(origins))
+        hits = Hits.none(len(origins))
         if len(origins):
             local = origins - self.triangles.centre
             rows, range_m, geometry, normal = self.triangles.trace(local, directions, limit_m, twice)
@@ -172,7 +171,7 @@ def _traced_at_rest(
     advance_m = advances_m(local, directions, np.repeat([one.radius_m for one in meshes], counts))
     local = (local + advance_m[:, None] * directions).astype(np.float32)
     toward, limit = directions.astype(np.float32), np.clip(limit_m - advance_m, 0.0, FARTHEST_M).astype(np.float32)
-    hits = _no_hits(len(origins))
+    hits = Hits.none(len(origins))
     rows, ranges, normals = [], [], []
     for one, begin, end in zip(meshes, starts[:-1], starts[1:], strict=True):
         if begin == end:
@@ -264,7 +263,7 @@ class _Meshes:
     def trace(
         self, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray, twice: SecondCasts | None
     ) -> Hits:
-        hits = self.resting.trace(origins, directions, limit_m, twice) if self.resting else _no_hits(len(origins))
+        hits = self.resting.trace(origins, directions, limit_m, twice) if self.resting else Hits.none(len(origins))
         if self.moving:
             self.moving.keep_nearer(hits, origins, directions, limit_m, twice)
         return hits
@@ -291,10 +290,6 @@ class _Meshes:
     def _step_m(self, limit_m: np.ndarray) -> float:
         reach = limit_m[np.isfinite(limit_m)].max(initial=0.0)
         return STEP_SHARE * max(float(reach), *(part.radius_m for part in (self.resting, self.moving) if part))
-
-
-def _no_hits(count: int) -> Hits:
-    return Hits(np.full(count, np.inf), np.full(count, -1, dtype=np.int64), np.zeros((count, 3)))
 
 
 def _turned(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
@@ -173,6 +174,20 @@ class Hits:
     range_m: np.ndarray
     body: np.ndarray
     normal: np.ndarray
+
+    @classmethod
+    def none(cls, count: int) -> Hits:
+        """So many misses."""
+        return cls(np.full(count, np.inf), np.full(count, -1, dtype=np.int64), np.zeros((count, 3)))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Hits]) -> Hits:
+        """Several lists as one, one after the other."""
+        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
+
+    def subset(self, chosen: np.ndarray | slice) -> Hits:
+        """The hits at an index or mask."""
+        return Hits(*(column[chosen] for column in vars(self).values()))
 
 
 class Crossings(NamedTuple):

@@ -5,7 +5,7 @@ Beams and echoes are flat lists that name the ray of a design that each entry be
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,6 +44,15 @@ class Beams:
     def __len__(self) -> int:
         return len(self.ray)
 
+    def subset(self, chosen: np.ndarray | slice) -> Beams:
+        """The beams at an index or mask."""
+        return Beams(*(column[chosen] for column in vars(self).values()))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Beams]) -> Beams:
+        """Several lists as one, one after the other."""
+        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
+
 
 @dataclass(frozen=True, eq=False)
 class Echoes:
@@ -66,15 +75,14 @@ class Echoes:
     def __len__(self) -> int:
         return len(self.ray)
 
-    def kept(self, chosen: np.ndarray) -> Echoes:
+    def subset(self, chosen: np.ndarray) -> Echoes:
         """The echoes at an index or mask."""
-        return Echoes(self.ray[chosen], self.path_m[chosen], self.gain[chosen], self.body[chosen])
+        return Echoes(*(column[chosen] for column in vars(self).values()))
 
     @classmethod
-    def joined(cls, parts: list[Echoes]) -> Echoes:
-        """Several lists as one."""
-        names = ("ray", "path_m", "gain", "body")
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    def joined(cls, parts: Sequence[Echoes]) -> Echoes:
+        """Several lists as one, one after the other."""
+        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,6 +41,7 @@ from lidardesign.simulate.effects import (
 )
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
+from lidardesign.simulate.light_transport import process
 from lidardesign.simulate.physics import EFFECTS, Physics, check_effects
 from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import Metric
@@ -233,28 +234,23 @@ class Planner:
         return self._decided(found, {decision.name: decision.seconds for decision in plan.decisions})
 
     def _decided(self, found: dict[str, Bound], seconds: dict[str, float]) -> EffectPlan:
-        missing = {name: _missing(name) for name in self._asked(found)}
-        on = self._chosen(found, missing)
+        if self.choice == "auto":
+            wanted = _called_for(found, self.tolerated)
+        elif self.choice == "all":
+            wanted = available_effects(self.detector)
+        else:
+            wanted = frozenset() if self.choice == "none" else self.choice
+        missing = {name: process.missing() if name == "multipath" else None for name in sorted(wanted)}
+        for name, reason in missing.items():
+            if reason is not None and isinstance(self.choice, frozenset):
+                raise ConfigError(f"{name} cannot be simulated here: {reason}", where="--effects", hint="leave it out")
+        on = {name for name, reason in missing.items() if reason is None}
         decisions = (Decision(name, name in on, found[name], seconds[name], missing.get(name)) for name in EFFECTS)
         return EffectPlan(tuple(decisions), self.tolerated)
 
     def physics(self, plan: EffectPlan, seed: int) -> Physics | None:
         """What `simulate` takes for a plan; None where nothing is on."""
         return Physics(self.detector, plan.effects, seed) if plan.effects else None
-
-    def _asked(self, found: dict[str, Bound]) -> list[str]:
-        """Effects that are on wherever they can be simulated."""
-        if self.choice == "auto":
-            return sorted(_called_for(found, self.tolerated))
-        if self.choice == "all":
-            return [name for name in EFFECTS if name in available_effects(self.detector)]
-        return [] if self.choice == "none" else sorted(self.choice)
-
-    def _chosen(self, found: dict[str, Bound], missing: dict[str, str | None]) -> frozenset[str]:
-        for name, reason in missing.items():
-            if reason is not None and isinstance(self.choice, frozenset):
-                raise ConfigError(f"{name} cannot be simulated here: {reason}", where="--effects", hint="leave it out")
-        return frozenset(name for name, reason in missing.items() if reason is None)
 
 
 def parse_effects(text: str) -> Choice:
@@ -264,21 +260,18 @@ def parse_effects(text: str) -> Choice:
         ConfigError: An unknown effect; all are listed.
     """
     names = [name.strip() for name in text.split(",")]
+    allowed = f"{', '.join(WORDS)}, or any of {', '.join(EFFECTS)}"
     if names[0] in CHOICES and len(names) == 1:
         return names[0]  # type: ignore[return-value]
     if not all(names):
-        raise ConfigError(f"{text!r} leaves an effect unnamed", where="--effects", allowed=_allowed())
+        raise ConfigError(f"{text!r} leaves an effect unnamed", where="--effects", allowed=allowed)
     for name in names:
         if name in WORDS:
             raise ConfigError(f"{name!r} stands among effects", where="--effects", allowed=f"{name} alone, or names")
         if name not in EFFECTS:
             hint = suggest(name.lower(), [*EFFECTS, *WORDS])
-            raise ConfigError(f"unknown effect {name!r}", where="--effects", allowed=_allowed(), hint=hint)
+            raise ConfigError(f"unknown effect {name!r}", where="--effects", allowed=allowed, hint=hint)
     return frozenset(names)
-
-
-def _allowed() -> str:
-    return f"{', '.join(WORDS)}, or any of {', '.join(EFFECTS)}"
 
 
 def available_effects(detector: Detector) -> frozenset[str]:
@@ -299,15 +292,6 @@ def _called_for(found: dict[str, Bound], tolerance: Tolerance) -> set[str]:
     return on
 
 
-def _missing(name: str) -> str | None:
-    """What an effect's simulation needs that is not here."""
-    if name != "multipath":
-        return None
-    from lidardesign.simulate.light_transport.process import missing
-
-    return missing()
-
-
 def _bounds(
     scene: Scene, lists: Sequence[Rays], detector: Detector, casters: Sequence[SceneCaster] | None
 ) -> dict[str, Bound]:
@@ -320,57 +304,52 @@ def _bounds(
     fired = [rays for rays in lists if len(rays)]
     if not fired:
         return found | {name: Bound(0.0, 0.0, "no ray is fired") for name in present}
-    sums = {name: _Sum(len(fired)) for name in present}
+    sums = {name: _BoundSum(len(fired)) for name in present}
     casters = build_casters(scene) if casters is None else casters
-    for frame in _spread(scene.frames):
-        caster = casters[frame]
-        counts = Counts(FirstHits.of(scene, frame, detector, fired, caster))
-        for name, stake in _stakes(counts, present).items():
-            sums[name].add(counts.first_hits, stake)
+    # all frames, or the middles of equal shares of time
+    most = min(scene.frames, MOST_FRAMES)
+    for frame in (int((i + 0.5) * scene.frames / most) for i in range(most)):
+        counts = Counts(FirstHits.of(scene, frame, detector, fired, casters[frame]))
+        for name, bound in _frame_bounds(counts, present).items():
+            sums[name].add(counts.first_hits, bound)
     return found | {name: total.bound() for name, total in sums.items()}
 
 
-def _spread(frames: int) -> list[int]:
-    """All frames, or `MOST_FRAMES` of them: the middles of equal shares of time."""
-    most = min(frames, MOST_FRAMES)
-    return [int((i + 0.5) * frames / most) for i in range(most)]
-
-
-def _stakes(counts: Counts, present: Sequence[str]) -> dict[str, EffectBound]:
+def _frame_bounds(counts: Counts, present: Sequence[str]) -> dict[str, EffectBound]:
     """What each effect could change: anything, where mirrors and glass lead light to what no first hit shows."""
-    stakes = {name: EFFECT_MODULES[name].bound(counts.first_hits, counts) for name in present}
-    led = stakes["specular"].lost if "specular" in stakes else np.zeros(0)
+    bounds = {name: EFFECT_MODULES[name].bound(counts.first_hits, counts) for name in present}
+    led = bounds["specular"].lost if "specular" in bounds else np.zeros(0)
     if not led.any():
-        return stakes
+        return bounds
     unknown = "; unknown behind mirrors and glass"
     return {
-        name: stake
+        name: bound
         if name in OF_FIRST_HITS
-        else replace(stake, lost=np.maximum(stake.lost, led), reason=stake.reason + unknown)
-        for name, stake in stakes.items()
+        else replace(bound, lost=np.maximum(bound.lost, led), reason=bound.reason + unknown)
+        for name, bound in bounds.items()
     }
 
 
-class _Sum:
-    """An effect's stakes over frames, list by list."""
+class _BoundSum:
+    """An effect's bounds over frames, list by list."""
 
     def __init__(self, lists: int) -> None:
         self._squared_m2, self._lost, self._returns = np.zeros(lists), np.zeros(lists), np.zeros(lists)
         self._unseen_m2, self._rays = np.zeros(lists), np.zeros(lists)
         self._reason, self._largest = "", -1.0
 
-    def add(self, first_hits: FirstHits, stake: EffectBound) -> None:
+    def add(self, first_hits: FirstHits, bound: EffectBound) -> None:
         def per_list(values: np.ndarray) -> np.ndarray:
             return np.bincount(first_hits.row, weights=values, minlength=len(self._lost))
 
-        squared, lost = per_list(stake.squared_m2 * first_hits.returned), per_list(stake.lost)
-        self._unseen_m2 += per_list(stake.squared_m2)
+        squared, lost = per_list(bound.squared_m2 * first_hits.returned), per_list(bound.lost)
+        self._unseen_m2 += per_list(bound.squared_m2)
         self._rays += per_list(np.ones(len(first_hits)))
         self._squared_m2 += squared
         self._lost += lost
         self._returns += per_list(first_hits.returned.astype(float))
         if float(squared.max() + lost.max()) > self._largest:
-            self._largest, self._reason = float(squared.max() + lost.max()), stake.reason
+            self._largest, self._reason = float(squared.max() + lost.max()), bound.reason
 
     def bound(self) -> Bound:
         # without a single return, every one that is invented is one too many, and may be of any ray

@@ -78,7 +78,7 @@ def rays_that_meet(
     design[:, RANGE] = np.where(np.isfinite(hits.range_m), hits.range_m, 2 * FARTHEST_M)
     of_target = np.array([*(body.is_target for body in scene.bodies), False])
     kept = of_target[hits.body] & space.contains(design)
-    return design[kept], Hits(hits.range_m[kept], hits.body[kept], hits.normal[kept])
+    return design[kept], hits.subset(kept)
 
 
 def with_noise(returns: Sequence[Returns], share: float, generator: np.random.Generator) -> list[Returns]:

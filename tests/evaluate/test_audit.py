@@ -28,7 +28,7 @@ JITTERY = Detector("jittery", jitter_sigma_s=1e-9)
 @pytest.fixture(autouse=True)
 def without_light_transport(monkeypatch):
     """The same on every machine: late light is rendered by another program, which some do not have."""
-    monkeypatch.setattr(plan_module, "_missing", lambda name: "not here" if name == "multipath" else None)
+    monkeypatch.setattr(plan_module.process, "missing", lambda: "not here")
 
 
 class RangeTask(MissTask):

@@ -314,7 +314,7 @@ def test_the_order_of_a_list_s_echoes_by_ray_does_not_matter():
     by_ray = np.argsort(-echoes.ray, kind="stable")
     gate = windows(rays, 1.0, 3.0)
     before = detected(gate, echoes, light, detector, ALL)
-    after = detected(gate, echoes.kept(by_ray), light, detector, ALL)
+    after = detected(gate, echoes.subset(by_ray), light, detector, ALL)
     assert np.array_equal(before.path_m, after.path_m, equal_nan=True)
     assert np.array_equal(before.body, after.body)
 

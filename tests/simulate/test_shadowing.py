@@ -74,7 +74,7 @@ def test_a_receiver_at_the_emitter_sees_all_that_is_lit():
 def test_the_shadow_of_a_ball_on_a_wall_is_its_cone():
     ball = Body(Sphere(0.3), poses=rigid(translation_m=(2.0, 0.5, 0.0)))
     direct, kept = both(Scene((wall(), ball), receiver=BESIDE), fan(4000))
-    lit = direct.kept(direct.body == 0)
+    lit = direct.subset(direct.body == 0)
     points = fan(4000)[lit.ray]
     points = points * (4.0 / points[:, :1])
     towards, centre = points - BESIDE.origin_m, np.array([2.0, 0.5, 0.0]) - BESIDE.origin_m

@@ -87,7 +87,7 @@ def test_a_pane_weakens_what_lies_behind_it_by_both_faces_both_ways():
     direct, led = traced(Scene((pane, wall)), beams_along(looking))
     clear, _ = traced(Scene((wall,)), beams_along(looking))
     assert (direct.body == 0).all()
-    behind, far_face = led.kept(led.body == 1), led.kept(led.body == 0)
+    behind, far_face = led.subset(led.body == 1), led.subset(led.body == 0)
     assert behind.path_m == pytest.approx(clear.path_m, abs=1e-12)
     assert behind.gain == pytest.approx(0.9**4 * clear.gain, rel=1e-12)
     assert far_face.path_m == pytest.approx(direct.path_m * 1.01, abs=1e-12)
@@ -99,7 +99,7 @@ def test_panes_add_up_until_beams_are_given_up():
     for panes in range(1, MAXIMUM_TURNS // 2 + 2):
         bodies = tuple(slab(1.0 + index, transmission=0.8, reflectance=0.0) for index in range(panes))
         _, led = traced(Scene((*bodies, wall)), beams_along([[1.0, 0, 0]]))
-        behind = led.kept(led.body == panes)
+        behind = led.subset(led.body == panes)
         if panes <= MAXIMUM_TURNS // 2:
             assert behind.path_m == pytest.approx([9.0], abs=1e-12)
             assert behind.gain == pytest.approx([0.8 ** (4 * panes) * 0.5 / (math.pi * 81)], rel=1e-9)
@@ -111,7 +111,7 @@ def test_a_ball_of_glass_is_crossed_through_both_of_its_sides():
     ball = Body(Sphere(0.5), poses=rigid(translation_m=(2, 0, 0)), reflectance=0.0, transmission=0.6)
     wall = Body(Box((0.1, 9, 9)), poses=rigid(translation_m=(5.1, 0, 0)), reflectance=0.5)
     _, led = traced(Scene((ball, wall)), beams_along([[1.0, 0, 0]]))
-    behind = led.kept(led.body == 1)
+    behind = led.subset(led.body == 1)
     assert behind.gain == pytest.approx([0.6**4 * 0.5 / (math.pi * 25)], rel=1e-9)
 
 
@@ -121,7 +121,7 @@ def test_two_mirrors_face_to_face_make_a_row_of_images():
     direct, led = traced(Scene(mirrors), beams_along(looking))
     # the near mirror at x = -1 is met after 2 + 3, 2 + 3 + 6, ... metres; each turn takes half both ways
     slant = math.cos(0.05)
-    met = led.kept(led.body == 1)
+    met = led.subset(led.body == 1)
     turns = np.arange(1, 2 * len(met), 2)
     lengths = (2 + 3 * turns) / slant
     assert len(met) == MAXIMUM_TURNS // 2
@@ -198,7 +198,7 @@ def test_a_fixed_receiver_hears_through_panes_on_both_ways():
     )
     receiver = Receiver((0.0, 0.5, 0.0), **EVERYWHERE, range_m=(0.0, 9.0))
     _, led = traced(Scene((pane, wall), receiver=receiver), beams_along([[1.0, 0.0, 0.0]]))
-    behind = led.kept(led.body == 1)
+    behind = led.subset(led.body == 1)
     back_m = math.hypot(3.0, 0.5)
     assert behind.path_m == pytest.approx([(3 + back_m) / 2], abs=1e-9)
     assert behind.gain == pytest.approx([0.9**4 * 0.5 * (3 / back_m) / (math.pi * back_m**2)], rel=1e-9)

@@ -119,7 +119,7 @@ def _strongest(scene: Scene, frame: int, windows_m: np.ndarray, echoes: Echoes, 
     """The strongest echo in each window; those that the detector cannot tell from it, as their mean by gain."""
     count, detector = len(windows_m), physics.detector
     inside = (echoes.path_m >= windows_m[echoes.ray, 0]) & (echoes.path_m < windows_m[echoes.ray, 1])
-    echoes = echoes.kept(inside & (echoes.gain > 0))
+    echoes = echoes.subset(inside & (echoes.gain > 0))
     rising = np.argsort(echoes.gain, kind="stable")
     best = np.full(count, -1)
     best[echoes.ray[rising]] = rising

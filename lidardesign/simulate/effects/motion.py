@@ -171,8 +171,7 @@ def _local_tracer(shape: Shape) -> tuple[LocalTracer, np.ndarray, float]:
     group = PrimitiveGroup([(0, Body(shape))], 0)
 
     def trace(origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        count = len(origins)
-        hits = Hits(np.full(count, np.inf), np.full(count, -1, dtype=np.int64), np.zeros((count, 3)))
+        hits = Hits.none(len(origins))
         group.keep_nearer(hits, origins, directions, limit_m)
         return hits.range_m, hits.normal
 
@@ -207,9 +206,8 @@ def moving_tracer(scene: Scene, frame: int) -> Tracer:
     moving = [_MovingBody(scene, index, frame) for index in range(len(scene.bodies)) if index not in rest]
 
     def trace(origins: np.ndarray, directions: np.ndarray, time_s: np.ndarray) -> Hits:
-        count = len(origins)
         if caster is None:
-            hits = Hits(np.full(count, np.inf), np.full(count, -1, dtype=np.int64), np.zeros((count, 3)))
+            hits = Hits.none(len(origins))
         else:
             found = caster.first_hit(origins, directions)
             body = np.where(found.body >= 0, indices[found.body], -1)

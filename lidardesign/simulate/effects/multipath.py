@@ -89,7 +89,7 @@ def interreflections(scene: Scene, frame: int, rays: Rays, physics: Physics) -> 
         NumericalError: It died or took too long.
     """
     view = _View.of(scene, frame, rays, physics)
-    nothing = view.direct.kept(np.zeros(len(view.direct), dtype=bool))
+    nothing = view.direct.subset(np.zeros(len(view.direct), dtype=bool))
     if physics.detector.photons is None and resolution_m(physics.detector) == 0:
         return nothing
     flood = physics.detector.photons is not None and physics.detector.photons.emission == "flood"
@@ -138,7 +138,7 @@ class _View:
         echoes = direct_echoes(scene, Beams.of(rays), hits)
         windows_m = path_windows(rays, scene.receiver)
         in_time = echoes.path_m < windows_m[echoes.ray, 1]
-        direct = echoes.kept(in_time)
+        direct = echoes.subset(in_time)
         number = direct.ray
         apart_m = float(np.linalg.norm(np.ptp(rays.origin_m[number], axis=0))) if len(number) else 0.0
         earliest_m = np.maximum(windows_m[number, 0], direct.path_m - apart_m)
@@ -150,7 +150,7 @@ class _View:
             physics.detector,
             number,
             rays.subset(number),
-            Hits(hits.range_m[number], hits.body[number], hits.normal[number]),
+            hits.subset(number),
             direct,
             # the direct path lies in the middle of a bin, not on the edge of one
             2 * earliest_m - bins.width_m / 2,
@@ -334,8 +334,7 @@ def _is_flood(first_hits: FirstHits) -> bool:
 
 
 def _detours(first_hits: FirstHits, rows: np.ndarray) -> Detours:
-    rays, hits = first_hits.rays.subset(rows), first_hits.hits
-    hits = Hits(hits.range_m[rows], hits.body[rows], hits.normal[rows])
+    rays, hits = first_hits.rays.subset(rows), first_hits.hits.subset(rows)
     photons, receiver = first_hits.detector.photons, first_hits.scene.receiver
     flood = photons is not None and photons.emission == "flood"
     if not flood and receiver is None:

@@ -119,7 +119,7 @@ def visible_echoes(scene: Scene, beams: Beams, hits: Hits, echoes: Echoes, trace
     apart = (beams.origin_m[seen] != np.asarray(scene.receiver.origin_m)).any(axis=1)
     rows = seen[apart]
     share[apart] = sight_shares(scene, points[apart], hits.normal[rows], beams.time_s[rows], tracer)
-    return replace(echoes, gain=echoes.gain * share).kept(share > 0)
+    return replace(echoes, gain=echoes.gain * share).subset(share > 0)
 
 
 def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:

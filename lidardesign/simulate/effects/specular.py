@@ -58,14 +58,10 @@ class _Front:
     passed: np.ndarray
     hits: Hits
 
-    def kept(self, chosen: np.ndarray) -> _Front:
-        beams, hits = self.beams, self.hits
-        return _Front(
-            Beams(*(column[chosen] for column in _columns(beams))),
-            self.number[chosen],
-            self.passed[chosen],
-            Hits(hits.range_m[chosen], hits.body[chosen], hits.normal[chosen]),
-        )
+    def subset(self, chosen: np.ndarray | slice) -> _Front:
+        """The beams at an index or mask."""
+        hits = self.hits.subset(chosen)
+        return _Front(self.beams.subset(chosen), self.number[chosen], self.passed[chosen], hits)
 
 
 def detours(scene: Scene, beams: Beams, hits: Hits, tracer: Tracer) -> Echoes:
@@ -92,12 +88,13 @@ def _detours_of(scene: Scene, beams: Beams, hits: Hits, rows: slice, tracer: Tra
     """The detours of some of the beams."""
     mirrored = np.array([body.specular for body in scene.bodies])
     passing = np.array([body.transmission for body in scene.bodies])
-    number = np.arange(len(beams))[rows]
-    mine = Beams(*(column[rows] for column in _columns(beams)))
-    front = _Front(mine, number, np.ones(len(mine)), Hits(hits.range_m[rows], hits.body[rows], hits.normal[rows]))
+    front = _Front(beams, np.arange(len(beams)), np.ones(len(beams)), hits).subset(rows)
     echoes = [_no_echoes()]
     for _ in range(MAXIMUM_TURNS):
-        turned = _followed(scene, front, mirrored, _mirrored(front), tracer)
+        # after a mirror, v - 2 (v.n) n; anything where nothing was hit
+        direction, normal = front.beams.direction, front.hits.normal
+        back = direction - 2 * np.einsum("nk,nk->n", direction, normal)[:, None] * normal
+        turned = _followed(scene, front, mirrored, back, tracer)
         straight = _followed(scene, front, passing, front.beams.direction, tracer)
         front = _joined(turned, straight)
         if not len(front.beams):
@@ -106,17 +103,11 @@ def _detours_of(scene: Scene, beams: Beams, hits: Hits, rows: slice, tracer: Tra
     return Echoes.joined(echoes)
 
 
-def _mirrored(front: _Front) -> np.ndarray:
-    """Directions after a mirror, v - 2 (v.n) n; anything where nothing was hit."""
-    direction, normal = front.beams.direction, front.hits.normal
-    return direction - 2 * np.einsum("nk,nk->n", direction, normal)[:, None] * normal
-
-
 def _followed(scene: Scene, front: _Front, shares: np.ndarray, direction: np.ndarray, tracer: Tracer) -> _Front:
     """What beams that go on from their hits with a body's share (bodies,), in directions (B, 3), meet next."""
     passed = np.where(front.hits.body >= 0, shares[front.hits.body] * front.passed, 0.0)
     rows = np.flatnonzero(passed >= FAINTEST_SHARE)
-    old, direction = front.kept(rows), direction[rows]
+    old, direction = front.subset(rows), direction[rows]
     beams, path_m = old.beams, old.hits.range_m
     point = beams.origin_m + path_m[:, None] * beams.direction
     cosine = np.abs(np.einsum("nk,nk->n", direction, old.hits.normal))
@@ -134,15 +125,15 @@ def _followed(scene: Scene, front: _Front, shares: np.ndarray, direction: np.nda
 
 def _heard(scene: Scene, beams: Beams, front: _Front, tracer: Tracer) -> Echoes:
     """The echoes of what beams meet, where they are heard."""
-    front = front.kept(front.hits.body >= 0)
+    front = front.subset(front.hits.body >= 0)
     if scene.receiver is None:
         return _heard_back(scene, front)
     together = (beams.origin_m[front.number] == np.asarray(scene.receiver.origin_m)).all(axis=1)
-    back = front.kept(together)
+    back = front.subset(together)
     image = beams.origin_m[back.number] + back.hits.range_m[:, None] * beams.direction[back.number]
-    back = back.kept(in_view(scene.receiver, image))
+    back = back.subset(in_view(scene.receiver, image))
     return Echoes.joined(
-        [_heard_back(replace(scene, receiver=None), back), _heard_elsewhere(scene, front.kept(~together), tracer)]
+        [_heard_back(replace(scene, receiver=None), back), _heard_elsewhere(scene, front.subset(~together), tracer)]
     )
 
 
@@ -156,21 +147,16 @@ def _heard_elsewhere(scene: Scene, front: _Front, tracer: Tracer) -> Echoes:
     echoes = direct_echoes(scene, front.beams, front.hits)
     point = front.beams.origin_m + front.hits.range_m[:, None] * front.beams.direction
     share = sight_shares(scene, point, front.hits.normal, front.beams.time_s, tracer)
-    return replace(echoes, gain=echoes.gain * share).kept(share > 0)
+    return replace(echoes, gain=echoes.gain * share).subset(share > 0)
 
 
 def _joined(first: _Front, second: _Front) -> _Front:
-    hits = (first.hits, second.hits)
     return _Front(
-        Beams(*(np.concatenate(pair) for pair in zip(_columns(first.beams), _columns(second.beams), strict=True))),
+        Beams.joined([first.beams, second.beams]),
         np.concatenate([first.number, second.number]),
         np.concatenate([first.passed, second.passed]),
-        Hits(*(np.concatenate([getattr(one, name) for one in hits]) for name in ("range_m", "body", "normal"))),
+        Hits.joined([first.hits, second.hits]),
     )
-
-
-def _columns(beams: Beams) -> tuple[np.ndarray, ...]:
-    return beams.ray, beams.origin_m, beams.direction, beams.time_s, beams.share
 
 
 def _no_echoes() -> Echoes:
