@@ -242,14 +242,3 @@ EXPORTERS: dict[str, Exporter] = {
         ),
     )
 }
-
-
-def find_exporter(name: str) -> Exporter:
-    """The exporter of a format.
-
-    Raises:
-        ConfigError: There is no such format.
-    """
-    if name not in EXPORTERS:
-        raise ConfigError(f"no format is called {name!r}", where="--format", allowed=", ".join(EXPORTERS))
-    return EXPORTERS[name]

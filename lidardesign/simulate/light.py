@@ -101,7 +101,7 @@ class Background:
 
 
 def direct_echoes(scene: Scene, beams: Beams, hits: Hits) -> Echoes:
-    """The echo of every beam's first hit, wherever it is heard: share * reflectance * cosine / (pi * distance^2)."""
+    """The echo of every beam's first hit, wherever it is received: share * reflectance * cosine / (pi * distance^2)."""
     seen = np.flatnonzero(hits.body >= 0)
     points = beams.origin_m[seen] + hits.range_m[seen, None] * beams.direction[seen]
     origins = beams.origin_m[seen]

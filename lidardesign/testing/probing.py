@@ -83,8 +83,8 @@ def rays_that_meet(
 
 def with_noise(returns: Sequence[Returns], share: float, generator: np.random.Generator) -> list[Returns]:
     """The same returns with normal noise on their ranges; its spread is a share of their median range."""
-    heard = np.concatenate([one.range_m[one.returned] for one in returns])
-    spread_m = share * float(np.median(heard)) if len(heard) else 0.0
+    received = np.concatenate([one.range_m[one.returned] for one in returns])
+    spread_m = share * float(np.median(received)) if len(received) else 0.0
     noise = [spread_m * generator.normal(size=len(one.range_m)) for one in returns]
     return [
         replace(one, range_m=np.maximum(one.range_m + added, one.rays.gate_m[:, 0]))
@@ -104,7 +104,7 @@ def shuffled(returns: Sequence[Returns], generator: np.random.Generator) -> list
 
 
 def without_returns(returns: Sequence[Returns]) -> list[Returns]:
-    """The same rays, none of which heard anything."""
+    """The same rays, none of which received anything."""
     return [
         Returns(
             one.rays,

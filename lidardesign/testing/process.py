@@ -75,7 +75,7 @@ def check_apart(request: CheckRequest) -> Iterator[Finding]:
     with tempfile.TemporaryDirectory(prefix="lidardesign-check-") as folder:
         child = Apart(CHILD, _as_document(request, offer, folder))
         try:
-            yield from _heard(child, request.limits.seconds)
+            yield from _read_findings(child, request.limits.seconds)
         finally:
             child.end()
 
@@ -94,7 +94,7 @@ def _as_document(request: CheckRequest, offer: EntryPoint, folder: str) -> dict[
     }
 
 
-def _heard(child: Apart, seconds: float) -> Iterator[Finding]:
+def _read_findings(child: Apart, seconds: float) -> Iterator[Finding]:
     """Findings as they come; where the process is lost, the law that it tried does not hold."""
     _, line = child.next_line(time.monotonic() + START_SECONDS)
     if line != BEGUN:

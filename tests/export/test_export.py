@@ -10,9 +10,9 @@ from support.tables import each_row
 from lidardesign.design.files import load_design
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import DesignSpec, Sensor
-from lidardesign.errors import ConfigError, DataError
+from lidardesign.errors import DataError
 from lidardesign.export.ray_lists import ray_columns
-from lidardesign.export.registry import EXPORTERS, find_exporter
+from lidardesign.export.registry import EXPORTERS
 
 
 def design(count=2):
@@ -120,11 +120,6 @@ def test_a_file_is_never_written_over_a_folder_nor_a_folder_over_a_file(tmp_path
     with pytest.raises(DataError, match="taken"):
         exporter.write(design(), lay_out(design()), path)
     assert contents(path) == ({".": b"mine"} if exporter.folder else {})
-
-
-def test_an_unknown_format_names_the_known_ones():
-    with pytest.raises(ConfigError, match="csv, npz, sensors-csv"):
-        find_exporter("obj")
 
 
 def test_listing_the_formats_imports_none_of_them():

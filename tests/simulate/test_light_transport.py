@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.tables import each_row
-from support.transients import needs_simulator, rays_from, spiral
+from support.transients import needs_simulator, pixel_rays, rays_from, spiral
 
 from lidardesign.errors import ConfigError, NumericalError
 from lidardesign.geometry.raycast import shared_caster
@@ -26,7 +26,7 @@ from lidardesign.simulate.effects.motion import still_tracer
 from lidardesign.simulate.effects.shadowing import visible_echoes
 from lidardesign.simulate.light import Beams, Echoes, direct_echoes
 from lidardesign.simulate.light_transport import process
-from lidardesign.simulate.light_transport.transport import Lights, PathBins, available, pixel_rays, render_transient
+from lidardesign.simulate.light_transport.transport import Lights, PathBins, render_transient
 
 # float32 intersections against float64 ones: 1e-7 of lengths, some ten times that where surfaces are curved or grazed
 ENERGY, MOST_ENERGY = 1e-5, 5e-3
@@ -270,7 +270,7 @@ def test_an_old_or_absent_library_is_not_used_even_if_it_is_named(monkeypatch, t
 def test_without_the_simulator_the_reason_and_the_remedy_are_given(monkeypatch):
     process.end_worker()
     monkeypatch.setattr(process, "PACKAGES", {"no_such_renderer": (1, 0)})
-    assert not available()
+    assert process.missing() is not None
     with pytest.raises(ConfigError, match="not installed: no_such_renderer") as caught:
         process.ask({}, {})
     assert "lidardesign[transport]" in str(caught.value)

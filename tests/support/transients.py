@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from lidardesign.geometry.rays import Rays
+from lidardesign.geometry.receiver import receiver_axes
+from lidardesign.scene import Receiver
 from lidardesign.simulate.light_transport import process
-from lidardesign.simulate.light_transport.transport import available
 
 needs_simulator = pytest.mark.skipif(
-    not available(), reason=f"the light-transport simulator cannot run here: {process.missing()}"
+    process.missing() is not None, reason=f"the light-transport simulator cannot run here: {process.missing()}"
 )
 
 
@@ -33,3 +34,28 @@ def rays_from(origin_m: tuple[float, ...], direction: np.ndarray, far_m: float =
     zeros = np.zeros(count)
     gate_m = np.tile([0.0, far_m], (count, 1))
     return Rays(np.tile(np.asarray(origin_m, dtype=float), (count, 1)), direction, gate_m, zeros, zeros)
+
+
+def pixel_rays(receiver: Receiver, columns: int, rows: int) -> tuple[Rays, np.ndarray]:
+    """A receiver's field of view as a camera's pixels: a ray through each one's centre, and its solid angle [sr].
+
+    Pixels are equal on the image plane; their solid angles add up to the field's.
+    """
+    half = np.tan([receiver.horizontal_rad / 2, receiver.vertical_rad / 2])
+    left, up = (
+        (2 * (np.arange(number) + 0.5) / number - 1) * extent
+        for number, extent in zip((columns, rows), half, strict=True)
+    )
+    grid = np.stack(np.meshgrid(left, up, indexing="ij"), axis=-1).reshape(-1, 2)
+    ahead = np.concatenate([np.ones((len(grid), 1)), grid], axis=1)
+    length = np.linalg.norm(ahead, axis=1)
+    area = 4 * half[0] * half[1] / len(grid)
+    count = len(grid)
+    rays = Rays(
+        np.tile(np.asarray(receiver.origin_m, dtype=float), (count, 1)),
+        (ahead / length[:, None]) @ receiver_axes(receiver),
+        np.tile(np.asarray(receiver.range_m, dtype=float), (count, 1)),
+        np.zeros(count),
+        np.zeros(count),
+    )
+    return rays, area / length**3

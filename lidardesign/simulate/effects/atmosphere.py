@@ -7,7 +7,7 @@ there to the receiver: b = r at the emitter's own place (the lidar equation; Mea
 There a pixel looks along the ray, sharp at the range f of what the ray meets, or far away. Haze at r is blurred on it
 to the solid angle A (1 / r - 1 / f)^2, as an aperture A seen from r is wider than from f; a pixel of a smaller solid
 angle catches its share of that (the overlap of an ideal lens). So haze right before the sensor counts no more than a
-pixel's solid angle, and not 1 / r^2. A fixed receiver elsewhere hears all haze in its view.
+pixel's solid angle, and not 1 / r^2. A fixed receiver elsewhere receives all haze in its view.
 
 What it could change (`bound`): over a range R the air leaves exp(-2 alpha R) of an echo's photons: the range strays
 more and returns are lost, as from fewer photons. Haze sends h counts into a bin, most at the gate's start; it is taken
@@ -116,7 +116,7 @@ class _Haze:
     """What haze along rays sends back.
 
     Arguments:
-        rays, receiver, medium, photons: Who sends, who hears, what is between, and with which aperture and pixel.
+        rays, receiver, medium, photons: Who sends, who receives, what is between, and with which aperture and pixel.
         focus_m: Ranges that the rays' pixels are sharp at, infinite for far away, shape (N,) [m].
     """
 

@@ -80,7 +80,7 @@ def haze_per_pulse(first_hits: FirstHits, emitted: np.ndarray, bin_m: float) -> 
 
 
 def _beside(first_hits: FirstHits, end_m: np.ndarray, bin_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Solid angle times length of the haze that a fixed receiver hears, up to half paths (N,), and in one bin, (N,).
+    """Solid angle times length of the haze that a fixed receiver gets, up to half paths (N,), and in one bin, (N,).
 
     It sees all of a ray that passes it at the distance h, c from the ray's start: at most the integral of
     A / (h^2 + (r - c)^2), A / h times the difference of arctan((r - c) / h), and no more than half of all around. Half

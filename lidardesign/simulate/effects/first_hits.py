@@ -46,7 +46,7 @@ class FirstHits:
     Arguments:
         scene: What they meet.
         frame: The time frame.
-        detector: What hears their light.
+        detector: What receives their light.
         rays: Those of all lists, N.
         row: The list of each, ascending, shape (N,).
         sharing: How many rays share its emitter's energy, shape (N,).

@@ -1,15 +1,15 @@
 """Light that comes back by way of other surfaces, rendered by the light-transport simulator.
 
-Which detours a receiver hears depends on what is lit and what is looked at while a ray is listened to:
+Which detours a receiver gets depends on what is lit and what is looked at while a ray is listened to:
 
 - A *flood* lights all rays' spots at once, and each pixel sees its own: light goes from the emitter to Q, to P and
   back, and pixel n sees its spot P, which all other spots Q light too. The spots are the lights, matt points with the
   power of what they reflect (Keller 1997, Instant radiosity), so that light goes where the design's rays go and nowhere
-  else. Where pixels overlap, each hears the part that is its own ray's, of detours as of direct light.
+  else. Where pixels overlap, each receives the part that is its own ray's, of detours as of direct light.
 - A *scanned* beam lights one spot P, and its pixel sees a cone around the beam: light comes back by P, Q, P and, where
   Q lies in that cone, by P, Q. The beam's own spot is the only light, looked at along rays spread in the cone. A pixel
-  without a solid angle hears no detours.
-- A *fixed receiver* hears a scanned beam's detours P, Q from all Q that lie in its field of view. By reciprocity light
+  without a solid angle receives no detours.
+- A *fixed receiver* gets a scanned beam's detours P, Q from all Q that lie in its field of view. By reciprocity light
   is sent from the receiver instead, and what is seen along the beam is its gain.
 
 A detector that resolves everything and counts nothing (`ideal`) takes no late light for an echo, not even where no
@@ -18,19 +18,19 @@ direct one arrives.
 Paths have up to `MOST_SURFACES` surfaces. A spot has a size, within which its light grows no stronger: without it, the
 few paths that end next to a spot in a crease would be worth any amount; light within a spot's own size is not told from
 its direct echo. Beams are thin, and nothing moves within a frame. Mirrors and glass are left to `specular`: here they
-swallow what they do not scatter, so that no light is heard twice. What arrives earlier than a ray's direct echo by more
-than the emitters are apart (from nearer surfaces at the edge of its pixel) is left out. Estimates are unbiased up to
-that; their noise falls with the root of `PATHS`, which all rays share.
+swallow what they do not scatter, so that no light is received twice. What arrives earlier than a ray's direct echo by
+more than the emitters are apart (from nearer surfaces at the edge of its pixel) is left out. Estimates are unbiased up
+to that; their noise falls with the root of `PATHS`, which all rays share.
 
 Echoes are the simulator's bins of half path, a quarter of the detector's resolution where no more than `MOST_CELLS` of
 them reach to the gates' ends. They name the body of the ray's first hit, whose echo they disturb.
 
 What it could change (`bound`): from points that rays meet, other surfaces are looked for, and what they send there is
-bounded (`multipath_bound`): of a flood or for one receiver that hears all, what they get of the light; where one spot
-at a time is lit and seen, what falls on it again. What is late by less than a detector tells apart moves the echo by
-its delay times its share; what is late by more makes its own peak, taken for the echo at most where all of it outweighs
-that. Where a receiver that stands elsewhere does not hear the echo at all, whatever comes by detours may be taken for
-it.
+bounded (`multipath_bound`): of a flood or for one receiver that receives all, what they get of the light; where one
+spot at a time is lit and seen, what falls on it again. What is late by less than a detector tells apart moves the echo
+by its delay times its share; what is late by more makes its own peak, taken for the echo at most where all of it
+outweighs that. Where a receiver that stands elsewhere does not receive the echo at all, whatever comes by detours may
+be taken for it.
 
 Where a flood lights all spots at once, other rays' spots send light to a ray's own. All rays have the same power. Ray j
 lights a spot Q at the distance R_j, which sends rho_Q of it on; a spot P of the area A, seen by pixel i, gets rho_Q cos
@@ -71,7 +71,7 @@ MOST_CELLS = 512
 WIDTHS_PER_DECADE = 6
 # How densely a flood's rays lie is told from so many neighbours: right for grids and for random ones, within 5 %.
 NEIGHBOURS = 6
-# Rays whose detours together are fainter than this share of the direct light hear none: no detector counts so far.
+# Rays whose detours together are fainter than this share of the direct light receive none: no detector counts so far.
 FAINTEST_SHARE = 1e-8
 
 
@@ -97,8 +97,8 @@ def interreflections(scene: Scene, frame: int, rays: Rays, physics: Physics) -> 
     if not len(view.rays) or (by_pixel and view.pixel_sr == 0):
         return nothing
     found = view.of_a_flood() if flood else view.of_a_pixel() if by_pixel else view.of_a_receiver()
-    heard_sr = view.solid_angles() if flood else np.full(len(view.rays), view.pixel_sr if by_pixel else 1.0)
-    gain = found.radiance * heard_sr[found.ray]
+    received_sr = view.solid_angles() if flood else np.full(len(view.rays), view.pixel_sr if by_pixel else 1.0)
+    gain = found.radiance * received_sr[found.ray]
     together = np.bincount(found.ray, gain, len(view.rays))
     kept = (together > FAINTEST_SHARE * view.direct.gain)[found.ray]
     ray, cell = found.ray[kept], found.cell[kept]
@@ -108,7 +108,7 @@ def interreflections(scene: Scene, frame: int, rays: Rays, physics: Physics) -> 
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """Rays that could hear detours: their first hit lies before the end of their gate.
+    """Rays that could receive detours: their first hit lies before the end of their gate.
 
     Arguments:
         number: Their places in the whole list, shape (K,).
@@ -210,7 +210,7 @@ class _View:
         )
 
     def _looks(self) -> Rays:
-        """The lines along which detours are looked for: from where light is heard, or along the beams themselves."""
+        """The lines along which detours are looked for: from where light is received, or along the beams themselves."""
         photons = self.detector.photons
         receiver = self.scene.receiver
         if receiver is None or photons is None or photons.emission != "flood":
@@ -328,7 +328,7 @@ def _hidden(first_hits: FirstHits, rows: np.ndarray) -> np.ndarray:
 
 
 def _is_flood(first_hits: FirstHits) -> bool:
-    """Whether all rays are lit at once, and each is heard where it starts."""
+    """Whether all rays are lit at once, and each is received where it starts."""
     photons = first_hits.detector.photons
     return first_hits.scene.receiver is None and photons is not None and photons.emission == "flood"
 
@@ -341,7 +341,7 @@ def _detours(first_hits: FirstHits, rows: np.ndarray) -> Detours:
         beam_sr = math.pi * (first_hits.detector.divergence_rad / 2) ** 2
         pixel_sr = beam_sr if photons is None else max(photons.field_of_view_sr, beam_sr)
         return pixel_bound(first_hits.scene, rays, hits, first_hits.caster, pixel_sr, first_hits.resolution_m)
-    # a flood's pixels look at spots that its emitters light; a receiver alone hears what is sent anywhere in its view
+    # a flood's pixels look at spots that its emitters light; a receiver alone gets what is sent anywhere in its view
     lamp_m = None if flood or receiver is None else np.asarray(receiver.origin_m)
     return lamp_bound(first_hits.scene, rays, hits, first_hits.caster, lamp_m, first_hits.resolution_m)
 

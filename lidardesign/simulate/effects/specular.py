@@ -1,13 +1,13 @@
 """Mirrors and glass lead light elsewhere: what it meets there comes back later, and fainter.
 
-At every surface a beam goes on twice, mirrored with the share `specular` and straight on with the share
-`transmission`; nothing is drawn at random. What it meets sends light back. A ray that is heard at its own origin is
-heard through the pixel that it was sent from, so its light comes back the way it went and meets every mirror and pane
-twice: an emitter behind a mirror is its image there, and an echo is that of the image, times the square of the share
-that went out. A fixed receiver elsewhere hears a lit surface straight, through glass but by no mirror; rays that start
-where it stands are heard as without one. Mirrors are flat over the width of a beam: curved ones neither gather nor
-spread it. Panes do not bend light. A mirror that a beam meets squarely enough to shine back into the receiver is not
-taken for an echo.
+At every surface a beam goes on twice, mirrored with the share `specular` and straight on with the share `transmission`;
+nothing is drawn at random. What it meets sends light back. A ray that is received at its own origin is received through
+the pixel that it was sent from, so its light comes back the way it went and meets every mirror and pane twice: an
+emitter behind a mirror is its image there, and an echo is that of the image, times the square of the share that went
+out. A fixed receiver elsewhere receives a lit surface straight, through glass but by no mirror; rays that start where
+it stands are received as without one. Mirrors are flat over the width of a beam: curved ones neither gather nor spread
+it. Panes do not bend light. A mirror that a beam meets squarely enough to shine back into the receiver is not taken for
+an echo.
 
 What it could change (`bound`): what they lead elsewhere may meet anything, so every ray that they meet may be wrong.
 Lost is the share of rays whose first hit is on a body that mirrors or lets through, and what else comes back of them
@@ -99,7 +99,7 @@ def _detours_of(scene: Scene, beams: Beams, hits: Hits, rows: slice, tracer: Tra
         front = _joined(turned, straight)
         if not len(front.beams):
             break
-        echoes.append(_heard(scene, beams, front, tracer))
+        echoes.append(_received(scene, beams, front, tracer))
     return Echoes.joined(echoes)
 
 
@@ -123,26 +123,25 @@ def _followed(scene: Scene, front: _Front, shares: np.ndarray, direction: np.nda
     return _Front(image, old.number, passed[rows], Hits(path_m + step_m + found.range_m, found.body, found.normal))
 
 
-def _heard(scene: Scene, beams: Beams, front: _Front, tracer: Tracer) -> Echoes:
-    """The echoes of what beams meet, where they are heard."""
+def _received(scene: Scene, beams: Beams, front: _Front, tracer: Tracer) -> Echoes:
+    """The echoes of what beams meet, where they are received."""
     front = front.subset(front.hits.body >= 0)
     if scene.receiver is None:
-        return _heard_back(scene, front)
+        return _received_back(scene, front)
     together = (beams.origin_m[front.number] == np.asarray(scene.receiver.origin_m)).all(axis=1)
     back = front.subset(together)
     image = beams.origin_m[back.number] + back.hits.range_m[:, None] * beams.direction[back.number]
     back = back.subset(in_view(scene.receiver, image))
-    return Echoes.joined(
-        [_heard_back(replace(scene, receiver=None), back), _heard_elsewhere(scene, front.subset(~together), tracer)]
-    )
+    elsewhere = _received_elsewhere(scene, front.subset(~together), tracer)
+    return Echoes.joined([_received_back(replace(scene, receiver=None), back), elsewhere])
 
 
-def _heard_back(scene: Scene, front: _Front) -> Echoes:
+def _received_back(scene: Scene, front: _Front) -> Echoes:
     """The way that the light came."""
     return direct_echoes(scene, replace(front.beams, share=front.beams.share * front.passed), front.hits)
 
 
-def _heard_elsewhere(scene: Scene, front: _Front, tracer: Tracer) -> Echoes:
+def _received_elsewhere(scene: Scene, front: _Front, tracer: Tracer) -> Echoes:
     """Straight from what is lit, by a fixed receiver."""
     echoes = direct_echoes(scene, front.beams, front.hits)
     point = front.beams.origin_m + front.hits.range_m[:, None] * front.beams.direction

@@ -8,7 +8,7 @@ All that a flood sends to P by way of them, relative to what it sends P directly
 with E = cosine / distance^2 to the emitter, 0 in its shadow. The first two sums are measured by casting rays; all the
 others are at most mean(rho_Q rho_R) once E_max / E(P) / (1 - once), once = rho F_max for the largest reflectance: a
 geometric series, since no point gets more than that part of what the brightest has. With the receiver in the emitter's
-place the same holds for a beam whose detours a fixed receiver hears, by reciprocity. A pixel that is lit through itself
+place the same holds for a beam whose detours a fixed receiver gets, by reciprocity. A pixel that is lit through itself
 alone gets back
 
     share = mean over Q of rho_P rho_Q (form factor of the pixel's spot from Q), at most rho_P rho_Q,
@@ -72,7 +72,7 @@ def series(once: float) -> float:
 def lamp_bound(
     scene: Scene, rays: Rays, hits: Hits, caster: SceneCaster, lamp_m: np.ndarray | None, resolution_m: float
 ) -> Detours:
-    """Detours of a flood at the rays' origins, or of beams that a fixed receiver hears in all of its field of view.
+    """Detours of a flood at the rays' origins, or of beams that a fixed receiver gets in all of its field of view.
 
     A flood shines everywhere as it does along each ray.
 
@@ -81,7 +81,7 @@ def lamp_bound(
         rays: N of them.
         hits: What they meet.
         caster: Of this frame.
-        lamp_m: Where light comes from, or is heard, shape (3,) [m]; None: at each ray's origin.
+        lamp_m: Where light comes from, or is received, shape (3,) [m]; None: at each ray's origin.
         resolution_m: Half paths that a detector does not tell apart [m].
     """
     chosen = _sample(hits)
@@ -92,7 +92,7 @@ def lamp_bound(
     own = np.maximum(np.einsum("kj,kj->k", start.normal, lamp - place), 0.0) / direct_m**3
     first = _next(scene, caster, start, DIRECTIONS)
     second = _next(scene, caster, first, FURTHER_DIRECTIONS)
-    # a pixel that looks at a flood's spots sees them wherever they are; a receiver hears what is in its view
+    # a pixel that looks at a flood's spots sees them wherever they are; a receiver gets what is in its view
     viewed = scene if lamp_m is not None else None
     lit = [_lit(ends, lamp[ends.point], caster, viewed) for ends in (first, second)]
     brightest = max([own.max(initial=0.0), *(light.max(initial=0.0) for light, _ in lit)])
@@ -113,7 +113,7 @@ def lamp_bound(
 def pixel_bound(
     scene: Scene, rays: Rays, hits: Hits, caster: SceneCaster, pixel_sr: float, resolution_m: float
 ) -> Detours:
-    """Detours of scanned beams that only the pixel around each beam hears; arguments as in `lamp_bound`."""
+    """Detours of scanned beams that only the pixel around each beam receives; arguments as in `lamp_bound`."""
     chosen = _sample(hits)
     distance_m, normal = hits.range_m[chosen], hits.normal[chosen]
     place = rays.origin_m[chosen] + distance_m[:, None] * rays.direction[chosen]

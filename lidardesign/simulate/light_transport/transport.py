@@ -7,11 +7,10 @@ point at distance d from it, whose normal is turned by theta, has the radiance L
 (pi d^2). By Helmholtz's reciprocity light may be sent either way: with I = 1 W/sr at a *receiver*, the radiance seen
 along a *beam* is the beam's gain, the share of its light that reaches 1 m^2 of aperture (`Echoes.gain`).
 
-A frame of a scene as shapes of the light-transport simulator: float32 around a centre of its own.
-
-Spheres and the sides of capsules stay exact, boxes become twelve triangles. An infinite plane ends where little light
-could come from: it is as large as `PLANE_REACHES` times the distance to what is looked at, in squares that grow
-outward, so that what is near keeps its accuracy.
+A frame of a scene becomes shapes in float32 around a centre of its own: spheres and the sides of capsules stay exact,
+boxes become twelve triangles. An infinite plane ends where little light could come from: it is as large as
+`PLANE_REACHES` times the distance to what is looked at, in squares that grow outward, so that what is near keeps its
+accuracy.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ from lidardesign.errors import ConfigError
 from lidardesign.geometry.raycast import shared_caster
 from lidardesign.geometry.rays import Hits, Rays
 from lidardesign.geometry.receiver import receiver_axes
-from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Receiver, Scene, Sphere
-from lidardesign.simulate.light_transport.process import TIME_LIMIT_S, ask, missing
+from lidardesign.scene import Body, Box, Capsule, Plane, Receiver, Scene, Sphere
+from lidardesign.simulate.light_transport.process import TIME_LIMIT_S, ask
 
 # Half sizes of a plane's nested squares, in reaches. What lies further sends back less than 1e-4 of its light.
 PLANE_REACHES = (2.0, 10.0, 100.0)
@@ -35,7 +34,7 @@ _SQUARE = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float
 _BOX_QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 
 
-def exported(
+def scene_shapes(
     scene: Scene, frame: int, centre_m: np.ndarray, reach_m: float, *, matt: bool = False
 ) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
     """The shapes of a frame as JSON and their arrays.
@@ -72,16 +71,12 @@ def _shape(
         nearest = rotation[:, 2] * (rotation[:, 2] @ place)
         vertices, faces = _plane(max(reach_m, float(np.linalg.norm(nearest))))
         return {"kind": "mesh"}, {"vertices": vertices @ rotation.T + nearest, "faces": faces}
-    vertices, faces = _box(shape) if isinstance(shape, Box) else _triangles(shape)
+    vertices, faces = _box(shape) if isinstance(shape, Box) else (shape.vertices, shape.faces)
     return {"kind": "mesh"}, {"vertices": vertices @ rotation.T + place, "faces": faces}
 
 
 def _round(ends: list[np.ndarray], radius_m: float) -> dict[str, Any]:
     return {"kind": "round", "ends": [end.tolist() for end in ends], "radius": float(radius_m)}
-
-
-def _triangles(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    return mesh.vertices, mesh.faces
 
 
 def _box(box: Box) -> tuple[np.ndarray, np.ndarray]:
@@ -110,11 +105,6 @@ FEWEST_RAYS = 16
 EVERYWHERE = -2.0  # a cosine that every direction exceeds
 # Points closer than this share of the reach are one: some hundred times the rounding of float32 paths.
 SAME_PLACE = 1e-4
-
-
-def available() -> bool:
-    """Whether the simulator can be used here: installed, with an LLVM library that it works with. Imports nothing."""
-    return missing() is None
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,13 +283,16 @@ def render_transient(
         NumericalError: It died or took too long.
     """
     count = len(rays)
-    _check(count, lights, bounces, samples, own_light)
+    if bounces < 1 or samples < 1:
+        raise ConfigError(f"{bounces} bounces, {samples} samples", where="light transport", allowed="1 or more")
+    if own_light and count != len(lights):
+        raise ConfigError(f"{len(lights)} lights of {count} rays", where="own_light", allowed="one for each ray")
     if not count or not len(lights):
         nothing = np.zeros(0, dtype=np.int64)
         return Transients(bins, nothing, nothing, np.zeros(0), np.zeros(count))
     first = shared_caster(scene, frame).first_hit(rays.origin_m, rays.direction)
     centre_m, reach_m = _neighbourhood(first, rays, lights)
-    shapes, arrays = exported(scene, frame, centre_m, reach_m, matt=matt)
+    shapes, arrays = scene_shapes(scene, frame, centre_m, reach_m, matt=matt)
     columns = _ray_columns(rays, first, centre_m, cone_sr)
     columns["baseline"] = bins.start_m + (np.zeros(count) if baseline_m is None else baseline_m)
     columns["dark_radius"] = np.full(count, 0.0 if direct else SAME_PLACE * reach_m)
@@ -310,7 +303,8 @@ def render_transient(
     parts = []
     for number, rows in enumerate(_chunks(count, bins.count)):
         mine = arrays | {name: values[rows] for name, values in by_ray.items()}
-        parts.append((rows[0], ask({**request, "seed": _seed(seed, number)}, mine, limit_s=limit_s)))
+        own_seed = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
+        parts.append((rows[0], ask({**request, "seed": own_seed}, mine, limit_s=limit_s)))
     return _joined(bins, count, parts)
 
 
@@ -322,38 +316,6 @@ def _joined(bins: PathBins, count: int, answers: list[tuple[int, dict[str, np.nd
     )
     real = ray < count
     return Transients(bins, ray[real], cell[real], radiance[real].astype(float), steady[:count].astype(float))
-
-
-def pixel_rays(receiver: Receiver, columns: int, rows: int) -> tuple[Rays, np.ndarray]:
-    """A receiver's field of view as a camera's pixels: a ray through each one's centre, and its solid angle [sr].
-
-    Pixels are equal on the image plane; their solid angles add up to the field's.
-    """
-    half = np.tan([receiver.horizontal_rad / 2, receiver.vertical_rad / 2])
-    left, up = (
-        (2 * (np.arange(number) + 0.5) / number - 1) * extent
-        for number, extent in zip((columns, rows), half, strict=True)
-    )
-    grid = np.stack(np.meshgrid(left, up, indexing="ij"), axis=-1).reshape(-1, 2)
-    ahead = np.concatenate([np.ones((len(grid), 1)), grid], axis=1)
-    length = np.linalg.norm(ahead, axis=1)
-    area = 4 * half[0] * half[1] / len(grid)
-    count = len(grid)
-    rays = Rays(
-        np.tile(np.asarray(receiver.origin_m, dtype=float), (count, 1)),
-        (ahead / length[:, None]) @ receiver_axes(receiver),
-        np.tile(np.asarray(receiver.range_m, dtype=float), (count, 1)),
-        np.zeros(count),
-        np.zeros(count),
-    )
-    return rays, area / length**3
-
-
-def _check(count: int, lights: Lights, bounces: int, samples: int, own_light: bool) -> None:
-    if bounces < 1 or samples < 1:
-        raise ConfigError(f"{bounces} bounces, {samples} samples", where="light transport", allowed="1 or more")
-    if own_light and count != len(lights):
-        raise ConfigError(f"{len(lights)} lights of {count} rays", where="own_light", allowed="one for each ray")
 
 
 def _neighbourhood(first: Hits, rays: Rays, lights: Lights) -> tuple[np.ndarray, float]:
@@ -401,10 +363,6 @@ def _chunks(count: int, bins: int) -> list[np.ndarray]:
     last = chunks[-1]
     full = max(FEWEST_RAYS, 1 << (len(last) - 1).bit_length())
     return [*chunks[:-1], np.concatenate([last, np.full(full - len(last), last[-1])])]
-
-
-def _seed(seed: int, chunk: int) -> int:
-    return int(np.random.SeedSequence([seed, chunk]).generate_state(1)[0])
 
 
 def _axes(forward: np.ndarray) -> np.ndarray:
