@@ -72,6 +72,7 @@ def unsafe(tree):
 READS_NO_FILE = {"lidardesign/testing/scenes.py": "imports pickle"}
 
 
+@pytest.mark.hard_case("P4")
 @each_row("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_a_module_runs_no_code_of_files(path):
     known = READS_NO_FILE.get(path.relative_to(ROOT).as_posix())
@@ -114,6 +115,7 @@ BOMB = (
 )
 
 
+@pytest.mark.hard_case("M4")
 @pytest.mark.parametrize(
     "text",
     [
@@ -131,6 +133,7 @@ def test_entities_of_a_robot_are_neither_expanded_nor_read(tmp_path, text):
     assert len(str(refused.value)) < 2000
 
 
+@pytest.mark.hard_case("M4")
 @pytest.mark.parametrize("depth", [1, 3])
 def test_a_link_that_leads_out_of_the_folder_of_a_robot_is_not_followed(tmp_path, depth):
     inside = tmp_path / "model"

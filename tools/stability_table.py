@@ -51,8 +51,10 @@ def _cell(text: str) -> str:
 
 
 def _tests(case: Any) -> str:
-    file = case.tests.__module__.rpartition(".")[2]
-    return f"[`{case.tests.__name__}`](../tests/hard_cases/{file}.py): {len(case.names)}"
+    module = case.tests.__module__.rpartition(".")[2]
+    own = {f"[`{case.tests.__name__}`](../tests/hard_cases/{module}.py)": len(case.names)} if case.names else {}
+    others = {f"[`{Path(file).name}`](../tests/{file})": count for file, count in case.elsewhere.items()}
+    return ", ".join(f"{link}: {count}" for link, count in {**own, **others}.items())
 
 
 def main() -> None:

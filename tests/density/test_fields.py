@@ -47,6 +47,7 @@ PRIMITIVES = {
 }
 
 
+@pytest.mark.hard_case("14")
 @pytest.mark.parametrize("name", PRIMITIVES)
 def test_posed_primitives_have_their_closed_form_distance(name):
     generator = np.random.default_rng(1)

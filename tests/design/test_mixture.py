@@ -30,6 +30,7 @@ from lidardesign.numerics import logsumexp, wrap_angle
 from lidardesign.space import DesignSpace, angles
 
 
+@pytest.mark.hard_case("30")
 def test_the_density_equals_plain_loops():
     generator = np.random.default_rng(0)
     mixture = random_mixture(generator, 5)
@@ -133,6 +134,7 @@ def test_the_angle_ratio_is_accurate_from_zero_to_the_antipode():
     assert np.isfinite(angle_ratio(np.array([-1.0, 1.0]), np.empty(2), np.empty(2))).all()
 
 
+@pytest.mark.hard_case("30")
 def test_responsibilities_sum_to_one_sixty_sigma_away():
     generator = np.random.default_rng(7)
     mixture = random_mixture(generator, 4)
@@ -275,6 +277,7 @@ def assert_keeps(mixture, bounds):
     assert (np.abs(mixture.roll_rad) <= math.pi / 4 + tiny).all()
 
 
+@pytest.mark.hard_case("29")
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data(), count=st.integers(1, 4), seed_number=st.integers(0, 10_000))
 def test_the_log_likelihood_never_decreases_and_every_bound_holds(data, count, seed_number):

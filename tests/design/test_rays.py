@@ -57,6 +57,7 @@ def coordinates(design, rays):
 # --- budgets
 
 
+@pytest.mark.hard_case("35")
 @settings(max_examples=200, deadline=None)
 @given(
     weights=st.lists(st.floats(0, 1e6), min_size=1, max_size=20).filter(lambda w: max(w) > 1e-3),
@@ -71,6 +72,7 @@ def test_a_budget_sums_exactly_and_no_share_is_a_whole_ray_off(weights, count):
     assert (shares[np.array(weights) == 0] == 0).all()
 
 
+@pytest.mark.hard_case("35")
 @settings(max_examples=50, deadline=None)
 @given(
     weights=st.lists(st.integers(1, 1000), min_size=1, max_size=10, unique=True), count=st.integers(0, 400)
@@ -80,6 +82,7 @@ def test_a_budget_does_not_depend_on_the_scale_of_the_weights(weights, count):
     assert (split_budget(weights, count) == split_budget(weights / weights.sum(), count)).all()
 
 
+@pytest.mark.hard_case("35")
 def test_seven_equal_sensors_share_a_hundred_rays_the_first_ones_ahead():
     assert split_budget(np.full(7, 1 / 7), 100).tolist() == [15, 15, 14, 14, 14, 14, 14]
     assert split_budget(np.ones(7), 100).tolist() == [15, 15, 14, 14, 14, 14, 14]
@@ -91,6 +94,7 @@ def test_fewer_rays_than_sensors_leave_some_without():
     assert split_budget(np.array([0.1, 0.2, 0.7]), 0).tolist() == [0, 0, 0]
 
 
+@pytest.mark.hard_case("35")
 @each_row(
     ("weights", "count"),
     [

@@ -197,6 +197,7 @@ class Bomb:
         return (open, ("owned", "w"))
 
 
+@pytest.mark.hard_case("P4")
 def test_pickled_objects_are_refused_and_never_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     np.savez("s.npz", **{**make_capture(3), "origin_m": np.array([Bomb()], dtype=object)}, allow_pickle=True)

@@ -189,6 +189,7 @@ def test_a_limit_is_open_a_hit_at_it_is_a_miss():
     assert (caster.trace(origins, directions, np.zeros(500)).body == -1).all()
 
 
+@pytest.mark.hard_case("17")
 def test_chunks_of_rays_do_not_change_the_bits():
     caster = SceneCaster(mixed_scene())
     origins, directions = rays_towards(1001, 11)

@@ -386,6 +386,7 @@ class TestBrokenPlugins:
             f"program with {len(hard.stderr)} words; SIGALRM never reaches Python where one hangs in compiled code"
         )
 
+    @pytest.mark.hard_case("P5")
     def test_all_are_listed_with_their_reasons_and_the_others_still_list_and_run(self, install, lidardesign):
         install({"good": GOOD, **{name: source for name, (source, _) in {**BROKEN, **FATAL}.items()}})
         listed = {entry["name"]: entry for entry in lidardesign("tasks", "list", "--json").json["tasks"]}
@@ -397,6 +398,7 @@ class TestBrokenPlugins:
         assert lidardesign("tasks", "show", "flatland").code == 0
         assert registry.load_task("good").name == "good"
 
+    @pytest.mark.hard_case("P5")
     @pytest.mark.parametrize("name", [*BROKEN, *FATAL])
     def test_using_it_names_it_and_exits_6(self, install, lidardesign, tmp_path, name):
         source, words = {**BROKEN, **FATAL}[name]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from multiprocessing.reduction import ForkingPickler
+
 import numpy as np
 import pytest
 import trimesh
@@ -16,7 +18,6 @@ from lidardesign.design.files import design_from_document
 from lidardesign.errors import ConfigError, LidardesignError
 from lidardesign.evaluate.scene_scores import score_in_scene
 from lidardesign.evaluate.score import slipped_notes
-from lidardesign.evaluate.workers.worker import pack, scores_as_document, scores_from_document, unpack
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Rays
 from lidardesign.geometry.triangles import BESIDE_SHARE, SecondCasts, Triangles
@@ -171,7 +172,7 @@ class TestRaysThroughEdgesAndVertices:
         slipped = found.second_casts
         assert slipped.rays == count
         assert 0.0005 < slipped.found / count < 0.01
-        again = scores_from_document(unpack(pack(scores_as_document(found)))[0]).second_casts
+        again = ForkingPickler.loads(ForkingPickler.dumps(found)).second_casts
         assert again == slipped
         (note,) = slipped_notes(again)
         assert f"{slipped.found} of {count:,} rays" in note

@@ -51,6 +51,7 @@ def test_a_write_makes_folders_and_leaves_only_the_file(tmp_path):
     assert stat.S_IMODE(path.stat().st_mode) & stat.S_IRUSR
 
 
+@pytest.mark.hard_case("38")
 @pytest.mark.parametrize("failing", ["fsync", "replace"])
 def test_a_write_that_fails_leaves_the_old_file_and_no_temporary(tmp_path, monkeypatch, failing):
     path = tmp_path / "file"
@@ -95,6 +96,7 @@ def test_stray_temporaries_of_killed_writers_are_removed(tmp_path):
     assert os.listdir(tmp_path) == ["samples.npz"]
 
 
+@pytest.mark.hard_case("38")
 @pytest.mark.parametrize("name", ["samples.npz", "größe " * 14 + ".npz"])
 def test_the_next_writer_of_a_file_removes_what_a_killed_one_left(tmp_path, name):
     left = files.temporary_beside(tmp_path / name)

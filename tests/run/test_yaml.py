@@ -64,6 +64,7 @@ BAD = {
 }
 
 
+@pytest.mark.hard_case("36")
 @each_row(("text", "value"), PLAIN)
 def test_plain_scalars_mean_what_they_look_like(text, value):
     read = parse_yaml(f"key: {text}", where="f").value["key"]
@@ -71,6 +72,7 @@ def test_plain_scalars_mean_what_they_look_like(text, value):
     assert type(read) is type(value)
 
 
+@pytest.mark.hard_case("36")
 @each_row("case", BAD)
 def test_bad_yaml_is_refused_with_its_position(case):
     text, position, words = BAD[case]

@@ -143,6 +143,7 @@ def test_what_cannot_be_simulated_here_is_named_and_asking_for_it_is_refused(mon
         Planner(CONSUMER, parse_effects("multipath")).plan(scene, [grid()])
 
 
+@pytest.mark.hard_case("21")
 @each_row("text", ["noise", "", "jitter,", "photon_noise,ambint", "Auto"])
 def test_unknown_effects_are_refused_with_the_names_of_all(text):
     with pytest.raises(ConfigError) as caught:

@@ -112,6 +112,7 @@ def moving_scene(generator, frames=4):
     )
 
 
+@pytest.mark.hard_case("19")
 def test_lists_of_rays_return_the_same_bits_together_as_alone():
     generator = np.random.default_rng(11)
     scene = moving_scene(generator)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import ast
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 
 # Design space and density, fields, rays, flow, mixture, files; MuJoCo; the promises. 28 was of a dropped feature.
 KEYS = (
@@ -34,9 +38,26 @@ class HardCase:
         """The names of its tests, in the order in which they stand."""
         return [name for name, value in vars(self.tests).items() if name.startswith("test_") and callable(value)]
 
+    @property
+    def elsewhere(self) -> dict[str, int]:
+        """How many tests stand with what they test, under the mark `hard_case`, by their file in tests/."""
+        return marked()[self.key]
+
     def broke(self) -> str:
         """What used to break, in one sentence."""
         return self.tests.broke()
+
+
+@lru_cache
+def marked() -> dict[str, Counter[str]]:
+    """Files of tests that bear the mark `hard_case(key)`, and how many of them, by key; read from their source."""
+    tests, found = Path(__file__).parents[1], {key: Counter() for key in KEYS}
+    for path in sorted(tests.rglob("test_*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            for mark in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
+                if isinstance(mark, ast.Call) and ast.unparse(mark.func) == "pytest.mark.hard_case":
+                    found[ast.literal_eval(mark.args[0])][path.relative_to(tests).as_posix()] += 1
+    return found
 
 
 CASES: dict[str, HardCase] = {}
