@@ -25,7 +25,7 @@ from lidardesign.simulate.plan import Choice, Decision, EffectPlan, Tolerance
 from lidardesign.task import Metric
 
 if TYPE_CHECKING:
-    from lidardesign.evaluate.cma.candidate import Record
+    from lidardesign.evaluate.cma.candidate import SearchRecord
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +149,7 @@ class Evaluation:
     planning_seconds: float = 0.0
     audit: Audit | None = None
     accuracy: Accuracy | None = None
-    searches: Sequence[Record] = ()
+    searches: Sequence[SearchRecord] = ()
 
     def estimates(self) -> dict[str, Estimate]:
         """The designs' values and their differences to the baselines with half of their intervals, by what they are."""

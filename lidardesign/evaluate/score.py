@@ -24,8 +24,8 @@ from lidardesign.evaluate.baselines.candidates import Candidate, Positions, Trai
 from lidardesign.evaluate.baselines.catalog import part_notes
 from lidardesign.evaluate.baselines.no_visibility import TwinCandidate
 from lidardesign.evaluate.baselines.simple import CMA, Baselines, Judge, Option
-from lidardesign.evaluate.cma.candidate import CmaCandidate, Record
-from lidardesign.evaluate.cma.objective import TrainingObjective
+from lidardesign.evaluate.cma.candidate import CmaCandidate, SearchRecord
+from lidardesign.evaluate.cma.search import TrainingObjective
 from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, left_out
 from lidardesign.evaluate.results import (
     Audit,
@@ -70,7 +70,7 @@ class Entry:
     redraw: Callable[[int], Positions] | None = None
     matched_to: str | None = None
     matched_rays: int | None = None
-    search: Record | None = None
+    search: SearchRecord | None = None
 
     @property
     def rays(self) -> int:
@@ -436,7 +436,7 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
     return notes
 
 
-def search_notes(searches: Sequence[Record], request: EvaluationRequest) -> list[str]:
+def search_notes(searches: Sequence[SearchRecord], request: EvaluationRequest) -> list[str]:
     """How the rows of `cma` were found."""
     return [record.note(request.designs[0].name, request.task.metric) for record in searches]
 

@@ -23,12 +23,10 @@ from lidardesign.design.sensor import DesignSpec, Sensor, Track, tangent_coordin
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.candidates import TrainingViews, dense_points, mean_mbps, whole_range
 from lidardesign.evaluate.cma.candidate import CmaCandidate, CmaSettings
-from lidardesign.evaluate.cma.models import Amount, SensorModel, widest_bins
-from lidardesign.evaluate.cma.objective import OutOfTimeError, TrainingObjective
-from lidardesign.evaluate.cma.search import Budget, Search
-from lidardesign.evaluate.cma.sensor_parameters import Setting, exp_matrix, log_matrix
+from lidardesign.evaluate.cma.model import DesignModel, RayBudget, Way, widest_bins
+from lidardesign.evaluate.cma.parameters import SearchRules, exp_matrix, log_matrix
+from lidardesign.evaluate.cma.search import Budget, OutOfTimeError, Search, TrainingObjective
 from lidardesign.evaluate.cma.starts import starts, tiles
-from lidardesign.evaluate.cma.track import TrackFigures, TrackModel, Way
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.score import evaluate
 from lidardesign.scene import Body, Scene, Sphere, rigid
@@ -92,14 +90,14 @@ def named(case):
     return f"{place.lower()} {layout} {json.dumps(rules)[:60]}"
 
 
-def setting_of(space, layout, rules, gates=True):
-    return Setting(space, Constraints.from_mapping(rules), 0.95, layout, {}, gates)
+def rules_of(space, layout, rules, gates=True):
+    return SearchRules(space, Constraints.from_mapping(rules), 0.95, layout, {}, gates)
 
 
 def models_of(space, train, layout, rules, count=3):
-    setting = setting_of(space, layout, rules)
+    setting = rules_of(space, layout, rules)
     found = starts(setting, TrainingViews(space, train), count)
-    return [SensorModel(setting, start, [{}], rules) for start in found]
+    return [DesignModel(setting, start, [{}], rules) for start in found]
 
 
 @each_row("case", CASES, ids=named)
@@ -108,7 +106,9 @@ def test_every_vector_however_far_stands_for_a_design_that_keeps_its_constraints
     generator = np.random.default_rng(5)
     for model in models_of(space, train, layout, rules)[::7]:
         for step in (0.0, 0.5, 4.0, 40.0):
-            design = model.design(step * generator.standard_normal(model.size), Amount(12 if layout != "scan" else 3))
+            design = model.design(
+                step * generator.standard_normal(model.size), RayBudget(12 if layout != "scan" else 3)
+            )
             checks = check_design(design_document(design), rules, space)
             assert not [check for check in checks if not check.satisfied]
             assert design.rays in (0, 12, 3)
@@ -122,7 +122,7 @@ def test_projecting_twice_is_projecting_once(case):
     for model in models_of(*case)[::7]:
         for step in (0.5, 4.0):
             vector = step * generator.standard_normal(model.size)
-            designs = [model.design(one, Amount(12)) for one in (vector, model.projected(vector))]
+            designs = [model.design(one, RayBudget(12)) for one in (vector, model.projected(vector))]
             for one, other in zip(*(design.sensors for design in designs), strict=True):
                 for name in ("origin_m", "origin_covariance_m2", "frame", "field_of_view_rad", "gate_m", "weight"):
                     found, expected = getattr(one, name), getattr(other, name)
@@ -135,7 +135,7 @@ def test_a_vector_that_breaks_nothing_is_its_own_projection():
         for i in range(3)
     ]
     for layout, size in (("grid", 11), ("distributed", 20)):
-        model = SensorModel(setting_of(FREE, layout, {}), sensors, [{}], {})
+        model = DesignModel(rules_of(FREE, layout, {}), sensors, [{}], {})
         assert model.size == 3 * size
         vector = 0.5 * np.random.default_rng(1).standard_normal(model.size)
         back = model.projected(vector)
@@ -153,8 +153,8 @@ def test_the_vector_zero_is_the_start():
         Sensor(f"s{i}", 0.2 + 0.3 * i, [0.1, 0, 0], np.zeros((3, 3)), 0.1 * i, -0.1, 0.4 * i, 0.04, 0.02, 1.5, 0.1)
         for i in range(2)
     ]
-    model = SensorModel(setting_of(FREE, "grid", {}), sensors, [{}], {})
-    for one, other in zip(model.design(model.zero, Amount(10)).sensors, sensors, strict=True):
+    model = DesignModel(rules_of(FREE, "grid", {}), sensors, [{}], {})
+    for one, other in zip(model.design(model.zero, RayBudget(10)).sensors, sensors, strict=True):
         np.testing.assert_allclose(one.frame, other.frame, atol=1e-9)
         assert one.gate_m == pytest.approx(other.gate_m)
         assert one.field_of_view_rad == pytest.approx(other.field_of_view_rad)
@@ -163,15 +163,15 @@ def test_the_vector_zero_is_the_start():
 
 @pytest.mark.parametrize("focus", [0.0, 1.0])
 def test_rays_of_spread_sensors_are_parallel_or_meet_in_one_point(focus):
-    setting = setting_of(FREE, "distributed", {})
+    setting = rules_of(FREE, "distributed", {})
     start = next(
         one
         for one in starts(setting, TrainingViews(FREE, AHEAD), 1)
         if np.allclose(-one[0].range_m * one[0].coupling.direction_per_m[0] @ one[0].frame[1], focus, atol=1e-9)
     )
     narrow = replace(start[0], coupling=replace(start[0].coupling, spread_rad=np.full(2, 1e-4)))
-    model = SensorModel(setting, [narrow], [{}], {})
-    (rays,) = model.positions(model.zero, Amount(50))
+    model = DesignModel(setting, [narrow], [{}], {})
+    (rays,) = model.positions(model.zero, RayBudget(50))
     # what lies along the boresight is no matter of directions
     met = rays.origin_m + (narrow.range_m if focus else 1e6) * rays.direction
     spread = np.linalg.norm(np.ptp(met @ narrow.frame[1:].T, axis=0)) / (1.0 if focus else 1e6)
@@ -201,8 +201,8 @@ def test_matrix_logarithms_and_exponentials_undo_each_other():
 
 
 def test_the_widest_cap_keeps_a_budget_that_one_bin_more_breaks():
-    amount = Amount(None, 1.0)
-    read_out = amount.read_outs(setting_of(FIXED, "grid", {}))[0]
+    amount = RayBudget(None, 1.0)
+    read_out = amount.read_outs(rules_of(FIXED, "grid", {}))[0]
     widths = np.array([0.5, 1.5])
     for most in range(1, 101):
         cap = widest_bins(lambda width, most=most: width <= most * read_out.model.bin_m, widths, read_out)
@@ -217,7 +217,7 @@ def test_rays_within_a_bandwidth_cost_no_more_and_hardly_less(layout, limit):
     generator = np.random.default_rng(2)
     for model in models_of(space, AHEAD, layout, {})[::6]:
         for step in (0.0, 1.0):
-            amount = Amount(None, limit)
+            amount = RayBudget(None, limit)
             positions = model.positions(step * generator.standard_normal(model.size), amount)
             spent = mean_mbps(positions, Bandwidth())
             assert spent <= limit * (1 + 1e-12)
@@ -262,7 +262,7 @@ class Distance:
 
 def search(objective, starts, evaluations=1500, seed=0, **options):
     budget = Budget(math.inf, evaluations)
-    return Search(starts, Amount(1), objective, budget, np.random.default_rng(seed), **options).run()
+    return Search(starts, RayBudget(1), objective, budget, np.random.default_rng(seed), **options).run()
 
 
 def test_a_search_finds_the_lowest_point_inside_the_constraints():
@@ -309,7 +309,7 @@ def test_a_search_ends_when_its_time_is_up_by_its_own_clock():
     now = itertools.count()
     objective = Distance(np.zeros((40, 4)))
     budget = Budget(200.0, clock=lambda: float(next(now)))
-    found = Search([Bowl([2.0] * 4)], Amount(1), objective, budget, np.random.default_rng(0)).run()
+    found = Search([Bowl([2.0] * 4)], RayBudget(1), objective, budget, np.random.default_rng(0)).run()
     assert 100 < found.seconds <= 220
 
 
@@ -467,15 +467,17 @@ def test_a_track_keeps_its_constraints_at_every_place():
         "boresight": {"elevation_deg": {"min": -10, "max": 20}},
         "budget": {"bandwidth_mbps": 0.015},
     }
-    places, count = np.array([0.0, 1.0]), 4
-    start = TrackFigures(
-        np.zeros((2, count)), np.tile(np.linspace(-0.3, 0.3, count), (2, 1)), np.tile([0.5, 3.0], (2, count, 1))
-    )
-    model = TrackModel(setting_of(AISLE, "scan", rules), Way(0, places), start, [{"x_m": 0.3}], rules)
+    count = 4
+    start = [
+        Sensor(f"s{i}", 1 / count, np.zeros(3), np.zeros((3, 3)), 0.0, elevation, 0.0, 0.0, 0.0, 1.75, 0.6)
+        for i, elevation in enumerate(np.linspace(-0.3, 0.3, count))
+    ]
+    way = Way(0, np.array([0.0, 1.0]))
+    model = DesignModel(rules_of(AISLE, "scan", rules), start * 2, [{"x_m": 0.3}], rules, way)
     generator = np.random.default_rng(0)
     for step in (0.0, 1.0, 10.0):
         vector = step * generator.standard_normal(model.size)
-        design = model.design(vector, Amount(count))
+        design = model.design(vector, RayBudget(count))
         checks = check_design(design_document(design), rules, AISLE)
         assert not [check for check in checks if not check.satisfied]
         once = model.projected(vector)
@@ -483,7 +485,7 @@ def test_a_track_keeps_its_constraints_at_every_place():
 
 
 def test_starts_on_returns_see_them_and_stay_in_the_space():
-    setting = setting_of(FIXED, "grid", {}, gates=False)
+    setting = rules_of(FIXED, "grid", {}, gates=False)
     for start in starts(setting, TrainingViews(FIXED, AHEAD), 4):
         assert sum(sensor.weight for sensor in start) == pytest.approx(1.0)
         for sensor in start:
@@ -569,7 +571,7 @@ def test_without_a_terminal_a_search_is_announced_once(capsys):
 
 
 def test_from_several_places_every_sensor_may_look_at_all_returns():
-    setting = setting_of(CEILING, "distributed", CEILING_PLACES["mounts"])
+    setting = rules_of(CEILING, "distributed", CEILING_PLACES["mounts"])
     views = TrainingViews(CEILING, BELOW)
     hits = views.hits(dense_points(CEILING)).hits_m
     first = starts(setting, views, 3)[0]

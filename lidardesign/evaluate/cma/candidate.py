@@ -1,8 +1,9 @@
 """The baseline `cma`: what direct optimisation of the metric finds, within a budget of time per number of rays.
 
 It varies the sensors that the first design has, under the design's constraints and with its layout of rays, and asks
-the task's metric on training scenes alone (see `cma_search`). A design whose rays follow from samples of the density
-(layout `density`), or from the pattern of a part (`fixed`), is followed with even rays in its sensors' fields.
+the task's metric on training scenes alone (see `lidardesign.evaluate.cma.search`). A design whose rays follow from
+samples of the density (layout `density`), or from the pattern of a part (`fixed`), is followed with even rays in its
+sensors' fields.
 """
 
 from __future__ import annotations
@@ -21,12 +22,10 @@ from lidardesign.design.files import design_document
 from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import MOST_RAYS, DesignSpec
 from lidardesign.evaluate.baselines.candidates import Positions, TrainingViews, dense_points, opened_gate, whole_range
-from lidardesign.evaluate.cma.models import Amount, Model, SensorModel
-from lidardesign.evaluate.cma.objective import TrainingObjective
-from lidardesign.evaluate.cma.search import Budget, Found, Progress, Search
-from lidardesign.evaluate.cma.sensor_parameters import Setting
+from lidardesign.evaluate.cma.model import DesignModel, RayBudget, Way
+from lidardesign.evaluate.cma.parameters import SearchRules
+from lidardesign.evaluate.cma.search import Budget, Progress, Search, SearchResult, TrainingObjective
 from lidardesign.evaluate.cma.starts import scan_starts, starts
-from lidardesign.evaluate.cma.track import TrackFigures, TrackModel, Way
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.run.clock import phase
 from lidardesign.simulate.detector.detector import IDEAL
@@ -34,8 +33,6 @@ from lidardesign.space import DIMENSIONS, DesignSpace
 from lidardesign.task import Metric, random_generator
 
 NAME = "cma"
-# Rays of a track are given at so many places, linear in between.
-TRACK_PLACES = 2
 # A scan within a bandwidth has at most so many times the rays of the design that it follows.
 MOST_RAYS_FACTOR = 4
 
@@ -58,7 +55,7 @@ class CmaSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class SearchRecord:
     """A search and what came of it.
 
     Arguments:
@@ -72,7 +69,7 @@ class Record:
 
     rays: int
     limit_mbps: float | None
-    found: Found
+    found: SearchResult
     broken: Sequence[str]
     parameters: int
     design: DesignSpec
@@ -139,46 +136,46 @@ class CmaCandidate:
     seed: int
     name: str = NAME
     drawn_anew: bool = False
-    _known: dict[tuple[int | None, float | None], tuple[Positions, Record]] = field(default_factory=dict)
+    _known: dict[tuple[int | None, float | None], tuple[Positions, SearchRecord]] = field(default_factory=dict)
 
     def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
         """See `lidardesign.evaluate.baselines.candidates.Candidate`."""
-        return self._searched((count, None), Amount(count))
+        return self._searched((count, None), RayBudget(count))
 
     def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
         """See `lidardesign.evaluate.baselines.candidates.Candidate`: the number of rays is part of what is searched."""
-        return self._searched((None, limit_mbps), Amount(None, limit_mbps, bandwidth))
+        return self._searched((None, limit_mbps), RayBudget(None, limit_mbps, bandwidth))
 
     @phase("cma")
-    def _searched(self, key: tuple[int | None, float | None], amount: Amount) -> Positions:
+    def _searched(self, key: tuple[int | None, float | None], rays: RayBudget) -> Positions:
         if key not in self._known:
             budget = self.settings.budget
             began = budget.clock()
-            models = self._models(amount)
+            models = self._models(rays)
             generator = random_generator(self.seed, "cma", str(key))
-            label = f"cma, {amount.count} rays" if amount.count else f"cma, {amount.limit_mbps:.3g} Mbit/s"
+            label = f"cma, {rays.count} rays" if rays.count else f"cma, {rays.limit_mbps:.3g} Mbit/s"
             told = self.settings.show
             show = None if told is None else (lambda progress: told(label, progress))
-            found = Search(models, amount, self.objective, budget, generator, show, began).run()
-            if not self._varies_gates(amount):
-                found = self._cropped(found, amount)
-            self._known[key] = found.model.positions(found.vector, amount), self._record(found, amount)
+            found = Search(models, rays, self.objective, budget, generator, show, began).run()
+            if not self._varies_gates(rays):
+                found = self._cropped(found, rays)
+            self._known[key] = found.model.positions(found.vector, rays), self._record(found, rays)
         return self._known[key][0]
 
-    def record_of(self, positions: Positions) -> Record | None:
+    def record_of(self, positions: Positions) -> SearchRecord | None:
         """How these rays were found."""
         return next((record for known, record in self._known.values() if known is positions), None)
 
-    def _varies_gates(self, amount: Amount) -> bool:
+    def _varies_gates(self, rays: RayBudget) -> bool:
         """Whether a wider gate could be worse: where it costs, where it is bounded, or where light is counted."""
         one = self._constraints()
         bounded = one.gate != Gate() or any(other.gate != Gate() for other in one.each)
         ideal = self.objective.planner.detector == IDEAL
-        return not ideal or bounded or amount.limit_mbps is not None or one.budget.bandwidth_mbps is not None
+        return not ideal or bounded or rays.limit_mbps is not None or one.budget.bandwidth_mbps is not None
 
-    def _cropped(self, found: Found, amount: Amount) -> Found:
+    def _cropped(self, found: SearchResult, rays: RayBudget) -> SearchResult:
         """The same rays with gates from the nearest to the furthest return that their sensor had."""
-        positions = found.model.positions(found.vector, amount)
+        positions = found.model.positions(found.vector, rays)
         sensor, range_m = self.objective.returned(positions, range(found.scenes))
         gates = np.tile(whole_range(self.space), (int(max(rays.sensor.max() for rays in positions)) + 1, 1))
         for index in np.unique(sensor):
@@ -188,25 +185,25 @@ class CmaCandidate:
         model = found.model.with_gates(found.vector, gates)
         return replace(found, model=model, vector=model.zero)
 
-    def _record(self, found: Found, amount: Amount) -> Record:
-        design = found.model.design(found.vector, amount)
+    def _record(self, found: SearchResult, rays: RayBudget) -> SearchRecord:
+        design = found.model.design(found.vector, rays)
         broken = []
         if design.rays:
-            checks = check_design(design_document(design), design.constraints, self._setting(amount).space)
+            checks = check_design(design_document(design), design.constraints, self._rules(rays).space)
             broken = [check.name for check in checks if not check.satisfied]
-        return Record(design.rays or 0, amount.limit_mbps, found, broken, found.model.size, design)
+        return SearchRecord(design.rays or 0, rays.limit_mbps, found, broken, found.model.size, design)
 
     def _constraints(self) -> Constraints:
         return Constraints.from_mapping(self._document(), where=f"constraints of {self.followed.name}")
 
-    def _setting(self, amount: Amount) -> Setting:
+    def _rules(self, rays: RayBudget) -> SearchRules:
         design = self.followed
         layout = design.layout if layout_of(design).follows_from_sensors else "grid"
         space = self.space
         if space.conditioned:
             bolted = self.conditions[len(self.conditions) // 2] if design.track is None else {}
             space = space.at({**bolted, **design.at})
-        return Setting(space, self._constraints(), design.level, layout, design.at, self._varies_gates(amount))
+        return SearchRules(space, self._constraints(), design.level, layout, design.at, self._varies_gates(rays))
 
     def _document(self) -> dict[str, Any]:
         """The followed design's constraints; the number of rays is that of the comparison."""
@@ -215,43 +212,30 @@ class CmaCandidate:
             document["budget"] = {key: value for key, value in document["budget"].items() if key != "rays"}
         return document
 
-    def _models(self, amount: Amount) -> list[Model]:
+    def _models(self, rays: RayBudget) -> list[DesignModel]:
         """Every start as a model whose vector 0 it is."""
-        setting, views = self._setting(amount), self.views
-        if setting.space != views.space:
-            views = TrainingViews(setting.space, views.train)
-        document = self._document()
-        if self.followed.track is not None:
-            return self._tracks(setting, views, amount, document)
-        count = len(self.followed.sensors)
-        if setting.one_sensor_per_ray:
-            count = self._scan_rays(amount)
-        return [SensorModel(setting, one, self.conditions, document) for one in starts(setting, views, count)]
+        rules, views, document = self._rules(rays), self.views, self._document()
+        if rules.space != views.space:
+            views = TrainingViews(rules.space, views.train)
+        track, count = self.followed.track, len(self.followed.sensors)
+        if track is not None:
+            way = Way(DIMENSIONS.index(track.dimension), np.array([track.knots[0], track.knots[-1]]))
+            middle = replace(rules, space=rules.space.at({track.dimension: float(way.places.mean())}))
+            observed = views.hits(dense_points(rules.space))
+            return [
+                DesignModel(rules, [*start] * len(way.places), self.conditions, document, way)
+                for start in scan_starts(middle, views, observed, self._scan_rays(rays))
+            ]
+        if rules.one_sensor_per_ray:
+            count = self._scan_rays(rays)
+        return [DesignModel(rules, start, self.conditions, document) for start in starts(rules, views, count)]
 
-    def _scan_rays(self, amount: Amount) -> int:
+    def _scan_rays(self, rays: RayBudget) -> int:
         """The number of rays of a scan: as asked, or what a bandwidth pays for at the followed design's gates."""
-        if amount.count is not None:
-            return amount.count
+        if rays.count is not None:
+            return rays.count
         own = self.followed
         widths = np.array([end - start for start, end in (sensor.gate_m for sensor in own.sensors)])
-        spent = amount.bandwidth.mbps_of_widths(widths)
-        affordable = math.floor(len(widths) * (amount.limit_mbps or 0.0) / spent)
+        spent = rays.bandwidth.mbps_of_widths(widths)
+        affordable = math.floor(len(widths) * (rays.limit_mbps or 0.0) / spent)
         return int(np.clip(affordable, 1, min(MOST_RAYS, MOST_RAYS_FACTOR * len(widths))))
-
-    def _tracks(
-        self, setting: Setting, views: TrainingViews, amount: Amount, document: Mapping[str, object]
-    ) -> list[Model]:
-        track = self.followed.track
-        places = np.linspace(track.knots[0], track.knots[-1], TRACK_PLACES)
-        way = Way(DIMENSIONS.index(track.dimension), places)
-        middle = setting.space.at({track.dimension: float(places.mean())})
-        observed = views.hits(dense_points(setting.space))
-        found: list[Model] = []
-        for sensors in scan_starts(replace(setting, space=middle), views, observed, self._scan_rays(amount)):
-            figures = TrackFigures(
-                azimuth=np.tile([one.azimuth_rad for one in sensors], (TRACK_PLACES, 1)),
-                elevation=np.tile([one.elevation_rad for one in sensors], (TRACK_PLACES, 1)),
-                gate=np.tile([one.gate_m for one in sensors], (TRACK_PLACES, 1, 1)),
-            )
-            found.append(TrackModel(setting, way, figures, self.conditions, document))
-        return found

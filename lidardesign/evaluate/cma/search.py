@@ -6,6 +6,9 @@ and the last share is kept to compare the finalists (every start that a search b
 the mean of the last distribution) on all of them. A search that has converged begins anew at the best found so far,
 with twice the population. Vectors beyond the constraints stand for their projection, and are ranked behind it by how
 far they lie beyond.
+
+All candidates of a step see the same scenes and the same chance (common random numbers), so that what tells them apart
+is what they are. Casters, and what a scene calls for, are worked out once per scene and kept.
 """
 
 from __future__ import annotations
@@ -19,9 +22,15 @@ from typing import Any
 import numpy as np
 
 from lidardesign.evaluate.baselines.candidates import Positions
-from lidardesign.evaluate.cma.models import Amount, Model
-from lidardesign.evaluate.cma.objective import OutOfTimeError, TrainingObjective
+from lidardesign.evaluate.cma.model import DesignModel, RayBudget
+from lidardesign.evaluate.scene_scores import score_lists
+from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.numerics import TINY
+from lidardesign.scene import Scene
+from lidardesign.simulate.physics import Physics
+from lidardesign.simulate.plan import Planner
+from lidardesign.simulate.simulate import build_casters, simulate_many
+from lidardesign.task import Task
 
 # Scenes that the first steps see; as many as baselines are compared on. With 4, tracks of an arm that were best there
 # were more than twice as far off on 16.
@@ -40,6 +49,76 @@ CURVE_POINTS = 200
 STARTS_AT_ONCE = 8
 # Of more starts than that, the best in so many scenes are looked at in more.
 START_SCENES = 2
+
+
+class OutOfTimeError(Exception):
+    """The budget ended in the middle of a step; what was scored of it is dropped."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingObjective:
+    """The task's metric on training scenes, turned so that lower is better.
+
+    Arguments:
+        task: Whose score is taken.
+        scenes: Training scenes; the first ones are asked first.
+        planner: The detector, and how effects are chosen.
+        seed: Root of the effects' random streams.
+    """
+
+    task: Task
+    scenes: Sequence[Scene]
+    planner: Planner
+    seed: int
+    _prepared: dict[int, tuple[list[SceneCaster], Physics | None]] = field(default_factory=dict)
+
+    @property
+    def sign(self) -> float:
+        """What turns the metric so that lower is better."""
+        return 1.0 if self.task.metric.better == "lower" else -1.0
+
+    def values(
+        self, lists: Sequence[Positions], scenes: Sequence[int], stop: Callable[[], bool] = lambda: False
+    ) -> np.ndarray:
+        """The score of every set of rays in some scenes, lower is better, shape (sets, scenes).
+
+        Arguments:
+            lists: The sets of rays; one without rays has the metric's worst value everywhere.
+            scenes: Numbers of the scenes.
+            stop: Asked after every scene whether the time is up.
+
+        Raises:
+            OutOfTimeError: The time was up before all scenes were asked.
+        """
+        found = np.empty((len(lists), len(scenes)))
+        for column, number in enumerate(scenes):
+            casters, physics = self._of_scene(number, lists)
+            scored = score_lists(self.task, self.scenes[number], lists, casters, physics)
+            found[:, column] = [self.sign * score.value for score, _ in scored]
+            if column + 1 < len(scenes) and stop():
+                raise OutOfTimeError
+        return found
+
+    def returned(self, positions: Positions, scenes: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        """The sensor (R,) and the range (R,) [m] of every return of a set of rays in some scenes."""
+        sensors, ranges_m = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
+        for number in scenes:
+            casters, physics = self._of_scene(number, [positions])
+            repeats = list(range(len(positions)))
+            found = simulate_many(self.scenes[number], positions, casters=casters, physics=physics, repeats=repeats)
+            for one in (returns for frames in found for returns in frames):
+                sensors.append(np.asarray(one.rays.sensor)[one.returned])
+                ranges_m.append(one.range_m[one.returned])
+        return np.concatenate(sensors), np.concatenate(ranges_m)
+
+    def _of_scene(self, number: int, lists: Sequence[Positions]) -> tuple[list[SceneCaster], Physics | None]:
+        """Casters and effects of a scene; the rays that are fired first say which effects it calls for."""
+        if number not in self._prepared:
+            scene = self.scenes[number]
+            casters = build_casters(scene)
+            plan = self.planner.plan(scene, [rays for positions in lists for rays in positions], casters)
+            self._prepared[number] = casters, self.planner.physics(plan, self.seed)
+        return self._prepared[number]
 
 
 @dataclass(frozen=True)
@@ -73,7 +152,7 @@ class Progress:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class SearchResult:
     """What a search found.
 
     Arguments:
@@ -89,7 +168,7 @@ class Found:
             where the next stage sees more scenes.
     """
 
-    model: Model
+    model: DesignModel
     vector: np.ndarray
     start_value: float
     value: float
@@ -103,10 +182,10 @@ class Found:
 
 
 @dataclass(eq=False)
-class _Best:
-    """The best parameters so far, and what they are worth in the scenes of the stage."""
+class _Scored:
+    """Parameters, and their score in the scenes of the stage, lower is better."""
 
-    model: Model
+    model: DesignModel
     vector: np.ndarray
     value: float
 
@@ -116,7 +195,7 @@ class Search:
 
     Arguments:
         starts: Models whose vector 0 is a start, the likeliest to be good first.
-        amount: The number of rays, or the bandwidth.
+        rays: The number of rays, or the bandwidth.
         objective: The metric on training scenes.
         budget: When to end.
         generator: Of all its random numbers.
@@ -126,15 +205,15 @@ class Search:
 
     def __init__(
         self,
-        starts: Sequence[Model],
-        amount: Amount,
+        starts: Sequence[DesignModel],
+        rays: RayBudget,
         objective: TrainingObjective,
         budget: Budget,
         generator: np.random.Generator,
         show: Callable[[Progress], None] | None = None,
         began: float | None = None,
     ) -> None:
-        self._starts, self._amount, self._objective, self._budget = starts, amount, objective, budget
+        self._starts, self._rays, self._objective, self._budget = starts, rays, objective, budget
         self._generator, self._show = generator, show
         self._began, self._worked = budget.clock() if began is None else began, time.process_time()
         self._candidates = self._evaluations = self._restarts = 0
@@ -142,20 +221,20 @@ class Search:
         self._stages = _stages(self._last)
         self._per_evaluation = 0.0
         self._curve: list[tuple[float, int, int, float]] = []
-        self._finalists: list[_Best] = []
+        self._finalists: list[_Scored] = []
 
-    def run(self) -> Found:
+    def run(self) -> SearchResult:
         """Search until the budget is used up."""
         stage = 0
         best = self._best_start(self._stages[0])
-        start = _Best(best.model, best.vector, best.value)
+        start = _Scored(best.model, best.vector, best.value)
         self._finalists = [start]
         strategy = _Strategy(best.model, best.vector, self._generator)
         while best.model.size and not self._over(strategy.population * self._stages[stage]):
             wanted = self._stage()
             if wanted > stage:
                 stage = wanted
-                self._finalists.append(_Best(best.model, best.vector, best.value))
+                self._finalists.append(_Scored(best.model, best.vector, best.value))
                 best = self._rescored(best, self._stages[stage])
             try:
                 self._step(strategy, best, self._stages[stage])
@@ -166,44 +245,44 @@ class Search:
                 strategy = _Strategy(best.model, best.vector, self._generator, self._restarts)
         self._finalists.append(best)
         if best.model.size:
-            self._finalists.append(_Best(strategy.model, strategy.model.projected(strategy.mean), math.inf))
+            self._finalists.append(_Scored(strategy.model, strategy.model.projected(strategy.mean), math.inf))
         return self._chosen(start)
 
-    def _best_start(self, scenes: int) -> _Best:
+    def _best_start(self, scenes: int) -> _Scored:
         """The best of all starts: of many, the best on few scenes are compared on more.
 
         The first one where the time ends before they are scored.
         """
-        starts = [_Best(model, model.zero, math.inf) for model in self._starts]
+        starts = [_Scored(model, model.zero, math.inf) for model in self._starts]
         if len(starts) > STARTS_AT_ONCE:
             starts = self._ranked(starts, min(START_SCENES, scenes))[:STARTS_AT_ONCE]
         best = self._ranked(starts, scenes)[0]
         self._note(best, scenes)
         return best
 
-    def _ranked(self, starts: Sequence[_Best], scenes: int) -> list[_Best]:
-        """Starts by what they are worth in the first scenes, the best first; those that are not scored come last."""
-        found = [_Best(one.model, one.vector, math.inf) for one in starts]
+    def _ranked(self, starts: Sequence[_Scored], scenes: int) -> list[_Scored]:
+        """Starts by their scores in the first scenes, the best first; those that are not scored come last."""
+        found = [_Scored(one.model, one.vector, math.inf) for one in starts]
         for first in range(0, len(found), STARTS_AT_ONCE):
             group = found[first : first + STARTS_AT_ONCE]
             try:
-                values = self._values([one.model.positions(one.vector, self._amount) for one in group], scenes)
+                values = self._values([one.model.positions(one.vector, self._rays) for one in group], scenes)
             except OutOfTimeError:
                 break
             for one, value in zip(group, values, strict=True):
                 one.value = float(value)
         return sorted(found, key=lambda one: one.value)
 
-    def _rescored(self, best: _Best, scenes: int) -> _Best:
+    def _rescored(self, best: _Scored, scenes: int) -> _Scored:
         try:
-            value = float(self._values([best.model.positions(best.vector, self._amount)], scenes)[0])
+            value = float(self._values([best.model.positions(best.vector, self._rays)], scenes)[0])
         except OutOfTimeError:
             return best
-        again = _Best(best.model, best.vector, value)
+        again = _Scored(best.model, best.vector, value)
         self._note(again, scenes)
         return again
 
-    def _step(self, strategy: _Strategy, best: _Best, scenes: int) -> None:
+    def _step(self, strategy: _Strategy, best: _Scored, scenes: int) -> None:
         """One population: asked, scored, told; the best is kept.
 
         Raises:
@@ -211,7 +290,7 @@ class Search:
         """
         vectors = strategy.ask()
         admitted = [strategy.model.projected(vector) for vector in vectors]
-        values = self._values([strategy.model.positions(one, self._amount) for one in admitted], scenes)
+        values = self._values([strategy.model.positions(one, self._rays) for one in admitted], scenes)
         strategy.tell(vectors, admitted, values)
         first = int(values.argmin())
         if values[first] < best.value:
@@ -246,23 +325,23 @@ class Search:
         """The number of the stage: each takes half as large a share of what is left as the one before had."""
         return min(int(-math.log2(max(1.0 - self._share(), TINY)) * STAGE_PACE), len(self._stages) - 1)
 
-    def _chosen(self, start: _Best) -> Found:
+    def _chosen(self, start: _Scored) -> SearchResult:
         """The best finalist on all scenes."""
         unique = {(id(one.model), one.vector.tobytes()): one for one in self._finalists}
-        lists = [one.model.positions(one.vector, self._amount) for one in unique.values()]
+        lists = [one.model.positions(one.vector, self._rays) for one in unique.values()]
         scenes = self._final_scenes(len(lists))
         values = self._objective.values(lists, range(scenes)).mean(axis=1)
         self._evaluations += len(lists) * scenes
-        worth = dict(zip(unique, (float(value) for value in values), strict=True))
-        best = min(worth, key=lambda key: worth[key])
+        scores = dict(zip(unique, (float(value) for value in values), strict=True))
+        best = min(scores, key=lambda key: scores[key])
         sign = self._objective.sign
         seconds = self._budget.clock() - self._began
-        self._curve.append((seconds, self._evaluations, scenes, sign * worth[best]))
-        return Found(
+        self._curve.append((seconds, self._evaluations, scenes, sign * scores[best]))
+        return SearchResult(
             model=unique[best].model,
             vector=unique[best].vector,
-            start_value=sign * worth[id(start.model), start.vector.tobytes()],
-            value=sign * worth[best],
+            start_value=sign * scores[id(start.model), start.vector.tobytes()],
+            value=sign * scores[best],
             seconds=seconds,
             cpu_seconds=time.process_time() - self._worked,
             candidates=self._candidates,
@@ -279,7 +358,7 @@ class Search:
         affordable = min(affordable, (self._budget.evaluations - self._evaluations) / finalists)
         return int(np.clip(affordable, self._stages[0], self._last))
 
-    def _note(self, best: _Best, scenes: int) -> None:
+    def _note(self, best: _Scored, scenes: int) -> None:
         value = self._objective.sign * best.value
         last = self._curve[-1][2:] if self._curve else None
         if last != (scenes, value):
@@ -315,7 +394,7 @@ class _Strategy:
         restart: How often a search has begun anew; each time the population doubles, up to a limit.
     """
 
-    model: Model
+    model: DesignModel
     mean_at_start: np.ndarray
     generator: np.random.Generator
     restart: int = 0

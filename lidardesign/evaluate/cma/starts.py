@@ -32,8 +32,8 @@ from lidardesign.evaluate.baselines.candidates import (
     whole_range,
 )
 from lidardesign.evaluate.baselines.simple import bounding, parallel_angles
-from lidardesign.evaluate.cma.models import with_gate
-from lidardesign.evaluate.cma.sensor_parameters import NARROWEST_RAD, Setting, admitted_origins
+from lidardesign.evaluate.cma.model import with_gate
+from lidardesign.evaluate.cma.parameters import NARROWEST_RAD, SearchRules, admitted_origins
 from lidardesign.numerics import TINY, sphere_exp, sphere_log
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, angles, direction
 
@@ -54,27 +54,27 @@ class Tile(NamedTuple):
     high: np.ndarray
 
 
-def starts(setting: Setting, views: TrainingViews, count: int) -> list[Start]:
+def starts(rules: SearchRules, views: TrainingViews, count: int) -> list[Start]:
     """The sensors to start from, the likeliest to be good first; duplicates may occur.
 
     Arguments:
-        setting: What all candidates share.
+        rules: What all candidates share.
         views: The training scenes.
         count: The number of sensors; of a scan, of rays.
     """
-    observed = views.hits(dense_points(setting.space))
-    if setting.one_sensor_per_ray:
-        return scan_starts(setting, views, observed, count)
-    if setting.spread_axes:
-        found = [*_focused(setting, observed, count), *_parallel(setting, observed, count), *_even(setting, count)]
+    observed = views.hits(dense_points(rules.space))
+    if rules.one_sensor_per_ray:
+        return scan_starts(rules, views, observed, count)
+    if rules.spread_axes:
+        found = [*_focused(rules, observed, count), *_parallel(rules, observed, count), *_even(rules, count)]
     else:
-        found = [*_tilings(setting, observed, count), *_even(setting, count)]
-    return found if setting.gates else [_opened(setting, start) for start in found]
+        found = [*_tilings(rules, observed, count), *_even(rules, count)]
+    return found if rules.gates else [_opened(rules, start) for start in found]
 
 
-def _opened(setting: Setting, start: Start) -> Start:
+def _opened(rules: SearchRules, start: Start) -> Start:
     """The same sensors with gates over the whole range."""
-    return tuple(with_gate(sensor, *whole_range(setting.space).tolist()) for sensor in start)
+    return tuple(with_gate(sensor, *whole_range(rules.space).tolist()) for sensor in start)
 
 
 def tiles(low: np.ndarray, high: np.ndarray, count: int, rows: int) -> list[Tile]:
@@ -90,21 +90,21 @@ def tiles(low: np.ndarray, high: np.ndarray, count: int, rows: int) -> list[Tile
     return found
 
 
-def _tilings(setting: Setting, observed: Observed, count: int) -> Iterator[Start]:
+def _tilings(rules: SearchRules, observed: Observed, count: int) -> Iterator[Start]:
     """Every arrangement of tiles over the returns, from every set of origins."""
     if not len(observed.points):
         return
-    for origins in _origin_sets(setting, observed, count):
+    for origins in _origin_sets(rules, observed, count):
         distinct, which = np.unique(origins, axis=0, return_inverse=True)
-        views = [_seen(setting, observed, origin) for origin in distinct]
+        views = [_seen(rules, observed, origin) for origin in distinct]
         ends = [Tile(*central(view.places)) for view in views]
         if len(distinct) > 1:  # from several places, each may look at everything
             parts = enumerate(which.ravel())
-            yield tuple(_tile_sensor(setting, views[v], ends[v], index, 1.0 / count)[0] for index, v in parts)
+            yield tuple(_tile_sensor(rules, views[v], ends[v], index, 1.0 / count)[0] for index, v in parts)
         for rows in range(1, count + 1):
             split = [tiles(*end, count, rows) for end in ends]
             sensors = [
-                _tile_sensor(setting, views[view], split[view][index], index, 1.0 / count)
+                _tile_sensor(rules, views[view], split[view][index], index, 1.0 / count)
                 for index, view in enumerate(which.ravel())
             ]
             yield tuple(sensor for sensor, _ in sensors)
@@ -113,17 +113,17 @@ def _tilings(setting: Setting, observed: Observed, count: int) -> Iterator[Start
                 yield tuple(replace(one, weight=n / returns.sum()) for (one, n) in sensors)
 
 
-def _origin_sets(setting: Setting, observed: Observed, count: int) -> list[np.ndarray]:
+def _origin_sets(rules: SearchRules, observed: Observed, count: int) -> list[np.ndarray]:
     """Origins (G, 3) each: the middle of what is admitted, and where that is a box, spread over it."""
-    bounds = setting.bounds(count)
+    bounds = rules.bounds(count)
     middle = (bounds.origin_low + bounds.origin_high) / 2
-    sets = [admitted_origins(middle, bounds, setting.constraints)]
-    if setting.axes.origin:
+    sets = [admitted_origins(middle, bounds, rules.constraints)]
+    if rules.axes.origin:
         spread = bounds.origin_low + low_discrepancy(count, 3) * (bounds.origin_high - bounds.origin_low)
-        sets.append(admitted_origins(spread, bounds, setting.constraints))
+        sets.append(admitted_origins(spread, bounds, rules.constraints))
         low, high = central(observed.points[:, :3])
         seen = np.tile((low + high) / 2, (count, 1))
-        sets.append(admitted_origins(seen, bounds, setting.constraints))
+        sets.append(admitted_origins(seen, bounds, rules.constraints))
     return sets
 
 
@@ -139,18 +139,18 @@ class _Seen(NamedTuple):
     frame: np.ndarray | None
 
 
-def _seen(setting: Setting, observed: Observed, origin: np.ndarray) -> _Seen:
+def _seen(rules: SearchRules, observed: Observed, origin: np.ndarray) -> _Seen:
     away = observed.hits_m - origin
     distance = np.linalg.norm(away, axis=1)
     looking = away / np.maximum(distance, TINY)[:, None]
     frame = boresight_frame(*(float(angle) for angle in angles(looking.mean(axis=0))))
-    if setting.axes.angular == 2 and (looking @ frame[0]).min() > math.cos(TANGENT_RAD):
+    if rules.axes.angular == 2 and (looking @ frame[0]).min() > math.cos(TANGENT_RAD):
         return _Seen(origin, sphere_log(looking @ frame.T), distance, frame)
     turned, raised = angles(looking)
     return _Seen(origin, np.stack([unrolled(turned), raised], axis=1), distance, None)
 
 
-def _tile_sensor(setting: Setting, seen: _Seen, tile: Tile, index: int, weight: float) -> tuple[Sensor, int]:
+def _tile_sensor(rules: SearchRules, seen: _Seen, tile: Tile, index: int, weight: float) -> tuple[Sensor, int]:
     """The sensor of one tile of the returns, and how many returns lie in it."""
     middle = (tile.low + tile.high) / 2
     if seen.frame is None:
@@ -160,19 +160,19 @@ def _tile_sensor(setting: Setting, seen: _Seen, tile: Tile, index: int, weight: 
         azimuth, elevation = (float(angle[0]) for angle in angles(sphere_exp(middle[None]) @ seen.frame))
         field = tile.high - tile.low
     inside = ((seen.places >= tile.low) & (seen.places <= tile.high)).all(axis=1)
-    gate = _gate(setting, seen.distance[inside] if inside.sum() >= FEWEST_RETURNS else seen.distance)
-    return _sensor(setting, index, weight, seen.origin, (azimuth, elevation), field, gate), int(inside.sum())
+    gate = _gate(rules, seen.distance[inside] if inside.sum() >= FEWEST_RETURNS else seen.distance)
+    return _sensor(rules, index, weight, seen.origin, (azimuth, elevation), field, gate), int(inside.sum())
 
 
-def _gate(setting: Setting, range_m: np.ndarray) -> np.ndarray:
+def _gate(rules: SearchRules, range_m: np.ndarray) -> np.ndarray:
     """The central 99 % of distances inside the range of the space, shape (2,) [m]."""
-    lowest, highest = whole_range(setting.space)
+    lowest, highest = whole_range(rules.space)
     low, high = np.clip(central(range_m), lowest, highest)
     return opened_gate(float(low), float(high))
 
 
 def _sensor(
-    setting: Setting,
+    rules: SearchRules,
     index: int,
     weight: float,
     origin: np.ndarray,
@@ -181,7 +181,7 @@ def _sensor(
     gate: np.ndarray,
 ) -> Sensor:
     """A sensor whose intervals are a field of view (2,) [rad] and a gate (2,) [m]."""
-    spread = np.asarray(field, dtype=np.float64) / (2 * setting.interval)
+    spread = np.asarray(field, dtype=np.float64) / (2 * rules.interval)
     return Sensor(
         name=f"s{index}",
         weight=weight,
@@ -193,37 +193,37 @@ def _sensor(
         spread_horizontal_rad=float(spread[0]),
         spread_vertical_rad=float(spread[1]),
         range_m=float(gate.mean()),
-        spread_range_m=float(gate[1] - gate[0]) / (2 * setting.interval),
-        level=setting.level,
+        spread_range_m=float(gate[1] - gate[0]) / (2 * rules.interval),
+        level=rules.level,
     )
 
 
-def _even(setting: Setting, count: int) -> list[Start]:
+def _even(rules: SearchRules, count: int) -> list[Start]:
     """The whole space in tiles whose cells are as square as can be, with the whole range."""
-    space = setting.space
-    bounds = setting.bounds(count)
+    space = rules.space
+    bounds = rules.bounds(count)
     low, high = (np.array(end)[[AZIMUTH, ELEVATION]] for end in (space.low, space.high))
     width, height = (high - low) * [math.cos((low[1] + high[1]) / 2), 1.0]
     rows = int(np.clip(round(math.sqrt(count * height / max(width, NARROWEST_RAD))), 1, count))
     origins = bounds.origin_low + low_discrepancy(count, 3) * (bounds.origin_high - bounds.origin_low)
-    origins = admitted_origins(origins, bounds, setting.constraints)
+    origins = admitted_origins(origins, bounds, rules.constraints)
     found = []
     for index, tile in enumerate(tiles(low, high, count, rows)):
         azimuth, elevation = ((tile.low + tile.high) / 2).tolist()
         field = (tile.high - tile.low) * [math.cos(elevation), 1.0]
         gate = whole_range(space)
-        one = _sensor(setting, index, 1.0 / count, origins[index], (azimuth, elevation), field, gate)
-        if setting.spread_axes:
+        one = _sensor(rules, index, 1.0 / count, origins[index], (azimuth, elevation), field, gate)
+        if rules.spread_axes:
             extent = (bounds.origin_high - bounds.origin_low)[index] / math.sqrt(count)
-            one = _spread_out(setting, one, extent, 0.0, one.spread_horizontal_rad, one.spread_vertical_rad)
+            one = _spread_out(rules, one, extent, 0.0, one.spread_horizontal_rad, one.spread_vertical_rad)
         found.append(one)
     return [tuple(found)]
 
 
-def _spread_out(setting: Setting, sensor: Sensor, extent_m: np.ndarray, focus: float, *spread_rad: float) -> Sensor:
+def _spread_out(rules: SearchRules, sensor: Sensor, extent_m: np.ndarray, focus: float, *spread_rad: float) -> Sensor:
     """A sensor whose origins fill a box, with rays that meet at its mean range over the focus (0: parallel)."""
-    along = np.isin(np.arange(3), setting.spread_axes)
-    deviation = np.where(along, np.maximum(extent_m, 0.0) / (2 * setting.interval), 0.0)
+    along = np.isin(np.arange(3), rules.spread_axes)
+    deviation = np.where(along, np.maximum(extent_m, 0.0) / (2 * rules.interval), 0.0)
     slopes = -focus * sensor.frame[1:] / max(sensor.range_m, NARROWEST_RAD)
     moving = np.sqrt(np.square(slopes * deviation).sum(axis=1))
     coupling = Coupling(slopes, np.zeros(3), np.zeros(2), np.array(spread_rad), sensor.spread_range_m)
@@ -237,9 +237,9 @@ def _spread_out(setting: Setting, sensor: Sensor, extent_m: np.ndarray, focus: f
     )
 
 
-def _origin_tiles(setting: Setting, low: np.ndarray, high: np.ndarray, count: int) -> Iterator[list[Tile]]:
+def _origin_tiles(rules: SearchRules, low: np.ndarray, high: np.ndarray, count: int) -> Iterator[list[Tile]]:
     """Boxes of origins (3,) each: every arrangement of tiles along the two longest spread axes."""
-    axes = sorted(setting.spread_axes, key=lambda axis: low[axis] - high[axis])[:2]
+    axes = sorted(rules.spread_axes, key=lambda axis: low[axis] - high[axis])[:2]
     for rows in range(1, count + 1) if len(axes) == 2 else (1,):
         pair = (axes * 2)[:2]
         plane = tiles(low[pair], high[pair], count, rows)
@@ -250,68 +250,68 @@ def _origin_tiles(setting: Setting, low: np.ndarray, high: np.ndarray, count: in
         yield boxes
 
 
-def _parallel(setting: Setting, observed: Observed, count: int) -> Iterator[Start]:
+def _parallel(rules: SearchRules, observed: Observed, count: int) -> Iterator[Start]:
     """Origins over the returns, looking straight down where that is admitted."""
     if not len(observed.points):
         return
-    azimuth, elevation = parallel_angles(setting.space, observed)
-    bounds = setting.bounds(count)
+    azimuth, elevation = parallel_angles(rules.space, observed)
+    bounds = rules.bounds(count)
     looking = direction(azimuth, elevation)
     low, high = central(observed.hits_m)
-    low, high = (np.clip(end, setting.space.low[:3], setting.space.high[:3]) for end in (low, high))
-    spread = 2 * setting.interval * np.full(2, PARALLEL_RAD)
-    for boxes in _origin_tiles(setting, low, high, count):
-        origins = admitted_origins(np.array([(box.low + box.high) / 2 for box in boxes]), bounds, setting.constraints)
+    low, high = (np.clip(end, rules.space.low[:3], rules.space.high[:3]) for end in (low, high))
+    spread = 2 * rules.interval * np.full(2, PARALLEL_RAD)
+    for boxes in _origin_tiles(rules, low, high, count):
+        origins = admitted_origins(np.array([(box.low + box.high) / 2 for box in boxes]), bounds, rules.constraints)
         start = []
         for index, (origin, box) in enumerate(zip(origins, boxes, strict=True)):
-            gate = _gate(setting, np.maximum((observed.hits_m - origin) @ looking, 0.0))
-            one = _sensor(setting, index, 1.0 / count, origin, (azimuth, elevation), spread, gate)
-            start.append(_spread_out(setting, one, box.high - box.low, 0.0, PARALLEL_RAD, PARALLEL_RAD))
+            gate = _gate(rules, np.maximum((observed.hits_m - origin) @ looking, 0.0))
+            one = _sensor(rules, index, 1.0 / count, origin, (azimuth, elevation), spread, gate)
+            start.append(_spread_out(rules, one, box.high - box.low, 0.0, PARALLEL_RAD, PARALLEL_RAD))
         yield tuple(start)
 
 
-def _focused(setting: Setting, observed: Observed, count: int) -> Iterator[Start]:
+def _focused(rules: SearchRules, observed: Observed, count: int) -> Iterator[Start]:
     """Origins over all that see returns, each part looking at the middle of what it sees, or half as focused."""
     if not len(observed.points):
         return
-    bounds = setting.bounds(count)
+    bounds = rules.bounds(count)
     low, high = central(observed.points[:, :3])
-    for boxes in _origin_tiles(setting, low, high, count):
-        origins = admitted_origins(np.array([(box.low + box.high) / 2 for box in boxes]), bounds, setting.constraints)
+    for boxes in _origin_tiles(rules, low, high, count):
+        origins = admitted_origins(np.array([(box.low + box.high) / 2 for box in boxes]), bounds, rules.constraints)
         for focus in (1.0, 0.5):
             parts = enumerate(zip(origins, boxes, strict=True))
             yield tuple(
-                _looking_at(setting, observed, index, origin, box, count, focus) for index, (origin, box) in parts
+                _looking_at(rules, observed, index, origin, box, count, focus) for index, (origin, box) in parts
             )
 
 
 def _looking_at(
-    setting: Setting, observed: Observed, index: int, origin: np.ndarray, box: Tile, count: int, focus: float
+    rules: SearchRules, observed: Observed, index: int, origin: np.ndarray, box: Tile, count: int, focus: float
 ) -> Sensor:
     """The sensor whose origins fill a box, looking at what is seen from there."""
-    axes = list(setting.spread_axes)
+    axes = list(rules.spread_axes)
     starts_m = observed.points[:, :3]
     inside = ((starts_m >= box.low) & (starts_m <= box.high))[:, axes].all(axis=1)
     chosen = inside if inside.sum() >= FEWEST_RETURNS else np.ones(len(inside), dtype=bool)
     hits, middle = observed.hits_m[chosen], observed.hits_m[chosen].mean(axis=0)
     azimuth, elevation = (float(angle) for angle in angles(middle - origin))
-    gate = _gate(setting, np.linalg.norm(hits - origin, axis=1))
-    one = _sensor(setting, index, 1.0 / count, origin, (azimuth, elevation), np.zeros(2), gate)
+    gate = _gate(rules, np.linalg.norm(hits - origin, axis=1))
+    one = _sensor(rules, index, 1.0 / count, origin, (azimuth, elevation), np.zeros(2), gate)
     across = (hits - middle) @ one.frame[1:].T / max(float(np.linalg.norm(middle - origin)), NARROWEST_RAD)
     residual = np.maximum(across.std(axis=0), NARROWEST_RAD)
-    return _spread_out(setting, one, box.high - box.low, focus, *residual.tolist())
+    return _spread_out(rules, one, box.high - box.low, focus, *residual.tolist())
 
 
-def scan_starts(setting: Setting, views: TrainingViews, observed: Observed, count: int) -> list[Start]:
+def scan_starts(rules: SearchRules, views: TrainingViews, observed: Observed, count: int) -> list[Start]:
     """Even rays with one gate, as the simple rivals have them, and with gates by the returns next to each ray."""
     found = []
-    for points, gate in scan_layouts(setting.space, views, observed, count):
-        every = np.tile(gate if setting.gates else whole_range(setting.space), (count, 1))
-        for gates in (every, nearby_gates(setting, observed, points, every))[: 1 + setting.gates]:
+    for points, gate in scan_layouts(rules.space, views, observed, count):
+        every = np.tile(gate if rules.gates else whole_range(rules.space), (count, 1))
+        for gates in (every, nearby_gates(rules, observed, points, every))[: 1 + rules.gates]:
             rays = zip(points, gates, strict=True)
             found.append(
                 tuple(
-                    _sensor(setting, i, 1.0 / count, point[:3], (point[AZIMUTH], point[ELEVATION]), np.zeros(2), one)
+                    _sensor(rules, i, 1.0 / count, point[:3], (point[AZIMUTH], point[ELEVATION]), np.zeros(2), one)
                     for i, (point, one) in enumerate(rays)
                 )
             )
@@ -332,9 +332,9 @@ def scan_layouts(
     return [*found, (even_placement(low, high, count), whole_range(space))]
 
 
-def nearby_gates(setting: Setting, observed: Observed, points: np.ndarray, gates: np.ndarray) -> np.ndarray:
+def nearby_gates(rules: SearchRules, observed: Observed, points: np.ndarray, gates: np.ndarray) -> np.ndarray:
     """Gates (N, 2) by the returns whose rays are nearest to each ray; where they are few, the one it had [m]."""
-    free = [axis for axis in range(RAY_AXES) if axis in setting.space.free]
+    free = [axis for axis in range(RAY_AXES) if axis in rules.space.free]
     if not (free and len(observed.points)):
         return gates
     scale = np.maximum(np.ptp(observed.points[:, free], axis=0), TINY)
@@ -343,5 +343,5 @@ def nearby_gates(setting: Setting, observed: Observed, points: np.ndarray, gates
     for ray in range(len(points)):
         range_m = observed.points[nearest == ray, RANGE]
         if len(range_m) >= FEWEST_RETURNS:
-            found[ray] = _gate(setting, range_m)
+            found[ray] = _gate(rules, range_m)
     return found
