@@ -27,10 +27,10 @@ from common import Timing, interleaved, median_ratio, parser, report, robot_sett
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields.distance import build_field, scene_columns
-from lidardesign.density.target.frames import FramesTarget
+from lidardesign.density.target.proposals import independent_points
+from lidardesign.density.target.surfaces import SceneTable
 from lidardesign.density.target.target import PADDING_SIGMAS, Target, build_target
-from lidardesign.density.training.independent import independent_points
-from lidardesign.density.visibility.quadrature import NoVisibility, RayBatch, Raycast, RayGradient
+from lidardesign.density.target.visibility import NoVisibility, RayBatch, Raycast, RayGradient
 from lidardesign.scene import Body, Scene
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction, observed_point
 
@@ -58,10 +58,10 @@ def arm_scenes(robot: str, trajectories: int, frames: int) -> tuple[list[Scene],
     return list(task.scenes(config, "train", 0)), task.space(config), DensitySettings(**task.defaults.density)
 
 
-def cases(target: FramesTarget, scenes: Sequence[Scene], count: int) -> list[Case]:
+def cases(target: Target, count: int) -> list[Case]:
     """Near the surfaces at the final sigma, and uniform at the first one."""
     generator, sigma_m = np.random.default_rng(0), target.optics.sigma_m
-    near, _ = independent_points(target, scenes, 2 * count, generator)
+    near, _ = independent_points(target, 2 * count, generator)
     return [
         Case("near surfaces", generator.permutation(near)[:count], sigma_m),
         Case("wide start", target.space.sample(count, generator), START_SIGMAS * sigma_m),
@@ -77,7 +77,7 @@ class CasterPerFrame:
         chosen: The frames that casters are built for, as columns.
     """
 
-    def __init__(self, scenes: Sequence[Scene], target: FramesTarget, chosen: np.ndarray) -> None:
+    def __init__(self, scenes: Sequence[Scene], target: Target, chosen: np.ndarray) -> None:
         columns = scene_columns(scenes)
         started = time.perf_counter()
         self._raycast = Raycast([_at_rest(scenes[columns[c][0]], columns[c][1]) for c in chosen])
@@ -90,14 +90,13 @@ class CasterPerFrame:
             resolution=DensitySettings().field_resolution,
             padding_m=PADDING_SIGMAS * target.optics.sigma_m,
         )
-        self.dense = Target(
-            field, NoVisibility(), target.log_column_weights, target.optics, target.space, target.surface_tolerance_nats
-        )
+        table = SceneTable(field, target.surfaces.log_column_weights)
+        self.dense = replace(target, surfaces=table, visibility=NoVisibility())
 
     def surface_terms(self, case: Case) -> np.ndarray:
         """log of every frame's surface term, shape (N, columns)."""
-        distances = self.dense.field.distances(observed_point(case.points))
-        return self.dense.log_column_weights - np.square(distances / case.sigma_m) / 2
+        observed = observed_point(case.points)
+        return self.dense.surfaces.terms(observed, self.dense.surfaces.field.distances(observed), case.sigma_m)
 
     def cast(self, case: Case) -> Callable[[], object]:
         """What casts at the chosen frames, for the pairs of point and frame that count among all frames."""
@@ -131,7 +130,7 @@ def tolerances(settings: DensitySettings) -> dict[str, float]:
 
 
 def compare(
-    target: FramesTarget, case: Case, casters: CasterPerFrame, ways: dict[str, float], rounds: int
+    target: Target, case: Case, casters: CasterPerFrame, ways: dict[str, float], rounds: int
 ) -> tuple[list[list[object]], list[list[object]]]:
     """Rows of times of every way, and rows of errors of the culled ones."""
     targets = {name: replace(target, surface_tolerance_nats=nats) for name, nats in ways.items()}
@@ -156,7 +155,7 @@ def compare(
     return times, errors(targets, case, casters.surface_terms(case))
 
 
-def errors(targets: dict[str, FramesTarget], case: Case, surface: np.ndarray) -> list[list[object]]:
+def errors(targets: dict[str, Target], case: Case, surface: np.ndarray) -> list[list[object]]:
     """What culling loses of p*, in units of each point's largest surface term, beside the bound that is stated."""
     largest = surface.max(axis=1)
     full = targets[FULL].log_density(case.points, case.sigma_m)
@@ -176,7 +175,7 @@ def growth(robot: str, frames: int, options: Any) -> list[object]:
     """One row: the time of ours and of the full sum over so many frames, near the surfaces."""
     scenes, space, settings = arm_scenes(robot, max(frames // options.frames, 1), min(frames, options.frames))
     target = build_target(scenes, space, settings, "raycast")
-    near = cases(target, scenes, options.points)[0]
+    near = cases(target, options.points)[0]
     whole = replace(target, surface_tolerance_nats=NOTHING_LEFT_OUT_NATS)
     measured = interleaved(
         {
@@ -186,19 +185,19 @@ def growth(robot: str, frames: int, options: Any) -> list[object]:
         options.rounds,
     )
     ratio = median_ratio(measured[FULL].wall, measured["ours"].wall)
-    return [robot, target.field.columns, 1e3 * measured["ours"].wall_median, 1e3 * measured[FULL].wall_median, ratio]
+    return [robot, target.columns, 1e3 * measured["ours"].wall_median, 1e3 * measured[FULL].wall_median, ratio]
 
 
 def measure(robot: str, options: Any) -> tuple[list[list[object]], list[list[object]], list[str]]:
     """Rows of times and of errors, and remarks, for one arm."""
     scenes, space, settings = arm_scenes(robot, options.trajectories, options.frames)
     target = build_target(scenes, space, settings, "raycast")
-    columns = target.field.columns
+    columns = target.columns
     chosen = np.unique(np.linspace(0, columns - 1, min(options.casters, columns)).round().astype(int))
     casters = CasterPerFrame(scenes, target, chosen)
     times: list[list[object]] = []
     lost: list[list[object]] = []
-    for case in cases(target, scenes, options.points):
+    for case in cases(target, options.points):
         found = compare(target, case, casters, tolerances(settings), options.rounds)
         times += found[0]
         lost += found[1]

@@ -24,8 +24,8 @@ from common import face_scenes, interleaved, median_ratio, model_option, parser,
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields.distance import TableField
+from lidardesign.density.target.proposals import propose
 from lidardesign.density.target.target import Target, build_target
-from lidardesign.density.training.proposals import propose
 from lidardesign.space import DesignSpace, observed_point
 
 EXPONENT_LIMIT = 60.0
@@ -39,7 +39,7 @@ class PlainTarget:
     def __init__(
         self, target: Target, dtype: torch.dtype, layout: torch.memory_format, *, per_scene: bool = False
     ) -> None:
-        field: TableField = target.field
+        field: TableField = target.surfaces.field
         counts = [int(n) for n in field.grid.counts]
         volume = torch.as_tensor(field.table).reshape(*counts, field.columns).permute(3, 0, 1, 2)[None]
         self.volume = volume.to(dtype).contiguous(memory_format=layout)
@@ -111,7 +111,7 @@ def exact_queries(scenes: list, target: Target, points: np.ndarray) -> Callable[
 
 def copied(target: Target, count: int) -> Callable[[], object]:
     """A plain copy of as many bytes as the gathers of a full evaluation touch."""
-    gathered = count * (target.visibility.points + 1) * CORNERS * target.field.columns
+    gathered = count * (target.visibility.points + 1) * CORNERS * target.surfaces.field.columns
     source, destination = (np.zeros(gathered, dtype=np.float32) for _ in range(2))
     return lambda: np.copyto(destination, source)
 

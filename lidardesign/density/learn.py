@@ -7,24 +7,30 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from lidardesign.config import LearningSettings, RunConfig
 from lidardesign.density.flow.flow import DesignFlow
-from lidardesign.density.flow.objective import Coordinates
-from lidardesign.density.target.device import on_device, stays_on
+from lidardesign.density.flow.objective import Coordinates, on_device, stays_on
+from lidardesign.density.target.prepare import prepare_target
+from lidardesign.density.target.proposals import independent_points
+from lidardesign.density.target.target import Target
+from lidardesign.density.target.visibility import common_receiver
 from lidardesign.density.training.checkpoint import clear_snapshots, save_arrays
+from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import Measured, draw_probes, measure
 from lidardesign.density.training.training import PROGRESS, LearnProgress, Trainer
-from lidardesign.density.training.training_data import Ground, prepare_ground
-from lidardesign.errors import ConfigError
+from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
+from lidardesign.geometry.receiver import in_view
+from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase, running
 from lidardesign.run.manifest import note, record
 from lidardesign.samples import Samples, save_samples
 from lidardesign.scene import Scene
-from lidardesign.space import AZIMUTH
-from lidardesign.task import Task, random_generator
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction
+from lidardesign.task import Task, notes_of, random_generator, scenes_of
 
 FLOW = "flow.safetensors"
 ON_PROCESSOR = (
@@ -61,6 +67,90 @@ class LearnResult:
         return {**asdict(self), "notes": list(self.notes)}
 
 
+@dataclass(frozen=True, eq=False)
+class TrainingData:
+    """What learning stands on, however many steps it takes: the target of the training scenes, notes, and proposals.
+
+    `pool` is what balancing draws from.
+    """
+
+    target: Target
+    notes: tuple[str, ...]
+    pool: Pool
+
+
+def prepare_training_data(task: Task, config: RunConfig) -> TrainingData:
+    """The training data of a task; it does not depend on the steps, the flow or its optimiser.
+
+    Arguments:
+        task: The plugin.
+        config: The resolved configuration.
+
+    Raises:
+        ConfigError, DataError: Unusable settings or scenes.
+        PluginError: The task's own code failed.
+    """
+    if not set(config.space.free) - set(config.space.conditioned):
+        raise ConfigError(
+            "every dimension of the design space is fixed: it is one design point, with nothing to learn",
+            where="space",
+            hint="free at least one, or write the point as a design file",
+        )
+    with plugin_guard(config.task_name):
+        task_notes = notes_of(task, config.task, config.space)
+    target, notes = prepare_target(training_scenes(task, config), config)
+    return TrainingData(target, (*task_notes, *notes), _pool(target, config))
+
+
+@phase("scenes")
+def training_scenes(task: Task, config: RunConfig) -> list[Scene]:
+    """The scenes that a density is learned from.
+
+    Raises:
+        DataError: There are none.
+        PluginError: The task's own code failed.
+    """
+    with plugin_guard(config.task_name):
+        scenes = list(scenes_of(task, config.task, "train", config.seed, config.space))
+    if not scenes:
+        raise DataError(f"the task {config.task_name!r} gave no training scenes", where="task")
+    return scenes
+
+
+@phase("proposals")
+def _pool(target: Target, config: RunConfig) -> Pool:
+    """Proposals for balancing, independent of those that coverage is measured on."""
+    count = config.learning.balance_proposals
+    generator = random_generator(config.seed, "balancing")
+    points, log_density = independent_points(target, count, generator)
+    if not len(points):
+        raise DataError(
+            "no ray of the design space reaches a target surface in any training scene",
+            where="space",
+            hint="widen the angles or the range, move the origin, or raise density.sigma_m",
+        )
+    refuse_blind_receiver(target.scenes, points)
+    log_target = target.log_density(points)
+    # points on the space's faces may leave it by rounding
+    return Pool.of(config.space.to_unit(points).clip(-1.0, 1.0), log_target, log_density)
+
+
+def refuse_blind_receiver(scenes: Sequence[Scene], points: np.ndarray) -> None:
+    """Refuse scenes whose fixed receiver sees nothing that is lit: none of the points observed by rays (N, 6).
+
+    Raises:
+        DataError: So it is.
+    """
+    receiver = common_receiver(scenes)
+    reached = points[:, :3] + points[:, RANGE, None] * direction(points[:, AZIMUTH], points[:, ELEVATION])
+    if receiver is not None and not in_view(receiver, reached).any():
+        raise DataError(
+            "its field of view and range hold no surface that a ray of the design space reaches",
+            where="receiver",
+            hint="turn it, widen its field of view or its range, or move it",
+        )
+
+
 def learn(
     task: Task,
     config: RunConfig,
@@ -69,7 +159,7 @@ def learn(
     resume: bool = False,
     device: str = "auto",
     progress: Callable[[LearnProgress], None] | None = None,
-    ground: Ground | None = None,
+    data: TrainingData | None = None,
     replan: Callable[[Trainer], LearningSettings] | None = None,
 ) -> LearnResult:
     """Learn the density of a task into a run folder.
@@ -81,7 +171,7 @@ def learn(
         resume: Continue from the run's checkpoint; the result is that of an uninterrupted run, bit for bit.
         device: auto, cpu or cuda: where the flow lives, and what of the target can (`device_target`).
         progress: Called about every tenth step.
-        ground: What `prepare_ground` made of the same task and configuration, to be learned on again.
+        data: What `prepare_training_data` made of the same task and configuration, to be learned on again.
         replan: Asked for the settings anew when balancing begins; see `Trainer`.
 
     Raises:
@@ -90,8 +180,8 @@ def learn(
     """
     place = choose_device(device)
     with running() as clock:
-        ground = prepare_ground(task, config) if ground is None else ground
-        trainer = make_trainer(ground, config, run, place)
+        data = prepare_training_data(task, config) if data is None else data
+        trainer = make_trainer(data, config, run, place)
         trainer.replan = replan
         if resume:
             trainer.resume()
@@ -102,19 +192,19 @@ def learn(
             trainer.train(progress)
         # float32 steps train as well and cost less; samples and their densities are worth float64
         trainer.flow.double()
-        measured = _measured(trainer, ground.scenes, config)
+        measured = _measured(trainer, config)
         _store(trainer, measured.samples, config, run)
     result = LearnResult(
         run=str(run),
         task=config.task_name,
         seconds=round(clock.seconds, 3),
         steps=trainer.step,
-        notes=(*ground.notes, *_notes(trainer, place), *measured.notes),
+        notes=(*data.notes, *_notes(trainer, place), *measured.notes),
         timings=clock.timings(),
         error_estimates=measured.estimates,
         **{name: estimate.value for name, estimate in measured.estimates.items()},
     )
-    found = {"visibility": ground.target.visibility.name, "round_trip_nats": measured.round_trip_nats}
+    found = {"visibility": data.target.visibility.name, "round_trip_nats": measured.round_trip_nats}
     note(run, learn=result.as_dict(), ranks=1, **found)
     return result
 
@@ -145,13 +235,13 @@ def choose_device(name: str) -> torch.device:
 
 
 @phase("flow")
-def make_trainer(ground: Ground, config: RunConfig, run: Path, device: torch.device) -> Trainer:
+def make_trainer(data: TrainingData, config: RunConfig, run: Path, device: torch.device) -> Trainer:
     """A trainer at its first step."""
     generator = torch.Generator().manual_seed(config.seed)
     flow = make_flow(config, generator).to(device=device, dtype=getattr(torch, config.learning.dtype))
     coordinates = Coordinates(config.space)
-    target = ground.target if device.type == "cpu" else on_device(ground.target, device)
-    return Trainer(flow, target, coordinates, config.learning, run, generator, ground.pool.to(device))
+    target = data.target if device.type == "cpu" else on_device(data.target, device)
+    return Trainer(flow, target, coordinates, config.learning, run, generator, data.pool.to(device))
 
 
 def make_flow(config: RunConfig, generator: torch.Generator) -> DesignFlow:
@@ -169,10 +259,10 @@ def make_flow(config: RunConfig, generator: torch.Generator) -> DesignFlow:
     )
 
 
-def _measured(trainer: Trainer, scenes: Sequence[Scene], config: RunConfig) -> Measured:
+def _measured(trainer: Trainer, config: RunConfig) -> Measured:
     generator = random_generator(config.seed, "coverage")
     with phase("measuring"):
-        probes = draw_probes(trainer.target, scenes, config.learning.coverage_proposals, generator)
+        probes = draw_probes(trainer.target, config.learning.coverage_proposals, generator)
     return measure(trainer, probes, config.learning.samples)
 
 

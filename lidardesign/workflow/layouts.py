@@ -78,7 +78,7 @@ def twin_without_visibility(design: DesignSpec, run: RunFolder, layouts: Layouts
     Raises:
         DataError: No ray of the design space comes near a target.
     """
-    from lidardesign.density.training.independent import samples_without_visibility
+    from lidardesign.density.target.proposals import samples_without_visibility
     from lidardesign.evaluate.baselines.no_visibility import fitted_twin
 
     config = run.config

@@ -149,13 +149,13 @@ class Learner:
 
     def _to_tolerance(self, config: RunConfig, goal: Goal, resume: bool) -> LearnResult:
         from lidardesign.density.learn import learn as learn_density
+        from lidardesign.density.learn import prepare_training_data
         from lidardesign.density.training.schedule import goal_of, learn_to_tolerance
-        from lidardesign.density.training.training_data import prepare_ground
 
         begun, note = goal_of(self.run), ""
         if begun is None:
             config, begun, note = self._begun(config, goal)
-        ground = prepare_ground(self.task, config)
+        data = prepare_training_data(self.task, config)
 
         def once(staged: RunConfig, going_on: bool) -> LearnResult:
             return learn_density(
@@ -163,7 +163,7 @@ class Learner:
                 staged,
                 self.run,
                 resume=going_on,
-                ground=ground,
+                data=data,
                 device=self.device,
                 progress=self.progress,
             )
@@ -175,8 +175,8 @@ class Learner:
 
     def _begun(self, config: RunConfig, goal: Goal) -> tuple[RunConfig, ToleranceGoal, str]:
         """The configuration with fields for the tolerance, and what they leave of it to learning."""
+        from lidardesign.density.learn import training_scenes
         from lidardesign.density.training.schedule import ToleranceGoal
-        from lidardesign.density.training.training_data import training_scenes
         from lidardesign.evaluate.accuracy.fields import fields_within
 
         scenes = training_scenes(self.task, config)
@@ -192,21 +192,20 @@ class Learner:
         return replace(config, density=chosen.density), begun, chosen.note
 
     def _within(self, config: RunConfig, time_budget_s: float) -> LearnResult:
-        from lidardesign.density.learn import choose_device
+        from lidardesign.density.learn import choose_device, prepare_training_data
         from lidardesign.density.learn import learn as learn_density
         from lidardesign.density.training.schedule import Timekeeper
-        from lidardesign.density.training.training_data import prepare_ground
 
         place, startup = choose_device(self.device), self._startup_s()
         keeper = Timekeeper(time_budget_s, lambda: self.clock.seconds + startup, config, self.run)
-        ground = prepare_ground(self.task, config)
+        data = prepare_training_data(self.task, config)
         with phase("planning"):
-            planned = keeper.plan(ground, place)
+            planned = keeper.plan(data, place)
         result = learn_density(
             self.task,
             planned,
             self.run,
-            ground=ground,
+            data=data,
             replan=keeper.replan,
             device=self.device,
             progress=self.progress,

@@ -10,7 +10,7 @@ from support.command_line import caller, make_run
 from support.tables import each_row
 
 from lidardesign.config import load_run_config
-from lidardesign.density.target.resolution import resolution_notes
+from lidardesign.density.target.prepare import resolution_notes
 from lidardesign.design.compare import outside_notes
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.registry import load_task
@@ -62,7 +62,7 @@ def test_the_error_about_sigma_names_the_likely_cause_after_a_note_before_learni
 def test_the_error_about_sigma_leaves_units_alone_where_scenes_are_small(monkeypatch):
     found = {}
     for step in (0.9, 3.6):
-        steps = "lidardesign.density.target.resolution._grid_steps_m"
+        steps = "lidardesign.density.target.prepare._grid_steps_m"
         monkeypatch.setattr(steps, lambda field, step=step: np.array([step]))
         settings = type("Settings", (), {"sigma_m": 0.002, "field_resolution": 16})
         with pytest.raises(ConfigError) as refused:

@@ -12,8 +12,14 @@ from support.tables import each_row
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.flow.flow import DesignFlow
-from lidardesign.density.flow.objective import Coordinates, log_target, log_target_values
-from lidardesign.density.target.device import DeviceTarget, on_device, stays_on
+from lidardesign.density.flow.objective import (
+    Coordinates,
+    DeviceTarget,
+    log_target,
+    log_target_values,
+    on_device,
+    stays_on,
+)
 from lidardesign.density.target.target import build_target
 from lidardesign.density.training.losses import Pool, balancing_loss, pathwise_loss
 from lidardesign.errors import NumericalError

@@ -11,13 +11,12 @@ from scipy import integrate, stats
 from support import references
 
 from lidardesign.config import DensitySettings
-from lidardesign.density.fields.bodies import collect_bodies, occluding_bodies
+from lidardesign.density.fields.bodies import Pairs, collect_bodies, occluding_bodies
 from lidardesign.density.fields.distance import BodyField
-from lidardesign.density.target.frames import FramesTarget
+from lidardesign.density.target.proposals import independent_points
+from lidardesign.density.target.surfaces import MovingFrames
 from lidardesign.density.target.target import build_target
-from lidardesign.density.training.independent import draw_near_surfaces, independent_points
-from lidardesign.density.visibility.occlusion import BodyRaycast, Pairs
-from lidardesign.density.visibility.quadrature import RayBatch
+from lidardesign.density.target.visibility import BodyRaycast, RayBatch
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, rigid
@@ -70,8 +69,8 @@ def moving_scenes(seed=0, scenes=3, frames=7, with_mesh=True):
     return result
 
 
-def near_points(target, scenes, count=300, seed=1):
-    points, _ = independent_points(target, scenes, count, np.random.default_rng(seed))
+def near_points(target, count=300, seed=1):
+    points, _ = independent_points(target, count, np.random.default_rng(seed))
     return points
 
 
@@ -93,8 +92,8 @@ def full_sum(scenes, points, optics):
 def test_the_target_equals_the_full_sum_over_all_frames():
     scenes = moving_scenes()
     target = build_target(scenes, CEILING, ALL, "raycast")
-    assert isinstance(target, FramesTarget)
-    points = near_points(target, scenes)
+    assert isinstance(target.surfaces, MovingFrames)
+    points = near_points(target)
     expected = full_sum(scenes, points, target.optics)
     # embree casts in float32: 1e-6 m times the attenuation of 40 / m
     np.testing.assert_allclose(np.exp(target.log_density(points)), expected, rtol=2e-4, atol=1e-12)
@@ -106,8 +105,8 @@ def test_leaving_out_frames_costs_no_more_than_stated(tolerance):
     scenes = moving_scenes(frames=20)
     exact = build_target(scenes, CEILING, ALL, "raycast")
     quick = build_target(scenes, CEILING, SETTINGS.model_copy(update={"surface_tolerance_nats": tolerance}), "raycast")
-    points = near_points(exact, scenes, 600)
-    columns = exact.field.columns
+    points = near_points(exact, 600)
+    columns = exact.columns
     observed = observed_point(points)
     balls = np.concatenate([scene.bodies[0].poses[:, :3, 3] for scene in scenes])
     distances = np.linalg.norm(observed[:, None] - balls, axis=2) - 0.03
@@ -122,7 +121,7 @@ def test_leaving_out_frames_costs_no_more_than_stated(tolerance):
 def test_gradients_match_differences_of_the_values():
     scenes = moving_scenes(with_mesh=False)
     target = build_target(scenes, CEILING, ALL, "raycast")
-    points = near_points(target, scenes, 200)
+    points = near_points(target, 200)
     points = points[points[:, ELEVATION] > -1.4]
     _, gradient = target.log_density_and_gradient(points)
     numerical = references.numerical_gradient(
@@ -136,8 +135,8 @@ def test_gradients_match_differences_of_the_values():
 def test_parts_of_all_frames_average_to_the_whole():
     scenes = moving_scenes(with_mesh=False)
     target = build_target(scenes, CEILING, ALL, "raycast")
-    points = near_points(target, scenes)
-    order = np.random.default_rng(3).permutation(target.field.columns)
+    points = near_points(target)
+    order = np.random.default_rng(3).permutation(target.columns)
     parts = [target.drawn(np.sort(part)).log_density(points) for part in np.split(order, 3)]
     np.testing.assert_allclose(np.exp(parts).mean(axis=0), np.exp(target.log_density(points)), rtol=1e-9)
 
@@ -147,7 +146,7 @@ def test_bodies_are_found_by_their_boxes_as_by_looking_at_all():
     bodies = collect_bodies(scenes, lambda body: not isinstance(body.shape, Plane), resolution=24, padding_m=0.1)
     points = np.random.default_rng(5).uniform(-0.6, 0.8, (400, 3))
     everything = BodyField(bodies).distances(points)
-    from lidardesign.density.target.frames import near_pairs
+    from lidardesign.density.target.surfaces import near_pairs
 
     pairs = near_pairs(bodies, points, np.zeros(bodies.columns), 0.05, 1e9)
     np.testing.assert_array_equal(pairs.columns, np.tile(np.arange(bodies.columns), len(points)))
@@ -177,7 +176,7 @@ def test_first_hits_of_pairs_are_those_of_the_scene(with_mesh):
 def test_points_near_a_ball_follow_its_surface_term():
     scenes = [Scene((Body(Sphere(0.1), "ball", "target", rigid(translation_m=(0.2, 0, 0.3))),))]
     target = build_target(scenes, CEILING, DensitySettings(sigma_m=0.05), "off")
-    points = draw_near_surfaces(target, 20_000, np.random.default_rng(0))
+    points = target.surfaces.draw_near(20_000, 0.05, np.random.default_rng(0))
     radius = np.linalg.norm(points - (0.2, 0, 0.3), axis=1)
 
     def density(r):
@@ -191,7 +190,7 @@ def test_points_near_a_ball_follow_its_surface_term():
 def test_independent_points_weighted_by_their_density_integrate_the_target():
     scenes = moving_scenes(with_mesh=False)
     target = build_target(scenes, CEILING, SETTINGS.model_copy(update={"sigma_m": 0.1}), "raycast")
-    points, log_density = independent_points(target, scenes, 40_000, np.random.default_rng(0))
+    points, log_density = independent_points(target, 40_000, np.random.default_rng(0))
     weights = np.exp(target.log_density(points) - log_density)
     uniform = CEILING.sample(40_000, np.random.default_rng(1))
     values = np.exp(target.log_density(uniform))

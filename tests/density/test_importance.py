@@ -22,12 +22,11 @@ from lidardesign.density.fields.importance import (
     is_weighted,
     log_weight_grid,
 )
-from lidardesign.density.flow.objective import Coordinates, log_target
+from lidardesign.density.flow.objective import Coordinates, DeviceTarget, log_target, on_device
 from lidardesign.density.learn import learn
-from lidardesign.density.target.device import DeviceTarget, on_device
 from lidardesign.density.target.prepare import prepare_target
+from lidardesign.density.target.proposals import independent_points
 from lidardesign.density.target.target import build_target
-from lidardesign.density.training.independent import independent_points
 from lidardesign.errors import DataError
 from lidardesign.numerics import logsumexp
 from lidardesign.samples import load_samples
@@ -115,8 +114,8 @@ def test_no_weights_and_weights_of_one_are_the_same_target_to_the_bit(case):
     points = SPACE.sample(300, np.random.default_rng(1))
     plain = built(make, visibility, ball())
     ones = built(make, visibility, ball(lambda vertices: np.ones(len(vertices))))
-    assert plain.importance is None
-    assert ones.importance is None
+    assert plain.surfaces.importance is None
+    assert ones.surfaces.importance is None
     for found, expected in zip(
         ones.log_density_and_gradient(points), plain.log_density_and_gradient(points), strict=True
     ):
@@ -136,13 +135,13 @@ def test_a_constant_weight_moves_log_density_by_its_log_and_nothing_else(case, o
         weighted = built(make, visibility, ball(), factor=7.0)
     else:
         weighted = built(make, visibility, ball(lambda vertices: np.full(len(vertices), 7.0)))
-    assert isinstance(weighted.importance, kind)
+    assert isinstance(weighted.surfaces.importance, kind)
     value, gradient = weighted.log_density_and_gradient(points, 0.1)
     expected, slope = plain.log_density_and_gradient(points, 0.1)
     assert np.allclose(value - expected, np.log(7.0), atol=1e-6)
     assert np.allclose(gradient, slope, rtol=1e-5, atol=1e-5 * np.abs(slope).max())
     assert np.allclose(weighted.log_proximity(points) - plain.log_proximity(points), np.log(7.0), atol=1e-6)
-    assert weighted.log_peak - plain.log_peak == pytest.approx(np.log(7.0), abs=1e-6)
+    assert weighted.surfaces.log_peak - plain.surfaces.log_peak == pytest.approx(np.log(7.0), abs=1e-6)
 
 
 @each_row("case", CASES)
@@ -153,7 +152,7 @@ def test_the_gradient_is_that_of_finite_differences(case):
     points = SPACE.sample(400, np.random.default_rng(2))
     points = points[target.log_density(points, 0.1) > -30]
     _, gradient = target.log_density_and_gradient(points, 0.1)
-    unweighted = replace(target, importance=None)
+    unweighted = replace(target, surfaces=replace(target.surfaces, importance=None))
     _, plain = unweighted.log_density_and_gradient(points, 0.1)
     step = 1e-4
     for dimension in (1, 3, 5):  # the elevation is in the chart as its sine
@@ -261,13 +260,15 @@ def test_a_few_drawn_columns_estimate_the_weighted_density(make):
 
 def test_plain_interpolation_and_compiled_loops_give_the_same_weights():
     scenes = at_rest(ball(sideways))
-    compiled, plain = (build_target(scenes, SPACE, SETTINGS, "off", compiled=c).importance for c in (True, False))
+    compiled, plain = (
+        build_target(scenes, SPACE, SETTINGS, "off", compiled=choice).surfaces.importance for choice in (True, False)
+    )
     points = np.random.default_rng(8).uniform(-1, 3, (500, 3))
     assert np.allclose(compiled.values(points), plain.values(points), atol=1e-5)
 
 
 def test_weights_beyond_their_grid_are_those_at_its_faces_and_have_no_slope_across():
-    weights = build_target(at_rest(ball(sideways), count=1), SPACE, SETTINGS, "off").importance
+    weights = build_target(at_rest(ball(sideways), count=1), SPACE, SETTINGS, "off").surfaces.importance
     high = weights.grid.low + weights.grid.step * (weights.grid.counts - 1)
     inside = np.array([[high[0], 0.1, 0.1]])
     beyond = inside + np.array([5.0, 0, 0])
@@ -317,7 +318,7 @@ def test_independent_proposals_find_surfaces_however_little_they_count(make, fac
     space = DesignSpace((0, 0, 0, -0.5, 0, 0.3), (0, 0, 0, 0.5, 0, 2.2))
     scenes = make(Sphere(0.3) if make is moving else ball(), factor)
     target = build_target(scenes, space, SETTINGS, "off")
-    points, log_density = independent_points(target, scenes, 500, np.random.default_rng(10))
+    points, log_density = independent_points(target, 500, np.random.default_rng(10))
     assert len(points) == 500
     assert np.isfinite(log_density).all()
 
@@ -427,7 +428,7 @@ def test_what_a_density_is_worth_is_measured_against_the_weighted_target(learned
     log_z = np.log(values.mean()) + PATCHES.log_volume
     error = values.std() / values.mean() / np.sqrt(len(values)) + result.error_estimates["log_z"].error
     assert abs(result.log_z - log_z) < 4 * error
-    plain = replace(target, importance=None).log_density(samples.points)
+    plain = replace(target, surfaces=replace(target.surfaces, importance=None)).log_density(samples.points)
     assert np.allclose(samples.log_target, target.log_density(samples.points), atol=1e-6)
     # left of the middle all that is near the left patch counts three times
     sure = np.abs(samples.points[:, 3]) > 0.1
@@ -441,7 +442,8 @@ def test_samples_of_the_plain_density_reweighted_are_those_of_the_weighted_one(l
     _, samples, config = learned
     scenes = PatchesTask().scenes(config.task, "train", 1)
     target = prepare_target(scenes, config, visibility="off")[0]
-    factors = replace(target, importance=None).log_density(samples.points) - target.log_density(samples.points)
+    plain = replace(target, surfaces=replace(target.surfaces, importance=None))
+    factors = plain.log_density(samples.points) - target.log_density(samples.points)
     back = samples.reweighted(factors)
     share = float(back.weights[back.points[:, 3] > 0].sum())
     assert share == pytest.approx(0.5, abs=0.02)

@@ -12,11 +12,9 @@ import torch
 from support.learning import SPACE, BallTask, Interrupter, a_trainer, config_of, result_bytes
 
 from lidardesign.density import learn as learning
-from lidardesign.density.learn import learn
+from lidardesign.density.learn import learn, prepare_training_data
 from lidardesign.density.target.prepare import prepare_target
-from lidardesign.density.training import training_data as ground
 from lidardesign.density.training.quality import log_density_of
-from lidardesign.density.training.training_data import prepare_ground
 from lidardesign.errors import ConfigError, DataError, PluginError
 from lidardesign.samples import load_samples
 from lidardesign.space import DesignSpace
@@ -53,8 +51,8 @@ def test_a_resumed_run_is_an_uninterrupted_run_bit_for_bit(finished, tmp_path, s
 def test_proposals_on_the_faces_of_the_space_are_inside_the_flows_box(monkeypatch):
     # the space counts what is outside by rounding as inside; the flow's density would be 0 there
     points = np.array([[0, 0, 0, 0.4 + 1e-10, 0, 1.0], [0, 0, 0, 0.1, 0, 0.2 - 1e-10]])
-    monkeypatch.setattr(ground, "independent_points", lambda *_: (points, np.zeros(2)))
-    pool = prepare_ground(BallTask(), config_of()).pool
+    monkeypatch.setattr(learning, "independent_points", lambda *_: (points, np.zeros(2)))
+    pool = prepare_training_data(BallTask(), config_of()).pool
     assert SPACE.contains(points).all()
     assert float(pool.unit.abs().max()) == 1.0
 

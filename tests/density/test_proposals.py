@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from support import references
 
-from lidardesign.density.training.proposals import occluded_share, propose
+from lidardesign.density.target.proposals import occluded_share, propose
 from lidardesign.scene import Body, Box, Mesh, Plane, Scene, Sphere, rigid
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 

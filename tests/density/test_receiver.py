@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from lidardesign.config import DensitySettings
-from lidardesign.density.target.refinement import refine_quadrature
+from lidardesign.density.target.prepare import refine_quadrature
 from lidardesign.density.target.target import build_target
-from lidardesign.density.visibility.quadrature import NoVisibility
-from lidardesign.density.visibility.receiver import HeardVisibility
+from lidardesign.density.target.visibility import BistaticVisibility, NoVisibility
 from lidardesign.errors import ConfigError
 from lidardesign.scene import Body, Box, Receiver, Scene, Sphere, rigid
 from lidardesign.space import RANGE, DesignSpace, aim, observed_point
@@ -76,8 +75,8 @@ def test_too_few_midpoints_are_refined_also_where_a_receiver_listens():
     scenes = balls(looking(), plate((0.8, 0.0, 0.0), half=(0.02, 0.5, 0.5)))
     few = DensitySettings(sigma_m=SETTINGS.sigma_m, quadrature_points=4)
     coarse = build_target(scenes, SPACE, few, "quadrature")
-    finer, notes = refine_quadrature(coarse, scenes, points_near())
-    assert isinstance(finer.visibility, HeardVisibility)
+    finer, notes = refine_quadrature(coarse, points_near())
+    assert isinstance(finer.visibility, BistaticVisibility)
     assert finer.visibility.one_way.points > 4
     assert "refined from 4" in notes[0]
 
@@ -115,7 +114,7 @@ def test_an_emitter_at_the_receiver_has_the_square_of_its_own_visibility():
 
 def test_the_view_is_one_inside_a_half_on_its_edges_and_nothing_outside():
     receiver = looking(origin_m=(0.0, 0.0, 0.0), azimuth_rad=0.0, elevation_rad=0.0)
-    way = HeardVisibility(NoVisibility(), receiver)
+    way = BistaticVisibility(NoVisibility(), receiver)
     half = receiver.horizontal_rad / 2
     points = np.array([
         [1.0, 0.0, 0.0],
@@ -144,8 +143,8 @@ def test_turning_and_moving_everything_changes_nothing():
         origin_m=tuple(rotation @ np.array(receiver.origin_m) + shift), azimuth_rad=receiver.azimuth_rad + turn
     )
     points = np.random.default_rng(3).normal(size=(200, 3)) + np.array([1.5, 0.0, 0.0])
-    before, _ = HeardVisibility(NoVisibility(), receiver).log_view(points, 0.05)
-    after, _ = HeardVisibility(NoVisibility(), turned).log_view(points @ rotation.T + shift, 0.05)
+    before, _ = BistaticVisibility(NoVisibility(), receiver).log_view(points, 0.05)
+    after, _ = BistaticVisibility(NoVisibility(), turned).log_view(points @ rotation.T + shift, 0.05)
     assert np.allclose(before, after, atol=1e-9)
 
 

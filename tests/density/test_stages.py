@@ -6,7 +6,7 @@ import pytest
 from support.learning import BallTask, Interrupter, config_of, result_bytes
 
 from lidardesign.config import save_run_config
-from lidardesign.density.learn import learn
+from lidardesign.density.learn import learn, prepare_training_data
 from lidardesign.density.training.schedule import (
     Stage,
     ToleranceGoal,
@@ -15,7 +15,6 @@ from lidardesign.density.training.schedule import (
     stage_steps,
     with_steps,
 )
-from lidardesign.density.training.training_data import prepare_ground
 from lidardesign.errors import DataError
 from lidardesign.run.manifest import note, read_manifest, start_manifest, verify
 from lidardesign.run.yaml import load_yaml
@@ -26,10 +25,10 @@ PLANNED = 40
 def staged(run, tolerance, progress=None, **options):
     config = config_of(steps=PLANNED)
     start_manifest(run, command=[], seed=config.seed)
-    ground = prepare_ground(BallTask(), config)
+    data = prepare_training_data(BallTask(), config)
 
     def once(config, resume):
-        return learn(BallTask(), config, run, resume=resume, ground=ground, progress=progress)
+        return learn(BallTask(), config, run, resume=resume, data=data, progress=progress)
 
     return learn_to_tolerance(config, run, ToleranceGoal(tolerance, PLANNED), once, **options)
 

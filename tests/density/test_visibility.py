@@ -13,8 +13,8 @@ from support.visibility import OPTICS, SPACE, along_axis, both_ways, config_of, 
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields.distance import build_field
 from lidardesign.density.target.prepare import prepare_target
+from lidardesign.density.target.quadrature import Quadrature
 from lidardesign.density.target.target import build_target
-from lidardesign.density.visibility.quadrature import Quadrature
 from lidardesign.scene import Body, Mesh, Scene, Sphere, rigid
 from lidardesign.space import RANGE
 
@@ -110,7 +110,7 @@ def test_an_open_sheet_hides_what_is_behind_it_but_not_itself(visibility):
     points[:, RANGE] = ranges
     values = target.log_density(points)
     # interpolated unsigned distances are blunt at the surface: the peak is only known to half a cell
-    assert abs(ranges[values.argmax()] - 1.0) < target.field.grid.step / 2
+    assert abs(ranges[values.argmax()] - 1.0) < target.surfaces.field.grid.step / 2
     assert transmittance_on(None, target.visibility, [1.0], target.optics)[0] > 0.99
     assert transmittance_on(None, target.visibility, [2.0], target.optics)[0] < 0.01
 

@@ -128,7 +128,7 @@ class TestProbes:
         scene, space = Scene((Body(Sphere(0.3), poses=rigid(translation_m=(2, 0, 0))),)), SPACE
         space = DesignSpace((0, 0, 0, 0, -0.35, 0.5), (0, 0, 0, 0, 0.35, 3.5))
         target = build_target([scene], space, SETTINGS, "raycast")
-        probes = draw_probes(target, [scene], 5000, 0, "test")
+        probes = draw_probes(target, 5000, 0, "test")
         assert len(np.unique(probes.points, axis=0)) == len(probes.points) < 5000
         # uniform points resampled by surface proximity: what repeated points lack in number they have in weight
         log_times = target.log_proximity(probes.points) - probes.log_proposal
@@ -147,7 +147,7 @@ class TestOpaque:
     @pytest.mark.parametrize("kind", [Box, Mesh])
     def test_a_point_is_hidden_or_seen(self, kind):
         scene = hidden_wall((1.5, 0.0, 0.0), kind)
-        target = opaque_target(build_target([scene], SPACE, SETTINGS, "raycast"), [scene])
+        target = opaque_target(build_target([scene], SPACE, SETTINGS, "raycast"))
         points = np.array([[0, 0, 0, 0.0, 0, 3.0], [0, 0, 0, 0.3, 0, 3.0 / math.cos(0.3)]])
         assert target.log_density(points) == pytest.approx([LOG_OPAQUE, 0.0], abs=1e-2)
 
@@ -158,15 +158,15 @@ class TestOpaque:
         for attenuation in (1e2, 1e3, 1e4):
             settings = SETTINGS.model_copy(update={"attenuation_per_m": attenuation})
             target = build_target([scene], SPACE, settings, "raycast")
-            probes = draw_probes(target, [scene], 4096, 0, "test")
-            exact = opaque_target(target, [scene]).log_density(probes.points)
+            probes = draw_probes(target, 4096, 0, "test")
+            exact = opaque_target(target).log_density(probes.points)
             errors.append(probes.misplaced(target.log_density(probes.points), exact)[0])
         assert errors[0] > 3 * errors[1] > 9 * errors[2]
 
     def test_a_receiver_sees_past_nothing_either(self):
         receiver = Receiver((0.0, 1.0, 0.0), -0.3, 0.0, 1.5, 1.5, (0.1, 5.0))
         scene = Scene(hidden_wall((1.5, 0.5, 0.0), Mesh).bodies, receiver=receiver)
-        target = opaque_target(build_target([scene], SPACE, SETTINGS, "raycast"), [scene])
+        target = opaque_target(build_target([scene], SPACE, SETTINGS, "raycast"))
         # the plate lies between the wall's middle and the receiver, not before the ray
         assert target.log_density(np.array([[0, 0, 0, 0.0, 0, 3.0]]))[0] == pytest.approx(LOG_OPAQUE, rel=1e-3)
 
@@ -295,7 +295,7 @@ class TestFieldSweeps:
         assert errors[0] > 2.5 * errors[1] > 6 * errors[2]
         assert sweep.measurements[0].error > sweep.measurements[2].error
         assert sweep.default.setting == "24"
-        assert sweep.measurements[1].memory_bytes == case.target.field.table.nbytes // 2 * 3
+        assert sweep.measurements[1].memory_bytes == case.target.surfaces.field.table.nbytes // 2 * 3
 
     def test_resolutions_that_take_long_are_left_out_beyond_the_runs_own(self, case, monkeypatch):
         monkeypatch.setattr(fields, "RESOLUTIONS", (8, 12, 48))
@@ -319,7 +319,7 @@ class TestFieldSweeps:
         case = fields.Case.of([scene], SPACE, DensitySettings(sigma_m=0.02, field_resolution=48), 0, "off")
         sweep = fields.resolution_sweep(case)
         assert sweep.measurements[0].error > sweep.measurements[1].error
-        assert sweep.measurements[1].memory_bytes == case.target.field.bodies.grids.values.nbytes
+        assert sweep.measurements[1].memory_bytes == case.target.surfaces.field.bodies.grids.values.nbytes
 
     def test_primitives_need_no_field(self):
         request = SimpleNamespace(config=None, request=SimpleNamespace(train=[hidden_wall((1.5, 0, 0))]))
@@ -330,7 +330,7 @@ class TestDrawnScenes:
     def test_the_mean_over_all_choices_is_the_density_of_all(self):
         every = balls(4)
         target = build_target(every, SPACE, SETTINGS, "raycast")
-        points = draw_probes(target, every, 200, 0, "test").points
+        points = draw_probes(target, 200, 0, "test").points
         # culled by other best terms, scenes that are left out add less than exp(-16) of the largest term
         means = [
             np.exp(target.drawn(np.array(chosen)).log_density(points)) for chosen in itertools.combinations(range(4), 2)
@@ -348,7 +348,7 @@ class TestDrawnScenes:
             return way(rays, active, *args, **options)
 
         target.visibility.transmittance = watched
-        points = draw_probes(target, every, 100, 0, "test").points
+        points = draw_probes(target, 100, 0, "test").points
         values, slopes = target.drawn(np.array([1])).log_density_and_gradient(points)
         assert np.isfinite(values).all()
         assert np.isfinite(slopes).all()
@@ -362,7 +362,7 @@ def steps(tmp_path_factory):
         patch.setenv("LIDARDESIGN_CACHE", str(tmp_path_factory.mktemp("cache")))
         every = balls(6)
         target = build_target(every, SPACE, SETTINGS, "raycast")
-    probes = draw_probes(target, every, 512, 0, "test")
+    probes = draw_probes(target, 512, 0, "test")
     coordinates = Coordinates(SPACE)
     flow = DesignFlow(
         coordinates.blocks, 0, layers=1, hidden=8, bins=4, generator=torch.Generator().manual_seed(0)

@@ -107,7 +107,7 @@ def test_runs_of_other_presets_are_measurements_and_runs_of_other_densities_are_
 def test_errors_repeat_within_their_uncertainty_on_other_samples_and_probes(runs, sweeps):
     request = request_for(runs)
     config, target = request.config, run_target(request)
-    probes = draw_probes(target, list(request.request.train), 8192, random_generator(99, "others"))
+    probes = draw_probes(target, 8192, random_generator(99, "others"))
     again = remeasured(runs, config, target, probes, count=8192, seed=99)
     for measurement, reached in zip(sweeps[0].measurements, again, strict=True):
         found = reached.misplaced

@@ -33,12 +33,12 @@ from lidardesign.density.fields.distance import build_field
 from lidardesign.density.flow.flow import DesignFlow
 from lidardesign.density.flow.objective import Coordinates
 from lidardesign.density.learn import learn
-from lidardesign.density.target.frames import FramesTarget
-from lidardesign.density.target.prepare import prepare_target
-from lidardesign.density.target.resolution import ROUNDINGS, UNRESOLVED_SHARE
+from lidardesign.density.target.prepare import ROUNDINGS, UNRESOLVED_SHARE, prepare_target
+from lidardesign.density.target.quadrature import Quadrature
+from lidardesign.density.target.surfaces import MovingFrames
 from lidardesign.density.target.target import build_target
+from lidardesign.density.target.visibility import MINIMUM_COSINE, Optics, RayBatch, Raycast
 from lidardesign.density.training.losses import Pool, balancing_loss, pathwise_loss
-from lidardesign.density.visibility.quadrature import MINIMUM_COSINE, Optics, Quadrature, RayBatch, Raycast
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.errors import ConfigError
@@ -108,7 +108,7 @@ def moving_target(scale=1.0, offset=(0.0, 0.0, 0.0), turn=None):
         sigma_m=0.03 * scale, attenuation_per_m=40.0 / scale, margin_m=0.03 * scale, surface_tolerance_nats=30.0
     )
     target = build_target([moving_scene(scale, offset, turn)], space, settings, visibility="raycast")
-    assert isinstance(target, FramesTarget)
+    assert isinstance(target.surfaces, MovingFrames)
     return target
 
 

@@ -24,9 +24,9 @@ from lidardesign.config import DensitySettings
 from lidardesign.density.fields import grids
 from lidardesign.density.fields.bodies import collect_bodies
 from lidardesign.density.fields.distance import BodyField, TableField, build_field
-from lidardesign.density.target.frames import near_pairs
+from lidardesign.density.target.surfaces import SceneTable, near_pairs
 from lidardesign.density.target.target import Target, build_target
-from lidardesign.density.visibility.quadrature import NoVisibility, Optics
+from lidardesign.density.target.visibility import NoVisibility, Optics
 from lidardesign.errors import DataError
 from lidardesign.evaluate.accuracy.fields import ExactField, InterpolatedField
 from lidardesign.meshio import SUFFIXES, check_mesh, load_mesh, signed_volume_m3, unique_rows
@@ -616,7 +616,8 @@ class TestManyFacesAndManyQueries:
             grid = grids.grid_around(np.array([[-1.0, -1, -1], [1, 1, 1]]), 8, 0.0)
             table = np.random.default_rng(13).uniform(-0.1, 0.1, (grid.size, 4000)).astype(np.float32)
             field = TableField(table, grid, np.zeros(4000))
-            target = Target(field, NoVisibility(), np.zeros(4000), Optics(0.05, 1e3, 1e3, 0.05), AROUND)
+            surfaces = SceneTable(field, np.zeros(4000))
+            target = Target((), surfaces, NoVisibility(), Optics(0.05, 1e3, 1e3, 0.05), AROUND)
         else:
             target = build_target(many_columns(4000), AROUND, DensitySettings(sigma_m=0.001), "off")
         ask = target.log_density_and_gradient if gradient else target.log_density

@@ -23,13 +23,12 @@ from zuko.transforms import MonotonicRQSTransform
 from lidardesign.cli.main import run as run_program
 from lidardesign.config import DensitySettings
 from lidardesign.density.flow.splines import BoundedSpline
-from lidardesign.density.learn import learn, make_trainer
+from lidardesign.density.learn import learn, make_trainer, prepare_training_data
 from lidardesign.density.target.target import Target
 from lidardesign.density.training import quality as measure
 from lidardesign.density.training import training
 from lidardesign.density.training.checkpoint import load_arrays
 from lidardesign.density.training.losses import TOLERANCE_NATS, round_trip_nats
-from lidardesign.density.training.training_data import prepare_ground
 from lidardesign.errors import DivergenceError
 from lidardesign.samples import load_samples
 from lidardesign.scene import Body, Scene, Sphere, rigid
@@ -352,8 +351,8 @@ class BallsTask(BallTask):
 
 def trainer_of(task, space, run, **settings):
     config = config_of(space, **settings)
-    ground = prepare_ground(task, config)
-    return make_trainer(ground, config, run, torch.device("cpu")), ground, config
+    data = prepare_training_data(task, config)
+    return make_trainer(data, config, run, torch.device("cpu")), data, config
 
 
 @hard_case(
@@ -391,11 +390,11 @@ class TestModesFarApart:
         judged = SimpleNamespace(
             flow=one.flow.double(), target=both.target, coordinates=one.coordinates, generator=one.generator
         )
-        probes = measure.draw_probes(both.target, both.scenes, 2000, np.random.default_rng(1))
+        probes = measure.draw_probes(both.target, 2000, np.random.default_rng(1))
         found = measure.measure(judged, probes, 4000).estimates
-        alone = SimpleNamespace(**{**vars(judged), "target": prepare_ground(BallsTask(LEFT), config).target})
+        alone = SimpleNamespace(**{**vars(judged), "target": prepare_training_data(BallsTask(LEFT), config).target})
         whole = measure.measure(
-            alone, measure.draw_probes(alone.target, both.scenes[:1], 2000, np.random.default_rng(1)), 4000
+            alone, measure.draw_probes(alone.target, 2000, np.random.default_rng(1)), 4000
         )
         assert found["ess"].value > 0.8 * whole.estimates["ess"].value
         assert found["coverage"].value == pytest.approx(0.5, abs=0.1)

@@ -24,7 +24,7 @@ from support.heads import EVERYTHING, face_rays, heads
 from support.scoring import design, make_request, rows_by_key
 from support.tables import each_row
 
-from lidardesign.density.training.training_data import refuse_blind_receiver
+from lidardesign.density.learn import refuse_blind_receiver
 from lidardesign.errors import DataError
 from lidardesign.evaluate.metrics import (
     SurfaceCloud,

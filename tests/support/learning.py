@@ -9,8 +9,8 @@ import torch
 import lidardesign.density.learn as density_learn
 from lidardesign.config import DensitySettings, LearningSettings, RunConfig
 from lidardesign.density import learn as learning
+from lidardesign.density.learn import prepare_training_data
 from lidardesign.density.training import training
-from lidardesign.density.training.training_data import prepare_ground
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace
 from lidardesign.task import Defaults, Metric, TaskConfig
@@ -66,7 +66,7 @@ class Interrupter:
 
 def a_trainer(run):
     config = config_of()
-    return learning.make_trainer(prepare_ground(BallTask(), config), config, run, torch.device("cpu"))
+    return learning.make_trainer(prepare_training_data(BallTask(), config), config, run, torch.device("cpu"))
 
 
 def interrupt_after_a_checkpoint(monkeypatch, folder):

@@ -8,7 +8,8 @@ import numpy as np
 
 from lidardesign.config import DensitySettings
 from lidardesign.density.fields.distance import build_field
-from lidardesign.density.visibility.quadrature import Optics, Quadrature, RayBatch, Raycast
+from lidardesign.density.target.quadrature import Quadrature
+from lidardesign.density.target.visibility import Optics, RayBatch, Raycast
 from lidardesign.scene import Body, Box, Plane, rigid
 from lidardesign.space import DesignSpace
 

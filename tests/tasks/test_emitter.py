@@ -14,8 +14,8 @@ from lidardesign_tasks.face import FaceTask
 from support.tables import each_row
 
 from lidardesign.config import DensitySettings
+from lidardesign.density.target.proposals import propose
 from lidardesign.density.target.target import build_target
-from lidardesign.density.training.proposals import propose
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts.rays import lay_out

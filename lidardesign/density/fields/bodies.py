@@ -9,20 +9,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
 
-from lidardesign.density.fields import grids as interpolation
 from lidardesign.density.fields.grids import Grid, cached_distance_grids, grid_around
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere, inverse_rigid
 
-KINDS: dict[type, int] = {
-    Sphere: interpolation.SPHERE,
-    Box: interpolation.BOX,
-    Capsule: interpolation.CAPSULE,
-    Plane: interpolation.PLANE,
-    Mesh: interpolation.GRID,
-}
+# Kinds of bodies, as the compiled loops know them.
+SPHERE, BOX, CAPSULE, PLANE, GRID = range(5)
+KINDS: dict[type, int] = {Sphere: SPHERE, Box: BOX, Capsule: CAPSULE, Plane: PLANE, Mesh: GRID}
 # Frames of one motion are close together: so many of them are looked at, or passed over, at once.
 GROUP_COLUMNS = 16
 BuildGrid = Callable[[Mesh], tuple[Grid, np.ndarray]]
@@ -51,12 +47,66 @@ class Grids:
     log_weights: np.ndarray | None = None
 
 
+class BodyArrays(NamedTuple):
+    """What the compiled loops need to know of `Bodies` and of the `Grids` of their meshes.
+
+    Arguments:
+        kinds, sizes, to_body, grid, low, high, starts: See `Bodies`.
+        values: The distances of all grids, end to end.
+        grids: Low corner, counts, inverse step and start in `values` of each grid, shape (grids, 8).
+        edges: The low and then the high sides of the bounding boxes by axis, shape (6, B).
+    """
+
+    kinds: np.ndarray
+    sizes: np.ndarray
+    to_body: np.ndarray
+    grid: np.ndarray
+    values: np.ndarray
+    grids: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    edges: np.ndarray
+    starts: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Points, or their rays, with the columns that matter to them, row by row.
+
+    Arguments:
+        row_starts: Where each point's pairs begin, shape (N + 1,).
+        columns: Shape (P,).
+        distances: Of the points to the columns' bodies, shape (P,) [m].
+        bodies: The nearest body of each, shape (P,).
+    """
+
+    row_starts: np.ndarray
+    columns: np.ndarray
+    distances: np.ndarray
+    bodies: np.ndarray
+
+    @property
+    def shape(self) -> tuple[int]:
+        """Of one value per pair, (P,)."""
+        return self.columns.shape
+
+    @property
+    def rows(self) -> np.ndarray:
+        """The point of each pair, shape (P,)."""
+        return np.repeat(np.arange(len(self.row_starts) - 1), np.diff(self.row_starts))
+
+    def where(self, kept: np.ndarray) -> Pairs:
+        """Those that a mask (P,) keeps."""
+        row_starts = np.concatenate([[0], np.cumsum(kept)])[self.row_starts]
+        return Pairs(row_starts, self.columns[kept], self.distances[kept], self.bodies[kept])
+
+
 @dataclass(frozen=True, eq=False)
 class Bodies:
     """Bodies of many columns, sorted by column.
 
     Arguments:
-        kinds: What each is (`interpolation.SPHERE`, ...), shape (B,).
+        kinds: What each is (`SPHERE`, ...), shape (B,).
         sizes: Radius, radius and half length, or half extents, shape (B, 3) [m].
         to_body: Rows of the world-to-body transform, shape (B, 3, 4).
         grid: Row in `grids` of meshes, 0 for others, shape (B,).
@@ -87,12 +137,20 @@ class Bodies:
         """The number of columns."""
         return len(self.starts) - 1
 
+    @cached_property
+    def arrays(self) -> BodyArrays:
+        """All of it, for the compiled loops."""
+        grids, edges = self.grids, np.concatenate([self.low.T, self.high.T])
+        placed = np.column_stack([grids.lows, grids.counts, grids.inverse_steps, grids.starts])
+        return BodyArrays(
+            self.kinds, self.sizes, self.to_body, self.grid, grids.values, placed, self.low, self.high, edges,
+            self.starts,
+        )  # fmt: skip
+
     @property
-    def shapes(self) -> tuple[np.ndarray, ...]:
-        """What the kernels need to evaluate one body."""
-        grids = self.grids
-        geometry = (grids.values, grids.starts, grids.counts, grids.lows, grids.inverse_steps)
-        return (self.kinds, self.sizes, self.to_body, self.grid, *geometry)
+    def grid_steps_m(self) -> np.ndarray:
+        """The grid steps of all meshes [m]."""
+        return 1.0 / self.grids.inverse_steps[1:]
 
     @cached_property
     def mesh_bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -101,13 +159,8 @@ class Bodies:
         return np.stack([b[0] for b in bounds]), np.stack([b[1] for b in bounds])
 
     @cached_property
-    def edges(self) -> np.ndarray:
-        """The low and then the high sides of the bounding boxes by axis, each beside its neighbours', shape (6, B)."""
-        return np.concatenate([self.low.T, self.high.T])
-
-    @cached_property
     def group_edges(self) -> np.ndarray:
-        """As `edges`, of boxes around `GROUP_COLUMNS` neighbouring columns each [m]; empty groups are nowhere."""
+        """Boxes around `GROUP_COLUMNS` neighbouring columns each, as `BodyArrays.edges`; empty groups are nowhere."""
         first = np.arange(0, self.columns, GROUP_COLUMNS)
         rows = self.starts[first]
         low = np.full((len(first), 3), np.inf)
@@ -247,12 +300,12 @@ def _world_bounds(
 ) -> tuple[np.ndarray, np.ndarray]:
     """World boxes around every body, shape (B, 3) each; of a mesh, around its whole grid."""
     centre, half = np.zeros((len(kinds), 3)), sizes.copy()
-    sphere, capsule = kinds == interpolation.SPHERE, kinds == interpolation.CAPSULE
+    sphere, capsule = kinds == SPHERE, kinds == CAPSULE
     half[sphere] = sizes[sphere, :1]
     half[capsule] = np.stack(
         [sizes[capsule, 0], sizes[capsule, 0], sizes[capsule, 0] + sizes[capsule, 1]], axis=1
     ).reshape(-1, 3)
-    mesh = kinds == interpolation.GRID
+    mesh = kinds == GRID
     centre[mesh] = (grids.lows[grid[mesh]] + grids.high[grid[mesh]]) / 2
     half[mesh] = (grids.high[grid[mesh]] - grids.lows[grid[mesh]]) / 2
     rotation = poses[:, :3, :3]
@@ -260,5 +313,5 @@ def _world_bounds(
     reach = np.einsum("bij,bj->bi", np.abs(rotation), half)
     # a sphere is as wide in every turned frame
     reach[sphere] = half[sphere]
-    reach[kinds == interpolation.PLANE] = np.inf
+    reach[kinds == PLANE] = np.inf
     return np.ascontiguousarray(middle - reach), np.ascontiguousarray(middle + reach)

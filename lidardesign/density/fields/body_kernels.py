@@ -1,7 +1,8 @@
-"""Compiled loops over bodies in their own frames: which columns matter at a point, distances, gradients.
+"""Compiled loops over bodies in their own frames: columns that matter at a point, distances, importance, first hits.
 
-Every loop takes the arrays of `bodies.Bodies`: bodies sorted by column, `starts` telling where each column begins, and
-for each body its world bounding box, which decides whether it is looked at at all.
+Every loop takes the arrays of bodies (`bodies.BodyArrays`): sorted by column, `starts` tells where each column begins,
+and for each body its world bounding box, which decides whether it is looked at at all. Primitives are crossed by rays
+in closed form; meshes only tell which rays pass their boxes.
 """
 
 from __future__ import annotations
@@ -11,8 +12,8 @@ import math
 import numpy as np
 from numba import njit
 
-from lidardesign.density.fields.grids import BOX, CAPSULE, PLANE, SPHERE
-from lidardesign.density.fields.kernels import corners, locate
+from lidardesign.density.fields.bodies import BOX, CAPSULE, GRID, GROUP_COLUMNS, PLANE, SPHERE
+from lidardesign.density.fields.table_kernels import corners, locate, trilinear_slope
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -28,8 +29,8 @@ def to_frame(to_body, b, points, n, q):  # noqa: ANN001, ANN201
 
 
 @njit(cache=True, nogil=True)
-def _shape_distance(kind, size, values, start, counts, low, inverse_step, q, gradient):  # noqa: ANN001, ANN202
-    """Signed distance of a body other than a sphere at a point in its own frame, with its gradient (3,)."""
+def _primitive_distance(kind, size, q, gradient):  # noqa: ANN001, ANN202
+    """Signed distance of a box, capsule or plane at a point in its own frame, with its gradient (3,)."""
     if kind == CAPSULE:
         z = q[2] - min(max(q[2], -size[1]), size[1])
         length = math.sqrt(q[0] * q[0] + q[1] * q[1] + z * z)
@@ -40,9 +41,7 @@ def _shape_distance(kind, size, values, start, counts, low, inverse_step, q, gra
     if kind == PLANE:
         gradient[0], gradient[1], gradient[2] = 0.0, 0.0, 1.0
         return q[2]
-    if kind == BOX:
-        return _box_distance(size, q, gradient)
-    return _grid_distance(values, start, counts, low, inverse_step, q, gradient)
+    return _box_distance(size, q, gradient)
 
 
 @njit(cache=True, nogil=True)
@@ -67,7 +66,9 @@ def _box_distance(size, q, gradient):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def _grid_distance(values, start, counts, low, inverse_step, q, gradient):  # noqa: ANN001, ANN202
+def _grid_distance(values, placed, q, gradient):  # noqa: ANN001, ANN202
+    """Signed distance of a mesh by its grid, a row of `grids`, at a point in its own frame, with its gradient (3,)."""
+    low, counts, inverse_step, start = placed[:3], placed[3:6], placed[6], int(placed[7])
     cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
     index, weight = np.zeros(8, np.int64), np.zeros(8)
     squared = locate(counts, low, inverse_step, q, cell, fraction, excess)
@@ -95,7 +96,7 @@ def _grid_distance(values, start, counts, low, inverse_step, q, gradient):  # no
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _distance(kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, points, n, q, gradient):  # noqa: ANN001, ANN202
+def _distance(kinds, sizes, to_body, grid, values, grids, b, points, n, q, gradient):  # noqa: ANN001, ANN202
     """Signed distance of body b at point n, its gradient in the body's frame."""
     to_frame(to_body, b, points, n, q)
     if kinds[b] == SPHERE:
@@ -103,23 +104,18 @@ def _distance(kinds, sizes, to_body, grid, values, grid_starts, counts, lows, st
         scale = 1.0 / length if length > 0.0 else 0.0
         gradient[0], gradient[1], gradient[2] = q[0] * scale, q[1] * scale, q[2] * scale
         return length - sizes[b, 0]
-    g = grid[b]
-    return _shape_distance(
-        kinds[b], sizes[b], values, grid_starts[g], counts[g], lows[g], steps[g], q, gradient
-    )
+    if kinds[b] != GRID:
+        return _primitive_distance(kinds[b], sizes[b], q, gradient)
+    return _grid_distance(values, grids[grid[b]], q, gradient)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _plain_distance(  # noqa: ANN202
-    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, points, n, q, gradient,  # noqa: ANN001
-):  # fmt: skip
+def _plain_distance(kinds, sizes, to_body, grid, values, grids, b, points, n, q):  # noqa: ANN001, ANN202
     """`_distance` without a gradient: primitives are written out, since calls and slices cost more than they do."""
     kind = kinds[b]
-    if kind != SPHERE and kind != BOX and kind != CAPSULE and kind != PLANE:
-        return _distance(
-            kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, points, n, q, gradient
-        )
     to_frame(to_body, b, points, n, q)
+    if kind == GRID:
+        return _grid_distance(values, grids[grid[b]], q, np.zeros(3))
     if kind == PLANE:
         return q[2]
     if kind == BOX:
@@ -166,10 +162,7 @@ def _within(reach, first, last, limit):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _column_distance(  # noqa: ANN202
-    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps,  # noqa: ANN001
-    first, last, points, n, reach, q, gradient,  # noqa: ANN001
-):  # fmt: skip
+def _column_distance(kinds, sizes, to_body, grid, values, grids, first, last, points, n, reach, q):  # noqa: ANN001, ANN202
     """Distance of the nearest of some bodies to point n, and which it is; `reach` (B,) tells how far their boxes are.
 
     The body whose box is nearest goes first; after it hardly any other has to be evaluated.
@@ -177,15 +170,11 @@ def _column_distance(  # noqa: ANN202
     if first == last:
         return np.inf, -1
     if last == first + 1:
-        return _plain_distance(
-            kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, first, points, n, q, gradient
-        ), first
+        return _plain_distance(kinds, sizes, to_body, grid, values, grids, first, points, n, q), first
     leader, least = first, _least(reach, first, last)
     while reach[leader] > least:
         leader += 1
-    distance = _plain_distance(
-        kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, leader, points, n, q, gradient
-    )
+    distance = _plain_distance(kinds, sizes, to_body, grid, values, grids, leader, points, n, q)
     body, limit = leader, max(distance, 0.0) * max(distance, 0.0)
     # counting takes all at once, and mostly finds the leader alone
     if _within(reach, first, last, limit) == (1 if least < limit or least == 0.0 else 0):
@@ -193,9 +182,7 @@ def _column_distance(  # noqa: ANN202
     for b in range(first, last):
         if (reach[b] >= limit and reach[b] > 0.0) or b == leader:
             continue
-        value = _plain_distance(
-            kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, points, n, q, gradient
-        )
+        value = _plain_distance(kinds, sizes, to_body, grid, values, grids, b, points, n, q)
         if value < distance:
             distance, body, limit = value, b, max(value, 0.0) * max(value, 0.0)
     return distance, body
@@ -213,58 +200,33 @@ def _most_promising(group_edges, group_weights, precision, points, n, hopes):  #
     return leader
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _add_near(  # noqa: ANN202
-    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, starts, first, last,  # noqa: ANN001
-    points, n, log_weights, precision, tolerance, reach, q, gradient, best, kept, seen, found, nearest,  # noqa: ANN001
-):  # fmt: skip
-    """Append those of columns `first` to `last` that are not yet too far off; the best term and the number by then."""
-    for c in range(first, last):
-        alone = starts[c + 1] == starts[c] + 1
-        if alone and log_weights[c] - 0.5 * precision * reach[starts[c]] < best - tolerance:
-            continue
-        distance, body = _column_distance(
-            kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps,
-            starts[c], starts[c + 1], points, n, reach, q, gradient,
-        )  # fmt: skip
-        term = log_weights[c] - 0.5 * precision * distance * distance
-        if term < best - tolerance:
-            continue
-        best = max(best, term)
-        seen[kept], found[kept], nearest[kept] = c, distance, body
-        kept += 1
-    return best, kept
-
-
 @njit(cache=True, nogil=True)
-def near_columns(  # noqa: ANN201
-    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps,  # noqa: ANN001
-    edges, starts, group_edges, group_columns,  # noqa: ANN001
-    points, log_weights, group_weights, precision, tolerance,  # noqa: ANN001
-    row_starts, columns, distances, bodies,  # noqa: ANN001
-):  # fmt: skip
+def near_columns(bodies, group_edges, points, log_weights, group_weights, precision, tolerance, row_starts, out):  # noqa: ANN001, ANN201
     """The columns whose term log_weight - precision * d^2 / 2 is within a tolerance of the best one, for each point.
 
     Bounding boxes bound the terms from above, first of groups of neighbouring columns (frames of one motion are close
     together), then of columns; only columns that could matter are evaluated, each by its nearest body.
 
     Arguments:
-        edges: World bounding boxes of the bodies, low sides and high sides by axis, shape (6, B).
-        group_edges: The same of boxes around `group_columns` columns each.
+        bodies: The arrays of all bodies.
+        group_edges: Boxes around `GROUP_COLUMNS` columns each, low sides and high sides by axis, shape (6, groups).
         points: Shape (N, 3).
         log_weights, group_weights: Per column, and the largest of each group.
         precision: 1 / sigma^2 [1/m^2].
         tolerance: In nats.
         row_starts: Out: where each point's pairs begin, shape (N + 1,).
-        columns, distances, bodies: Out: one entry per pair, as many as there is room for.
+        out: Columns, distances and nearest bodies, one entry per pair, as many as there is room for.
 
     Returns:
         The number of pairs; where it is above the room, the lists are cut off and the call has to be repeated.
     """
+    kinds, sizes, to_body, grid, values, grids, _, _, edges, starts = bodies
+    columns, distances, nearest = out
     count, groups, room = starts.shape[0] - 1, group_edges.shape[1], columns.shape[0]
-    q, gradient = np.zeros(3), np.zeros(3)
+    q = np.zeros(3)
     hopes, reach = np.empty(groups), np.empty(kinds.shape[0])
-    found, nearest, seen = np.empty(count), np.empty(count, np.int64), np.empty(count, np.int64)
+    # of the point at hand: columns that are not yet too far off, their distances and their nearest bodies
+    candidates, candidate_m, candidate_body = np.empty(count, np.int64), np.empty(count), np.empty(count, np.int64)
     total = 0
     for n in range(points.shape[0]):
         row_starts[n] = total
@@ -275,69 +237,329 @@ def near_columns(  # noqa: ANN201
             g = leader if turn == 0 else (0 if turn == leader else turn)
             if hopes[g] < best - tolerance:
                 continue
-            first, last = g * group_columns, min((g + 1) * group_columns, count)
+            first, last = g * GROUP_COLUMNS, min((g + 1) * GROUP_COLUMNS, count)
             _outside_squared(edges, starts[first], starts[last], points, n, reach)
-            best, kept = _add_near(
-                kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, starts, first, last,
-                points, n, log_weights, precision, tolerance, reach, q, gradient, best, kept, seen, found, nearest,
-            )  # fmt: skip
+            for c in range(first, last):
+                alone = starts[c + 1] == starts[c] + 1
+                if alone and log_weights[c] - 0.5 * precision * reach[starts[c]] < best - tolerance:
+                    continue
+                distance, body = _column_distance(
+                    kinds, sizes, to_body, grid, values, grids, starts[c], starts[c + 1], points, n, reach, q
+                )
+                term = log_weights[c] - 0.5 * precision * distance * distance
+                if term < best - tolerance:
+                    continue
+                best = max(best, term)
+                candidates[kept], candidate_m[kept], candidate_body[kept] = c, distance, body
+                kept += 1
         for k in range(kept):
-            if log_weights[seen[k]] - 0.5 * precision * found[k] * found[k] < best - tolerance:
+            if log_weights[candidates[k]] - 0.5 * precision * candidate_m[k] * candidate_m[k] < best - tolerance:
                 continue
             if total < room:
-                columns[total], distances[total], bodies[total] = seen[k], found[k], nearest[k]
+                columns[total], distances[total], nearest[total] = candidates[k], candidate_m[k], candidate_body[k]
             total += 1
     row_starts[points.shape[0]] = total
     return total
 
 
 @njit(cache=True, nogil=True)
-def add_gradients(  # noqa: ANN201
-    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps,  # noqa: ANN001
-    points, row_starts, bodies, weights, out,  # noqa: ANN001
-):  # fmt: skip
+def add_gradients(bodies, points, row_starts, nearest, weights, out):  # noqa: ANN001, ANN201
     """Gradients of sum_pairs weight * d(body, point): pairs as `near_columns` lists them, out (N, 3)."""
+    kinds, sizes, to_body, grid, values, grids = bodies[:6]
     q, gradient = np.zeros(3), np.zeros(3)
     out[:] = 0.0
     for n in range(points.shape[0]):
         for pair in range(row_starts[n], row_starts[n + 1]):
-            b = bodies[pair]
+            b = nearest[pair]
             if weights[pair] == 0.0:
                 continue
-            _distance(
-                kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, points, n, q, gradient
-            )
+            _distance(kinds, sizes, to_body, grid, values, grids, b, points, n, q, gradient)
             for k in range(3):
                 for i in range(3):
                     out[n, k] += weights[pair] * to_body[b, i, k] * gradient[i]
 
 
 @njit(cache=True, nogil=True)
-def distances_of(  # noqa: ANN201
-    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, bodies, points, out  # noqa: ANN001
-):
-    """Distance of one body each at points: bodies (N,), points (N, 3), out (N,)."""
+def distances_of(bodies, chosen, points, out):  # noqa: ANN001, ANN201
+    """Distance of one body each at points: chosen (N,), points (N, 3), out (N,)."""
+    kinds, sizes, to_body, grid, values, grids = bodies[:6]
     q, gradient = np.zeros(3), np.zeros(3)
     for n in range(points.shape[0]):
-        out[n] = _distance(
-            kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, bodies[n], points, n, q, gradient
-        )
+        out[n] = _distance(kinds, sizes, to_body, grid, values, grids, chosen[n], points, n, q, gradient)
 
 
 @njit(cache=True, nogil=True)
-def all_distances(  # noqa: ANN201
-    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, starts, points, out, nearest  # noqa: ANN001
-):
+def all_distances(bodies, points, out, nearest):  # noqa: ANN001, ANN201
     """Distances of the nearest body of every column: out (N, C), and which body it was: nearest (N, C)."""
+    kinds, sizes, to_body, grid, values, grids, _, _, _, starts = bodies
     q, gradient = np.zeros(3), np.zeros(3)
     out[:] = np.inf
     nearest[:] = -1
     for n in range(points.shape[0]):
         for c in range(starts.shape[0] - 1):
             for b in range(starts[c], starts[c + 1]):
-                value = _distance(
-                    kinds, sizes, to_body, grid, values, grid_starts, counts, lows, steps, b, points, n, q, gradient
-                )
+                value = _distance(kinds, sizes, to_body, grid, values, grids, b, points, n, q, gradient)
                 if value < out[n, c]:
                     out[n, c] = value
                     nearest[n, c] = b
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _corner_values(values, placed, q, cell, fraction, excess, index, weight, found):  # noqa: ANN001, ANN202
+    """The values at the corners of a point's cell in a grid, one row of `grids`, into `found` (8,)."""
+    low, counts, inverse_step, start = placed[:3], placed[3:6], placed[6], int(placed[7])
+    locate(counts, low, inverse_step, q, cell, fraction, excess)
+    corners(counts, cell, fraction, index, weight)
+    for corner in range(8):
+        found[corner] = values[start + index[corner]]
+
+
+@njit(cache=True, nogil=True)
+def pair_log_weights(bodies, constants, values, points, row_starts, nearest, out):  # noqa: ANN001, ANN201
+    """log weights of pairs of a point and a body, listed as `near_columns` does: out (P,).
+
+    Arguments:
+        bodies: The arrays of all bodies.
+        constants: log weight of each body as a whole, shape (B,).
+        values: log weights of all grids of meshes, end to end; bodies of grid 0 have none.
+        points, row_starts: As in `near_columns`.
+        nearest: The body of each pair, -1 for none.
+    """
+    grid, to_body, grids = bodies.grid, bodies.to_body, bodies.grids
+    cell, fraction, excess, q = np.zeros(3, np.int64), np.zeros(3), np.zeros(3), np.zeros(3)
+    index, weight, found = np.zeros(8, np.int64), np.zeros(8), np.zeros(8)
+    for n in range(points.shape[0]):
+        for pair in range(row_starts[n], row_starts[n + 1]):
+            b = nearest[pair]
+            if b < 0:
+                out[pair] = 0.0
+                continue
+            total, g = constants[b], grid[b]
+            if g > 0:
+                to_frame(to_body, b, points, n, q)
+                _corner_values(values, grids[g], q, cell, fraction, excess, index, weight, found)
+                for corner in range(8):
+                    total += weight[corner] * found[corner]
+            out[pair] = total
+
+
+@njit(cache=True, nogil=True)
+def add_log_weight_gradients(bodies, values, points, row_starts, nearest, weights, out):  # noqa: ANN001, ANN201
+    """Add the gradients of sum_pairs weight * log weight of its body at the point to out (N, 3)."""
+    grid, to_body, grids = bodies.grid, bodies.to_body, bodies.grids
+    cell, fraction, excess, q = np.zeros(3, np.int64), np.zeros(3), np.zeros(3), np.zeros(3)
+    index, corner_weight, found = np.zeros(8, np.int64), np.zeros(8), np.zeros(8)
+    for n in range(points.shape[0]):
+        for pair in range(row_starts[n], row_starts[n + 1]):
+            b = nearest[pair]
+            if b < 0 or weights[pair] == 0.0 or grid[b] == 0:
+                continue
+            g = grid[b]
+            to_frame(to_body, b, points, n, q)
+            _corner_values(values, grids[g], q, cell, fraction, excess, index, corner_weight, found)
+            for axis in range(3):
+                if excess[axis] == 0.0:
+                    slope = weights[pair] * trilinear_slope(found, fraction, axis) * grids[g, 6]
+                    for k in range(3):
+                        out[n, k] += slope * to_body[b, axis, k]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _turn(to_body, b, vectors, n, out):  # noqa: ANN001, ANN202
+    for k in range(3):
+        out[k] = (
+            to_body[b, k, 0] * vectors[n, 0] + to_body[b, k, 1] * vectors[n, 1] + to_body[b, k, 2] * vectors[n, 2]
+        )
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _ball_roots(origin, direction, radius):  # noqa: ANN001, ANN202
+    """Both crossings of a line with a ball, NaN where it passes by; |direction| is 1."""
+    along = origin[0] * direction[0] + origin[1] * direction[1] + origin[2] * direction[2]
+    squared = 0.0
+    for k in range(3):
+        across = origin[k] - along * direction[k]
+        squared += across * across
+    room = radius * radius - squared
+    if room < 0.0:
+        return np.nan, np.nan
+    half = math.sqrt(room)
+    return -along - half, -along + half
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _box_roots(low, high, origin, direction):  # noqa: ANN001, ANN202
+    near, far = -np.inf, np.inf
+    for k in range(3):
+        if direction[k] == 0.0:
+            if origin[k] < low[k] or origin[k] > high[k]:
+                return np.nan, np.nan
+            continue
+        one, other = (low[k] - origin[k]) / direction[k], (high[k] - origin[k]) / direction[k]
+        near, far = max(near, min(one, other)), min(far, max(one, other))
+    if near > far:
+        return np.nan, np.nan
+    return near, far
+
+
+@njit(cache=True, nogil=True)
+def _capsule_roots(size, origin, direction, centred):  # noqa: ANN001, ANN202
+    """A line meets the side, or the cap on whose side it meets the endless cylinder (as in `simulate.raycast`)."""
+    radius, half_length = size[0], size[1]
+    across = direction[0] * direction[0] + direction[1] * direction[1]
+    roots = (np.nan, np.nan)
+    near, far = np.nan, np.nan
+    half = 0.0
+    along = 0.0
+    if across > 0.0:
+        along = (origin[0] * direction[0] + origin[1] * direction[1]) / across
+        x, y = origin[0] - along * direction[0], origin[1] - along * direction[1]
+        room = radius * radius - x * x - y * y
+        if room < 0.0:
+            return roots
+        half = math.sqrt(room / across)
+    for end in (-1.0, 1.0):
+        side = -along + end * half
+        height = origin[2] + side * direction[2] if across > 0.0 else end * direction[2] * np.inf
+        value = side
+        if not abs(height) <= half_length:
+            centred[0], centred[1] = origin[0], origin[1]
+            centred[2] = origin[2] - (half_length if height > 0.0 else -half_length)
+            first, second = _ball_roots(centred, direction, radius)
+            value = first if end < 0.0 else second
+        if end < 0.0:
+            near = value
+        else:
+            far = value
+    return near, far
+
+
+@njit(cache=True, nogil=True)
+def _primitive_roots(kind, size, origin, direction, work):  # noqa: ANN001, ANN202
+    if kind == SPHERE:
+        return _ball_roots(origin, direction, size[0])
+    if kind == BOX:
+        for k in range(3):
+            work[k] = -size[k]
+        return _box_roots(work, size, origin, direction)
+    if kind == CAPSULE:
+        return _capsule_roots(size, origin, direction, work)
+    if direction[2] == 0.0:
+        return np.nan, np.nan
+    return -origin[2] / direction[2], np.nan
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _normal(kind, size, point, out):  # noqa: ANN001, ANN202
+    """Outward normal of a primitive at a point on it, in its frame."""
+    out[0], out[1], out[2] = 0.0, 0.0, 0.0
+    if kind == PLANE:
+        out[2] = 1.0
+    elif kind == BOX:
+        axis, largest = 0, -1.0
+        for k in range(3):
+            share = abs(point[k]) / size[k]
+            if share > largest:
+                axis, largest = k, share
+        out[axis] = 1.0 if point[axis] >= 0.0 else -1.0
+    else:
+        z = point[2] - min(max(point[2], -size[1]), size[1]) if kind == CAPSULE else point[2]
+        length = math.sqrt(point[0] * point[0] + point[1] * point[1] + z * z)
+        if length > 0.0:
+            out[0], out[1], out[2] = point[0] / length, point[1] / length, z / length
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _boxes_meet(low, high, b, start, end):  # noqa: ANN001, ANN202
+    """Whether the box from `start` (3,) to `end` (3,) meets box b."""
+    for k in range(3):  # noqa: SIM110 - numba compiles the loop to half the time of one expression
+        if start[k] > high[b, k] or end[k] < low[b, k]:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _segment_box(origins, directions, limits, n, start, end):  # noqa: ANN001, ANN202
+    """The bounding box of ray n up to its limit."""
+    for k in range(3):
+        tip = origins[n, k] + limits[n] * directions[n, k]
+        start[k], end[k] = min(origins[n, k], tip), max(origins[n, k], tip)
+
+
+@njit(cache=True, nogil=True)
+def first_hits(bodies, row_starts, columns, rays, hits, normals):  # noqa: ANN001, ANN201
+    """First hits of rays on the primitives of columns, before a limit.
+
+    Arguments:
+        bodies: The arrays of all bodies.
+        row_starts, columns: Ray-column pairs as `near_columns` lists them.
+        rays: Origins (N, 3), directions of unit length (N, 3), and where rays end (N,) [m].
+        hits: Out: ranges, infinite without a hit, shape (P,) [m].
+        normals: Out: world normals that face the origin, shape (P, 3).
+    """
+    kinds, sizes, to_body, starts = bodies.kinds, bodies.sizes, bodies.to_body, bodies.starts
+    low, high, (origins, directions, limits) = bodies.low, bodies.high, rays
+    q, turned, work, point = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    local, start, end = np.zeros(3), np.zeros(3), np.zeros(3)
+    for n in range(origins.shape[0]):
+        _segment_box(origins, directions, limits, n, start, end)
+        for pair in range(row_starts[n], row_starts[n + 1]):
+            best, body = limits[n], -1
+            for b in range(starts[columns[pair]], starts[columns[pair] + 1]):
+                if kinds[b] == GRID or not _boxes_meet(low, high, b, start, end):
+                    continue
+                to_frame(to_body, b, origins, n, q)
+                _turn(to_body, b, directions, n, turned)
+                near, far = _primitive_roots(kinds[b], sizes[b], q, turned, work)
+                value = near if near >= 0.0 else far
+                if value >= 0.0 and value < best:
+                    best, body = value, b
+            hits[pair] = np.inf
+            if body < 0:
+                continue
+            hits[pair] = best
+            to_frame(to_body, body, origins, n, q)
+            _turn(to_body, body, directions, n, turned)
+            for k in range(3):
+                point[k] = q[k] + best * turned[k]
+            _normal(kinds[body], sizes[body], point, local)
+            facing = local[0] * turned[0] + local[1] * turned[1] + local[2] * turned[2]
+            sign = -1.0 if facing > 0.0 else 1.0
+            for k in range(3):
+                normals[pair, k] = sign * (
+                    to_body[body, 0, k] * local[0] + to_body[body, 1, k] * local[1] + to_body[body, 2, k] * local[2]
+                )
+
+
+@njit(cache=True, nogil=True)
+def mesh_candidates(bodies, mesh_bounds, row_starts, columns, rays, out):  # noqa: ANN001, ANN201
+    """Pairs and mesh bodies whose own bounding box the ray passes before its limit.
+
+    Arguments:
+        bodies, row_starts, columns, rays: As in `first_hits`.
+        mesh_bounds: Low and high corners of the meshes in their own frames, by grid, shape (grids, 3) each [m].
+        out: Rays, pairs and bodies, as many as there is room for.
+
+    Returns:
+        Their number; where it is above the room, the call has to be repeated.
+    """
+    kinds, to_body, grid, starts = bodies.kinds, bodies.to_body, bodies.grid, bodies.starts
+    low, high = bodies.low, bodies.high
+    (origins, directions, limits), (mesh_low, mesh_high), (out_rows, out_pairs, out_bodies) = rays, mesh_bounds, out
+    q, turned, start, end = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    total, room = 0, out_pairs.shape[0]
+    for n in range(origins.shape[0]):
+        _segment_box(origins, directions, limits, n, start, end)
+        for pair in range(row_starts[n], row_starts[n + 1]):
+            for b in range(starts[columns[pair]], starts[columns[pair] + 1]):
+                if kinds[b] != GRID or not _boxes_meet(low, high, b, start, end):
+                    continue
+                to_frame(to_body, b, origins, n, q)
+                _turn(to_body, b, directions, n, turned)
+                near, far = _box_roots(mesh_low[grid[b]], mesh_high[grid[b]], q, turned)
+                if not (far >= 0.0 and near < limits[n]):
+                    continue
+                if total < room:
+                    out_rows[total], out_pairs[total], out_bodies[total] = n, pair, b
+                total += 1
+    return total

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Protocol
 
 import numpy as np
 
-from lidardesign.density.fields import grids as interpolation
+from lidardesign.density.fields import grids
 from lidardesign.density.fields.bodies import Bodies, own_grid, place_bodies
-from lidardesign.density.fields.grids import Grid, cached_distance_grids, grid_around
+from lidardesign.density.fields.grids import Grid, GridTable, cached_distance_grids, grid_around
 from lidardesign.errors import ConfigError
 from lidardesign.scene import Body, Mesh, Scene
 
@@ -26,11 +26,13 @@ FAR_M = np.float32(1e9)  # the distance of a column without a mesh in the table
 class Field(Protocol):
     """Signed distances of all columns, with contracted gradients.
 
-    `shell_m` is half the thickness given to surfaces without an inside where they occlude, shape (columns,).
+    `shell_m` is half the thickness given to surfaces without an inside where they occlude, shape (columns,), and
+    `grid_steps_m` are the grid steps of all meshes [m]: none where every distance is exact.
     """
 
     columns: int
     shell_m: np.ndarray
+    grid_steps_m: np.ndarray
 
     def distances(self, points: np.ndarray) -> np.ndarray:
         """Distances at points: (N, 3) to (N, columns) [m]."""
@@ -63,28 +65,33 @@ class TableField:
         return self.table.shape[1]
 
     @property
-    def geometry(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """Counts, low corner and inverse step, as the kernels take them."""
-        return self.grid.counts, self.grid.low, 1.0 / self.grid.step
+    def grid_steps_m(self) -> np.ndarray:
+        """See `Field`."""
+        return np.array([self.grid.step])
+
+    @cached_property
+    def arrays(self) -> GridTable:
+        """As the compiled loops take it."""
+        return GridTable.on(self.grid, self.table)
 
     def distances(self, points: np.ndarray) -> np.ndarray:
         """See `Field`."""
         points = np.ascontiguousarray(points, dtype=np.float64)
         if not self.compiled:
-            return interpolation.table_distances(self.table, *self.geometry, points)
-        from lidardesign.density.fields import kernels
+            return grids.table_distances(self.arrays, points)
+        from lidardesign.density.fields import table_kernels
 
         out = np.empty((len(points), self.columns), dtype=np.float32)
-        kernels.table_distances(self.table, *self.geometry, points, out)
+        table_kernels.table_distances(self.arrays, points, out)
         return out
 
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """See `Field`."""
         points = np.ascontiguousarray(points, dtype=np.float64)
-        from lidardesign.density.fields import kernels
+        from lidardesign.density.fields import table_kernels
 
         out = np.empty_like(points)
-        kernels.table_gradient(self.table, *self.geometry, points, np.ascontiguousarray(weights, np.float64), out)
+        table_kernels.table_gradient(self.arrays, points, np.ascontiguousarray(weights, np.float64), out)
         return out
 
 
@@ -97,7 +104,7 @@ class BodyField:
 
     def __init__(self, bodies: Bodies) -> None:
         self.bodies = bodies
-        self.columns = bodies.columns
+        self.columns, self.grid_steps_m = bodies.columns, bodies.grid_steps_m
         self.shell_m = np.zeros(bodies.columns)
         steps = 1.0 / bodies.grids.inverse_steps
         unsigned = np.array([False, *(mesh.sign == "unsigned" for mesh in bodies.grids.meshes)])
@@ -109,7 +116,7 @@ class BodyField:
 
         shape = (len(points), self.columns)
         distances, nearest = np.empty(shape), np.empty(shape, dtype=np.int64)
-        body_kernels.all_distances(*self.bodies.shapes, self.bodies.starts, points, distances, nearest)
+        body_kernels.all_distances(self.bodies.arrays, points, distances, nearest)
         return distances, nearest
 
     def distances(self, points: np.ndarray) -> np.ndarray:
@@ -126,7 +133,7 @@ class BodyField:
         known = np.where(nearest >= 0, weights, 0.0).ravel()
         rows = np.arange(len(points) + 1) * self.columns
         out = np.empty_like(points)
-        body_kernels.add_gradients(*self.bodies.shapes, points, rows, nearest.ravel(), known, out)
+        body_kernels.add_gradients(self.bodies.arrays, points, rows, nearest.ravel(), known, out)
         return out
 
 
@@ -146,6 +153,11 @@ class UnionField:
     def shell_m(self) -> np.ndarray:
         """See `Field`."""
         return np.maximum(self.first.shell_m, self.second.shell_m)
+
+    @property
+    def grid_steps_m(self) -> np.ndarray:
+        """See `Field`."""
+        return np.concatenate([self.first.grid_steps_m, self.second.grid_steps_m])
 
     def distances(self, points: np.ndarray) -> np.ndarray:
         """See `Field`."""

@@ -4,9 +4,9 @@ libigl gives the unsigned distance in a narrow band and the generalised winding 
 mode scales the distance and is not used). Beyond the band the distance to the nearest closest point of the band is
 taken, found by an exact Euclidean distance transform, so that gradients reach from afar.
 
-Distances from a grid table in plain NumPy, for the few thousand points of a process that compiles nothing.
-
-`kernels` computes the same at a fifth of the time, after 0.8 s of loading: worth it in learning, not in `constrain`.
+Distances and values are read from tables in plain NumPy, for the few thousand points of a process that compiles
+nothing. `table_kernels` computes the same at a fifth of the time, after 0.8 s of loading: worth it in learning, not in
+`constrain`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -56,6 +57,25 @@ class Grid:
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
+class GridTable(NamedTuple):
+    """Values of many columns at the points of a grid, as compiled loops take them.
+
+    Arguments:
+        table: Shape (grid points, columns) float32.
+        counts, low, inverse_step: How the grid is placed, see `Grid`.
+    """
+
+    table: np.ndarray
+    counts: np.ndarray
+    low: np.ndarray
+    inverse_step: float
+
+    @classmethod
+    def on(cls, grid: Grid, table: np.ndarray) -> GridTable:
+        """A table on a grid."""
+        return cls(table, grid.counts, grid.low, 1.0 / grid.step)
+
+
 def grid_around(bounds_m: np.ndarray, resolution: int, padding_m: float) -> Grid:
     """A grid over an axis-aligned box, shape (2, 3), with `resolution` points along its longest padded side."""
     low, high = bounds_m[0] - padding_m, bounds_m[1] + padding_m
@@ -78,7 +98,9 @@ def distance_grid(mesh: Mesh, grid: Grid) -> np.ndarray:
     points, vertices = Grid(np.zeros(3), grid.step, grid.counts).points(), mesh.vertices - grid.low
     faces = mesh.faces.astype(np.int64)
     distance, _, closest = narrow_band(points, vertices, faces, grid)
-    distance = _filled(distance, closest, points, grid)
+    beyond = np.isnan(distance)
+    if beyond.any():
+        distance[beyond] = np.linalg.norm(points[beyond] - closest[nearest_known(beyond, grid)], axis=1)
     if mesh.sign != "unsigned":
         import igl
 
@@ -112,15 +134,6 @@ def nearest_known(beyond: np.ndarray, grid: Grid) -> np.ndarray:
         beyond.reshape(grid.counts), return_distances=False, return_indices=True
     ).reshape(3, -1)[:, beyond]
     return np.ravel_multi_index(tuple(nearest), tuple(grid.counts))
-
-
-def _filled(distance: np.ndarray, closest: np.ndarray, points: np.ndarray, grid: Grid) -> np.ndarray:
-    beyond = np.isnan(distance)
-    if not beyond.any():
-        return distance
-    rows, filled = nearest_known(beyond, grid), distance.copy()
-    filled[beyond] = np.linalg.norm(points[beyond] - closest[rows], axis=1)
-    return filled
 
 
 def cache_folder() -> Path:
@@ -204,53 +217,40 @@ def _store(path: Path, values: np.ndarray) -> None:
         return
 
 
-# Kinds of bodies, shared with the compiled kernels.
-SPHERE, BOX, CAPSULE, PLANE, GRID = range(5)
-
 CHUNK = 2048
 
 
-def table_distances(
-    table: np.ndarray, counts: np.ndarray, low: np.ndarray, inverse_step: float, points: np.ndarray
-) -> np.ndarray:
-    """Distances of all columns at points, a lower bound outside the grid: table (G, C), (N, 3) to (N, C) float32."""
-    out = np.empty((len(points), table.shape[1]), dtype=np.float32)
+def table_distances(field: GridTable, points: np.ndarray) -> np.ndarray:
+    """Distances of all columns at points, a lower bound outside the grid: (N, 3) to (N, C) float32."""
+    out = np.empty((len(points), field.table.shape[1]), dtype=np.float32)
     for start in range(0, len(points), CHUNK):
         rows = slice(start, start + CHUNK)
-        out[rows] = _distances(table, counts, low, inverse_step, points[rows])
+        place = (points[rows] - field.low) * field.inverse_step
+        clamped = np.clip(place, 0.0, field.counts - 1.0)
+        squared = np.square((place - clamped) / field.inverse_step).sum(axis=1)
+        inner = _blended(field, clamped)
+        outside = squared > 0
+        inner[outside] = np.sqrt(squared[outside, None] + np.square(np.maximum(inner[outside], 0.0)))
+        out[rows] = inner
     return out
 
 
-def table_values(
-    table: np.ndarray, counts: np.ndarray, low: np.ndarray, inverse_step: float, points: np.ndarray
-) -> np.ndarray:
-    """Values of all columns at points, outside the grid those at its faces: table (G, C), (N, 3) to (N, C) float32."""
-    out = np.empty((len(points), table.shape[1]), dtype=np.float32)
+def table_values(field: GridTable, points: np.ndarray) -> np.ndarray:
+    """Values of all columns at points, outside the grid those at its faces: (N, 3) to (N, C) float32."""
+    out = np.empty((len(points), field.table.shape[1]), dtype=np.float32)
     for start in range(0, len(points), CHUNK):
         rows = slice(start, start + CHUNK)
-        out[rows] = _blended(table, counts, np.clip((points[rows] - low) * inverse_step, 0.0, counts - 1.0))
+        out[rows] = _blended(field, np.clip((points[rows] - field.low) * field.inverse_step, 0.0, field.counts - 1.0))
     return out
 
 
-def _distances(
-    table: np.ndarray, counts: np.ndarray, low: np.ndarray, inverse_step: float, points: np.ndarray
-) -> np.ndarray:
-    place = (points - low) * inverse_step
-    clamped = np.clip(place, 0.0, counts - 1.0)
-    squared = np.square((place - clamped) / inverse_step).sum(axis=1)
-    inner = _blended(table, counts, clamped)
-    outside = squared > 0
-    inner[outside] = np.sqrt(squared[outside, None] + np.square(np.maximum(inner[outside], 0.0)))
-    return inner
-
-
-def _blended(table: np.ndarray, counts: np.ndarray, clamped: np.ndarray) -> np.ndarray:
+def _blended(field: GridTable, clamped: np.ndarray) -> np.ndarray:
     """Trilinear values at places inside the grid, in steps from its first point: (N, 3) to (N, C)."""
-    cell = np.minimum(clamped.astype(np.int64), counts - 2)
+    cell = np.minimum(clamped.astype(np.int64), field.counts - 2)
     fraction = clamped - cell
-    inner = np.zeros((len(clamped), table.shape[1]))
+    inner = np.zeros((len(clamped), field.table.shape[1]))
     for corner in np.ndindex(2, 2, 2):
         weight = np.where(corner, fraction, 1.0 - fraction).prod(axis=1)
-        index = np.ravel_multi_index(tuple((cell + corner).T), tuple(counts))
-        inner += weight[:, None] * table[index]
+        index = np.ravel_multi_index(tuple((cell + corner).T), tuple(field.counts))
+        inner += weight[:, None] * field.table[index]
     return inner

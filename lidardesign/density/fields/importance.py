@@ -1,14 +1,9 @@
-"""How much surfaces count in the target density: log w at the nearest surface point, in the form of `fields`.
+"""How much surfaces count in the target density: log w at the nearest surface point, in the form of `distance`.
 
 Meshes at rest share one table of log weights on the grid of their distances; primitives and moving bodies have theirs
-in their own frames. Between grid points log w is trilinear, so its gradient is exact for what the density uses.
-
-The importance of meshes on grids: log w at the nearest surface point of every grid point, cached on disk.
-
-As with distances (`grids`) the nearest surface point is exact in a narrow band around the surface; beyond it, that of
-the nearest grid point of the band is taken.
-
-Compiled loops over grids of log weights: as those of distances, but constant beyond the grid's faces.
+in their own frames. As with distances (`grids`) the nearest surface point is exact in a narrow band around the surface;
+beyond it, that of the nearest grid point of the band is taken. Between grid points log w is trilinear, so its gradient
+is exact for what the density uses; beyond a grid's faces it is constant.
 """
 
 from __future__ import annotations
@@ -19,15 +14,18 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from numba import njit
 
-from lidardesign.density.fields import grids as interpolation
-from lidardesign.density.fields.bodies import Bodies
-from lidardesign.density.fields.body_kernels import to_frame
+from lidardesign.density.fields import grids
+from lidardesign.density.fields.bodies import Bodies, Pairs
 from lidardesign.density.fields.distance import BodyField, Field, TableField, UnionField, check_table, scene_columns
-from lidardesign.density.fields.grids import Grid, cached_distance_grids, cached_grids, narrow_band, nearest_known
-from lidardesign.density.fields.kernels import FAST, corners, locate
-from lidardesign.density.visibility.occlusion import Pairs
+from lidardesign.density.fields.grids import (
+    Grid,
+    GridTable,
+    cached_distance_grids,
+    cached_grids,
+    narrow_band,
+    nearest_known,
+)
 from lidardesign.scene import Body, Mesh, Scene
 
 ALGORITHM = "log importance at the nearest surface point, narrow band 3 cells, filled by distance transform, float32"
@@ -105,28 +103,29 @@ class TableWeights:
         """See `LogWeights`."""
         return float(self.table.max())
 
-    @property
-    def _geometry(self) -> tuple[np.ndarray, np.ndarray, float]:
-        return self.grid.counts, self.grid.low, 1.0 / self.grid.step
+    @cached_property
+    def arrays(self) -> GridTable:
+        """As the compiled loops take it."""
+        return GridTable.on(self.grid, self.table)
 
     def values(self, points: np.ndarray) -> np.ndarray:
         """See `LogWeights`."""
         points = np.ascontiguousarray(points, dtype=np.float64)
         if not self.compiled:
-            return interpolation.table_values(self.table, *self._geometry, points)
-        from lidardesign.density.fields import importance as importance_kernels
+            return grids.table_values(self.arrays, points)
+        from lidardesign.density.fields import table_kernels
 
         out = np.empty((len(points), self.table.shape[1]), dtype=np.float32)
-        importance_kernels.table_values(self.table, *self._geometry, points, out)
+        table_kernels.table_values(self.arrays, points, out)
         return out
 
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """See `LogWeights`."""
-        from lidardesign.density.fields import importance as importance_kernels
+        from lidardesign.density.fields import table_kernels
 
         points, weights = (np.ascontiguousarray(values, dtype=np.float64) for values in (points, weights))
         out = np.empty_like(points)
-        importance_kernels.table_gradient(self.table, *self._geometry, points, weights, out)
+        table_kernels.table_value_gradient(self.arrays, points, weights, out)
         return out
 
 
@@ -160,54 +159,45 @@ class BodyWeights:
 
     def values(self, points: np.ndarray) -> np.ndarray:
         """See `LogWeights`."""
-        points = np.ascontiguousarray(points, dtype=np.float64)
-        rows, nearest = self._nearest(points)
-        return self._of_bodies(points, rows, nearest).reshape(len(points), -1)
+        return self.of_pairs(points, self._pairs(points)).reshape(len(points), -1)
 
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """See `LogWeights`."""
-        points = np.ascontiguousarray(points, dtype=np.float64)
-        rows, nearest = self._nearest(points)
-        out = np.zeros_like(points)
-        self._add_gradients(points, rows, nearest, np.ascontiguousarray(weights, dtype=np.float64).ravel(), out)
+        out = np.zeros(points.shape)
+        weights = np.ascontiguousarray(weights, dtype=np.float64).ravel()
+        self.add_pair_gradients(points, self._pairs(points), weights, out)
         return out
 
     def of_pairs(self, points: np.ndarray, pairs: Pairs) -> np.ndarray:
         """log w of pairs of points (N, 3) and columns, shape (P,)."""
-        return self._of_bodies(np.ascontiguousarray(points), pairs.row_starts, pairs.bodies)
+        from lidardesign.density.fields import body_kernels
+
+        points, values = np.ascontiguousarray(points, dtype=np.float64), self.bodies.grids.log_weights
+        constants, out = np.ascontiguousarray(self.bodies.log_weight[:, 0]), np.empty(len(pairs.bodies))
+        body_kernels.pair_log_weights(
+            self.bodies.arrays, constants, values, points, pairs.row_starts, pairs.bodies, out
+        )
+        return out
 
     def add_pair_gradients(self, points: np.ndarray, pairs: Pairs, weights: np.ndarray, out: np.ndarray) -> None:
         """Add the gradients of sum_p weights_p log w_p by the points to `out` (N, 3)."""
-        self._add_gradients(np.ascontiguousarray(points), pairs.row_starts, pairs.bodies, weights, out)
+        from lidardesign.density.fields import body_kernels
 
-    def _nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where each point's columns begin, (N + 1,), and the nearest body in each, (N * columns,)."""
+        points, values = np.ascontiguousarray(points, dtype=np.float64), self.bodies.grids.log_weights
+        body_kernels.add_log_weight_gradients(
+            self.bodies.arrays, values, points, pairs.row_starts, pairs.bodies, weights, out
+        )
+
+    def _pairs(self, points: np.ndarray) -> Pairs:
+        """All points with all columns."""
         from lidardesign.density.fields import body_kernels
 
         shape = len(points), self.bodies.columns
         distances, nearest = np.empty(shape), np.empty(shape, dtype=np.int64)
-        body_kernels.all_distances(*self.bodies.shapes, self.bodies.starts, points, distances, nearest)
-        return np.arange(shape[0] + 1) * shape[1], nearest.ravel()
-
-    @property
-    def _grids(self) -> tuple[np.ndarray, ...]:
-        bodies, grids = self.bodies, self.bodies.grids
-        geometry = (grids.log_weights, grids.starts, grids.counts, grids.lows, grids.inverse_steps)
-        return (bodies.to_body, bodies.grid, *geometry)
-
-    def _of_bodies(self, points: np.ndarray, row_starts: np.ndarray, bodies: np.ndarray) -> np.ndarray:
-        from lidardesign.density.fields import importance as importance_kernels
-
-        constants, out = np.ascontiguousarray(self.bodies.log_weight[:, 0]), np.empty(len(bodies))
-        importance_kernels.pair_values(constants, *self._grids, points, row_starts, bodies, out)
-        return out
-
-    def _add_gradients(
-        self, points: np.ndarray, row_starts: np.ndarray, bodies: np.ndarray, weights: np.ndarray, out: np.ndarray
-    ) -> None:
-        from lidardesign.density.fields import importance as importance_kernels
-
-        importance_kernels.add_pair_gradients(*self._grids, points, row_starts, bodies, weights, out)
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        body_kernels.all_distances(self.bodies.arrays, points, distances, nearest)
+        columns = np.tile(np.arange(shape[1]), shape[0])
+        return Pairs(np.arange(shape[0] + 1) * shape[1], columns, distances.ravel(), nearest.ravel())
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,116 +317,3 @@ def _table_weights(field: TableField, bodies: list[tuple[int, Body]], columns: i
         nearest[nearer, place[column]] = distances[nearer]
         table[nearer, column] = values[nearer]
     return TableWeights(table, field.grid, field.compiled)
-
-
-@njit(cache=True, nogil=True, fastmath=FAST)
-def table_values(table, counts, low, inverse_step, points, out):  # noqa: ANN001, ANN201
-    """Values of all columns at points: table (G, C), points (N, 3), out (N, C)."""
-    cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
-    index, weight = np.zeros(8, np.int64), np.zeros(8, table.dtype)
-    for n in range(points.shape[0]):
-        locate(counts, low, inverse_step, points[n], cell, fraction, excess)
-        corners(counts, cell, fraction, index, weight)
-        for c in range(table.shape[1]):
-            out[n, c] = 0.0
-        for corner in range(8):
-            share, row = weight[corner], table[index[corner]]
-            for c in range(table.shape[1]):
-                out[n, c] += share * row[c]
-
-
-@njit(cache=True, nogil=True, fastmath=FAST)
-def table_gradient(table, counts, low, inverse_step, points, weights, out):  # noqa: ANN001, ANN201
-    """Gradients of sum_c weights_nc * value_c(points_n): weights (N, C), out (N, 3)."""
-    cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
-    index, corner_weight, dots = np.zeros(8, np.int64), np.zeros(8), np.zeros(8)
-    for n in range(points.shape[0]):
-        locate(counts, low, inverse_step, points[n], cell, fraction, excess)
-        corners(counts, cell, fraction, index, corner_weight)
-        for corner in range(8):
-            row, total = table[index[corner]], 0.0
-            for c in range(table.shape[1]):
-                total += row[c] * weights[n, c]
-            dots[corner] = total
-        for axis in range(3):
-            out[n, axis] = _slope(dots, fraction, axis) * inverse_step if excess[axis] == 0.0 else 0.0
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _slope(values, fraction, axis):  # noqa: ANN001, ANN202
-    """The derivative of a cell's trilinear value along an axis, per step; values (8,) at its corners."""
-    total = 0.0
-    for corner in range(8):
-        share = 1.0 if (corner >> axis) & 1 else -1.0
-        for k in range(3):
-            if k != axis:
-                share *= fraction[k] if (corner >> k) & 1 else 1.0 - fraction[k]
-        total += share * values[corner]
-    return total
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _corner_values(values, start, counts, low, inverse_step, q, cell, fraction, excess, index, weight, found):  # noqa: ANN001, ANN202
-    """The values at the corners of a point's cell in a grid that begins at `start`, into `found` (8,)."""
-    locate(counts, low, inverse_step, q, cell, fraction, excess)
-    corners(counts, cell, fraction, index, weight)
-    for corner in range(8):
-        found[corner] = values[start + index[corner]]
-
-
-@njit(cache=True, nogil=True)
-def pair_values(  # noqa: ANN201
-    constants, to_body, grid, values, grid_starts, counts, lows, steps,  # noqa: ANN001
-    points, row_starts, bodies, out,  # noqa: ANN001
-):  # fmt: skip
-    """log weights of pairs of a point and a body, listed as `body_kernels.near_columns` does: out (P,).
-
-    Arguments:
-        constants: log weight of each body as a whole, shape (B,).
-        values: log weights of all grids of meshes, end to end; bodies of grid 0 have none.
-        bodies: The body of each pair, -1 for none.
-    """
-    cell, fraction, excess, q = np.zeros(3, np.int64), np.zeros(3), np.zeros(3), np.zeros(3)
-    index, weight, found = np.zeros(8, np.int64), np.zeros(8), np.zeros(8)
-    for n in range(points.shape[0]):
-        for pair in range(row_starts[n], row_starts[n + 1]):
-            b = bodies[pair]
-            if b < 0:
-                out[pair] = 0.0
-                continue
-            total, g = constants[b], grid[b]
-            if g > 0:
-                to_frame(to_body, b, points, n, q)
-                _corner_values(
-                    values, grid_starts[g], counts[g], lows[g], steps[g],
-                    q, cell, fraction, excess, index, weight, found,
-                )  # fmt: skip
-                for corner in range(8):
-                    total += weight[corner] * found[corner]
-            out[pair] = total
-
-
-@njit(cache=True, nogil=True)
-def add_pair_gradients(  # noqa: ANN201
-    to_body, grid, values, grid_starts, counts, lows, steps,  # noqa: ANN001
-    points, row_starts, bodies, weights, out,  # noqa: ANN001
-):  # fmt: skip
-    """Add the gradients of sum_pairs weight * log weight of its body at the point to out (N, 3)."""
-    cell, fraction, excess, q = np.zeros(3, np.int64), np.zeros(3), np.zeros(3), np.zeros(3)
-    index, corner_weight, found = np.zeros(8, np.int64), np.zeros(8), np.zeros(8)
-    for n in range(points.shape[0]):
-        for pair in range(row_starts[n], row_starts[n + 1]):
-            b = bodies[pair]
-            if b < 0 or weights[pair] == 0.0 or grid[b] == 0:
-                continue
-            g = grid[b]
-            to_frame(to_body, b, points, n, q)
-            _corner_values(
-                values, grid_starts[g], counts[g], lows[g], steps[g],
-                q, cell, fraction, excess, index, corner_weight, found,
-            )  # fmt: skip
-            for axis in range(3):
-                if excess[axis] == 0.0:
-                    slope = weights[pair] * _slope(found, fraction, axis) * steps[g]
-                    for k in range(3):
-                        out[n, k] += slope * to_body[b, axis, k]

@@ -1,23 +1,48 @@
-"""The target of a run's training scenes: visibility decided, quadrature refined, doubts noted. Needs no torch."""
+"""The target of a run's training scenes: visibility decided, quadrature refined, doubts noted. Needs no torch.
+
+The quadrature of visibility is refined until it agrees with exact ray casting, or a note says what it can resolve.
+
+Sigma is refused where it is finer than distances are, and noted where it blurs or flattens. Trilinear distances to a
+surface of curvature radius R are off by about step^2 / (8 R), and by nothing to a flat one. So sigma may be finer than
+the grid for flat surfaces, with a note; below a hundredth of the step even what bends over twelve cells is off by more
+than sigma, and the density would follow the grid instead of the surface.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lidardesign.config import RunConfig
+import numpy as np
+
+from lidardesign.config import DensitySettings, RunConfig
+from lidardesign.density.fields.distance import TableField
 from lidardesign.density.fields.importance import importance_notes
-from lidardesign.density.target.refinement import refine_quadrature
-from lidardesign.density.target.resolution import flatness_notes, resolution_notes
+from lidardesign.density.target.proposals import occluded_share, propose
+from lidardesign.density.target.quadrature import Quadrature
 from lidardesign.density.target.target import Target, build_target
-from lidardesign.density.training.proposals import occluded_share, propose
-from lidardesign.density.visibility.quadrature import Optics
+from lidardesign.density.target.visibility import Optics, RayBatch, Raycast
+from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
+from lidardesign.space import RANGE, DesignSpace, observed_point
 from lidardesign.task import random_generator
 
 PROBES = 4096
 OCCLUDED_SHARE_TO_CARE = 1e-3
 HIDDEN_SHARE_TO_WARN = 0.99
+MAXIMUM_POINTS = 1024
+# The share of probed rays that quadrature may see through although ray casting finds them opaque.
+MISSED_SHARE_TO_CARE = 0.005
+OPAQUE, TRANSPARENT = 0.01, 0.1
+# Shares of a grid step: sigma below the first blurs curved surfaces, below the second nothing curved is told apart.
+BLURRED_SHARE, UNRESOLVED_SHARE = 0.5, 0.01
+# Roundings of coordinates that a distance passes through.
+ROUNDINGS = 4
+# A density that varies by less than this over the whole space prefers hardly anything.
+FLAT_NATS = 0.5
+FLATNESS_PROBES = 256
+# Scenes that large with a sigma that fine are more likely in another unit.
+DOUBTFUL_ACROSS_M = 20.0
 
 
 @phase("fields")
@@ -46,7 +71,9 @@ def prepare_target(
         notes.append(reason)
     target = build_target(scenes, config.space, settings, visibility, compiled=compiled)
     if visibility == "quadrature":
-        target, refined = _refine_quadrature(target, scenes, config)
+        generator = random_generator(config.seed, "quadrature")
+        probes = propose(scenes, config.space, PROBES, settings.sigma_m, generator).points
+        target, refined = refine_quadrature(target, probes)
         notes.extend(refined)
     notes.extend(resolution_notes(target, settings))
     notes.extend(flatness_notes(target, settings.sigma_m, random_generator(config.seed, "flatness")))
@@ -73,7 +100,107 @@ def _choose_visibility(scenes: Sequence[Scene], config: RunConfig) -> tuple[str,
     return "raycast", reason
 
 
-def _refine_quadrature(target: Target, scenes: Sequence[Scene], config: RunConfig) -> tuple[Target, list[str]]:
-    generator = random_generator(config.seed, "quadrature")
-    proposals = propose(scenes, config.space, PROBES, config.density.sigma_m, generator)
-    return refine_quadrature(target, scenes, proposals.points)
+def refine_quadrature(target: Target, probes: np.ndarray) -> tuple[Target, list[str]]:
+    """The target with enough midpoints that probes hidden by an occluder are hidden, and notes about it.
+
+    Arguments:
+        target: Seen by quadrature.
+        probes: Design points, shape (N, 6).
+    """
+    rays = RayBatch.of(probes)
+    active = np.ones((len(probes), target.columns), dtype=bool)
+    exact = Raycast(target.scenes).transmittance(rays, active, target.optics, differentiable=False).log_values
+    hidden = exact < np.log(OPAQUE)
+    if not hidden.any():
+        return target, []
+
+    def passed_through(visibility: Quadrature) -> np.ndarray:
+        """T of the hidden ray-column pairs."""
+        return np.exp(visibility.transmittance(rays, hidden, target.optics, differentiable=False).log_values[hidden])
+
+    visibility = target.visibility.one_way
+    first, passed = visibility.points, passed_through(visibility)
+    while visibility.points < MAXIMUM_POINTS:
+        finer = Quadrature(visibility.field, 2 * visibility.points)
+        passed_finer = passed_through(finer)
+        # seen through, or not opaque only because midpoints are too few
+        coarse = (passed > TRANSPARENT) | ((passed > OPAQUE) & (passed_finer <= OPAQUE))
+        if coarse.mean() <= MISSED_SHARE_TO_CARE:
+            break
+        visibility, passed = finer, passed_finer
+    missed = float((passed > TRANSPARENT).mean())
+    notes = []
+    if visibility.points != first:
+        notes.append(f"visibility quadrature refined from {first} to {visibility.points} points")
+    if missed > MISSED_SHARE_TO_CARE:
+        step_m = visibility.field.grid.step if isinstance(visibility.field, TableField) else 0.0
+        opaque_m = -np.log(OPAQUE) / target.optics.attenuation_per_m
+        thickness_m = max(float(probes[:, RANGE].max(initial=0.0)) / visibility.points, step_m, opaque_m)
+        notes.append(
+            f"visibility quadrature still sees through {missed:.1%} of the hidden rays: it resolves occluders "
+            f"thicker than {thickness_m:.2g} m; use density.visibility=raycast"
+        )
+    return target.with_visibility(visibility), notes
+
+
+def resolution_notes(target: Target, settings: DensitySettings) -> list[str]:
+    """What sigma blurs.
+
+    Raises:
+        ConfigError: Sigma is finer than distances are known.
+    """
+    sigma_m = settings.sigma_m
+    _refuse_below_rounding(target.space, sigma_m)
+    steps = target.surfaces.grid_steps_m
+    if not len(steps) or sigma_m >= BLURRED_SHARE * steps.max():
+        return []
+    if sigma_m < UNRESOLVED_SHARE * steps.min():
+        raise ConfigError(
+            f"sigma {sigma_m:g} m is far below the grid step {steps.min():.3g} m of the fields",
+            where="density.sigma_m",
+            allowed=f"at least {UNRESOLVED_SHARE * steps.min():.3g} m on this grid",
+            hint=_finer_hint(float(steps.min()) * settings.field_resolution),
+        )
+    return [
+        f"sigma {sigma_m:g} m is below half the field's grid step {steps.max():.3g} m: "
+        "surfaces are blurred more than sigma says; raise density.field_resolution"
+    ]
+
+
+def _finer_hint(across_m: float) -> str:
+    """What to do about fields across so many metres that sigma is lost in them."""
+    finer = "raise density.field_resolution, or sigma"
+    if across_m < DOUBTFUL_ACROSS_M:
+        return finer
+    return (
+        f"are the lengths in metres? the scenes are about {across_m:.2g} m across; files in millimetres need the "
+        f"factor 0.001 (task meshes: --set scale=0.001); else {finer}"
+    )
+
+
+def flatness_notes(target: Target, sigma_m: float, generator: np.random.Generator) -> list[str]:
+    """Whether a sigma wider than all that the space can observe leaves the density flat, measured by uniform points."""
+    if not target.space.free:
+        return []
+    points = target.space.sample(FLATNESS_PROBES, generator)
+    if sigma_m < float(np.linalg.norm(np.ptp(observed_point(points), axis=0))):
+        return []
+    varies = float(np.ptp(target.log_proximity(points, sigma_m)))
+    if varies >= FLAT_NATS:
+        return []
+    return [
+        f"the target density is flat: with sigma {sigma_m:g} m it varies by {varies:.2g} nats over the whole space, "
+        "so that no design is better than another; lower density.sigma_m"
+    ]
+
+
+def _refuse_below_rounding(space: DesignSpace, sigma_m: float) -> None:
+    farthest = max(np.abs([*space.low[:3], *space.high[:3]]).max(), space.high[RANGE])
+    rounding = ROUNDINGS * float(np.spacing(farthest))
+    if sigma_m < rounding:
+        raise ConfigError(
+            f"sigma {sigma_m:g} m is below what coordinates of {farthest:g} m are rounded to, {rounding:.2g} m",
+            where="density.sigma_m",
+            allowed=f"at least {rounding:.2g} m here",
+            hint="move the scene nearer to the origin, or raise sigma",
+        )

@@ -25,7 +25,7 @@ of a density's numerical choices: by the triangle inequality the errors of sever
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -35,15 +35,14 @@ from scipy.optimize import brentq
 
 from lidardesign.density.flow.flow import DesignFlow
 from lidardesign.density.flow.objective import Coordinates
+from lidardesign.density.target.proposals import independent_points
 from lidardesign.density.target.target import Target
-from lidardesign.density.training.independent import independent_points
 from lidardesign.density.training.losses import TOLERANCE_NATS, draw_conditions, round_trip_nats
 from lidardesign.errors import NumericalError
 from lidardesign.estimates import Estimate, effective_share_error, log_mean_error, standard_error, weighted_mean_error
 from lidardesign.numerics import SLACK, TINY, logsumexp, normalised_weights
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
-from lidardesign.scene import Scene
 from lidardesign.space import DesignSpace
 
 # A point counts as covered where p >= COVERED_RATIO * p* / Z.
@@ -298,9 +297,9 @@ class Measured:
     notes: tuple[str, ...] = ()
 
 
-def draw_probes(target: Target, scenes: Sequence[Scene], count: int, generator: np.random.Generator) -> Probes:
+def draw_probes(target: Target, count: int, generator: np.random.Generator) -> Probes:
     """At most `count` probes of a target; none where no ray of the space comes near a surface."""
-    points, log_proposal = independent_points(target, scenes, count, generator)
+    points, log_proposal = independent_points(target, count, generator)
     log_target = target.log_density(points) if len(points) else log_proposal
     return Probes(points, log_proposal, log_target)
 

@@ -27,11 +27,11 @@ import torch
 from pydantic import TypeAdapter, ValidationError
 
 from lidardesign.config import LearningSettings, RunConfig, save_run_config
-from lidardesign.density.learn import FLOW, LearnResult, make_trainer
+from lidardesign.density.learn import FLOW, LearnResult, TrainingData, make_trainer
+from lidardesign.density.target.target import Target
 from lidardesign.density.training.checkpoint import clear_snapshots
 from lidardesign.density.training.quality import draw_probes, draw_samples, log_density_of
 from lidardesign.density.training.training import CHECKPOINT, PROGRESS, Trainer
-from lidardesign.density.training.training_data import Ground
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.manifest import DAMAGED_HINT, FILE_NAME, forget, note, read_manifest, write_manifest
 from lidardesign.samples import FILE_NAME as SAMPLES
@@ -280,18 +280,18 @@ class Timekeeper:
         """What can be planned with."""
         return (self.time_budget_s - self.elapsed_s()) * (1 - RESERVE)
 
-    def plan(self, ground: Ground, device: torch.device) -> RunConfig:
+    def plan(self, data: TrainingData, device: torch.device) -> RunConfig:
         """The configuration with as many steps as fit.
 
         Raises:
             ConfigError: Not even `LEAST_STEPS` fit; it says what would be enough.
         """
-        trainer = make_trainer(ground, self.config, self.run, device)
+        trainer = make_trainer(data, self.config, self.run, device)
         last = max(trainer.pathwise_steps - 1, 0)
         pathwise = max(_seconds_per_step(trainer, 0), _seconds_per_step(trainer, last)) if trainer.pathwise_steps else 0
         share = self.config.learning.balance
         balancing = _seconds_per_step(trainer, trainer.pathwise_steps) if share > 0 else 0.0
-        self.probes = _timed_probes(ground, self.config)
+        self.probes = _timed_probes(data.target, self.config)
         finishing, left = _finishing_s(trainer, self.probes, self.config), self.left_s
         per_step = (1 - share) * pathwise + share * balancing
         steps = math.floor((left - finishing) / per_step)
@@ -338,11 +338,11 @@ def _seconds_per_step(trainer: Trainer, step: int) -> float:
     return float(np.mean(taken[1:]))  # the first one may have to compile
 
 
-def _timed_probes(ground: Ground, config: RunConfig) -> TimedProbes:
+def _timed_probes(target: Target, config: RunConfig) -> TimedProbes:
     asked = config.learning.coverage_proposals
     count = min(MOST_PROBES, asked)
     generator = random_generator(config.seed, "time budget")
-    drawn, seconds = _timed(lambda: draw_probes(ground.target, ground.scenes, count, generator))
+    drawn, seconds = _timed(lambda: draw_probes(target, count, generator))
     return TimedProbes(drawn.points, asked / count, seconds * asked / count)
 
 

@@ -23,11 +23,11 @@ from lidardesign.density.flow.flow import DesignFlow
 from lidardesign.density.flow.objective import Coordinates
 from lidardesign.density.learn import FLOW, make_flow
 from lidardesign.density.target.target import Target
+from lidardesign.density.target.visibility import Optics
 from lidardesign.density.training.checkpoint import kept_snapshots, load_arrays, rung_steps, twin_step
 from lidardesign.density.training.losses import Pool, balancing_loss, draw_conditions, pathwise_loss
 from lidardesign.density.training.quality import Probes, measure
 from lidardesign.density.training.training import PROGRESS, SIGMA_START_RATIO
-from lidardesign.density.visibility.quadrature import Optics
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
 from lidardesign.numerics import TINY

@@ -26,9 +26,13 @@ from lidardesign.density.fields.bodies import place_bodies
 from lidardesign.density.fields.distance import BodyField, Field, TableField, scene_columns
 from lidardesign.density.fields.grids import distance_grid, grid_around
 from lidardesign.density.fields.importance import build_log_weights
+from lidardesign.density.target.surfaces import SceneTable
 from lidardesign.density.target.target import PADDING_SIGMAS, Target
-from lidardesign.density.visibility.quadrature import NoVisibility, Optics, RayBatch, Raycast
-from lidardesign.density.visibility.receiver import HeardVisibility, common_receiver
+from lidardesign.density.target.visibility import (
+    NoVisibility,
+    Optics,
+    RayBatch,
+)
 from lidardesign.evaluate.accuracy.probes import (
     BECAUSE,
     ERROR_OF,
@@ -235,19 +239,13 @@ class Case:
     ) -> Case | None:
         """A case of training scenes; None where no probe reaches a surface."""
         few = few_columns(scenes, COLUMNS)
-        receiver, way = common_receiver(few), NoVisibility() if visibility == "off" else Raycast(few)
         frames = np.array([few[index].frames for index, _ in scene_columns(few)], dtype=np.float64)
         field = fresh(few, scenes, settings.field_resolution, settings)
-        target = Target(
-            field=field,
-            visibility=way if receiver is None else HeardVisibility(way, receiver),
-            log_column_weights=-np.log(frames),
-            optics=Optics.of(settings),
-            space=space,
-            surface_tolerance_nats=settings.surface_tolerance_nats,
-            importance=build_log_weights(few, field),
-        )
-        probes = draw_probes(target, few, PROBES, seed, "fields", widening=WIDENING)
+        surfaces = SceneTable(field, -np.log(frames), build_log_weights(few, field))
+        way = NoVisibility() if visibility == "off" else surfaces.raycast(few)
+        target = Target(tuple(few), surfaces, way, Optics.of(settings), space, settings.surface_tolerance_nats)
+        target = target.with_visibility(way)
+        probes = draw_probes(target, PROBES, seed, "fields", widening=WIDENING)
         if not len(probes.points):
             return None
         rays = RayBatch.of(probes.points)
@@ -258,7 +256,7 @@ class Case:
 
     def log_density(self, distances: np.ndarray) -> np.ndarray:
         """log p* at the probes from their distances (N, columns)."""
-        surface = self.target.surface_terms(self.observed, distances, self.target.optics.sigma_m)
+        surface = self.target.surfaces.terms(self.observed, distances, self.target.optics.sigma_m)
         return logsumexp(surface + self.log_transmittance, axis=1)
 
     def errors(self, field: Field) -> tuple[float, float, dict[str, float]]:
@@ -282,7 +280,7 @@ def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     if case is None:
         return []
     found = [resolution_sweep(case)]
-    return [*found, interpolation_sweep(case)] if isinstance(case.target.field, TableField) else found
+    return [*found, interpolation_sweep(case)] if isinstance(case.target.surfaces.field, TableField) else found
 
 
 def resolution_sweep(case: Case) -> Sweep:
@@ -340,7 +338,7 @@ def _meshes(scenes: list[Scene]) -> int:
 
 def interpolation_sweep(case: Case) -> Sweep:
     """How distances between grid points are found, at the run's own resolution."""
-    table, points = case.target.field, case.observed[:TIMED_POINTS]
+    table, points = case.target.surfaces.field, case.observed[:TIMED_POINTS]
     exact = ExactField(case.few, lambda body: body.is_target)
     _, seconds, memory = timed(lambda: exact.distances(points))
     ways = {

@@ -12,8 +12,8 @@ import numpy as np
 from lidardesign.config import RunConfig
 from lidardesign.density.fields.distance import scene_columns
 from lidardesign.density.target.prepare import prepare_target
+from lidardesign.density.target.proposals import independent_points
 from lidardesign.density.target.target import Target
-from lidardesign.density.training.independent import independent_points
 from lidardesign.density.training.quality import misplaced_share
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.results import Evaluation
@@ -71,16 +71,13 @@ class Probes:
         return misplaced_share(log_target, log_reference, self.log_proposal)
 
 
-def draw_probes(
-    target: Target, scenes: Sequence[Scene], count: int, seed: int, label: str, *, widening: float = 1.0
-) -> Probes:
+def draw_probes(target: Target, count: int, seed: int, label: str, *, widening: float = 1.0) -> Probes:
     """At most `count` probes of a target, none where no ray of the space comes near a surface.
 
     Points that were drawn several times count once, with the weight of all: evaluating them again adds nothing.
 
     Arguments:
         target: What to probe.
-        scenes: The scenes that it was built of.
         count: The number of draws.
         seed: The run's.
         label: Of the random stream.
@@ -89,7 +86,7 @@ def draw_probes(
     wide = replace(target, optics=target.optics.widened(widening * target.optics.sigma_m))
     generator = random_generator(seed, "accuracy", label)
     drawn = [
-        independent_points(wide, scenes, min(DRAWN_AT_ONCE, count - start), generator)
+        independent_points(wide, min(DRAWN_AT_ONCE, count - start), generator)
         for start in range(0, count, DRAWN_AT_ONCE)
     ]
     points, log_proposal = (np.concatenate(parts) for parts in zip(*drawn, strict=True))

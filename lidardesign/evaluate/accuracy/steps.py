@@ -53,7 +53,7 @@ def run_steps(request: AccuracyRequest) -> Steps | None:
 
 def _steps(request: AccuracyRequest) -> Steps | None:
     target, config = run_target(request), request.config
-    probes = draw_probes(target, request.request.train, POOL, config.seed, "steps")
+    probes = draw_probes(target, POOL, config.seed, "steps")
     if not len(probes.points):
         return None
     unit = config.space.to_unit(probes.points)

@@ -54,7 +54,7 @@ def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     """The run's own snapshots; the stages of a tolerance, and runs of other presets beside it, where there are any."""
     seed, target = request.config.seed, run_target(request)
     generator = random_generator(seed, "accuracy", "training")
-    probes = draw_probes(target, list(request.request.train), PROBES, generator)
+    probes = draw_probes(target, PROBES, generator)
     reached = remeasured(request.run, request.config, target, probes, count=SAMPLES, seed=seed)
     found = [_steps_sweep(request, reached), *_stages_sweep(request)]
     return [*found, *_preset_sweep(request, reached[-1], target, probes)]

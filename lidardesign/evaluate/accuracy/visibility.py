@@ -14,20 +14,18 @@ from functools import cached_property
 import numpy as np
 
 from lidardesign.config import DensitySettings
-from lidardesign.density.fields.distance import Field, TableField, build_field
-from lidardesign.density.target.frames import FramesTarget
-from lidardesign.density.target.target import PADDING_SIGMAS, Target, build_target
-from lidardesign.density.visibility.occlusion import Blocked, BodyRaycast, NoOcclusion, Pairs
-from lidardesign.density.visibility.quadrature import (
+from lidardesign.density.fields.distance import TableField
+from lidardesign.density.target.quadrature import Quadrature
+from lidardesign.density.target.target import Target, build_target
+from lidardesign.density.target.visibility import (
+    Columns,
     NoVisibility,
+    OneWay,
     Optics,
-    Quadrature,
     RayBatch,
-    Raycast,
     RayGradient,
     Visibility,
 )
-from lidardesign.density.visibility.receiver import HeardVisibility, common_receiver
 from lidardesign.evaluate.accuracy.probes import (
     BECAUSE,
     ERROR_OF,
@@ -47,23 +45,21 @@ from lidardesign.space import DesignSpace
 LOG_OPAQUE = -1e4
 
 
-def opaque_target(target: Target, scenes: list[Scene]) -> Target:
-    """The same target with opaque occluders; scenes are those that it was built of."""
-    if isinstance(target, FramesTarget):
-        return replace(target, visibility=OpaqueBodies(BodyRaycast.of(scenes)))
-    receiver, way = common_receiver(scenes), Opaque(Raycast(scenes))
-    return replace(target, visibility=way if receiver is None else HeardVisibility(way, receiver))
+def opaque_target(target: Target) -> Target:
+    """The same target with opaque occluders."""
+    return target.with_visibility(Opaque(target.surfaces.raycast(target.scenes)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Hidden:
     log_values: np.ndarray
+    rays: int
 
     def gradient(self, weights: np.ndarray) -> RayGradient:
-        return RayGradient.zeros(len(self.log_values))
+        return RayGradient.zeros(self.rays)
 
 
-class Opaque:
+class Opaque(OneWay):
     """Exact first hits on opaque scenes."""
 
     name = "opaque"
@@ -72,32 +68,15 @@ class Opaque:
         self._exact, self.rows_at_once = exact, exact.rows_at_once
 
     def transmittance(
-        self, rays: RayBatch, active: np.ndarray, optics: Optics, *, differentiable: bool = True
+        self, rays: RayBatch, columns: Columns, optics: Optics, *, differentiable: bool = True
     ) -> _Hidden:
         """See `Visibility`; its gradient is 0 wherever there is one."""
-        return _Hidden(_opaque(self._exact.transmittance(rays, active, optics, differentiable=False).log_values))
+        exact = self._exact.transmittance(rays, columns, optics, differentiable=False)
+        return _Hidden(np.where(exact.log_values < 0, LOG_OPAQUE, 0.0), len(rays.ranges))
 
-
-class OpaqueBodies:
-    """Exact first hits on opaque bodies of many columns."""
-
-    name = "opaque"
-
-    def __init__(self, exact: BodyRaycast) -> None:
-        self._exact = exact
-
-    def take(self, columns: np.ndarray) -> OpaqueBodies:
-        """The same for some columns."""
-        return OpaqueBodies(self._exact.take(columns))
-
-    def blocked(self, rays: RayBatch, pairs: Pairs, optics: Optics) -> Blocked:
-        """log T of every pair."""
-        found = self._exact.blocked(rays, pairs, optics)
-        return replace(found, log_values=_opaque(found.log_values), attenuation_per_m=0.0)
-
-
-def _opaque(log_values: np.ndarray) -> np.ndarray:
-    return np.where(log_values < 0, LOG_OPAQUE, 0.0)
+    def take(self, columns: np.ndarray) -> Opaque:
+        """See `Visibility`."""
+        return Opaque(self._exact.take(columns))
 
 
 POINTS = (16, 32, 64, 128, 256)
@@ -146,21 +125,16 @@ class Case:
                 batch: The number of points that is timed, fewer where bodies are evaluated one by one.
         """
         cast = build_target(scenes, space, settings, "raycast")
-        if isinstance(cast, FramesTarget):
-            off = replace(cast, visibility=NoOcclusion())
-            integrated = build_target(scenes, space, settings, "quadrature")
-        else:
-            off = replace(cast, visibility=_heard(NoVisibility(), scenes))
-            way = Quadrature(_occluders(cast, scenes, settings), settings.quadrature_points)
-            integrated = replace(cast, visibility=_heard(way, scenes))
-        shared = isinstance(one_way(integrated.visibility).field, TableField)
+        off = cast.with_visibility(NoVisibility())
+        integrated = build_target(scenes, space, settings, "quadrature")
+        shared = isinstance(integrated.visibility.one_way.field, TableField)
         few, batch = (TABLE_PROBES, batch) if shared else (BODY_PROBES, min(BODY_BATCH, batch))
-        return cls(scenes, off, cast, integrated, draw_probes(cast, scenes, PROBES, seed, "visibility"), few, batch)
+        return cls(scenes, off, cast, integrated, draw_probes(cast, PROBES, seed, "visibility"), few, batch)
 
     @cached_property
     def exact(self) -> np.ndarray:
         """log p* at the probes where occluders are opaque, shape (N,)."""
-        return opaque_target(self.cast, self.scenes).log_density(self.probes.points)
+        return opaque_target(self.cast).log_density(self.probes.points)
 
     @property
     def is_blind(self) -> bool:
@@ -169,8 +143,7 @@ class Case:
 
     def quadrature(self, points: int) -> Target:
         """The target with so many midpoints."""
-        field = one_way(self.integrated.visibility).field
-        return replace(self.integrated, visibility=_heard(Quadrature(field, points), self.scenes))
+        return self.integrated.with_visibility(Quadrature(self.integrated.visibility.one_way.field, points))
 
     def measure(self, setting: str, target: Target, exact: np.ndarray, *, default: bool) -> Measurement:
         """A target's error at as many probes as there are exact values (N,), and its time for a batch."""
@@ -248,11 +221,6 @@ def points_sweep(case: Case, default: int | None) -> Sweep:
     )
 
 
-def one_way(visibility: Visibility) -> Visibility:
-    """The way from the ray's origin, also where light comes back to a receiver."""
-    return visibility.one_way if isinstance(visibility, HeardVisibility) else visibility
-
-
 def _part(few: list[Scene], scenes: list[Scene]) -> str:
     """Which part of the scenes was measured; "" where it was all of them."""
     if few is scenes:
@@ -263,20 +231,6 @@ def _part(few: list[Scene], scenes: list[Scene]) -> str:
 
 def _joined(*notes: str) -> str:
     return "; ".join(note for note in notes if note)
-
-
-def _heard(way: Visibility, scenes: list[Scene]) -> Visibility:
-    """A way from the ray's origin, and back to the receiver where there is one."""
-    receiver = common_receiver(scenes)
-    return way if receiver is None else HeardVisibility(way, receiver)
-
-
-def _occluders(target: Target, scenes: list[Scene], settings: DensitySettings) -> Field:
-    """Distances to the occluders: those to the targets where they are the same bodies."""
-    if all(body.role == "both" for scene in scenes for body in scene.bodies):
-        return target.field
-    padding_m = PADDING_SIGMAS * settings.sigma_m
-    return build_field(scenes, lambda body: body.is_occluder, resolution=settings.field_resolution, padding_m=padding_m)
 
 
 def affordable_scenes(scenes: list[Scene]) -> list[Scene]:
@@ -293,4 +247,4 @@ def _own_setting(request: AccuracyRequest) -> tuple[str, int]:
     name = run_visibility(request) or request.config.density.visibility
     if name != "quadrature":
         return name, request.config.density.quadrature_points
-    return name, one_way(run_target(request).visibility).points
+    return name, run_target(request).visibility.one_way.points

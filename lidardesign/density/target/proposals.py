@@ -1,23 +1,17 @@
-"""Independent proposals: design points that listen at random surfaces, drawn without the flow.
+"""Points that know nothing of the flow, with the density that they were drawn from: for balancing and for coverage.
 
-They find modes that the flow dropped (`coverage`), and show whether anything can be in the way of a ray at all
-(visibility `auto`). Where both angles are free they aim at points that are uniform in area from random admissible
-origins; where an angle is fixed hardly any surface point can be aimed at, so random admissible rays are traced
-through all surfaces within reach and one of these is chosen. A normal range error is added in both cases; where the
-range is fixed, the error is what the surface is away from it.
+- Both angles free: the surfaces of the target draw them (`surfaces`), where they have an end.
+- An angle fixed: hardly any surface point can be aimed at from a given origin, but few dimensions are free, so uniform
+  points of the space are resampled by the surface proximity, which is then their density; with more free dimensions
+  uniform rays are traced (`propose`).
+- The range fixed: hardly any surface point is that far from a given origin. Uniform points are resampled, too.
 
-The density that they are drawn from sums over all surfaces of all scenes along a ray, each with its own range error;
-surfaces more than `WINDOW_SPREADS` of these away add less than 1e-13 of their share and are not looked for.
-
-Proposals from the shell around the surfaces, with their density from the distance field.
-
-Where both angles are free, a point is drawn uniform in area on a random scene's targets, moved along the normal by a
-normal offset of the target's own sigma, and observed from a random admissible origin. Its density per volume is then
-q(s) = sum_i N(SDF_i(s); sigma) / A_i over the scenes, and r^2 q(s) per solid angle and range: exact for flat surfaces
-and off in first order of sigma times the curvature for others (on a ball of 15 sigma the rim weighs 14 % too little,
-which a pool for balancing and a coverage can bear). Weights p* / q are bounded by A / r^2, and unlike range errors
-along rays these proposals also reach the rim of silhouettes, where a ray passes a surface within sigma without
-meeting it.
+`propose` also shows, without a target, whether anything can be in the way of a ray at all (visibility `auto`). Where
+both angles are free its points aim at points that are uniform in area from random admissible origins; where an angle is
+fixed random admissible rays are traced through all surfaces within reach and one of these is chosen. A normal range
+error is added in both cases; where the range is fixed, the error is what the surface is away from it. The density that
+they are drawn from sums over all surfaces of all scenes along a ray, each with its own range error; surfaces more than
+`WINDOW_SPREADS` of these away add less than 1e-13 of their share and are not looked for.
 """
 
 from __future__ import annotations
@@ -27,13 +21,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidardesign.density.fields.distance import Field, scene_columns
+from lidardesign.config import DensitySettings
+from lidardesign.density.fields.distance import scene_columns
+from lidardesign.density.target.target import Target, build_target
 from lidardesign.geometry.raycast import Crossings, SceneCaster, shared_caster
 from lidardesign.geometry.surface import sample_body, target_area_m2
-from lidardesign.numerics import TINY, logsumexp
+from lidardesign.numerics import normalised_weights
+from lidardesign.samples import Samples
 from lidardesign.scene import Scene
-from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, aim, direction, observed_point
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, aim, direction
 
+# Up to so many free dimensions, uniform candidates meet the surfaces often enough to be resampled.
+RESAMPLED_DIMENSIONS = 3
+CANDIDATES = 131_072
+# Surfaces that fill less than a millionth of the space are given up.
+CANDIDATE_ROUNDS = 8
+FARTHEST_SIGMAS = 6.0
 WINDOW_SPREADS = 8.0
 # A proposal whose own surface ray casting does not find again within this many range errors (a ray through an edge
 # or a vertex, by rounding) is dropped: its density would be far too small and its weight without bounds.
@@ -41,6 +44,64 @@ FOUND_SPREADS = 0.5
 # Surfaces seen more flatly than this have an unbounded density per solid angle; area sampling hardly meets them.
 MINIMUM_COSINE = 1e-3
 MAXIMUM_COLUMNS = 128
+
+
+def independent_points(
+    target: Target, count: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 6) inside the space, at most `count`, and their log density per chart volume up to a constant.
+
+    Empty where no ray of the space comes near a target.
+    """
+    space, sigma_m = target.space, target.optics.sigma_m
+    if RANGE not in space.free:
+        return resampled_proposals(target, count, generator)
+    if AZIMUTH in space.free and ELEVATION in space.free:
+        if target.surfaces.can_propose:
+            return target.surfaces.propose(target.scenes, space, count, sigma_m, generator)
+    elif len(space.free) <= RESAMPLED_DIMENSIONS:
+        return resampled_proposals(target, count, generator)
+    proposals = propose(target.scenes, space, count, sigma_m, generator)
+    return proposals.points, proposals.log_density
+
+
+def resampled_proposals(
+    target: Target, count: int, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Uniform points resampled by surface proximity, (count, 6), and their log density up to a constant, (count,).
+
+    Empty where no candidate comes within `FARTHEST_SIGMAS` of any surface.
+    """
+    for _ in range(CANDIDATE_ROUNDS):
+        candidates = target.space.sample(CANDIDATES, generator)
+        log_proximity = target.log_proximity(candidates)
+        near = log_proximity > target.surfaces.log_peak - FARTHEST_SIGMAS**2 / 2
+        if near.any():
+            break
+    candidates, log_proximity = candidates[near], log_proximity[near]
+    if not len(candidates):
+        return candidates, log_proximity
+    chosen = generator.choice(len(candidates), size=count, p=normalised_weights(log_proximity))
+    return candidates[chosen], log_proximity[chosen]
+
+
+def samples_without_visibility(
+    scenes: Sequence[Scene], space: DesignSpace, settings: DensitySettings, count: int, generator: np.random.Generator
+) -> Samples:
+    """Weighted samples of the density with T = 1 everywhere, at most `count`; log_prob is known up to a constant.
+
+    No flow has to be trained to show what visibility is worth: the density is known at all these points.
+
+    Arguments:
+        scenes: The training scenes.
+        space: The design space.
+        settings: Sigma and what goes with it.
+        count: The number of draws; those that leave the space are dropped.
+        generator: Of all draws.
+    """
+    target = build_target(scenes, space, settings, "off")
+    points, log_density = independent_points(target, count, generator)
+    return Samples(points, log_density, target.log_density(points), space)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,76 +281,3 @@ def _aimed_rays(
     angles_only[:, RANGE] = space.low[RANGE]
     admissible = space.contains(angles_only)
     return rays[admissible], column[admissible]
-
-
-def shell_proposals(
-    field: Field,
-    scenes: Sequence[Scene],
-    space: DesignSpace,
-    count: int,
-    sigma_m: float,
-    generator: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 6) inside the space, at most `count`, and their log density per chart volume up to a constant.
-
-    Arguments:
-        field: Distances to the targets, one column per scene and frame.
-        scenes: The scenes of these columns.
-        space: The design space; its origins are proposed uniformly.
-        count: The number of draws; those that leave the space are dropped.
-        sigma_m: Standard deviation of the offset along the normal [m].
-        generator: Of all draws.
-    """
-    columns = scene_columns(scenes)
-    column = np.sort(generator.integers(len(columns), size=count))
-    surface = np.empty((count, 3))
-    normal = np.empty((count, 3))
-    for number in np.unique(column):
-        rows = np.flatnonzero(column == number)
-        index, frame = columns[number]
-        targets = [body for body in scenes[index].bodies if body.is_target]
-        drawn = sample_body(targets, space, len(rows), generator, frame)
-        surface[rows], normal[rows] = drawn.points, _normals(field, drawn.points, drawn.triangles, number)
-    surface += generator.normal(scale=sigma_m, size=(count, 1)) * normal
-    points = space.wrap(aim(space.sample(count, generator)[:, :3], surface))
-    points = points[space.contains(points) & (points[:, RANGE] > 0)]
-    return points, _log_density(field, scenes, columns, space, points, sigma_m)
-
-
-def _log_proximity(field: Field, points: np.ndarray, sigma_m: float, weights: np.ndarray | None = None) -> np.ndarray:
-    """log of the sum over columns of weight * exp(-d^2 / (2 sigma^2)) at the observed points, shape (N,)."""
-    distances = field.distances(observed_point(points)).astype(np.float64)
-    return logsumexp(-np.square(distances / sigma_m) / 2, axis=1, weights=weights)
-
-
-def _normals(field: Field, points: np.ndarray, triangles: np.ndarray, column: int) -> np.ndarray:
-    """Unit normals of triangles, and of primitives, whose triangles are points, from the field's gradient."""
-    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    flat = length[:, 0] == 0
-    if flat.any():
-        weights = np.zeros((int(flat.sum()), field.columns))
-        weights[:, column] = 1.0
-        normal[flat] = field.gradient(points[flat], weights)
-        length = np.linalg.norm(normal, axis=1, keepdims=True)
-    return normal / np.where(length == 0, 1.0, length)
-
-
-def _log_density(
-    field: Field,
-    scenes: Sequence[Scene],
-    columns: list[tuple[int, int]],
-    space: DesignSpace,
-    points: np.ndarray,
-    sigma_m: float,
-) -> np.ndarray:
-    area_m2 = np.array([target_area_m2(scene, space) for scene in scenes])[[index for index, _ in columns]]
-    log_density = _log_proximity(field, points, sigma_m, 1.0 / area_m2) + 2 * np.log(points[:, RANGE])
-    return log_density + log_chart_factor(space, points)
-
-
-def log_chart_factor(space: DesignSpace, points: np.ndarray) -> np.ndarray | float:
-    """log of solid angle per chart area at design points: 0 where the chart measures solid angle."""
-    if space.measure == "solid_angle":
-        return 0.0
-    return np.log(np.maximum(np.cos(points[:, ELEVATION]), TINY))

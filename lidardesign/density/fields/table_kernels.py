@@ -94,8 +94,9 @@ def _contract(table, index, column_weight, fraction, inverse_step, dots, out):  
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def table_distances(table, counts, low, inverse_step, points, out):  # noqa: ANN001, ANN201
-    """Distances of all columns at points: table (G, C), points (N, 3), out (N, C)."""
+def table_distances(field, points, out):  # noqa: ANN001, ANN201
+    """Distances of all columns at points: points (N, 3), out (N, C)."""
+    table, counts, low, inverse_step = field.table, field.counts, field.low, field.inverse_step
     cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
     index, weight = np.zeros(8, np.int64), np.zeros(8, table.dtype)
     for n in range(points.shape[0]):
@@ -109,8 +110,9 @@ def table_distances(table, counts, low, inverse_step, points, out):  # noqa: ANN
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def table_gradient(table, counts, low, inverse_step, points, weights, out):  # noqa: ANN001, ANN201
+def table_gradient(field, points, weights, out):  # noqa: ANN001, ANN201
     """Gradients of sum_c weights_nc * d_c(points_n): weights (N, C), out (N, 3)."""
+    table, counts, low, inverse_step = field.table, field.counts, field.low, field.inverse_step
     columns = table.shape[1]
     cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
     index, corner_weight = np.zeros(8, np.int64), np.zeros(8, table.dtype)
@@ -176,22 +178,24 @@ def _insides(distance, sharpness, bits, powers, out):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def table_quadrature(
-    table, clear, counts, low, inverse_step, shell, origins, directions, lengths, points_per_ray,  # noqa: ANN001
-    attenuation, sharpness, cutoff, depth, slope,  # noqa: ANN001
-) -> None:  # fmt: skip
+def table_quadrature(field, clear, shell, rays, points_per_ray, attenuation, sharpness, cutoff, depth, slope) -> None:  # noqa: ANN001
     """Optical depths along rays by midpoints, and the slopes that their gradient needs.
 
     Cells whose every column is further than `cutoff` from a surface cannot attenuate and are never read.
 
     Arguments:
-        table, clear: Distances (G, C) and their cell minima (G,).
+        field: The table of distances.
+        clear: The smallest distance in each cell, shape (G,).
         shell: Half thickness of surfaces without an inside, per column, shape (C,) [m].
-        origins, directions, lengths: Rays, shapes (N, 3), (N, 3), (N,); lengths are integrated from 0 [m].
+        rays: Origins (N, 3), directions (N, 3) and lengths (N,) that are integrated from 0 [m].
+        points_per_ray: The number of midpoints.
+        attenuation, sharpness: beta and k [1/m].
         depth: Out: integral of attenuation * sigmoid(-sharpness * d), shape (N, C).
         slope: Out: derivative of the integrand by the distance times the step, shape (N, M, C); pass shape
             (0, 0, 0) when no gradient is needed.
     """
+    table, counts, low, inverse_step = field.table, field.counts, field.low, field.inverse_step
+    origins, directions, lengths = rays
     columns = table.shape[1]
     cell, fraction, excess, p = np.zeros(3, np.int64), np.zeros(3), np.zeros(3), np.zeros(3)
     index, weight, row = np.zeros(8, np.int64), np.zeros(8, table.dtype), np.zeros(columns, table.dtype)
@@ -230,14 +234,13 @@ def table_quadrature(
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def table_quadrature_gradient(
-    table, clear, counts, low, inverse_step, origins, directions, lengths, cutoff, slope, weights,  # noqa: ANN001
-    by_origin, by_direction, by_length,  # noqa: ANN001
-) -> None:  # fmt: skip
+def table_quadrature_gradient(field, clear, rays, cutoff, slope, weights, by_origin, by_direction, by_length) -> None:  # noqa: ANN001
     """Gradients of sum_c weights_nc * depth_nc by origin (N, 3), direction (N, 3) and length (N,), at fixed step.
 
     The caller adds the derivative by the step itself, which is depth / length.
     """
+    table, counts, low, inverse_step = field.table, field.counts, field.low, field.inverse_step
+    origins, directions, lengths = rays
     columns = table.shape[1]
     points_per_ray = slope.shape[1]
     cell, fraction, excess, p = np.zeros(3, np.int64), np.zeros(3), np.zeros(3), np.zeros(3)
@@ -274,3 +277,53 @@ def table_quadrature_gradient(
                 by_origin[n, k] += value
                 by_direction[n, k] += along * value
                 by_length[n] += (m + 0.5) / points_per_ray * value * directions[n, k]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def trilinear_slope(values, fraction, axis):  # noqa: ANN001, ANN201
+    """The derivative of a cell's trilinear value along an axis, per step; values (8,) at its corners."""
+    total = 0.0
+    for corner in range(8):
+        share = 1.0 if (corner >> axis) & 1 else -1.0
+        for k in range(3):
+            if k != axis:
+                share *= fraction[k] if (corner >> k) & 1 else 1.0 - fraction[k]
+        total += share * values[corner]
+    return total
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def table_values(field, points, out):  # noqa: ANN001, ANN201
+    """Values of all columns at points, constant beyond the grid's faces: points (N, 3), out (N, C)."""
+    table, counts, low, inverse_step = field.table, field.counts, field.low, field.inverse_step
+    cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
+    index, weight = np.zeros(8, np.int64), np.zeros(8, table.dtype)
+    for n in range(points.shape[0]):
+        locate(counts, low, inverse_step, points[n], cell, fraction, excess)
+        corners(counts, cell, fraction, index, weight)
+        for c in range(table.shape[1]):
+            out[n, c] = 0.0
+        for corner in range(8):
+            share, row = weight[corner], table[index[corner]]
+            for c in range(table.shape[1]):
+                out[n, c] += share * row[c]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def table_value_gradient(field, points, weights, out):  # noqa: ANN001, ANN201
+    """Gradients of sum_c weights_nc * value_c(points_n): weights (N, C), out (N, 3)."""
+    table, counts, low, inverse_step = field.table, field.counts, field.low, field.inverse_step
+    cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
+    index, corner_weight, dots = np.zeros(8, np.int64), np.zeros(8), np.zeros(8)
+    for n in range(points.shape[0]):
+        locate(counts, low, inverse_step, points[n], cell, fraction, excess)
+        corners(counts, cell, fraction, index, corner_weight)
+        for corner in range(8):
+            row, total = table[index[corner]], 0.0
+            for c in range(table.shape[1]):
+                total += row[c] * weights[n, c]
+            dots[corner] = total
+        for axis in range(3):
+            out[n, axis] = trilinear_slope(dots, fraction, axis) * inverse_step if excess[axis] == 0.0 else 0.0
+
+

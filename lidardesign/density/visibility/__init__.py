@@ -1,1 +1,0 @@
-"""How much of a ray reaches the point that it observes."""
