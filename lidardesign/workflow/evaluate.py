@@ -21,7 +21,7 @@ from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numb
 from lidardesign.evaluate.results import Evaluation, Paired, Row, write_csv
 from lidardesign.evaluate.score import evaluate as score_designs
 from lidardesign.evaluate.workers.pool import check_workers, workers_of
-from lidardesign.run.clock import Clock, outermost_clock, phase, running
+from lidardesign.run.clock import outermost_clock, phase, running
 from lidardesign.run.files import is_there
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
@@ -54,7 +54,7 @@ CMA = "cma"
 LEAST_CMA_SECONDS = 0.1
 MILLIMETRES = 1000.0
 MOST_NAMED = 8
-THIS = "evaluate"
+COMMAND = "evaluate"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,7 +219,7 @@ class ScoreRequest:
             f"{path}/" if option == "--plots" else path for option, path in (outputs or {}).items() if path is not None
         ]
         return RequestPlan(
-            THIS,
+            COMMAND,
             [
                 f"score {listed} in the held-out scenes of task {run.task.name}, with {', '.join(map(str, counts))} "
                 "rays per frame",
@@ -235,7 +235,7 @@ class ScoreRequest:
             ],
             [*written, run.folder / MANIFEST],
             {"designs": names, "rays": counts, "baselines": list(self.baselines), **settings},
-            last_time(run.folder, THIS),
+            last_time(run.folder, COMMAND),
         )
 
     @property
@@ -272,7 +272,8 @@ class ScoreRequest:
                     scorer.prepare(request)
                     scoring = replace(request, scorer=scorer)
                 evaluation = score_designs(scoring, progress=progress)
-        return Scores(evaluation, replace(request, cma=replace(request.cma, show=None)), self.learned, clock, self)
+            timings = clock.timings()
+        return Scores(evaluation, replace(request, cma=replace(request.cma, show=None)), self.learned, timings, self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,7 +286,7 @@ class Scores:
         evaluation: Rows, differences, effects and notes.
         evaluation_request: What was evaluated.
         run: The run as it was learned.
-        clock: Where the time went.
+        timings: Where the time went, seconds by phase.
         request: What was asked for.
 
     Example:
@@ -301,7 +302,7 @@ class Scores:
     evaluation: Evaluation
     evaluation_request: EvaluationRequest
     run: RunFolder
-    clock: Clock
+    timings: Mapping[str, float]
     request: ScoreRequest
 
     @property
@@ -349,8 +350,8 @@ class Scores:
         """What pictures and reports draw beside the scores."""
         from lidardesign.evaluate.figures.scene_figure import figure_data
 
-        # what the clock counts under this command's name up to now
-        times = {**self.run.command_times(), THIS: self.clock.timings()}
+        clock = outermost_clock()
+        times = {**self.run.command_times(), COMMAND: self.timings if clock is None else clock.timings()}
         return figure_data(self.evaluation, self.evaluation_request, times)
 
     @phase("writing")
