@@ -1,16 +1,14 @@
-"""A real part in one of its modes, as designs use it.
+"""A real part in one of its modes, as designs use it: its figures, and where its rays go in its own frame.
 
-Where the rays of a part go, in its own frame: x forward, y to the left (growing azimuth), z up.
-
-A field of view is an interval of two angles. What they mean depends on the part: equal angles from the forward axis
-(`tangent`: zones behind a wide lens, rosettes), azimuth and elevation (`sphere`: whatever turns or steps), or angles
-in the horizontal and the vertical plane (`plane`: a camera whose pixels are even on its focal plane).
-
-Evenly spread subsets of a fixed set of directions: what a part can do with fewer rays than it has.
+That frame has x forward, y to the left (growing azimuth), z up. What the two angles of a field of view mean depends on
+the part: equal angles from the forward axis (`tangent`: zones behind a wide lens, rosettes), azimuth and elevation
+(`sphere`: whatever turns or steps), or angles in the horizontal and the vertical plane (`plane`: a camera whose pixels
+are even on its focal plane).
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -38,6 +36,9 @@ from lidardesign.space import direction
 
 Projection = Literal["tangent", "sphere", "plane"]
 FULL_TURN_DEG = 360.0
+BITS_PER_MEGABIT = 1e6
+BITS_PER_BYTE = 8
+CONDITIONS = ("reflectance_percent", "illuminance_klux", "detection_percent", "at")
 
 
 def projection_of(pattern: Any, view: FieldOfView) -> Projection:
@@ -72,62 +73,46 @@ def to_directions(projection: Projection, angles: np.ndarray) -> np.ndarray:
 
 def pattern_directions(pattern: Any, view: FieldOfView, rate_hz: float) -> np.ndarray:
     """The unit vectors of a frame in the part's frame, in the order in which they fire, shape (M, 3)."""
-    return to_directions(projection_of(pattern, view), np.radians(_angles_deg(pattern, view, rate_hz)))
-
-
-def _angles_deg(pattern: Any, view: FieldOfView, rate_hz: float) -> np.ndarray:
+    (left, right), (bottom, top) = view.azimuth, view.elevation
     if isinstance(pattern, Rosette):
-        return _rosette(pattern, rate_hz)
-    if isinstance(pattern, Even):
-        return _even(pattern.rays, view)
-    if isinstance(pattern, Rings):
-        return _rings(pattern, view)
-    across, up = _centres(*view.azimuth, pattern.columns), _centres(*view.elevation, pattern.rows)
-    if isinstance(pattern, Pixels):
-        across, up = _focal_plane(*view.azimuth, pattern.columns), _focal_plane(*view.elevation, pattern.rows)
-    return _row_by_row(across, up)
+        # thin prisms: each adds a fixed deflection in the direction in which it stands (first order in the wedge)
+        time_s = np.arange(ray_count(pattern, rate_hz)) / pattern.points_per_s
+        angles_deg = np.zeros((len(time_s), 2))
+        for turns_hz, deflection_deg in zip(pattern.rotor_hz, pattern.deflection_deg, strict=True):
+            phase = 2 * np.pi * turns_hz * time_s
+            angles_deg += deflection_deg * np.stack([np.cos(phase), np.sin(phase)], axis=1)
+    elif isinstance(pattern, Even):
+        angles_deg = _even_angles(pattern.rays, view)
+    elif isinstance(pattern, Rings):
+        # column by column, as a head turns; all beams of a column fire at about the same time
+        elevations = pattern.elevations_deg or _ends_included(bottom, top, pattern.rings or 1)
+        spaced = _cell_centres if right - left >= FULL_TURN_DEG - COARSE_SLACK else _ends_included
+        across = spaced(left, right, pattern.columns)
+        angles_deg = np.stack([np.repeat(across, len(elevations)), np.tile(elevations, pattern.columns)], axis=1)
+    else:
+        # row by row; pixels are even on a plane
+        spaced = _plane_centres if isinstance(pattern, Pixels) else _cell_centres
+        across, up = spaced(left, right, pattern.columns), spaced(bottom, top, pattern.rows)
+        angles_deg = np.stack([np.tile(across, len(up)), np.repeat(up, len(across))], axis=1)
+    return to_directions(projection_of(pattern, view), np.radians(angles_deg))
 
 
-def _row_by_row(across: np.ndarray, up: np.ndarray) -> np.ndarray:
-    return np.stack([np.tile(across, len(up)), np.repeat(up, len(across))], axis=1)
-
-
-def _centres(low: float, high: float, count: int) -> np.ndarray:
+def _cell_centres(low: float, high: float, count: int) -> np.ndarray:
     """Centres of equal cells of an interval: never on its ends, shape (count,)."""
     return low + (high - low) * (np.arange(count) + 0.5) / count
 
 
-def _focal_plane(low_deg: float, high_deg: float, count: int) -> np.ndarray:
+def _plane_centres(low_deg: float, high_deg: float, count: int) -> np.ndarray:
     """Angles of pixels that are even on a plane, shape (count,) [degrees]."""
     low, high = math.tan(math.radians(low_deg)), math.tan(math.radians(high_deg))
-    return np.degrees(np.arctan(_centres(low, high, count)))
-
-
-def _rings(pattern: Rings, view: FieldOfView) -> np.ndarray:
-    """Column by column, as a head turns; all beams of a column fire at about the same time."""
-    elevations = pattern.elevations_deg or _ends_included(*view.elevation, pattern.rings or 1)
-    low, high = view.azimuth
-    whole = high - low >= FULL_TURN_DEG - COARSE_SLACK
-    across = _centres(low, high, pattern.columns) if whole else _ends_included(low, high, pattern.columns)
-    return np.stack([np.repeat(across, len(elevations)), np.tile(elevations, pattern.columns)], axis=1)
+    return np.degrees(np.arctan(_cell_centres(low, high, count)))
 
 
 def _ends_included(low: float, high: float, count: int) -> np.ndarray:
     return np.linspace(low, high, count) if count > 1 else np.array([(low + high) / 2])
 
 
-def _rosette(pattern: Rosette, rate_hz: float) -> np.ndarray:
-    """Thin prisms: each adds a fixed deflection in the direction in which it stands (first order in the wedge)."""
-    count = ray_count(pattern, rate_hz)
-    time_s = np.arange(count) / pattern.points_per_s
-    angles = np.zeros((count, 2))
-    for turns_hz, deflection_deg in zip(pattern.rotor_hz, pattern.deflection_deg, strict=True):
-        phase = 2 * np.pi * turns_hz * time_s
-        angles += deflection_deg * np.stack([np.cos(phase), np.sin(phase)], axis=1)
-    return angles
-
-
-def _even(count: int, view: FieldOfView) -> np.ndarray:
+def _even_angles(count: int, view: FieldOfView) -> np.ndarray:
     """Points that fill the field evenly per solid angle (a disc in its tangent plane), shape (count, 2) [degrees]."""
     unit = low_discrepancy(count, 2)
     (left, right), (bottom, top) = view.azimuth, view.elevation
@@ -139,23 +124,6 @@ def _even(count: int, view: FieldOfView) -> np.ndarray:
     low, high = math.sin(math.radians(bottom)), math.sin(math.radians(top))
     up = np.degrees(np.arcsin(np.clip(low + (high - low) * unit[:, 1], -1.0, 1.0)))
     return np.stack([left + (right - left) * unit[:, 0], up], axis=1)
-
-
-def inside(view: FieldOfView, projection: Projection, directions: np.ndarray) -> np.ndarray:
-    """Which unit vectors in the part's frame lie in its field of view, ends included: (N, 3) to bool (N,)."""
-    angles = np.degrees(to_angles(projection, directions))
-    low = np.array([view.azimuth[0], view.elevation[0]])
-    high = np.array([view.azimuth[1], view.elevation[1]])
-    if view.shape == "ellipse":
-        half = np.maximum((high - low) / 2, COARSE_SLACK)
-        return np.square((angles - (low + high) / 2) / half).sum(axis=1) <= 1 + COARSE_SLACK
-    within = (angles >= low - COARSE_SLACK) & (angles <= high + COARSE_SLACK)
-    return within.all(axis=1)
-
-
-BITS_PER_MEGABIT = 1e6
-BITS_PER_BYTE = 8
-CONDITIONS = ("reflectance_percent", "illuminance_klux", "detection_percent", "at")
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,10 +248,6 @@ class Part:
         frame = self.value("frame_bytes")
         return None if frame is None else frame * BITS_PER_BYTE * self.rate_hz / BITS_PER_MEGABIT
 
-    def inside(self, directions: np.ndarray) -> np.ndarray:
-        """Which unit vectors in its own frame it sees: (N, 3) to bool (N,)."""
-        return inside(self.view, self.projection, directions)
-
     def under(self, *, reflectance_percent: float | None = None, illuminance_klux: float | None = None) -> Part:
         """The same part with the range that its sources vouch for under conditions.
 
@@ -296,8 +260,14 @@ class Part:
         fits = [
             one
             for one in self.figures["far_m"]
-            if _at_most(one.reflectance_percent, reflectance_percent)
-            and _at_least(one.illuminance_klux, illuminance_klux)
+            if (
+                reflectance_percent is None
+                or (one.reflectance_percent is not None and one.reflectance_percent <= reflectance_percent)
+            )
+            and (
+                illuminance_klux is None
+                or (one.illuminance_klux is not None and one.illuminance_klux >= illuminance_klux)
+            )
         ]
         if not fits:
             asked = _conditions(reflectance_percent, illuminance_klux)
@@ -309,14 +279,6 @@ class Part:
         best = max(fits, key=lambda one: one.value)
         others = [one for one in self.figures["far_m"] if one is not best]
         return replace(self, figures={**self.figures, "far_m": [best, *others]})
-
-
-def _at_most(stated: float | None, asked: float | None) -> bool:
-    return asked is None or (stated is not None and stated <= asked)
-
-
-def _at_least(stated: float | None, asked: float | None) -> bool:
-    return asked is None or (stated is not None and stated >= asked)
 
 
 def _conditions(reflectance_percent: float | None, illuminance_klux: float | None) -> str:
@@ -336,24 +298,18 @@ def conditions_of(statement: Statement) -> str:
 
 def disagreements(part: Part) -> list[str]:
     """Fields of which two sources give different figures for the same conditions."""
-    return [name for name, statements in part.figures.items() if _disagree(statements)]
-
-
-def _disagree(statements: Sequence[Statement]) -> bool:
-    """Whether two statements differ in what they say, but neither in conditions nor by having one source."""
-    told: dict[tuple[Any, ...], list[tuple[str, Any]]] = {}
-    for one in statements:
-        given = one.model_dump()
-        conditions = tuple(given.pop(name) for name in CONDITIONS)
-        source = given.pop("source")
-        given.pop("note")
-        told.setdefault(conditions, []).append((source, given))
-    return any(
-        first[0] != second[0] and first[1] != second[1]
-        for same in told.values()
-        for index, first in enumerate(same)
-        for second in same[index + 1 :]
-    )
+    names = []
+    for name, statements in part.figures.items():
+        # source and figure of the statements under the same conditions
+        same: dict[tuple[Any, ...], list[tuple[str, Any]]] = {}
+        for statement in statements:
+            figure = statement.model_dump(exclude={"note"})
+            conditions = tuple(figure.pop(key) for key in CONDITIONS)
+            same.setdefault(conditions, []).append((figure.pop("source"), figure))
+        pairs = (pair for found in same.values() for pair in itertools.combinations(found, 2))
+        if any(first[0] != second[0] and first[1] != second[1] for first, second in pairs):
+            names.append(name)
+    return names
 
 
 def thinned(points: np.ndarray, count: int) -> np.ndarray:

@@ -25,7 +25,6 @@ from lidardesign.design.sensor import (
 )
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Rays
-from lidardesign.space import observed_point
 
 Wanted = Callable[[np.ndarray], np.ndarray]
 
@@ -57,19 +56,6 @@ def looking_at(part: Part, origin_m: np.ndarray, azimuth_rad: float, elevation_r
     """
     frame = boresight_frame(*part.centre_rad).T @ boresight_frame(azimuth_rad, elevation_rad)
     return Pose(np.asarray(origin_m, dtype=np.float64), *boresight_of(frame))
-
-
-def covered(part: Part, pose: Pose, points: np.ndarray) -> np.ndarray:
-    """Which scene points of design points a part at a pose could measure: (N, 6) to bool (N,).
-
-    A design point says what is seen from its own origin; the part sees the same scene point from its own, if it lies
-    in its field of view and between its nearest and its farthest range.
-    """
-    offset = observed_point(points) - pose.origin_m
-    distance = np.linalg.norm(offset, axis=1)
-    near, far = part.range_m
-    local = (offset / np.where(distance > 0, distance, 1.0)[:, None]) @ pose.frame.T
-    return (distance >= near) & (distance <= far) & (distance > 0) & part.inside(local)
 
 
 def parts_for(part: Part, count: int) -> int:
@@ -212,7 +198,7 @@ def side_by_side(part: Part, pose: Pose, number: int) -> list[Pose]:
     rows = np.ones(number, dtype=np.int64) if horizontal > math.pi else grid_rows(horizontal, vertical, number)
     across = np.concatenate([np.arange(n) - (n - 1) / 2 for n in rows])
     up = np.repeat(np.arange(len(rows)) - (len(rows) - 1) / 2, rows)
-    return [_turned(pose, *shift) for shift in zip(across * horizontal, up * vertical, strict=True)]
+    return [_rotate(pose, *shift) for shift in zip(across * horizontal, up * vertical, strict=True)]
 
 
 def interleaved(part: Part, pose: Pose, number: int) -> list[Pose]:
@@ -222,9 +208,9 @@ def interleaved(part: Part, pose: Pose, number: int) -> list[Pose]:
     """
     horizontal, vertical = part.field_of_view_rad
     columns, rows = part.grid
-    return [_turned(pose, *shift) for shift in grid_tangent(horizontal / columns, vertical / rows, number)]
+    return [_rotate(pose, *shift) for shift in grid_tangent(horizontal / columns, vertical / rows, number)]
 
 
-def _turned(pose: Pose, azimuth_rad: float, elevation_rad: float) -> Pose:
+def _rotate(pose: Pose, azimuth_rad: float, elevation_rad: float) -> Pose:
     """A pose turned about its own place by an azimuth and an elevation in its own frame."""
     return Pose(pose.origin_m, *boresight_of(boresight_frame(azimuth_rad, elevation_rad) @ pose.frame))
