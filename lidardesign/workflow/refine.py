@@ -17,7 +17,7 @@ from lidardesign.design.fit import FitResult
 from lidardesign.design.fit import fit as fit_samples
 from lidardesign.design.layouts.quantise import SAMPLES_PER_RAY
 from lidardesign.design.mixture.bounds import groups
-from lidardesign.design.mixture.conditions import MOVED_SAMPLES, at_condition, shown
+from lidardesign.design.mixture.conditions import MOVED_SAMPLES, at_condition, condition_text
 from lidardesign.design.mixture.support import LEAST_SAMPLES
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError, InfeasibleError
@@ -109,7 +109,8 @@ class Fitter:
         count = max(MOVED_SAMPLES, SAMPLES_PER_RAY * (request.choices.get("rays") or 0))
         moved = at_condition(samples, request.at, retarget, count, random_generator(request.seed, "condition"))
         if not self._has_noted_condition:
-            self.notes(f"at {shown(request.at)} {len(moved)} samples have ESS {moved.effective_sample_size:.2f}")
+            ess = moved.effective_sample_size
+            self.notes(f"at {condition_text(request.at)} {len(moved)} samples have ESS {ess:.2f}")
         self._has_noted_condition = True
         return moved
 

@@ -82,7 +82,13 @@ def load_library(own: Sequence[Path] = ()) -> Library:
     files = dict(_shipped())
     origins = dict.fromkeys(files, SHIPPED)
     taken: dict[str, str] = {}
-    for path in [file for one in own for file in _part_files(Path(one))]:
+    paths: list[Path] = []
+    for path in map(Path, own):
+        inside = sorted(path.glob(f"*{SUFFIX}")) if path.is_dir() else [path]
+        if not inside:
+            raise ConfigError(f"holds no file *{SUFFIX}", where=str(path), hint="docs/catalog.md shows a part file")
+        paths += inside
+    for path in paths:
         name = part_name(path)
         if name in taken:
             raise ConfigError(f"is a second part {name!r}", where=str(path), hint=f"the first is {taken[name]}")
@@ -109,16 +115,6 @@ def find_part(name_or_path: str | Path, own: Sequence[Path] = ()) -> Part:
 @lru_cache(maxsize=1)
 def _shipped() -> dict[str, PartFile]:
     return {path.stem: read_part(path) for path in sorted(FOLDER.glob(f"*{SUFFIX}"))}
-
-
-def _part_files(path: Path) -> list[Path]:
-    """The part files of a folder, or the one file that a path is."""
-    if not path.is_dir():
-        return [path]
-    found = sorted(path.glob(f"*{SUFFIX}"))
-    if not found:
-        raise ConfigError(f"holds no file *{SUFFIX}", where=str(path), hint="docs/catalog.md shows a part file")
-    return found
 
 
 def part_name(path: Path) -> str:

@@ -249,18 +249,11 @@ def check_pattern(pattern: Any, view: FieldOfView, rate_hz: float, of_mode: str)
     if isinstance(pattern, Pixels) and max(widest) >= RIGHT_DEG:
         raise ValueError(f"field_of_view_deg{of_mode} reaches {RIGHT_DEG:g} degrees, which no flat sensor sees")
     if isinstance(pattern, Rosette):
-        _check_rosette(pattern, view, of_mode)
-    elif not isinstance(pattern, Even):
-        _check_grid(pattern, view, of_mode)
-
-
-def _check_rosette(pattern: Rosette, view: FieldOfView, of_mode: str) -> None:
-    reach = sum(pattern.deflection_deg)
-    if any(low > -reach or high < reach for low, high in (view.azimuth, view.elevation)):
-        raise ValueError(f"pattern{of_mode} reaches {reach:g} degrees, outside of field_of_view_deg")
-
-
-def _check_grid(pattern: Zones | Pixels | Raster | Rings, view: FieldOfView, of_mode: str) -> None:
+        reach = sum(pattern.deflection_deg)
+        if any(low > -reach or high < reach for low, high in (view.azimuth, view.elevation)):
+            raise ValueError(f"pattern{of_mode} reaches {reach:g} degrees, outside of field_of_view_deg")
+    if isinstance(pattern, Rosette | Even):
+        return
     rows = pattern.rings or 1 if isinstance(pattern, Rings) else pattern.rows
     for name, number, (low, high) in (("azimuth", pattern.columns, view.azimuth), ("elevation", rows, view.elevation)):
         if number > 1 and low == high:
@@ -268,10 +261,10 @@ def _check_grid(pattern: Zones | Pixels | Raster | Rings, view: FieldOfView, of_
     if view.shape == "ellipse" and pattern.columns * rows > 1:
         raise ValueError(f"field_of_view_deg{of_mode} is an ellipse, but its pattern has corners")
     bottom, top = view.elevation
-    if isinstance(pattern, Rings) and pattern.elevations_deg is not None:
-        outside = [one for one in pattern.elevations_deg if not bottom <= one <= top]
-        if outside:
-            raise ValueError(f"pattern{of_mode} has a beam at {outside[0]:g} degrees, outside of field_of_view_deg")
+    beams = (pattern.elevations_deg or []) if isinstance(pattern, Rings) else []
+    outside = [elevation for elevation in beams if not bottom <= elevation <= top]
+    if outside:
+        raise ValueError(f"pattern{of_mode} has a beam at {outside[0]:g} degrees, outside of field_of_view_deg")
 
 
 class PartFile(Figures):

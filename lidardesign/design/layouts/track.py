@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidardesign.design.mixture.conditions import shown
+from lidardesign.design.mixture.conditions import condition_text
 from lidardesign.design.sensor import DesignSpec, Sensor, Track, interval_factor
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Rays
@@ -97,7 +97,7 @@ def _on_track(design: DesignSpec, track: Track, at: Mapping[str, float]) -> Desi
     unknown = [name for name in at if name != track.dimension and at[name] != design.at.get(name)]
     if unknown:
         raise ConfigError(
-            f"the track of {design.name} does not follow {shown({unknown[0]: at[unknown[0]]})}",
+            f"the track of {design.name} does not follow {condition_text({unknown[0]: at[unknown[0]]})}",
             where="--at",
             allowed=track.dimension,
         )
@@ -172,6 +172,6 @@ def _check_coordinate(design: DesignSpec, name: str, value: float) -> None:
         raise ConfigError(
             f"{design.name} cannot be moved to {name}={value:g}",
             where="--at",
-            allowed=shown({name: design.at[name]}) if name in design.at else ", ".join(TRAVELLED),
+            allowed=condition_text({name: design.at[name]}) if name in design.at else ", ".join(TRAVELLED),
             hint=f"lidardesign fit RUN --at {name}={value:g}",
         )

@@ -56,21 +56,48 @@ def at_condition(
         return samples
     if retarget is None:
         raise ConfigError(
-            f"the density at {shown(condition)} needs the target density",
+            f"the density at {condition_text(condition)} needs the target density",
             where="--at",
             hint="give the run folder, or a design that lies in its run",
         )
-    order, nearest = _nearest(samples, condition, count, generator)
+    # the nearest samples in a random order; distances are shares of each condition's bounds
+    order = generator.permutation(len(samples))
+    squared = np.zeros(len(samples))
+    for name, value in condition.items():
+        index = DIMENSIONS.index(name)
+        extent = samples.space.high[index] - samples.space.low[index]
+        if extent > 0:
+            squared += np.square((samples.points[order, index] - value) / extent)
+    near = np.sort(np.argsort(squared, kind="stable")[:count])
+    order, nearest = order[near], np.argsort(squared[near], kind="stable")
     points = samples.points[order].copy()
     for name, value in condition.items():
         points[:, DIMENSIONS.index(name)] = value
     log_target = np.asarray(retarget(points), dtype=np.float64)
     if log_target.shape != (len(points),) or np.isnan(log_target).any():
-        raise NumericalError(f"the target density is NaN at {shown(condition)}", where="--at")
+        raise NumericalError(f"the target density is NaN at {condition_text(condition)}", where="--at")
     # samples were drawn with uniform conditions; given their values that density is no part of it
-    log_prob = samples.log_prob[order] + _log_extent(samples.space, condition)
-    moved = Samples(points, log_prob, log_target, space)
-    return moved.subset(_worthiest(moved, nearest, condition))
+    named = [index for index in samples.space.conditioned if DIMENSIONS[index] in condition]
+    log_extent = float(np.log(samples.space.chart_high[named] - samples.space.chart_low[named]).sum())
+    moved = Samples(points, samples.log_prob[order] + log_extent, log_target, space)
+    # all of them, the nearer half, a quarter, ...
+    parts = [nearest]
+    while len(parts[-1]) >= 2 * LEAST_SAMPLES:
+        parts.append(parts[-1][: len(parts[-1]) // 2])
+    effective = [
+        effective_count(normalised_weights(weights)) if np.isfinite(weights.max(initial=-np.inf)) else 0.0
+        for weights in (moved.log_weights[part] for part in parts)
+    ]
+    best = int(np.argmax(effective))
+    if effective[best] < LEAST_SAMPLES:
+        raise DataError(
+            f"at {condition_text(condition)} the {len(moved)} nearest samples are worth {effective[best]:.0f}",
+            where="--at",
+            allowed=f"at least {LEAST_SAMPLES}",
+            hint="another value, learn longer (--preset standard or fine), or with more learning.samples",
+        )
+    # later steps take the first samples as a fair subset, so the random order stays
+    return moved.subset(np.sort(parts[best]))
 
 
 def conditioned(samples: Samples, condition: Mapping[str, float], retarget: Retarget | None) -> Samples:
@@ -103,59 +130,6 @@ def fixed_conditions(space: DesignSpace) -> dict[str, float]:
     }
 
 
-def shown(condition: Mapping[str, float]) -> str:
+def condition_text(condition: Mapping[str, float]) -> str:
     """Conditions for people, as `x_m=0.37, y_m=1`."""
     return ", ".join(f"{name}={value:g}" for name, value in condition.items())
-
-
-def _nearest(
-    samples: Samples, condition: Mapping[str, float], count: int, generator: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the nearest samples in a random order, and the places in it from the nearest to the furthest.
-
-    Distances are shares of each condition's bounds.
-    """
-    order = generator.permutation(len(samples))
-    squared = np.zeros(len(samples))
-    for name, value in condition.items():
-        index = DIMENSIONS.index(name)
-        extent = samples.space.high[index] - samples.space.low[index]
-        if extent > 0:
-            squared += np.square((samples.points[order, index] - value) / extent)
-    kept = np.sort(np.argsort(squared, kind="stable")[:count])
-    return order[kept], np.argsort(squared[kept], kind="stable")
-
-
-def _worthiest(samples: Samples, nearest: np.ndarray, condition: Mapping[str, float]) -> np.ndarray:
-    """The places of the nearest samples that are worth most: all, half of them, a quarter, ..., in order.
-
-    Raises:
-        DataError: The best part is worth too few.
-    """
-    parts = [nearest]
-    while len(parts[-1]) >= 2 * LEAST_SAMPLES:
-        parts.append(parts[-1][: len(parts[-1]) // 2])
-    worth = [_worth(samples.log_weights[part]) for part in parts]
-    best = int(np.argmax(worth))
-    if worth[best] < LEAST_SAMPLES:
-        raise DataError(
-            f"at {shown(condition)} the {len(samples)} nearest samples are worth {worth[best]:.0f}",
-            where="--at",
-            allowed=f"at least {LEAST_SAMPLES}",
-            hint="another value, learn longer (--preset standard or fine), or with more learning.samples",
-        )
-    # later steps take the first samples as a fair subset, so the random order stays
-    return np.sort(parts[best])
-
-
-def _worth(log_weights: np.ndarray) -> float:
-    """The number of equal weights that are worth as much."""
-    if not np.isfinite(log_weights.max(initial=-np.inf)):
-        return 0.0
-    return effective_count(normalised_weights(log_weights))
-
-
-def _log_extent(space: DesignSpace, condition: Mapping[str, float]) -> float:
-    """Logarithm of the chart volume of the conditions that get a value."""
-    named = [index for index in space.conditioned if DIMENSIONS[index] in condition]
-    return float(np.log(space.chart_high[named] - space.chart_low[named]).sum())

@@ -21,7 +21,7 @@ import numpy as np
 from lidardesign.design.constraints.document import SensorRules
 from lidardesign.design.constraints.feasibility import azimuth_interval
 from lidardesign.design.constraints.origins import inside_excluded, origin_box
-from lidardesign.design.mixture.bounds import Group, Pins
+from lidardesign.design.mixture.bounds import Group
 from lidardesign.errors import ConfigError, InfeasibleError, NumericalError
 from lidardesign.numerics import SLACK, effective_count, systematic_draw, wrap_angle
 from lidardesign.samples import Samples
@@ -69,26 +69,20 @@ def admissible(points: np.ndarray, rules: Sequence[SensorRules], space: DesignSp
             inside &= points[:, RANGE] >= one.gate.start_m.min
         if one.gate.end_m.max is not None:
             inside &= points[:, RANGE] <= one.gate.end_m.max
-        keep |= inside & _in_sight(points, one, space)
+        widest = one.field_of_view.horizontal_deg.max, one.field_of_view.vertical_deg.max
+        ends = one.boresight.azimuth_deg, one.boresight.elevation_deg
+        if None not in widest and any(value is not None for end in ends for value in (end.min, end.max)):
+            # the directions that are near enough to an admitted boresight
+            low, high = azimuth_interval(one, space)
+            middle, half = (low + high) / 2, (high - low) / 2
+            azimuth = middle + np.clip(wrap_angle(points[:, AZIMUTH] - middle), -half, half)
+            bottom, top = -90.0 if ends[1].min is None else ends[1].min, 90.0 if ends[1].max is None else ends[1].max
+            elevation = np.clip(points[:, ELEVATION], math.radians(bottom), math.radians(top))
+            nearest, ray = direction(azimuth, elevation), direction(points[:, AZIMUTH], points[:, ELEVATION])
+            reach = math.radians(math.hypot(*widest)) / 2
+            inside &= np.einsum("ni,ni->n", nearest, ray) >= math.cos(min(reach, math.pi))
+        keep |= inside
     return keep
-
-
-def _in_sight(points: np.ndarray, rules: SensorRules, space: DesignSpace) -> np.ndarray:
-    """Directions that a sensor with bounded boresight and bounded field of view can reach."""
-    widest = rules.field_of_view.horizontal_deg.max, rules.field_of_view.vertical_deg.max
-    aims = rules.boresight
-    bounded = any(v is not None for part in (aims.azimuth_deg, aims.elevation_deg) for v in (part.min, part.max))
-    if None in widest or not bounded:
-        return np.ones(len(points), dtype=bool)
-    low, high = azimuth_interval(rules, space)
-    middle, half = (low + high) / 2, (high - low) / 2
-    azimuth = middle + np.clip(wrap_angle(points[:, AZIMUTH] - middle), -half, half)
-    bottom = -90.0 if aims.elevation_deg.min is None else aims.elevation_deg.min
-    top = 90.0 if aims.elevation_deg.max is None else aims.elevation_deg.max
-    elevation = np.clip(points[:, ELEVATION], math.radians(bottom), math.radians(top))
-    nearest, ray = direction(azimuth, elevation), direction(points[:, AZIMUTH], points[:, ELEVATION])
-    reach = math.radians(math.hypot(*widest)) / 2
-    return np.einsum("ni,ni->n", nearest, ray) >= math.cos(min(reach, math.pi))
 
 
 def restrict_samples(samples: Samples, rules: Sequence[SensorRules], group: Group) -> Support:
@@ -141,7 +135,10 @@ def reaim_samples(
             hint="give the run folder instead of a design file",
         )
     points, space = samples.points[chosen], samples.space
-    aimed = space.wrap(_from_pins(points, group.pins))
+    origins = points[:, :3].copy()
+    for axis, pin in enumerate(group.pins):
+        origins[:, axis] = origins[:, axis] if pin is None else pin
+    aimed = space.wrap(aim(origins, observed_point(points)))
     weights = np.zeros(len(aimed))
     log_old = _per_scene_volume(points, samples.log_target[chosen], space)
     keep = space.contains(aimed, TOLERANCE) & admissible(aimed, rules, space, group)
@@ -154,14 +151,6 @@ def reaim_samples(
     with np.errstate(invalid="ignore"):
         weights[keep] = np.exp(_per_scene_volume(aimed[keep], log_target, space) - log_old[keep])
     return aimed, weights
-
-
-def _from_pins(points: np.ndarray, pins: Pins) -> np.ndarray:
-    origins = points[:, :3].copy()
-    for axis, value in enumerate(pins):
-        if value is not None:
-            origins[:, axis] = value
-    return aim(origins, observed_point(points))
 
 
 def _per_scene_volume(points: np.ndarray, log_target: np.ndarray, space: DesignSpace) -> np.ndarray:

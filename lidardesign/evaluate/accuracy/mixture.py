@@ -21,7 +21,7 @@ from lidardesign.design.fit import EM_SAMPLES, RESTARTS
 from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.layouts.sensor_fit import HELD_OUT_SHARE
 from lidardesign.design.mixture.bounds import Bounds, bounds_of, groups
-from lidardesign.design.mixture.conditions import MOVED_SAMPLES, at_condition, shown
+from lidardesign.design.mixture.conditions import MOVED_SAMPLES, at_condition, condition_text
 from lidardesign.design.mixture.em import fit_mixture
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.mixture import log_density
@@ -81,7 +81,7 @@ def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
 
 def _sweep(knob: str, beside: str, measurements: Sequence[Measurement], design: DesignSpec, work: str) -> Sweep:
     fitted = f"{len(design.sensors)} sensors, as {design.name} has"
-    where = f", at {shown(design.at)}" if design.at else ""
+    where = f", at {condition_text(design.at)}" if design.at else ""
     held = ", without its constraints" if design.constraints else ""
     return Sweep(
         knob=knob,
