@@ -1,8 +1,7 @@
 """Mesh files, read through trimesh and checked: refused or mended with a note, never silently wrong.
 
-Faces of a mesh that run around it the same way: what is told from edges alone, and by how much they disagree.
-
-Weights that someone painted on a mesh: a number per vertex, or the brightness of vertex colours.
+Whether faces run around a mesh the same way is found from edges alone. Weights that someone painted on a mesh are a
+number per vertex, or the brightness of vertex colours.
 """
 
 from __future__ import annotations

@@ -1,10 +1,7 @@
 """Task plugins found through the entry-point group `lidardesign.tasks`; a broken one affects only itself.
 
-Plugins of other packages are imported in a process of their own first, see `probe`.
-
-What a plugin does when it is imported, found out in a process of its own.
-
-A plugin may hang in compiled code, where no signal reaches Python, or crash: both end that process and not this one.
+Plugins of other packages are imported in a process of their own first: one that hangs in compiled code, where no signal
+reaches Python, or crashes, ends that process and not this one.
 """
 
 from __future__ import annotations
@@ -42,7 +39,7 @@ START_SECONDS = 60.0
 # An import that can be interrupted was interrupted by then, and said so [s].
 GRACE_SECONDS = 2.0
 # The exit code of a probing process that could not say what it found.
-UNHEARD = 117
+UNANSWERED = 117
 
 
 @dataclass(frozen=True)
@@ -60,7 +57,7 @@ class Probe:
     contained: bool = False
 
 
-class Apart:
+class PluginProcess:
     """A process of its own that runs a plugin's code and answers by lines; to be ended in any case.
 
     Arguments:
@@ -115,14 +112,14 @@ class Apart:
             code = self._process.wait(max(deadline - time.monotonic(), 0.0) + GRACE_SECONDS)
         except subprocess.TimeoutExpired:
             return None
-        if code == UNHEARD:
+        if code == UNANSWERED:
             return f"closes files that are not its own {when}"
         if code < 0:
             return f"crashes {when} ({signal.strsignal(-code)})"
         return f"ends the program {when} (exit code {code})"
 
 
-class Probing(Apart):
+class ImportProcess(PluginProcess):
     """A plugin that is being imported elsewhere.
 
     Arguments:
@@ -163,10 +160,10 @@ def probed(offers: list[EntryPoint], seconds: float) -> list[Probe | None]:
         offers: Their entry points.
         seconds: How long each import may take.
     """
-    running: list[Probing] = []
+    running: list[ImportProcess] = []
     try:
         for offer in offers:
-            running.append(Probing(offer, seconds))
+            running.append(ImportProcess(offer, seconds))
         return [one.result() for one in running]
     except OSError:  # no further process may be started
         return [None] * len(offers)
@@ -181,7 +178,7 @@ def answer(result: Any, document: dict[str, Any]) -> None:
         result.write(json.dumps(document).encode() + b"\n")
         result.flush()
     except OSError:
-        os._exit(UNHEARD)
+        os._exit(UNANSWERED)
     os._exit(0)
 
 
@@ -220,17 +217,16 @@ def list_tasks() -> list[TaskListing]:
     for start in range(0, len(foreign), SIDE_BY_SIDE):
         some = foreign[start : start + SIDE_BY_SIDE]
         probes.update(zip((offer.name for offer in some), probed(some, IMPORT_SECONDS), strict=True))
-    return [_listing(name, offers, probes.get(name)) for name, offers in found]
-
-
-def _listing(name: str, offers: list[EntryPoint], probe: Probe | None) -> TaskListing:
-    distribution = ", ".join(_distribution(offer) for offer in offers)
-    if probe is not None:
-        return TaskListing(name, probe.summary, distribution, probe.error)
-    try:
-        return TaskListing(name, _load(name, offers).summary, distribution)
-    except PluginError as error:
-        return TaskListing(name, "", distribution, error.message)
+    listings = []
+    for name, offers in found:
+        distribution, probe = ", ".join(_distribution(offer) for offer in offers), probes.get(name)
+        if probe is None:
+            try:
+                probe = Probe(_load(name, offers).summary)
+            except PluginError as error:
+                probe = Probe(error=error.message)
+        listings.append(TaskListing(name, probe.summary, distribution, probe.error))
+    return listings
 
 
 @phase("tasks")
@@ -284,27 +280,19 @@ def text_of(error: BaseException) -> str:
 
 def _offers() -> dict[str, list[EntryPoint]]:
     """Entry points by name; one that is found twice on the path (an editable install) counts once."""
+    try:
+        offers = list(entry_points(group=GROUP))
+    except Exception:  # importlib reads those of all packages, and one broken file ends it
+        offers = []
+        for distribution in distributions():
+            with contextlib.suppress(Exception):
+                offers += distribution.entry_points.select(group=GROUP)
     found: dict[str, list[EntryPoint]] = {}
-    for offer in _all_offers():
+    for offer in offers:
         same_name = found.setdefault(offer.name, [])
         if all(offer.value != other.value for other in same_name):
             same_name.append(offer)
     return {name: sorted(same_name, key=_distribution) for name, same_name in found.items()}
-
-
-def _all_offers() -> list[EntryPoint]:
-    """Every entry point of the group; of a package whose list of them cannot be read, none."""
-    try:
-        return list(entry_points(group=GROUP))
-    except Exception:  # importlib reads those of all packages, and one broken file ends it
-        return [offer for distribution in distributions() for offer in _offers_of(distribution)]
-
-
-def _offers_of(distribution: Any) -> list[EntryPoint]:
-    try:
-        return list(distribution.entry_points.select(group=GROUP))
-    except Exception:
-        return []
 
 
 def _distribution(offer: EntryPoint) -> str:
@@ -315,7 +303,7 @@ def _load(name: str, offers: list[EntryPoint]) -> Task:
     offer = _only(name, offers)
     if _is_foreign(offer):
         _check_containable(name, offer.value, tuple(sys.path))
-    return _imported(name, offer, IMPORT_SECONDS)
+    return import_task(offer, IMPORT_SECONDS)
 
 
 def _only(name: str, offers: list[EntryPoint]) -> EntryPoint:
@@ -325,11 +313,16 @@ def _only(name: str, offers: list[EntryPoint]) -> EntryPoint:
     return offers[0]
 
 
-def _imported(name: str, offer: EntryPoint, seconds: float) -> Task:
-    with plugin_guard(name), _time_limit(name, seconds):
+def import_task(offer: EntryPoint, seconds: float) -> Task:
+    """The task of an entry point, imported here and now.
+
+    Raises:
+        PluginError: It cannot be loaded in time, or does not keep the contract.
+    """
+    with plugin_guard(offer.name), _time_limit(offer.name, seconds):
         plugin = offer.load()
         task = plugin() if callable(plugin) else plugin
-        check_interface(name, task)
+        check_interface(offer.name, task)
     return task
 
 
@@ -365,15 +358,6 @@ def offer_of(name: str) -> EntryPoint:
     return _only(name, _known(name))
 
 
-def import_task(offer: EntryPoint, seconds: float) -> Task:
-    """The task of an entry point, imported here and now: for a process that may be lost with it.
-
-    Raises:
-        PluginError: It cannot be loaded in time, or does not keep the contract.
-    """
-    return _imported(offer.name, offer, seconds)
-
-
 def answer_probe(request: dict[str, Any]) -> None:
     """In the process of a probe: import the plugin that is asked about, answer on stdout, and end."""
     result = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
@@ -385,7 +369,7 @@ def answer_probe(request: dict[str, Any]) -> None:
     # ends this process even where nobody is left to do it, and long after whoever asked has stopped waiting
     faulthandler.dump_traceback_later(seconds + START_SECONDS, exit=True, file=nowhere)
     try:
-        answer(result, {"summary": _imported(name, EntryPoint(name, request["value"], GROUP), seconds).summary})
+        answer(result, {"summary": import_task(EntryPoint(name, request["value"], GROUP), seconds).summary})
     except PluginError as error:
         answer(result, {"error": error.message})
     except BaseException as error:

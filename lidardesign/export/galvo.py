@@ -5,12 +5,11 @@ and y are optical, twice the mechanical ones. A scanner has one place, so rays t
 another `position`, with its own origin, boresight and tour: the scanner is moved there, or another one stands there.
 A position's boresight is the middle of its rays.
 
-The order in which a steering mirror reaches all its angles with little travel: a short round trip.
-
-Both mirrors turn at once, so a step takes as long as the one that turns further: the length of a step is the larger of
-its two angles. A frame follows the next, so the trip leads back to where it began. Tours start from the nearest
-neighbour and from rows to and fro, and are improved by turning stretches round (2-opt, Croes 1958) and by moving
-stretches of up to three stops elsewhere (Or 1976) until neither helps. Nothing in it is random.
+The order is a short round trip. Both mirrors turn at once, so a step takes as long as the one that turns further: the
+length of a step is the larger of its two angles. A frame follows the next, so the trip leads back to where it began.
+Tours start from the nearest neighbour and from rows to and fro, and are improved by turning stretches round (2-opt,
+Croes 1958) and by moving stretches of up to three stops elsewhere (Or 1976) until neither helps. Nothing in it is
+random.
 """
 
 from __future__ import annotations

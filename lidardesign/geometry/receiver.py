@@ -1,9 +1,8 @@
-"""What a fixed receiver looks at: directions in its own frame, as angles about its upright and its lateral axis.
+"""What a fixed receiver looks at, and ranges along a ray from the whole path of its light to it.
 
 The receiver stands upright: its lateral axis is horizontal, wherever it looks. A field of view is the pyramid of the
-points whose two angles are both within half of its extents, as behind the rectangular stop of a camera.
-
-Emitter and receiver at two places: ranges along a ray from the whole path of its light, in closed form.
+points whose two angles, about its upright and its lateral axis, are both within half of its extents, as behind the
+rectangular stop of a camera.
 
 Light that leaves o along v, meets a surface at range r and goes on to a receiver at x has the path
 L = r + |o + r v - x|. With b = x - o: r = (L / 2) (1 - (|b| / L)^2) / (1 - b.v / L). For b = 0 it is L / 2 exactly.

@@ -1,9 +1,8 @@
-"""Archives of numpy arrays, read without running anything in them and without more memory than they truly need.
+"""Archives of numpy arrays and rows of CSV, read without running anything in them.
 
-The header of every array is read first: objects (pickles) are refused, and so is one that promises more data than it
-has. numpy itself would make room for the promise before it finds that the data is missing.
-
-The rows of a CSV file that somebody else wrote, with their lines.
+Archives take no more memory than they truly need. The header of every array is read first: objects (pickles) are
+refused, and so is one that promises more data than it has. numpy itself would make room for the promise before it finds
+that the data is missing.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""From pydantic's errors to messages that name file, line and column, what was found and what is allowed.
+"""Values of files, checked: errors name file, line and column, what was found and what is allowed.
 
-What values of files are: booleans and quoted text are no numbers, and names do not steer terminals.
-
-Reading plain documents with errors that say where: a value, its key path, and its position in the file.
+Booleans and quoted text are no numbers, and names do not steer terminals.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ HASH_SEEDS = ("20251", "20252")
 SPLITS = 2
 
 
-def fingerprints_elsewhere(config: RunConfig, kind: type, seconds: float) -> dict[str, list[str]]:
+def fingerprints_in_process(config: RunConfig, kind: type, seconds: float) -> dict[str, list[str]]:
     """Fingerprints of all scenes by split, made in a process of its own.
 
     Arguments:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 from lidardesign import registry
 from lidardesign.config import resolve
 from lidardesign.errors import ConfigError, DataError, LidardesignError
-from lidardesign.registry import BEGUN, GRACE_SECONDS, START_SECONDS, UNHEARD, Apart, answer
+from lidardesign.registry import BEGUN, GRACE_SECONDS, START_SECONDS, UNANSWERED, PluginProcess, answer
 from lidardesign.testing.law import LOADS, Finding, Law, Limits, error_words, place_of
 from lidardesign.testing.watch import Watch
 
@@ -61,7 +61,7 @@ class CheckRequest:
     limits: Limits = field(default_factory=Limits)
 
 
-def check_apart(request: CheckRequest) -> Iterator[Finding]:
+def check_in_process(request: CheckRequest) -> Iterator[Finding]:
     """What became of each law, as it is found; the first is that the plugin loads.
 
     Raises:
@@ -73,7 +73,7 @@ def check_apart(request: CheckRequest) -> Iterator[Finding]:
         yield from _all_lost(0, error_words(error))
         return
     with tempfile.TemporaryDirectory(prefix="lidardesign-check-") as folder:
-        child = Apart(CHILD, _as_document(request, offer, folder))
+        child = PluginProcess(CHILD, _as_document(request, offer, folder))
         try:
             yield from _read_findings(child, request.limits.seconds)
         finally:
@@ -94,7 +94,7 @@ def _as_document(request: CheckRequest, offer: EntryPoint, folder: str) -> dict[
     }
 
 
-def _read_findings(child: Apart, seconds: float) -> Iterator[Finding]:
+def _read_findings(child: PluginProcess, seconds: float) -> Iterator[Finding]:
     """Findings as they come; where the process is lost, the law that it tried does not hold."""
     _, line = child.next_line(time.monotonic() + START_SECONDS)
     if line != BEGUN:
@@ -112,7 +112,7 @@ def _read_findings(child: Apart, seconds: float) -> Iterator[Finding]:
             return
 
 
-def _next_finding(child: Apart, seconds: float, *, loading: bool) -> dict[str, Any] | str:
+def _next_finding(child: PluginProcess, seconds: float, *, loading: bool) -> dict[str, Any] | str:
     """The next line that is a finding, or how the process was lost; every call of the task's code has time of its own.
 
     Arguments:
@@ -267,4 +267,4 @@ def _write(result: BinaryIO, document: dict[str, Any]) -> None:
         result.write(json.dumps(document).encode() + b"\n")
         result.flush()
     except OSError:
-        os._exit(UNHEARD)
+        os._exit(UNANSWERED)

@@ -10,7 +10,7 @@ from lidardesign.errors import LidardesignError
 from lidardesign.evaluate.scene_scores import gives_residuals
 from lidardesign.scene import Scene
 from lidardesign.task import Split
-from lidardesign.testing.elsewhere import fingerprints_elsewhere
+from lidardesign.testing.elsewhere import fingerprints_in_process
 from lidardesign.testing.fingerprint import fingerprint, geometry_fingerprint
 from lidardesign.testing.law import BrokenLawError, Law, LawHolds, NotApplicable, Subject
 
@@ -82,7 +82,7 @@ def check_elsewhere(subject: Subject) -> LawHolds | NotApplicable:
     kind = type(subject.task)
     if kind.__module__ == "__main__" or "<locals>" in kind.__qualname__ or find_spec(kind.__module__) is None:
         return NotApplicable("the task's class cannot be imported in another process")
-    found = fingerprints_elsewhere(subject.config, kind, subject.limits.seconds)
+    found = fingerprints_in_process(subject.config, kind, subject.limits.seconds)
     for split in SPLITS:
         mine = [fingerprint(scene) for scene in subject.scenes(split)]
         if found[split] != mine:

@@ -18,7 +18,7 @@ from lidardesign.registry import START_SECONDS
 from lidardesign.testing import process
 from lidardesign.testing.contract import LAWS
 from lidardesign.testing.law import Finding, Limits
-from lidardesign.testing.process import CheckRequest, check_apart
+from lidardesign.testing.process import CheckRequest, check_in_process
 
 SCORE = "    def score(self, scene, returns):\n"
 SCENES = "    def scenes(self, config, split, seed):\n"
@@ -99,7 +99,7 @@ def findings(place):
 
     def checked(name):
         limits = Limits(SECONDS.get(name, 60.0), MEMORY.get(name, 2**32))
-        return name, list(check_apart(CheckRequest(name, limits=limits)))
+        return name, list(check_in_process(CheckRequest(name, limits=limits)))
 
     before = files_under(place)
     with ThreadPoolExecutor(4) as pool:
@@ -174,7 +174,7 @@ def test_a_good_plugin_keeps_every_law_that_applies(place, tmp_path, monkeypatch
 
 def test_an_unknown_task_and_a_refused_configuration_are_the_users_errors(place, tmp_path, monkeypatch, capsys):
     with pytest.raises(ConfigError, match="did you mean 'good'"):
-        list(check_apart(CheckRequest("god")))
+        list(check_in_process(CheckRequest("god")))
     call = caller(capsys, tmp_path, monkeypatch)
     result = call("tasks", "check", "good", "--set", "no_such_key=1", "--json")
     assert result.code == 2

@@ -154,13 +154,13 @@ def check(
         with phase("libraries"):
             from lidardesign.testing.contract import LAWS, refuse_broken
             from lidardesign.testing.law import Limits
-            from lidardesign.testing.process import CheckRequest, check_apart
+            from lidardesign.testing.process import CheckRequest, check_in_process
 
         request = CheckRequest(name, config, tuple(overrides or ()), seed, Limits(seconds, memory_mb * MEBIBYTE))
         findings = []
         with output.progress("law") as bar, phase("contract"):
             line = bar.add_task("contract", total=len(LAWS) + 1, law="") if bar else None
-            for finding in check_apart(request):
+            for finding in check_in_process(request):
                 findings.append(finding)
                 if bar is not None and line is not None:
                     bar.update(line, completed=len(findings), law=finding.law)

@@ -9,11 +9,8 @@ sqrt(n) (Cramer and Rao's bound for a Gaussian without background), or as far as
 number is Poisson: the return is lost with the probability that the echo's bins hold fewer than a return needs. A pulse
 has a width: a gate's end that cuts it off moves the mean of what is left by sigma phi(z) / Phi(z), z the distance in
 sigma, and a surface outside the gate spills n Phi(-z) photons into it, which make a return with at most the probability
-that there is any.
-
-n is what a detector that is blind after a count leaves of them.
-
-An estimate where n is a few: photons are then in the tail as often as not, and a lost return has no range.
+that there is any. n is what a detector that is blind after a count leaves of them. An estimate where n is a few:
+photons are then in the tail as often as not, and a lost return has no range.
 """
 
 from __future__ import annotations
