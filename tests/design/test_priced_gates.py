@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support.tables import each_row
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.layouts.gates import Heard, _Prices, central_intervals, gates_within
+from lidardesign.design.layouts.gates import RayRanges, _Prices, central_intervals, gates_within
 from lidardesign.design.mixture.bounds import Bounds
 from lidardesign.design.sensor import interval_factor
 
@@ -27,7 +27,7 @@ def hearing(seed, rays, per_ray=12, *, weighted=True):
     centre = generator.uniform(0.5, 3, (rays, 2))
     ranges = centre[ray, generator.integers(2, size=len(ray))] + generator.normal(0, 0.1, len(ray))
     weights = generator.uniform(0.01, 1, len(ray)) if weighted else np.ones(len(ray))
-    return Heard(np.abs(ranges), weights, ray, rays)
+    return RayRanges(np.abs(ranges), weights, ray, rays)
 
 
 def free(rays):
@@ -115,7 +115,7 @@ def test_the_unit_of_weights_does_not_matter(seed, factor):
 
 def test_a_ray_that_hears_more_gets_the_bandwidth():
     ranges = np.concatenate([np.linspace(1, 2, 100), np.linspace(1, 2, 10)])
-    heard = Heard(ranges, np.ones(110), np.repeat([0, 1], [100, 10]), 2)
+    heard = RayRanges(ranges, np.ones(110), np.repeat([0, 1], [100, 10]), 2)
     gates = gates_within(heard, free(2), 1.0, MODEL, 80)
     widths = np.diff(gates, axis=1)[:, 0]
     assert widths[0] > 0.9
@@ -124,7 +124,7 @@ def test_a_ray_that_hears_more_gets_the_bandwidth():
 
 def test_a_gate_goes_to_the_denser_of_two_surfaces():
     ranges = np.concatenate([np.linspace(1.0, 1.1, 30), np.linspace(2.0, 2.1, 10)])
-    heard = Heard(ranges, np.ones(40), np.zeros(40, dtype=int), 1)
+    heard = RayRanges(ranges, np.ones(40), np.zeros(40, dtype=int), 1)
     # both together take 74 bins, the near one 7
     ((start, end),) = gates_within(heard, free(1), 1.0, MODEL, 60)
     np.testing.assert_allclose([start, end], [1.0, 1.1], atol=1e-6)
@@ -164,14 +164,14 @@ def test_the_order_of_returns_and_rays_does_not_matter(seed):
     heard, generator = hearing(seed, 9), np.random.default_rng(seed)
     order, turn = generator.permutation(len(heard.ray)), generator.permutation(9)
     place = np.argsort(turn)
-    other = Heard(heard.range_m[order], heard.weights[order], place[heard.ray[order]], 9)
+    other = RayRanges(heard.range_m[order], heard.weights[order], place[heard.ray[order]], 9)
     one = gates_within(heard, free(9), 0.9, MODEL, 45)
     np.testing.assert_allclose(gates_within(other, free(9), 0.9, MODEL, 45), one[turn], atol=1e-6)
 
 
 def test_returns_without_weight_are_nothing():
     heard = hearing(1, 10)
-    more = Heard(
+    more = RayRanges(
         np.append(heard.range_m, [9.0, 0.01]), np.append(heard.weights, [0, 0]), np.append(heard.ray, [0, 1]), 10
     )
     for limit in (None, 30):
@@ -182,6 +182,6 @@ def test_returns_without_weight_are_nothing():
 
 
 def test_what_gates_hold_is_counted_with_their_ends():
-    heard = Heard(np.array([1.0, 2.0, 3.0, 1.0]), np.array([1.0, 2.0, 4.0, 8.0]), np.array([0, 0, 0, 1]), 2)
+    heard = RayRanges(np.array([1.0, 2.0, 3.0, 1.0]), np.array([1.0, 2.0, 4.0, 8.0]), np.array([0, 0, 0, 1]), 2)
     assert heard.held_by(np.array([[1.0, 2.0], [1.5, 9.0]])) == 3.0
     assert heard.held_by(np.array([[0.0, 9.0], [1.0, 1.0]])) == 15.0

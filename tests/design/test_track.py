@@ -25,7 +25,7 @@ from lidardesign.design.layouts.quantise import lloyd
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.layouts.scan import fit_track
 from lidardesign.design.layouts.track import interpolated, placed, travels
-from lidardesign.design.layouts.track_kmeans import Along, aimed_rays
+from lidardesign.design.layouts.track_kmeans import TrackSamples, aimed_rays
 from lidardesign.design.sensor import DesignSpec, Sensor, Track
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.run.yaml import dump_yaml, parse_yaml
@@ -219,7 +219,7 @@ def test_every_update_of_the_cells_lowers_their_cost(monkeypatch):
 
     monkeypatch.setattr(module, "_cost", watched)
     knots = np.linspace(-0.5, 4.0, 10)
-    samples = Along.of(SAMPLES.points, SAMPLES.weights, knots, 0, AISLE)
+    samples = TrackSamples.of(SAMPLES.points, SAMPLES.weights, knots, 0, AISLE)
     aimed_rays(samples, 5, np.random.default_rng(0))
     assert len(costs) > 3
     # nearer than a hundredth of the mean distance squares are minimised instead

@@ -19,7 +19,7 @@ from scipy.special import ndtri
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.layouts.fields import FIELD_ROUNDING_RAD, Members, members, ray_gates, rays_in_fields
-from lidardesign.design.layouts.gates import Heard, gates_within
+from lidardesign.design.layouts.gates import RayRanges, gates_within
 from lidardesign.design.layouts.grid import field_on_sphere, grid_tangent
 from lidardesign.design.layouts.layout import FittedDesign, Layout, missing_samples, shares_of
 from lidardesign.design.layouts.quantise import lloyd, samples_for
@@ -174,7 +174,7 @@ def shared_rays(design: DesignSpec, shares: np.ndarray, samples: Samples, seed: 
     if not count:
         return None
     looking, sensor = np.concatenate(directions), np.concatenate(sensors)
-    heard = Heard(np.concatenate(ranges), np.concatenate(weights), np.concatenate(rays), count)
+    heard = RayRanges(np.concatenate(ranges), np.concatenate(weights), np.concatenate(rays), count)
     gate = _priced_gates(design, heard, sensor, samples)
     order = np.lexsort((looking[:, 0], looking[:, 1], np.round(looking[:, 2], ORDER_DECIMALS), sensor))
     origin = np.array([s.origin_m for s in design.sensors], dtype=np.float64)[sensor[order]]
@@ -204,7 +204,7 @@ def _cells(
     return directions, owner
 
 
-def _priced_gates(design: DesignSpec, heard: Heard, sensor: np.ndarray, samples: Samples) -> np.ndarray:
+def _priced_gates(design: DesignSpec, heard: RayRanges, sensor: np.ndarray, samples: Samples) -> np.ndarray:
     """Gates by what rays hear, inside their sensors' bounds and the design's bandwidth, shape (N, 2) [m]."""
     constraints = Constraints.from_mapping(design.constraints, where=f"constraints of {design.name}")
     sensors = tuple(range(len(design.sensors)))
@@ -224,7 +224,7 @@ def _narrowed(design: DesignSpec, gates: np.ndarray, sensor: np.ndarray, samples
     shape = ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES)
     ranges = gates.mean(axis=1)[:, None] + np.diff(gates, axis=1) / 2 * shape / shape[-1]
     ray = np.repeat(np.arange(len(gates)), QUANTILES)
-    heard = Heard(ranges.reshape(-1), np.ones(ranges.size), ray, len(gates))
+    heard = RayRanges(ranges.reshape(-1), np.ones(ranges.size), ray, len(gates))
     return _priced_gates(design, heard, sensor, samples)
 
 

@@ -36,7 +36,7 @@ from scipy.special import chdtri, ndtri
 from lidardesign.design.constraints.document import Constraints, SensorRules, rules_of
 from lidardesign.design.constraints.origins import box_around, free_boxes, inside_excluded, origin_box
 from lidardesign.design.layouts.fields import FIELD_ROUNDING_RAD, SMALLEST_ANGLE_RAD, SMALLEST_LENGTH
-from lidardesign.design.layouts.gates import SMALLEST_CELL, central_intervals, kept_gates
+from lidardesign.design.layouts.gates import SMALLEST_CELL, bounded_gates, central_intervals
 from lidardesign.design.layouts.grid import field_on_sphere, low_discrepancy
 from lidardesign.design.layouts.layout import Layout, shares_of
 from lidardesign.design.layouts.quantise import lloyd, samples_for
@@ -326,7 +326,7 @@ def _gates(part: Features, origins: np.ndarray, looking: np.ndarray, sensor: Sen
     gate = np.tile(sensor.gate_m, (len(origins), 1))
     wanted = np.clip(wanted, *sensor.gate_m)
     known = np.flatnonzero((effective >= SMALLEST_CELL) & (np.diff(wanted, axis=1)[:, 0] > 0))
-    gate[known] = kept_gates(wanted[known], sensor, bounds.take(np.zeros(len(known), dtype=np.int64)))
+    gate[known] = bounded_gates(wanted[known], sensor, bounds.take(np.zeros(len(known), dtype=np.int64)))
     return gate
 
 
@@ -359,7 +359,7 @@ def _gaussian_rays(
     gate = np.clip(np.stack([middle - reach, middle + reach], axis=1), *sensor.gate_m)
     empty = gate[:, 1] <= gate[:, 0]
     gate[empty] = sensor.gate_m
-    gate = kept_gates(gate, sensor, bounds.take(np.zeros(count, dtype=np.int64)))
+    gate = bounded_gates(gate, sensor, bounds.take(np.zeros(count, dtype=np.int64)))
     return rays[:, :3], direction(rays[:, AZIMUTH], rays[:, ELEVATION]), gate
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.layouts.gates import SMALLEST_CELL, central_intervals, kept_gates
+from lidardesign.design.layouts.gates import SMALLEST_CELL, bounded_gates, central_intervals
 from lidardesign.design.layouts.grid import field_on_sphere, grid_tangent
 from lidardesign.design.layouts.layout import Layout, missing_samples, shares_of
 from lidardesign.design.mixture.bounds import bounds_of
@@ -179,6 +179,6 @@ def ray_gates(
             known = np.flatnonzero((effective >= SMALLEST_CELL) & (np.diff(wanted, axis=1)[:, 0] > 0))
             wanted = np.clip(wanted[known], *sensor.gate_m)
             bounds = bounds_of(constraints.rules, space, (index,), interval_factor(design.level))
-            own[known] = kept_gates(wanted, sensor, bounds.take(np.zeros(len(known), dtype=np.int64)))
+            own[known] = bounded_gates(wanted, sensor, bounds.take(np.zeros(len(known), dtype=np.int64)))
         gates.append(own)
     return np.concatenate(gates)

@@ -71,7 +71,7 @@ def admissible_gates(wanted_m: np.ndarray, bounds: Bounds) -> tuple[np.ndarray, 
     return fit_gate(centre, np.square(spread), bounds, smallest)
 
 
-def kept_gates(wanted: np.ndarray, sensor: Sensor, bounds: Bounds) -> np.ndarray:
+def bounded_gates(wanted: np.ndarray, sensor: Sensor, bounds: Bounds) -> np.ndarray:
     """Wanted gates (K, 2), those that break a bound replaced by the best gate that keeps all of them [m]."""
     start, end = sensor.gate_m
     width = np.diff(wanted, axis=1)[:, 0]
@@ -93,7 +93,7 @@ BISECTIONS = 26
 
 
 @dataclass(frozen=True, eq=False)
-class Heard:
+class RayRanges:
     """Ranges that rays would measure, over scenes or samples.
 
     Arguments:
@@ -115,7 +115,7 @@ class Heard:
         return float(self.weights[held].sum())
 
 
-def gates_within(heard: Heard, bounds: Bounds, level: float, model: Bandwidth, most_bins: int | None) -> np.ndarray:
+def gates_within(heard: RayRanges, bounds: Bounds, level: float, model: Bandwidth, most_bins: int | None) -> np.ndarray:
     """Gates that hold the level of what each ray hears, or less where their bins would be too many.
 
     Arguments:
@@ -152,11 +152,11 @@ def gates_within(heard: Heard, bounds: Bounds, level: float, model: Bandwidth, m
     return admitted(prices.gates(float(np.exp(dear))))
 
 
-def _admissible(heard: Heard, bounds: Bounds, level: float) -> tuple[Heard, np.ndarray]:
+def _admissible(heard: RayRanges, bounds: Bounds, level: float) -> tuple[RayRanges, np.ndarray]:
     """What gates may hear at all, and the gates (N, 2) [m] that hold the level of it; narrow where it is nothing."""
     low, high = np.maximum(bounds.start_low, 0.0), bounds.end_high
     kept = (heard.weights > 0) & (heard.range_m >= low[heard.ray]) & (heard.range_m <= high[heard.ray])
-    inside = Heard(heard.range_m[kept], heard.weights[kept], heard.ray[kept], heard.count)
+    inside = RayRanges(heard.range_m[kept], heard.weights[kept], heard.ray[kept], heard.count)
     wide, _ = central_intervals(inside.range_m, inside.weights, inside.ray, heard.count, level)
     middle = np.bincount(heard.ray, heard.range_m, heard.count) / np.bincount(heard.ray, minlength=heard.count)
     return inside, np.where(np.isnan(wide), np.clip(middle, low, high)[:, None], wide)
@@ -171,7 +171,7 @@ class _Prices:
     until: np.ndarray
 
     @classmethod
-    def of(cls, heard: Heard, wide: np.ndarray) -> _Prices:
+    def of(cls, heard: RayRanges, wide: np.ndarray) -> _Prices:
         start, end = wide[heard.ray].T
         inside = (heard.range_m >= start) & (heard.range_m <= end) & (heard.weights > 0)
         ranges, weights, ray = heard.range_m[inside], heard.weights[inside], heard.ray[inside]

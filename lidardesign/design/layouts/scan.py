@@ -38,7 +38,7 @@ from lidardesign.design.layouts.layout import FittedDesign, Layout, likelihood_e
 from lidardesign.design.layouts.quantise import SAMPLES_PER_RAY, lloyd
 from lidardesign.design.layouts.sensor_fit import FitProblem, admitted_samples, group_samples
 from lidardesign.design.layouts.track import TRAVELLED, boresight_azimuth, interpolated
-from lidardesign.design.layouts.track_kmeans import Along, aimed_rays
+from lidardesign.design.layouts.track_kmeans import TrackSamples, aimed_rays
 from lidardesign.design.mixture.bounds import Bounds, Group, bounds_of
 from lidardesign.design.mixture.conditions import fixed_conditions
 from lidardesign.design.mixture.em import EMResult, from_labels
@@ -255,7 +255,7 @@ def fit_track(
     check_support(support, group, mass=support.total, several=False)
     places = _knots(*ends, support.effective, read_out.rays, knots)
     used = support.weights > 0
-    along = Along.of(support.points[used], support.weights[used], places, dimension, samples.space)
+    along = TrackSamples.of(support.points[used], support.weights[used], places, dimension, samples.space)
     bounds = bounds_of(constraints.rules, samples.space, group.sensors, interval_factor(level))
     centres, labels = aimed_rays(along, read_out.rays, random_generator(seed, "track"))
     azimuth, elevation = _admitted(centres, along, bounds)
@@ -356,7 +356,7 @@ def _knots(low: float, high: float, effective: float, rays: int, wanted: int | N
     return np.linspace(low, high, max(min(usual, affordable), 1) + 1)
 
 
-def _admitted(centres: np.ndarray, along: Along, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
+def _admitted(centres: np.ndarray, along: TrackSamples, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
     """Azimuths, unrolled along the knots, and elevations inside their bounds, shape (P, N) each [rad]."""
     azimuth, elevation = angles(centres)
     space = along.space
@@ -374,7 +374,7 @@ def _admitted(centres: np.ndarray, along: Along, bounds: Bounds) -> tuple[np.nda
 
 
 def _with_gates(
-    along: Along,
+    along: TrackSamples,
     labels: np.ndarray,
     azimuth: np.ndarray,
     elevation: np.ndarray,
@@ -419,7 +419,7 @@ def _worst_widths(track: Track, read_out: BandwidthBudget) -> np.ndarray:
 
 
 def _wanted_gates(
-    along: Along, labels: np.ndarray, azimuth: np.ndarray, elevation: np.ndarray, level: float
+    along: TrackSamples, labels: np.ndarray, azimuth: np.ndarray, elevation: np.ndarray, level: float
 ) -> np.ndarray:
     """Central intervals of what rays observe, projected onto them, smooth along the knots: (P, N, 2) [m]."""
     knots, count = azimuth.shape
@@ -447,7 +447,7 @@ def _bridged(gates: np.ndarray) -> np.ndarray:
 
 
 def _sensors(
-    along: Along, labels: np.ndarray, track: Track, bounds: Bounds, level: float
+    along: TrackSamples, labels: np.ndarray, track: Track, bounds: Bounds, level: float
 ) -> tuple[tuple[Sensor, ...], float, float]:
     """One sensor per ray, the ray in the middle of its travel; the samples' log-likelihood and its error [nats]."""
     middle = float(along.knots[0] + along.knots[-1]) / 2
@@ -466,7 +466,7 @@ def _sensors(
 
 
 def _components(
-    along: Along, labels: np.ndarray, track: Track, knot: int, bounds: Bounds
+    along: TrackSamples, labels: np.ndarray, track: Track, knot: int, bounds: Bounds
 ) -> tuple[float, Mixture, Features]:
     """The share of the samples near a knot, the rays there as mixture components, and these samples."""
     chosen, weights = along.near(knot)
@@ -484,7 +484,7 @@ def _components(
 
 
 def _in_the_middle(
-    track: Track, middle: float, along: Along, mixture: Mixture, axes: Axes, level: float
+    track: Track, middle: float, along: TrackSamples, mixture: Mixture, axes: Axes, level: float
 ) -> tuple[Sensor, ...]:
     azimuth, elevation, gate = interpolated(track, middle)
     origin = np.array(along.space.low[:3])

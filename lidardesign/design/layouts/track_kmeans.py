@@ -51,7 +51,7 @@ SMALLEST_STIFFNESS = SLACK
 
 
 @dataclass(frozen=True, eq=False)
-class Along:
+class TrackSamples:
     """Weighted samples along a condition, and the knots that they lie between.
 
     Arguments:
@@ -75,7 +75,7 @@ class Along:
     @classmethod
     def of(
         cls, points: np.ndarray, weights: np.ndarray, knots: np.ndarray, dimension: int, space: DesignSpace
-    ) -> Along:
+    ) -> TrackSamples:
         """Samples with weights that need not sum to 1, none of them beyond the first or last of ascending knots."""
         values = points[:, dimension]
         left = np.clip(np.searchsorted(knots, values, side="right") - 1, 0, len(knots) - 2)
@@ -94,7 +94,7 @@ class Along:
         return (1 - share) * values[self.left, labels] + share * values[self.left + 1, labels]
 
 
-def aimed_rays(along: Along, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def aimed_rays(along: TrackSamples, count: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """What the rays aim at, relative to the sensor, at the knots (P, N, 3), and the ray of each sample (M,)."""
     features = Features.of(along.points, along.weights, Axes.of(along.space), along.space)
     surface = ray_features(features) - along.points[:, :3]
@@ -117,7 +117,7 @@ def aimed_rays(along: Along, count: int, generator: np.random.Generator) -> tupl
     return centres[:, order], np.argsort(order)[labels]
 
 
-def _cost(along: Along, distance: np.ndarray, centres: np.ndarray, stiffness: float) -> float:
+def _cost(along: TrackSamples, distance: np.ndarray, centres: np.ndarray, stiffness: float) -> float:
     """What every sweep lowers: the weighted mean distance and the cost of bends [m]."""
     bends = np.square(np.diff(centres, n=2, axis=0)).sum()
     return float(along.weights @ distance) + stiffness / 2 * float(bends)
@@ -129,7 +129,7 @@ def _upwards(centres: np.ndarray) -> np.ndarray:
     return np.lexsort((azimuth, np.round(elevation, ORDER_DECIMALS)))
 
 
-def _started(along: Along, surface: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
+def _started(along: TrackSamples, surface: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
     """Lloyd's cells at each knot, each begun at its neighbour's, from the best known knot outward: (P, N, 3)."""
     windows = [along.near(knot) for knot in range(len(along.knots))]
     first = int(np.argmax([effective_count(weights) for _, weights in windows]))
@@ -171,7 +171,7 @@ def _best_start(points: np.ndarray, weights: np.ndarray, count: int, generator: 
     return best
 
 
-def _nearest(along: Along, surface: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _nearest(along: TrackSamples, surface: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The ray that aims nearest to each sample at the sample's own condition, and its distance, shape (M,)."""
     labels = np.empty(len(surface), dtype=np.int64)
     order = np.argsort(along.left, kind="stable")
@@ -195,7 +195,7 @@ def _nearest_between(surface: np.ndarray, share: np.ndarray, left: np.ndarray, r
 
 
 def _smoothed(
-    along: Along,
+    along: TrackSamples,
     surface: np.ndarray,
     pulls: np.ndarray,
     labels: np.ndarray,

@@ -14,7 +14,7 @@ from scipy.special import ndtri
 
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.layouts.density import bandwidth_limit
-from lidardesign.design.layouts.gates import Heard, gates_within
+from lidardesign.design.layouts.gates import RayRanges, gates_within
 from lidardesign.design.layouts.rays import gates_of, layout_of
 from lidardesign.design.mixture.bounds import bounds_of
 from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor
@@ -69,7 +69,7 @@ class Gating:
         model, limit = bandwidth_limit(constraints, len(rays))
         bins = model.bins(np.diff(rays.gate_m, axis=1)[:, 0])
         most = (int(bins.sum()) if limit is None else limit) - int(bins.sum() - bins[known].sum())
-        own = Heard(heard.range_m, heard.weights, place[heard.ray], len(known))
+        own = RayRanges(heard.range_m, heard.weights, place[heard.ray], len(known))
         gates = rays.gate_m.copy()
         gates[known] = gates_within(own, bounds, EVERYTHING, model, most)
         too_wide = int(model.bins(gates[:, 1] - gates[:, 0])[known].sum()) > most
@@ -77,7 +77,7 @@ class Gating:
             return design
         return _with_gates(design, gates)
 
-    def _heard(self, rays: Rays, spread_m: float) -> Heard:
+    def _heard(self, rays: Rays, spread_m: float) -> RayRanges:
         """The targets that rays meet with open gates, over all scenes and their frames."""
         low, high = self.space.low[RANGE], self.space.high[RANGE]
         gates = np.tile([low, high], (len(rays), 1))
@@ -92,7 +92,7 @@ class Gating:
                 indices.append(hit)
         offsets = spread_m * ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES)
         spread = np.clip(np.concatenate(ranges)[:, None] + offsets, low, high).reshape(-1)
-        return Heard(spread, np.ones(len(spread)), np.repeat(np.concatenate(indices), QUANTILES), len(rays))
+        return RayRanges(spread, np.ones(len(spread)), np.repeat(np.concatenate(indices), QUANTILES), len(rays))
 
 
 def has_ray_gates(design: DesignSpec) -> bool:
