@@ -1,11 +1,7 @@
-"""Two designs beside each other, sensor by sensor.
+"""Two designs beside each other, sensor by sensor; what a design costs to read out; and whether it fits a space at all.
 
 Sensors of the same names are compared by name; otherwise each sensor of one design with one of the other so that all
 differences together are smallest, where a metre of place and of gate counts as much as a radian at the designs' range.
-
-What a design costs to read out, from its file alone.
-
-Designs that stand or hear so far outside a design space that their lengths are likelier in another unit.
 """
 
 from __future__ import annotations
@@ -23,6 +19,9 @@ from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.space import RANGE, DesignSpace
 
 RIGHT_ANGLE_M = 1.0
+# How far a rig of others may stand beside a space, in sizes of it: the diagonal of its box of origins and its reach.
+FAR_SIZES = 10.0
+MODEL_KEYS = ("bin_ps", "bits_per_bin", "rate_hz")
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,9 +93,6 @@ def _distances(first: DesignSpec, second: DesignSpec) -> np.ndarray:
     return sum(np.linalg.norm(one[key][:, None] - other[key][None], axis=2) for key in one)
 
 
-MODEL_KEYS = ("bin_ps", "bits_per_bin", "rate_hz")
-
-
 @dataclass(frozen=True)
 class Readout:
     """The bandwidth of a design.
@@ -134,26 +130,12 @@ def readout_of(design: DesignSpec) -> Readout:
         once = model.mbps_of_widths(gates[:, 1] - gates[:, 0])
         return Readout(model, once, once, len(gates))
     widths = np.array([sensor.gate_m[1] - sensor.gate_m[0] for sensor in design.sensors])
-    counts = _counts(design)
-    if counts is None:
-        once = float(design.weights @ np.array([model.mbps_of_widths(width) for width in widths]))
-        return Readout(model, once, once, None)
-    once = model.mbps_of_widths(widths, counts)
-    return Readout(model, once, once, int(counts.sum()))
-
-
-def _counts(design: DesignSpec) -> np.ndarray | None:
-    """Rays per sensor, shape (G,); None where the design leaves them open."""
-    own = [sensor.rays for sensor in design.sensors]
-    if None not in own:
-        return np.array(own, dtype=np.int64)
     count = layout_of(design).own_count(design)
-    return None if count is None else shares_of(design, count)
-
-
-# In sizes of the space: the diagonal of its box of origins and its reach. Rigs of others may stand a bit beside.
-FAR_SIZES = 10.0
-UNIT = "are its lengths in millimetres?"
+    if count is None:
+        once = float(design.weights @ np.array([model.mbps_of_widths(width) for width in widths]))
+    else:
+        once = model.mbps_of_widths(widths, shares_of(design, count))
+    return Readout(model, once, once, count)
 
 
 def outside_notes(design: DesignSpec, space: DesignSpace) -> list[str]:
@@ -165,23 +147,18 @@ def outside_notes(design: DesignSpec, space: DesignSpace) -> list[str]:
     """
     low, high = np.array(space.low[:3]), np.array(space.high[:3])
     size_m = float(np.linalg.norm(high - low)) + space.high[RANGE]
-    origins_m, starts_m = _places(design)
+    origins_m = np.array([sensor.origin_m for sensor in design.sensors]).reshape(-1, 3)
+    starts_m = np.array([sensor.gate_m[0] for sensor in design.sensors])
+    if design.ray_table is not None:
+        origins_m = np.concatenate([origins_m, design.ray_table.origin_m])
+        starts_m = np.concatenate([starts_m, design.ray_table.gate_m[:, 0]])
+    unit = "are its lengths in millimetres?"
     apart_m = np.linalg.norm(np.maximum(np.maximum(origins_m - high, low - origins_m), 0.0), axis=1)
     if len(apart_m) and apart_m.max() > FAR_SIZES * size_m:
-        return [f"{design.name} stands {apart_m.max():.4g} m outside the run's design space; {UNIT}"]
+        return [f"{design.name} stands {apart_m.max():.4g} m outside the run's design space; {unit}"]
     if len(starts_m) and starts_m.max() > FAR_SIZES * size_m:
         return [
             f"{design.name} hears from {starts_m.max():.4g} m on, and the run's design space ends at "
-            f"{space.high[RANGE]:.4g} m; {UNIT}"
+            f"{space.high[RANGE]:.4g} m; {unit}"
         ]
     return []
-
-
-def _places(design: DesignSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Origins (N, 3) and where gates begin (M,) of everything in a design [m]."""
-    origins_m = [np.array([sensor.origin_m for sensor in design.sensors]).reshape(-1, 3)]
-    starts_m = [np.array([sensor.gate_m[0] for sensor in design.sensors])]
-    if design.ray_table is not None:
-        origins_m.append(design.ray_table.origin_m)
-        starts_m.append(design.ray_table.gate_m[:, 0])
-    return np.concatenate(origins_m), np.concatenate(starts_m)

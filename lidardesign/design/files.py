@@ -5,14 +5,11 @@ Of a sensor's spreads and its intervals one is enough. The spread is authoritati
 interval, the spread follows, so that people can write designs: with z standard deviations on each side that
 hold `level` of a normal distribution, field of view = 2 z spread and gate = mean range -+ z spread, its start
 cut at 0. Numbers are written with all their digits: what is loaded is bit for bit what was saved.
-
-Tracks and conditions as they stand in a design file: units in the keys, one row of rays per knot.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -44,6 +41,37 @@ from lidardesign.run.validation import LocateKey, Node
 from lidardesign.run.yaml import Document, dump_yaml, load_yaml
 from lidardesign.space import DIMENSIONS
 
+SCHEMA_VERSION = 1
+SCHEMA_FILE = Path(__file__).with_name("design.schema.json")
+LAYOUTS = get_args(LayoutName)
+# A file of a hundred thousand explicit rays; the YAML reader's own limit is for settings.
+MAX_BYTES = 64_000_000
+# Eight numbers a ray stay below the number of values that the YAML reader accepts in one file.
+MOST_TABLE_RAYS = 60_000
+# How far a written interval may be from the one that the spread gives: digits that a person may have rounded.
+AGREEMENT = COARSE_SLACK
+# Weights that sum to 1 within this are taken as they stand, so that loading changes no bit.
+WEIGHT_SUM_TOLERANCE = SLACK
+# How much below zero rounding may push an eigenvalue of a covariance, relative to the largest.
+COVARIANCE_ROUNDING = SLACK
+
+REQUIRED = ("schema_version", "sensors")
+OPTIONAL = ("name", "layout", "level", "rays", "at", "gates", "ray_table", "track", "constraints", "provenance")
+SENSOR_REQUIRED = ("origin_m", "boresight")
+SENSOR_OPTIONAL = (
+    "name", "part", "weight", "field_of_view_rad", "gate_m", "range_m", "spread", "travel_m", "coupling", "rays",
+)  # fmt: skip
+COUPLING_KEYS = ("direction_rad_per_m", "range_m_per_m", "range_m_per_rad", "spread_rad", "spread_m")
+TABLE_KEYS = (
+    "origin_x_m",
+    "origin_y_m",
+    "origin_z_m",
+    "azimuth_rad",
+    "elevation_rad",
+    "gate_start_m",
+    "gate_end_m",
+    "sensor",
+)
 TRACK_KEYS = (
     "dimension", "knots_m", "azimuth_rad", "elevation_rad", "gate_start_m", "gate_end_m", "sensor",
 )  # fmt: skip
@@ -94,48 +122,6 @@ def read_track(node: Node, sensors: int) -> Track:
     return Track(dimension, knots, azimuth, elevation, np.stack([start, end], axis=2), index)
 
 
-def read_at(node: Node) -> Mapping[str, float]:
-    """The condition values of a design, as {"x_m": 0.37}.
-
-    Raises:
-        ConfigError: A name that is no dimension of the design space, or a value that is no number.
-    """
-    return {name: item.number() for name, item in node.mapping((), DIMENSIONS).items()}
-
-
-SCHEMA_VERSION = 1
-SCHEMA_FILE = Path(__file__).with_name("design.schema.json")
-LAYOUTS = get_args(LayoutName)
-# A file of a hundred thousand explicit rays; the YAML reader's own limit is for settings.
-MAX_BYTES = 64_000_000
-# Eight numbers a ray stay below the number of values that the YAML reader accepts in one file.
-MOST_TABLE_RAYS = 60_000
-# How far a written interval may be from the one that the spread gives: digits that a person may have rounded.
-AGREEMENT = COARSE_SLACK
-# Weights that sum to 1 within this are taken as they stand, so that loading changes no bit.
-WEIGHT_SUM_TOLERANCE = SLACK
-# How much below zero rounding may push an eigenvalue of a covariance, relative to the largest.
-COVARIANCE_ROUNDING = SLACK
-
-REQUIRED = ("schema_version", "sensors")
-OPTIONAL = ("name", "layout", "level", "rays", "at", "gates", "ray_table", "track", "constraints", "provenance")
-SENSOR_REQUIRED = ("origin_m", "boresight")
-SENSOR_OPTIONAL = (
-    "name", "part", "weight", "field_of_view_rad", "gate_m", "range_m", "spread", "travel_m", "coupling", "rays",
-)  # fmt: skip
-COUPLING_KEYS = ("direction_rad_per_m", "range_m_per_m", "range_m_per_rad", "spread_rad", "spread_m")
-TABLE_KEYS = (
-    "origin_x_m",
-    "origin_y_m",
-    "origin_z_m",
-    "azimuth_rad",
-    "elevation_rad",
-    "gate_start_m",
-    "gate_end_m",
-    "sensor",
-)
-
-
 def design_document(design: DesignSpec) -> dict[str, Any]:
     """The plain document of a design, in the order in which it is written."""
     document: dict[str, Any] = {
@@ -143,12 +129,14 @@ def design_document(design: DesignSpec) -> dict[str, Any]:
         "name": design.name,
         "layout": design.layout,
         "level": float(design.level),
-        "rays": _count(design.rays),
+        "rays": None if design.rays is None else int(design.rays),
         # one level holds for the whole file, whatever level a sensor was made at: its spread says what it is
         "sensors": [_sensor_document(replace(sensor, level=design.level)) for sensor in design.sensors],
     }
     if design.ray_table is not None:
-        document["ray_table"] = _table_document(design.ray_table)
+        table = design.ray_table
+        columns = (*table.origin_m.T, table.azimuth_rad, table.elevation_rad, *table.gate_m.T, table.sensor)
+        document["ray_table"] = {key: column.tolist() for key, column in zip(TABLE_KEYS, columns, strict=True)}
     if design.track is not None:
         document["track"] = track_document(design.track)
     if design.at:
@@ -162,24 +150,12 @@ def design_document(design: DesignSpec) -> dict[str, Any]:
 
 def _sensor_document(sensor: Sensor) -> dict[str, Any]:
     values = sensor.as_dict()
-    rays = _count(values.pop("rays"))
-    coupling = values.pop("coupling")
+    rays, coupling = values.pop("rays"), values.pop("coupling")
     if values["travel_m"]["length"] == 0:
         del values["travel_m"]
     # the gate's start is cut at 0, so the mean range cannot be told from the gate alone
-    document = {**values, "range_m": float(sensor.range_m)}
-    return {**document, "rays": rays} if coupling is None else {**document, "coupling": coupling, "rays": rays}
-
-
-def _count(rays: int | None) -> int | None:
-    return None if rays is None else int(rays)
-
-
-def _table_document(table: Rays) -> dict[str, list[float] | list[int]]:
-    origin, gate = np.asarray(table.origin_m, np.float64), np.asarray(table.gate_m, np.float64)
-    angles = (np.asarray(table.azimuth_rad, np.float64), np.asarray(table.elevation_rad, np.float64))
-    columns = (*origin.T, *angles, *gate.T, np.asarray(table.sensor, np.int64))
-    return {key: column.tolist() for key, column in zip(TABLE_KEYS, columns, strict=True)}
+    coupled = {} if coupling is None else {"coupling": coupling}
+    return {**values, "range_m": float(sensor.range_m), **coupled, "rays": None if rays is None else int(rays)}
 
 
 def save_design(design: DesignSpec, path: Path) -> None:
@@ -284,7 +260,7 @@ def design_from_document(
         provenance=keys["provenance"].plain() if "provenance" in keys else {},
         level=level,
         track=track,
-        at=read_at(keys["at"]) if "at" in keys else {},
+        at={name: item.number() for name, item in keys["at"].mapping((), DIMENSIONS).items()} if "at" in keys else {},
         gates=keys["gates"].choice(get_args(Gates)) if "gates" in keys else None,  # type: ignore[arg-type]
     )
 

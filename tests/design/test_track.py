@@ -20,7 +20,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import SCHEMA_FILE, design_document, design_from_document, load_design, save_design
-from lidardesign.design.fit import fit
+from lidardesign.design.fit import fit, rays_at
 from lidardesign.design.layouts.quantise import lloyd
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.layouts.scan import fit_track
@@ -312,7 +312,7 @@ def test_sensors_are_the_rays_in_the_middle_and_report_their_travel(free):
 
 
 def test_another_number_of_rays_is_another_track_and_needs_the_samples(free):
-    rays = lay_out(free.design, 5, SAMPLES, at={"x_m": 1.0})
+    rays = rays_at(free.design, 5, SAMPLES, at={"x_m": 1.0})
     assert len(rays) == 5
     np.testing.assert_array_equal(
         rays.gate_m, lay_out(fit(SAMPLES, layout="scan", rays=5).design, at={"x_m": 1.0}).gate_m
@@ -323,7 +323,7 @@ def test_another_number_of_rays_is_another_track_and_needs_the_samples(free):
 
 
 def test_a_refitted_track_keeps_the_constraints(tight):
-    rays = lay_out(tight.design, 5, SAMPLES, at={"x_m": 1.0})
+    rays = rays_at(tight.design, 5, SAMPLES, at={"x_m": 1.0})
     assert np.diff(rays.gate_m, axis=1).max() <= 0.2
     assert Bandwidth().mbps(rays) <= 0.03
 

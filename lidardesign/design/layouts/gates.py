@@ -1,10 +1,9 @@
 """Gates of single rays: the interval of ranges that a ray would see, moved no further than constraints ask.
 
-Gates of single rays under a bandwidth: every metre of gate, wherever it is, holds as many returns as it costs.
-
-The interval [a, b] of a ray that maximises its returns less a price per metre, P(a, b) - price * (b - a), listens where
-the density of returns along the ray is above the price. The same price for all rays holds the most returns for the
-bins that they take together; the price is found by bisection.
+Under a bandwidth every metre of gate, wherever it is, holds as many returns as it costs. The interval [a, b] of a ray
+that maximises its returns less a price per metre, P(a, b) - price * (b - a), listens where the density of returns along
+the ray is above the price. The same price for all rays holds the most returns for the bins that they take together; the
+price is found by bisection.
 """
 
 from __future__ import annotations

@@ -3,10 +3,9 @@
 Lloyd's iteration (S. P. Lloyd, Least squares quantization in PCM, 1982) with k-means++ seeding (D. Arthur and
 S. Vassilvitskii, 2007). Every step lowers the weighted sum of squared distances, so the iteration ends.
 
-The nearest of some centres for each of many points, asked again and again while the centres move a little.
-
-A point whose centre is nearer than any other can have become, by how far centres moved, is not asked about again
-(G. Hamerly, Making k-means even faster, 2010). The answers are those of a search over all points.
+The nearest of some centres for each of many points is asked again and again while the centres move a little. A point
+whose centre is nearer than any other can have become, by how far centres moved, is not asked about again (G. Hamerly,
+Making k-means even faster, 2010). The answers are those of a search over all points.
 """
 
 from __future__ import annotations
@@ -122,7 +121,8 @@ def lloyd(
     features, weights = _checked(features, weights, count)
     distinct, inverse, merged = _distinct(features, weights)
     if len(distinct) <= count:
-        return _repeat(distinct, merged, inverse, count)
+        heaviest = np.argsort(-merged, kind="stable")
+        return np.concatenate([distinct, distinct[np.resize(heaviest, count - len(distinct))]]), inverse
     offset = distinct.mean(axis=0)
     points = distinct - offset
     tolerance = MOVEMENT_TOLERANCE * np.ptp(points, axis=0).max()
@@ -183,15 +183,6 @@ def _distinct(features: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np
     return distinct, inverse, np.maximum(merged / merged.sum(), SMALLEST_WEIGHT)
 
 
-def _repeat(
-    distinct: np.ndarray, merged: np.ndarray, inverse: np.ndarray, count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """At most as many distinct points as centres: the points themselves, the heaviest repeated."""
-    heaviest = np.argsort(-merged, kind="stable")
-    extra = np.resize(heaviest, count - len(distinct))
-    return np.concatenate([distinct, distinct[extra]]), inverse
-
-
 def _seed(points: np.ndarray, weights: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
     """k-means++: each seed is drawn with probability weight times squared distance to the seeds so far."""
     if len(points) > SEED_POOL * count:
@@ -201,20 +192,18 @@ def _seed(points: np.ndarray, weights: np.ndarray, count: int, generator: np.ran
     chosen = np.empty(count, dtype=np.int64)
     squared = np.full(len(points), 1.0)
     for k, draw in enumerate(draws):
-        chosen[k] = _draw(weights * squared, draw)
+        mass = weights * squared
+        cumulative = np.cumsum(mass)
+        if cumulative[-1] > 0:
+            # never one without mass
+            index = np.searchsorted(cumulative, draw * cumulative[-1], side="right")
+            chosen[k] = min(int(index), int(np.flatnonzero(mass)[-1]))
+        else:
+            # every distance underflowed: points that differ by less than the square root of the smallest number
+            chosen[k] = int(draw * len(mass))
         away = np.square(points - points[chosen[k]]).sum(axis=1)
         squared = np.minimum(squared, away) if k else away
     return points[chosen]
-
-
-def _draw(mass: np.ndarray, draw: float) -> int:
-    """The index at which the cumulative mass passes a share `draw`; never one without mass."""
-    cumulative = np.cumsum(mass)
-    if cumulative[-1] <= 0:
-        # every distance underflowed: points that differ by less than the square root of the smallest number
-        return int(draw * len(mass))
-    index = int(np.searchsorted(cumulative, draw * cumulative[-1], side="right"))
-    return min(index, int(np.flatnonzero(mass)[-1]))
 
 
 def _centroids(points: np.ndarray, weights: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:

@@ -30,7 +30,7 @@ from dataclasses import replace
 import numpy as np
 
 from lidardesign.design.constraints.budget import BandwidthBudget, fit_within_budget
-from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.document import Constraints, SensorRules
 from lidardesign.design.constraints.origins import free_boxes, is_mounted, origin_box
 from lidardesign.design.layouts.fields import members, ray_gates, rays_in_fields
 from lidardesign.design.layouts.gates import admissible_gates, central_intervals
@@ -249,23 +249,29 @@ def fit_track(
     if read_out.rays is None:
         raise ConfigError("a track needs its number of rays per position", where="--layout scan", hint="give --rays N")
     group = Group((None, None, None), tuple(range(read_out.rays)))
-    ends = _ends(samples.space, constraints, dimension, level)
+    low, high = _track_ends(samples.space, constraints.rules[0], dimension, level)
     support = restrict_samples(samples, constraints.rules, group)
     support = replace(support, mass=support.total)
     check_support(support, group, mass=support.total, several=False)
-    places = _knots(*ends, support.effective, read_out.rays, knots)
+    if knots is None:
+        usual = math.ceil((high - low) / KNOT_SPACING_M - SLACK)
+        affordable = int(support.effective / (read_out.rays * SAMPLES_PER_CELL))
+        knots = max(min(usual, affordable), 1) + 1
+    elif knots < 2:
+        raise ConfigError(f"{knots} knots", where="track", allowed="2 or more")
+    places = np.linspace(low, high, knots)
     used = support.weights > 0
     along = TrackSamples.of(support.points[used], support.weights[used], places, dimension, samples.space)
     bounds = bounds_of(constraints.rules, samples.space, group.sensors, interval_factor(level))
     centres, labels = aimed_rays(along, read_out.rays, random_generator(seed, "track"))
     azimuth, elevation = _admitted(centres, along, bounds)
     track = _with_gates(along, labels, azimuth, elevation, bounds, level, read_out)
-    sensors, score, error = _sensors(along, labels, track, bounds, level)
+    sensors, score = _track_sensors(along, labels, track, bounds, level)
     design = DesignSpec(
         name=name, sensors=sensors, layout="scan", rays=read_out.rays, constraints=constraints.as_document(),
         level=level, track=track, at=fixed_conditions(samples.space),
     )  # fmt: skip
-    return FittedDesign(design, Estimate(score, error, "nats"), [support])
+    return FittedDesign(design, score, [support])
 
 
 def _travelled(space: DesignSpace) -> int:
@@ -291,28 +297,33 @@ def _travelled(space: DesignSpace) -> int:
     return space.conditioned[0]
 
 
-def _travel_spread(length_m: float, level: float) -> float:
-    """The standard deviation of an origin whose interval is its travel [m]."""
-    return length_m / (2 * interval_factor(level))
-
-
-def _ends(space: DesignSpace, constraints: Constraints, dimension: int, level: float) -> tuple[float, float]:
-    """From where to where the rays travel [m].
+def _track_ends(space: DesignSpace, rules: SensorRules, dimension: int, level: float) -> tuple[float, float]:
+    """From where to where the rays travel: the one interval that the origin box and the excluded boxes leave [m].
 
     Raises:
-        InfeasibleError: The constraints hold the origin still.
+        InfeasibleError: The constraints hold the origin still, divide its way, or keep it shorter.
     """
-    one = constraints.rules[0]
     name = DIMENSIONS[dimension]
-    low, high = _way(constraints, space, dimension)
+    low, high = (float(end[dimension]) for end in origin_box(rules, space))
+    if low < high:
+        free = free_boxes(rules, space)
+        pieces = sorted(zip(free.low_m[:, dimension], free.high_m[:, dimension], strict=True))
+        if len(pieces) > 1:
+            raise InfeasibleError(
+                f"the excluded boxes divide the track into {len(pieces)} pieces",
+                conflicts=["origin.exclude", "--layout scan"],
+                hint=f"one of the pieces, as origin.low_m or origin.high_m with {name} "
+                f"up to {pieces[0][1]:g} or from {pieces[-1][0]:g}",
+            )
+        low, high = max(low, pieces[0][0]), min(high, pieces[0][1])
     if not low < high:
         raise InfeasibleError(
             f"the origin is fixed at {name}={low:g}, but a track follows {name}",
             conflicts=["origin", "--layout scan"],
             hint=f"give --at {name}={low:g} instead",
         )
-    limit = one.origin.spread_m.max
-    spread = _travel_spread(high - low, level)
+    limit = rules.origin.spread_m.max
+    spread = (high - low) / (2 * interval_factor(level))
     if limit is not None and spread > limit:
         raise InfeasibleError(
             f"a track from {low:g} to {high:g} m has a spread of {spread:.3g} m along {name}",
@@ -321,39 +332,6 @@ def _ends(space: DesignSpace, constraints: Constraints, dimension: int, level: f
             hint="a shorter origin box, or --at",
         )
     return low, high
-
-
-def _way(constraints: Constraints, space: DesignSpace, dimension: int) -> tuple[float, float]:
-    """The one interval that the origin box and the excluded boxes leave along a dimension [m].
-
-    Raises:
-        InfeasibleError: Excluded boxes divide it.
-    """
-    one = constraints.rules[0]
-    low, high = (float(end[dimension]) for end in origin_box(one, space))
-    if not low < high:
-        return low, high
-    free = free_boxes(one, space)
-    pieces = sorted(zip(free.low_m[:, dimension], free.high_m[:, dimension], strict=True))
-    if len(pieces) > 1:
-        raise InfeasibleError(
-            f"the excluded boxes divide the track into {len(pieces)} pieces",
-            conflicts=["origin.exclude", "--layout scan"],
-            hint=f"one of the pieces, as origin.low_m or origin.high_m with {DIMENSIONS[dimension]} "
-            f"up to {pieces[0][1]:g} or from {pieces[-1][0]:g}",
-        )
-    return max(low, pieces[0][0]), min(high, pieces[0][1])
-
-
-def _knots(low: float, high: float, effective: float, rays: int, wanted: int | None) -> np.ndarray:
-    """Even knots from end to end, shape (P,) [m]."""
-    if wanted is not None:
-        if wanted < 2:
-            raise ConfigError(f"{wanted} knots", where="track", allowed="2 or more")
-        return np.linspace(low, high, wanted)
-    usual = math.ceil((high - low) / KNOT_SPACING_M - SLACK)
-    affordable = int(effective / (rays * SAMPLES_PER_CELL))
-    return np.linspace(low, high, max(min(usual, affordable), 1) + 1)
 
 
 def _admitted(centres: np.ndarray, along: TrackSamples, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
@@ -401,68 +379,81 @@ def _with_gates(
         gate = np.maximum(np.stack([centre - half, centre + half], axis=1), 0.0).reshape(knots, count, 2)
         return Track(DIMENSIONS[along.dimension], along.knots, azimuth, elevation, gate, np.arange(count))
 
+    def worst_widths(fitted: Track) -> np.ndarray:
+        # at least what any position costs: the wider of two neighbouring knots, ray by ray
+        width = np.diff(fitted.gate_m, axis=2)[:, :, 0]
+        wider = np.maximum(width[:-1], width[1:])
+        return wider[read_out.model.bins(wider).sum(axis=1).argmax()]
+
     even = np.full(count, 1.0 / count)
-    fitted, _ = fit_within_budget(
-        track(bounds),
-        lambda _, width_m: track(bounds.narrowed(width_m)),
-        lambda t: (_worst_widths(t, read_out), even),
-        read_out,
-    )
-    return fitted
-
-
-def _worst_widths(track: Track, read_out: BandwidthBudget) -> np.ndarray:
-    """Gate widths that cost at least what any position does: the wider of two neighbouring knots, ray by ray."""
-    width = np.diff(track.gate_m, axis=2)[:, :, 0]
-    wider = np.maximum(width[:-1], width[1:])
-    return wider[read_out.model.bins(wider).sum(axis=1).argmax()]
+    return fit_within_budget(
+        track(bounds), lambda _, width_m: track(bounds.narrowed(width_m)), lambda t: (worst_widths(t), even), read_out
+    )[0]
 
 
 def _wanted_gates(
     along: TrackSamples, labels: np.ndarray, azimuth: np.ndarray, elevation: np.ndarray, level: float
 ) -> np.ndarray:
-    """Central intervals of what rays observe, projected onto them, smooth along the knots: (P, N, 2) [m]."""
+    """Central intervals of what rays observe, projected onto them, smooth along the knots: (P, N, 2) [m].
+
+    At knots at which a ray sees nothing they follow from its other knots, or else from all rays'.
+    """
     knots, count = azimuth.shape
     ray = direction(along.between(azimuth, labels), along.between(elevation, labels))
     ahead = ((observed_point(along.points) - along.points[:, :3]) * ray).sum(axis=1)
-    wanted = np.full((knots, count, 2), np.nan)
+    gates = np.full((knots, count, 2), np.nan)
     for knot in range(knots):
         chosen, weights = along.near(knot, GATE_REACH)
-        wanted[knot], _ = central_intervals(ahead[chosen], weights, labels[chosen], count, level)
-    return _bridged(wanted)
-
-
-def _bridged(gates: np.ndarray) -> np.ndarray:
-    """Gates of knots at which a ray sees nothing, from its other knots, or from all rays': (P, N, 2) [m]."""
-    knots, count, _ = gates.shape
-    places = np.arange(knots)
+        gates[knot], _ = central_intervals(ahead[chosen], weights, labels[chosen], count, level)
     known = np.isfinite(gates[:, :, 0])
-    everything = np.nanmin(gates[:, :, 0]), np.nanmax(gates[:, :, 1])
-    filled = gates.copy()
-    for ray in range(count):
-        own = known[:, ray]
-        for end in range(2):
-            filled[:, ray, end] = np.interp(places, places[own], gates[own, ray, end]) if own.any() else everything[end]
-    return filled
+    widest = np.nanmin(gates[:, :, 0]), np.nanmax(gates[:, :, 1])
+    places = np.arange(knots)
+    for own, of_ray in zip(known.T, gates.transpose(1, 2, 0), strict=True):
+        for values, end in zip(of_ray, widest, strict=True):
+            values[:] = np.interp(places, places[own], values[own]) if own.any() else end
+    return gates
 
 
-def _sensors(
+def _track_sensors(
     along: TrackSamples, labels: np.ndarray, track: Track, bounds: Bounds, level: float
-) -> tuple[tuple[Sensor, ...], float, float]:
-    """One sensor per ray, the ray in the middle of its travel; the samples' log-likelihood and its error [nats]."""
+) -> tuple[tuple[Sensor, ...], Estimate]:
+    """One sensor per ray, the ray in the middle of its travel; the samples' log-likelihood [nats]."""
     middle = float(along.knots[0] + along.knots[-1]) / 2
     seen = [knot for knot in range(len(along.knots)) if along.near(knot)[1].sum() > 0]
-    found = {knot: _components(along, labels, track, knot, bounds) for knot in seen}
-    values = {knot: log_density(rays, near) for knot, (_, rays, near) in found.items()}
-    score = sum(share * float(near.weights @ values[knot]) for knot, (share, _, near) in found.items())
+    components = {knot: _components(along, labels, track, knot, bounds) for knot in seen}
+    values = {knot: log_density(rays, near) for knot, (_, rays, near) in components.items()}
+    score = sum(share * float(near.weights @ values[knot]) for knot, (share, _, near) in components.items())
     # a sample between two knots counts at both
     influence = np.zeros(len(along.points))
     for knot, of_knot in values.items():
         chosen, weights = along.near(knot)
         influence[chosen] += weights * (of_knot - score)
-    error = float(np.linalg.norm(influence))
-    _, mixture, features = found[min(seen, key=lambda knot: abs(along.knots[knot] - middle))]
-    return _in_the_middle(track, middle, along, mixture, features.axes, level), score, error
+    _, mixture, features = components[min(seen, key=lambda knot: abs(along.knots[knot] - middle))]
+    azimuth, elevation, gate = interpolated(track, middle)
+    origin, covariance = np.array(along.space.low[:3]), np.zeros((3, 3))
+    travel = along.knots[-1] - along.knots[0]
+    origin[along.dimension] = middle
+    covariance[along.dimension, along.dimension] = (travel / (2 * interval_factor(level))) ** 2
+    axes, count = features.axes, len(track.sensor)
+    sensors = tuple(
+        Sensor(
+            name=f"s{ray}",
+            weight=1.0 / count,
+            origin_m=origin,
+            origin_covariance_m2=covariance,
+            azimuth_rad=boresight_azimuth(azimuth[ray]),
+            elevation_rad=float(elevation[ray]),
+            roll_rad=float(mixture.roll_rad[ray]),
+            spread_horizontal_rad=float(mixture.spread_rad[ray, 0] * axes.angle_scale) if axes.horizontal else 0.0,
+            spread_vertical_rad=float(mixture.spread_rad[ray, 1]) if axes.vertical else 0.0,
+            range_m=float(gate[ray].mean()),
+            spread_range_m=float(gate[ray, 1] - gate[ray, 0]) / (2 * interval_factor(level)),
+            level=level,
+            rays=1,
+        )
+        for ray in range(count)
+    )
+    return sensors, Estimate(score, float(np.linalg.norm(influence)), "nats")
 
 
 def _components(
@@ -481,32 +472,3 @@ def _components(
     if features.axes.vertical:
         mixture = replace(mixture, elevation_rad=track.elevation_rad[knot])
     return float(weights.sum()), mixture, features
-
-
-def _in_the_middle(
-    track: Track, middle: float, along: TrackSamples, mixture: Mixture, axes: Axes, level: float
-) -> tuple[Sensor, ...]:
-    azimuth, elevation, gate = interpolated(track, middle)
-    origin = np.array(along.space.low[:3])
-    origin[along.dimension] = middle
-    covariance = np.zeros((3, 3))
-    covariance[along.dimension, along.dimension] = _travel_spread(along.knots[-1] - along.knots[0], level) ** 2
-    count = len(track.sensor)
-    return tuple(
-        Sensor(
-            name=f"s{ray}",
-            weight=1.0 / count,
-            origin_m=origin,
-            origin_covariance_m2=covariance,
-            azimuth_rad=boresight_azimuth(azimuth[ray]),
-            elevation_rad=float(elevation[ray]),
-            roll_rad=float(mixture.roll_rad[ray]),
-            spread_horizontal_rad=float(mixture.spread_rad[ray, 0] * axes.angle_scale) if axes.horizontal else 0.0,
-            spread_vertical_rad=float(mixture.spread_rad[ray, 1]) if axes.vertical else 0.0,
-            range_m=float(gate[ray].mean()),
-            spread_range_m=float(gate[ray, 1] - gate[ray, 0]) / (2 * interval_factor(level)),
-            level=level,
-            rays=1,
-        )
-        for ray in range(count)
-    )
