@@ -172,10 +172,12 @@ def test_constraints_are_kept(kind, name):
     gates[:, 1] += 0.001 * np.arange(15)
     design = kind(gates, constraints.as_document())
     other = GATING(design, lay_out(design))
-    broken, before = (
-        {check.name for check in check_design(design_document(one), constraints) if not check.satisfied}
+    failed = (
+        [check.name for check in check_design(design_document(one), constraints) if not check.satisfied]
         for one in (other, design)
     )
+    # a table's own sensor stands for none of these gates
+    broken, before = ({name for name in names if kind is scan or not name.startswith("s0.")} for names in failed)
     assert broken <= before
     if name != "no room":
         assert not broken
