@@ -10,7 +10,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.layouts.grid import low_discrepancy
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines import simple as baselines
-from lidardesign.evaluate.baselines.candidates import Layout, even_placement, opened_gate, unrolled
+from lidardesign.evaluate.baselines.candidates import BaselineLayout, even_placement, opened_gate, unrolled
 from lidardesign.evaluate.baselines.simple import (
     Baselines,
     Family,
@@ -200,7 +200,7 @@ def of_axis(monkeypatch):
     """A family whose argument names the axis that all its rays look along."""
 
     def build(source, argument):
-        return [Layout(argument, lambda count, _: np.tile(AXES[argument], (count, 1)), np.array([0.1, 1.0]))]
+        return [BaselineLayout(argument, lambda count, _: np.tile(AXES[argument], (count, 1)), np.array([0.1, 1.0]))]
 
     def check(argument):
         if argument not in AXES:

@@ -117,7 +117,7 @@ class Candidate(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class BaselineLayout:
     """A layout whose rays all have one gate.
 
     Arguments:

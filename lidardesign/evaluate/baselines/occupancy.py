@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidardesign.evaluate.baselines.candidates import Layout, Spot, central, opened_gate, spread_frames
+from lidardesign.evaluate.baselines.candidates import BaselineLayout, Spot, central, opened_gate, spread_frames
 from lidardesign.geometry.surface import sample_body
 from lidardesign.numerics import TINY
 from lidardesign.scene import Scene
@@ -129,7 +129,7 @@ class AimedPoints:
         return points[aimed], weights[aimed]
 
 
-def occupancy(space: DesignSpace, train: Sequence[Scene], seed: int) -> Layout | None:
+def occupancy(space: DesignSpace, train: Sequence[Scene], seed: int) -> BaselineLayout | None:
     """The layout; None where no admissible ray ends in an occupied cell.
 
     At a condition value where none does, rays are uniform in what is left of the space.
@@ -152,4 +152,4 @@ def occupancy(space: DesignSpace, train: Sequence[Scene], seed: int) -> Layout |
             return spot.space.sample(count, generator)
         return found[generator.choice(len(found), count, p=worth / worth.sum())]
 
-    return Layout("occupancy", place, opened_gate(float(nearest), float(furthest)), drawn_anew=True)
+    return BaselineLayout("occupancy", place, opened_gate(float(nearest), float(furthest)), drawn_anew=True)

@@ -38,8 +38,8 @@ from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.candidates import (
     DENSE_RAYS,
     RAY_AXES,
+    BaselineLayout,
     Candidate,
-    Layout,
     Observed,
     Positions,
     Spot,
@@ -68,7 +68,7 @@ from lidardesign.task import random_generator
 ALIGNED = math.cos(math.pi / 4)
 
 
-def bounding(views: TrainingViews) -> list[Layout]:
+def bounding(views: TrainingViews) -> list[BaselineLayout]:
     """The layouts to choose from; none where dense rays return nothing."""
     space = views.space
     observed = views.hits(dense_points(space))
@@ -82,7 +82,7 @@ def bounding(views: TrainingViews) -> list[Layout]:
     return [cropped] if parallel is None else [parallel, cropped]
 
 
-def _boxed(name: str, space: DesignSpace, low: np.ndarray, high: np.ndarray, gate_m: np.ndarray) -> Layout:
+def _boxed(name: str, space: DesignSpace, low: np.ndarray, high: np.ndarray, gate_m: np.ndarray) -> BaselineLayout:
     """Even rays in a box whose conditions take the values of the spot."""
     conditions = [DIMENSIONS.index(one) for one in space.condition]
     conditions = [axis for axis in conditions if axis < RAY_AXES]
@@ -93,10 +93,10 @@ def _boxed(name: str, space: DesignSpace, low: np.ndarray, high: np.ndarray, gat
         highest[conditions] = np.array(spot.space.high)[conditions]
         return even_placement(lowest, highest, count)
 
-    return Layout(name, place, gate_m)
+    return BaselineLayout(name, place, gate_m)
 
 
-def _parallel(views: TrainingViews, observed: Observed) -> Layout | None:
+def _parallel(views: TrainingViews, observed: Observed) -> BaselineLayout | None:
     """Parallel rays from an even grid over the returns' box, within the admissible origins.
 
     An origin axis that runs along the rays stays at the bound behind the scene. None where such rays
@@ -233,7 +233,7 @@ def _uniform(source: Baselines, argument: str) -> list[Candidate]:
         low, high = np.array(spot.space.low[:RAY_AXES]), np.array(spot.space.high[:RAY_AXES])
         return even_placement(low, high, count)
 
-    return [Layout("even", place, whole_range(source.space))]
+    return [BaselineLayout("even", place, whole_range(source.space))]
 
 
 def _random(source: Baselines, argument: str) -> list[Candidate]:
@@ -243,7 +243,7 @@ def _random(source: Baselines, argument: str) -> list[Candidate]:
         generator = random_generator(source.seed, "random baseline", count, spot.scene, *later)
         return spot.space.sample(count, generator)
 
-    return [Layout("random", place, whole_range(source.space), drawn_anew=True)]
+    return [BaselineLayout("random", place, whole_range(source.space), drawn_anew=True)]
 
 
 def _bounding(source: Baselines, argument: str) -> list[Candidate]:
