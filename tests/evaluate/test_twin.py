@@ -10,7 +10,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.check import check_design
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document
-from lidardesign.design.fit import fit
+from lidardesign.design.fit import fit, rays_at
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.evaluate.baselines.candidates import mean_mbps
 from lidardesign.evaluate.baselines.no_visibility import TwinCandidate, fitted_twin
@@ -94,7 +94,7 @@ def test_a_twin_within_a_bandwidth_never_exceeds_it(case, limit):
 
     def counted(one, count, samples, *, at=None):
         calls.append(count)
-        return lay_out(one, count, samples, at=at)
+        return rays_at(one, count, samples, at=at)
 
     candidate = TwinCandidate(design, own, [{}], counted)
     positions = candidate.positions_within([SPACE], limit, Bandwidth())
