@@ -63,3 +63,17 @@ def global_state_is_untouched():
 def _numpy_state() -> tuple[object, ...]:
     name, keys, *rest = np.random.get_state()  # noqa: NPY002 (it is this state that must not change)
     return name, keys.tobytes(), *rest
+
+
+@pytest.fixture
+def lidardesign(capsys, tmp_path, monkeypatch):
+    """Run the program in this process, in an empty folder: see `caller`."""
+    from support.command_line import caller
+
+    return caller(capsys, tmp_path, monkeypatch)
+
+
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    """No field of another test is read from the cache."""
+    monkeypatch.setenv("LIDARDESIGN_CACHE", str(tmp_path / "cache"))

@@ -9,7 +9,7 @@ import os
 import h5py
 import numpy as np
 import pytest
-from support.command_line import caller, files_under, make_run
+from support.command_line import files_under, make_run
 from support.mistakes import GARBAGE, GOOD, check_one_clear_message
 
 from lidardesign.run.yaml import dump_yaml, load_yaml
@@ -210,11 +210,6 @@ def mistakes(tmp_path_factory):
     make_models(folder)
     make_runs(folder)
     return folder
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize(("arguments", "code", "words"), CASES, ids=[case[0] for case in CASES])

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from lidardesign_tasks.emitter import winding_number
 from lidardesign_tasks.flatland import FlatlandTask
-from support.command_line import caller, files_under, make_run
+from support.command_line import files_under, make_run
 from support.mistakes import GARBAGE, GOOD, check_one_clear_message
 
 from lidardesign.cli.output import EXIT_INTERRUPTED, Output, describe_error
@@ -154,11 +154,6 @@ def scan():
     counts[:, 20] = 50
     angles = {"x_deg": x.ravel(), "y_deg": y.ravel(), "boresight_azimuth_deg": 180.0, "boresight_elevation_deg": 0.0}
     return {"counts": counts, "bin_width_ps": 100.0, "start_ps": 0.0, "origin_m": [0.4, 0.0, 0.0], **angles}
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.command_line import caller, files_under, make_run
+from support.command_line import files_under, make_run
 
 from lidardesign import __version__
 from lidardesign.cli import output as console_module
@@ -20,12 +20,6 @@ from lidardesign.run.yaml import load_yaml
 from lidardesign.samples import Samples, load_samples, save_samples
 
 COMMANDS = ["learn", "fit", "constrain", "evaluate", "export", "show", "tasks", "tasks list", "tasks show"]
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    """Run the program in this process, in an empty folder."""
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 @pytest.fixture(scope="module")

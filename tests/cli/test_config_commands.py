@@ -12,7 +12,7 @@ import jsonschema
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.command_line import caller, make_run
+from support.command_line import make_run
 from support.tables import each_row
 
 from lidardesign.config import PRESETS, DensitySettings, LearningSettings, resolve
@@ -26,11 +26,6 @@ from lidardesign.workflow.config_reference import config_template, config_text, 
 TASKS = [item.name for item in list_tasks() if item.error is None and item.distribution.startswith("lidardesign ")]
 # They need a folder, so that no configuration follows from the defaults alone.
 WITHOUT_DEFAULTS = ("meshes",)
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 def written(task, tmp_path, preset=None):

@@ -15,11 +15,6 @@ TINY = ("steps=2", "batch=64", "samples=1000", "balance_proposals=256", "coverag
 
 
 @pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
-
-
-@pytest.fixture
 def flat(tmp_path):
     return make_run(tmp_path / "run")
 

@@ -13,7 +13,7 @@ import pytest
 from lidardesign_tasks.arm_robot import load_robot
 from lidardesign_tasks.basel import load_model
 from support.captures import make_capture
-from support.command_line import caller, make_run
+from support.command_line import make_run
 from support.tables import each_row
 
 from lidardesign.cli.output import Output, describe_error
@@ -36,11 +36,6 @@ from lidardesign.space import FARTHEST_M, DesignSpace
 SPACE = DesignSpace((0.0, 0, 0, 2, 0, 0), (1.0, 0, 0, 4, 0, 1))
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 # --- samples of a run

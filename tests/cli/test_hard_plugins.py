@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import pytest
 from lidardesign_tasks.flatland import FlatlandTask
-from support.command_line import caller, make_run
+from support.command_line import make_run
 from support.conditioned_runs import make_conditioned_run
 
 from lidardesign.errors import PluginError
 from lidardesign.space import DesignSpace
 from lidardesign.task import Score, scenes_of
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 def broken():

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import trimesh
 import typer
-from support.command_line import caller, files_under, make_run, program
+from support.command_line import files_under, make_run, program
 from support.tables import each_row
 
 from lidardesign.cli.main import app
@@ -30,11 +30,6 @@ from lidardesign.run.yaml import load_yaml
 ROOT = Path(__file__).parents[2]
 CI = ROOT / "examples" / "ci"
 COLOUR = re.compile(r"\x1b\[[0-9;]*(?:3[0-8]|4[0-8]|9[0-7]|10[0-7])[;m]")
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 @pytest.fixture

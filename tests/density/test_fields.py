@@ -15,10 +15,7 @@ from lidardesign.density.fields.distance import BodyField, UnionField, build_fie
 from lidardesign.errors import ConfigError
 from lidardesign.scene import Body, Box, Capsule, Plane, Scene, Sphere, rigid
 
-
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("LIDARDESIGN_CACHE", str(tmp_path / "cache"))
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 def field_of(*scenes, resolution=48):

@@ -27,9 +27,7 @@ SETTINGS = DensitySettings(sigma_m=0.03, attenuation_per_m=40.0, margin_m=0.03)
 ALL = SETTINGS.model_copy(update={"surface_tolerance_nats": 1e6})
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("LIDARDESIGN_CACHE", str(tmp_path / "cache"))
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 def turned(generator):

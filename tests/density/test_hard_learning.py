@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from support.command_line import caller
 from support.learning import interrupt_after_a_checkpoint
 
 from lidardesign.density.training import quality as measure
@@ -14,11 +13,6 @@ SETTINGS = (
     "learning.frames=3",
 )  # fmt: skip
 RESULTS = ("flow.safetensors", "samples.npz")
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 def learn(lidardesign, out, *further):

@@ -21,9 +21,7 @@ SETTINGS = DensitySettings(sigma_m=0.05, attenuation_per_m=20.0, sharpness_per_m
 CENTRES = ((2.0, 0.0, 0.0), (2.1, 0.2, 0.1), (1.8, -0.2, 0.0))
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("LIDARDESIGN_CACHE", str(tmp_path / "cache"))
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 def ball(centre, radius=0.5, role="both"):

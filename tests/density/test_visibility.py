@@ -18,10 +18,7 @@ from lidardesign.density.target.target import build_target
 from lidardesign.scene import Body, Mesh, Scene, Sphere, rigid
 from lidardesign.space import RANGE
 
-
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("LIDARDESIGN_CACHE", str(tmp_path / "cache"))
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 @each_row("name", ["raycast", "quadrature"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.command_line import caller
 from support.conditioned_runs import make_conditioned_run
 from support.tables import each_row
 
@@ -13,11 +12,6 @@ from lidardesign.design.layouts.gates import central_intervals
 from lidardesign.design.layouts.track import placed
 from lidardesign.errors import ConfigError
 from lidardesign.run.yaml import dump_yaml, load_yaml
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 def written(**changes):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.aisles import SAMPLES as AISLE_SAMPLES
-from support.command_line import caller, make_run
+from support.command_line import make_run
 from support.designs import drawn_from, three_sensors
 from support.rings import RING
 
@@ -119,11 +119,6 @@ def test_a_level_and_a_bound_on_gates_hold_together_or_are_refused_by_the_bound(
     beyond = Constraints.from_mapping({"gate": {"width_m": {"min": 0.5, "max": 0.4}}})
     with pytest.raises(InfeasibleError):
         fit(STILL, sensors=3, level=0.99, constraints=beyond)
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 def gates_in(path):

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.command_line import caller, make_run
+from support.command_line import make_run
 from support.planning import SINGLE
 from support.scoring import MissTask, design, make_request, scenes
 
@@ -172,11 +172,6 @@ class BrokenTask(MissTask):
 def test_a_score_that_cannot_take_noisy_returns_is_named():
     with pytest.raises(PluginError, match="no such body: -1"):
         evaluate(make_request(task=BrokenTask(), test=sunny(1), planner=Planner(SINGLE)))
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from support.command_line import caller
 from support.tables import each_row
 
 from lidardesign.cli.commands.evaluate import search_display
@@ -511,11 +510,6 @@ def test_a_time_that_is_none_or_that_nothing_takes_is_refused(seconds, names):
 def test_a_time_is_taken_where_it_is_asked_for_or_left_out():
     ScoreOptions(cma_seconds=5.0, baselines=["cma"])
     ScoreOptions()
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize(

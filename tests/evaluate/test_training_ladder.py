@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.command_line import caller
 from support.small_runs import shifted
 
 from lidardesign.config import load_run_config, resolve, save_run_config
@@ -193,11 +192,6 @@ def test_sweeps_are_those_of_the_scenes_that_were_learned_whatever_designs_are_j
     assert other.config == own.config
     poses = [[body.poses.tolist() for scene in one.request.train for body in scene.bodies] for one in asked]
     assert poses[0] == poses[1]
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 def flatland(lidardesign, out, *options):

@@ -11,7 +11,7 @@ from dataclasses import replace
 from multiprocessing.context import SpawnProcess
 
 import pytest
-from support.command_line import caller, make_run, program
+from support.command_line import make_run, program
 from support.workers import make_request, random_rays, results, without_times
 
 from lidardesign.errors import ConfigError, NumericalError, PluginError
@@ -154,11 +154,6 @@ def test_what_a_plugin_prints_and_raises_in_a_worker_arrives_whole(broken, pool,
     captured = capfd.readouterr()
     assert captured.out == ""
     assert "scored test 1" in captured.err
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 @pytest.fixture

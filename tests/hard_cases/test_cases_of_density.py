@@ -57,9 +57,7 @@ FRAMES = 5
 ICOSPHERE = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("LIDARDESIGN_CACHE", str(tmp_path / "cache"))
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 def ball_of_triangles(centre=(0.0, 0.0, 0.0), scale=1.0):

@@ -15,7 +15,6 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from support import references
-from support.command_line import caller
 from support.hard_cases import hard_case
 from support.meshes import BOX_FACES, BOX_VERTICES, write_box
 from support.tables import each_row
@@ -49,14 +48,7 @@ GARBAGE = {
 AROUND = DesignSpace((-2, -2, -2, 0, -math.pi / 2, 0), (2, 2, 2, 2 * math.pi, math.pi / 2, 4))
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("LIDARDESIGN_CACHE", str(tmp_path / "cache"))
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 def field_of(*scenes, resolution=32):

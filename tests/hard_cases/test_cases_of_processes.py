@@ -20,7 +20,7 @@ from pathlib import Path
 
 import pytest
 from lidardesign_tasks.flatland import FlatlandTask
-from support.command_line import caller, files_under, make_run, program
+from support.command_line import files_under, make_run, program
 from support.hard_cases import hard_case
 
 from lidardesign import registry
@@ -43,11 +43,6 @@ TINY = (
 GONE = 2**22 + 1  # beyond the largest process id that Linux gives
 # Python that has imported what it needs before anything is limited, as it writes files of its own
 QUIET = "import sys; sys.dont_write_bytecode = True; "
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 def script(text: str, *arguments: object, **options) -> subprocess.CompletedProcess:

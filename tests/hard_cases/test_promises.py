@@ -21,7 +21,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
-from support.command_line import caller, files_under, make_run
+from support.command_line import files_under, make_run
 from support.hard_cases import hard_case
 from support.learning import interrupt_after_a_checkpoint
 from support.small_runs import shifted
@@ -61,11 +61,6 @@ FLATLAND = (
 )  # fmt: skip
 BYTES = ("flow.safetensors", "samples.npz")
 NOT_NUMBERS = (math.nan, math.inf, -math.inf)
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 @pytest.fixture(scope="module")

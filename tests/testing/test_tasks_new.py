@@ -13,7 +13,7 @@ import venv
 from pathlib import Path
 
 import pytest
-from support.command_line import caller, files_under
+from support.command_line import files_under
 from support.docs_output import difference
 from support.docs_pages import blocks_of, commands_of
 from support.docs_session import COLUMNS
@@ -30,11 +30,6 @@ ROOT = Path(__file__).parents[2]
 TEMPLATES = ROOT / "lidardesign" / "testing" / "template"
 EXAMPLE = ROOT / "examples" / "third_party_task"
 NAME = "landmark"
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from lidardesign_tasks.flatland import FlatlandTask
-from support.command_line import caller, make_run
+from support.command_line import make_run
 
 from lidardesign import open_run
 from lidardesign.config import resolve, save_run_config
@@ -39,11 +39,6 @@ SEED = 3
 def few_restarts(monkeypatch):
     """Fits try fewer seeds than usual, which is quick."""
     monkeypatch.setitem(fit.__kwdefaults__, "restarts", 2)
-
-
-@pytest.fixture
-def lidardesign(capsys, tmp_path, monkeypatch):
-    return caller(capsys, tmp_path, monkeypatch)
 
 
 def traced_run(folder, name, overrides, count=900):
