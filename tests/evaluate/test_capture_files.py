@@ -14,7 +14,8 @@ from support.captures import BINS, make_capture
 from support.tables import each_row
 
 from lidardesign.errors import DataError
-from lidardesign.evaluate.captures.arrays import read_arrays, read_matlab
+from lidardesign.evaluate.captures import matlab
+from lidardesign.evaluate.captures.arrays import read_arrays
 from lidardesign.evaluate.captures.capture import load_capture
 from lidardesign.run import arrays as npz
 
@@ -223,14 +224,16 @@ NUMBERS = ("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "?")
 SHAPES = ((1, 1), (1, 3), (4, 1), (2, 3), (3, 2, 4), (0, 3), (0, 0))
 
 
-@each_row("kind", NUMBERS)
 @each_row("packed", [True, False])
-def test_every_type_and_shape_of_matlab_5_comes_through(kind, packed):
+def test_every_type_and_shape_of_matlab_5_comes_through(tmp_path, packed):
     generator = np.random.default_rng(0)
-    arrays = {f"a{n}": (100 * generator.random(shape)).astype(kind) for n, shape in enumerate(SHAPES)}
-    content = io.BytesIO()
-    savemat(content, arrays, do_compression=packed)
-    found = read_matlab(content.getvalue(), "s.mat")
+    arrays = {
+        f"a{number}_{kind.replace('?', 'logical')}": (100 * generator.random(shape)).astype(kind)
+        for kind in NUMBERS
+        for number, shape in enumerate(SHAPES)
+    }
+    savemat(tmp_path / "s.mat", arrays, do_compression=packed)
+    found = read_arrays(tmp_path / "s.mat")
     assert list(found) == list(arrays)
     for name, array in arrays.items():
         # SciPy writes booleans as bytes with a flag, as MATLAB does
@@ -238,23 +241,21 @@ def test_every_type_and_shape_of_matlab_5_comes_through(kind, packed):
         np.testing.assert_array_equal(found[name], array)
 
 
-@each_row("kind", ["f8", "f4", "i4", "i2", "u1"])
-def test_matrices_of_matlab_4_come_through(kind):
-    arrays = {"first": np.arange(12).reshape(3, 4).astype(kind), "b": np.ones((1, 1), kind)}
-    content = io.BytesIO()
-    savemat(content, arrays, format="4")
-    found = read_matlab(content.getvalue(), "s.mat")
+def test_matrices_of_matlab_4_come_through(tmp_path):
+    path = tmp_path / "s.mat"
+    arrays = {name: np.arange(12).reshape(3, 4).astype(name) for name in ("f8", "f4", "i4", "i2", "u1")}
+    savemat(path, arrays, format="4")
+    found = read_arrays(path)
     assert list(found) == list(arrays)
     for name, array in arrays.items():
         np.testing.assert_array_equal(found[name], array)
     for other in ({"a": "text"}, {"a": np.array([[1j]])}):
-        content = io.BytesIO()
-        savemat(content, other, format="4")
+        savemat(path, other, format="4")
         with pytest.raises(DataError, match=r"'a' is a MATLAB (char|complex)"):
-            read_matlab(content.getvalue(), "s.mat")
+            read_arrays(path)
 
 
-def test_numbers_that_matlab_stored_in_less_space_and_in_the_other_byte_order_come_through():
+def test_numbers_that_matlab_stored_in_less_space_and_in_the_other_byte_order_come_through(tmp_path):
     """Doubles that are whole and small are stored as bytes; files of some computers begin with the high byte."""
     for order, mark in (("<", b"IM"), (">", b"MI")):
         flags = struct.pack(order + "IIII", 6, 8, 6, 0)
@@ -262,10 +263,24 @@ def test_numbers_that_matlab_stored_in_less_space_and_in_the_other_byte_order_co
         name = struct.pack(order + "I", 1 << 16 | 1) + b"a\x00\x00\x00"
         values = struct.pack(order + "I", 3 << 16 | 2) + bytes([7, 8, 9, 0])
         body = flags + shape + name + values
-        content = bytes(124) + struct.pack(order + "H", 0x0100) + mark + struct.pack(order + "II", 14, len(body)) + body
-        found = read_matlab(content, "s.mat")["a"]
+        header = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack(order + "H", 0x0100) + mark
+        content = header + struct.pack(order + "II", 14, len(body)) + body
+        (tmp_path / "s.mat").write_bytes(content)
+        found = read_arrays(tmp_path / "s.mat")["a"]
         assert found.dtype == np.float64
         np.testing.assert_array_equal(found, [[7.0, 8.0, 9.0]])
+
+
+def test_a_reader_that_crashes_or_does_not_end_is_a_damaged_file(tmp_path, monkeypatch):
+    path = tmp_path / "s.mat"
+    save_matlab_5(path, make_capture(3))
+    monkeypatch.setattr(matlab, "PATIENCE_SECONDS", 0.01)
+    with pytest.raises(DataError, match="no MATLAB file, or a damaged one"):
+        load_capture(path)
+    monkeypatch.setattr(matlab, "PATIENCE_SECONDS", 60.0)
+    monkeypatch.setattr(matlab, "__name__", "ctypes; ctypes.string_at(0); from sys")
+    with pytest.raises(DataError, match="no MATLAB file, or a damaged one"):
+        load_capture(path)
 
 
 def test_matlab_7_structures_and_foreign_hdf5_are_refused(tmp_path):
@@ -307,7 +322,8 @@ def test_flipped_bytes_end_in_a_clear_error_or_in_a_checked_capture(tmp_path, ki
     FORMATS[kind](path, make_capture(3))
     content = path.read_bytes()
     generator = np.random.default_rng(1)
-    for _ in range(60):
+    # each file of MATLAB 5 takes a process
+    for _ in range(12 if kind == "mat 5" else 60):
         damaged = bytearray(content)
         for place in generator.integers(0, len(content), 3):
             damaged[place] = int(generator.integers(0, 256))

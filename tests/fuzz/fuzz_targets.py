@@ -194,7 +194,7 @@ TARGETS = (
     Target("mesh, glTF", 2_000, _meshes("gltf"), either(mutate_gltf, mutate_json), of_file(".gltf", read_mesh)),
     Target("face model (HDF5)", 3_000, corpus.face_models, mutate_hdf5, of_file(".h5", read_face)),
     Target("capture (npz)", 3_000, corpus.captures_npz, mutate_npz, of_file(".npz", read_capture)),
-    Target("capture (MATLAB 5)", 2_000, corpus.captures_matlab, mutate_matlab, of_file(".mat", read_capture)),
+    Target("capture (MATLAB 5)", 60, corpus.captures_matlab, mutate_matlab, of_file(".mat", read_capture)),
     Target("capture (MATLAB 7.3)", 1_500, corpus.captures_hdf5, mutate_hdf5, of_file(".mat", read_capture)),
     Target("steering list (CSV)", 2_000, corpus.steering_lists, TEXTS, of_file(".galvo.csv", read_steering)),
     Target("ray list (CSV)", 1_000, corpus.ray_tables, TEXTS, of_file(".csv", read_ray_table)),
