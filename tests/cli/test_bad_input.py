@@ -12,6 +12,7 @@ import pytest
 from support.command_line import files_under, make_run
 from support.mistakes import GARBAGE, GOOD, check_one_clear_message
 
+from lidardesign.run.lock import run_lock
 from lidardesign.run.yaml import dump_yaml, load_yaml
 
 CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"
@@ -180,7 +181,6 @@ def make_runs(folder):
     make_run(folder / "no_manifest", count=1000)
     (folder / "no_manifest" / "manifest.json").unlink()
     make_run(folder / "locked", count=1000)
-    (folder / "locked" / ".lock").write_text(json.dumps({"pid": 1, "host": "elsewhere"}))
     unfinished = make_run(folder / "unfinished", count=1000)
     manifest = json.loads((unfinished / "manifest.json").read_text())
     del manifest["files"]["samples.npz"]
@@ -209,7 +209,8 @@ def mistakes(tmp_path_factory):
     (folder / "good.yaml").write_text(GOOD)
     make_models(folder)
     make_runs(folder)
-    return folder
+    with run_lock(folder / "locked"):
+        yield folder
 
 
 @pytest.mark.parametrize(("arguments", "code", "words"), CASES, ids=[case[0] for case in CASES])

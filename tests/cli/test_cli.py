@@ -16,6 +16,7 @@ from lidardesign import __version__
 from lidardesign.cli import output as console_module
 from lidardesign.cli.output import Output, command, plain_json
 from lidardesign.errors import InfeasibleError
+from lidardesign.run.lock import run_lock
 from lidardesign.run.yaml import load_yaml
 from lidardesign.samples import Samples, load_samples, save_samples
 
@@ -266,8 +267,8 @@ def test_a_design_that_breaks_a_constraint_is_never_written(lidardesign, flat, m
 
 def test_a_run_that_is_being_written_is_left_alone(lidardesign, flat, monkeypatch):
     monkeypatch.setattr("lidardesign.workflow.designs.WAIT_S", 0.1)
-    (flat / ".lock").write_text(json.dumps({"pid": 1, "host": "elsewhere"}))
-    result = lidardesign("fit", flat)
+    with run_lock(flat):
+        result = lidardesign("fit", flat)
     assert result.code == 2
     assert "is writing this run" in result.err
 
