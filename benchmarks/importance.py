@@ -73,7 +73,7 @@ class Bench:
 
     def samples(self, settings: Mapping[str, Any]) -> Any:
         """The run's samples with the weights of some settings."""
-        from lidardesign.workflow.weighting import RunTarget, Weighting, weighted_samples
+        from lidardesign.workflow.run_samples import RunTarget, Weighting, weighted_samples
 
         texts = tuple(f"{key}={value}" for key, value in settings.items())
         weighting = Weighting(texts, range_spread_m=self.spread_m)

@@ -73,8 +73,7 @@ def curves(run_folder: Path, layout: str, sensors: int, rays: Sequence[int], see
     from lidardesign.evaluate.request import EvaluationRequest
     from lidardesign.evaluate.score import evaluate
     from lidardesign.samples import load_samples
-    from lidardesign.workflow.layouts import TWIN_NAME, Layouts, twin_without_visibility
-    from lidardesign.workflow.weighting import RunTarget
+    from lidardesign.workflow.run_samples import TWIN_NAME, Layouts, RunTarget, twin_without_visibility
 
     run = open_run(run_folder)
     config, samples = run.config, load_samples(run.folder)

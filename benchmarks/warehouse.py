@@ -71,7 +71,7 @@ def miss_rates(run_folder: Path, designs: list[Any], x_m: float, rays: int) -> d
     from lidardesign.evaluate.score import evaluate
     from lidardesign.samples import load_samples
     from lidardesign.task import scenes_of
-    from lidardesign.workflow.layouts import Layouts
+    from lidardesign.workflow.run_samples import Layouts
 
     run = open_run(run_folder)
     config = run.config
@@ -109,7 +109,7 @@ def divergence_nats(run_folder: Path, x_m: float, log_likelihood: float) -> floa
     from lidardesign.design.mixture.conditions import MOVED_SAMPLES, at_condition
     from lidardesign.samples import load_samples
     from lidardesign.task import random_generator
-    from lidardesign.workflow.weighting import RunTarget
+    from lidardesign.workflow.run_samples import RunTarget
 
     run = open_run(run_folder)
     generator = random_generator(run.config.seed, "condition")  # the fit's own samples

@@ -27,7 +27,6 @@ from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
 from lidardesign.task import judged_by_keys
 from lidardesign.workflow.designs import Design, html_table
-from lidardesign.workflow.layouts import Layouts, learned_density, twin_without_visibility
 from lidardesign.workflow.plans import RequestPlan, last_time
 from lidardesign.workflow.run_folder import (
     CONFIGURATION,
@@ -41,6 +40,7 @@ from lidardesign.workflow.run_folder import (
     run_of,
     settings_texts,
 )
+from lidardesign.workflow.run_samples import Layouts, learned_density, twin_without_visibility
 
 if TYPE_CHECKING:
     from lidardesign.evaluate.cma.candidate import Show

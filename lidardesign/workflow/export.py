@@ -18,10 +18,9 @@ from lidardesign.export.registry import EXPORTERS, Exporter
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
 from lidardesign.run.files import STDIO, is_input
-from lidardesign.workflow.layouts import may_need_samples
 from lidardesign.workflow.plans import RequestPlan, last_time
 from lidardesign.workflow.run_folder import CONFIGURATION, MANIFEST, Notes, RunFolder, folder_of, log_note, run_of
-from lidardesign.workflow.weighting import RunTarget, Weighting, weighted_samples
+from lidardesign.workflow.run_samples import RunTarget, Weighting, may_need_samples, weighted_samples
 
 # Formats that hold sensors only, so that the number of rays may stay open.
 WITHOUT_RAYS = ("sensors-csv", "stl")

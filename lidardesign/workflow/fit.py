@@ -31,7 +31,7 @@ from lidardesign.workflow.run_folder import (
     read_design,
     settings_texts,
 )
-from lidardesign.workflow.weighting import Weighting
+from lidardesign.workflow.run_samples import Weighting
 
 # Keys by which tasks are told where sensors may be.
 PLACE_KEYS = ("origin_m", "origin_box_m")

@@ -28,9 +28,8 @@ from lidardesign.scene import Scene
 from lidardesign.space import observed_point
 from lidardesign.task import conditions_of, random_generator
 from lidardesign.workflow.fit import FitRequest
-from lidardesign.workflow.layouts import Layouts
 from lidardesign.workflow.run_folder import Notes, RunFolder, log_note, provenance
-from lidardesign.workflow.weighting import KEY, RunTarget, Weighting
+from lidardesign.workflow.run_samples import KEY, Layouts, RunTarget, Weighting
 
 if TYPE_CHECKING:
     from lidardesign.evaluate.refinement.refinement import Refinement, Round, Shape, Trial

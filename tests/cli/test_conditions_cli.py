@@ -17,7 +17,7 @@ from lidardesign.registry import load_task
 @pytest.fixture
 def lidardesign(capsys, tmp_path, monkeypatch):
     """Run the program in this process; the target density is the planted one."""
-    monkeypatch.setattr("lidardesign.workflow.weighting.RunTarget.__call__", lambda self, points: log_target(points))
+    monkeypatch.setattr("lidardesign.workflow.run_samples.RunTarget.__call__", lambda self, points: log_target(points))
     return caller(capsys, tmp_path, monkeypatch)
 
 
@@ -213,7 +213,7 @@ def test_a_design_by_hand_without_a_number_of_rays_is_exported_at_the_one_that_i
 
 def test_a_design_is_exported_with_the_rays_that_it_is_evaluated_with(lidardesign, run, tmp_path):
     from lidardesign.samples import load_samples
-    from lidardesign.workflow.layouts import Layouts
+    from lidardesign.workflow.run_samples import Layouts
 
     for layout, gates in (("grid", "ray"), ("density", "ray"), ("distributed", "sensor"), ("distributed", "ray")):
         name = f"{layout}-{gates}"
@@ -247,7 +247,7 @@ def test_a_scan_for_one_value_is_fitted_anew_once_for_all_places(lidardesign, ru
 
 
 def test_a_distributed_design_by_hand_is_evaluated_with_the_gates_of_its_layout(tmp_path):
-    from lidardesign.workflow.layouts import Layouts
+    from lidardesign.workflow.run_samples import Layouts
 
     (tmp_path / "hand.yaml").write_text(OPEN.format(layout="distributed"))
     design = load_design(tmp_path / "hand.yaml")

@@ -15,7 +15,7 @@ from lidardesign.evaluate.refinement.reweighting import LARGEST_LOG_FACTOR, NEIG
 from lidardesign.run.yaml import dump_yaml, parse_yaml
 from lidardesign.samples import Samples
 from lidardesign.space import RANGE, DesignSpace, observed_point
-from lidardesign.workflow.weighting import KEY, WIDEST_SPREAD_M, Weighting
+from lidardesign.workflow.run_samples import KEY, WIDEST_SPREAD_M, Weighting
 
 SPACE = DesignSpace((0, 0, 0, -0.6, -0.4, 0.2), (0, 0, 0, 0.6, 0.4, 2.0))
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 # What learn, fit and evaluate import late; nothing of it may be run here, because threads do not survive a fork.
 LATE = (
-    "lidardesign.cli.main", "lidardesign.workflow.layouts", "lidardesign.density.fields.body_kernels",
+    "lidardesign.cli.main", "lidardesign.workflow.run_samples", "lidardesign.density.fields.body_kernels",
     "lidardesign.density.fields.body_kernels", "lidardesign.density.fields.table_kernels", "lidardesign.density.learn",
     "lidardesign.density.flow.spline_kernels", "lidardesign.design.mixture.conditions", "lidardesign.design.fit",
     "lidardesign.evaluate.metrics", "lidardesign.evaluate.report.report", "lidardesign.evaluate.score",

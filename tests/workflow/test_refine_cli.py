@@ -30,7 +30,7 @@ from lidardesign.space import RANGE, direction
 from lidardesign.task import Residuals, scenes_of
 from lidardesign.workflow.fit import FitRequest
 from lidardesign.workflow.refine import refinement_scenes
-from lidardesign.workflow.weighting import RunTarget, Weighting
+from lidardesign.workflow.run_samples import RunTarget, Weighting
 
 SEED = 3
 
