@@ -11,13 +11,8 @@ from scipy.stats import norm
 from support.references import first_photon_distribution
 from support.tables import each_row
 
-from lidardesign.simulate.detector.kernels import (
-    alive_shares,
-    at_least,
-    find_corrected,
-    find_returns,
-    pulse_shape,
-)
+from lidardesign.simulate.detector.dead_time import alive_shares, find_corrected
+from lidardesign.simulate.detector.kernels import at_least, find_returns, pulse_shape
 
 WHOLE = np.ones((1, 2))
 SIGMA, HALF = 2.5, 2

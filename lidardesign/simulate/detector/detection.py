@@ -8,6 +8,7 @@ import numpy as np
 
 from lidardesign.errors import ConfigError
 from lidardesign.scene import Scene
+from lidardesign.simulate.detector.dead_time import find_corrected
 from lidardesign.simulate.detector.detector import (
     FWHM_PER_SIGMA,
     Bins,
@@ -23,7 +24,6 @@ from lidardesign.simulate.detector.kernels import (
     echo_of,
     even_counts,
     expected_in_bins,
-    find_corrected,
     find_returns,
     poisson_of_bins,
 )

@@ -21,7 +21,6 @@ from lidardesign.scene import Scene
 from lidardesign.simulate.detector.detector import Detector, metres
 from lidardesign.simulate.effects.expected_counts import Blindness, Counts, Echo, estimate_error_m
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
-from lidardesign.simulate.streams import normals
 
 
 def add_timing_errors(
@@ -30,6 +29,9 @@ def add_timing_errors(
     """Half paths as they are timed [m], shape (K,): of photons by ray and order in it, or of whole returns."""
     if detector.jitter_sigma_s == 0:
         return path_m
+    # compiled, which bounds do without
+    from lidardesign.simulate.streams import normals
+
     return path_m + metres(detector.jitter_sigma_s) * normals(key, ray, order)
 
 

@@ -19,7 +19,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import TINY
@@ -27,27 +26,23 @@ from lidardesign.scene import Scene
 from lidardesign.simulate.detector.detector import Detector
 from lidardesign.simulate.effects.expected_counts import Blindness, Counts, missed_behind
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
-from lidardesign.simulate.streams import normals, poisson_quantile, uniform, uniforms
 
 # draws of a ray: 0 for the number of photons, from here on two per photon
 FIRST_PHOTON = 1
 
 
-@njit(cache=True, nogil=True)
-def _numbers(expected, rays, key):  # noqa: ANN001, ANN202
-    found = np.empty(len(expected), np.int64)
-    for i in range(len(expected)):
-        found[i] = poisson_quantile(expected[i], uniform(key, rays[i], 0))
-    return found
-
-
 def draw_numbers(expected: np.ndarray, rays: np.ndarray, key: int) -> np.ndarray:
     """Poisson counts of expected ones of rays, shapes (R,)."""
-    return _numbers(expected, rays, np.uint64(key))
+    # compiled, which bounds do without
+    from lidardesign.simulate.detector.kernels import poisson_of_rays
+
+    return poisson_of_rays(expected, rays, np.uint64(key))
 
 
 def draw_places(ray: np.ndarray, order: np.ndarray, key: int) -> tuple[np.ndarray, np.ndarray]:
     """For photons, by ray and order in it: a number in (0, 1) that chooses an echo, and a normal one for the pulse."""
+    from lidardesign.simulate.streams import normals, uniforms
+
     draw = FIRST_PHOTON + 2 * order
     return uniforms(key, ray, draw), normals(key, ray, draw + 1)
 
