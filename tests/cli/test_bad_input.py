@@ -293,13 +293,3 @@ def test_a_disk_that_takes_nothing_leaves_the_old_files(lidardesign, tmp_path, m
     check_one_clear_message(result, 3, os.strerror(reason))
     assert files_under(tmp_path) == before
     assert not (tmp_path / "new").exists()
-
-
-def test_evaluate_says_when_a_file_cannot_be_written(lidardesign, tmp_path):
-    make_run(tmp_path / "run", count=1000)
-    (tmp_path / "taken").write_text("a file")
-    lidardesign("fit", "run", "--sensors", "1")
-    for option, place in (("--csv", "taken/rows.csv"), ("--plots", "taken"), ("--report", "taken/report.html")):
-        result = lidardesign("evaluate", "run", "--rays", "16", option, place, "--json")
-        check_one_clear_message(result, 3, "taken")
-    assert (tmp_path / "taken").read_text() == "a file"

@@ -14,7 +14,7 @@ from support.command_line import files_under, make_run
 
 from lidardesign import __version__
 from lidardesign.cli import output as console_module
-from lidardesign.cli.output import Output, command, plain_json
+from lidardesign.cli.output import command, plain_json
 from lidardesign.errors import InfeasibleError
 from lidardesign.run.lock import run_lock
 from lidardesign.run.yaml import load_yaml
@@ -162,14 +162,6 @@ def test_tasks_alone_lists_them_and_json_is_one_document(lidardesign):
     listed = lidardesign("tasks", "list", "--json").json["tasks"]
     assert {"face", "flatland", "meshes"} <= {entry["name"] for entry in listed}
     assert lidardesign("tasks", "--json").json["tasks"] == listed
-
-
-def test_a_task_shows_its_keys_and_its_space(lidardesign):
-    document = lidardesign("tasks", "show", "flatland", "--json").json
-    assert document["metric"]["unit"] == "mm"
-    assert document["space"]["range_m"][0] >= 0
-    assert all(entry["description"] for entry in document["config"])
-    assert "design space" in lidardesign("tasks", "show", "flatland").out
 
 
 def test_a_task_shows_what_is_designed_what_is_given_and_how_it_is_fitted(lidardesign):
@@ -335,12 +327,6 @@ def test_numbers_that_json_lacks_become_null():
     assert plain_json(values) == {"a": None, "b": [None, 1.5], "c": [0, 1], "d": "x", "e": [None, True]}
 
 
-def test_quiet_says_nothing_by_the_way(capsys):
-    Output(quiet=True).note("something")
-    Output().note("something else")
-    assert capsys.readouterr().err == "something else\n"
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs the device /dev/full")
 def test_a_full_disk_behind_stdout_is_one_message(tmp_path):
     with open("/dev/full", "w") as full:
@@ -388,11 +374,6 @@ def test_a_scan_exported_at_another_count_has_its_own_sensors(lidardesign, flat,
     with np.load(tmp_path / "rays.npz") as arrays:
         assert len(arrays["sensor_names"]) == 20
         assert arrays["sensor"].max() == 19
-
-
-def test_help_gives_an_example_of_every_command(lidardesign):
-    for name in ("learn", "fit", "constrain", "evaluate", "export", "show"):
-        assert f"lidardesign {name} " in lidardesign(name, "--help").out.split(" Examples\n")[1]
 
 
 def test_a_design_that_was_copied_away_from_its_run_says_what_it_lacks(lidardesign, flat, tmp_path):

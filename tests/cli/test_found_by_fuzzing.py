@@ -200,13 +200,6 @@ def test_a_length_unit_without_a_value_is_refused(tmp_path):
         load_model(tmp_path / "m.h5")
 
 
-@pytest.mark.parametrize("kind", [np.float16, np.float32])
-def test_counts_of_half_precision_are_counted_without_a_warning(tmp_path, kind):
-    arrays = make_capture(3)
-    np.savez(tmp_path / "s.npz", **{**arrays, "counts": arrays["counts"].astype(kind)})
-    assert load_capture(tmp_path / "s.npz").counts.dtype == kind
-
-
 def test_directions_whose_length_overflows_are_refused_without_a_warning(tmp_path):
     arrays = {name: value for name, value in make_capture(3).items() if not name.endswith("_deg")}
     np.savez(tmp_path / "s.npz", **{**arrays, "direction": np.full((3, 3, 3), 1e200)})

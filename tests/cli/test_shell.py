@@ -300,12 +300,6 @@ def test_an_example_can_be_done_where_its_files_are(lidardesign, place, monkeypa
     assert sorted(place.rglob("*")) == before
 
 
-def test_every_command_has_the_options_that_all_have():
-    for name, command in commands():
-        names = {name for parameter in command.params for name in parameter.opts}
-        assert {"--json", "--seed", "--quiet", "-q", "--debug"} <= names, name
-
-
 def test_the_command_reference_is_the_program_s(monkeypatch):
     specification = importlib.util.spec_from_file_location("command_reference", ROOT / "tools/command_reference.py")
     tool = importlib.util.module_from_spec(specification)

@@ -224,11 +224,6 @@ def test_too_many_boxes_are_refused():
         Constraints.from_mapping({"origin": {"exclude": [SLAB] * 33}})
 
 
-def test_the_written_design_keeps_its_boxes():
-    result = fitted(origin={"exclude": [SLAB]})
-    assert design_document(result.design)["constraints"] == {"origin": {"exclude": [SLAB]}}
-
-
 @pytest.mark.parametrize("count", [40, 90])
 def test_rays_of_another_number_keep_out_with_and_without_samples(count, tmp_path):
     result = fitted(layout="distributed", rays=40, count=3, origin={"exclude": [PILLAR]})

@@ -140,11 +140,6 @@ def test_a_tour_stops_everywhere_once_even_where_stops_coincide(points):
         assert steps[-1] == steps.max()
 
 
-def test_a_square_grid_is_toured_without_a_detour():
-    grid = np.stack(np.meshgrid(np.arange(24.0), np.arange(24.0)), axis=-1).reshape(-1, 2)
-    assert travel(grid[short_tour(grid)]) == 576.0
-
-
 def test_scattered_stops_are_toured_nearly_as_shortly_as_is_known_to_be_possible():
     points = np.random.default_rng(5).uniform(-15, 15, (576, 2))
     stops = points[short_tour(points)]
@@ -202,11 +197,6 @@ def test_the_rows_follow_each_other_closely(tmp_path):
     stops = np.stack([table["x_deg"], table["y_deg"]], axis=1)
     assert travel(stops) < 0.7 * travel(stops[np.argsort(table["ray"])])
     assert np.abs(stops).max() <= 20.0
-
-
-def test_no_rays_make_a_file_without_rows(tmp_path):
-    write_galvo(design(), lay_out(design(), 0), tmp_path / "f.csv")
-    assert len(read_galvo(tmp_path / "f.csv")) == 0
 
 
 def test_sensors_at_other_places_are_positions_of_their_own(tmp_path):

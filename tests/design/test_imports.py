@@ -693,19 +693,6 @@ def test_a_rig_scores_as_the_design_that_fires_its_rays(call, run, tmp_path):
     assert any(note.startswith("no design fires") for note in result.json["notes"])
 
 
-def test_a_rig_is_shown_and_exported(call, tmp_path):
-    path = flat_rig(tmp_path)
-    shown = call("show", path, "--json").json
-    assert [sensor["name"] for sensor in shown["sensors"]] == ["left", "right"]
-    assert shown["bandwidth"]["rays"] == 16
-    assert "left" in call("show", path).out
-    assert call("export", path, "--format", "npz", "--out", "out.npz").code == 0
-    assert_same_rays(lay_out(load_design(tmp_path / "out.npz")), lay_out(load_design(path)))
-    refused = call("show", flat_rig(tmp_path, end=False))
-    assert refused.code == 3
-    assert "gate_end_m" in refused.err
-
-
 def test_what_is_no_file_is_refused_before_it_is_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path in (type(tmp_path)("/dev/zero"), tmp_path / "pipe"):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -154,9 +153,3 @@ def test_a_level_that_holds_nothing_or_everything_is_refused(lidardesign, tmp_pa
         result = lidardesign(command, run, "--level", level)
         assert result.code == 2
         assert "--level" in result.err
-
-
-def test_levels_are_no_part_of_what_a_ray_table_already_says():
-    design = fit(STILL, layout="density", sensors=3, rays=30, level=0.9, em_samples=4000, restarts=2).design
-    other = replace(design, level=0.5)
-    np.testing.assert_array_equal(lay_out(design).gate_m, lay_out(other).gate_m)

@@ -178,12 +178,6 @@ def test_each_ray_keeps_the_bounds_of_its_own_sensor():
     assert (rays.gate_m[:, 1] <= 2.5 + 1e-9).all()
 
 
-def test_a_bandwidth_is_no_limit_where_there_is_none():
-    model, limit = bandwidth_limit(Constraints(), 60)
-    assert limit is None
-    assert model == Bandwidth()
-
-
 def test_one_bin_per_ray_is_the_least():
     rules = Constraints.from_mapping({"budget": {"bandwidth_mbps": 0.001}}, where="test")
     assert bandwidth_limit(rules, 60)[1] == 60
@@ -229,8 +223,3 @@ def test_sensors_with_gates_of_their_own_keep_their_own_rays():
     rays = lay_out(replace(DESIGN, ray_table=None), 60, SAMPLES, gates="sensor")
     for sensor, gate in zip(rays.sensor, rays.gate_m, strict=True):
         np.testing.assert_allclose(gate, DESIGN.sensors[sensor].gate_m)
-
-
-def test_a_higher_level_hears_more():
-    widths = [np.diff(made(level=level).design.ray_table.gate_m, axis=1).mean() for level in (0.8, 0.95, 0.99)]
-    assert widths[0] < widths[1] < widths[2]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -570,11 +569,3 @@ def test_a_scan_has_no_sensors_that_could_be_parts(call, tmp_path):
 def test_more_rays_of_parts_than_a_file_holds_are_refused():
     with pytest.raises(ConfigError, match="at most 60000"):
         snapped(rays=60_001)
-
-
-def test_a_design_names_its_parts_in_its_file_and_without_them_says_nothing():
-    design = snapped(rays=30).design
-    document = design_document(design)
-    assert document["sensors"][0]["part"] == design.sensors[0].part
-    plain = replace(design, sensors=tuple(replace(sensor, part=None) for sensor in design.sensors))
-    assert all("part" not in sensor for sensor in design_document(plain)["sensors"])

@@ -103,13 +103,6 @@ def test_a_command_that_fails_ends_the_benchmark_with_its_message(common):
         result.document()
 
 
-def test_contestants_take_turns_after_one_round_that_is_not_counted(common):
-    calls = []
-    measured = common.interleaved({name: lambda name=name: calls.append(name) for name in "ab"}, rounds=2)
-    assert calls == list("ababab")
-    assert all(len(timing.wall) == len(timing.cpu) == 2 for timing in measured.values())
-
-
 @pytest.fixture
 def script(monkeypatch):
     """A benchmark script as a module, by its name."""
@@ -213,13 +206,6 @@ def test_positions_between_are_held_against_the_worst_of_the_papers(script):
     assert said([*paper, [0.37, 0.5, 0.1, 0.8, 20.0]]).startswith("holds")
     assert said([*paper, [0.37, 0.5, 2.0, 0.81, 20.0]]).startswith("does not hold")
     assert said([*paper, [0.37, 0.5, 2.0, math.nan, 20.0]]).startswith("does not hold")
-
-
-def test_the_exponent_of_a_power_law_is_its_power(script):
-    sizes = (10, 30, 100, 1000)
-    first, *others = script("growth").exponents(sizes, [5 * size**1.5 for size in sizes])
-    assert math.isnan(first)
-    assert others == pytest.approx([1.5, 1.5, 1.5])
 
 
 def test_the_reference_of_ray_casting_meets_a_box_where_planes_do(script):

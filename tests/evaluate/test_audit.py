@@ -114,12 +114,6 @@ def test_both_sides_of_an_audit_draw_the_same_random_numbers():
     assert audit.skipped == []
 
 
-def test_progress_of_an_audit_counts_both_passes():
-    told = []
-    evaluate(make_request(test=scenes(2, 3), audit=True), progress=lambda done, total, name: told.append((done, total)))
-    assert told == [(0, 6), (1, 6), (2, 6), (3, 6), (3, 6), (4, 6), (5, 6), (6, 6)]
-
-
 def test_what_cannot_be_simulated_is_noted_where_it_may_matter():
     decision = Planner(SINGLE).plan(sunny(1)[0], [make_request().lay_out(design(), 9, None)])
     found = [

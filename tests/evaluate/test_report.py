@@ -42,8 +42,6 @@ from lidardesign.evaluate.report.report import report_html, write_report
 from lidardesign.evaluate.report.tables import (
     CommandTimes,
     constraints_table,
-    four_digits,
-    number,
     rows_table,
     summary_sentences,
     table,
@@ -198,12 +196,6 @@ def test_phases_add_up_and_small_ones_count_as_other():
     assert "nothing" not in text
 
 
-def test_figures_of_any_kind_are_told():
-    assert number([0.5, -0.0]) == "0.5, 0"
-    assert number({"x": 1, "y": None}) == "x 1, y -"
-    assert number([[0.0, 1.0, 2.0]] * 3) == "3 places"
-
-
 def luminance(colour):
     shares = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
     linear = [value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4 for value in shares]
@@ -232,10 +224,6 @@ def test_a_verdict_needs_an_interval_that_excludes_zero_and_the_metrics_directio
     assert [verdict(lower, pair) for pair in lower.paired] == ["better", "open"]
     assert [verdict(higher, pair) for pair in higher.paired] == ["worse", "open"]
     assert "no clear difference from uniform" in summary_sentences(lower)[1]
-
-
-def test_figures_have_four_digits():
-    assert [four_digits(v) for v in (0.1152, 39.1, 1234.0, 0.0)] == ["0.1152", "39.10", "1234", "0.000"]
 
 
 @pytest.mark.parametrize(

@@ -142,12 +142,6 @@ def test_rows_that_fire_the_same_rays_are_scored_once():
     assert len(calls) == 6
 
 
-def test_progress_counts_scenes():
-    seen = []
-    evaluate(make_request(), progress=lambda done, total, row: seen.append((done, total)))
-    assert seen == [(i, 6) for i in range(7)]
-
-
 class BrokenTask(MissTask):
     def __init__(self, result):
         self.result = result

@@ -71,12 +71,6 @@ def test_the_angles_of_a_ray_list_give_its_directions():
     np.testing.assert_allclose(again, rays.direction, atol=1e-14)
 
 
-def test_every_column_has_its_unit_in_its_name_or_has_none():
-    without = {"direction_x", "direction_y", "direction_z", "sensor"}
-    for name in ray_columns(lay_out(design())):
-        assert name in without or name.rsplit("_", 1)[1] in {"m", "rad", "s"}
-
-
 def test_the_names_of_the_sensors_travel_in_the_npz(tmp_path):
     EXPORTERS["npz"].write(design(), lay_out(design()), tmp_path / "x.npz")
     assert read_npz(tmp_path / "x.npz")["sensor_names"].tolist() == ["s0, größe", "s1, größe"]

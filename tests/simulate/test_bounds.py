@@ -64,17 +64,6 @@ def test_expected_signal_is_the_light_budget_of_a_wall_met_head_on():
     assert found == pytest.approx(np.full(16, expected), rel=1e-6)
 
 
-def test_the_air_takes_the_whole_way_from_the_signal():
-    clear, foggy = facing_wall(), replace_medium(facing_wall(), Medium(0.3, 0.0))
-    found = counts(foggy, SINGLE, NARROW)
-    assert found.signal == pytest.approx(counts(clear, SINGLE, NARROW).signal)
-    assert found.in_air == pytest.approx(found.signal * math.exp(-0.3 * 4.0), rel=1e-6)
-
-
-def replace_medium(scene, medium):
-    return Scene(scene.bodies, scene.name, medium=medium)
-
-
 @each_row("mean", [0.0, 1e-9, 1e-3, 0.2, 1.0, 7.3, 100.0, 4e4])
 @each_row("bins", [1.0, 40.0, 3000.0])
 @each_row("allowed", [0.5, 0.01, 1e-6])

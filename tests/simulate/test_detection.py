@@ -277,23 +277,6 @@ FULL = {"pulse_sigma_s": SIGMA_S, "jitter_sigma_s": SIGMA_S, "bin_s": BIN_S, "de
 ALL = PHOTON_EFFECTS | {"atmosphere"}
 
 
-def test_results_do_not_depend_on_how_many_rays_are_counted_at_once(monkeypatch):
-    rays = 300
-    echoes, light = random_light(rays)
-    detector = counting_detector(rays, estimator="matched", **FULL)
-    whole = detected(windows(rays, 1.0, 3.0), echoes, light, detector, ALL)
-    assert np.isfinite(whole.path_m).mean() > 0.5
-    for at_once in (1, 700):
-        monkeypatch.setattr("lidardesign.simulate.detector.detector.BINS_AT_ONCE", at_once)
-        parts = detected(windows(rays, 1.0, 3.0), echoes, light, detector, ALL)
-        assert np.array_equal(parts.path_m, whole.path_m, equal_nan=True)
-        assert np.array_equal(parts.body, whole.body)
-    monkeypatch.undo()
-    monkeypatch.setattr("lidardesign.simulate.detector.detector.RAYS_AT_ONCE", 7)
-    parts = detected(windows(rays, 1.0, 3.0), echoes, light, detector, ALL)
-    assert np.array_equal(parts.path_m, whole.path_m, equal_nan=True)
-
-
 def test_a_ray_s_result_does_not_depend_on_other_rays_light():
     rays = 200
     echoes, light = random_light(rays)
@@ -514,7 +497,6 @@ class TestGatesThatDoNotFit:
         detector = counting_detector(1, repetition_hz=1e3, bin_s=1e-15)
         with pytest.raises(ConfigError, match=r"bins of 1.5e-07 m"):
             detected(windows(1, 1.0, 3.0), no_echoes(), background(1), detector, ALL)
-
 
 
 @each_row("seed", range(12))

@@ -197,18 +197,6 @@ def test_turning_the_world_and_its_motion_changes_nothing():
     assert there.normal[hit] == pytest.approx(here.normal[hit] @ world[:3, :3].T, abs=1e-7)
 
 
-def test_results_do_not_depend_on_the_other_rays():
-    generator = np.random.default_rng(14)
-    poses = np.stack([rigid(translation_m=(2.5, 0, 0)) @ random_pose(generator, 0.5) for _ in range(2)])
-    tracer = moving_tracer(Scene((Body(SHAPES["mesh"], poses=poses), Body(Plane()))), 0)
-    origins, looking, time_s = fan(200)
-    origins[:, 2] = 0.5
-    together = tracer(origins, looking, time_s)
-    for part in (slice(0, 1), slice(50, 120)):
-        alone = tracer(origins[part], looking[part], time_s[part])
-        assert np.array_equal(alone.range_m, together.range_m[part])
-
-
 def test_nothing_is_missed_however_fast_it_flies():
     # by the end of the frame the ball is 30 m further: the ball that holds its way still lets every ray through
     scene = Scene((Body(Sphere(0.2), poses=rigid(translation_m=(3, -15, 0)), velocity_m_s=(0.0, 300.0, 0.0)),))

@@ -63,13 +63,6 @@ def test_whatever_stands_before_the_gate_hides_what_is_in_it():
     assert len(hidden.points_m) == 0
 
 
-def test_casters_that_are_shared_change_nothing():
-    scene = Scene((ball(),))
-    rays = make_rays((0, 0, 0), fan())
-    (fresh,), (shared,) = simulate(scene, rays), simulate(scene, rays, casters=build_casters(scene))
-    assert np.array_equal(fresh.range_m, shared.range_m, equal_nan=True)
-
-
 def test_a_moving_body_gives_one_set_of_returns_per_frame():
     poses = np.stack([rigid(translation_m=(x, 0.0, 0.0)) for x in (2.0, 3.0, 4.0)])
     scene = Scene((Body(Sphere(0.5), "ball", "both", poses),))

@@ -227,25 +227,6 @@ def test_a_beam_that_starts_on_a_mirror_comes_back_finite():
     assert np.isfinite(led.path_m).all()
 
 
-def test_a_receiver_at_the_emitter_hears_the_same_detours_as_none():
-    bodies = (
-        slab(2.0, yaw_rad=0.6, specular=0.6, reflectance=0.2),
-        slab(1.2, yaw_rad=-0.3, transmission=0.8, specular=0.1, reflectance=0.05),
-        Body(Sphere(6.0)),
-    )
-    looking = fan(60)
-    _, alone = traced(Scene(bodies), beams_along(looking))
-    receiver = Receiver((0.0, 0.0, 0.0), **EVERYWHERE, range_m=(0.0, 99.0))
-    _, both = traced(Scene(bodies, receiver=receiver), beams_along(looking))
-    for name in ("ray", "path_m", "gain", "body"):
-        assert np.array_equal(getattr(alone, name), getattr(both, name))
-    narrow = Receiver((0.0, 0.0, 0.0), 0.0, 0.0, 0.2, 3.0, (0.0, 99.0))
-    _, seen = traced(Scene(bodies, receiver=narrow), beams_along(looking))
-    inside = np.abs(np.arctan2(looking[:, 1], looking[:, 0])) <= 0.1
-    assert 0 < len(seen) < len(alone)
-    assert np.array_equal(seen.ray, alone.ray[inside[alone.ray]])
-
-
 @pytest.mark.parametrize("at_once", [1, 7, 50])
 def test_beams_that_are_followed_in_groups_have_the_echoes_that_they_have_together(monkeypatch, at_once):
     window = slab(1.0, specular=0.3, transmission=0.6, reflectance=0.1)

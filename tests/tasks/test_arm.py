@@ -224,11 +224,6 @@ def test_scenes_without_jitter_are_refused():
         TASK.scenes(TASK.Config(jitter_m=0, size="small"), "train", 0)
 
 
-def test_more_trajectories_keep_the_first_ones(scenes):
-    (alone,) = TASK.scenes(TASK.Config(size="small", train=1), "train", 0)
-    np.testing.assert_array_equal(alone.truth["ball_m"], scenes["train"][0].truth["ball_m"])
-
-
 def test_a_ball_placed_exactly_by_its_returns_scores_zero(scenes):
     for scene in scenes["test"]:
         score = TASK.score(scene, exact_returns(scene, scene.truth["ball_m"]))

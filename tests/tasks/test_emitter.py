@@ -25,7 +25,7 @@ from lidardesign.geometry.rays import Outcome, Rays
 from lidardesign.geometry.receiver import in_view, path_of_range, path_windows, range_of_path
 from lidardesign.run.yaml import parse_yaml
 from lidardesign.samples import Samples
-from lidardesign.scene import Ambient, Body, Box, Medium, Plane, Receiver, Scene, Sphere, rigid
+from lidardesign.scene import Body, Box, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.detector.detector import IDEAL
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.effects.expected_counts import Counts
@@ -38,7 +38,6 @@ from lidardesign.space import RANGE, aim, direction
 
 SMALL = {"train": 4, "test": 2, "truth_points": 800}
 SHADOWED = Physics(IDEAL, frozenset({"shadowing"}))
-HALF_GATE_M = 0.02
 
 
 def receiver_at(place, **changes):
@@ -259,19 +258,6 @@ def test_an_emitter_at_the_detector_gives_the_returns_of_a_monostatic_sensor_to_
                 np.testing.assert_array_equal(getattr(bistatic, name)[kept], getattr(plain, name)[kept])
             first, second = task.score(scene, [plain]), task.score(scene, [bistatic])
             assert first == second
-
-
-def test_at_the_detector_noise_and_light_are_those_of_a_monostatic_sensor_too(heads):
-    """Every effect but detours, which a receiver of a whole field of view hears and a scanned pixel does not."""
-    _, config, scenes = heads
-    scene = replace(scenes[0], ambient=Ambient(100_000.0), medium=Medium(0.1, 0.01))
-    targets = np.random.default_rng(14).uniform((-0.2, -0.12, -0.12), (0.02, 0.12, 0.12), (1500, 3))
-    rays = rays_from(np.array(config.detector_m), targets, (0.05, 1.05))
-    physics = Physics(load_detector("single-photon"), frozenset(EFFECTS) - {"multipath"})
-    (alone,), (heard,) = (simulate(one, rays, physics=physics) for one in (replace(scene, receiver=None), scene))
-    assert 0.1 < alone.returned.mean() < 0.9
-    for name in ("outcome", "range_m", "body"):
-        np.testing.assert_array_equal(getattr(heard, name), getattr(alone, name))
 
 
 def test_heads_are_those_of_the_face_task(heads):
