@@ -94,6 +94,8 @@ def owned(
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """The samples of each sensor: their indices and, as it fires them, their design points.
 
+    Where a sensor's origin is pinned along a free axis of theirs, it fires them aimed anew.
+
     A sample belongs to the sensor with the highest weighted density of its own origin, direction and range
     among those whose region and origin box hold its ray, outside the excluded boxes, the first where they tie.
 
@@ -108,7 +110,12 @@ def owned(
     fired = []
     smallest = SMALLEST_LENGTH * (float(np.mean([sensor.range_m for sensor in design.sensors])) or 1.0)
     for index, (sensor, share) in enumerate(zip(design.sensors, design.weights, strict=True)):
-        own = _fired_by(sensor, points, space)
+        own = points
+        pinned = [axis for axis in range(3) if axis in space.free and sensor.origin_covariance_m2[axis, axis] == 0]
+        if pinned:
+            origins = points[:, :3].copy()
+            origins[:, pinned] = np.asarray(sensor.origin_m)[pinned]
+            own = space.wrap(aim(origins, observed_point(points)))
         fired.append(own)
         if share == 0:
             continue
@@ -124,24 +131,15 @@ def owned(
     return members, [own[member] for own, member in zip(fired, members, strict=True)]
 
 
-def _fired_by(sensor: Sensor, points: np.ndarray, space: DesignSpace) -> np.ndarray:
-    """The samples as a sensor fires them: aimed anew where its origin is pinned along an axis of theirs."""
-    pinned = [axis for axis in range(3) if axis in space.free and sensor.origin_covariance_m2[axis, axis] == 0]
-    if not pinned:
-        return points
-    origins = points[:, :3].copy()
-    origins[:, pinned] = np.asarray(sensor.origin_m)[pinned]
-    return space.wrap(aim(origins, observed_point(points)))
-
-
 def in_region(sensor: Sensor, points: np.ndarray) -> np.ndarray:
     """Which design points (N, 6) lie in a sensor's joint region, shape (N,) bool."""
     origin, tangent, _ = relative(sensor, points)
     inside = (np.abs(tangent) <= np.array(sensor.field_of_view_rad) / 2 + FIELD_ROUNDING_RAD).all(axis=1)
     spreads, axes = principal_axes(sensor)
     along = origin @ axes
-    within = np.square(along / spreads).sum(axis=1) <= ellipsoid_radius(sensor.level, len(spreads)) ** 2
-    return inside & within
+    # so many standard deviations within which the level of a normal vector of so many dimensions lies
+    radius = float(np.sqrt(chdtri(len(spreads), 1 - sensor.level))) if len(spreads) else 0.0
+    return inside & (np.square(along / spreads).sum(axis=1) <= radius**2)
 
 
 def principal_axes(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
@@ -149,11 +147,6 @@ def principal_axes(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
     values, axes = np.linalg.eigh(np.asarray(sensor.origin_covariance_m2, dtype=np.float64))
     free = values > SMALLEST_AXIS_SHARE * max(values[-1], 0.0)
     return np.sqrt(values[free]), axes[:, free]
-
-
-def ellipsoid_radius(level: float, axes: int) -> float:
-    """The number of standard deviations within which `level` of a normal vector of `axes` dimensions lies."""
-    return float(np.sqrt(chdtri(axes, 1 - level))) if axes else 0.0
 
 
 def log_joint_density(sensor: Sensor, points: np.ndarray, *, smallest_m: float) -> np.ndarray:

@@ -38,9 +38,7 @@ def placed(design: DesignSpec, at: Mapping[str, float]) -> DesignSpec:
     """
     if design.track is not None:
         return _on_track(design, design.track, at)
-    for name, value in at.items():
-        _check_coordinate(design, name, value)
-    moves = _moves(at)
+    moves = _moves(design, at)
     table = design.ray_table
     if table is not None:
         table = replace(table, origin_m=_moved(table.origin_m, moves))
@@ -54,9 +52,7 @@ def moved(rays: Rays, design: DesignSpec, at: Mapping[str, float]) -> Rays:
     Raises:
         ConfigError: A name that is no coordinate of the origin, at another value than the design's own.
     """
-    for name, value in at.items():
-        _check_coordinate(design, name, value)
-    return replace(rays, origin_m=_moved(rays.origin_m, _moves(at)))
+    return replace(rays, origin_m=_moved(rays.origin_m, _moves(design, at)))
 
 
 def interpolated(track: Track, at: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -111,7 +107,9 @@ def _on_track(design: DesignSpec, track: Track, at: Mapping[str, float]) -> Desi
         )
     value = float(at[track.dimension])
     azimuth, elevation, gate = interpolated(track, value)
-    table = Rays.from_angles(_origins(track, design, value), azimuth, elevation, gate, track.sensor)
+    move = {DIMENSIONS.index(track.dimension): value}
+    means = np.array([sensor.origin_m for sensor in design.sensors], dtype=np.float64)
+    table = Rays.from_angles(_moved(means[track.sensor], move), azimuth, elevation, gate, track.sensor)
     sensors = tuple(
         _turned(sensor, track, value, np.flatnonzero(track.sensor == index), (azimuth, elevation, gate))
         for index, sensor in enumerate(design.sensors)
@@ -145,7 +143,21 @@ def _bolted(sensor: Sensor, moves: Mapping[int, float]) -> Sensor:
     return replace(sensor, origin_m=_moved(sensor.origin_m, moves), origin_covariance_m2=covariance)
 
 
-def _moves(at: Mapping[str, float]) -> dict[int, float]:
+def _moves(design: DesignSpec, at: Mapping[str, float]) -> dict[int, float]:
+    """The coordinates of origins that change. Only origins move; a design for one direction is not one for another."""
+    for name, value in at.items():
+        if name not in DIMENSIONS:
+            allowed = ", ".join(DIMENSIONS)
+            raise ConfigError(f"{name!r} is no dimension of the design space", where="--at", allowed=allowed)
+        if not math.isfinite(value):
+            raise ConfigError(f"{name}={value}", where="--at", allowed="a finite number")
+        if name not in TRAVELLED and design.at.get(name) != value:
+            raise ConfigError(
+                f"{design.name} cannot be moved to {name}={value:g}",
+                where="--at",
+                allowed=condition_text({name: design.at[name]}) if name in design.at else ", ".join(TRAVELLED),
+                hint=f"lidardesign fit RUN --at {name}={value:g}",
+            )
     return {DIMENSIONS.index(name): float(value) for name, value in at.items() if name in TRAVELLED}
 
 
@@ -154,24 +166,3 @@ def _moved(origin_m: np.ndarray, moves: Mapping[int, float]) -> np.ndarray:
     for axis, value in moves.items():
         moved[..., axis] = value
     return moved
-
-
-def _origins(track: Track, design: DesignSpec, value: float) -> np.ndarray:
-    """Where the rays of a track start, shape (N, 3) [m]."""
-    means = np.array([sensor.origin_m for sensor in design.sensors], dtype=np.float64)[track.sensor]
-    return _moved(means, {DIMENSIONS.index(track.dimension): value})
-
-
-def _check_coordinate(design: DesignSpec, name: str, value: float) -> None:
-    """Only origins move; a design for one direction or range is not one for another."""
-    if name not in DIMENSIONS:
-        raise ConfigError(f"{name!r} is no dimension of the design space", where="--at", allowed=", ".join(DIMENSIONS))
-    if not math.isfinite(value):
-        raise ConfigError(f"{name}={value}", where="--at", allowed="a finite number")
-    if name not in TRAVELLED and design.at.get(name) != value:
-        raise ConfigError(
-            f"{design.name} cannot be moved to {name}={value:g}",
-            where="--at",
-            allowed=condition_text({name: design.at[name]}) if name in design.at else ", ".join(TRAVELLED),
-            hint=f"lidardesign fit RUN --at {name}={value:g}",
-        )
