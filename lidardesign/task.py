@@ -197,7 +197,7 @@ def notes_of(task: Task, config: Any, space: DesignSpace) -> list[str]:
     return list(found)
 
 
-def judged_by_keys(task: Task, config: Any) -> dict[str, Any]:
+def scoring_settings(task: Task, config: Any) -> dict[str, Any]:
     """The settings of a task that decide its scenes and scores: all but its `weighing_keys`."""
     return config.model_dump(mode="json", exclude=set(getattr(task, "weighing_keys", ())))
 

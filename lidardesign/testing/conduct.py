@@ -20,7 +20,7 @@ def check_random(subject: Subject) -> LawHolds:
 
 def check_files(subject: Subject) -> LawHolds:
     """Nothing is written but temporary files and caches."""
-    found = subject.watch.found_written()
+    found = subject.watch.written_files()
     if found:
         raise BrokenLawError(f"writes {', '.join(found)}", allowed="temporary files and the user's caches")
     return LawHolds("nothing but temporary files and caches")

@@ -76,7 +76,7 @@ class Watch:
             _note(self.drawn, [f"{name} in {what}" for name in _restored(before)])
             _note(self.changed, [f"{name} in {what}" for name in surroundings.restored()])
 
-    def found_written(self) -> list[str]:
+    def written_files(self) -> list[str]:
         """What was written or tried to be: also by compiled code, in a folder that was empty."""
         left = sorted(self.empty_folder.rglob("*")) if self.empty_folder else []
         return [*self.written, *(f"{path.name} in the working folder" for path in left[:MOST_NOTES])]

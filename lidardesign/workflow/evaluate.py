@@ -25,7 +25,7 @@ from lidardesign.run.clock import outermost_clock, phase, running
 from lidardesign.run.files import is_there
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
-from lidardesign.task import judged_by_keys
+from lidardesign.task import scoring_settings
 from lidardesign.workflow.designs import Design, html_table
 from lidardesign.workflow.plans import RequestPlan, last_time
 from lidardesign.workflow.run_folder import (
@@ -485,7 +485,7 @@ def common_run(designs: Sequence[Design], runs: Sequence[RunFolder]) -> RunFolde
 
     def scenes_key(run: RunFolder) -> tuple[Any, ...]:
         """What runs share whose designs are scored in the same scenes."""
-        return run.config.task_name, judged_by_keys(run.task, run.config.task), run.config.space
+        return run.config.task_name, scoring_settings(run.task, run.config.task), run.config.space
 
     first = candidates[0]
     for other in candidates[1:]:

@@ -32,7 +32,7 @@ from lidardesign.numerics import logsumexp
 from lidardesign.samples import load_samples
 from lidardesign.scene import LARGEST_WEIGHT, Body, Box, Capsule, Mesh, Receiver, Scene, Sphere, rigid
 from lidardesign.space import DesignSpace, observed_point
-from lidardesign.task import Defaults, Metric, TaskConfig, judged_by_keys
+from lidardesign.task import Defaults, Metric, TaskConfig, scoring_settings
 
 SPACE = DesignSpace((0, -0.1, -0.1, -0.5, -0.4, 0.3), (0, 0.1, 0.1, 0.5, 0.4, 2.2))
 SETTINGS = DensitySettings(sigma_m=0.05, field_resolution=24, quadrature_points=24)
@@ -456,6 +456,6 @@ def test_samples_of_the_plain_density_reweighted_are_those_of_the_weighted_one(l
 def test_settings_that_only_weigh_do_not_keep_designs_from_being_judged_together():
     task = FaceTask()
     plain, weighed, elsewhere = (FaceConfig(**keys) for keys in ({}, {"area_exponent": 0.5}, {"distance_m": 0.5}))
-    assert judged_by_keys(task, plain) == judged_by_keys(task, weighed)
-    assert judged_by_keys(task, plain) != judged_by_keys(task, elsewhere)
+    assert scoring_settings(task, plain) == scoring_settings(task, weighed)
+    assert scoring_settings(task, plain) != scoring_settings(task, elsewhere)
     assert set(task.weighing_keys) < set(FaceConfig.model_fields)

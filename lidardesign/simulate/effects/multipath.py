@@ -44,7 +44,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -102,7 +102,7 @@ def interreflections(scene: Scene, frame: int, rays: Rays, physics: Physics) -> 
     together = np.bincount(found.ray, gain, len(view.rays))
     kept = (together > FAINTEST_SHARE * view.direct.gain)[found.ray]
     ray, cell = found.ray[kept], found.cell[kept]
-    path_m = (view.start_m[ray] + found.bins.centres_m[cell]) / 2
+    path_m = (view.start_m[ray] + view.bins.centres_m[cell]) / 2
     return Echoes(view.number[ray], path_m, gain[kept], view.hits.body[ray])
 
 
@@ -201,11 +201,10 @@ class _View:
             self.frame,
             self._looks(),
             lights,
-            self.bins,
+            replace(self.bins, start_m=self.start_m),
             matt=True,
             samples=self.samples,
             seed=self.seed,
-            baseline_m=self.start_m,
             **options,
         )
 

@@ -26,7 +26,7 @@ from lidardesign.geometry.raycast import shared_caster
 from lidardesign.geometry.rays import Hits, Rays
 from lidardesign.geometry.receiver import receiver_axes
 from lidardesign.scene import Body, Box, Capsule, Plane, Receiver, Scene, Sphere
-from lidardesign.simulate.light_transport.process import TIME_LIMIT_S, ask
+from lidardesign.simulate.light_transport.process import ask
 
 # Half sizes of a plane's nested squares, in reaches. What lies further sends back less than 1e-4 of its light.
 PLANE_REACHES = (2.0, 10.0, 100.0)
@@ -196,25 +196,26 @@ class Lights:
 
 @dataclass(frozen=True)
 class PathBins:
-    """Equal bins of path lengths, less the rays' baselines where they have some.
+    """Equal bins of path lengths.
 
     Arguments:
         width_m: Of one bin: whole paths, there and back [m].
         count: How many.
-        start_m: Where the first begins [m].
+        start_m: Where the first begins [m], for all rays or for each, shape (N,).
     """
 
     width_m: float
     count: int
-    start_m: float = 0.0
+    start_m: float | np.ndarray = 0.0
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.width_m) and self.width_m > 0 and self.count > 0 and math.isfinite(self.start_m)):
+        finite = math.isfinite(self.width_m) and np.isfinite(self.start_m).all()
+        if not (finite and self.width_m > 0 and self.count > 0):
             raise ConfigError(f"{self}", where="bins", allowed="a finite start, a width above 0 m, one bin or more")
 
     @property
     def centres_m(self) -> np.ndarray:
-        """Centres of the bins [m], shape (count,)."""
+        """Centres of the bins [m], shape (count,), where they start alike for all rays."""
         return self.start_m + (np.arange(self.count) + 0.5) * self.width_m
 
 
@@ -257,8 +258,6 @@ def render_transient(
     matt: bool = False,
     own_light: bool = False,
     cone_sr: np.ndarray | None = None,
-    baseline_m: np.ndarray | None = None,
-    limit_s: float = TIME_LIMIT_S,
 ) -> Transients:
     """The transients along rays of light that met 1 to `bounces` surfaces.
 
@@ -275,8 +274,6 @@ def render_transient(
         matt: Whether mirrors and glass swallow the light that they do not scatter.
         own_light: Whether ray n sees light n alone; otherwise all of them.
         cone_sr: Solid angle around each ray that its radiance is the mean of [sr], shape (N,); None: thin rays.
-        baseline_m: Length to take off the paths of each ray [m], shape (N,); None: 0.
-        limit_s: How long a request may take [s].
 
     Raises:
         ConfigError: The simulator is not usable here, or numbers that are not allowed.
@@ -294,7 +291,7 @@ def render_transient(
     centre_m, reach_m = _neighbourhood(first, rays, lights)
     shapes, arrays = scene_shapes(scene, frame, centre_m, reach_m, matt=matt)
     columns = _ray_columns(rays, first, centre_m, cone_sr)
-    columns["baseline"] = bins.start_m + (np.zeros(count) if baseline_m is None else baseline_m)
+    columns["baseline"] = np.zeros(count) + bins.start_m
     columns["dark_radius"] = np.full(count, 0.0 if direct else SAME_PLACE * reach_m)
     request = {"shapes": shapes, "samples": samples, "bins": bins.count, "width_m": bins.width_m}
     request |= {"bounces": bounces, "own": own_light}
@@ -304,7 +301,7 @@ def render_transient(
     for number, rows in enumerate(_chunks(count, bins.count)):
         mine = arrays | {name: values[rows] for name, values in by_ray.items()}
         own_seed = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
-        parts.append((rows[0], ask({**request, "seed": own_seed}, mine, limit_s=limit_s)))
+        parts.append((rows[0], ask({**request, "seed": own_seed}, mine)))
     return _joined(bins, count, parts)
 
 
