@@ -19,7 +19,7 @@ import numpy as np
 from lidardesign.design.layouts.track import TRAVELLED
 from lidardesign.design.rigs.dispatch import read_rig
 from lidardesign.design.rigs.rig import rig_design
-from lidardesign.design.rigs.sensor_csv import looks_like_sensor_csv, read_sensor_csv
+from lidardesign.design.rigs.sensor_csv import begins_as_sensor_csv, read_sensor_csv
 from lidardesign.design.sensor import (
     DEFAULT_LEVEL,
     LEVELS,
@@ -220,7 +220,7 @@ def load_design(path: Path, reach_m: float | None = None) -> DesignSpec:
     rig = read_rig(path, head)
     if rig is not None:
         return rig_design(rig, path, reach_m)
-    if looks_like_sensor_csv(head):
+    if begins_as_sensor_csv(head):
         return read_sensor_csv(path)
     document = load_yaml(path, max_bytes=MAX_BYTES)
     design = design_from_document(document.value, str(path), locate=document.locate)

@@ -20,7 +20,7 @@ from lidardesign.design.files import design_document
 from lidardesign.design.layouts.layout import FittedDesign, Layout, likelihood_estimate, missing_samples
 from lidardesign.design.layouts.rays import LAYOUTS, gates_of, lay_out, layout_of, own_count
 from lidardesign.design.layouts.sensor_fit import FitProblem, fit_sensors
-from lidardesign.design.mixture.bounds import groups
+from lidardesign.design.mixture.bounds import sensor_groups
 from lidardesign.design.mixture.conditions import conditioned, fixed_conditions
 from lidardesign.design.mixture.support import Retarget, Support
 from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, DesignSpec, Gates, LayoutName, Sensor
@@ -279,7 +279,7 @@ def refitted(
         if "budget" in document:
             document["budget"] = {key: value for key, value in document["budget"].items() if key != "rays"}
         constraints = Constraints.from_mapping(document, where=f"constraints of {design.name}")
-        if any(pin is not None for group in groups(constraints.rules, samples.space, 1) for pin in group.pins):
+        if any(pin is not None for group in sensor_groups(constraints.rules, samples.space, 1) for pin in group.pins):
             raise ConfigError(
                 f"a scan from a pinned origin cannot be fitted anew to {count} rays without its target density",
                 where=design.name,

@@ -16,7 +16,7 @@ from lidardesign.design.files import design_document
 from lidardesign.design.fit import FitResult
 from lidardesign.design.fit import fit as fit_samples
 from lidardesign.design.layouts.quantise import SAMPLES_PER_RAY
-from lidardesign.design.mixture.bounds import groups
+from lidardesign.design.mixture.bounds import sensor_groups
 from lidardesign.design.mixture.conditions import MOVED_SAMPLES, at_condition, condition_text
 from lidardesign.design.mixture.support import LEAST_SAMPLES
 from lidardesign.design.sensor import DesignSpec
@@ -121,7 +121,7 @@ class Fitter:
             return False
         if constraints is None:
             return True
-        members = groups(constraints.rules, self.base.space, max(len(constraints.each), 1) + 1)
+        members = sensor_groups(constraints.rules, self.base.space, max(len(constraints.each), 1) + 1)
         return not is_mounted(constraints.rules) and all(pin is None for group in members for pin in group.pins)
 
 

@@ -15,7 +15,7 @@ from support.command_line import caller, make_run
 from support.tables import each_row
 
 from lidardesign.design.catalog.library import FOLDER, find_part, load_library
-from lidardesign.design.catalog.part import Part, conditions_of, disagreements, thinned, to_angles, to_directions
+from lidardesign.design.catalog.part import Part, conditions_of, disagreements, even_subset, to_angles, to_directions
 from lidardesign.design.catalog.placing import (
     Pose,
     boresight_of,
@@ -329,27 +329,27 @@ def test_rays_of_one_part_fire_over_its_own_frame():
 def test_a_subset_has_the_rays_asked_for_each_once(total, data):
     count = data.draw(st.integers(0, total))
     points = np.random.default_rng(total).normal(size=(total, 3))
-    kept = thinned(points, count)
+    kept = even_subset(points, count)
     assert len(np.unique(kept)) == len(kept) == count
     assert np.array_equal(kept, np.sort(kept))
-    assert np.array_equal(kept, thinned(points, count))
+    assert np.array_equal(kept, even_subset(points, count))
 
 
 def test_a_quarter_of_the_zones_is_one_of_every_block_of_four():
-    kept = thinned(PARTS["vl53l5cx"].directions, 16)
+    kept = even_subset(PARTS["vl53l5cx"].directions, 16)
     blocks = {(index // 8 // 2, index % 8 // 2) for index in kept}
     assert len(blocks) == 16
 
 
 def test_one_ray_of_each_quarter_stands_in_its_middle():
-    kept = thinned(PARTS["vl53l5cx"].directions, 4)
+    kept = even_subset(PARTS["vl53l5cx"].directions, 4)
     assert {(index // 8 // 4, index % 8 // 4) for index in kept} == {(0, 0), (0, 1), (1, 0), (1, 1)}
     assert all(index // 8 % 4 in (1, 2) and index % 4 in (1, 2) for index in kept)
 
 
 def test_a_subset_leaves_smaller_gaps_than_one_drawn_at_random():
     everything = PARTS["vlp-16"].directions
-    kept = everything[thinned(everything, 300)]
+    kept = everything[even_subset(everything, 300)]
     drawn = everything[np.random.default_rng(0).choice(len(everything), 300, replace=False)]
 
     def gap(chosen):

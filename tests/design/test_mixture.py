@@ -12,7 +12,7 @@ from support.mixtures import POINT, WHOLE, Z, drawn, features_of, naive_log_dens
 from support.tables import each_row
 
 from lidardesign.design.mixture.bounds import Bounds, Floors
-from lidardesign.design.mixture.em import fit_mixture, from_labels, run_em, seed_mixture
+from lidardesign.design.mixture.em import fit_mixture, mixture_of_labels, run_em, seed_mixture
 from lidardesign.design.mixture.m_step import fit_field, fit_gate, maximise
 from lidardesign.design.mixture.mixture import (
     Mixture,
@@ -209,7 +209,7 @@ def test_one_narrow_component_equals_the_sample_moments_of_scikit_learn():
     start = rival.predict(points[:, 3:])
     features = features_of(points, POINT)
     ours = run_em(
-        from_labels(features, start, Bounds.unbounded(2, Z)),
+        mixture_of_labels(features, start, Bounds.unbounded(2, Z)),
         features,
         Bounds.unbounded(2, Z),
         tolerance_nats=1e-10,

@@ -20,9 +20,9 @@ from lidardesign.design.mixture.m_step import fit_gate
 from lidardesign.design.mixture.origin_step import (
     OriginLimits,
     best_origins,
-    improved,
+    improve_in_boxes,
     objective,
-    projected,
+    project_into_boxes,
 )
 from lidardesign.space import DesignSpace
 
@@ -192,7 +192,7 @@ def test_one_bounded_axis_is_fitted_as_a_gate_and_the_others_follow_it(side):
     edge = generator.uniform(-0.3, 0.3, 40)
     (low if side == "low" else high)[:, 1] = edge
     box = box_of(low, high, -100, 100)
-    point, covariance = improved(mean, scatter, box, *projected(mean, scatter, box))
+    point, covariance = improve_in_boxes(mean, scatter, box, *project_into_boxes(mean, scatter, box))
     ends = {"start_low": edge} if side == "low" else {"end_high": edge}
     bounds = Bounds(**{**vars(Bounds.unbounded(40, Z)), **ends})
     centre, spread = fit_gate(mean[:, 1], scatter[:, 1, 1], bounds, 1e-9)
@@ -209,11 +209,11 @@ def test_steps_keep_the_bounds_and_only_gain(axes, most):
     generator = np.random.default_rng(axes)
     mean, scatter = moments(generator, 200, axes)
     box = box_of(*random_boxes(generator, 200, axes), most=most)
-    point, covariance = improved(mean, scatter, box, *projected(mean, scatter, box))
+    point, covariance = improve_in_boxes(mean, scatter, box, *project_into_boxes(mean, scatter, box))
     before = objective(mean, scatter, point, covariance)
     for _ in range(5):
         assert_inside(point, covariance, box)
-        point, covariance = improved(mean, scatter, box, point, covariance)
+        point, covariance = improve_in_boxes(mean, scatter, box, point, covariance)
         after = objective(mean, scatter, point, covariance)
         # with a bounded spread along tilted axes a step may be refused, which its caller does
         if math.isinf(most):
@@ -228,9 +228,9 @@ def test_repeated_steps_reach_what_a_general_optimiser_finds():
     mean, scatter = moments(generator, 6, 2)
     low, high = np.full((6, 2), 0.1), np.full((6, 2), 0.9)
     box = box_of(low, high)
-    point, covariance = projected(mean, scatter, box)
+    point, covariance = project_into_boxes(mean, scatter, box)
     for _ in range(40):
-        point, covariance = improved(mean, scatter, box, point, covariance)
+        point, covariance = improve_in_boxes(mean, scatter, box, point, covariance)
     found = objective(mean, scatter, point, covariance)
     for row in range(6):
 

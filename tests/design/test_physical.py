@@ -17,7 +17,7 @@ from lidardesign.design.files import design_document
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.mixture.bounds import Bounds
-from lidardesign.design.mixture.em import from_labels, run_em
+from lidardesign.design.mixture.em import mixture_of_labels, run_em
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.sensor import boresight_frame, interval_factor, tangent_directions
 from lidardesign.numerics import clipped_eigenvalues
@@ -152,7 +152,7 @@ def test_the_log_likelihood_never_falls_with_thin_origins():
     features = Features.of(samples.points, samples.weights, Axes.of(CUBE), CUBE)
     bounds = replace(Bounds.unbounded(4, interval_factor(0.95)), origin_thickness=np.full(4, 0.02))
     labels = np.random.default_rng(6).integers(0, 4, len(features))
-    trace = run_em(from_labels(features, labels, bounds), features, bounds, iterations=40)
+    trace = run_em(mixture_of_labels(features, labels, bounds), features, bounds, iterations=40)
     assert len(trace.history) > 3
     assert (np.diff(trace.history) >= 0).all()
     thin = np.sqrt(np.linalg.eigvalsh(trace.mixture.origin_covariance_m2)[:, 0])

@@ -25,7 +25,7 @@ from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts.grid import low_discrepancy
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.mixture.bounds import groups
+from lidardesign.design.mixture.bounds import sensor_groups
 from lidardesign.design.mixture.mixture import log_density
 from lidardesign.design.mixture.support import pin_samples, restrict_samples
 from lidardesign.design.sensor import DesignSpec, tangent_coordinates, tangent_directions
@@ -260,7 +260,7 @@ def bump(points):
 
 def restricted_draws(document, space=BOX, log_p_star=bump, count=8000):
     samples, constraints = samples_of(log_p_star, space), Constraints.from_mapping(document)
-    (group,) = groups(constraints.rules, space, 1)
+    (group,) = sensor_groups(constraints.rules, space, 1)
     support = restrict_samples(samples, constraints.rules, group)
     drawn = support.points[systematic_draw(support.weights, count, np.random.default_rng(10))]
     return support, drawn
@@ -343,7 +343,7 @@ def test_draws_from_a_pinned_origin_have_the_density_at_that_origin():
 
     samples = samples_of(log_p_star, space)
     constraints = Constraints.from_mapping({"origin": {"fixed_m": [0.04, 0, 0]}})
-    (group,) = groups(constraints.rules, space, 1)
+    (group,) = sensor_groups(constraints.rules, space, 1)
     support = pin_samples(samples, constraints.rules, group, log_p_star, 60_000, np.random.default_rng(11))
     drawn = support.points[systematic_draw(support.weights, 4000, np.random.default_rng(12))]
     assert (drawn[:, 0] == 0.04).all()

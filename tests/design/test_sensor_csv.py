@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from support.tables import each_row
 
 from lidardesign.design.files import load_design
-from lidardesign.design.rigs.sensor_csv import COLUMNS, looks_like_sensor_csv, read_sensor_csv, write_sensor_csv
+from lidardesign.design.rigs.sensor_csv import COLUMNS, begins_as_sensor_csv, read_sensor_csv, write_sensor_csv
 from lidardesign.design.sensor import DesignSpec, Sensor, tangent_coordinates
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.space import direction
@@ -93,7 +93,7 @@ def test_the_header_the_order_of_named_columns_and_a_byte_order_mark_do_not_matt
     order = np.random.default_rng(0).permutation(16)
     rows = [[line.split(",")[i] for i in order] for line in (HEADER, ROW)]
     shuffled.write_text("\ufeff" + "\r\n".join(" , ".join(row) for row in rows), encoding="utf-8")
-    assert looks_like_sensor_csv(shuffled.read_bytes())
+    assert begins_as_sensor_csv(shuffled.read_bytes())
     first, second = load_design(plain).sensors[0], load_design(shuffled).sensors[0]
     for field in FIELDS:
         np.testing.assert_array_equal(getattr(first, field), getattr(second, field))
@@ -202,7 +202,7 @@ def test_an_empty_file_and_bytes_that_are_no_text_are_refused(tmp_path):
     "text", ["schema_version: 1\nsensors: [1, 2]\n", "a: 1, 2", "{a: 1, b: 2}", "[1, 2]", "- 1"]
 )
 def test_yaml_is_not_taken_for_a_table(tmp_path, text):
-    assert not looks_like_sensor_csv(text.encode())
+    assert not begins_as_sensor_csv(text.encode())
     path = tmp_path / "a.csv"
     path.write_text(text)
     with pytest.raises(ConfigError):

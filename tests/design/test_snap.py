@@ -31,7 +31,7 @@ from lidardesign.design.snap.parts import (
     parts_of,
     wants_parts,
 )
-from lidardesign.design.snap.rays import affordable, capped_split, counts_of, useful_split
+from lidardesign.design.snap.rays import afford_rays, capped_split, count_rays, useful_split
 from lidardesign.design.snap.shapes import shapes_of
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.samples import Samples
@@ -270,7 +270,7 @@ def test_losses_are_what_the_mixture_loses_by_each_part_alone():
 
     ensemble = fitted_ensemble()
     assert isinstance(ensemble, Ensemble)
-    (group,), (trace,) = ensemble.parts, ensemble.traces
+    (group,), (trace,) = ensemble.parts, ensemble.results
     shapes = [shape for name in ("vl53l5cx", "tmf8828") for shape in shapes_of(find_part(name), SPACE)]
     choices = nearest_parts(ensemble, [PartOptions(shapes, True), PartOptions(shapes, True)], 200, seed=0)
     heaviest = int(np.argmax(trace.mixture.weights))
@@ -301,15 +301,15 @@ def test_refitting_poses_never_lowers_the_likelihood_and_keeps_the_shapes_and_sh
     shape = shapes_of(find_part("vl53l5cx"), SPACE)[0]
     choices = [PartChoice(shape, (0.0,)), PartChoice(shape, (0.0,))]
     moved, still = (fit_part_poses(ensemble, choices, [held, held]) for held in (False, True))
-    (history,) = (trace.history for trace in moved.traces)
+    (history,) = (trace.history for trace in moved.results)
     assert (np.diff(history) >= 0).all()
     assert moved.log_likelihood > still.log_likelihood
     for found in (moved, still):
-        mixture: Mixture = found.traces[0].mixture
-        np.testing.assert_allclose(mixture.weights, ensemble.traces[0].mixture.weights)
+        mixture: Mixture = found.results[0].mixture
+        np.testing.assert_allclose(mixture.weights, ensemble.results[0].mixture.weights)
         expected = shape.spread_rad(ensemble.parts[0].bounds.interval, ensemble.parts[0].features.axes)
         np.testing.assert_allclose(mixture.spread_rad, np.tile(expected, (2, 1)), rtol=1e-7)
-    before, after = ensemble.traces[0].mixture, still.traces[0].mixture
+    before, after = ensemble.results[0].mixture, still.results[0].mixture
     for key in ("azimuth_rad", "elevation_rad", "roll_rad", "origin_m"):
         np.testing.assert_allclose(getattr(after, key), getattr(before, key), atol=1e-9)
 
@@ -426,11 +426,11 @@ def test_rays_that_nobody_asked_for_are_those_that_see_something():
     useful = np.array([40, 10])
     free = BandwidthBudget.of(Constraints(), None)
     widths = np.array([1.0, 1.0])
-    assert counts_of(useful, np.array([0.5, 0.5]), widths, free).tolist() == [40, 10]
-    mixed = counts_of(np.array([40, 0]), np.array([0.8, 0.2]), widths, free)
+    assert count_rays(useful, np.array([0.5, 0.5]), widths, free).tolist() == [40, 10]
+    mixed = count_rays(np.array([40, 0]), np.array([0.8, 0.2]), widths, free)
     assert mixed.tolist() == [40, 10]
     tight = BandwidthBudget.of(Constraints.from_mapping({"budget": {"bandwidth_mbps": 0.3}}), None)
-    few = counts_of(useful, np.array([0.5, 0.5]), widths, tight)
+    few = count_rays(useful, np.array([0.5, 0.5]), widths, tight)
     assert tight.mbps(widths, few, int(few.sum())) <= 0.3 * 1.2
     assert tight.model.mbps_of_widths(widths, few) <= 0.3
     assert (few >= 1).all()
@@ -440,10 +440,10 @@ def test_choices_that_are_affordable_stay():
     shape = shapes_of(find_part("vl53l5cx"), SPACE)[0]
     options = [PartOptions([shape], True)]
     choice = [PartChoice(shape, (0.1,))]
-    found = affordable(choice, options, np.ones(1), np.ones(1), BandwidthBudget.of(Constraints(), 64))
+    found = afford_rays(choice, options, np.ones(1), np.ones(1), BandwidthBudget.of(Constraints(), 64))
     assert found == choice
     with pytest.raises(InfeasibleError, match="have 64 rays, 1 fewer"):
-        affordable(choice, options, np.ones(1), np.ones(1), BandwidthBudget.of(Constraints(), 65))
+        afford_rays(choice, options, np.ones(1), np.ones(1), BandwidthBudget.of(Constraints(), 65))
 
 
 # places

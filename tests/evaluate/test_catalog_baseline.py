@@ -15,7 +15,7 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.catalog.library import find_part
 from lidardesign.design.catalog.placing import Pose, part_rays
 from lidardesign.design.sensor import boresight_frame
-from lidardesign.design.snap.shapes import PartShape, gate_inside, in_view, shapes_of, worth_firing
+from lidardesign.design.snap.shapes import PartShape, gate_inside, in_part_view, shapes_of, useful_ray_filter
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.catalog import (
     CLUTTER,
@@ -173,7 +173,7 @@ def naive_worth(part, poses, points, space, visible=None):
             offset = spot - pose.origin_m
             range_m = math.dist(spot, pose.origin_m)
             near, far = max(part.range_m[0], space.low[5]), min(part.range_m[1], space.high[5])
-            seen = near <= range_m <= far and in_view(part, (pose.frame @ offset / range_m)[None])[0]
+            seen = near <= range_m <= far and in_part_view(part, (pose.frame @ offset / range_m)[None])[0]
             share = 1.0 if visible is None else visible[index][number]
             density += share * seen / range_m**2 / len(poses)
         total += math.log((1 - CLUTTER) * density + CLUTTER / middle**2)
@@ -193,8 +193,9 @@ def test_no_place_that_was_tried_is_likelier_than_the_one_taken():
 def test_two_parts_see_what_one_cannot():
     two = np.concatenate([cloud([2.0, -0.9, 0.0], FIXED, 200, 0.03), cloud([2.0, 0.9, 0.0], FIXED, 200, 0.03)])
     posed = PosedPart(find_part("tmf8820"), spots(FIXED, two), 1)
+    looking = direction(two[:, 3], two[:, 4])
     seen = [
-        np.mean([in_view(posed.part, direction(two[:, 3], two[:, 4]) @ pose.frame.T) for pose in posed.best(number)], 0)
+        np.mean([in_part_view(posed.part, looking @ pose.frame.T) for pose in posed.best(number)], 0)
         for number in (1, 2)
     ]
     assert (seen[0] > 0).mean() < 0.8
@@ -324,23 +325,23 @@ def test_rows_of_several_parts_say_how_many():
 @each_row("name", ["vl53l5cx", "rplidar-c1", "mid-360", "azure-kinect", "tmf8821:3x6"])
 def test_a_part_has_all_its_rays_in_view(name):
     part = find_part(name)
-    assert in_view(part, part.directions).all()
+    assert in_part_view(part, part.directions).all()
 
 
 def test_rays_worth_firing_are_those_nearest_to_what_there_is():
     part, pose = find_part("vl53l5cx"), Pose()
     rays = part.directions
     points = aim(np.zeros((60, 3)), rays[:3].repeat(20, axis=0) * 2.0)
-    kept = worth_firing(part, pose, points, np.ones(60))(rays)
+    kept = useful_ray_filter(part, pose, points, np.ones(60))(rays)
     assert np.flatnonzero(kept).tolist() == [0, 1, 2]
     # one stray in a thousand is none that a ray is spent on
     weights = np.concatenate([np.full(40, 1.0), np.full(20, 1e-3)])
-    assert np.flatnonzero(worth_firing(part, pose, points, weights)(rays)).tolist() == [0, 1]
-    assert not worth_firing(part, pose, points, np.zeros(60))(rays).any()
+    assert np.flatnonzero(useful_ray_filter(part, pose, points, weights)(rays)).tolist() == [0, 1]
+    assert not useful_ray_filter(part, pose, points, np.zeros(60))(rays).any()
     # asked for more, the rays beside them: of an 8 by 8 pattern the neighbours in its row and the next
-    more = worth_firing(part, pose, points, np.ones(60), least=7)(rays)
+    more = useful_ray_filter(part, pose, points, np.ones(60), least=7)(rays)
     assert np.flatnonzero(more).tolist() == [0, 1, 2, 3, 8, 9, 10]
-    assert worth_firing(part, pose, points, np.ones(60), least=1000)(rays).all()
+    assert useful_ray_filter(part, pose, points, np.ones(60), least=1000)(rays).all()
 
 
 def test_a_shape_is_where_its_component_looks_upright_and_turned():

@@ -208,7 +208,7 @@ class TestContradictions:
         def never(*_, **__):
             raise AssertionError("samples were asked for before the constraints")
 
-        for step in ("restrict_samples", "pin_samples", "choose_mounts", "fit_parts"):
+        for step in ("restrict_samples", "pin_samples", "choose_mounts", "fit_groups"):
             monkeypatch.setattr(f"lidardesign.design.layouts.sensor_fit.{step}", never)
         samples = Samples(FACE.sample(10, np.random.default_rng(0)), np.zeros(10), np.zeros(10), FACE)
         files = [(values, {}) for values, _ in CONTRADICTIONS.values()]

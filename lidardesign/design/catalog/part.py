@@ -312,7 +312,7 @@ def disagreements(part: Part) -> list[str]:
     return names
 
 
-def thinned(points: np.ndarray, count: int) -> np.ndarray:
+def even_subset(points: np.ndarray, count: int) -> np.ndarray:
     """Indices, ascending, of `count` of the points that lie evenly among them: (M, K) to int64 (count,).
 
     The points are halved along their longest extent until as many groups as wanted are left, each with the same

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lidardesign.design.catalog.part import Part, thinned
+from lidardesign.design.catalog.part import Part, even_subset
 from lidardesign.design.layouts.grid import grid_rows, grid_tangent
 from lidardesign.design.sensor import (
     DEFAULT_LEVEL,
@@ -108,12 +108,12 @@ def part_rays(
 def _chosen(directions: np.ndarray, count: int, wanted: Wanted | None) -> np.ndarray:
     """An evenly spread subset of a part's rays, of the wanted ones first, shape (count, 3)."""
     if count == len(directions) or wanted is None:
-        return directions[thinned(directions, count)]
+        return directions[even_subset(directions, count)]
     mask = np.asarray(wanted(directions), dtype=bool)
     first, other = np.flatnonzero(mask), np.flatnonzero(~mask)
     if len(first) >= count:
-        return directions[first[thinned(directions[first], count)]]
-    rest = other[thinned(directions[other], count - len(first))]
+        return directions[first[even_subset(directions[first], count)]]
+    rest = other[even_subset(directions[other], count - len(first))]
     return directions[np.sort(np.concatenate([first, rest]))]
 
 

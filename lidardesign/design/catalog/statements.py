@@ -20,14 +20,14 @@ Percent = Annotated[float, Field(gt=0, le=100)]
 Count = Annotated[int, Field(ge=1, le=MOST_RAYS)]
 
 
-def _shown(text: str) -> str:
+def _check_text(text: str) -> str:
     """Text that may be shown: not blank, and without characters that steer a terminal."""
     if not is_name(text):
         raise ValueError("is blank, or has characters that steer a terminal")
     return text
 
 
-Text = Annotated[str, Field(max_length=500), AfterValidator(_shown)]
+Text = Annotated[str, Field(max_length=500), AfterValidator(_check_text)]
 Angle = Annotated[float, Field(ge=-180, le=180)]
 Elevation = Annotated[float, Field(ge=-90, le=90)]
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]

@@ -1,4 +1,4 @@
-"""Keeping a bandwidth budget: how many rays fit, and which common gate width does."""
+"""Keeping a bandwidth budget: how many rays it pays for, and which common gate width."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def fit_within_budget(
     fitted: Fitted,
     refit: Callable[[Fitted, float], Fitted],
     shape: Callable[[Fitted], tuple[np.ndarray, np.ndarray]],
-    read_out: BandwidthBudget,
+    budget: BandwidthBudget,
 ) -> tuple[Fitted, int | None]:
     """A design that keeps the bandwidth budget, and its number of rays.
 
@@ -82,44 +82,44 @@ def fit_within_budget(
         fitted: The fit without a budget.
         refit: Continues a fit with gates no wider than a cap [m].
         shape: Gate widths [m] and weights of a fit, shape (K,) each.
-        read_out: Budget and bandwidth model.
+        budget: Budget and bandwidth model.
 
     Raises:
         InfeasibleError: Even the narrowest admitted gates exceed the budget.
     """
     widths, weights = shape(fitted)
-    if read_out.limit_mbps is None:
-        return fitted, read_out.rays
-    rays = read_out.rays if read_out.rays is not None else read_out.affordable_rays(widths, weights)
-    if read_out.fits(widths, weights, rays):
+    if budget.limit_mbps is None:
+        return fitted, budget.rays
+    rays = budget.rays if budget.rays is not None else budget.affordable_rays(widths, weights)
+    if budget.fits(widths, weights, rays):
         return fitted, rays
-    bins = _affordable_bins(read_out, widths, weights, rays)
+    bins = _affordable_bins(budget, widths, weights, rays)
     for _ in range(MOST_REFITS):
-        fitted = refit(fitted, (1 - BIN_MARGIN) * max(bins, 1) * read_out.model.bin_m)
+        fitted = refit(fitted, (1 - BIN_MARGIN) * max(bins, 1) * budget.model.bin_m)
         widths, weights = shape(fitted)
-        if read_out.fits(widths, weights, rays):
+        if budget.fits(widths, weights, rays):
             return fitted, rays
         if bins <= 1:
             break
-        bins = min(bins - 1, _affordable_bins(read_out, widths, weights, rays))
-    needed = read_out.mbps(widths, weights, rays)
+        bins = min(bins - 1, _affordable_bins(budget, widths, weights, rays))
+    needed = budget.mbps(widths, weights, rays)
     raise InfeasibleError(
         f"{rays} rays still need {needed:g} Mbit/s with the narrowest gates that the other constraints admit",
-        conflicts=["budget.bandwidth_mbps", *read_out.names],
-        allowed=f"at most {read_out.limit_mbps:g} Mbit/s",
+        conflicts=["budget.bandwidth_mbps", *budget.names],
+        allowed=f"at most {budget.limit_mbps:g} Mbit/s",
         hint="fewer rays, narrower gates, or more bandwidth",
     )
 
 
-def _affordable_bins(read_out: BandwidthBudget, widths: np.ndarray, weights: np.ndarray, rays: int) -> int:
+def _affordable_bins(budget: BandwidthBudget, widths: np.ndarray, weights: np.ndarray, rays: int) -> int:
     """The largest common cap in bins that keeps the budget with the present weights, at least 1."""
     counts = split_budget(weights, rays)
-    bins = read_out.model.bins(widths)
-    unit = read_out.model.mbps_of_widths(np.zeros(1), 1)
+    bins = budget.model.bins(widths)
+    unit = budget.model.mbps_of_widths(np.zeros(1), 1)
     low, high = 1, int(bins.max())
     while low < high:
         middle = (low + high + 1) // 2
-        if unit * int(np.dot(counts, np.minimum(bins, middle))) <= (read_out.limit_mbps or 0.0):
+        if unit * int(np.dot(counts, np.minimum(bins, middle))) <= (budget.limit_mbps or 0.0):
             low = middle
         else:
             high = middle - 1

@@ -158,7 +158,7 @@ class Gate(_Keys):
     width_m: DistanceRange = DistanceRange()
 
 
-class Budget(_Keys):
+class RayBudget(_Keys):
     """Rays per frame and the read-out of the whole design."""
 
     rays: Annotated[int, Field(ge=1, le=MOST_RAYS)] | None = None
@@ -246,7 +246,7 @@ class Constraints(SensorConstraints):
     """
 
     sensors: SensorCount = SensorCount()
-    budget: Budget = Budget()
+    budget: RayBudget = RayBudget()
     each: list[SensorConstraints] = []
 
     @classmethod

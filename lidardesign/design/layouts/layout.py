@@ -162,7 +162,7 @@ def likelihood_estimate(ensemble: Ensemble, supports: Sequence[Support]) -> Esti
     That the sensors were fitted to these very samples is not in it.
     """
     variance = 0.0
-    for part, trace, support in zip(ensemble.parts, ensemble.traces, supports, strict=True):
+    for part, trace, support in zip(ensemble.parts, ensemble.results, supports, strict=True):
         weights = part.features.weights
         # as long as finding the components took, where there are hundreds of them
         values = log_density(trace.mixture, part.features) if trace.values is None else trace.values

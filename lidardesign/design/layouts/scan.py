@@ -41,7 +41,7 @@ from lidardesign.design.layouts.track import TRAVELLED, boresight_azimuth, inter
 from lidardesign.design.layouts.track_kmeans import TrackSamples, aimed_rays
 from lidardesign.design.mixture.bounds import Bounds, Group, bounds_of
 from lidardesign.design.mixture.conditions import fixed_conditions
-from lidardesign.design.mixture.em import EMResult, from_labels
+from lidardesign.design.mixture.em import EMResult, mixture_of_labels
 from lidardesign.design.mixture.ensemble import Ensemble, GroupSamples, sensors_of
 from lidardesign.design.mixture.features import Axes, Features, ray_features
 from lidardesign.design.mixture.mixture import Mixture, log_density
@@ -186,7 +186,7 @@ def _fit_cells(samples: GroupSamples, count: int, request: FitProblem) -> Ensemb
     _, labels = lloyd(ray_features(features), features.weights, count, generator, iterations=LLOYD_ITERATIONS)
 
     def scan(limits: Bounds) -> Ensemble:
-        mixture = from_labels(features, labels, limits).with_weights(np.full(count, 1.0 / count))
+        mixture = mixture_of_labels(features, labels, limits).with_weights(np.full(count, 1.0 / count))
         mixture = _gates_of_cells(mixture, features, labels, limits, request.level)
         values = log_density(mixture, features)
         score = float(features.weights @ values)
@@ -464,7 +464,7 @@ def _components(
     space = along.space.at({track.dimension: float(along.knots[knot])})
     features = Features.of(along.points[chosen], weights, Axes.of(space), space)
     count = len(track.sensor)
-    mixture = from_labels(features, labels[chosen], bounds).with_weights(np.full(count, 1.0 / count))
+    mixture = mixture_of_labels(features, labels[chosen], bounds).with_weights(np.full(count, 1.0 / count))
     start, end = track.gate_m[knot].T
     mixture = replace(mixture, range_m=(start + end) / 2, spread_range_m=(end - start) / (2 * bounds.interval))
     if features.axes.horizontal:

@@ -12,13 +12,13 @@ from lidardesign.design.constraints.budget import BandwidthBudget, fit_within_bu
 from lidardesign.design.constraints.document import Constraints, SensorRules
 from lidardesign.design.constraints.feasibility import most_rays
 from lidardesign.design.constraints.origins import is_mounted, most_mounted
-from lidardesign.design.mixture.bounds import bounds_of, groups
+from lidardesign.design.mixture.bounds import bounds_of, sensor_groups
 from lidardesign.design.mixture.coupling import add_couplings
 from lidardesign.design.mixture.ensemble import (
     Ensemble,
     GroupSamples,
     choose_mounts,
-    fit_parts,
+    fit_groups,
     heaviest_first,
     sensors_of,
 )
@@ -95,9 +95,9 @@ def fit_sensors(request: FitProblem) -> FittedSensors:
         request = replace(request, rules=fixed)
     supports = admitted_samples(request, counts[-1])
     count = counts[0] if len(counts) == 1 else _best_count(request, supports, counts)
-    if len(supports) != len(groups(request.rules, request.samples.space, count)):
+    if len(supports) != len(sensor_groups(request.rules, request.samples.space, count)):
         supports = admitted_samples(request, count)
-    fitted = fit_parts(group_samples(request, supports, count), request.seed, request.restarts)
+    fitted = fit_groups(group_samples(request, supports, count), request.seed, request.restarts)
     ensemble, rays = fit_within_budget(fitted, Ensemble.narrowed, lambda e: (e.widths_m, e.weights), request.budget)
     sensors = add_couplings(ensemble, sensors_of(ensemble, request.samples.space, request.level))
     sensors = sensors if request.constraints.each else heaviest_first(sensors)
@@ -125,7 +125,7 @@ def _sensor_counts(request: FitProblem) -> list[int]:
 def admitted_samples(request: FitProblem, count: int) -> list[Support]:
     """The samples of each group of sensors, refused where they are too few."""
     supports = []
-    members = groups(request.rules, request.samples.space, count)
+    members = sensor_groups(request.rules, request.samples.space, count)
     for index, group in enumerate(members):
         free = all(pin is None for pin in group.pins)
         if free:
@@ -149,7 +149,7 @@ def group_samples(request: FitProblem, supports: list[Support], count: int) -> l
     measure is another, they share by numbers of sensors.
     """
     space = request.samples.space
-    members = groups(request.rules, space, count)
+    members = sensor_groups(request.rules, space, count)
     shares = np.array([len(group.sensors) for group in members], dtype=np.float64) / count
     is_pinned = np.array([any(pin is not None for pin in group.pins) for group in members])
     totals = np.array([support.total for support in supports])
@@ -173,14 +173,14 @@ def _best_count(request: FitProblem, supports: list[Support], counts: list[int])
     scores: dict[int, tuple[float, float]] = {}
     waiting, best = 0, -math.inf
     for count in counts:
-        if len(groups(request.rules, request.samples.space, count)) != len(supports):
+        if len(sensor_groups(request.rules, request.samples.space, count)) != len(supports):
             continue
         train, test = [], []
         for index, part in enumerate(group_samples(request, supports, count)):
             draw = random_generator(request.seed, "held out", index).uniform(size=len(part.features))
             train.append(replace(part, features=part.features.subset(draw >= HELD_OUT_SHARE)))
             test.append(replace(part, features=part.features.subset(draw < HELD_OUT_SHARE)))
-        mean, error = fit_parts(train, request.seed, request.restarts).held_out(test)
+        mean, error = fit_groups(train, request.seed, request.restarts).held_out(test)
         scores[count] = mean, error
         waiting = 0 if mean > best + error else waiting + 1
         best = max(best, mean)

@@ -165,7 +165,7 @@ def pins_of(rules: SensorRules, space: DesignSpace) -> Pins:
     return x, y, z
 
 
-def groups(rules: Sequence[SensorRules], space: DesignSpace, count: int) -> list[Group]:
+def sensor_groups(rules: Sequence[SensorRules], space: DesignSpace, count: int) -> list[Group]:
     """The first sensors by their pinned origins, in order of first appearance."""
     members: dict[Pins, list[int]] = {}
     for sensor in range(count):

@@ -28,7 +28,7 @@ SMALLEST_VARIANCE_SHARE = SLACK
 def add_couplings(ensemble: Ensemble, sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
     """The sensors of an ensemble, in its own order of sensors, with their couplings."""
     coupled = list(sensors)
-    for part, trace in zip(ensemble.parts, ensemble.traces, strict=True):
+    for part, trace in zip(ensemble.parts, ensemble.results, strict=True):
         if not part.features.axes.origin:
             continue
         share = responsibilities(trace.mixture, part.features) * part.features.weights[:, None]

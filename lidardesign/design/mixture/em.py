@@ -111,7 +111,7 @@ def _finite(statistics: Statistics) -> float:
     return statistics.log_likelihood
 
 
-def from_labels(features: Features, labels: np.ndarray, bounds: Bounds) -> Mixture:
+def mixture_of_labels(features: Features, labels: np.ndarray, bounds: Bounds) -> Mixture:
     """Admissible components of a hard assignment, in two passes: boresights, then moments about them.
 
     A cell whose samples weigh next to nothing repeats the heaviest one.
@@ -146,7 +146,7 @@ def seed_mixture(features: Features, bounds: Bounds, generator: np.random.Genera
     part = features.subset(np.sort(chosen)) if len(chosen) < len(features) else features
     embedding = np.ascontiguousarray(part.embedding)
     _, labels = lloyd(embedding, part.weights, len(bounds), generator, iterations=SEED_LLOYD_ITERATIONS)
-    return from_labels(part, _match_cells(part, labels, bounds), bounds)
+    return mixture_of_labels(part, _match_cells(part, labels, bounds), bounds)
 
 
 def _match_cells(features: Features, labels: np.ndarray, bounds: Bounds) -> np.ndarray:
@@ -197,7 +197,7 @@ def fit_mixture(
     """
     if start is None:
         start = _best_seed(features, bounds, generator, 1 if len(bounds) == 1 else max(restarts, 1))
-    result = _revive(run_em(start, features, bounds), features, bounds, generator)
+    result = _revive_dead(run_em(start, features, bounds), features, bounds, generator)
     for part in (features.points[: max(len(bounds), FEW_SAMPLES)], features.points):
         different = len(np.unique(part, axis=0))
         if different >= len(bounds):
@@ -225,7 +225,7 @@ def dead_components(mixture: Mixture, features: Features) -> np.ndarray:
     return mixture.weights * effective_count(features.weights) < min(DEAD_SAMPLES, len(features) / len(mixture))
 
 
-def _revive(result: EMResult, features: Features, bounds: Bounds, generator: np.random.Generator) -> EMResult:
+def _revive_dead(result: EMResult, features: Features, bounds: Bounds, generator: np.random.Generator) -> EMResult:
     """Give dead components half of the heaviest one's samples and go on, where the likelihood gains."""
     notes: list[str] = []
     for _ in range(MOST_REVIVALS):
@@ -238,7 +238,7 @@ def _revive(result: EMResult, features: Features, bounds: Bounds, generator: np.
             part = features.subset(inside)
             _, halves = lloyd(np.ascontiguousarray(part.embedding), part.weights, 2, generator, iterations=2)
             labels[inside[halves == 1]] = component
-        again = run_em(from_labels(features, labels, bounds), features, bounds)
+        again = run_em(mixture_of_labels(features, labels, bounds), features, bounds)
         if again.log_likelihood < result.log_likelihood:
             notes.append(f"{len(dead)} of {len(bounds)} sensors explain almost no samples")
             break

@@ -1,6 +1,4 @@
-"""Fits of several groups of sensors, each on its own samples, as one design's mixture.
-
-Which mounting points the sensors take, where a constraint file lists more than there are sensors.
+"""Groups of sensors, each with its own samples, fitted as one design's mixture; and the mounts that sensors take.
 
 A mount is a pinned origin. How much of the density sensors at several mounts see together is, per sample, the
 most that any of them sees of its scene point (re-aimed and reweighted as in `support`), summed over samples
@@ -32,6 +30,11 @@ from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
 from lidardesign.task import random_generator
 
+# So many samples tell apart mounts whose shares differ by a hundredth.
+MOUNT_SAMPLES = 4000
+# `auto` takes as few mounts as together see this share of what all see together.
+ENOUGH_SHARE = 0.95
+
 
 @dataclass(frozen=True, eq=False)
 class GroupSamples:
@@ -56,16 +59,16 @@ class Ensemble:
 
     Arguments:
         parts: What was fitted.
-        traces: One per part.
+        results: One per part.
     """
 
     parts: tuple[GroupSamples, ...]
-    traces: tuple[EMResult, ...]
+    results: tuple[EMResult, ...]
 
     @property
     def log_likelihood(self) -> float:
         """Weighted mean log density of the samples, given their group [nats]."""
-        return float(sum(p.share * t.log_likelihood for p, t in zip(self.parts, self.traces, strict=True)))
+        return float(sum(p.share * t.log_likelihood for p, t in zip(self.parts, self.results, strict=True)))
 
     @property
     def order(self) -> np.ndarray:
@@ -76,39 +79,39 @@ class Ensemble:
     def weights(self) -> np.ndarray:
         """Shares of the rays in the order of the sensors, summing to 1."""
         weights = np.empty(len(self.order))
-        pairs = zip(self.parts, self.traces, strict=True)
-        weights[self.order] = np.concatenate([part.share * trace.mixture.weights for part, trace in pairs])
+        pairs = zip(self.parts, self.results, strict=True)
+        weights[self.order] = np.concatenate([part.share * result.mixture.weights for part, result in pairs])
         return weights / weights.sum()
 
     @property
     def widths_m(self) -> np.ndarray:
         """Gate widths in the order of the sensors [m]."""
         widths = np.empty(len(self.order))
-        pairs = zip(self.parts, self.traces, strict=True)
+        pairs = zip(self.parts, self.results, strict=True)
         widths[self.order] = np.concatenate(
-            [2 * part.bounds.interval * trace.mixture.spread_range_m for part, trace in pairs]
+            [2 * part.bounds.interval * result.mixture.spread_range_m for part, result in pairs]
         )
         return widths
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What happened to components."""
-        return tuple(note for trace in self.traces for note in trace.notes)
+        return tuple(note for result in self.results for note in result.notes)
 
     def narrowed(self, width_m: float) -> Ensemble:
         """The fit continued with gates no wider than a cap [m]."""
-        traces = []
-        for part, trace in zip(self.parts, self.traces, strict=True):
+        results = []
+        for part, result in zip(self.parts, self.results, strict=True):
             bounds = part.bounds.narrowed(width_m)
-            start = admitted_mixture(trace.mixture, part.features, bounds)
-            traces.append(replace(run_em(start, part.features, bounds), notes=trace.notes))
-        return Ensemble(self.parts, tuple(traces))
+            start = admitted_mixture(result.mixture, part.features, bounds)
+            results.append(replace(run_em(start, part.features, bounds), notes=result.notes))
+        return Ensemble(self.parts, tuple(results))
 
     def held_out(self, parts: Sequence[GroupSamples]) -> tuple[float, float]:
         """Mean log density of other samples of the same groups, and its standard error [nats]."""
         mean, variance = 0.0, 0.0
-        for part, trace in zip(parts, self.traces, strict=True):
-            values, weights = log_density(trace.mixture, part.features), part.features.weights
+        for part, result in zip(parts, self.results, strict=True):
+            values, weights = log_density(result.mixture, part.features), part.features.weights
             centre = float(weights @ values)
             mean += part.share * centre
             variance += part.share**2 * float(np.square(weights) @ np.square(values - centre))
@@ -116,13 +119,13 @@ class Ensemble:
 
 
 @phase("mixture")
-def fit_parts(parts: Sequence[GroupSamples], seed: int, restarts: int) -> Ensemble:
+def fit_groups(parts: Sequence[GroupSamples], seed: int, restarts: int) -> Ensemble:
     """Fit every group."""
-    traces = [
+    results = [
         fit_mixture(part.features, part.bounds, random_generator(seed, "sensors", index), restarts=restarts)
         for index, part in enumerate(parts)
     ]
-    return Ensemble(tuple(parts), tuple(traces))
+    return Ensemble(tuple(parts), tuple(results))
 
 
 def admitted_mixture(mixture: Mixture, features: Features, bounds: Bounds) -> Mixture:
@@ -133,8 +136,8 @@ def admitted_mixture(mixture: Mixture, features: Features, bounds: Bounds) -> Mi
 def sensors_of(ensemble: Ensemble, space: DesignSpace, level: float) -> tuple[Sensor, ...]:
     """The fitted components as sensors s0, s1, ... in the order of the constraint file."""
     rows = [
-        _sensor(part, trace.mixture, row, space, level)
-        for part, trace in zip(ensemble.parts, ensemble.traces, strict=True)
+        _sensor(part, result.mixture, row, space, level)
+        for part, result in zip(ensemble.parts, ensemble.results, strict=True)
         for row in range(len(part.bounds))
     ]
     placed = [rows[i] for i in np.argsort(ensemble.order, kind="stable")]
@@ -176,12 +179,6 @@ def _sensor(part: GroupSamples, mixture: Mixture, row: int, space: DesignSpace, 
         spread_range_m=float(mixture.spread_range_m[row]) if axes.range else 0.0,
         level=level,
     )
-
-
-# So many samples tell apart mounts whose shares differ by a hundredth.
-MOUNT_SAMPLES = 4000
-# `auto` takes as few mounts as together see this share of what all see together.
-ENOUGH_SHARE = 0.95
 
 
 def choose_mounts(

@@ -7,8 +7,6 @@ matrix product, and so are all their sufficient statistics. Directions are unit 
 Axes that the space fixes are left out of the density, not given a tiny variance. Where only the azimuth is
 free, directions become unit vectors on the equator (a great circle, where tangent coordinates are exact) and
 angles scale by the cosine of the fixed elevation; where only the elevation is free, on the meridian.
-
-What rays look at: the coordinates in which rays are alike, however far their samples' scene points are.
 """
 
 from __future__ import annotations
@@ -27,6 +25,9 @@ from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction,
 POLE_COSINE = SLACK
 # A free axis on which the data do not vary is scaled by this share of its bounds: nothing divides by 0.
 IDLE_AXIS_SHARE = 1e-3
+# The mean range of like rays is over so many of so many samples: one in three hundred of the density.
+NEIGHBOURS = 16
+NEIGHBOUR_POOL = 5000
 
 
 @dataclass(frozen=True)
@@ -155,13 +156,11 @@ class Features:
         return Features(self.points[keep], weights / weights.sum(), self.axes, self.centre, self.scale)
 
 
-# The mean range of like rays is over so many of so many samples: one in three hundred of the density.
-NEIGHBOURS = 16
-NEIGHBOUR_POOL = 5000
-
-
 def ray_features(features: Features) -> np.ndarray:
-    """Directions where origins are given, else points of the mean surface, shape (N, F)."""
+    """What rays look at, however far their scene points are, shape (N, F): coordinates in which like rays are near.
+
+    Directions where origins are given, else points of the mean surface.
+    """
     aiming = features.embedding
     if features.axes.range:
         aiming = np.delete(aiming, len(features.axes.origin), axis=1)

@@ -99,7 +99,7 @@ def variances(covariance: np.ndarray) -> np.ndarray:
     return np.einsum("kii->ki", covariance)
 
 
-def improved(
+def improve_in_boxes(
     mean: np.ndarray, scatter: np.ndarray, box: OriginLimits, point: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Means (J, n) and covariances (J, n, n) whose intervals lie in their boxes, better than those they start from.
@@ -123,7 +123,7 @@ def improved(
     return point, covariance
 
 
-def projected(mean: np.ndarray, scatter: np.ndarray, box: OriginLimits) -> tuple[np.ndarray, np.ndarray]:
+def project_into_boxes(mean: np.ndarray, scatter: np.ndarray, box: OriginLimits) -> tuple[np.ndarray, np.ndarray]:
     """The samples' own moments with one axis after the other moved to its best inside the box, the worst first.
 
     The other axes keep their regressions on it.
@@ -308,10 +308,10 @@ def _between_boxes(
     boxes = np.concatenate([_promising(mean, floored, limits), held[:, None]], axis=1)
     count, tried = boxes.shape
     many, rows = limits.inside(boxes), np.repeat(np.arange(count), tried)
-    start, spread = projected(mean[rows], floored[rows], many)
+    start, spread = project_into_boxes(mean[rows], floored[rows], many)
     again = np.flatnonzero(usable) * tried + tried - 1
     start[again], spread[again] = old_mean[usable], old_covariance[usable]
-    point, covariance = improved(mean[rows], floored[rows], many, start, spread)
+    point, covariance = improve_in_boxes(mean[rows], floored[rows], many, start, spread)
     value = objective(mean[rows], scatter[rows], point, covariance).reshape(count, tried)
     best = np.arange(count) * tried + value.argmin(axis=1)
     point, covariance = point[best], covariance[best]

@@ -14,7 +14,7 @@ from lidardesign.design.rigs.mjcf import read_mjcf
 from lidardesign.design.rigs.ray_lists import read_ray_csv, read_ray_npz
 from lidardesign.design.rigs.rig import Rig, number_of
 from lidardesign.design.rigs.sdf import read_sdf
-from lidardesign.design.rigs.sensor_csv import COLUMNS, QUERY_COLUMN, looks_like_sensor_csv
+from lidardesign.design.rigs.sensor_csv import COLUMNS, QUERY_COLUMN, begins_as_sensor_csv
 from lidardesign.errors import DataError
 from lidardesign.run.xml import read_xml
 
@@ -62,7 +62,7 @@ def read_rig(path: Path, head: bytes) -> Rig | None:
         return XML_ROOTS[tag](path)
     lines = head.decode("utf-8-sig", errors="replace").splitlines()
     texts = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
-    if not looks_like_sensor_csv(head):
+    if not begins_as_sensor_csv(head):
         _check_text(path, texts)
         return None
     _, first = texts[0]

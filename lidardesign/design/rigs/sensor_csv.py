@@ -37,7 +37,7 @@ COVARIANCE_ROUNDING = COARSE_SLACK
 WEIGHT_SUM_TOLERANCE = SLACK
 
 
-def looks_like_sensor_csv(head: bytes) -> bool:
+def begins_as_sensor_csv(head: bytes) -> bool:
     """Whether a file begins with a line of comma-separated cells that no YAML mapping begins with."""
     text = head.decode("utf-8-sig", errors="replace")
     first = next((line.strip() for line in text.splitlines() if line.strip()), "")

@@ -19,7 +19,14 @@ from lidardesign.design.mixture.ensemble import Ensemble, sensors_of
 from lidardesign.design.mixture.features import Features
 from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor
 from lidardesign.design.snap.parts import PartChoice, PartOptions, fit_part_poses, nearest_parts, part_options
-from lidardesign.design.snap.rays import affordable, counts_of, fired, gate_widths, useful_rays, useful_split
+from lidardesign.design.snap.rays import (
+    afford_rays,
+    count_rays,
+    count_useful_rays,
+    fire_rays,
+    gate_widths,
+    useful_split,
+)
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Rays
 from lidardesign.space import DesignSpace, angles
@@ -101,7 +108,7 @@ def snap_design(
         raise ConfigError(f"{budget.rays} rays of parts", where="--rays", allowed=f"at most {MOST_TABLE_RAYS}")
     choices = nearest_parts(ensemble, options, budget.rays, seed)
     fitted_widths = np.array([sensor.gate_m[1] - sensor.gate_m[0] for sensor in before])
-    choices = affordable(choices, options, ensemble.weights, fitted_widths, budget)
+    choices = afford_rays(choices, options, ensemble.weights, fitted_widths, budget)
     snaps = [rules_of(rules, index).snap for index in range(len(before))]
     refitted = fit_part_poses(ensemble, choices, [snap is not None and snap.pose == "fitted" for snap in snaps])
     # every sensor with its part at the pose that its component has
@@ -196,10 +203,10 @@ def _ray_counts(placed: Sequence[_PlacedPart], budget: BandwidthBudget) -> np.nd
     choices = [one.choice for one in placed]
     widths = np.array(gate_widths(choices, np.array([np.diff(one.sensor.gate_m)[0] for one in placed])))
     useful = np.array(
-        [0 if one.pose is None else useful_rays(one.choice, one.pose, one.seen) for one in placed], dtype=np.int64
+        [0 if one.pose is None else count_useful_rays(one.choice, one.pose, one.seen) for one in placed], dtype=np.int64
     )
     if budget.rays is None:
-        return counts_of(useful, weights, widths, budget)
+        return count_rays(useful, weights, widths, budget)
     most = np.array([budget.rays if c.shape is None else min(c.shape.part.rays, budget.rays) for c in choices])
     first = np.where(useful > 0, np.minimum(useful, most), most)
     counts = useful_split(weights, budget.rays, first, most)
@@ -218,7 +225,7 @@ def _design(
         replace(one.sensor, rays=int(n), weight=int(n) / total) for one, n in zip(placed, counts, strict=True)
     )
     looking = np.concatenate(
-        [fired((one.choice, one.pose), one.sensor, int(n), one.seen) for one, n in zip(placed, counts, strict=True)]
+        [fire_rays((one.choice, one.pose), one.sensor, int(n), one.seen) for one, n in zip(placed, counts, strict=True)]
     )
     azimuth, elevation = angles(looking)
     owner = np.repeat(np.arange(len(placed)), counts)

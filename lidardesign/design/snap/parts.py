@@ -189,7 +189,7 @@ def nearest_parts(ensemble: Ensemble, options: Sequence[PartOptions], rays: int 
     """
     rays = USUAL_RAYS * len(options) if rays is None else rays
     choices: dict[int, PartChoice] = {}
-    for index, (part, result) in enumerate(zip(ensemble.parts, ensemble.traces, strict=True)):
+    for index, (part, result) in enumerate(zip(ensemble.parts, ensemble.results, strict=True)):
         features = part.features
         if len(features) > COMPARED_SAMPLES:
             drawn = systematic_draw(features.weights, COMPARED_SAMPLES, random_generator(seed, "parts", index))
@@ -255,7 +255,7 @@ def fit_part_poses(ensemble: Ensemble, choices: Sequence[PartChoice], held: Sequ
         held: Which sensors look where they did.
     """
     results = []
-    for part, result in zip(ensemble.parts, ensemble.traces, strict=True):
+    for part, result in zip(ensemble.parts, ensemble.results, strict=True):
         shapes = [choices[sensor].shape for sensor in part.group.sensors]
         still = np.array([held[sensor] for sensor in part.group.sensors])
         mixture = shaped_mixture(result.mixture, shapes, part.bounds.interval, part.features.axes)

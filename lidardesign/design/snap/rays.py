@@ -15,7 +15,7 @@ from lidardesign.design.layouts.grid import field_on_sphere, grid_tangent
 from lidardesign.design.mixture.features import Features
 from lidardesign.design.sensor import Sensor, tangent_directions
 from lidardesign.design.snap.parts import PartChoice, PartOptions
-from lidardesign.design.snap.shapes import worth_firing
+from lidardesign.design.snap.shapes import useful_ray_filter
 from lidardesign.errors import InfeasibleError
 
 # A sensor that stays as it was has as many rays as it is given.
@@ -60,7 +60,7 @@ def useful_split(weights: np.ndarray, count: int, useful: np.ndarray, most: np.n
     return useful + capped_split(weights, count - int(useful.sum()), most - useful)
 
 
-def affordable(
+def afford_rays(
     choices: Sequence[PartChoice],
     options: Sequence[PartOptions],
     weights: np.ndarray,
@@ -140,26 +140,26 @@ def _refused(chosen: Sequence[PartChoice], lack: tuple[int, int], budget: Bandwi
     )
 
 
-def fired(shape_pose: tuple[PartChoice, Pose | None], sensor: Sensor, count: int, seen: Features) -> np.ndarray:
+def fire_rays(shape_pose: tuple[PartChoice, Pose | None], sensor: Sensor, count: int, seen: Features) -> np.ndarray:
     """The unit vectors that a sensor fires: of its part's pattern, or of its own even grid, shape (count, 3)."""
     choice, pose = shape_pose
     if choice.shape is None or pose is None:
         return tangent_directions(sensor.frame, grid_tangent(*field_on_sphere(sensor), count))
     part = choice.shape.part
-    wanted = worth_firing(part, pose, seen.points, seen.weights, least=count)
+    wanted = useful_ray_filter(part, pose, seen.points, seen.weights, least=count)
     return part_rays(part, pose, count, wanted=wanted).direction
 
 
-def useful_rays(choice: PartChoice, pose: Pose, seen: Features) -> int:
+def count_useful_rays(choice: PartChoice, pose: Pose, seen: Features) -> int:
     """How many rays of a part look at some of the density; at least one."""
     if choice.shape is None:
         return 0
     part = choice.shape.part
-    wanted = worth_firing(part, pose, seen.points, seen.weights)(part.directions @ pose.frame)
+    wanted = useful_ray_filter(part, pose, seen.points, seen.weights)(part.directions @ pose.frame)
     return max(int(wanted.sum()), 1)
 
 
-def counts_of(useful: np.ndarray, weights: np.ndarray, widths_m: np.ndarray, budget: BandwidthBudget) -> np.ndarray:
+def count_rays(useful: np.ndarray, weights: np.ndarray, widths_m: np.ndarray, budget: BandwidthBudget) -> np.ndarray:
     """Rays of every sensor where none are asked for: what parts have to tell, as far as the bandwidth pays for it.
 
     Arguments:

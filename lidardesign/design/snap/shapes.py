@@ -1,9 +1,8 @@
 """Parts as components of fixed shape: their field of view and gate are what they are, only the pose is free.
 
 A part may be mounted upright or turned by a quarter about its boresight. A component's roll stays within an eighth of
-a turn, so a part that is turned is a component whose two spreads are exchanged.
-
-Which way the rays of a part look: what comes near to any of them, and which of them look at something.
+a turn, so a part that is turned is a component whose two spreads are exchanged. What a part can see, and which of its
+rays look at something, is asked of its pattern.
 """
 
 from __future__ import annotations
@@ -25,6 +24,13 @@ from lidardesign.space import RANGE, DesignSpace, angles, observed_point
 
 # A line scanner's field has no height; as a component it has this one, which a density can be fitted with.
 LEAST_FIELD_RAD = math.radians(1.0)
+# A ray counts as coming near what is this close to it: a line scanner's beam is as high.
+LEAST_REACH_RAD = 0.005
+# Rays are worth firing that see this share of what the part could see: the rest are strays.
+SEEN_SHARE = 0.99
+# Of so many things in view the nearest says how far from them a ray looks.
+NEAR_POINTS = 400
+GATE_BOUNDS = ("start_low", "start_high", "end_low", "end_high", "width_low", "width_high")
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,18 +127,7 @@ def shaped_mixture(mixture: Mixture, shapes: Sequence[PartShape | None], interva
     return replace(mixture, spread_rad=spread, range_m=middle, spread_range_m=depth)
 
 
-GATE_BOUNDS = ("start_low", "start_high", "end_low", "end_high", "width_low", "width_high")
-
-
-# A ray counts as coming near what is this close to it: a line scanner's beam is as high.
-LEAST_REACH_RAD = 0.005
-# Rays are worth firing that see this share of what the part could see: the rest are strays.
-SEEN_SHARE = 0.99
-# Of so many things in view the nearest says how far from them a ray looks.
-NEAR_POINTS = 400
-
-
-def in_view(part: Part, directions: np.ndarray) -> np.ndarray:
+def in_part_view(part: Part, directions: np.ndarray) -> np.ndarray:
     """Which unit vectors in a part's frame its rays come near to, (N, 3) to bool (N,).
 
     Its field of view and half a cell around it: the field of a line scanner has no height.
@@ -147,7 +142,7 @@ def in_view(part: Part, directions: np.ndarray) -> np.ndarray:
     return (np.abs(offset) <= half).all(axis=1)
 
 
-def worth_firing(
+def useful_ray_filter(
     part: Part, pose: Pose, points: np.ndarray, weights: np.ndarray, *, least: int = 0
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Which rays of a part at a pose look where scene points are: unit vectors (N, 3) of the world to bool (N,).
@@ -165,7 +160,7 @@ def worth_firing(
     range_m = np.linalg.norm(offset, axis=1)
     kept = (range_m > 0) & (weights > 0)
     looking = offset[kept] / range_m[kept, None]
-    seen = in_view(part, looking @ pose.frame.T)
+    seen = in_part_view(part, looking @ pose.frame.T)
     looking, mass = looking[seen], weights[kept][seen]
 
     def wanted(directions: np.ndarray) -> np.ndarray:

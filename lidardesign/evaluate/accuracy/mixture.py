@@ -20,7 +20,7 @@ from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.fit import EM_SAMPLES, RESTARTS
 from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.layouts.sensor_fit import HELD_OUT_SHARE
-from lidardesign.design.mixture.bounds import Bounds, bounds_of, groups
+from lidardesign.design.mixture.bounds import Bounds, bounds_of, sensor_groups
 from lidardesign.design.mixture.conditions import MOVED_SAMPLES, at_condition, condition_text
 from lidardesign.design.mixture.em import fit_mixture
 from lidardesign.design.mixture.features import Axes, Features
@@ -167,7 +167,7 @@ class FitBench:
     def bounds(self) -> Bounds:
         """What the space alone asks of the sensors."""
         space, free = self.samples.space, Constraints()
-        group = groups(free.rules, space, self.sensors)[0]
+        group = sensor_groups(free.rules, space, self.sensors)[0]
         return bounds_of(free.rules, space, group.sensors, interval_factor(self.level))
 
     @property

@@ -37,7 +37,14 @@ from lidardesign.design.mixture.em import fit_mixture
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.mixture import Mixture
 from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, interval_factor
-from lidardesign.design.snap.shapes import PartShape, gate_inside, in_view, shaped_bounds, shapes_of, worth_firing
+from lidardesign.design.snap.shapes import (
+    PartShape,
+    gate_inside,
+    in_part_view,
+    shaped_bounds,
+    shapes_of,
+    useful_ray_filter,
+)
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.candidates import Positions, TrainingViews, dense_points, whole_range
 from lidardesign.geometry.rays import Rays
@@ -190,7 +197,7 @@ class PosedPart:
         low, high = self.scene.space.low[RANGE], self.scene.space.high[RANGE]
         near, far = self.part.range_m
         inside = (range_m > 0) & (range_m >= max(near, low)) & (range_m <= min(far, high))
-        inside[inside] = in_view(self.part, (offset[inside] / range_m[inside, None]) @ pose.frame.T)
+        inside[inside] = in_part_view(self.part, (offset[inside] / range_m[inside, None]) @ pose.frame.T)
         return np.where(inside, visible, 0.0) / np.where(inside, np.square(range_m), 1.0)
 
     def _worth(self, density: np.ndarray) -> float:
@@ -449,7 +456,7 @@ class PartCandidate:
         even = np.ones(len(points))
         shares = [count // len(poses) + (index < count % len(poses)) for index in range(len(poses))]
         lists = [
-            part_rays(self.part, pose, share, wanted=worth_firing(self.part, pose, points, even, least=share))
+            part_rays(self.part, pose, share, wanted=useful_ray_filter(self.part, pose, points, even, least=share))
             for pose, share in zip(poses, shares, strict=True)
         ]
         return Rays(
