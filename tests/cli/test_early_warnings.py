@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import trimesh
@@ -59,14 +61,12 @@ def test_the_error_about_sigma_names_the_likely_cause_after_a_note_before_learni
     assert "density.field_resolution" in error
 
 
-def test_the_error_about_sigma_leaves_units_alone_where_scenes_are_small(monkeypatch):
+def test_the_error_about_sigma_leaves_units_alone_where_scenes_are_small():
     found = {}
     for step in (0.9, 3.6):
-        steps = "lidardesign.density.target.prepare._grid_steps_m"
-        monkeypatch.setattr(steps, lambda field, step=step: np.array([step]))
-        settings = type("Settings", (), {"sigma_m": 0.002, "field_resolution": 16})
+        target = SimpleNamespace(space=SPACE, surfaces=SimpleNamespace(grid_steps_m=np.array([step])))
         with pytest.raises(ConfigError) as refused:
-            resolution_notes(type("Target", (), {"space": SPACE, "field": None}), settings)
+            resolution_notes(target, SimpleNamespace(sigma_m=0.002, field_resolution=16))
         found[step] = refused.value.hint
     assert found[0.9] == "raise density.field_resolution, or sigma"
     assert "about 58 m across" in found[3.6]
