@@ -1,11 +1,7 @@
 """The configuration of a run: defaults, preset, file and `--set`, in that order, checked with positions.
 
 The document has the sections task, space, density and learning. Every value remembers where it came from, so
-that an error can point at file, line and column, or at the `--set` that brought it.
-
-`--set KEY=VALUE`: dotted paths into a document of plain values.
-
-Settings of the target density and of learning it, with their defaults, units and presets.
+that an error can point at file, line and column, or at the `--set KEY=VALUE` that brought it.
 """
 
 from __future__ import annotations
@@ -316,7 +312,7 @@ def resolve(
     return _build(task, header, layers)
 
 
-def judged_by(task: Task, config: RunConfig, overrides: Sequence[str], *, option: str = "--set") -> RunConfig:
+def with_task_settings(task: Task, config: RunConfig, overrides: Sequence[str], *, option: str = "--set") -> RunConfig:
     """A run's configuration with other values of the task's own keys, to judge its designs by.
 
     Raises:

@@ -13,11 +13,11 @@ from lidardesign import config as config_module
 from lidardesign.config import (
     DensitySettings,
     LearningSettings,
-    judged_by,
     load_run_config,
     parse_override,
     resolve,
     save_run_config,
+    with_task_settings,
 )
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run.manifest import start_manifest
@@ -255,10 +255,10 @@ def test_no_validation_warns(write):
 
 def test_a_run_is_judged_by_other_values_of_its_task_and_keeps_the_rest():
     config = resolve(TASK, overrides=["label=b", "density.sigma_m=0.02"])
-    judged = judged_by(TASK, config, ["jitter.angle_rad=0.5"])
+    judged = with_task_settings(TASK, config, ["jitter.angle_rad=0.5"])
     assert judged.task == config.task.model_copy(update={"jitter": Jitter(angle_rad=0.5)})
     assert (judged.density, judged.learning, judged.space) == (config.density, config.learning, config.space)
-    assert judged_by(TASK, config, []) == config
+    assert with_task_settings(TASK, config, []) == config
 
 
 @each_row(
@@ -273,5 +273,5 @@ def test_a_run_is_judged_by_other_values_of_its_task_and_keeps_the_rest():
 )
 def test_what_was_learned_stays_when_a_run_is_judged(override, message):
     with pytest.raises(ConfigError, match=message) as caught:
-        judged_by(TASK, resolve(TASK), [override])
+        with_task_settings(TASK, resolve(TASK), [override])
     assert override in str(caught.value.where)

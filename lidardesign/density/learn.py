@@ -19,7 +19,7 @@ from lidardesign.density.target.target import Target
 from lidardesign.density.target.visibility import common_receiver
 from lidardesign.density.training.checkpoint import clear_snapshots, save_arrays
 from lidardesign.density.training.losses import Pool
-from lidardesign.density.training.quality import Measured, draw_probes, measure
+from lidardesign.density.training.quality import draw_probes, measure
 from lidardesign.density.training.training import PROGRESS, LearnProgress, Trainer
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
@@ -192,8 +192,11 @@ def learn(
             trainer.train(progress)
         # float32 steps train as well and cost less; samples and their densities are worth float64
         trainer.flow.double()
-        measured = _measured(trainer, config)
-        _store(trainer, measured.samples, config, run)
+        generator = random_generator(config.seed, "coverage")
+        with phase("measuring"):
+            probes = draw_probes(trainer.target, config.learning.coverage_proposals, generator)
+        measured = measure(trainer, probes, config.learning.samples)
+        _store(trainer, measured.samples, run)
     result = LearnResult(
         run=str(run),
         task=config.task_name,
@@ -259,15 +262,8 @@ def make_flow(config: RunConfig, generator: torch.Generator) -> DesignFlow:
     )
 
 
-def _measured(trainer: Trainer, config: RunConfig) -> Measured:
-    generator = random_generator(config.seed, "coverage")
-    with phase("measuring"):
-        probes = draw_probes(trainer.target, config.learning.coverage_proposals, generator)
-    return measure(trainer, probes, config.learning.samples)
-
-
 @phase("writing")
-def _store(trainer: Trainer, samples: Samples, config: RunConfig, run: Path) -> None:
+def _store(trainer: Trainer, samples: Samples, run: Path) -> None:
     weights = {name: value.detach().cpu().numpy() for name, value in trainer.flow.state_dict().items()}
     save_arrays(run, FLOW, weights, {"features": trainer.flow.features, "context": trainer.flow.context})
     save_samples(samples, run)

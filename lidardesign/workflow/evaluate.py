@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lidardesign.config import judged_by
+from lidardesign.config import with_task_settings
 from lidardesign.design.compare import outside_notes
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.evaluate.baselines.simple import baseline_of
@@ -175,7 +175,7 @@ class ScoreRequest:
             _check_measurable(learned)
         overrides = settings_texts(options.settings)
         if overrides:
-            run = replace(run, config=judged_by(run.task, run.config, overrides))
+            run = replace(run, config=with_task_settings(run.task, run.config, overrides))
         if options.range_tolerance_mm is None:
             planner = replace(planner, tolerance=planner.tolerated.within(run.task.metric))
         return cls(

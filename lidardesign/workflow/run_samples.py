@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lidardesign.config import judged_by
+from lidardesign.config import with_task_settings
 from lidardesign.design.fit import rays_at
 from lidardesign.design.layouts.rays import gates_of, layout_of
 from lidardesign.design.sensor import DesignSpec
@@ -130,7 +130,8 @@ class RunTarget:
 
         run, weighting = self._run, self._weighting
         if weighting.settings:
-            run = replace(run, config=judged_by(run.task, run.config, weighting.settings, option=weighting.origin))
+            config = with_task_settings(run.task, run.config, weighting.settings, option=weighting.origin)
+            run = replace(run, config=config)
         decided = self._visibility or read_manifest(run.folder).get("visibility")
         return prepare_target(run.scenes("train", run.config.seed), run.config, visibility=decided, compiled=False)[0]
 

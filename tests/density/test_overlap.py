@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support import references
 
-from lidardesign.density.training.quality import Sides, overlap
+from lidardesign.density.training.quality import OverlapPoints, overlap
 from lidardesign.errors import NumericalError
 
 LOG_Z = -2.3
@@ -25,7 +25,7 @@ def mixture(x, weights, means):
 
 def sides_of(samples, log_prob, log_target, generator, count=COUNT, width=12.0):
     proposals = generator.uniform(-width, width, size=count)
-    return Sides(
+    return OverlapPoints(
         at_samples=log_target(samples) + LOG_Z - log_prob(samples),
         at_proposals=log_target(proposals) + LOG_Z - log_prob(proposals),
         log_weights=log_target(proposals) + 5.0,
@@ -71,9 +71,9 @@ def test_mass_that_leaked_where_no_proposal_goes_is_misplaced_too():
 
 
 def test_densities_without_overlap_are_wholly_apart():
-    sides = Sides(np.full(100, -900.0), np.full(100, np.inf), np.zeros(100))
+    sides = OverlapPoints(np.full(100, -900.0), np.full(100, np.inf), np.zeros(100))
     assert overlap(sides).misplaced == 1.0
-    sides = Sides(np.full(100, -900.0), np.full(100, 900.0), np.zeros(100))
+    sides = OverlapPoints(np.full(100, -900.0), np.full(100, 900.0), np.zeros(100))
     assert overlap(sides).misplaced == 1.0
 
 
@@ -82,7 +82,7 @@ def test_every_condition_is_normalised_by_itself():
     samples, proposals = generator.normal(size=COUNT), generator.uniform(-8, 8, size=COUNT)
     mine, theirs = np.arange(COUNT) % 2, np.arange(COUNT) % 2
     shift, log_z = np.array([0.0, 1.0]), np.array([2.0, -3.0])
-    sides = Sides(
+    sides = OverlapPoints(
         gaussian(samples, shift[mine]) + log_z[mine] - gaussian(samples),
         gaussian(proposals, shift[theirs]) + log_z[theirs] - gaussian(proposals),
         gaussian(proposals, shift[theirs]) + log_z[theirs],
@@ -97,6 +97,6 @@ def test_every_condition_is_normalised_by_itself():
 
 def test_nan_and_targets_that_are_nowhere_are_refused():
     with pytest.raises(NumericalError, match="NaN"):
-        overlap(Sides(np.array([math.nan, 0.0]), np.zeros(2), np.zeros(2)))
+        overlap(OverlapPoints(np.array([math.nan, 0.0]), np.zeros(2), np.zeros(2)))
     with pytest.raises(NumericalError, match="0 at all points"):
-        overlap(Sides(np.full(2, -np.inf), np.zeros(2), np.zeros(2)))
+        overlap(OverlapPoints(np.full(2, -np.inf), np.zeros(2), np.zeros(2)))

@@ -16,7 +16,7 @@ from lidardesign.density.training.checkpoint import (
     clear_snapshots,
     kept_snapshots,
     load_arrays,
-    rung_steps,
+    measured_steps,
     snapshot_name,
     snapshot_steps,
     twin_step,
@@ -52,7 +52,7 @@ def test_snapshots_are_kept_when_balancing_begins_and_twins_at_a_quarter_and_hal
 @given(st.integers(1, 5000), st.floats(0, 1), st.floats(0, 1))
 def test_rungs_ascend_to_the_last_step_and_twins_lie_between_the_first_rung_and_their_own(steps, balance, anneal):
     settings = LearningSettings(steps=steps, balance=balance, anneal=anneal)
-    rungs = rung_steps(settings)
+    rungs = measured_steps(settings)
     assert list(rungs) == sorted(set(rungs))
     assert rungs[-1] == steps
     for step in rungs:

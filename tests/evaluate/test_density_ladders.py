@@ -23,12 +23,12 @@ from lidardesign.density.target.target import build_target
 from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import misplaced_share
 from lidardesign.density.training.snapshot_quality import (
-    Drawn,
-    Steps,
-    beside_noise,
-    each_beside_noise,
+    FlowSamples,
+    LearningSteps,
     gradient,
     in_arithmetic,
+    noise_share,
+    noise_shares,
 )
 from lidardesign.errors import NumericalError
 from lidardesign.evaluate.accuracy import fields, visibility
@@ -366,7 +366,7 @@ def steps(tmp_path_factory):
         coordinates.blocks, 0, layers=1, hidden=8, bins=4, generator=torch.Generator().manual_seed(0)
     ).double()
     pool = Pool.of(SPACE.to_unit(probes.points), target.log_density(probes.points), probes.log_proposal)
-    return Steps(flow, target, LearningSettings(batch=64, layers=1, hidden=8, bins=4, frames=2), pool)
+    return LearningSteps(flow, target, LearningSettings(batch=64, layers=1, hidden=8, bins=4, frames=2), pool)
 
 
 class TestGradients:
@@ -374,17 +374,17 @@ class TestGradients:
         generator = np.random.default_rng(0)
         exact = generator.normal(size=(200, 50)) + 5.0
         found = exact + 0.1 * generator.normal(size=exact.shape)
-        share, error = beside_noise(found, exact)
+        share, error = noise_share(found, exact)
         assert abs(share - 0.1) < 4 * error + 1e-3
-        assert each_beside_noise(found, exact) == pytest.approx(0.1, rel=0.5)
-        assert beside_noise(exact, exact) == (0.0, 0.0)
+        assert noise_shares(found, exact) == pytest.approx(0.1, rel=0.5)
+        assert noise_share(exact, exact) == (0.0, 0.0)
 
     def test_several_draws_for_each_batch_count_with_their_mean_square(self):
         generator = np.random.default_rng(1)
         exact = generator.normal(size=(10, 30))
         apart = generator.normal(size=(10, 30))
-        once, _ = beside_noise(exact + apart, exact)
-        twice, _ = beside_noise(np.stack([exact + apart, exact - apart], axis=1), exact)
+        once, _ = noise_share(exact + apart, exact)
+        twice, _ = noise_share(np.stack([exact + apart, exact - apart], axis=1), exact)
         assert once == pytest.approx(twice)
 
     def test_the_standard_error_is_the_spread_over_repetitions(self):
@@ -392,7 +392,7 @@ class TestGradients:
         found = []
         for _ in range(200):
             exact = generator.normal(size=(12, 20))
-            found.append(beside_noise(exact + 0.3 * generator.normal(size=exact.shape), exact))
+            found.append(noise_share(exact + 0.3 * generator.normal(size=exact.shape), exact))
         values, errors = np.array(found).T
         assert values.std() == pytest.approx(errors.mean(), rel=0.25)
 
@@ -418,7 +418,7 @@ class TestGradients:
 
 class TestPrecisionSweep:
     def test_a_float64_flow_finds_its_samples_densities_again(self, steps):
-        drawn = Drawn.of(steps.flow, 500, 0)
+        drawn = FlowSamples.of(steps.flow, 500, 0)
         assert drawn.log_densities(steps.flow) == pytest.approx(drawn.log_prob, abs=1e-8)
         assert drawn.round_trip_nats(steps.flow) < 1e-8
 

@@ -65,27 +65,28 @@ def _box_distance(size, q, gradient):  # noqa: ANN001, ANN202
     return distance
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _corner_values(values, placed, q, cell, fraction, excess, index, weight, found):  # noqa: ANN001, ANN202
+    """The values at the corners of a point's cell in a grid, one of `grids`, into `found` (8,); the excess squared."""
+    low, counts, inverse_step, start = placed[:3], placed[3:6], placed[6], int(placed[7])
+    squared = locate(counts, low, inverse_step, q, cell, fraction, excess)
+    corners(counts, cell, fraction, index, weight)
+    for corner in range(8):
+        found[corner] = values[start + index[corner]]
+    return squared
+
+
 @njit(cache=True, nogil=True)
 def _grid_distance(values, placed, q, gradient):  # noqa: ANN001, ANN202
     """Signed distance of a mesh by its grid, a row of `grids`, at a point in its own frame, with its gradient (3,)."""
-    low, counts, inverse_step, start = placed[:3], placed[3:6], placed[6], int(placed[7])
     cell, fraction, excess = np.zeros(3, np.int64), np.zeros(3), np.zeros(3)
-    index, weight = np.zeros(8, np.int64), np.zeros(8)
-    squared = locate(counts, low, inverse_step, q, cell, fraction, excess)
-    corners(counts, cell, fraction, index, weight)
+    index, weight, found = np.zeros(8, np.int64), np.zeros(8), np.zeros(8)
+    squared = _corner_values(values, placed, q, cell, fraction, excess, index, weight, found)
     value = 0.0
     for corner in range(8):
-        value += weight[corner] * values[start + index[corner]]
+        value += weight[corner] * found[corner]
     for axis in range(3):
-        total = 0.0
-        for corner in range(8):
-            upper = (corner >> axis) & 1
-            other = 1.0
-            for k in range(3):
-                if k != axis:
-                    other *= fraction[k] if (corner >> k) & 1 else 1.0 - fraction[k]
-            total += (1.0 if upper else -1.0) * other * values[start + index[corner]]
-        gradient[axis] = total * inverse_step
+        gradient[axis] = trilinear_slope(found, fraction, axis) * placed[6]
     if squared == 0.0:
         return value
     inner = max(value, 0.0)
@@ -302,16 +303,6 @@ def all_distances(bodies, points, out, nearest):  # noqa: ANN001, ANN201
                 if value < out[n, c]:
                     out[n, c] = value
                     nearest[n, c] = b
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _corner_values(values, placed, q, cell, fraction, excess, index, weight, found):  # noqa: ANN001, ANN202
-    """The values at the corners of a point's cell in a grid, one row of `grids`, into `found` (8,)."""
-    low, counts, inverse_step, start = placed[:3], placed[3:6], placed[6], int(placed[7])
-    locate(counts, low, inverse_step, q, cell, fraction, excess)
-    corners(counts, cell, fraction, index, weight)
-    for corner in range(8):
-        found[corner] = values[start + index[corner]]
 
 
 @njit(cache=True, nogil=True)

@@ -36,11 +36,9 @@ class Field(Protocol):
 
     def distances(self, points: np.ndarray) -> np.ndarray:
         """Distances at points: (N, 3) to (N, columns) [m]."""
-        ...
 
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Gradients of sum_c weights_nc * d_c(points_n): (N, 3), (N, columns) to (N, 3)."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

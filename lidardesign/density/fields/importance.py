@@ -73,15 +73,12 @@ class LogWeights(Protocol):
     @property
     def peak(self) -> float:
         """What no value exceeds."""
-        ...
 
     def values(self, points: np.ndarray) -> np.ndarray:
         """log w at points: (N, 3) to (N, columns)."""
-        ...
 
     def gradient(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Gradients of sum_c weights_nc log w_c(points_n): (N, 3), (N, columns) to (N, 3)."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from lidardesign.density.target.visibility import Optics, RayBatch, Raycast
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
-from lidardesign.space import RANGE, DesignSpace, observed_point
+from lidardesign.space import RANGE, observed_point
 from lidardesign.task import random_generator
 
 PROBES = 4096
@@ -149,8 +149,16 @@ def resolution_notes(target: Target, settings: DensitySettings) -> list[str]:
     Raises:
         ConfigError: Sigma is finer than distances are known.
     """
-    sigma_m = settings.sigma_m
-    _refuse_below_rounding(target.space, sigma_m)
+    sigma_m, space = settings.sigma_m, target.space
+    farthest = max(np.abs([*space.low[:3], *space.high[:3]]).max(), space.high[RANGE])
+    rounding = ROUNDINGS * float(np.spacing(farthest))
+    if sigma_m < rounding:
+        raise ConfigError(
+            f"sigma {sigma_m:g} m is below what coordinates of {farthest:g} m are rounded to, {rounding:.2g} m",
+            where="density.sigma_m",
+            allowed=f"at least {rounding:.2g} m here",
+            hint="move the scene nearer to the origin, or raise sigma",
+        )
     steps = target.surfaces.grid_steps_m
     if not len(steps) or sigma_m >= BLURRED_SHARE * steps.max():
         return []
@@ -192,15 +200,3 @@ def flatness_notes(target: Target, sigma_m: float, generator: np.random.Generato
         f"the target density is flat: with sigma {sigma_m:g} m it varies by {varies:.2g} nats over the whole space, "
         "so that no design is better than another; lower density.sigma_m"
     ]
-
-
-def _refuse_below_rounding(space: DesignSpace, sigma_m: float) -> None:
-    farthest = max(np.abs([*space.low[:3], *space.high[:3]]).max(), space.high[RANGE])
-    rounding = ROUNDINGS * float(np.spacing(farthest))
-    if sigma_m < rounding:
-        raise ConfigError(
-            f"sigma {sigma_m:g} m is below what coordinates of {farthest:g} m are rounded to, {rounding:.2g} m",
-            where="density.sigma_m",
-            allowed=f"at least {rounding:.2g} m here",
-            hint="move the scene nearer to the origin, or raise sigma",
-        )

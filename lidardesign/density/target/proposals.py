@@ -105,7 +105,7 @@ def samples_without_visibility(
 
 
 @dataclass(frozen=True, eq=False)
-class Proposals:
+class ProposedPoints:
     """Design points with the density that they were proposed from.
 
     Arguments:
@@ -125,7 +125,7 @@ class Proposals:
 
 def propose(
     scenes: Sequence[Scene], space: DesignSpace, count: int, spread_m: float, generator: np.random.Generator
-) -> Proposals:
+) -> ProposedPoints:
     """Proposals from at most `count` draws; those that leave the space are dropped."""
     columns = _chosen_columns(scenes, generator)
     angles_free = AZIMUTH in space.free and ELEVATION in space.free
@@ -134,10 +134,10 @@ def propose(
     if angles_free and space.measure == "angles":
         density *= np.cos(points[:, ELEVATION])
     kept = np.flatnonzero(space.contains(points) & (density > 0))
-    return Proposals(points[kept], np.log(density[kept]), surface_range[kept], column[kept], columns)
+    return ProposedPoints(points[kept], np.log(density[kept]), surface_range[kept], column[kept], columns)
 
 
-def occluded_share(scenes: Sequence[Scene], proposals: Proposals, margin_m: float) -> float:
+def occluded_share(scenes: Sequence[Scene], proposals: ProposedPoints, margin_m: float) -> float:
     """The share of proposals whose surface has an occluder more than the margin in front of it, on any of its ways."""
     origins = proposals.points[:, :3]
     surface = proposals.surface_range_m[:, None]

@@ -58,11 +58,9 @@ class NearSurfaces(Protocol):
 
     def log_sums(self, log_transmittance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """log p* at the points from log T of the columns, shape (N,), and the share of each term in it."""
-        ...
 
     def gradient(self, shares: np.ndarray) -> np.ndarray:
         """The gradient of log p* by the points at fixed T, shape (N, 3)."""
-        ...
 
 
 class Surfaces(Protocol):
@@ -81,25 +79,20 @@ class Surfaces(Protocol):
 
     def near(self, observed: np.ndarray, sigma_m: float, tolerance_nats: float) -> NearSurfaces:
         """What matters at scene points (N, 3): columns within a tolerance of the best one there."""
-        ...
 
     def log_proximity(self, observed: np.ndarray, sigma_m: float, tolerance_nats: float) -> np.ndarray:
         """log of the sum of surface terms at scene points, (N, 3) to (N,)."""
-        ...
 
     def drawn(self, columns: np.ndarray) -> Surfaces:
         """Some columns alone, weighted to stand for all."""
-        ...
 
     def raycast(self, scenes: Sequence[Scene]) -> Visibility:
         """Ray casting at scenes, for the columns as they are listed here."""
-        ...
 
     def propose(
         self, scenes: Sequence[Scene], space: DesignSpace, count: int, sigma_m: float, generator: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         """Points (N, 6) inside the space, at most `count`, and their log density per chart volume up to a constant."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -149,7 +149,6 @@ class Transmittance(Protocol):
 
     def gradient(self, weights: np.ndarray) -> RayGradient:
         """Derivatives of sum weights * log T by each ray, weights of the shape of the values."""
-        ...
 
 
 class Visibility(Protocol):
@@ -167,11 +166,9 @@ class Visibility(Protocol):
         self, rays: RayBatch, columns: Columns, optics: Optics, *, differentiable: bool = True
     ) -> Transmittance:
         """log T where `columns` matter, 0 elsewhere; its gradient may only be asked for if `differentiable`."""
-        ...
 
     def take(self, columns: np.ndarray) -> Visibility:
         """The same for some columns, where it knows them one by one."""
-        ...
 
 
 class OneWay:

@@ -1,16 +1,13 @@
-"""Checkpoints of learning: every array and counter that a bit-identical resume needs, in one safetensors file.
+"""Checkpoints and snapshots of learning: arrays and counters in safetensors files, refused where they are damaged.
 
-safetensors runs no code and refuses truncated files; the hash in the manifest catches flipped bits and `load` checks
-that values are finite.
+A checkpoint holds every array and counter that a bit-identical resume needs: counters, the optimiser's memory of every
+weight, the random stream. safetensors runs no code and refuses truncated files; the hash in the manifest catches
+flipped bits and `load_arrays` checks that values are finite.
 
-What a checkpoint must hold to be resumed: counters, the optimiser's memory of every weight, the random stream.
-
-The flow as it was at a few steps of learning, kept in the run: what more steps bought can then be measured.
-
-Snapshots lie where the target is the final one: when balancing begins, and at a quarter and half of it. Before that,
-steps sharpen the target instead of reducing an error. Within it the error jitters from step to step while steps are
-long, so those two have a twin shortly before: how far twins are apart tells by how much. After the last step the flow
-itself is there.
+Snapshots are the flow as it was at a few steps of learning: what more steps bought can then be measured. They lie where
+the target is the final one: when balancing begins, and at a quarter and half of it. Before that, steps sharpen the
+target instead of reducing an error. Within it the error jitters from step to step while steps are long, so those two
+have a twin shortly before: how far twins are apart tells by how much. After the last step the flow itself is there.
 """
 
 from __future__ import annotations
@@ -67,17 +64,13 @@ def load_arrays(run: Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, 
     for key, value in arrays.items():
         if value.dtype.kind == "f" and not np.isfinite(value).all():
             raise DataError(f"{key} holds values that are not finite", where=str(path), hint="learn the run again")
-    return arrays, _state_of(metadata[FORMAT], path)
-
-
-def _state_of(text: str, path: Path) -> dict[str, Any]:
     try:
-        state = json.loads(text)
+        state = json.loads(metadata[FORMAT])
     except (ValueError, RecursionError) as error:
         raise DataError(f"its state cannot be read: {error}", where=str(path), hint="learn the run again") from None
     if not isinstance(state, dict):
         raise DataError("holds no state", where=str(path), hint="learn the run again")
-    return state
+    return arrays, state
 
 
 COUNTERS = ("step", "skipped", "skipped_in_a_row", "halvings")
@@ -155,7 +148,7 @@ def last_phase_begins(settings: LearningSettings) -> int:
     return pathwise if settings.balance else math.ceil(settings.anneal * pathwise)
 
 
-def rung_steps(settings: LearningSettings) -> tuple[int, ...]:
+def measured_steps(settings: LearningSettings) -> tuple[int, ...]:
     """The steps that a training is judged after, ascending; the last one is its end."""
     first, steps = last_phase_begins(settings), settings.steps
     return tuple(sorted({*(first + int(share * (steps - first)) for share in SHARES), steps} - {0}))
@@ -164,13 +157,13 @@ def rung_steps(settings: LearningSettings) -> tuple[int, ...]:
 def twin_step(settings: LearningSettings, step: int) -> int | None:
     """The step of a rung's twin; None for the first rung, the last one, and where there is no room for one."""
     twin = step - max(round(TWIN_SHARE * (settings.steps - last_phase_begins(settings))), 1)
-    before = max((rung for rung in rung_steps(settings) if rung < step), default=step)
+    before = max((rung for rung in measured_steps(settings) if rung < step), default=step)
     return twin if before < twin and step < settings.steps else None
 
 
 def snapshot_steps(settings: LearningSettings) -> tuple[int, ...]:
     """The steps after which a snapshot is kept, ascending."""
-    rungs = [step for step in rung_steps(settings) if step < settings.steps]
+    rungs = [step for step in measured_steps(settings) if step < settings.steps]
     twins = (twin_step(settings, step) for step in rungs)
     return tuple(sorted({*rungs, *(twin for twin in twins if twin is not None)}))
 

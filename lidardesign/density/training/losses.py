@@ -9,14 +9,13 @@ squared weight, the inverse of the ESS, which brings back what the flow dropped.
 -100 and below, yet they would make up most of the KL: these are led back along paths, with a cost that grows like
 their distance in sigmas.
 
+Balancing has to trust densities that the flow finds at places (`round_trip_nats`). Sampling runs splines forward, the
+density of a place inverts them, layer after layer. Where splines are steep, rounding between the layers is what the
+inverse multiplies: float32 fails before float64 does. Measured on learned flows of the face, the arm and the warehouse:
+6e-6 to 6e-5 nats in float32, 1e-13 to 1e-12 in float64.
+
 References:
     VarGrad, Richter et al. 2020. Flow annealed importance sampling bootstrap, Midgley et al. 2023.
-
-Whether a flow can be trusted in its arithmetic: densities of samples, and those that it finds at the same places.
-
-Sampling runs splines forward, the density of a place inverts them, layer after layer. Where splines are steep, rounding
-between the layers is what the inverse multiplies: float32 fails before float64 does. Measured on learned flows of the
-face, the arm and the warehouse: 6e-6 to 6e-5 nats in float32, 1e-13 to 1e-12 in float64.
 """
 
 from __future__ import annotations

@@ -1,25 +1,19 @@
 """What a learned density is worth, measured on fresh samples of it and on points that know nothing of it.
 
-What a learned density is worth: effective sample size, KL divergence, log Z, and coverage.
+Effective sample size, KL divergence and log Z come from fresh samples of the flow with unclipped importance weights
+w = p* / p and cannot see a mode that the flow dropped. Coverage can: it is the share of the target's mass, estimated
+from independent proposals, that lies where the flow's density is at least a tenth of the normalised target's.
 
-The first three come from fresh samples of the flow with unclipped importance weights w = p* / p and cannot see a mode
-that the flow dropped. Coverage can: it is the share of the target's mass, estimated from independent proposals, that
-lies where the flow's density is at least a tenth of the normalised target's.
-
-The share of a learned density's mass that is in the wrong place: its total variation to the normalised target.
-
-Samples of the density alone cannot see what it dropped, and proposals that follow the surfaces alone cannot see what
-leaked away from them. The overlap of both densities is the mean of min(1, pi / p) over samples of p, and that of
-min(1, p / pi) over samples of pi = p* / Z. The two agree at one log Z only, which is the bridge estimate of it with the
-bridge min(p, p* / Z); both means are of values in [0, 1], so no weight can spoil them.
+Misplaced is the share of the density's mass in the wrong place: its total variation TV = 1/2 integral |p - pi| to the
+normalised target pi = p* / Z. It is the one unit of all errors of a density's numerical choices: by the triangle
+inequality the errors of several choices add up at most. Samples of the density alone cannot see what it dropped, and
+proposals that follow the surfaces alone cannot see what leaked away from them. The overlap of both is the mean
+of min(1, pi / p) over samples of p, and that of min(1, p / pi) over samples of pi. The two agree at one log Z only,
+which is the bridge estimate of it with the bridge min(p, p* / Z); both means are of values in [0, 1], so no weight can
+spoil them.
 
 References:
     Simulating ratios of normalizing constants via a simple identity, Meng and Wong 1996.
-
-How far two densities are apart: the share of the mass that is in the wrong place.
-
-That is their total variation, TV = 1/2 integral |a - b| of the normalised densities. It is the one unit of all errors
-of a density's numerical choices: by the triangle inequality the errors of several choices add up at most.
 """
 
 from __future__ import annotations
@@ -160,7 +154,7 @@ class Overlap:
 
 
 @dataclass(frozen=True, eq=False)
-class Sides:
+class OverlapPoints:
     """Points of both densities and what is known at them.
 
     Arguments:
@@ -177,7 +171,7 @@ class Sides:
     proposal_groups: np.ndarray | None = None
 
 
-def overlap(sides: Sides) -> Overlap:
+def overlap(sides: OverlapPoints) -> Overlap:
     """The total variation of a density and its target; with condition groups, their mean.
 
     Groups are alike in their conditions' share, so the mean over them is that over conditions.
@@ -202,13 +196,17 @@ def overlap(sides: Sides) -> Overlap:
 
 
 def _overlap(at_samples: np.ndarray, at_proposals: np.ndarray, log_weights: np.ndarray) -> Overlap:
-    _check(at_samples, at_proposals, log_weights)
+    if any(np.isnan(values).any() for values in (at_samples, at_proposals, log_weights)):
+        raise NumericalError("a density is NaN at the points that it is compared at")
+    if not np.isfinite(at_samples).any() or not np.isfinite(log_weights).any():
+        raise NumericalError("the target is 0 at all points that the density is compared at")
     weights = normalised_weights(log_weights)
     finite = at_samples[np.isfinite(at_samples)]
     start = float(logsumexp(finite)) - math.log(len(at_samples))
 
     def gap(log_z: float) -> float:
-        return _mean_kept(at_samples - log_z) - float(weights @ np.exp(np.minimum(log_z - at_proposals, 0.0)))
+        kept = float(np.exp(np.minimum(at_samples - log_z, 0.0)).mean())
+        return kept - float(weights @ np.exp(np.minimum(log_z - at_proposals, 0.0)))
 
     low, high = _bracket(gap, start)
     log_z = float(brentq(gap, low, high, xtol=LOG_Z_TOLERANCE_NATS))
@@ -223,10 +221,6 @@ def _overlap(at_samples: np.ndarray, at_proposals: np.ndarray, log_weights: np.n
     return Overlap(misplaced=1.0 - shared, error=error, log_z=log_z)
 
 
-def _mean_kept(log_ratios: np.ndarray) -> float:
-    return float(np.exp(np.minimum(log_ratios, 0.0)).mean())
-
-
 def _bracket(gap: Callable[[float], float], start: float) -> tuple[float, float]:
     """Two values of log Z with the root between them; the gap falls from 1 to -1, to 0 where nothing is shared."""
     low = high = start
@@ -239,13 +233,6 @@ def _bracket(gap: Callable[[float], float], start: float) -> tuple[float, float]
     return low, high
 
 
-def _check(at_samples: np.ndarray, at_proposals: np.ndarray, log_weights: np.ndarray) -> None:
-    if any(np.isnan(values).any() for values in (at_samples, at_proposals, log_weights)):
-        raise NumericalError("a density is NaN at the points that it is compared at")
-    if not np.isfinite(at_samples).any() or not np.isfinite(log_weights).any():
-        raise NumericalError("the target is 0 at all points that the density is compared at")
-
-
 SAMPLE_CHUNK = 16384
 CONDITION_GROUPS = 32
 # So many samples go back to the flow's base.
@@ -256,7 +243,7 @@ NOT_COVERED = (
 )
 
 
-class Learned(Protocol):
+class LearnedFlow(Protocol):
     """A flow, the target that it was learned for, and the stream that its samples are drawn from."""
 
     flow: DesignFlow
@@ -266,7 +253,7 @@ class Learned(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Probes:
+class IndependentProbes:
     """Points that know nothing of a flow.
 
     Arguments:
@@ -281,7 +268,7 @@ class Probes:
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class MeasuredFlow:
     """Fresh samples of a flow, and its figures with their errors.
 
     Arguments:
@@ -297,15 +284,15 @@ class Measured:
     notes: tuple[str, ...] = ()
 
 
-def draw_probes(target: Target, count: int, generator: np.random.Generator) -> Probes:
+def draw_probes(target: Target, count: int, generator: np.random.Generator) -> IndependentProbes:
     """At most `count` probes of a target; none where no ray of the space comes near a surface."""
     points, log_proposal = independent_points(target, count, generator)
     log_target = target.log_density(points) if len(points) else log_proposal
-    return Probes(points, log_proposal, log_target)
+    return IndependentProbes(points, log_proposal, log_target)
 
 
 @phase("measuring")
-def measure(learned: Learned, probes: Probes, count: int) -> Measured:
+def measure(learned: LearnedFlow, probes: IndependentProbes, count: int) -> MeasuredFlow:
     """The figures of a flow from `count` fresh samples and from probes.
 
     Raises:
@@ -316,14 +303,14 @@ def measure(learned: Learned, probes: Probes, count: int) -> Measured:
     groups = condition_groups(space, samples.points)
     found = quality(samples.log_prob, samples.log_target, groups)
     covered, notes = Estimate(0.0, None), []
-    sides = Sides(samples.log_weights, samples.log_weights, samples.log_weights, groups, groups)
+    sides = OverlapPoints(samples.log_weights, samples.log_weights, samples.log_weights, groups, groups)
     if len(probes.points):
         log_prob = log_density_of(learned, probes.points)
         log_z = _log_z_at(probes.points, samples, groups, found.log_z)
         covered = coverage(log_prob, probes.log_target, probes.log_proposal, log_z)
         log_weights = probes.log_target - probes.log_proposal
         theirs = condition_groups(space, probes.points)
-        sides = Sides(samples.log_weights, probes.log_target - log_prob, log_weights, groups, theirs)
+        sides = OverlapPoints(samples.log_weights, probes.log_target - log_prob, log_weights, groups, theirs)
     else:
         notes.append(NOT_COVERED)
     apart = overlap(sides)
@@ -334,10 +321,10 @@ def measure(learned: Learned, probes: Probes, count: int) -> Measured:
             f"log densities are off by up to {off:.2g} nats: the flow's splines are too steep to be inverted in "
             "float64; fewer learning.layers are easier to invert"
         )
-    return Measured(samples, estimates, off, tuple(notes))
+    return MeasuredFlow(samples, estimates, off, tuple(notes))
 
 
-def draw_samples(learned: Learned, count: int) -> Samples:
+def draw_samples(learned: LearnedFlow, count: int) -> Samples:
     """Fresh samples of the flow with their log density and log target, in chunks."""
     points, log_prob = [], []
     flow, coordinates = learned.flow, learned.coordinates
@@ -355,7 +342,7 @@ def draw_samples(learned: Learned, count: int) -> Samples:
     return Samples(points, np.concatenate(log_prob) + offset, log_target, coordinates.space)
 
 
-def log_density_of(learned: Learned, points: np.ndarray) -> np.ndarray:
+def log_density_of(learned: LearnedFlow, points: np.ndarray) -> np.ndarray:
     """The flow's log density per chart volume at any design points, (N, 6) to (N,); -inf outside the space."""
     flow, coordinates = learned.flow, learned.coordinates
     like = next(flow.parameters())

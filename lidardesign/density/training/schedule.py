@@ -1,23 +1,21 @@
-"""Learning to a tolerance: trainings of doubled length, until the misplaced share of the density is small enough.
+"""How long learning goes on where its user gave a goal instead of steps: a tolerance, or a time budget.
 
-Every stage starts anew with a schedule of its own length, because the schedule is what makes few steps good: sigma
-falls and the mass is balanced within them. All stages together take less than twice the steps of the last one. The run
-is left as if learning had been asked for with the steps of that last one, bit for bit; the manifest keeps what was
-tried.
+To a tolerance: trainings of doubled length, until the misplaced share of the density is small enough. Every stage
+starts anew with a schedule of its own length, because the schedule is what makes few steps good: sigma falls and the
+mass is balanced within them. All stages together take less than twice the steps of the last one. The run is left as if
+learning had been asked for with the steps of that last one, bit for bit; the manifest keeps what was tried.
 
-Learning within a time budget: as many steps as fit, planned from this run's own first steps.
-
-The first plan comes from a few steps of the untrained flow. What balancing steps and the measurement at the end take is
-only known once the flow has found the surfaces, so their number is planned anew when balancing begins. The path-wise
-phase knows nothing of it: the run is then the one that the new numbers of steps would have given from the start, and
-config.yaml has them.
+Within a time budget: as many steps as fit, planned from this run's own first steps. The first plan comes from a few
+steps of the untrained flow. What balancing steps and the measurement at the end take is only known once the flow has
+found the surfaces, so their number is planned anew when balancing begins. The path-wise phase knows nothing of it: the
+run is then the one that the new numbers of steps would have given from the start, and config.yaml has them.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -106,8 +104,8 @@ class ToleranceGoal:
 
     def with_stage(self, stage: Stage) -> ToleranceGoal:
         """The goal after a stage, in place of an earlier one of the same steps."""
-        kept = tuple(one for one in self.stages if one.steps != stage.steps)
-        return replace(self, stages=(*kept, stage))
+        others = tuple(other for other in self.stages if other.steps != stage.steps)
+        return replace(self, stages=(*others, stage))
 
     def as_dict(self) -> dict[str, Any]:
         """The form that the manifest has."""
@@ -162,7 +160,9 @@ def learn_to_tolerance(
         resume: Continue the stage of the configuration from its checkpoint.
     """
     first = config.learning.steps if resume or goal.stages else 0
-    for steps in _remaining(goal.planned_steps, first):
+    # the stages from this one on; a configuration that is none of them is one of its own
+    later = {steps for steps in stage_steps(goal.planned_steps) if steps > first}
+    for steps in sorted(later | ({first} if first else set())):
         staged = with_steps(config, steps)
         if not resume:
             _begin(run, staged, goal)
@@ -174,11 +174,6 @@ def learn_to_tolerance(
         if goal.met or goal.hopeless:
             break
     return result, goal
-
-
-def _remaining(planned: int, first: int) -> Sequence[int]:
-    """The stages from one on; a configuration that is none of them is one of its own."""
-    return sorted({*(steps for steps in stage_steps(planned) if steps > first), *([first] if first else [])})
 
 
 def _begin(run: Path, config: RunConfig, goal: ToleranceGoal) -> None:

@@ -1,9 +1,8 @@
-"""What learning had reached after a part of its steps, measured anew from the snapshots that a run kept.
+"""What learning had reached after a part of its steps, and what its settings cost in accuracy.
 
-What torch has to measure of a learned flow: gradients of its steps beside their own noise, float32 beside float64.
-
-A step's gradient is an estimate: another batch gives another one. What arithmetic or fewer scenes change in it matters
-only beside that noise, sqrt(E |g - E g|^2) over batches.
+The snapshots that a run kept are measured anew. Gradients of steps are compared beside their own noise: a step's
+gradient is an estimate, another batch gives another one. What arithmetic or fewer scenes change in it matters only
+beside that noise, sqrt(E |g - E g|^2) over batches.
 """
 
 from __future__ import annotations
@@ -24,9 +23,9 @@ from lidardesign.density.flow.objective import Coordinates
 from lidardesign.density.learn import FLOW, make_flow
 from lidardesign.density.target.target import Target
 from lidardesign.density.target.visibility import Optics
-from lidardesign.density.training.checkpoint import kept_snapshots, load_arrays, rung_steps, twin_step
+from lidardesign.density.training.checkpoint import kept_snapshots, load_arrays, measured_steps, twin_step
 from lidardesign.density.training.losses import Pool, balancing_loss, draw_conditions, pathwise_loss
-from lidardesign.density.training.quality import Probes, measure
+from lidardesign.density.training.quality import IndependentProbes, measure
 from lidardesign.density.training.training import PROGRESS, SIGMA_START_RATIO
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
@@ -47,7 +46,7 @@ class LoadedFlow:
 
 
 @dataclass(frozen=True, eq=False)
-class Reached:
+class SnapshotQuality:
     """What a run's flow was worth after a step.
 
     Arguments:
@@ -84,7 +83,9 @@ def check_kept(run: Path) -> None:
         verify(run, name)
 
 
-def remeasured(run: Path, config: RunConfig, target: Target, probes: Probes, *, count: int, seed: int) -> list[Reached]:
+def remeasured(
+    run: Path, config: RunConfig, target: Target, probes: IndependentProbes, *, count: int, seed: int
+) -> list[SnapshotQuality]:
     """The figures of every snapshot of a run and of its flow, in the order of steps.
 
     All are measured on the same base points and the same probes, so that they differ by what was learned.
@@ -101,14 +102,14 @@ def remeasured(run: Path, config: RunConfig, target: Target, probes: Probes, *, 
         DataError: The run is unfinished or damaged.
     """
     files = {**kept_snapshots(run), config.learning.steps: FLOW}
-    rungs = [step for step in rung_steps(config.learning) if step in files]
+    rungs = [step for step in measured_steps(config.learning) if step in files]
     seconds, found = seconds_at(run, rungs), []
     for step in rungs:
         reached = measure(load_flow(run, files[step], config, target, seed), probes, count)
         twin = files.get(twin_step(config.learning, step))
         other = measure(load_flow(run, twin, config, target, seed), probes, count) if twin else None
         apart = None if other is None else other.estimates["misplaced"]
-        found.append(Reached(step, seconds[step], reached.estimates, reached.samples, apart))
+        found.append(SnapshotQuality(step, seconds[step], reached.estimates, reached.samples, apart))
     return found
 
 
@@ -170,7 +171,7 @@ class FlatTarget:
 
 
 @dataclass(frozen=True, eq=False)
-class Steps:
+class LearningSteps:
     """The two kinds of steps of learning, at a flow.
 
     Arguments:
@@ -185,7 +186,7 @@ class Steps:
     settings: LearningSettings
     pool: Pool
 
-    def without_target(self) -> Steps:
+    def without_target(self) -> LearningSteps:
         """The same steps with a target that costs nothing, to be timed."""
         return replace(self, target=FlatTarget(self.target.optics, self.target.space))
 
@@ -234,7 +235,7 @@ def in_arithmetic(flow: DesignFlow, dtype: str) -> DesignFlow:
     return copy.deepcopy(flow).to(dtype=getattr(torch, dtype))
 
 
-def beside_noise(gradients: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> tuple[float, float]:
+def noise_share(gradients: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> tuple[float, float]:
     """The rms error of gradients as a share of the noise that the exact ones have anyway, and its standard error.
 
     Arguments:
@@ -248,7 +249,7 @@ def beside_noise(gradients: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -
     return _share(apart, products, np.arange(count)), float(np.sqrt((count - 1) * np.var(left_out)))
 
 
-def each_beside_noise(gradients: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> np.ndarray:
+def noise_shares(gradients: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> np.ndarray:
     """The error of every batch's gradient as a share of the noise of exact ones, shape (batches,)."""
     apart, products = _apart(gradients, exact)
     variance = _variance(products)
@@ -278,7 +279,7 @@ def _variance(products: np.ndarray) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
+class FlowSamples:
     """Samples of a flow in float64, to be evaluated in any arithmetic.
 
     Arguments:
@@ -294,7 +295,7 @@ class Drawn:
     log_prob: np.ndarray
 
     @classmethod
-    def of(cls, flow: DesignFlow, count: int, seed: int) -> Drawn:
+    def of(cls, flow: DesignFlow, count: int, seed: int) -> FlowSamples:
         """Samples of a float64 flow."""
         generator = torch.Generator().manual_seed(seed)
         conditions, base = draw_conditions(flow, count, generator), flow.draw_base(count, generator)

@@ -4,15 +4,10 @@ First the reverse KL along paths, while sigma falls geometrically from its start
 are found while they are wide; eta falls to zero with it. The last steps balance the mass by values of p* (`losses`).
 A step whose loss or gradient is not finite is skipped; several in a row take the last good weights back and halve the
 step size; when that does not help either, training stops with the last good checkpoint. Balancing looks back from
-places to densities: where float32 cannot (`round_trip`), the remaining steps are taken in float64.
+places to densities: where float32 cannot (`losses.round_trip_nats`), the remaining steps are taken in float64.
 
-Every `SNAPSHOT_STEPS` steps the whole state is copied. Checkpoints are these snapshots, also after an interruption: a
+Every `SNAPSHOT_STEPS` steps the whole state is copied. Checkpoints are these copies, also after an interruption: a
 resumed run falls back on the same weights as an uninterrupted one would, so both stay the same bit for bit.
-
-Adam's steps over the weights of a flow (Kingma and Ba 2015, arXiv:1412.6980), as `torch.optim.Adam` takes them.
-
-The steps are PyTorch's own function, and equal bit for bit. Its class imports the compiler of PyTorch, which nothing
-here uses, when it is made: that takes as long again as importing PyTorch, in every process that learns.
 """
 
 from __future__ import annotations
@@ -55,6 +50,9 @@ MOMENTS = ("exp_avg", "exp_avg_sq")
 
 class Adam:
     """Steps of one size for all weights, each along its own mean gradient over the root of its mean square.
+
+    The steps are those of `torch.optim.Adam` (Kingma and Ba 2015, arXiv:1412.6980), bit for bit. Its class imports the
+    compiler of PyTorch, which nothing here uses: that takes as long again as importing PyTorch, in every process.
 
     Arguments:
         parameters: The weights, which are changed in place.

@@ -13,14 +13,14 @@ from lidardesign.density.training.losses import Pool
 from lidardesign.density.training.quality import misplaced_share
 from lidardesign.density.training.snapshot_quality import (
     DTYPES,
-    Drawn,
+    FlowSamples,
+    LearningSteps,
     Loss,
-    Steps,
-    beside_noise,
-    each_beside_noise,
     gradient,
     in_arithmetic,
     load_flow,
+    noise_share,
+    noise_shares,
 )
 from lidardesign.evaluate.accuracy.probes import AccuracyRequest, draw_probes, run_target
 from lidardesign.evaluate.accuracy.settings import Measurement, Sweep, timed
@@ -35,7 +35,7 @@ SAMPLES = 16_384
 # Of a normal sample: standard deviation over median deviation, and the median's standard error over the mean's.
 MEDIAN_DEVIATION, MEDIAN_ERROR = 1.4826, 1.2533
 
-_STEPS: WeakKeyDictionary[AccuracyRequest, Steps | None] = WeakKeyDictionary()
+_STEPS: WeakKeyDictionary[AccuracyRequest, LearningSteps | None] = WeakKeyDictionary()
 
 
 def dtype_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
@@ -44,14 +44,14 @@ def dtype_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     return [] if steps is None else [dtype_sweep(steps, request.config.seed)]
 
 
-def run_steps(request: AccuracyRequest) -> Steps | None:
+def run_steps(request: AccuracyRequest) -> LearningSteps | None:
     """The steps of a run's learning, at the flow that it learned; None where no probe reaches a surface."""
     if request not in _STEPS:
         _STEPS[request] = _steps(request)
     return _STEPS[request]
 
 
-def _steps(request: AccuracyRequest) -> Steps | None:
+def _steps(request: AccuracyRequest) -> LearningSteps | None:
     target, config = run_target(request), request.config
     probes = draw_probes(target, POOL, config.seed, "steps")
     if not len(probes.points):
@@ -59,17 +59,17 @@ def _steps(request: AccuracyRequest) -> Steps | None:
     unit = config.space.to_unit(probes.points)
     pool = Pool.of(unit, target.log_density(probes.points), probes.log_proposal)
     flow = load_flow(request.run, FLOW, config, target, config.seed).flow
-    return Steps(flow, target, config.learning, pool)
+    return LearningSteps(flow, target, config.learning, pool)
 
 
-def dtype_sweep(steps: Steps, seed: int) -> Sweep:
+def dtype_sweep(steps: LearningSteps, seed: int) -> Sweep:
     """The error of a step's gradient in float32, the larger of both kinds of steps.
 
     The target is the same in any arithmetic, so only the flow's part of a step is timed.
     """
     kinds = {"pathwise": steps.pathwise(), "balancing": steps.balancing()}
     exact = {name: _gradients("float64", steps, loss, seed) for name, loss in kinds.items()}
-    drawn = Drawn.of(steps.flow, SAMPLES, seed)
+    drawn = FlowSamples.of(steps.flow, SAMPLES, seed)
     return Sweep(
         knob="learning.dtype",
         error_of="error of a step's gradient beside the noise of its batch, median over batches",
@@ -83,13 +83,14 @@ def dtype_sweep(steps: Steps, seed: int) -> Sweep:
     )
 
 
-def _gradients(dtype: str, steps: Steps, loss: Loss, seed: int) -> list[np.ndarray]:
+def _gradients(dtype: str, steps: LearningSteps, loss: Loss, seed: int) -> list[np.ndarray]:
     flow = in_arithmetic(steps.flow, dtype)
     return [gradient(flow, loss, number, steps.settings.clip_norm) for number in range(seed, seed + DTYPE_BATCHES)]
 
 
 def _dtype_measure(
-    dtype: str, steps: Steps, kinds: dict[str, Loss], exact: dict[str, list[np.ndarray]], drawn: Drawn, seed: int
+    dtype: str, steps: LearningSteps, kinds: dict[str, Loss], exact: dict[str, list[np.ndarray]], drawn: FlowSamples,
+    seed: int,
 ) -> Measurement:
     flow, alone = in_arithmetic(steps.flow, dtype), steps.without_target()
     both, clip_norm = (alone.pathwise(), alone.balancing()), steps.settings.clip_norm
@@ -97,7 +98,7 @@ def _dtype_measure(
     default, values = dtype == steps.settings.dtype, _densities(dtype, steps, drawn)
     if dtype == "float64":
         return Measurement(dtype, 0.0, 0.0, seconds, memory, default, reference=True, values=values)
-    found = {name: each_beside_noise(_gradients(dtype, steps, loss, seed), exact[name]) for name, loss in kinds.items()}
+    found = {name: noise_shares(_gradients(dtype, steps, loss, seed), exact[name]) for name, loss in kinds.items()}
     for name, shares in found.items():
         # a leaked sample near a silhouette has a gradient without bounds, which any rounding may turn over
         values |= {
@@ -115,7 +116,7 @@ def _median(values: np.ndarray) -> tuple[float, float]:
     return middle, MEDIAN_ERROR * deviation / math.sqrt(len(values))
 
 
-def _densities(dtype: str, steps: Steps, drawn: Drawn) -> dict[str, float]:
+def _densities(dtype: str, steps: LearningSteps, drawn: FlowSamples) -> dict[str, float]:
     """What densities of the flow's samples would lose and cost in an arithmetic."""
     flow, exact = in_arithmetic(steps.flow, dtype), drawn.log_prob
     found, seconds, _ = timed(lambda: drawn.log_densities(flow))
@@ -145,7 +146,7 @@ def frames_sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     return [frames_sweep(steps, request.config.seed)]
 
 
-def frames_sweep(steps: Steps, seed: int) -> Sweep:
+def frames_sweep(steps: LearningSteps, seed: int) -> Sweep:
     """The error of a path-wise step's gradient when a few scenes and frames, drawn anew each time, stand for all."""
     steps_flow = in_arithmetic(steps.flow, steps.settings.dtype)
     seeds = range(seed, seed + FRAMES_BATCHES)
@@ -173,7 +174,7 @@ def counts(columns: int, default: int) -> list[int]:
 
 
 def _frames_measure(
-    count: int, steps: Steps, exact: list[np.ndarray], seeds: Sequence[int], default: int
+    count: int, steps: LearningSteps, exact: list[np.ndarray], seeds: Sequence[int], default: int
 ) -> Measurement:
     columns, flow = steps.target.columns, in_arithmetic(steps.flow, steps.settings.dtype)
     generator = random_generator(seeds[0], "scenes", count)
@@ -187,5 +188,5 @@ def _frames_measure(
     if count == columns:
         return Measurement(str(count), 0.0, 0.0, seconds, memory, default == count, reference=True)
     found = [np.stack([drawn(number) for _ in range(DRAWS)]) for number in seeds]
-    error, uncertainty = beside_noise(found, exact)
+    error, uncertainty = noise_share(found, exact)
     return Measurement(str(count), error, uncertainty, seconds, memory, default == count)

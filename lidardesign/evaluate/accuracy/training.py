@@ -12,9 +12,9 @@ import numpy as np
 from lidardesign.config import PRESETS, RunConfig, load_run_config
 from lidardesign.density.learn import FLOW
 from lidardesign.density.target.target import Target
-from lidardesign.density.training.quality import Probes, draw_probes, measure
+from lidardesign.density.training.quality import IndependentProbes, draw_probes, measure
 from lidardesign.density.training.schedule import goal_of
-from lidardesign.density.training.snapshot_quality import Reached, load_flow, remeasured
+from lidardesign.density.training.snapshot_quality import SnapshotQuality, load_flow, remeasured
 from lidardesign.design.fit import fit_like
 from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import DesignSpec
@@ -60,7 +60,7 @@ def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     return [*found, *_preset_sweep(request, reached[-1], target, probes)]
 
 
-def _steps_sweep(request: AccuracyRequest, reached: Sequence[Reached]) -> Sweep:
+def _steps_sweep(request: AccuracyRequest, reached: Sequence[SnapshotQuality]) -> Sweep:
     judge = _Judge(request, reached[-1].samples)
     scores = [judge.scores(one.samples) for one in reached]
     measurements = [
@@ -71,7 +71,7 @@ def _steps_sweep(request: AccuracyRequest, reached: Sequence[Reached]) -> Sweep:
     return _sweep("learning.steps", "learning up to there", measurements, "; ".join([*notes, *judge.notes]))
 
 
-def _around(reached: Reached) -> dict[str, Estimate]:
+def _around(reached: SnapshotQuality) -> dict[str, Estimate]:
     """The figures of a measurement, its error with the jitter from step to step."""
     return {**reached.estimates, "misplaced": reached.misplaced}
 
@@ -89,7 +89,9 @@ def _stages_sweep(request: AccuracyRequest) -> Sequence[Sweep]:
     return [_sweep("learning.steps, each anew", "learning and measuring", measurements, note)]
 
 
-def _preset_sweep(request: AccuracyRequest, own: Reached, target: Target, probes: Probes) -> Sequence[Sweep]:
+def _preset_sweep(
+    request: AccuracyRequest, own: SnapshotQuality, target: Target, probes: IndependentProbes
+) -> Sequence[Sweep]:
     """Runs of other presets against the same target, in the order of effort; empty where none lies beside this one."""
     config, seconds = request.config, _seconds(request.run)
     beside = [_measurement_beside(run, other, target, probes, config.seed) for run, other in _presets(request)]
@@ -101,7 +103,9 @@ def _preset_sweep(request: AccuracyRequest, own: Reached, target: Target, probes
     return [_sweep("preset", "the whole of learn", measurements, PRESET_NOTE)]
 
 
-def _measurement_beside(run: Path, config: RunConfig, target: Target, probes: Probes, seed: int) -> Measurement | None:
+def _measurement_beside(
+    run: Path, config: RunConfig, target: Target, probes: IndependentProbes, seed: int
+) -> Measurement | None:
     """Another run; None where it cannot be measured: this run's figures do not depend on what lies beside it."""
     try:
         seconds, learned = _seconds(run), load_flow(run, FLOW, config, target, seed)
