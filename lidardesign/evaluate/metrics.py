@@ -145,18 +145,14 @@ def triangle_distance_m(points: np.ndarray, triangles: np.ndarray) -> np.ndarray
     for start, end in itertools.pairwise([*corners, corners[0]]):
         along, offset = end - start, at - start
         inside &= _dot(_cross(along, offset), normal) >= 0
-        squared = np.minimum(squared, _segment_squared(along, offset))
+        # squared distances to segments of points offset from their starts, (3, N) and (3, N) to (N,)
+        length = _dot(along, along)
+        share = np.divide(_dot(offset, along), length, out=np.zeros(len(length)), where=length > 0)
+        away = offset - np.clip(share, 0.0, 1.0) * along
+        squared = np.minimum(squared, _dot(away, away))
     height = _dot(at - corners[0], normal)
     above = np.divide(height**2, area, out=np.full(len(points), np.inf), where=inside)
     return np.sqrt(np.minimum(squared, above))
-
-
-def _segment_squared(along: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Squared distances to segments of points offset from their starts, (3, N) and (3, N) to (N,)."""
-    length = _dot(along, along)
-    share = np.divide(_dot(offset, along), length, out=np.zeros(len(length)), where=length > 0)
-    away = offset - np.clip(share, 0.0, 1.0) * along
-    return _dot(away, away)
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -241,7 +237,13 @@ def delaunay_surface(
     except QhullError:  # fewer than 3 points, or all of them collinear
         return None
     vertices, faces = points[seen], triangulation.simplices
-    kept = _facing_cosine(vertices[faces], viewpoint) >= math.cos(math.radians(steepest_deg))
+    # cosine of the angle between a triangle's normal and the line of sight, 0 to 1
+    triangles = vertices[faces]
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    normal, sight = np.cross(b - a, c - a), (a + b + c) / 3 - viewpoint
+    lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(sight, axis=1)
+    across = np.abs(np.einsum("fk,fk->f", normal, sight))
+    kept = np.divide(across, lengths, out=np.zeros(len(a)), where=lengths > 0) >= math.cos(math.radians(steepest_deg))
     kept &= _longest_edge(directions[seen][faces]) <= MOST_SPACINGS * spacing[seen][faces].mean(axis=1)
     return vertices, faces[kept] if kept.any() else faces
 
@@ -249,15 +251,6 @@ def delaunay_surface(
 def _longest_edge(corners: np.ndarray) -> np.ndarray:
     """The longest edge of triangles (F, 3, 3), shape (F,)."""
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-
-
-def _facing_cosine(triangles: np.ndarray, viewpoint: np.ndarray) -> np.ndarray:
-    """Cosine of the angle between a triangle's normal and the line of sight, 0 to 1, shape (F,)."""
-    a, b, c = np.moveaxis(triangles, 1, 0)
-    normal, sight = np.cross(b - a, c - a), (a + b + c) / 3 - viewpoint
-    lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(sight, axis=1)
-    across = np.abs(np.einsum("fk,fk->f", normal, sight))
-    return np.divide(across, lengths, out=np.zeros(len(a)), where=lengths > 0)
 
 
 def _stereographic(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

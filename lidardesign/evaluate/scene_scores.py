@@ -105,7 +105,15 @@ def checked_score(task: Task, scene: Scene, returns: Sequence[Returns]) -> Score
         raise PluginError(
             f"score returned {type(score).__name__}", where=where, allowed="lidardesign.task.Score"
         )
-    _check_details(score, where)
+    if not isinstance(score.details, Mapping) or not all(isinstance(name, str) for name in score.details):
+        raise PluginError(
+            f"score returned the details {score.details!r}", where=where, allowed="numbers by name, as {'seen': 3.0}"
+        )
+    bad = [name for name, value in score.details.items() if not _is_number(value)]
+    if bad:
+        raise PluginError(
+            f"score returned the detail {bad[0]!r}: {score.details[bad[0]]!r}", where=where, allowed="a number"
+        )
     if score.failed:
         return Score(float(task.metric.worst), failed=True, details=score.details)
     if not _is_number(score.value) or not math.isfinite(score.value):
@@ -146,18 +154,6 @@ def checked_residuals(task: Task, scene: Scene, returns: Sequence[Returns]) -> R
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-
-
-def _check_details(score: Score, where: str) -> None:
-    if not isinstance(score.details, Mapping) or not all(isinstance(name, str) for name in score.details):
-        raise PluginError(
-            f"score returned the details {score.details!r}", where=where, allowed="numbers by name, as {'seen': 3.0}"
-        )
-    bad = [name for name, value in score.details.items() if not _is_number(value)]
-    if bad:
-        raise PluginError(
-            f"score returned the detail {bad[0]!r}: {score.details[bad[0]]!r}", where=where, allowed="a number"
-        )
 
 
 Progress = Callable[[int, int, str], None]

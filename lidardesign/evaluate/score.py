@@ -368,6 +368,10 @@ def _rows(request: EvaluationRequest, entries: Sequence[Entry], scored: _Scored)
 def _row(request: EvaluationRequest, entry: Entry, tally: _Tally) -> Row:
     values = np.array(tally.values)
     mean, low, high = bootstrap_interval(values, request.seed)
+    # the mean of each further figure over the scenes that give it; figures that are not finite are left out
+    names = dict.fromkeys(name for details in tally.details for name in details)
+    given = {name: [float(details[name]) for details in tally.details if name in details] for name in names}
+    finite = {name: [value for value in values if math.isfinite(value)] for name, values in given.items()}
     return Row(
         design=entry.name,
         rays=entry.rays,
@@ -378,19 +382,11 @@ def _row(request: EvaluationRequest, entry: Entry, tally: _Tally) -> Row:
         bandwidth_mbps=entry.mbps(request.bandwidth),
         seconds=tally.seconds,
         per_scene=values,
-        details=_mean_details(tally.details),
+        details={name: float(np.mean(values)) for name, values in finite.items() if values},
         baseline=entry.baseline,
         matched_to=entry.matched_to,
         matched_rays=entry.matched_rays,
     )
-
-
-def _mean_details(scenes: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """The mean of each further figure over the scenes that give it; figures that are not finite are left out."""
-    names = dict.fromkeys(name for details in scenes for name in details)
-    given = {name: [float(details[name]) for details in scenes if name in details] for name in names}
-    finite = {name: [value for value in values if math.isfinite(value)] for name, values in given.items()}
-    return {name: float(np.mean(values)) for name, values in finite.items() if values}
 
 
 def _pair(first: Row, second: Row, seed: int, rays_b: int | None = None) -> Paired:

@@ -203,7 +203,6 @@ PROBES = 16_384
 LONGEST_SECONDS = 20.0
 # A coarse field has its surfaces elsewhere: probes must meet them there too.
 WIDENING = 3.0
-NEAR_SIGMAS = 2.0
 TIMED_POINTS = 1024
 ORDERS = {"nearest": 0, "trilinear": 1, "tricubic": 3}
 DEFAULT_ORDER = "trilinear"
@@ -262,7 +261,7 @@ class Case:
     def errors(self, field: Field) -> tuple[float, float, dict[str, float]]:
         """The share of mass in the wrong place, its standard error, and the error of distances near surfaces."""
         distances = np.asarray(field.distances(self.observed), dtype=np.float64)
-        near = np.abs(self.exact) < NEAR_SIGMAS * self.target.optics.sigma_m
+        near = np.abs(self.exact) < 2.0 * self.target.optics.sigma_m
         apart_m = math.sqrt(np.square((distances - self.exact)[near]).mean()) if near.any() else 0.0
         return (
             *self.probes.misplaced(self.log_density(distances), self.log_density(self.exact)),

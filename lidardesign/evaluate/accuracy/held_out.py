@@ -18,7 +18,6 @@ RIVAL = "bounding"
 COUNTS = (5, 10, 20, 50, 100, 200)
 # So many sets of scenes are drawn for each; a mean half-width is then known to a few percent beside the scenes' own.
 DRAWS = 32
-RESAMPLES = 1000
 
 
 def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
@@ -44,7 +43,9 @@ def _pair(evaluation: Evaluation) -> tuple[Row, Row] | None:
 
 def _sweep(differences: np.ndarray, design: Row, request: AccuracyRequest) -> Sweep:
     metric, total = request.evaluation.metric, len(differences)
-    seconds = _seconds(request.evaluation) / total
+    # of all rows in all scenes [s]; rows that fire the same rays have one time, to the last bit
+    taken = {row.seconds for row in (*request.evaluation.rows, *request.evaluation.equal_bandwidth)}
+    seconds = (request.evaluation.planning_seconds + sum(taken)) / total
     counts = [count for count in COUNTS if count < total]
     measurements = [_measure(differences, count, seconds, request.request.seed) for count in (*counts, total)]
     return Sweep(
@@ -60,19 +61,13 @@ def _sweep(differences: np.ndarray, design: Row, request: AccuracyRequest) -> Sw
     )
 
 
-def _seconds(evaluation: Evaluation) -> float:
-    """Of all rows in all scenes [s]; rows that fire the same rays have one time, to the last bit."""
-    taken = {row.seconds for row in (*evaluation.rows, *evaluation.equal_bandwidth)}
-    return evaluation.planning_seconds + sum(taken)
-
-
 def _measure(differences: np.ndarray, count: int, seconds: float, seed: int) -> Measurement:
     """The mean half-width over sets of so many scenes; over the one set where all are taken."""
     total = len(differences)
     generator = random_generator(seed, "held-out ladder", count)
     draws = DRAWS if count < total else 1
     sets = [generator.permutation(total)[:count] for _ in range(draws)] if count < total else [np.arange(total)]
-    intervals = [bootstrap_interval(differences[chosen], seed, resamples=RESAMPLES) for chosen in sets]
+    intervals = [bootstrap_interval(differences[chosen], seed, resamples=1000) for chosen in sets]
     halves = np.array([(one.high - one.low) / 2 for one in intervals])
     sign = np.sign(differences.mean())
     agree = np.mean([sign * one.low > 0 and sign * one.high > 0 for one in intervals])

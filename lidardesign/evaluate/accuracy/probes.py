@@ -18,7 +18,7 @@ from lidardesign.density.training.quality import misplaced_share
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.results import Evaluation
 from lidardesign.run.manifest import read_manifest
-from lidardesign.scene import Body, Scene
+from lidardesign.scene import Scene
 from lidardesign.task import random_generator
 
 # Each of a density's choices may misplace a fiftieth of its mass: half of what the best learned flows miss it by.
@@ -125,9 +125,5 @@ def with_frames(scene: Scene, most: int) -> Scene:
     if scene.frames <= most:
         return scene
     chosen = np.linspace(0, scene.frames - 1, most).round().astype(int)
-    bodies = tuple(_thinned(body, chosen) for body in scene.bodies)
+    bodies = tuple(body if body.poses.ndim == 2 else replace(body, poses=body.poses[chosen]) for body in scene.bodies)
     return replace(scene, bodies=bodies)
-
-
-def _thinned(body: Body, frames: np.ndarray) -> Body:
-    return body if body.poses.ndim == 2 else replace(body, poses=body.poses[frames])

@@ -28,7 +28,6 @@ STANDARD_ERRORS = 2.0
 TIMED_SECONDS = 0.2
 MOST_REPEATS = 5
 _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-_RESET_PEAK = "5"
 
 
 @dataclass(frozen=True)
@@ -214,7 +213,7 @@ def with_memory(call: Callable[[], Value]) -> tuple[Value, int | None]:
 
 def _peak_was_reset() -> bool:
     with contextlib.suppress(OSError):
-        _CLEAR.write_text(_RESET_PEAK, encoding="ascii")
+        _CLEAR.write_text("5", encoding="ascii")
         return True
     return False
 

@@ -28,7 +28,6 @@ from lidardesign.task import random_generator
 
 # Errors of a tenth of the noise add a hundredth to its variance.
 DTYPE_TOLERANCE = 0.1
-DTYPE_BECAUSE = "it adds a hundredth to the variance that gradients have anyway"
 DTYPE_BATCHES = 10
 POOL = 8192
 SAMPLES = 16_384
@@ -76,7 +75,7 @@ def dtype_sweep(steps: LearningSteps, seed: int) -> Sweep:
         unit="",
         against="float64",
         tolerance=DTYPE_TOLERANCE,
-        because=DTYPE_BECAUSE,
+        because="it adds a hundredth to the variance that gradients have anyway",
         work=f"the flow's part of a path-wise and a balancing step of {steps.settings.batch} design points",
         measurements=[_dtype_measure(dtype, steps, kinds, exact, drawn, seed) for dtype in DTYPES],
         note=f"densities are always float64; their figures are those of {SAMPLES} samples in either",
@@ -132,7 +131,6 @@ def _densities(dtype: str, steps: LearningSteps, drawn: FlowSamples) -> dict[str
 
 # The error of few scenes is noise like that of few design points; half as much adds a quarter to its variance.
 FRAMES_TOLERANCE = 0.5
-FRAMES_BECAUSE = "it adds a quarter to the variance that gradients have anyway, as a batch a fifth smaller would"
 POWERS = (4, 16, 64, 256)
 # Batches, and how often scenes are drawn for each. Few batches have most of the error, so many are better than draws.
 FRAMES_BATCHES, DRAWS = 32, 1
@@ -161,7 +159,7 @@ def frames_sweep(steps: LearningSteps, seed: int) -> Sweep:
         unit="",
         against="all scenes and frames",
         tolerance=FRAMES_TOLERANCE,
-        because=FRAMES_BECAUSE,
+        because="it adds a quarter to the variance that gradients have anyway, as a batch a fifth smaller would",
         work=f"the gradient of a path-wise step of {steps.settings.batch} design points",
         measurements=measurements,
         note=f"at sigma {steps.sigma_m:.3g} m, the middle of the annealing",

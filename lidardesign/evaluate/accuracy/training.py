@@ -39,12 +39,9 @@ TOLERANCE = 0.1
 BECAUSE = (
     "a tenth of the rays in the wrong place is at worst a tenth fewer rays: 5 % of an error that falls like their root"
 )
-AGAINST = "the target density"
 # A quick fit shows what a density's errors are worth in the metric; a careful one would take the sweep's time.
 SCORED_SCENES = 8
 RESTARTS = 2
-EM_SAMPLES = 4000
-PRESET_NOTE = "runs of the same task, space and density beside this one"
 STEPS_NOTE = (
     "fewer steps are what this run had reached then, on its way; a run that is planned for as many does better"
 )
@@ -100,7 +97,9 @@ def _preset_sweep(
         return []
     measurements.append(_measure(config.preset, own.estimates, seconds, {}, default=True))
     measurements.sort(key=lambda measurement: PRESETS.index(measurement.setting))
-    return [_sweep("preset", "the whole of learn", measurements, PRESET_NOTE)]
+    return [
+        _sweep("preset", "the whole of learn", measurements, "runs of the same task, space and density beside this one")
+    ]
 
 
 def _measurement_beside(
@@ -164,7 +163,7 @@ def _measure(
 
 
 def _sweep(knob: str, work: str, measurements: Sequence[Measurement], note: str) -> Sweep:
-    return Sweep(knob, ERROR_OF, "", AGAINST, TOLERANCE, BECAUSE, work, measurements, note)
+    return Sweep(knob, ERROR_OF, "", "the target density", TOLERANCE, BECAUSE, work, measurements, note)
 
 
 class _Judge:
@@ -226,7 +225,7 @@ class _Judge:
             rays=None if is_open else self._rays,
             seed=self._asked.seed,
             restarts=RESTARTS,
-            em_samples=EM_SAMPLES,
+            em_samples=4000,
             retarget=self._retarget,
         )
 

@@ -82,7 +82,6 @@ def opened_gate(start_m: float, end_m: float) -> np.ndarray:
     return np.array([start, start + SMALLEST_GATE_M])
 
 
-CENTRAL_SHARE = 0.99
 
 Positions = tuple[Rays, ...]  # one list of rays per condition value, in the task's order
 
@@ -171,7 +170,7 @@ def whole_range(space: DesignSpace) -> np.ndarray:
 
 def central(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Ends of the central 99 % of each column, (N, ...) to two of shape (...)."""
-    tail = (1 - CENTRAL_SHARE) / 2
+    tail = (1 - 0.99) / 2
     low, high = np.quantile(values, [tail, 1 - tail], axis=0)
     return low, np.maximum(low, high)
 

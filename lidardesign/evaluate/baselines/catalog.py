@@ -213,15 +213,12 @@ class PosedPart:
             worth = [self._worth((total + one) / count) for one in proposals.density]
             taken.append(int(np.argmax(worth)))
             total = total + proposals.density[taken[-1]]
-        return _repeated(self.part, [proposals.poses[index] for index in taken])
-
-
-def _repeated(part: Part, poses: list[Pose]) -> list[Pose]:
-    """The same poses; parts that have one in common fire between each other's rays."""
-    found: list[Pose] = []
-    for pose in dict.fromkeys(poses):
-        found += interleaved(part, pose, poses.count(pose))
-    return found
+        # the same poses; parts that have one in common fire between each other's rays
+        poses = [proposals.poses[index] for index in taken]
+        found: list[Pose] = []
+        for pose in dict.fromkeys(poses):
+            found += interleaved(self.part, pose, poses.count(pose))
+        return found
 
 
 def places(space: DesignSpace) -> np.ndarray:
@@ -288,7 +285,6 @@ def _pose(shape: PartShape, mixture: Mixture, row: int, origin_m: np.ndarray, ax
 
 
 FAMILY = "catalog"
-POSE_NUMBERS = (5, 6)
 FORM = "NAME@X,Y,Z,AZIMUTH,ELEVATION[,ROLL] in metres and degrees"
 
 
@@ -332,7 +328,7 @@ def split_argument(argument: str) -> tuple[Part, Pose | None]:
         numbers = [float(one) for one in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) not in POSE_NUMBERS or not np.isfinite(numbers).all() or abs(numbers[4]) > 90:
+    if len(numbers) not in (5, 6) or not np.isfinite(numbers).all() or abs(numbers[4]) > 90:
         raise ConfigError(f"{text!r} is no pose", where=f"catalog:{name}", allowed=FORM)
     if np.abs(numbers[:3]).max() > FARTHEST_M:
         allowed = f"at most {FARTHEST_M:g} m along each axis"

@@ -29,7 +29,6 @@ MOST_VIEWS = 4096  # scenes times frames that enter the grid, evenly spread wher
 SURFACE_POINTS = 400_000  # over all views, between these numbers in each
 FEWEST_POINTS, MOST_POINTS = 256, 4096
 BLOCK = 16_384  # draws at a time
-MOST_BLOCKS = 128
 HOPELESS_BLOCKS = 32  # without one aimed point
 # Rays are drawn from so many times as many weighted points as there are rays, so that few are drawn twice.
 POINTS_PER_RAY = 16
@@ -106,7 +105,7 @@ class AimedPoints:
         """
         chosen: list[tuple[np.ndarray, np.ndarray]] = []
         total = squares = 0.0
-        while len(chosen) < MOST_BLOCKS and total**2 < worth * max(squares, TINY):
+        while len(chosen) < 128 and total**2 < worth * max(squares, TINY):
             if len(chosen) == HOPELESS_BLOCKS and total == 0.0:
                 break
             if len(chosen) == len(self._blocks):

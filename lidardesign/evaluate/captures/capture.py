@@ -30,8 +30,7 @@ from lidardesign.evaluate.captures.arrays import read_arrays
 REQUIRED = ("counts", "bin_width_ps", "start_ps", "origin_m")
 BORESIGHT = ("boresight_azimuth_deg", "boresight_elevation_deg")
 GALVO = ("x_deg", "y_deg", *BORESIGHT)
-OPTIONAL = ("true_range_m", "pulse_fwhm_ps")
-KEYS = (*REQUIRED, "direction", *GALVO, *OPTIONAL)
+KEYS = (*REQUIRED, "direction", *GALVO, *("true_range_m", "pulse_fwhm_ps"))
 # A femtosecond and a microsecond: what lies outside was given in another unit.
 BIN_LIMITS_PS = (1e-3, 1e6)
 # Light that was under way for a tenth of a second came back from beyond the horizon.
@@ -149,13 +148,40 @@ def load_capture(path: Path) -> Capture:
     """
     where = str(path)
     arrays = read_arrays(Path(path))
-    _check_keys(arrays, where)
+    for name in arrays:
+        if name not in KEYS:
+            same = [key for key in KEYS if key.rpartition("_")[0] and name.startswith(key.rpartition("_")[0] + "_")]
+            hint = f"is it {same[0]!r} in another unit?" if same else None
+            raise DataError(f"has an unknown key {name!r}", where=where, allowed=", ".join(KEYS), hint=hint)
+    missing = [name for name in REQUIRED if name not in arrays]
+    if missing:
+        raise DataError(f"has no {', '.join(missing)}", where=where, allowed=", ".join(KEYS))
+    angles = [name for name in GALVO if name in arrays]
+    if ("direction" in arrays) == bool(angles) or len(angles) not in (0, len(GALVO)):
+        found = ", ".join([*(["direction"] if "direction" in arrays else []), *angles]) or "neither"
+        raise DataError(
+            f"says where the pixels look by {found}", where=where, allowed=f"direction, or all of {', '.join(GALVO)}"
+        )
     counts = arrays["counts"]
     if counts.ndim not in (2, 3) or not counts.size:
         raise _shape("counts", counts, "(P, B) or (H, W, B), not empty", where)
     pixels = counts.shape[:-1]
     counts = counts.reshape(-1, counts.shape[-1])
-    _check_counts(counts, where)
+    rows = max(1, CHUNK // counts.shape[1])
+    seen = False
+    for first in range(0, len(counts), rows):
+        part = counts[first : first + rows]
+        if part.dtype.kind == "f":
+            bad = ~np.isfinite(part)
+            _refuse_counts(bad, part, first, "finite numbers", where)
+            _refuse_counts(part != np.floor(part), part, first, "whole numbers of photons", where)
+        _refuse_counts(part < 0, part, first, "0 or more", where)
+        # some types of counts do not reach the limit
+        most = min(MOST_COUNTS, float(np.finfo(part.dtype).max)) if part.dtype.kind == "f" else MOST_COUNTS
+        _refuse_counts(part > most, part, first, f"at most {MOST_COUNTS:.3g}", where)
+        seen = seen or bool(part.any())
+    if not seen:
+        raise DataError("counts are all zero: no photon was captured", where=where)
     pulse = _scalar(arrays, "pulse_fwhm_ps", where) if "pulse_fwhm_ps" in arrays else None
     origin = np.asarray(arrays["origin_m"], dtype=np.float64)
     if origin.size != 3:
@@ -171,23 +197,6 @@ def load_capture(path: Path) -> Capture:
     )
     _check_values(capture, where)
     return capture
-
-
-def _check_keys(arrays: Mapping[str, np.ndarray], where: str) -> None:
-    for name in arrays:
-        if name not in KEYS:
-            same = [key for key in KEYS if key.rpartition("_")[0] and name.startswith(key.rpartition("_")[0] + "_")]
-            hint = f"is it {same[0]!r} in another unit?" if same else None
-            raise DataError(f"has an unknown key {name!r}", where=where, allowed=", ".join(KEYS), hint=hint)
-    missing = [name for name in REQUIRED if name not in arrays]
-    if missing:
-        raise DataError(f"has no {', '.join(missing)}", where=where, allowed=", ".join(KEYS))
-    angles = [name for name in GALVO if name in arrays]
-    if ("direction" in arrays) == bool(angles) or len(angles) not in (0, len(GALVO)):
-        found = ", ".join([*(["direction"] if "direction" in arrays else []), *angles]) or "neither"
-        raise DataError(
-            f"says where the pixels look by {found}", where=where, allowed=f"direction, or all of {', '.join(GALVO)}"
-        )
 
 
 def _shape(name: str, array: np.ndarray, allowed: str, where: str) -> DataError:
@@ -241,24 +250,6 @@ def _directions(arrays: Mapping[str, np.ndarray], pixels: tuple[int, ...], where
         worst = float(length[np.abs(length - 1).argmax(), 0])
         raise DataError(f"direction has a vector of length {worst:.4g}", where=where, allowed="unit vectors")
     return vectors / length
-
-
-def _check_counts(counts: np.ndarray, where: str) -> None:
-    rows = max(1, CHUNK // counts.shape[1])
-    seen = False
-    for first in range(0, len(counts), rows):
-        part = counts[first : first + rows]
-        if part.dtype.kind == "f":
-            bad = ~np.isfinite(part)
-            _refuse_counts(bad, part, first, "finite numbers", where)
-            _refuse_counts(part != np.floor(part), part, first, "whole numbers of photons", where)
-        _refuse_counts(part < 0, part, first, "0 or more", where)
-        # some types of counts do not reach the limit
-        most = min(MOST_COUNTS, float(np.finfo(part.dtype).max)) if part.dtype.kind == "f" else MOST_COUNTS
-        _refuse_counts(part > most, part, first, f"at most {MOST_COUNTS:.3g}", where)
-        seen = seen or bool(part.any())
-    if not seen:
-        raise DataError("counts are all zero: no photon was captured", where=where)
 
 
 def _refuse_counts(bad: np.ndarray, part: np.ndarray, first: int, allowed: str, where: str) -> None:

@@ -40,13 +40,11 @@ from lidardesign.scene import Body, Scene
 from lidardesign.space import DesignSpace, angles
 from lidardesign.task import random_generator
 
-NEIGHBOURS = 9
 SURFACE_POINTS = 4000
 # Flatter triangles bridge depth steps.
 STEEPEST_DEG = 85.0
 MILLIMETRES = 1000.0
 OWN, WHOLE = "own", "whole"
-UNIFORM = "uniform"
 
 
 @dataclass(frozen=True)
@@ -211,7 +209,7 @@ def evaluate_capture(
             rows.append(row(name, WHOLE, whole_window(rays, capture)))
     if not capture.gated:
         for count in dict.fromkeys(len(rays) for _, rays in designs):
-            rows.append(row(UNIFORM, WHOLE, uniform_rays(capture, count), baseline=True))
+            rows.append(row("uniform", WHOLE, uniform_rays(capture, count), baseline=True))
     return CaptureEvaluation(capture, settings, rows, ranges_from, surface_from, _notes(capture, rows))
 
 
@@ -240,7 +238,7 @@ def _reference_ranges(capture: Capture, estimation: Estimation) -> tuple[np.ndar
     if capture.true_range_m is not None:
         return capture.true_range_m, "the capture's true ranges"
     ranges = scan_pixels(capture, estimation).range_m
-    count = min(NEIGHBOURS, len(capture))
+    count = min(9, len(capture))
     near = cKDTree(capture.direction).query(capture.direction, k=count)[1].reshape(len(capture), count)
     sorted_m = np.sort(ranges[near], axis=1)  # NaN comes last
     known = (~np.isnan(sorted_m)).sum(axis=1)

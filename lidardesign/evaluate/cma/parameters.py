@@ -30,7 +30,6 @@ LEAST_SHARE = 1e-3
 # Weights that differ by more nats leave sensors without a ray.
 MOST_LOG_WEIGHT = 5.0
 NARROWEST_RAD = 1e-3
-WIDEST_RAD = math.pi / 2
 # Rays that meet nearer than a quarter of their range, or behind the sensor as near, are no design that anybody wants.
 MOST_FOCUS = 4.0
 
@@ -223,7 +222,7 @@ class SensorParameters:
         )
         # what moves with the origin counts in the fields of view
         scale = np.array([axes.angle_scale, 1.0])
-        low, high = bounds.spread_low * scale, np.minimum(bounds.spread_high * scale, WIDEST_RAD / bounds.interval)
+        low, high = bounds.spread_low * scale, np.minimum(bounds.spread_high * scale, math.pi / 2 / bounds.interval)
         high = np.maximum(high, low)
         moving = moved.moving(rules)
         shrink = np.minimum(1.0, high / np.maximum(np.hypot(moved.spread, moving), TINY))

@@ -231,7 +231,8 @@ class Search:
         self._finalists = [start]
         strategy = _Strategy(best.model, best.vector, self._generator)
         while best.model.size and not self._over(strategy.population * self._stages[stage]):
-            wanted = self._stage()
+            # the number of the stage: each takes half as large a share of what is left as the one before had
+            wanted = min(int(-math.log2(max(1.0 - self._share(), TINY)) * STAGE_PACE), len(self._stages) - 1)
             if wanted > stage:
                 stage = wanted
                 self._finalists.append(_Scored(best.model, best.vector, best.value))
@@ -320,10 +321,6 @@ class Search:
 
     def _over(self, ahead: int = 0) -> bool:
         return self._share(ahead) >= 1.0
-
-    def _stage(self) -> int:
-        """The number of the stage: each takes half as large a share of what is left as the one before had."""
-        return min(int(-math.log2(max(1.0 - self._share(), TINY)) * STAGE_PACE), len(self._stages) - 1)
 
     def _chosen(self, start: _Scored) -> SearchResult:
         """The best finalist on all scenes."""

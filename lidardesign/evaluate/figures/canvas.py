@@ -29,7 +29,6 @@ DOTS_PER_INCH = 300
 LETTERS_POINTS, SMALL_POINTS = 8.0, 7.0
 INK, SOFT, GRID = "#1f2933", "#52606d", "#dde1e6"
 BAND_OPACITY = 0.15
-LONGEST_LABEL = 28
 KINDS = ("png", "svg")
 # What is drawn does not hang on the user's own settings of matplotlib, nor on the day.
 LOOK: dict[str, Any] = {
@@ -131,7 +130,7 @@ def label_powers(axis: Any) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def plain_label(text: str, longest: int = LONGEST_LABEL) -> str:
+def plain_label(text: str, longest: int = 28) -> str:
     """Text that can be drawn as it is: one line, no control characters, no hidden legend entries, not too long."""
     shown = "".join(letter if letter.isprintable() else " " for letter in text)
     shown = shown if len(shown) <= longest else f"{shown[: longest - 1]}…"

@@ -18,7 +18,7 @@ from lidardesign.evaluate.figures.canvas import (
     plain_axes,
     plain_label,
 )
-from lidardesign.evaluate.figures.density_views import DensityView, Marginal, PlaneDensity
+from lidardesign.evaluate.figures.density_views import DensityView, Marginal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,9 +37,7 @@ LEFT_INCHES, RIGHT_INCHES, BELOW_INCHES, HEAD_INCHES = 0.6, 0.75, 0.45, 0.25
 TARGET, OTHER = "#d9d4cf", "#aab2bd"
 # From pale to dark, so that grey print keeps the order; the least of it is left clear.
 FIELD_COLOURS = ("#fde9b8", "#f6b04a", "#d95f30", "#93265f", "#2b0f54")
-FAINTEST = 0.02
 MOST_SHARE = 0.998  # of the cells that hold anything, up to the darkest colour
-BAR_INCHES = 0.1
 
 
 def marginals_picture(view: DensityView) -> Figure:
@@ -85,13 +83,39 @@ def _draw_marginal(axes: Axes, marginal: Marginal) -> None:
 
 def field_picture(view: DensityView) -> Figure:
     """Where in space the density looks, over what the scene covers, a page wide; one panel per plane."""
-    places, height = panel_places([_ratio(plane) for plane in view.planes])
+    # width over height
+    places, height = panel_places([float(np.ptp(plane.edges[0]) / np.ptp(plane.edges[1])) for plane in view.planes])
     figure = new_figure(PAGE_INCHES, height)
     # panels keep their shape: where they are is known, and nothing is left to lay out
     figure.set_layout_engine("none")
     for plane, (left, bottom, width, tall) in zip(view.planes, places, strict=True):
         size = (left / PAGE_INCHES, bottom / height, width / PAGE_INCHES, tall / height)
-        _draw_plane(figure.add_axes(size), plane, width)
+        axes = figure.add_axes(size)
+        across, up = plane.edges
+        extent = (across[0], across[-1], up[0], up[-1])
+        # cells coloured by what covers them
+        from matplotlib.colors import to_rgb
+
+        colours = np.ones((*plane.targets.shape, 3))
+        colours[plane.others] = to_rgb(OTHER)
+        colours[plane.targets] = to_rgb(TARGET)
+        axes.imshow(colours, extent=extent, origin="lower", interpolation="nearest")
+        most = most_shown(plane.heights)
+        shown = np.ma.masked_less(plane.heights, 0.02 * most)
+        drawn = axes.imshow(
+            shown, extent=extent, origin="lower", interpolation="nearest", cmap=field_colours(), vmin=0.0, vmax=most
+        )
+        axes.set_aspect("equal")
+        axes.set_xlabel(plane.labels[0])
+        axes.set_ylabel(plane.labels[1])
+        for mask, colour in ((plane.others, SOFT), (plane.targets, INK)):
+            if mask.any() and not mask.all():
+                axes.contour(mask, (0.5,), extent=extent, colors=[colour], linewidths=0.5, alpha=0.7)
+        beyond = "max" if plane.heights.max() > most else "neither"
+        bar = axes.figure.colorbar(drawn, extend=beyond, cax=_bar_axes(axes, width))
+        bar.set_label(plane.unit.replace("2", "²"))
+        bar.outline.set_visible(False)
+        axes.spines[["top", "right"]].set_visible(False)
     told = f"what the density observes, over {plain_label(view.scene)} (outlined: its bodies)"
     figure.text(0.5, 1 - 0.5 * HEAD_INCHES / height, told, fontsize=SMALL_POINTS, color=SOFT, ha="center", va="center")
     return figure
@@ -121,33 +145,6 @@ def panel_places(ratios: list[float]) -> tuple[list[tuple[float, float, float, f
     return places, height
 
 
-def _ratio(plane: PlaneDensity) -> float:
-    """Width over height."""
-    return float(np.ptp(plane.edges[0]) / np.ptp(plane.edges[1]))
-
-
-def _draw_plane(axes: Axes, plane: PlaneDensity, width_inches: float) -> None:
-    across, up = plane.edges
-    extent = (across[0], across[-1], up[0], up[-1])
-    axes.imshow(_bodies(plane), extent=extent, origin="lower", interpolation="nearest")
-    most = most_shown(plane.heights)
-    shown = np.ma.masked_less(plane.heights, FAINTEST * most)
-    drawn = axes.imshow(
-        shown, extent=extent, origin="lower", interpolation="nearest", cmap=field_colours(), vmin=0.0, vmax=most
-    )
-    axes.set_aspect("equal")
-    axes.set_xlabel(plane.labels[0])
-    axes.set_ylabel(plane.labels[1])
-    for mask, colour in ((plane.others, SOFT), (plane.targets, INK)):
-        if mask.any() and not mask.all():
-            axes.contour(mask, (0.5,), extent=extent, colors=[colour], linewidths=0.5, alpha=0.7)
-    beyond = "max" if plane.heights.max() > most else "neither"
-    bar = axes.figure.colorbar(drawn, extend=beyond, cax=_bar_axes(axes, width_inches))
-    bar.set_label(plane.unit.replace("2", "²"))
-    bar.outline.set_visible(False)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
 def most_shown(heights: np.ndarray) -> float:
     """Where the colours end: a few cells beyond, where a heavy sample lies, would leave all others pale."""
     return float(np.quantile(heights[heights > 0], MOST_SHARE)) if (heights > 0).any() else 1.0
@@ -155,18 +152,8 @@ def most_shown(heights: np.ndarray) -> float:
 
 def _bar_axes(axes: Axes, width_inches: float) -> Axes:
     """Axes for the colours beside a panel of so many inches, as high as it is."""
-    width = BAR_INCHES / width_inches
+    width = 0.1 / width_inches
     return axes.inset_axes((1.0 + 0.8 * width, 0.0, width, 1.0))
-
-
-def _bodies(plane: PlaneDensity) -> np.ndarray:
-    """Cells coloured by what covers them, shape (V, U, 3)."""
-    from matplotlib.colors import to_rgb
-
-    colours = np.ones((*plane.targets.shape, 3))
-    colours[plane.others] = to_rgb(OTHER)
-    colours[plane.targets] = to_rgb(TARGET)
-    return colours
 
 
 def field_colours() -> Colormap:

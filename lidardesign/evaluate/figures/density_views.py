@@ -50,7 +50,9 @@ def sensor_points(sensor: Sensor, normal: np.ndarray) -> np.ndarray:
 
     Ranges below 0 are none, and become 0.
     """
-    origin = normal[:, :3] @ _square_root(sensor.origin_covariance_m2).T
+    # a with A A' = covariance, also where that is singular: origins are often fixed along an axis
+    values, vectors = np.linalg.eigh(np.asarray(sensor.origin_covariance_m2, dtype=np.float64))
+    origin = normal[:, :3] @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
     spread = np.array([sensor.spread_horizontal_rad, sensor.spread_vertical_rad])
     tangent, range_m = normal[:, 3:5] * spread, sensor.range_m + sensor.spread_range_m * normal[:, 5]
     follow = sensor.coupling
@@ -68,12 +70,6 @@ def _along_track(design: DesignSpec) -> list[DesignSpec]:
         return [design]
     chosen = np.unique(np.linspace(0, len(track.knots) - 1, PLACES).round().astype(int))
     return [placed(design, {track.dimension: float(track.knots[index])}) for index in chosen]
-
-
-def _square_root(covariance: np.ndarray) -> np.ndarray:
-    """A with A A' = covariance, also where that is singular: origins are often fixed along an axis."""
-    values, vectors = np.linalg.eigh(np.asarray(covariance, dtype=np.float64))
-    return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
 MOST_STEPS = 512  # along a triangle's side: beyond, it is far larger than any picture
@@ -95,44 +91,37 @@ def silhouette(
     for body in scene.bodies:
         if body.is_target == targets and not isinstance(body.shape, Plane):
             vertices, faces = body_triangles(body, frame, np.zeros((2, 3)), share)
-            _cover(covered, vertices[:, list(axes)][faces].astype(np.float64), edges)
+            # mark the cells that hold a point of a lattice, no wider than a cell, on triangles (F, 3, 2)
+            corners = vertices[:, list(axes)][faces].astype(np.float64)
+            low = np.array([edge[0] for edge in edges])
+            cell = np.array([edge[1] - edge[0] for edge in edges])
+            places = (corners - low) / cell
+            upper = np.array(covered.shape[::-1])
+            near = (places.max(axis=1) >= 0).all(axis=1) & (places.min(axis=1) < upper).all(axis=1)
+            places = places[near]
+            sides = np.abs(places - np.roll(places, 1, axis=1)).max(axis=(1, 2))
+            steps = np.minimum(2 ** np.ceil(np.log2(np.maximum(sides, 1.0))), MOST_STEPS).astype(int)
+            for count in np.unique(steps):
+                # barycentric coordinates of a lattice on a triangle with so many steps along each side
+                first, second = np.meshgrid(np.arange(count + 1), np.arange(count + 1))
+                keep = first + second <= count
+                first, second = first[keep], second[keep]
+                lattice = np.stack([first, second, count - first - second], axis=1) / count
+                for some in np.array_split(
+                    places[steps == count], max(1, (steps == count).sum() * len(lattice) // 2_000_000)
+                ):
+                    inside = np.floor(np.einsum("lc,fck->flk", lattice, some)).astype(int).reshape(-1, 2)
+                    inside = inside[((inside >= 0) & (inside < upper)).all(axis=1)]
+                    covered[inside[:, 1], inside[:, 0]] = True
     return covered
-
-
-def _cover(covered: np.ndarray, corners: np.ndarray, edges: tuple[np.ndarray, np.ndarray]) -> None:
-    """Mark the cells that hold a point of a lattice, no wider than a cell, on triangles (F, 3, 2)."""
-    low = np.array([edge[0] for edge in edges])
-    cell = np.array([edge[1] - edge[0] for edge in edges])
-    places = (corners - low) / cell
-    upper = np.array(covered.shape[::-1])
-    near = (places.max(axis=1) >= 0).all(axis=1) & (places.min(axis=1) < upper).all(axis=1)
-    places = places[near]
-    sides = np.abs(places - np.roll(places, 1, axis=1)).max(axis=(1, 2))
-    steps = np.minimum(2 ** np.ceil(np.log2(np.maximum(sides, 1.0))), MOST_STEPS).astype(int)
-    for count in np.unique(steps):
-        lattice = _lattice(count)
-        for some in np.array_split(places[steps == count], max(1, (steps == count).sum() * len(lattice) // 2_000_000)):
-            inside = np.floor(np.einsum("lc,fck->flk", lattice, some)).astype(int).reshape(-1, 2)
-            inside = inside[((inside >= 0) & (inside < upper)).all(axis=1)]
-            covered[inside[:, 1], inside[:, 0]] = True
-
-
-def _lattice(steps: int) -> np.ndarray:
-    """Barycentric coordinates of a lattice on a triangle with so many steps along each side, shape (L, 3)."""
-    first, second = np.meshgrid(np.arange(steps + 1), np.arange(steps + 1))
-    keep = first + second <= steps
-    first, second = first[keep], second[keep]
-    return np.stack([first, second, steps - first - second], axis=1) / steps
 
 
 PERCENT = 100.0
 # What lies further out than this share, at each end, is not shown: a stray sample would stretch every axis.
 TAIL = 0.001
-DESIGN_TAIL = 0.025
 MARGIN = 0.04  # of an axis, beyond what it shows at each end
 LEAST_BINS, MOST_BINS = 12, 80
 LEAST_CELLS, MOST_CELLS = 16, 140
-SAMPLES_PER_CELL = 5.0
 # A plane whose second axis holds a thousandth of the first one's spread is a line.
 THINNEST = 1e-3
 # Designs whose marginals stand out further are cut off: a fixed origin is a spike of any height.
@@ -263,7 +252,7 @@ def _marginal(
     bins: int,
 ) -> Marginal:
     ends = [_central(values, weights, TAIL)]
-    ends += [_central(points[:, axis], share, DESIGN_TAIL) for points, share in beside.values()]
+    ends += [_central(points[:, axis], share, 0.025) for points, share in beside.values()]
     low, high = _widened(min(end[0] for end in ends), max(end[1] for end in ends))
     # nothing lies beyond the space but a design that was made for another one
     low, high = max(low, bounds[0]), min(high, bounds[1])
@@ -314,13 +303,9 @@ def plane_densities(samples: Samples, scene: Scene, frame: int) -> tuple[PlaneDe
     wide = [pair for pair in pairs if spans[list(pair)].min() > THINNEST * spans.max() and spans.max() > 0]
     ranked = sorted(wide, key=lambda pair: -float(spans[pair[0]] * spans[pair[1]]))
     # along a condition the density is even: a second picture without it shows more
-    beside = sorted(ranked[1:], key=lambda pair: bool(_given(samples.space, pair)))
+    beside = sorted(ranked[1:], key=lambda pair: bool(set(pair) & set(samples.space.conditioned)))
     chosen = [*ranked[:1], *beside[:1]]
     return tuple(_plane(pair, points, weights, [ends[axis] for axis in pair], scene, frame) for pair in chosen)
-
-
-def _given(space: DesignSpace, axes: tuple[int, int]) -> set[int]:
-    return set(axes) & set(space.conditioned)
 
 
 def _plane(
@@ -333,7 +318,7 @@ def _plane(
 ) -> PlaneDensity:
     ends = [_widened(*end) for end in ends]
     spans = [high - low for low, high in ends]
-    most = np.clip(np.sqrt(effective_count(weights) / SAMPLES_PER_CELL), LEAST_CELLS, MOST_CELLS)
+    most = np.clip(np.sqrt(effective_count(weights) / 5.0), LEAST_CELLS, MOST_CELLS)
     cell = max(spans) / most
     counts = [max(int(np.ceil(span / cell)), 1) for span in spans]
     edges = tuple(np.linspace(low, high, count + 1) for (low, high), count in zip(ends, counts, strict=True))

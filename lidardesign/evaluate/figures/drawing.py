@@ -52,7 +52,12 @@ def own_triangles(
     elif isinstance(shape, Box):
         vertices, faces = _box(np.asarray(shape.half_extents_m))
     else:
-        vertices, faces = _square(pose, bounds_m)
+        # the part of the plane z = 0 below a scene's bounds, in the plane's own frame
+        corners = np.array([[x, y, z] for x in bounds_m[:, 0] for y in bounds_m[:, 1] for z in bounds_m[:, 2]])
+        local = (corners - pose[:3, 3]) @ pose[:3, :3]
+        (x0, y0), (x1, y1) = local[:, :2].min(axis=0), local[:, :2].max(axis=0)
+        square = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
+        vertices, faces = square, np.array([[0, 1, 2], [0, 2, 3]])
     return vertices, faces.astype(np.int32)
 
 
@@ -175,12 +180,3 @@ def _box(half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     # corners of their own for every side keep the light from rounding the edges
     faces = [(k, k + 1, k + 2) for k in range(0, 24, 4)] + [(k, k + 2, k + 3) for k in range(0, 24, 4)]
     return (signs * half)[np.ravel(quads)], np.array(faces)
-
-
-def _square(pose: np.ndarray, bounds_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The part of the plane z = 0 below a scene's bounds, in the plane's own frame."""
-    corners = np.array([[x, y, z] for x in bounds_m[:, 0] for y in bounds_m[:, 1] for z in bounds_m[:, 2]])
-    local = (corners - pose[:3, 3]) @ pose[:3, :3]
-    (x0, y0), (x1, y1) = local[:, :2].min(axis=0), local[:, :2].max(axis=0)
-    square = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
-    return square, np.array([[0, 1, 2], [0, 2, 3]])

@@ -24,7 +24,6 @@ from lidardesign.evaluate.figures.canvas import (
 )
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 COLUMNS = 3
@@ -38,12 +37,10 @@ FINE_TICKS_SPAN = 60.0
 SHOWN_SHARE = 1e-4
 LINE, CHOSEN, TOLERANCE = "#0072B2", "#D55E00", "#555555"
 PALE = 0.45
-LONGEST_SETTING = 22
 # Points per inch, and a line of the settings' text [points].
 POINTS, LINE_POINTS = 72.0, 8.0
 # Text on marks whose places along the axis differ by more than this share of it does not meet.
 TEXT_SHARE = 0.45
-LEFT_FROM = 0.66
 # Of a panel's height, what its title and axis take.
 MARGIN_INCHES = 0.75
 
@@ -110,16 +107,6 @@ def panels(sweeps: Sequence[Sweep]) -> list[Panel]:
 
 def _panel(sweep: Sweep) -> Panel:
     seconds = [measurement.seconds for measurement in sweep.measurements if measurement.seconds > 0] or [1.0]
-    errors = _error_axis(sweep)
-    chosen = sweep.chosen
-    marks = tuple(
-        _mark(measurement, min(seconds), errors, measurement is chosen, _beaten(measurement, sweep))
-        for measurement in sweep.measurements
-    )
-    return Panel(sweep, marks, _spanned(min(seconds), max(seconds)), errors)
-
-
-def _error_axis(sweep: Sweep) -> tuple[float, float]:
     known = [
         measurement.error
         for measurement in sweep.measurements
@@ -130,7 +117,13 @@ def _error_axis(sweep: Sweep) -> tuple[float, float]:
     shown = [error for error in [*known, *tolerance] if error >= SHOWN_SHARE * largest]
     low, high = _spanned(min(shown, default=1.0), largest)
     # room for what stands on the edge
-    return (low / BEYOND, high)
+    errors = (low / BEYOND, high)
+    chosen = sweep.chosen
+    marks = tuple(
+        _mark(measurement, min(seconds), errors, measurement is chosen, _beaten(measurement, sweep))
+        for measurement in sweep.measurements
+    )
+    return Panel(sweep, marks, _spanned(min(seconds), max(seconds)), errors)
 
 
 def _spanned(low: float, high: float) -> tuple[float, float]:
@@ -188,65 +181,58 @@ def pareto_picture(sweeps: Sequence[Sweep]) -> Figure | None:
     rows = math.ceil(len(shown) / columns)
     figure = new_figure(columns * PANEL_INCHES[0], rows * PANEL_INCHES[1] + 0.5)
     for number, panel in enumerate(shown):
-        _draw(figure.add_subplot(rows, columns, number + 1), panel)
+        axes = figure.add_subplot(rows, columns, number + 1)
+        front = panel.front
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_xlim(*panel.seconds)
+        axes.set_ylim(*panel.errors)
+        for axis, ends in ((axes.xaxis, panel.seconds), (axes.yaxis, panel.errors)):
+            if has_fine_ticks(ends):
+                label_ticks(axis, None)
+            else:
+                # on axes of one or two powers of ten there would be names at all ticks, which do not fit
+                label_powers(axis)
+        axes.set_title(plain_label(panel.sweep.knob, 48), fontsize=LETTERS_POINTS, loc="left", color="#222222")
+        axes.set_xlabel("seconds")
+        axes.set_ylabel(plain_label(panel.error_title, 40))
+        axes.tick_params(labelsize=SMALL_POINTS)
+        axes.set_axisbelow(True)
+        axes.grid(True, which="major", color="#e2e2e2", linewidth=0.7, zorder=0.5)
+        axes.spines[["top", "right"]].set_visible(False)
+        if panel.shows_tolerance:
+            axes.axhline(panel.sweep.tolerance, color=TOLERANCE, linestyle="dashed", linewidth=1.1, zorder=1.5)
+        axes.plot(
+            [mark.x for mark in front], [mark.y for mark in front], color=LINE, alpha=PALE, linewidth=1.3, zorder=2
+        )
+        for mark in panel.marks:
+            colour, alpha = (CHOSEN, 1.0) if mark.chosen else (LINE, PALE if mark.beaten else 1.0)
+            if mark.high > mark.y or mark.low < mark.y:
+                axes.plot([mark.x, mark.x], [mark.low, mark.high], color=colour, linewidth=1.0, alpha=alpha, zorder=3)
+            look = {"linestyle": "none", "clip_on": False, "zorder": 4}
+            shape = "v" if mark.on_edge else "o"
+            axes.plot(
+                mark.x, mark.y, marker=shape, markersize=4.5, color=colour, alpha=alpha, markeredgewidth=0, **look
+            )
+            if mark.measurement.default:
+                axes.plot(mark.x, mark.y, marker="o", markersize=8.5, color="none", markeredgecolor="#222222", **look)
+        places = label_places(panel, POINTS * (PANEL_INCHES[1] - MARGIN_INCHES), LINE_POINTS)
+        for mark, (across, up, side) in zip(panel.marks, places, strict=True):
+            axes.annotate(
+                plain_label(mark.measurement.setting, 22),
+                (mark.x, mark.y),
+                xytext=(across, up),
+                textcoords="offset points",
+                ha=side,
+                va="center",
+                fontsize=SMALL_POINTS,
+                color=CHOSEN if mark.chosen else "#333333",
+                # lines behind the text would strike it through
+                bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.6},
+                zorder=3.5,
+            )
     figure.legend(*_legend(), loc="outside lower center", ncols=4 if columns > 1 else 2, frameon=False)
     return figure
-
-
-def _draw(axes: Axes, panel: Panel) -> None:
-    front = panel.front
-    _dress(axes, panel)
-    if panel.shows_tolerance:
-        axes.axhline(panel.sweep.tolerance, color=TOLERANCE, linestyle="dashed", linewidth=1.1, zorder=1.5)
-    axes.plot([mark.x for mark in front], [mark.y for mark in front], color=LINE, alpha=PALE, linewidth=1.3, zorder=2)
-    for mark in panel.marks:
-        _draw_mark(axes, mark)
-    places = label_places(panel, POINTS * (PANEL_INCHES[1] - MARGIN_INCHES), LINE_POINTS)
-    for mark, (across, up, side) in zip(panel.marks, places, strict=True):
-        axes.annotate(
-            plain_label(mark.measurement.setting, LONGEST_SETTING),
-            (mark.x, mark.y),
-            xytext=(across, up),
-            textcoords="offset points",
-            ha=side,
-            va="center",
-            fontsize=SMALL_POINTS,
-            color=CHOSEN if mark.chosen else "#333333",
-            # lines behind the text would strike it through
-            bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 0.6},
-            zorder=3.5,
-        )
-
-
-def _dress(axes: Axes, panel: Panel) -> None:
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.set_xlim(*panel.seconds)
-    axes.set_ylim(*panel.errors)
-    for axis, ends in ((axes.xaxis, panel.seconds), (axes.yaxis, panel.errors)):
-        if has_fine_ticks(ends):
-            label_ticks(axis, None)
-        else:
-            # on axes of one or two powers of ten there would be names at all ticks, which do not fit
-            label_powers(axis)
-    axes.set_title(plain_label(panel.sweep.knob, 48), fontsize=LETTERS_POINTS, loc="left", color="#222222")
-    axes.set_xlabel("seconds")
-    axes.set_ylabel(plain_label(panel.error_title, 40))
-    axes.tick_params(labelsize=SMALL_POINTS)
-    axes.set_axisbelow(True)
-    axes.grid(True, which="major", color="#e2e2e2", linewidth=0.7, zorder=0.5)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-def _draw_mark(axes: Axes, mark: Mark) -> None:
-    colour, alpha = (CHOSEN, 1.0) if mark.chosen else (LINE, PALE if mark.beaten else 1.0)
-    if mark.high > mark.y or mark.low < mark.y:
-        axes.plot([mark.x, mark.x], [mark.low, mark.high], color=colour, linewidth=1.0, alpha=alpha, zorder=3)
-    look = {"linestyle": "none", "clip_on": False, "zorder": 4}
-    shape = "v" if mark.on_edge else "o"
-    axes.plot(mark.x, mark.y, marker=shape, markersize=4.5, color=colour, alpha=alpha, markeredgewidth=0, **look)
-    if mark.measurement.default:
-        axes.plot(mark.x, mark.y, marker="o", markersize=8.5, color="none", markeredgecolor="#222222", **look)
 
 
 def label_places(panel: Panel, height: float, line: float) -> list[tuple[float, float, str]]:
@@ -266,7 +252,7 @@ def label_places(panel: Panel, height: float, line: float) -> list[tuple[float, 
         near = [up for other, up in placed.items() if abs(across[other] - across[index]) < TEXT_SHARE]
         up = max(wanted[index], line * 0.6)
         placed[index] = max([up, *(other + line for other in near if other + line > up)])
-    left = [share > LEFT_FROM for share in across]
+    left = [share > 0.66 for share in across]
     return [
         (-line if left[index] else line, placed[index] - wanted[index], "right" if left[index] else "left")
         for index in range(len(wanted))

@@ -141,7 +141,13 @@ def shaded(scene: Scene, frame: int, view: View, width: int) -> Shaded:
     up = bottom + (np.arange(height) + 0.5) / height * (top - bottom)
     grid = np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2)
     starts = grid[:, :1] * view.right + grid[:, 1:] * view.up + view.near_m * view.forward
-    seen = _without_backs(scene, frame, view)
+    # the scene without the planes that the camera is behind: walls and ceilings would hide everything
+    kept = tuple(
+        body
+        for body in scene.bodies
+        if not isinstance(body.shape, Plane) or body.pose(frame)[:3, 2] @ view.forward < -EPSILON_FLOAT32
+    )
+    seen = replace(scene, bodies=kept) if kept and len(kept) < len(scene.bodies) else scene
     colour, depth = np.zeros((len(starts), 4)), np.full(len(starts), np.inf)
     if seen.bodies:
         caster = SceneCaster(seen, frame)
@@ -150,12 +156,26 @@ def shaded(scene: Scene, frame: int, view: View, width: int) -> Shaded:
             hits = caster.first_hit(starts[block], np.broadcast_to(view.forward, (len(block), 3)))
             met = np.isfinite(hits.range_m)
             depth[block] = view.near_m + hits.range_m
-            lit = kinds[hits.body[met]] * _light(hits.normal[met], view)[:, None]
+            # brightness of surfaces: from the front, and from the upper left
+            normal = hits.normal[met]
+            lamp = -view.forward - 0.8 * view.right + 0.9 * view.up
+            lamp /= np.linalg.norm(lamp)
+            front, sideways = np.abs(normal @ view.forward), np.clip(normal @ lamp, 0.0, 1.0)
+            lit = kinds[hits.body[met]] * (AMBIENT + FRONT * front + LAMP * sideways)[:, None]
             colour[block[met], :3] = np.minimum(lit, 1.0)
             colour[block[met], 3] = 1.0
     depth = depth.reshape(height, width)
     colour = colour.reshape(height, width, 4)
-    _draw_edges(colour, depth, EDGE_DEPTH * (right - left))
+    # darken pixels where the depth jumps: outlines tell things apart that are lit alike
+    step_m = EDGE_DEPTH * (right - left)
+    from matplotlib.colors import to_rgb
+
+    edge = np.zeros(depth.shape, dtype=bool)
+    finite = np.where(np.isfinite(depth), depth, depth[np.isfinite(depth)].max(initial=0.0) + 10 * step_m)
+    edge[:, 1:] |= np.abs(np.diff(finite, axis=1)) > step_m
+    edge[1:] |= np.abs(np.diff(finite, axis=0)) > step_m
+    edge &= np.isfinite(depth)
+    colour[edge, :3] = 0.55 * colour[edge, :3] + 0.45 * np.array(to_rgb(INK))
     return Shaded(colour, depth)
 
 
@@ -165,39 +185,8 @@ def _colour(body: Body) -> tuple[float, float, float]:
     return TARGET if body.is_target else OTHER
 
 
-def _light(normal: np.ndarray, view: View) -> np.ndarray:
-    """Brightness of surfaces: from the front, and from the upper left."""
-    lamp = -view.forward - 0.8 * view.right + 0.9 * view.up
-    lamp /= np.linalg.norm(lamp)
-    front, sideways = np.abs(normal @ view.forward), np.clip(normal @ lamp, 0.0, 1.0)
-    return AMBIENT + FRONT * front + LAMP * sideways
-
-
-def _without_backs(scene: Scene, frame: int, view: View) -> Scene:
-    """The scene without the planes that the camera is behind: walls and ceilings would hide everything."""
-    kept = tuple(
-        body
-        for body in scene.bodies
-        if not isinstance(body.shape, Plane) or body.pose(frame)[:3, 2] @ view.forward < -EPSILON_FLOAT32
-    )
-    return replace(scene, bodies=kept) if kept and len(kept) < len(scene.bodies) else scene
-
-
-def _draw_edges(colour: np.ndarray, depth: np.ndarray, step_m: float) -> None:
-    """Darken pixels where the depth jumps: outlines tell things apart that are lit alike."""
-    from matplotlib.colors import to_rgb
-
-    edge = np.zeros(depth.shape, dtype=bool)
-    finite = np.where(np.isfinite(depth), depth, depth[np.isfinite(depth)].max(initial=0.0) + 10 * step_m)
-    edge[:, 1:] |= np.abs(np.diff(finite, axis=1)) > step_m
-    edge[1:] |= np.abs(np.diff(finite, axis=0)) > step_m
-    edge &= np.isfinite(depth)
-    colour[edge, :3] = 0.55 * colour[edge, :3] + 0.45 * np.array(to_rgb(INK))
-
-
 MOST_DESIGNS = 6
 COLUMNS = 2
-PIXELS_PER_INCH = 160
 MOST_RAYS = 600
 # From so many sensors on their frusta are a thicket; rays say it all.
 MOST_SENSORS = 20
@@ -221,9 +210,7 @@ RECEIVER_LOOK = {"marker": "s", "color": INK, "markersize": 4.0, "linestyle": "n
 SLACK_SHARE = 0.004
 # Where more than this share of the rays start behind something, what is before the sensors is cut away.
 MOST_HIDDEN = 0.5
-CUT_OPEN = "; cut open before the sensors"
 HEAD_INCHES, LEGEND_INCHES = 0.25, 0.3
-LARGEST_PANEL = 4.6
 # Rays from more places than these are drawn with small marks.
 FEW_PLACES = 30
 
@@ -236,20 +223,27 @@ def scene_picture(shown: SceneFigure) -> Figure:
     columns = min(COLUMNS, len(designs)) or 1
     rows = math.ceil(len(designs) / columns)
     width = PAGE_INCHES / columns
-    height = min(width / view.ratio, LARGEST_PANEL)
+    height = min(width / view.ratio, 4.6)
     figure = new_figure(PAGE_INCHES, rows * (height + HEAD_INCHES) + LEGEND_INCHES)
     receiver = shown.scene.receiver
-    pixels = int(PIXELS_PER_INCH * min(width, height * view.ratio))
+    pixels = int(160 * min(width, height * view.ratio))
     image, cut = opened(shown, place, step, view, pixels)
     for number, design in enumerate(designs):
         axes = figure.add_subplot(rows, columns, number + 1)
-        _draw_scene(axes, image, view)
+        axes.imshow(image.colour, extent=view.window, origin="lower", interpolation="antialiased", zorder=0)
+        axes.set_xlim(view.window[0], view.window[1])
+        axes.set_ylim(view.window[2], view.window[3])
+        axes.set_aspect("equal")
+        axes.set_axis_off()
+        _scale_bar(axes, view)
         _draw_design(axes, design, place, step, image, view)
         if receiver is not None:
             axes.plot(*view.project(np.array(receiver.origin_m)), **RECEIVER_LOOK)
     kinds = [int(kind) for one in designs for kind in np.unique(one.outcome[place, step])]
     _legend(figure, kinds, receiver=receiver is not None)
-    figure.suptitle(_told(shown, place, step) + CUT_OPEN * cut, fontsize=SMALL_POINTS, color=SOFT)
+    figure.suptitle(
+        _told(shown, place, step) + "; cut open before the sensors" * cut, fontsize=SMALL_POINTS, color=SOFT
+    )
     return figure
 
 
@@ -276,32 +270,20 @@ def framed_points(shown: SceneFigure, place: int, step: int) -> np.ndarray:
         ends += [rays.origin_m, one.ends_m[place, step][met] if met.any() else one.ends_m[place, step]]
     points = np.concatenate(ends)
     around = [frustum_lines(sensor) for one in shown.designs for sensor in _drawn_sensors(one.placed[place].sensors)]
-    bodies = np.concatenate([_body_points(shown.scene, shown.frames[step]), *around])
+    # ends of all finite targets along the axes
+    frame = shown.frames[step]
+    found = [np.zeros((0, 3))]
+    for body in shown.scene.bodies:
+        if body.is_target and not isinstance(body.shape, Plane):
+            vertices, _ = body_triangles(body, frame, np.zeros((2, 3)))
+            found.append(np.stack([vertices.min(axis=0), vertices.max(axis=0)]))
+    bodies = np.concatenate([np.concatenate(found), *around])
     bodies = bodies[np.isfinite(bodies).all(axis=1)]
     if not len(points):
         return bodies if len(bodies) else np.zeros((1, 3))
     low, high = points.min(axis=0), points.max(axis=0)
     reach = REACH * float((high - low).max())
     return np.concatenate([points, np.clip(bodies, low - reach, high + reach)])
-
-
-def _body_points(scene: Scene, frame: int) -> np.ndarray:
-    """Ends of all finite targets along the axes, shape (K, 3)."""
-    found = [np.zeros((0, 3))]
-    for body in scene.bodies:
-        if body.is_target and not isinstance(body.shape, Plane):
-            vertices, _ = body_triangles(body, frame, np.zeros((2, 3)))
-            found.append(np.stack([vertices.min(axis=0), vertices.max(axis=0)]))
-    return np.concatenate(found)
-
-
-def _draw_scene(axes: Axes, image: Shaded, view: View) -> None:
-    axes.imshow(image.colour, extent=view.window, origin="lower", interpolation="antialiased", zorder=0)
-    axes.set_xlim(view.window[0], view.window[1])
-    axes.set_ylim(view.window[2], view.window[3])
-    axes.set_aspect("equal")
-    axes.set_axis_off()
-    _scale_bar(axes, view)
 
 
 def _scale_bar(axes: Axes, view: View) -> None:

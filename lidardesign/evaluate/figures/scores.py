@@ -60,27 +60,23 @@ def curve_picture(evaluation: Evaluation, against: Against) -> Figure:
     figure = new_figure(COLUMN_INCHES, CURVE_HEIGHT + lines * LEGEND_LINE)
     axes = figure.add_subplot()
     for curve in curves:
-        _draw_curve(axes, curve, against)
+        across = [position(row, against) for row in curve.rows]
+        low, high = [row.ci_low for row in curve.rows], [row.ci_high for row in curve.rows]
+        axes.fill_between(across, low, high, color=curve.colour, alpha=BAND_OPACITY, linewidth=0)
+        axes.plot(
+            across,
+            [row.value for row in curve.rows],
+            color=curve.colour,
+            marker=curve.marker,
+            linestyle=curve.dash,
+            linewidth=1.0 if curve.baseline else 1.5,
+            label=plain_label(curve.name),
+        )
+        if len(curve.rows) == 1:  # there is no band of a single point
+            axes.errorbar(across, [curve.rows[0].value], _lengths(curve.rows[0]), color=curve.colour, capsize=2.0)
     _dress_curves(axes, evaluation, curves, against)
     figure.legend(loc="outside lower center", ncols=LEGEND_COLUMNS, frameon=False, handlelength=2.6, borderaxespad=0.2)
     return figure
-
-
-def _draw_curve(axes: Axes, curve: Series, against: Against) -> None:
-    across = [position(row, against) for row in curve.rows]
-    low, high = [row.ci_low for row in curve.rows], [row.ci_high for row in curve.rows]
-    axes.fill_between(across, low, high, color=curve.colour, alpha=BAND_OPACITY, linewidth=0)
-    axes.plot(
-        across,
-        [row.value for row in curve.rows],
-        color=curve.colour,
-        marker=curve.marker,
-        linestyle=curve.dash,
-        linewidth=1.0 if curve.baseline else 1.5,
-        label=plain_label(curve.name),
-    )
-    if len(curve.rows) == 1:  # there is no band of a single point
-        axes.errorbar(across, [curve.rows[0].value], _lengths(curve.rows[0]), color=curve.colour, capsize=2.0)
 
 
 def _lengths(row: Row) -> list[list[float]]:
@@ -129,7 +125,13 @@ def differences_picture(evaluation: Evaluation) -> Figure:
     axes.set_xlabel(plain_label(f"a - b: {metric.name} [{metric.unit}], {metric.better} is better", longest=90))
     plain_axes(axes, grid="x")
     axes.set_title(told, fontsize=SMALL_POINTS, loc="left", color=SOFT)
-    _verdict_legend(figure)
+    from matplotlib.lines import Line2D
+
+    handles = [
+        Line2D([], [], color=colour, marker=marker, markerfacecolor=colour if filled else "white", linewidth=1.2)
+        for colour, marker, filled in VERDICT_LOOKS.values()
+    ]
+    figure.legend(handles, list(VERDICT_WORDS.values()), loc="outside lower center", ncols=3, frameon=False)
     return figure
 
 
@@ -154,16 +156,6 @@ def _pair_label(pair: Paired) -> str:
     return f"{plain_label(pair.a)} - {plain_label(pair.b)}, {pair.rays} rays"
 
 
-def _verdict_legend(figure: Figure) -> None:
-    from matplotlib.lines import Line2D
-
-    handles = [
-        Line2D([], [], color=colour, marker=marker, markerfacecolor=colour if filled else "white", linewidth=1.2)
-        for colour, marker, filled in VERDICT_LOOKS.values()
-    ]
-    figure.legend(handles, list(VERDICT_WORDS.values()), loc="outside lower center", ncols=3, frameon=False)
-
-
 PHASE_ROW_INCHES, PANEL_MARGIN_INCHES = 0.17, 0.62
 PERCENT = 100.0
 # Phases of a smaller share of their command are in `other`.
@@ -185,7 +177,19 @@ def times_picture(times: Mapping[str, Mapping[str, float]]) -> Figure | None:
     figure = new_figure(PAGE_INCHES, sum(counts) * PHASE_ROW_INCHES + len(shown) * PANEL_MARGIN_INCHES)
     panels = figure.subplots(len(shown), 1, squeeze=False, gridspec_kw={"height_ratios": [n + 1 for n in counts]})
     for axes, (command, rows) in zip(panels[:, 0], shown.items(), strict=True):
-        _draw(axes, command, rows)
+        total = sum(seconds for _, seconds, inside in rows if not inside)
+        most = max(seconds for _, seconds, _ in rows)
+        for place, (_, seconds, inside) in enumerate(rows):
+            axes.barh(place, seconds, height=0.62 if inside else 0.78, color=INNER if inside else WHOLE, linewidth=0)
+            text = f" {seconds:.3g} s, {PERCENT * seconds / total:.0f} %"
+            axes.text(seconds, place, text, va="center", fontsize=SMALL_POINTS, color=INK)
+        axes.set_yticks(range(len(rows)), [f"{'in it: ' * inside}{plain_label(name)}" for name, _, inside in rows])
+        axes.set_ylim(len(rows) - 0.4, -0.6)
+        axes.set_xlim(0.0, 1.22 * most)
+        axes.set_xlabel("seconds")
+        axes.set_title(f"{plain_label(command)}: {total:.3g} s", loc="left", color=INK)
+        axes.tick_params(axis="y", length=0)
+        plain_axes(axes, grid="x")
     return figure
 
 
@@ -209,22 +213,6 @@ def phase_rows(timings: Mapping[str, float]) -> list[tuple[str, float, bool]]:
         rows = [row for row in rows if not row[2]][:MOST_PHASES]
     rest = total - sum(seconds for _, seconds, inside in rows if not inside)
     return [*rows, (OTHER, rest, False)] if rows and rest >= LEAST_SHARE * total else rows
-
-
-def _draw(axes: Axes, command: str, rows: list[tuple[str, float, bool]]) -> None:
-    total = sum(seconds for _, seconds, inside in rows if not inside)
-    most = max(seconds for _, seconds, _ in rows)
-    for place, (_, seconds, inside) in enumerate(rows):
-        axes.barh(place, seconds, height=0.62 if inside else 0.78, color=INNER if inside else WHOLE, linewidth=0)
-        text = f" {seconds:.3g} s, {PERCENT * seconds / total:.0f} %"
-        axes.text(seconds, place, text, va="center", fontsize=SMALL_POINTS, color=INK)
-    axes.set_yticks(range(len(rows)), [f"{'in it: ' * inside}{plain_label(name)}" for name, _, inside in rows])
-    axes.set_ylim(len(rows) - 0.4, -0.6)
-    axes.set_xlim(0.0, 1.22 * most)
-    axes.set_xlabel("seconds")
-    axes.set_title(f"{plain_label(command)}: {total:.3g} s", loc="left", color=INK)
-    axes.tick_params(axis="y", length=0)
-    plain_axes(axes, grid="x")
 
 
 BOUND_ROW_INCHES, BOUND_MARGIN_INCHES = 0.19, 0.95

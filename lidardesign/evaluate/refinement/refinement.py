@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +29,6 @@ from lidardesign.scene import Scene
 from lidardesign.simulate.simulate import build_casters, simulate
 from lidardesign.task import Task
 
-FIRST_STEP = 0.5
 # So many rounds in a row without a gain end it.
 PATIENCE = 2
 # A wider interval costs bandwidth: ten percent more of it have to bring at least one percent of the score.
@@ -70,12 +69,8 @@ class Trial:
     bandwidth_mbps: float
 
 
-class Refit(Protocol):
-    """Fits a design anew, with the same constraints."""
-
-    def __call__(self, reweighting: Reweighting | None, shape: Shape) -> Trial:
-        """The design of a reweighted density."""
-        ...
+# Fits a design to a reweighted density, with the same constraints.
+Refit = Callable[[Reweighting | None, Shape], Trial]
 
 
 @dataclass(frozen=True)
@@ -198,10 +193,10 @@ class Refiner:
             InfeasibleError, ConfigError: The design that it starts with cannot be fitted.
         """
         best = self._started(shape, np.zeros(len(self.attention.points_m)) if log_factors is None else log_factors)
-        step, idle, gains = FIRST_STEP, 0, None
+        step, idle, gains = 0.5, 0, None
         for number in range(1, rounds + 1):
             before = best
-            if number == 1 and _may_be_traced(best.trial):
+            if number == 1 and (len(best.trial.positions) == 1 and has_ray_gates(best.trial.result.design)):
                 shape = replace(best.shape, traced_gates=True)
                 best = self._tried(number, "gates by traced returns", best, shape=shape)
             best = self._climbed(number, best, "range_spread_m" if number % 2 else "level")
@@ -294,11 +289,6 @@ class Refiner:
         self.rounds.append(one)
         if self.progress:
             self.progress(one)
-
-
-def _may_be_traced(trial: Trial) -> bool:
-    """Whether every ray has a gate of its own, at one place."""
-    return len(trial.positions) == 1 and has_ray_gates(trial.result.design)
 
 
 def _words(name: str, value: float) -> str:

@@ -132,7 +132,6 @@ def _all_numbers(rows: Any) -> bool:
 ANCHORS = 300
 # Where rays differ along a condition, anchors have to be as near to each other in all of the scene that is passed.
 MOST_ANCHORS = 1000
-ANCHOR_ITERATIONS = 10
 # Errors and rays at an anchor are means over so many nearest anchors, itself among them.
 SMOOTHED_OVER = 5
 # This share of the mean is added to errors and rays: an anchor without either asks for no infinite factor.
@@ -167,7 +166,7 @@ class Attention:
     def over(cls, places_m: np.ndarray, generator: np.random.Generator, count: int = ANCHORS) -> Attention:
         """Anchors that stand for places (N, 3) drawn from the density."""
         count = min(count, len(np.unique(places_m, axis=0)))
-        anchors, _ = lloyd(places_m, np.ones(len(places_m)), count, generator, iterations=ANCHOR_ITERATIONS)
+        anchors, _ = lloyd(places_m, np.ones(len(places_m)), count, generator, iterations=10)
         return cls.at(_rounded(anchors), places_m)
 
     @classmethod

@@ -231,7 +231,6 @@ COLUMNS = 2
 ROW_PX = 300
 # The share of the figure's width between panels; pixels above panels for titles, below for axes, and per line of text.
 BETWEEN, ABOVE_PX, BELOW_PX, LINE_PX = 0.13, 34, 46, 11
-RING = "#222222"
 BYTES_PER_MB = 1e6
 
 
@@ -256,26 +255,39 @@ def pareto_figure(sweeps: Sequence[Sweep]) -> dict[str, Any]:
     traces: list[dict[str, Any]] = []
     for index, panel in enumerate(shown):
         name = "" if index == 0 else str(index + 1)
-        traces += _traces(panel, name)
-        layout |= _axes(panel, name, index, rows)
+        where = {"xaxis": f"x{name}", "yaxis": f"y{name}", "type": "scatter"}
+        front = panel.front
+        line = {
+            **where,
+            "x": [mark.x for mark in front],
+            "y": [mark.y for mark in front],
+            "mode": "lines",
+            "line": {"color": LINE, "width": 1.5},
+            "opacity": PALE,
+            "hoverinfo": "skip",
+        }
+        tolerance = [{**where, **_tolerance(panel)}] if panel.shows_tolerance else []
+        traces += [*tolerance, line, {**where, **_marks(panel)}]
+        # both axes of a panel in its place: across, then down
+        row, column = divmod(index, COLUMNS)
+        width = (1 - BETWEEN) / COLUMNS
+        left = column * (width + BETWEEN)
+        top = 1 - (row + ABOVE_PX / ROW_PX) / rows
+        bottom = 1 - (row + 1 - BELOW_PX / ROW_PX) / rows
+        look = {
+            "type": "log",
+            "gridcolor": "#e4e7eb",
+            "linecolor": "#9aa5b1",
+            "ticks": "outside",
+            "zeroline": False,
+        }
+        seconds = {**look, **_ticks(panel.seconds), "domain": [left, left + width], "anchor": f"y{name}"}
+        errors = {**look, **_ticks(panel.errors), "domain": [bottom, top], "anchor": f"x{name}"}
+        seconds |= {"title": {"text": "seconds", "standoff": 4, "font": {"size": 11}}}
+        errors |= {"title": {"text": html.escape(panel.error_title), "standoff": 4, "font": {"size": 11}}}
+        layout |= {f"xaxis{name}": seconds, f"yaxis{name}": errors}
         layout["annotations"] += [_title(panel, name), *_settings(panel, name)]
     return {"data": traces, "layout": layout}
-
-
-def _traces(panel: Panel, name: str) -> list[dict[str, Any]]:
-    where = {"xaxis": f"x{name}", "yaxis": f"y{name}", "type": "scatter"}
-    front = panel.front
-    line = {
-        **where,
-        "x": [mark.x for mark in front],
-        "y": [mark.y for mark in front],
-        "mode": "lines",
-        "line": {"color": LINE, "width": 1.5},
-        "opacity": PALE,
-        "hoverinfo": "skip",
-    }
-    tolerance = [{**where, **_tolerance(panel)}] if panel.shows_tolerance else []
-    return [*tolerance, line, {**where, **_marks(panel)}]
 
 
 def _marks(panel: Panel) -> dict[str, Any]:
@@ -293,7 +305,7 @@ def _marks(panel: Panel) -> dict[str, Any]:
             "opacity": [
                 PALE if mark.beaten and not (mark.chosen or mark.measurement.default) else 1.0 for mark in marks
             ],
-            "line": {"color": RING, "width": [2.5 if mark.measurement.default else 0 for mark in marks]},
+            "line": {"color": "#222222", "width": [2.5 if mark.measurement.default else 0 for mark in marks]},
         },
         "error_y": {
             "type": "data",
@@ -345,27 +357,6 @@ def _told(mark: Mark, sweep: Sweep) -> str:
     lines += ["the one to choose"] if mark.chosen else []
     lines += ["the run's own"] if measurement.default else []
     return "<br>".join(line.strip() for line in lines)
-
-
-def _axes(panel: Panel, name: str, index: int, rows: int) -> dict[str, Any]:
-    """Both axes of a panel in its place: across, then down."""
-    row, column = divmod(index, COLUMNS)
-    width = (1 - BETWEEN) / COLUMNS
-    left = column * (width + BETWEEN)
-    top = 1 - (row + ABOVE_PX / ROW_PX) / rows
-    bottom = 1 - (row + 1 - BELOW_PX / ROW_PX) / rows
-    look = {
-        "type": "log",
-        "gridcolor": "#e4e7eb",
-        "linecolor": "#9aa5b1",
-        "ticks": "outside",
-        "zeroline": False,
-    }
-    seconds = {**look, **_ticks(panel.seconds), "domain": [left, left + width], "anchor": f"y{name}"}
-    errors = {**look, **_ticks(panel.errors), "domain": [bottom, top], "anchor": f"x{name}"}
-    seconds |= {"title": {"text": "seconds", "standoff": 4, "font": {"size": 11}}}
-    errors |= {"title": {"text": html.escape(panel.error_title), "standoff": 4, "font": {"size": 11}}}
-    return {f"xaxis{name}": seconds, f"yaxis{name}": errors}
 
 
 def _ticks(ends: tuple[float, float]) -> dict[str, Any]:

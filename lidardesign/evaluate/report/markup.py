@@ -16,7 +16,6 @@ from typing import Any
 
 # Tables of more rows are folded away; printing opens them.
 MOST_ROWS = 40
-SWATCH_PX = (34, 12)
 STROKES = {
     "solid": "",
     "dash": "6 3",
@@ -96,7 +95,7 @@ def script_safe(text: str) -> str:
 
 def swatch(colour: str, dash: str | None, mark: str | None = None) -> str:
     """A piece of a line as it is drawn, with its mark; without a dash a filled box."""
-    width, height = SWATCH_PX
+    width, height = (34, 12)
     middle = f"translate({width / 2} {height / 2})"
     if dash is None:
         drawn = f'<rect x="8" width="18" height="{height}" fill="{colour}"/>'
@@ -127,7 +126,6 @@ POLICY = (
     "img-src data: blob:; worker-src blob:; font-src data:; base-uri 'none'; form-action 'none'"
 )
 STYLE = "report.css"
-SCRIPTS = ("scene.js", "page.js")
 
 
 def asset(name: str) -> str:
@@ -147,7 +145,7 @@ def page(title: str, lead: str, body: str, plotly: str, links: Sequence[tuple[st
     """
     name = html.escape(title)
     items = "".join(f'<li><a href="#{identifier}">{html.escape(heading)}</a></li>' for identifier, heading in links)
-    scripts = "".join(f"<script>{source}</script>\n" for source in (plotly, *map(asset, SCRIPTS)))
+    scripts = "".join(f"<script>{source}</script>\n" for source in (plotly, *map(asset, ("scene.js", "page.js"))))
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'

@@ -90,7 +90,9 @@ def report_html(report: Report) -> str:
     body = "\n".join(section(heading, content, identifier) for identifier, heading, content in parts)
     lead = f"{metric.name} in {metric.unit}, {metric.better} is better."
     links = [(identifier, heading) for identifier, heading, _ in parts]
-    return page(report.title, lead, embedded(FONT, id="page-font") + body, _plotly_source(), links)
+    from plotly.offline import get_plotlyjs
+
+    return page(report.title, lead, embedded(FONT, id="page-font") + body, get_plotlyjs(), links)
 
 
 def _parts(report: Report) -> list[tuple[str, str, str]]:
@@ -200,9 +202,3 @@ def _accuracy(sweeps: Sequence[Sweep]) -> str:
     picture = figure(pareto_figure(sweeps), ACCURACY_ID, height, "Error against seconds") if height else ""
     wide = f'<div class="scroll" tabindex="0"><div class="panels">{picture}</div></div>'
     return f"<p>{read}</p>{wide}{accuracy_tables(sweeps)}"
-
-
-def _plotly_source() -> str:
-    from plotly.offline import get_plotlyjs
-
-    return get_plotlyjs()

@@ -74,7 +74,14 @@ def rows_table(evaluation: Evaluation) -> str:
     headings += [] if detail is None else [_words(detail)]
     caption = f"Means over {held_out_scenes(evaluation.scenes)}; seconds are those of simulating and scoring all."
     headings += ["Mbit/s", "seconds"]
-    return table(headings, _grouped(evaluation.rows, detail), text_columns=1, caption=caption)
+    lines = []
+    for index, row in enumerate(evaluation.rows):
+        cells = [row.design, str(row.rays), four_digits(row.value), _interval(row), str(row.failures)]
+        if detail is not None:
+            cells.append(four_digits(row.details[detail]) if detail in row.details else "-")
+        cells += [four_digits(row.bandwidth_mbps), f"{row.seconds:.2f}"]
+        lines.append((cells, "", bool(index and row.design != evaluation.rows[index - 1].design)))
+    return table(headings, lines, text_columns=1, caption=caption)
 
 
 def paired_table(evaluation: Evaluation) -> str:
@@ -168,17 +175,6 @@ def _interval(item: Row | Paired) -> str:
 
 def _words(name: str) -> str:
     return name.replace("_", " ")
-
-
-def _grouped(rows: Sequence[Row], detail: str | None) -> list[tuple[list[str], str, bool]]:
-    lines = []
-    for index, row in enumerate(rows):
-        cells = [row.design, str(row.rays), four_digits(row.value), _interval(row), str(row.failures)]
-        if detail is not None:
-            cells.append(four_digits(row.details[detail]) if detail in row.details else "-")
-        cells += [four_digits(row.bandwidth_mbps), f"{row.seconds:.2f}"]
-        lines.append((cells, "", bool(index and row.design != rows[index - 1].design)))
-    return lines
 
 
 def table(

@@ -41,7 +41,6 @@ MOST_BODIES = 2000  # of a scene, the largest first
 MARGIN = 1.0  # of the scene's extent: rays that go farther are cut there
 # More rays that hit nothing would hide everything else.
 MANY_RAYS, FAINT = 300, 0.22
-LARGEST_UINT16 = 65_535
 # What tells outcomes apart beside their colours (Okabe and Ito 2008): dashes of lines, marks at their ends.
 OUTCOMES = (
     (Outcome.RETURN, "return", "#009E73", "solid", "plus"),
@@ -159,7 +158,7 @@ def _side_view(directions: np.ndarray) -> dict[str, float]:
 
 
 def _mesh(vertices: np.ndarray, faces: np.ndarray) -> dict[str, Any]:
-    wide = len(vertices) > LARGEST_UINT16
+    wide = len(vertices) > 65_535
     return {"vertices": encoded(vertices, "<f4"), "faces": encoded(faces, "<u4" if wide else "<u2"), "wide": wide}
 
 
@@ -217,8 +216,6 @@ def _cone(sensor: Sensor, level: float) -> np.ndarray:
     )
 
 
-SCENE_ID = "view-scene"
-DENSITY_COLOUR = "#7b2d8b"
 CAMERA = (
     ("left", "Turn left"),
     ("right", "Turn right"),
@@ -237,13 +234,29 @@ def view_section(shown: SceneFigure, looks: Sequence[Series], density_m: np.ndar
     """Everything of the view; `looks` are the designs' colours and dashes, `density_m` (K, 3) observed points."""
     document = view_document(shown, looks, density_m)
     stage = (
-        f'<div class="stage"><div id="{SCENE_ID}" tabindex="0" role="application" aria-label="3D view of the scene. '
+        f'<div class="stage"><div id="view-scene" tabindex="0" role="application" aria-label="3D view of the scene. '
         'Arrow keys turn it, plus and minus go closer and farther, Home shows the first view."></div>'
         '<img id="view-printed" alt="The 3D view as it stood when the page was printed">'
         f"{_camera_buttons(is_flat(shown.directions))}</div>"
     )
+    # one switch per outcome that any ray has, with the look of its rays and how many are drawn
+    there = {int(code) for one in shown.designs for code in np.unique(one.outcome)} | {int(Outcome.RETURN)}
+    switches = "".join(
+        switch(name, picture=swatch(colour, dash, symbol), count=str(int(code)), outcome=str(int(code)))
+        for code, name, colour, dash, symbol in OUTCOMES
+        if int(code) in there
+    )
+    density = density_m is not None
+    occluders = any(not body.is_target for body in shown.scene.bodies)
+    layers = [switch("scene", picture=swatch("#c9b8a8", None), layer="scene")]
+    layers += [switch("occluders", picture=swatch("#6b7280", None), layer="occluders")] if occluders else []
+    layers += [switch("fields of view", layer="fields"), switch("gates", layer="gates")]
+    layers += [switch("where rays start", layer="starts")]
+    if density:
+        dots = swatch("#7b2d8b", "dotted")
+        layers.append(switch("what the learned density observes", picture=dots, checked=False, layer="density"))
     controls = "".join(
-        (_sliders(shown), _outcomes(shown), _layers(shown, density_m is not None), _designs(shown, looks))
+        (_sliders(shown), _group("Rays", switches), _group("Shown", "".join(layers)), _designs(shown, looks))
     )
     return (
         f"{''.join(f'<p>{html.escape(text)}</p>' for text in view_notes(shown))}"
@@ -312,29 +325,6 @@ def _sliders(shown: SceneFigure) -> str:
                 f'max="{len(labels) - 1}" step="1" value="{middle}" data-labels="{named}"></div>'
             )
     return found
-
-
-def _outcomes(shown: SceneFigure) -> str:
-    """One switch per outcome that any ray has, with the look of its rays and how many are drawn."""
-    there = {int(code) for one in shown.designs for code in np.unique(one.outcome)} | {int(Outcome.RETURN)}
-    switches = "".join(
-        switch(name, picture=swatch(colour, dash, symbol), count=str(int(code)), outcome=str(int(code)))
-        for code, name, colour, dash, symbol in OUTCOMES
-        if int(code) in there
-    )
-    return _group("Rays", switches)
-
-
-def _layers(shown: SceneFigure, density: bool) -> str:
-    occluders = any(not body.is_target for body in shown.scene.bodies)
-    layers = [switch("scene", picture=swatch("#c9b8a8", None), layer="scene")]
-    layers += [switch("occluders", picture=swatch("#6b7280", None), layer="occluders")] if occluders else []
-    layers += [switch("fields of view", layer="fields"), switch("gates", layer="gates")]
-    layers += [switch("where rays start", layer="starts")]
-    if density:
-        dots = swatch(DENSITY_COLOUR, "dotted")
-        layers.append(switch("what the learned density observes", picture=dots, checked=False, layer="density"))
-    return _group("Shown", "".join(layers))
 
 
 def _designs(shown: SceneFigure, looks: Sequence[Series]) -> str:

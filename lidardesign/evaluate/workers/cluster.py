@@ -58,7 +58,25 @@ class Cluster:
             ) from None
         self._logger.setLevel(logging.CRITICAL)
         try:
-            self._client = _connected(Client, address)
+            try:
+                client = _answered(lambda: Client(address, timeout=SCHEDULER_SECONDS, set_as_default=False))
+            except (OSError, ValueError) as error:
+                found = " ".join(str(error).split())
+                raise ConfigError(f"no scheduler answers at {address}: {found}", where="--workers", hint=HINT) from None
+            try:
+                client.wait_for_workers(1, timeout=WORKER_SECONDS)
+                _check_versions(client)
+            except asyncio.TimeoutError:
+                client.close()
+                raise ConfigError(
+                    f"the scheduler at {address} had no worker within {WORKER_SECONDS:g} s",
+                    where="--workers",
+                    hint=HINT,
+                ) from None
+            except ConfigError:
+                client.close()
+                raise
+            self._client = client
         except ConfigError:
             self._logger.setLevel(self._level)
             raise
@@ -136,26 +154,6 @@ def _unusable(found: str) -> ConfigError:
         where="--workers",
         hint="install the same versions of lidardesign and of the task for the scheduler and all workers",
     )
-
-
-def _connected(client_class: Any, address: str) -> Any:
-    try:
-        client = _answered(lambda: client_class(address, timeout=SCHEDULER_SECONDS, set_as_default=False))
-    except (OSError, ValueError) as error:
-        found = " ".join(str(error).split())
-        raise ConfigError(f"no scheduler answers at {address}: {found}", where="--workers", hint=HINT) from None
-    try:
-        client.wait_for_workers(1, timeout=WORKER_SECONDS)
-        _check_versions(client)
-    except asyncio.TimeoutError:
-        client.close()
-        raise ConfigError(
-            f"the scheduler at {address} had no worker within {WORKER_SECONDS:g} s", where="--workers", hint=HINT
-        ) from None
-    except ConfigError:
-        client.close()
-        raise
-    return client
 
 
 def _answered(connect: Callable[[], Any]) -> Any:

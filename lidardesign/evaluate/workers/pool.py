@@ -12,58 +12,30 @@ import re
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from typing import Protocol
 
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.scene_scores import Progress, ScenePass, SceneScores
+from lidardesign.evaluate.workers.cluster import Cluster
+from lidardesign.evaluate.workers.processes import Processes
 from lidardesign.evaluate.workers.worker import SceneFailure, SceneJob, SceneSource
 from lidardesign.registry import load_task
 
 ADDRESS = re.compile(r"tcp://(\[[0-9a-fA-F:]+\]|[^\s:/\[\]]+):(\d{1,5})")
 MOST_PROCESSES = 1024
 ALLOWED = f"a whole number from 1 to {MOST_PROCESSES}, or tcp://HOST:PORT of a dask scheduler"
-MOST_PORT = 65_535
 # How often somebody looks whether there is still a worker, while none answers.
 LOOK_SECONDS = 2.0
-
-
-class Engine(Protocol):
-    """What hands jobs to workers."""
-
-    def prepare(self, source: SceneSource) -> None:
-        """Have workers make scenes ahead."""
-        ...
-
-    def at_once(self) -> int:
-        """How many jobs it takes at a time."""
-        ...
-
-    def submit(self, job: SceneJob) -> Future[SceneScores | SceneFailure]:
-        """Hand a job over."""
-        ...
-
-    def check(self) -> None:
-        """Raise where no answer can come any more."""
-        ...
-
-    def lost(self, error: Exception, numbers: Sequence[int]) -> None:
-        """Raise what became of the jobs of these scenes, or be ready to have them again."""
-        ...
-
-    def close(self) -> None:
-        """End what was started."""
-        ...
 
 
 class WorkerScorer:
     """Scores scenes with workers; a context that ends them.
 
     Arguments:
-        engine: What hands jobs to them.
+        engine: What hands jobs to them: an executor that says what became of lost workers.
     """
 
-    def __init__(self, engine: Engine) -> None:
+    def __init__(self, engine: Processes | Cluster) -> None:
         self._engine = engine
 
     def __enter__(self) -> WorkerScorer:
@@ -138,7 +110,7 @@ def check_workers(text: str) -> int | str:
         ConfigError: It is neither.
     """
     address = ADDRESS.fullmatch(text.strip())
-    if address and 0 < int(address.group(2)) <= MOST_PORT:
+    if address and 0 < int(address.group(2)) <= 65_535:
         return text.strip()
     if re.fullmatch(r"\d{1,9}", text.strip()) and 1 <= int(text) <= MOST_PROCESSES:
         return int(text)
@@ -159,13 +131,6 @@ def workers_of(wanted: int | str, most: int) -> Iterator[WorkerScorer | None]:
     if isinstance(wanted, int) and min(wanted, most) == 1:
         yield None
         return
-    if isinstance(wanted, str):
-        from lidardesign.evaluate.workers.cluster import Cluster
-
-        engine: Engine = Cluster(wanted)
-    else:
-        from lidardesign.evaluate.workers.processes import Processes
-
-        engine = Processes(min(wanted, most))
+    engine = Cluster(wanted) if isinstance(wanted, str) else Processes(min(wanted, most))
     with WorkerScorer(engine) as scorer:
         yield scorer
