@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from array_api_compat import array_namespace, device, is_torch_array
 
-LOG_HALF = -math.log(2.0)
 FULL_TURN = 2 * math.pi
 
 # Series in the square of a small angle t, or of its sine s: there the plain quotients are 0 / 0, and their derivatives
@@ -73,26 +72,6 @@ def logsumexp(values: Any, axis: int | None = None, weights: Any | None = None) 
     logarithm = xp.log(xp.where(some, total, xp.ones_like(total))) + shift
     otherwise = xp.where(finite, xp.full_like(peak, -math.inf), peak)
     return _scalar(xp.squeeze(xp.where(some, logarithm, otherwise), axis=axis))
-
-
-def log1mexp(values: Any) -> Any:
-    r"""$\log(1 - e^{a})$ for a <= 0, accurate at both ends (M. Maechler, 2012): -inf at a = 0."""
-    xp, values = _floats(values)
-    near = values > LOG_HALF
-    one = xp.ones_like(values)
-    with np.errstate(divide="ignore"):
-        # 0 minus, for -0 would turn the sign of the derivative at 0
-        close = xp.log(0 - xp.expm1(xp.where(near, values, -one)))
-        far = xp.log1p(-xp.exp(xp.where(near, -one, values)))
-    return xp.where(near, close, far)
-
-
-def log_sigmoid(values: Any) -> Any:
-    r"""$\log \sigma(a) = -\log(1 + e^{-a})$: a itself far below 0, $-e^{-a}$ far above."""
-    xp, values = _floats(values)
-    negative = values < 0
-    magnitude = xp.where(negative, values, -values)
-    return xp.where(negative, values, xp.zeros_like(values)) - xp.log1p(xp.exp(magnitude))
 
 
 def safe_divide(numerator: Any, denominator: Any, otherwise: float = 0.0) -> Any:
@@ -154,16 +133,6 @@ def circular_difference(first_rad: Any, second_rad: Any) -> Any:
     """The turn from the second angle to the first one, in [-pi, pi) [rad]."""
     _, first, second = _floats(first_rad, second_rad)
     return wrap_angle(first - second)
-
-
-def circular_mean(angle_rad: Any, weights: Any | None = None) -> Any:
-    """Direction of the weighted mean of unit vectors, in [0, 2 pi) [rad]; 0 where they cancel exactly."""
-    xp, angle = _floats(angle_rad)
-    share = xp.ones_like(angle) if weights is None else _as(weights, angle)
-    along, across = xp.sum(share * xp.cos(angle)), xp.sum(share * xp.sin(angle))
-    cancelled = (along == 0) & (across == 0)
-    mean = xp.atan2(across, xp.where(cancelled, xp.ones_like(along), along))
-    return wrap_turn(mean)
 
 
 def sphere_log(local: Any) -> Any:
@@ -260,27 +229,6 @@ def clipped_eigenvalues(matrices: np.ndarray, low: Any, high: Any = np.inf, smal
     values[..., 0] = np.minimum(values[..., 0], smallest)
     rebuilt = (vectors * values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     return (rebuilt + np.swapaxes(rebuilt, -1, -2)) / 2
-
-
-def nearest_positive_definite(covariance: Any, floor: float) -> Any:
-    """The nearest symmetric matrix (Frobenius norm) whose eigenvalues are at least `floor`, (..., n, n).
-
-    The derivative is that of Daleckii and Krein (1965), of the eigenvalues' divided differences: eigenvectors of equal
-    eigenvalues have none, the projection does.
-    """
-    xp, matrices = _floats(covariance)
-    symmetric = (matrices + xp.matrix_transpose(matrices)) / 2
-    values, vectors = xp.linalg.eigh(_constant(symmetric))
-    clipped = xp.where(values < floor, xp.full_like(values, floor), values)
-    gap = values[..., :, None] - values[..., None, :]
-    rise = clipped[..., :, None] - clipped[..., None, :]
-    kept = xp.astype(values >= floor, values.dtype)
-    slope = xp.where(gap == 0, xp.broadcast_to(kept[..., None], gap.shape), safe_divide(rise, gap))
-    turned = xp.matrix_transpose(vectors)
-    # 0 in value, the derivative in its derivative
-    change = turned @ (symmetric - _constant(symmetric)) @ vectors
-    moved = vectors @ (xp.eye(values.shape[-1], dtype=values.dtype) * clipped[..., None, :] + slope * change) @ turned
-    return (moved + xp.matrix_transpose(moved)) / 2
 
 
 def box_quadratic_minimum(

@@ -17,14 +17,10 @@ from lidardesign.numerics import (
     angle_over_sine,
     box_quadratic_minimum,
     circular_difference,
-    circular_mean,
     clipped_eigenvalues,
     effective_count,
     effective_sample_size,
-    log1mexp,
-    log_sigmoid,
     logsumexp,
-    nearest_positive_definite,
     normalised_weights,
     safe_divide,
     safe_norm,
@@ -79,18 +75,6 @@ def of_ratio(value):
 
 # function, what it is, its derivative, and arguments, ordinary and special
 ELEMENTWISE = {
-    "log1mexp": (
-        log1mexp,
-        lambda a: mpmath.log(-mpmath.expm1(a)),
-        lambda a: mpmath.exp(a) / mpmath.expm1(a),
-        [-1e-30, -1e-12, -1e-3, -0.5, -0.693, -0.694, -1.0, -17.0, -40.0, -80.0],
-    ),
-    "log_sigmoid": (
-        log_sigmoid,
-        lambda a: -mpmath.log1p(mpmath.exp(-a)),
-        lambda a: 1 / (1 + mpmath.exp(a)),
-        [-1e4, -200.0, -17.0, -1.0, -1e-8, 0.0, 1e-8, 1.0, 17.0, 80.0],
-    ),
     "safe_sqrt": (
         safe_sqrt,
         mpmath.sqrt,
@@ -137,8 +121,6 @@ def test_the_derivative_of_a_function_of_one_number_keeps_them_too(name, dtype):
 @each_dtype
 def test_values_at_the_edges_are_limits_and_derivatives_there_are_defined(dtype):
     cases = {
-        log1mexp: ([0.0, -math.inf], [-math.inf, 0.0], [-math.inf, 0.0]),
-        log_sigmoid: ([-math.inf, math.inf], [-math.inf, 0.0], [1.0, 0.0]),
         safe_sqrt: ([0.0, -1.0, math.inf], [0.0, 0.0, math.inf], [0.0, 0.0, 0.0]),
     }
     for function, (values, expected, slopes) in cases.items():
@@ -147,7 +129,7 @@ def test_values_at_the_edges_are_limits_and_derivatives_there_are_defined(dtype)
 
 
 @each_dtype
-@pytest.mark.parametrize("function", [log1mexp, log_sigmoid, safe_sqrt, wrap_angle, logsumexp, safe_norm])
+@pytest.mark.parametrize("function", [safe_sqrt, wrap_angle, logsumexp, safe_norm])
 def test_what_is_not_a_number_stays_none(function, dtype):
     assert np.isnan(np.asarray(function(np.asarray([math.nan], dtype=dtype)))).all()
     assert torch.isnan(function(torch.tensor([math.nan], dtype=TORCH[dtype]))).all()
@@ -275,36 +257,6 @@ def test_a_circular_difference_is_the_turn_that_leads_from_one_angle_to_the_othe
     assert float(circular_difference(angle + turn, angle)) == pytest.approx(turn, abs=1e-12)
 
 
-@given(st.floats(0, 6.28), st.floats(0.01, 1.0))
-def test_the_circular_mean_of_a_symmetric_pair_is_its_middle_also_across_zero(middle, offset):
-    mean = circular_mean([middle - offset, middle + offset])
-    assert 0 <= mean < 2 * math.pi
-    assert abs(float(wrap_angle(mean - middle))) < 1e-9
-
-
-@each_dtype
-def test_circular_means_weight_their_angles_and_have_derivatives(dtype):
-    angles, weights = np.asarray([6.2, 0.1, 0.4], dtype), np.asarray([1.0, 2.0, 0.0], dtype)
-    shifted = np.asarray([6.2 - 2 * math.pi, 0.1, 0.4], dtype)
-    exact = digits(
-        lambda a, b: mpmath.atan2(mpmath.sin(a) + 2 * mpmath.sin(b), mpmath.cos(a) + 2 * mpmath.cos(b)), *angles[:2]
-    )
-    assert close(circular_mean(angles, weights), exact, dtype, least=1.0)
-    assert close(circular_mean(shifted, weights), exact, dtype, least=1.0)
-    slopes = gradients(lambda a: circular_mean(a, torch.tensor(weights)), angles, dtype)
-    assert slopes[2] == 0
-    assert slopes.sum() == pytest.approx(1.0, rel=1e-5)  # a turned set has a turned mean
-    assert slopes[1] == pytest.approx(2 * slopes[0], rel=0.2)
-
-
-@each_dtype
-def test_directions_that_cancel_have_the_circular_mean_0_and_derivative_0(dtype):
-    assert circular_mean(np.zeros(0, dtype)) == 0
-    none = np.zeros(2, dtype)
-    assert circular_mean(np.asarray([1.0, 2.0], dtype), none) == 0
-    np.testing.assert_array_equal(gradients(lambda a: circular_mean(a, torch.tensor(none)), [1.0, 2.0], dtype), [0, 0])
-
-
 def at_angle(angle, dtype, toward=0.3):
     """A unit vector at an angle from the pole (1, 0, 0), rounded, and its exact tangent coordinates."""
     sine = mpmath.sin(angle)
@@ -406,47 +358,6 @@ def test_clipped_eigenvalues_lie_within_their_bounds():
     values = np.linalg.eigvalsh(fixed)
     assert values.min() >= 0.1 - 1e-12
     assert values.max() <= 0.5 + 1e-12
-
-
-@each_dtype
-def test_positive_definite_matrices_are_left_as_they_are_and_others_moved_to_the_nearest(dtype):
-    matrix = np.diag(np.asarray([1.0, 2.0, 3.0], dtype))
-    np.testing.assert_allclose(nearest_positive_definite(matrix, 0.5), matrix, atol=4 * np.finfo(dtype).eps)
-    repaired = nearest_positive_definite(np.diag(np.asarray([1.0, -1.0], dtype)), 0.5)
-    assert repaired.dtype == dtype
-    np.testing.assert_allclose(repaired, np.diag([1.0, 0.5]))
-    generator = np.random.default_rng(2)
-    noise = generator.standard_normal((10, 3, 3)).astype(dtype)
-    found = nearest_positive_definite(noise, 0.3)
-    np.testing.assert_array_equal(found, np.swapaxes(found, 1, 2))
-    assert np.linalg.eigvalsh(found).min() > 0.3 - 1e-5
-    symmetric = (noise + np.swapaxes(noise, 1, 2)) / 2
-    for _ in range(50):
-        root = generator.standard_normal((10, 3, 3)).astype(dtype)
-        other = 0.3 * np.eye(3) + root @ np.swapaxes(root, 1, 2)
-        assert (np.linalg.norm(found - symmetric, axis=(1, 2)) <= np.linalg.norm(other - symmetric, axis=(1, 2))).all()
-
-
-def test_the_derivative_of_the_nearest_positive_definite_matrix_is_the_one_of_small_differences():
-    generator = np.random.default_rng(3)
-    noise, direction = generator.standard_normal((2, 4, 4))
-    weight = generator.standard_normal((4, 4))
-
-    def value(matrix):
-        return float((weight * nearest_positive_definite(matrix, 0.3)).sum())
-
-    slope = gradients(lambda m: torch.tensor(weight) * nearest_positive_definite(m, 0.3), noise, np.float64)
-    step = 1e-6
-    central = (value(noise + step * direction) - value(noise - step * direction)) / (2 * step)
-    assert (slope * direction).sum() == pytest.approx(central, rel=1e-6)
-
-
-@each_dtype
-def test_equal_eigenvalues_leave_the_derivative_of_the_nearest_positive_definite_matrix_defined(dtype):
-    kept = gradients(lambda m: nearest_positive_definite(m, 0.5), np.eye(3), dtype)
-    np.testing.assert_allclose(kept, np.ones((3, 3)), atol=1e-6)
-    lost = gradients(lambda m: nearest_positive_definite(m, 0.5), np.zeros((3, 3)), dtype)
-    np.testing.assert_array_equal(lost, np.zeros((3, 3)))
 
 
 def test_the_box_minimum_beats_every_other_point_of_the_box():
@@ -573,15 +484,6 @@ def test_an_angle_inside_its_turn_keeps_every_bit():
     np.testing.assert_array_equal(wrap_turn(small, -0.5), small)
     assert wrap_turn(5.0, 5.0) == 5.0
     assert float(wrap_turn(4.999, 5.0)) == pytest.approx(4.999 + 2 * math.pi)
-
-
-def test_circular_means_on_the_axes_are_no_cancellation():
-    assert float(circular_mean([3.0, -3.0])) == pytest.approx(math.pi)
-    assert float(circular_mean([math.pi, -math.pi], [0.5, 0.5])) == pytest.approx(math.pi)
-    # the cosines of these cancel to the last bit
-    assert math.cos(0.3) + math.cos(math.pi - 0.3) == 0
-    assert float(circular_mean([0.3, math.pi - 0.3])) == pytest.approx(math.pi / 2)
-    assert float(circular_mean([0.0])) == 0.0
 
 
 def test_unit_vectors_are_along_the_last_axis_of_any_number():

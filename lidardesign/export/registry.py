@@ -24,8 +24,9 @@ class Exporter:
         name: As `export --format` takes it.
         suffix: Of the file that it writes, with the dot; of the folder where it writes several.
         summary: One line for `export --list`.
-        module: Where its `write_NAME(design, rays, path) -> list[str]` is, and `NAME_rounding(design, rays, path)`,
-            which reads the file back and says what its numbers lose.
+        module: Where its functions are.
+        functions: The names of the one that writes, `(design, rays, path) -> list[str]`, and of the one that reads the
+            file back and says what its numbers lose, `(design, rays, path)`.
         reader: The program that reads it.
         checked: How the tests show that this program takes what is written.
         folder: Whether it writes a folder of files.
@@ -36,15 +37,11 @@ class Exporter:
     suffix: str
     summary: str
     module: str
+    functions: tuple[str, str]
     reader: str
     checked: str
     folder: bool = False
     rated: bool = False
-
-    @property
-    def word(self) -> str:
-        """Its name as its functions bear it."""
-        return self.name.replace("-", "_")
 
     def write(self, design: DesignSpec, rays: Rays, path: Path, rate_hz: float | None = None) -> list[str]:
         """Write the file, atomically; returns notes of what the format cannot hold.
@@ -59,7 +56,7 @@ class Exporter:
             ConfigError: A frame rate for a format that holds none, or one that no sensor has.
             DataError: The file cannot be written, or the format cannot hold such a design at all.
         """
-        write = getattr(import_module(self.module), f"write_{self.word}")
+        write = getattr(import_module(self.module), self.functions[0])
         self.check_rate(rate_hz)
         rate = {"rate_hz": Bandwidth().rate_hz if rate_hz is None else rate_hz} if self.rated else {}
         return write(design, rays, Path(path), **rate)
@@ -84,7 +81,7 @@ class Exporter:
         Raises:
             DataError: The file does not hold what was written.
         """
-        return getattr(import_module(self.module), f"{self.word}_rounding")(design, rays, Path(path))
+        return getattr(import_module(self.module), self.functions[1])(design, rays, Path(path))
 
 
 EXPORTERS: dict[str, Exporter] = {
@@ -95,6 +92,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".csv",
             "one ray per row: origin, direction, angles, gate, time",
             "lidardesign.export.ray_lists",
+            ("write_csv", "csv_rounding"),
             reader="anything that reads CSV; `evaluate` and `fit` too",
             checked="read by numpy, and read back",
         ),
@@ -103,6 +101,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".npz",
             "the same columns as numpy arrays",
             "lidardesign.export.ray_lists",
+            ("write_npz", "npz_rounding"),
             reader="numpy",
             checked="read by numpy, and read back",
         ),
@@ -111,6 +110,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".sensors.csv",
             "one sensor per row, the 16 columns of the research code",
             "lidardesign.export.ray_lists",
+            ("write_sensors_csv", "sensors_csv_rounding"),
             reader="the research code of the paper",
             checked="read back; the columns are those of its own files",
         ),
@@ -119,6 +119,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".galvo.csv",
             "mirror angles in the order of least travel, gates in ps: +-20 degrees per axis",
             "lidardesign.export.galvo",
+            ("write_galvo", "galvo_rounding"),
             reader="a script that drives two mirrors and a gated detector",
             checked="read back, and by `capture`",
         ),
@@ -127,6 +128,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".mjcf.xml",
             "a rangefinder site per ray",
             "lidardesign.export.mjcf",
+            ("write_mjcf", "mjcf_rounding"),
             reader="MuJoCo",
             checked="loaded and run in MuJoCo: its distances are ours",
         ),
@@ -135,6 +137,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".sdf",
             "a gpu_lidar per sensor, on even grids",
             "lidardesign.export.sdf",
+            ("write_sdf", "sdf_rounding"),
             reader="Gazebo",
             checked="parsed by libsdformat without a warning, all values compared",
             rated=True,
@@ -144,6 +147,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".urdf",
             "a fixed link per sensor, with Gazebo's gpu_lidar",
             "lidardesign.export.urdf",
+            ("write_urdf", "urdf_rounding"),
             reader="ROS, robot_state_publisher",
             checked="parsed by check_urdf; sensors by libsdformat",
             rated=True,
@@ -153,6 +157,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".urdf.xacro",
             "the same as a macro that mounts it on a robot",
             "lidardesign.export.urdf",
+            ("write_xacro", "xacro_rounding"),
             reader="ROS, xacro",
             checked="expanded by xacro and parsed by check_urdf",
             rated=True,
@@ -162,6 +167,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".carla.json",
             "attributes and transform of a ray_cast lidar per sensor",
             "lidardesign.export.carla",
+            ("write_carla", "carla_rounding"),
             reader="a script that sets blueprint attributes",
             checked="names and types against CARLA's documented ones; its sweep in a twin",
             rated=True,
@@ -171,6 +177,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".isaac",
             "a solid-state profile per sensor, and where they are",
             "lidardesign.export.isaac",
+            ("write_isaac_json", "isaac_json_rounding"),
             reader="Isaac Sim before 5",
             checked="fields, types and lengths against a JSON Schema of NVIDIA's profiles",
             folder=True,
@@ -181,6 +188,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".usda",
             "an OmniLidar per sensor, gates per ray",
             "lidardesign.export.isaac",
+            ("write_isaac_usd", "isaac_usd_rounding"),
             reader="Isaac Sim from 5 on",
             checked="opened with OpenUSD; types, tokens and lengths as its schema has them",
             rated=True,
@@ -190,6 +198,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".helios",
             "a scanner per sensor with a channel per ray, and surveys of one frame each",
             "lidardesign.export.helios",
+            ("write_helios", "helios_rounding"),
             reader="HELIOS++",
             checked="valid by schemas of its fields; a twin of HELIOS++ fires the rays",
             folder=True,
@@ -200,6 +209,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".osi.json",
             "a lidar configuration per sensor: mounting position, unit vectors, microseconds",
             "lidardesign.export.osi",
+            ("write_osi", "osi_rounding"),
             reader="sensor models and simulators of ASAM OSI",
             checked="parsed by protobuf, with ASAM's own bindings where they are",
             rated=True,
@@ -209,6 +219,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".rgl",
             "a pattern of float32 ray poses per sensor, and the model with the plugin",
             "lidardesign.export.rgl",
+            ("write_rgl", "rgl_rounding"),
             reader="Robotec GPU Lidar and its Gazebo plugin",
             checked="parsed by libsdformat, and read back as the plugin reads patterns",
             folder=True,
@@ -219,6 +230,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".mitsuba",
             "a scene per sensor: gated film, rays as radiancemeters, a flash beside them",
             "lidardesign.export.mitsuba",
+            ("write_mitsuba", "mitsuba_rounding"),
             reader="Mitsuba 3 with mitransient",
             checked="rendered by them: light comes back in the bin of its range",
             folder=True,
@@ -228,6 +240,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".ply.d",
             "rays as points, beams as edges, fields of view as surfaces",
             "lidardesign.export.ply",
+            ("write_ply", "ply_rounding"),
             reader="CloudCompare, Blender, MeshLab",
             checked="loaded by trimesh, and read back",
             folder=True,
@@ -237,6 +250,7 @@ EXPORTERS: dict[str, Exporter] = {
             ".stl",
             "mounting positions as small solids, in millimetres",
             "lidardesign.export.stl",
+            ("write_stl", "stl_rounding"),
             reader="CAD programs",
             checked="loaded by trimesh as closed solids, and read back",
         ),
