@@ -130,12 +130,10 @@ def circles() -> list[list[str]]:
     return [sorted(group) for group in groups if len(group) > 1]
 
 
-@pytest.mark.xfail(reason="the rooms are tidied one by one")
 def test_no_modules_import_each_other():
     assert not circles()
 
 
-@pytest.mark.xfail(reason="the rooms are tidied one by one")
 def test_folders_are_small_enough_to_overlook():
     crowded = {}
     for folder in {path.parent for path in PACKAGE.rglob("*.py")}:
@@ -155,7 +153,6 @@ def test_a_public_class_name_stands_for_one_thing():
     assert not {name: places for name, places in homes.items() if len(places) > 1}
 
 
-@pytest.mark.xfail(reason="the rooms are tidied one by one")
 def test_functions_outside_commands_take_few_parameters():
     long = []
     for name, tree in package().items():
@@ -170,7 +167,6 @@ def test_functions_outside_commands_take_few_parameters():
     assert not long
 
 
-@pytest.mark.xfail(reason="the rooms are tidied one by one")
 def test_libraries_stay_in_their_homes():
     astray = []
     for name, tree in package().items():
