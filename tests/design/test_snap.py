@@ -22,6 +22,7 @@ from lidardesign.design.fit import fit
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.mixture.mixture import Mixture
 from lidardesign.design.sensor import tangent_coordinates
+from lidardesign.design.snap.fit import afford_rays, capped_split, count_rays, useful_split
 from lidardesign.design.snap.parts import (
     PartChoice,
     PartOptions,
@@ -31,7 +32,6 @@ from lidardesign.design.snap.parts import (
     parts_of,
     wants_parts,
 )
-from lidardesign.design.snap.rays import afford_rays, capped_split, count_rays, useful_split
 from lidardesign.design.snap.shapes import shapes_of
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.samples import Samples

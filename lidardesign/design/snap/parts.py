@@ -6,7 +6,7 @@ does its read-out stop. So a constraint that no part keeps is said by name.
 A part is a component of its own shape (see `shapes`), where the sensor stands. One sensor after the other takes the
 part with which the mixture's log-likelihood is highest, until none changes any more; then the poses are refitted with
 these shapes and the sensors' own shares of the rays, which never lowers it. Where the parts lack the rays that are
-asked for, or need more bandwidth than there is, sensors change to parts that help (see `rays`).
+asked for, or need more bandwidth than there is, sensors change to parts that help (see `fit`).
 """
 
 from __future__ import annotations
