@@ -113,15 +113,22 @@ class Target:
         size, order = self.rows_at_once, nearby_order(observed_point(points))
         for start in range(0, len(points), size):
             rows = order[start : start + size]
-            rays = RayBatch.of(points[rows])
-            near = self.surfaces.near(rays.observed, optics.sigma_m, self.surface_tolerance_nats)
-            passed = self.visibility.transmittance(rays, near.columns, optics, differentiable=gradient)
-            values[rows], shares = near.log_sums(passed.log_values)
+            values[rows], by_chart = self._evaluate(points[rows], optics, gradient)
             if gradient:
-                by_point, by_ray = near.gradient(shares), passed.gradient(shares)
-                by_ray.add_by_point(by_point, rays)
-                gradients[rows] = self._by_chart(points[rows], by_ray)
+                gradients[rows] = by_chart
         return values, gradients
+
+    def _evaluate(self, points: np.ndarray, optics: Optics, gradient: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        """Apart from the loop over chunks, so that the arrays of one chunk are gone before the next one's."""
+        rays = RayBatch.of(points)
+        near = self.surfaces.near(rays.observed, optics.sigma_m, self.surface_tolerance_nats)
+        passed = self.visibility.transmittance(rays, near.columns, optics, differentiable=gradient)
+        values, shares = near.log_sums(passed.log_values)
+        if not gradient:
+            return values, None
+        by_point, by_ray = near.gradient(shares), passed.gradient(shares)
+        by_ray.add_by_point(by_point, rays)
+        return values, self._by_chart(points, by_ray)
 
     def _by_chart(self, points: np.ndarray, by_ray: RayGradient) -> np.ndarray:
         sin_a, cos_a = np.sin(points[:, AZIMUTH]), np.cos(points[:, AZIMUTH])
