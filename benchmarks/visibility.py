@@ -17,7 +17,7 @@ import numpy as np
 from common import face_scenes, interleaved, model_option, parser, report
 
 from lidardesign.config import DensitySettings
-from lidardesign.evaluate.accuracy.visibility import POINTS, REFERENCE_POINTS, Case
+from lidardesign.evaluate.accuracy.visibility import POINTS, REFERENCE_POINTS, VisibilityCase
 from lidardesign.scene import Body, Box, Scene, rigid
 from lidardesign.space import DesignSpace
 
@@ -38,7 +38,7 @@ def plate_scenes(count: int) -> tuple[list[Scene], DesignSpace]:
     return scenes, space
 
 
-def measure(name: str, case: Case, points: tuple[int, ...], rounds: int) -> list[list[object]]:
+def measure(name: str, case: VisibilityCase, points: tuple[int, ...], rounds: int) -> list[list[object]]:
     """One row per way: its error with the standard error, and milliseconds."""
     ways = {"off": case.off, "raycast": case.cast}
     ways |= {f"quadrature {count}": case.quadrature(count) for count in points}
@@ -81,7 +81,7 @@ def main() -> None:
         ("faces", heads, FaceTask().space(FaceConfig())),
         ("thin plate", *plate_scenes(options.scenes)),
     ]:
-        case = Case.of(scenes, space, DensitySettings(), 0, options.batch)
+        case = VisibilityCase.of(scenes, space, DensitySettings(), 0, options.batch)
         rows += measure(name, case, tuple(options.points), options.rounds)
         lines.append(verdict(rows[-2 - len(options.points) :]))
     columns = ["case", "visibility", "mass in the wrong place", "standard error", "wall ms"]

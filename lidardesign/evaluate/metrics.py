@@ -292,7 +292,7 @@ def visible_surface(
     points, triangles, found, draw = [], [], 0, 3 * count
     for _ in range(DRAW_ROUNDS):
         candidates = sample_body(targets, space, min(draw, LARGEST_DRAW), generator, frame)
-        seen = is_heard(caster, scene.receiver, candidates.points)
+        seen = is_received(caster, scene.receiver, candidates.points)
         seen[seen] = is_visible(caster, space, origins, candidates.points[seen])
         points.append(candidates.points[seen])
         triangles.append(candidates.triangles[seen])
@@ -337,12 +337,12 @@ def is_visible(
     return visible
 
 
-def is_heard(caster: SceneCaster, receiver: Receiver | None, points: np.ndarray) -> np.ndarray:
+def is_received(caster: SceneCaster, receiver: Receiver | None, points: np.ndarray) -> np.ndarray:
     """Which points (N, 3) a fixed receiver has in its view with nothing in front, shape (N,); all without one."""
     if receiver is None:
         return np.ones(len(points), dtype=bool)
-    heard = in_view(receiver, points)
-    way = points[heard] - np.asarray(receiver.origin_m)
+    received = in_view(receiver, points)
+    way = points[received] - np.asarray(receiver.origin_m)
     hits = caster.first_hit(np.asarray(receiver.origin_m), way)
-    heard[heard] = hits.range_m > np.linalg.norm(way, axis=1) * (1 - HIT_TOLERANCE)
-    return heard
+    received[received] = hits.range_m > np.linalg.norm(way, axis=1) * (1 - HIT_TOLERANCE)
+    return received

@@ -22,7 +22,7 @@ from lidardesign.design.sensor import DesignSpec, Sensor, Track, tangent_coordin
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.candidates import TrainingViews, dense_points, mean_mbps, whole_range
 from lidardesign.evaluate.cma.candidate import CmaCandidate, CmaSettings
-from lidardesign.evaluate.cma.model import DesignModel, RayBudget, Way, widest_bins
+from lidardesign.evaluate.cma.model import DesignModel, RayAllowance, Way, widest_bins
 from lidardesign.evaluate.cma.parameters import SearchRules, exp_matrix, log_matrix
 from lidardesign.evaluate.cma.search import Budget, OutOfTimeError, Search, TrainingObjective
 from lidardesign.evaluate.cma.starts import starts, tiles
@@ -106,7 +106,7 @@ def test_every_vector_however_far_stands_for_a_design_that_keeps_its_constraints
     for model in models_of(space, train, layout, rules)[::7]:
         for step in (0.0, 0.5, 4.0, 40.0):
             design = model.design(
-                step * generator.standard_normal(model.size), RayBudget(12 if layout != "scan" else 3)
+                step * generator.standard_normal(model.size), RayAllowance(12 if layout != "scan" else 3)
             )
             checks = check_design(design_document(design), rules, space)
             assert not [check for check in checks if not check.satisfied]
@@ -121,7 +121,7 @@ def test_projecting_twice_is_projecting_once(case):
     for model in models_of(*case)[::7]:
         for step in (0.5, 4.0):
             vector = step * generator.standard_normal(model.size)
-            designs = [model.design(one, RayBudget(12)) for one in (vector, model.projected(vector))]
+            designs = [model.design(one, RayAllowance(12)) for one in (vector, model.projected(vector))]
             for one, other in zip(*(design.sensors for design in designs), strict=True):
                 for name in ("origin_m", "origin_covariance_m2", "frame", "field_of_view_rad", "gate_m", "weight"):
                     found, expected = getattr(one, name), getattr(other, name)
@@ -153,7 +153,7 @@ def test_the_vector_zero_is_the_start():
         for i in range(2)
     ]
     model = DesignModel(rules_of(FREE, "grid", {}), sensors, [{}], {})
-    for one, other in zip(model.design(model.zero, RayBudget(10)).sensors, sensors, strict=True):
+    for one, other in zip(model.design(model.zero, RayAllowance(10)).sensors, sensors, strict=True):
         np.testing.assert_allclose(one.frame, other.frame, atol=1e-9)
         assert one.gate_m == pytest.approx(other.gate_m)
         assert one.field_of_view_rad == pytest.approx(other.field_of_view_rad)
@@ -170,7 +170,7 @@ def test_rays_of_spread_sensors_are_parallel_or_meet_in_one_point(focus):
     )
     narrow = replace(start[0], coupling=replace(start[0].coupling, spread_rad=np.full(2, 1e-4)))
     model = DesignModel(setting, [narrow], [{}], {})
-    (rays,) = model.positions(model.zero, RayBudget(50))
+    (rays,) = model.positions(model.zero, RayAllowance(50))
     # what lies along the boresight is no matter of directions
     met = rays.origin_m + (narrow.range_m if focus else 1e6) * rays.direction
     spread = np.linalg.norm(np.ptp(met @ narrow.frame[1:].T, axis=0)) / (1.0 if focus else 1e6)
@@ -200,7 +200,7 @@ def test_matrix_logarithms_and_exponentials_undo_each_other():
 
 
 def test_the_widest_cap_keeps_a_budget_that_one_bin_more_breaks():
-    amount = RayBudget(None, 1.0)
+    amount = RayAllowance(None, 1.0)
     read_out = amount.read_outs(rules_of(FIXED, "grid", {}))[0]
     widths = np.array([0.5, 1.5])
     for most in range(1, 101):
@@ -216,7 +216,7 @@ def test_rays_within_a_bandwidth_cost_no_more_and_hardly_less(layout, limit):
     generator = np.random.default_rng(2)
     for model in models_of(space, AHEAD, layout, {})[::6]:
         for step in (0.0, 1.0):
-            amount = RayBudget(None, limit)
+            amount = RayAllowance(None, limit)
             positions = model.positions(step * generator.standard_normal(model.size), amount)
             spent = mean_mbps(positions, Bandwidth())
             assert spent <= limit * (1 + 1e-12)
@@ -261,7 +261,7 @@ class Distance:
 
 def search(objective, starts, evaluations=1500, seed=0, **options):
     budget = Budget(math.inf, evaluations)
-    return Search(starts, RayBudget(1), objective, budget, np.random.default_rng(seed), **options).run()
+    return Search(starts, RayAllowance(1), objective, budget, np.random.default_rng(seed), **options).run()
 
 
 def test_a_search_finds_the_lowest_point_inside_the_constraints():
@@ -308,7 +308,7 @@ def test_a_search_ends_when_its_time_is_up_by_its_own_clock():
     now = itertools.count()
     objective = Distance(np.zeros((40, 4)))
     budget = Budget(200.0, clock=lambda: float(next(now)))
-    found = Search([Bowl([2.0] * 4)], RayBudget(1), objective, budget, np.random.default_rng(0)).run()
+    found = Search([Bowl([2.0] * 4)], RayAllowance(1), objective, budget, np.random.default_rng(0)).run()
     assert 100 < found.seconds <= 220
 
 
@@ -476,7 +476,7 @@ def test_a_track_keeps_its_constraints_at_every_place():
     generator = np.random.default_rng(0)
     for step in (0.0, 1.0, 10.0):
         vector = step * generator.standard_normal(model.size)
-        design = model.design(vector, RayBudget(count))
+        design = model.design(vector, RayAllowance(count))
         checks = check_design(design_document(design), rules, AISLE)
         assert not [check for check in checks if not check.satisfied]
         once = model.projected(vector)

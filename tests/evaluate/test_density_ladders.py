@@ -180,7 +180,7 @@ class TestVisibilitySweep:
             patch.setattr(visibility, "TABLE_PROBES", 1024)
             for kind in (Box, Mesh):
                 few = [hidden_wall(place, kind) for place in places]
-                made[kind] = visibility.Case.of(few, SPACE, SETTINGS, seed=0, batch=64)
+                made[kind] = visibility.VisibilityCase.of(few, SPACE, SETTINGS, seed=0, batch=64)
         return made
 
     @pytest.mark.parametrize("kind", [Box, Mesh])
@@ -208,8 +208,8 @@ class TestVisibilitySweep:
         monkeypatch.setattr(visibility, "PROBES", 512)
         wall, _ = hidden_wall((1.5, 0, 0)).bodies
         screen = Body(Box((0.01, 5.0, 5.0)), "screen", "occluder", rigid(translation_m=(1.0, 0, 0)))
-        assert visibility.Case.of([Scene((wall, screen))], SPACE, SETTINGS, 0).is_blind
-        assert not visibility.Case.of([hidden_wall((1.5, 0, 0))], SPACE, SETTINGS, 0).is_blind
+        assert visibility.VisibilityCase.of([Scene((wall, screen))], SPACE, SETTINGS, 0).is_blind
+        assert not visibility.VisibilityCase.of([hidden_wall((1.5, 0, 0))], SPACE, SETTINGS, 0).is_blind
 
     def test_bodies_one_by_one_are_measured_on_few_scenes(self):
         every = [hidden_wall((1.5, 0, 0)) for _ in range(100)]
@@ -282,7 +282,7 @@ class TestFieldSweeps:
             patch.setattr(fields, "PROBES", 4096)
             patch.setattr(fields, "COLUMNS", 2)
             settings = DensitySettings(sigma_m=0.02, field_resolution=24)
-            return fields.Case.of(balls(3), SPACE, settings, 0, "raycast")
+            return fields.FieldCase.of(balls(3), SPACE, settings, 0, "raycast")
 
     def test_errors_fall_with_resolution(self, case, monkeypatch):
         monkeypatch.setattr(fields, "RESOLUTIONS", (12, 24, 48))
@@ -314,7 +314,7 @@ class TestFieldSweeps:
         monkeypatch.setattr(fields, "RESOLUTIONS", (12, 48))
         poses = np.stack([rigid(translation_m=(2.0, y, 0)) for y in (-0.1, 0.0, 0.1)])
         scene = Scene((Body(ball_mesh(0.3), poses=poses),))
-        case = fields.Case.of([scene], SPACE, DensitySettings(sigma_m=0.02, field_resolution=48), 0, "off")
+        case = fields.FieldCase.of([scene], SPACE, DensitySettings(sigma_m=0.02, field_resolution=48), 0, "off")
         sweep = fields.resolution_sweep(case)
         assert sweep.measurements[0].error > sweep.measurements[1].error
         assert sweep.measurements[1].memory_bytes == case.target.surfaces.field.bodies.grids.values.nbytes

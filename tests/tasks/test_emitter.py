@@ -19,7 +19,7 @@ from lidardesign.density.target.target import build_target
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.evaluate.metrics import is_heard, is_visible, trial_origins
+from lidardesign.evaluate.metrics import is_received, is_visible, trial_origins
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome, Rays
 from lidardesign.geometry.receiver import in_view, path_of_range, path_windows, range_of_path
@@ -170,7 +170,7 @@ def test_what_one_place_lights_and_another_hears_can_be_lit_there_and_heard_here
 def test_the_same_share_of_an_even_source_arrives_with_emitter_and_receiver_swapped(two_ways):
     """Of an even source a patch gets cosine / distance^2, so gain * cosine / distance^2 is mutual (Helmholtz)."""
     scenes, points = two_ways
-    points = points[is_heard(SceneCaster(scenes[0]), scenes[0].receiver, points)]
+    points = points[is_received(SceneCaster(scenes[0]), scenes[0].receiver, points)]
     arriving = []
     for scene, place in zip(scenes, PLACES, strict=True):
         rays = rays_from(place, points)
@@ -192,7 +192,7 @@ def test_what_the_receiver_cannot_see_is_not_detected():
     (free,) = simulate(replace(scene, receiver=None), rays)
     heard = heard_rays(scene, rays)
     seen = np.zeros(len(rays), dtype=bool)
-    seen[free.returned] = is_heard(SceneCaster(scene), scene.receiver, free.points_m)
+    seen[free.returned] = is_received(SceneCaster(scene), scene.receiver, free.points_m)
     assert 0.1 < seen.mean() < 0.9
     agree = heard.returned == seen
     assert agree.mean() > 0.995
@@ -227,7 +227,7 @@ def test_detours_are_bounded_by_all_returns_of_which_nothing_else_is_heard():
     targets = np.random.default_rng(16).uniform((-0.1, -0.1, -0.1), (0.0, 0.1, 0.1), (3000, 3))
     rays = rays_from(np.array([0.4, 0.15, 0.0]), targets)
     (free,) = simulate(replace(room, receiver=None), rays)
-    hidden = ~is_heard(SceneCaster(room), room.receiver, free.points_m)
+    hidden = ~is_received(SceneCaster(room), room.receiver, free.points_m)
     sight = FirstHits.of(room, 0, detector, [rays], SceneCaster(room))
     np.testing.assert_array_equal(_hidden(sight, np.flatnonzero(sight.returned)), hidden)
     # from inside a room every point sees its walls; of a few of the points 5 % more or less are hidden
@@ -279,7 +279,7 @@ def test_the_truth_is_seen_by_the_receiver_and_lit_from_the_emitter_box(heads):
     for scene in scenes:
         points, caster = scene.truth["surface"].points, SceneCaster(scene)
         assert in_view(config.receiver, points).all()
-        assert is_heard(caster, config.receiver, points).all()
+        assert is_received(caster, config.receiver, points).all()
         origins = trial_origins(space, np.random.default_rng(11))
         assert is_visible(caster, space, origins, points).mean() > 0.99
 

@@ -209,7 +209,7 @@ DEFAULT_ORDER = "trilinear"
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class FieldCase:
     """A few scenes of meshes, and what their fields are compared by.
 
     Arguments:
@@ -235,7 +235,7 @@ class Case:
     @classmethod
     def of(
         cls, scenes: list[Scene], space: DesignSpace, settings: DensitySettings, seed: int, visibility: str
-    ) -> Case | None:
+    ) -> FieldCase | None:
         """A case of training scenes; None where no probe reaches a surface."""
         few = few_columns(scenes, COLUMNS)
         frames = np.array([few[index].frames for index, _ in scene_columns(few)], dtype=np.float64)
@@ -275,14 +275,14 @@ def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     if not any(isinstance(body.shape, Mesh) for scene in scenes for body in scene.bodies if body.is_target):
         return []
     visibility = run_visibility(request) or config.density.visibility
-    case = Case.of(scenes, config.space, config.density, config.seed, visibility)
+    case = FieldCase.of(scenes, config.space, config.density, config.seed, visibility)
     if case is None:
         return []
     found = [resolution_sweep(case)]
     return [*found, interpolation_sweep(case)] if isinstance(case.target.surfaces.field, TableField) else found
 
 
-def resolution_sweep(case: Case) -> Sweep:
+def resolution_sweep(case: FieldCase) -> Sweep:
     """Grid points along the longest side of a field, against exact distances."""
     measurements, left_out = _resolution_measurements(case)
     return Sweep(
@@ -298,7 +298,7 @@ def resolution_sweep(case: Case) -> Sweep:
     )
 
 
-def _resolution_measurements(case: Case) -> tuple[list[Measurement], str]:
+def _resolution_measurements(case: FieldCase) -> tuple[list[Measurement], str]:
     """The measurements that do not take too long beyond the run's own, and what the first one that would is called."""
     measurements: list[Measurement] = []
     for count in sorted({*RESOLUTIONS, case.settings.field_resolution}):
@@ -308,12 +308,12 @@ def _resolution_measurements(case: Case) -> tuple[list[Measurement], str]:
     return measurements, ""
 
 
-def _predicted_s(case: Case, last: Measurement, resolution: int) -> float:
+def _predicted_s(case: FieldCase, last: Measurement, resolution: int) -> float:
     """What building the fields at a resolution will take, growing like their volume [s]."""
     return last.seconds * (resolution / int(last.setting)) ** 3 * len(case.few)
 
 
-def _resolution_measure(case: Case, resolution: int) -> Measurement:
+def _resolution_measure(case: FieldCase, resolution: int) -> Measurement:
     started = time.perf_counter()
     field = fresh(case.few, case.scenes, resolution, case.settings)
     seconds = (time.perf_counter() - started) / len(case.few)
@@ -322,7 +322,7 @@ def _resolution_measure(case: Case, resolution: int) -> Measurement:
     return Measurement(str(resolution), error, uncertainty, seconds, _bytes(field, case), default, values=values)
 
 
-def _bytes(field: Field, case: Case) -> int:
+def _bytes(field: Field, case: FieldCase) -> int:
     """The memory of the fields of all scenes; moving meshes have one each, however many scenes they are in."""
     if isinstance(field, TableField):
         return field.table.nbytes // field.columns * len(scene_columns(case.scenes))
@@ -335,7 +335,7 @@ def _meshes(scenes: list[Scene]) -> int:
     return len({shape.content_hash for shape in shapes if isinstance(shape, Mesh)})
 
 
-def interpolation_sweep(case: Case) -> Sweep:
+def interpolation_sweep(case: FieldCase) -> Sweep:
     """How distances between grid points are found, at the run's own resolution."""
     table, points = case.target.surfaces.field, case.observed[:TIMED_POINTS]
     exact = ExactField(case.few, lambda body: body.is_target)
@@ -359,7 +359,7 @@ def interpolation_sweep(case: Case) -> Sweep:
     )
 
 
-def _way_measure(case: Case, name: str, field: Field, points: np.ndarray) -> Measurement:
+def _way_measure(case: FieldCase, name: str, field: Field, points: np.ndarray) -> Measurement:
     _, seconds, memory = timed(lambda: field.distances(points))
     error, uncertainty, values = case.errors(field)
     return Measurement(name, error, uncertainty, seconds, memory, name == DEFAULT_ORDER, values=values)
@@ -374,7 +374,7 @@ def fresh(few: list[Scene], scenes: list[Scene], resolution: int, settings: Dens
     return fresh_bodies(few, resolution, padding_m)
 
 
-def _part(case: Case, note: str) -> str:
+def _part(case: FieldCase, note: str) -> str:
     return f"measured on {len(case.few)} of {len(case.scenes)} training scenes; {note}"
 
 
@@ -411,7 +411,7 @@ def fields_within(scenes: list[Scene], config: RunConfig, tolerance: float, *, f
     if not any(isinstance(body.shape, Mesh) for scene in scenes for body in scene.bodies if body.is_target):
         return FieldChoice(density, 0.0)
     visibility = "off" if density.visibility == "off" else "raycast"
-    case = Case.of(scenes, config.space, density, config.seed, visibility)
+    case = FieldCase.of(scenes, config.space, density, config.seed, visibility)
     if case is None:
         return FieldChoice(density, 0.0)
     misplaced = 0.0

@@ -44,8 +44,8 @@ def _pair(evaluation: Evaluation) -> tuple[Row, Row] | None:
 def _sweep(differences: np.ndarray, design: Row, request: AccuracyRequest) -> Sweep:
     metric, total = request.evaluation.metric, len(differences)
     # of all rows in all scenes [s]; rows that fire the same rays have one time, to the last bit
-    taken = {row.seconds for row in (*request.evaluation.rows, *request.evaluation.equal_bandwidth)}
-    seconds = (request.evaluation.planning_seconds + sum(taken)) / total
+    row_seconds = {row.seconds for row in (*request.evaluation.rows, *request.evaluation.equal_bandwidth)}
+    seconds = (request.evaluation.planning_seconds + sum(row_seconds)) / total
     counts = [count for count in COUNTS if count < total]
     measurements = [_measure(differences, count, seconds, request.request.seed) for count in (*counts, total)]
     return Sweep(

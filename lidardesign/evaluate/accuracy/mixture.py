@@ -105,7 +105,7 @@ def _command_seconds(run: Path, design: DesignSpec) -> float | None:
     options += ["--level", str(design.level)]
     options += [] if design.rays is None else ["--rays", str(design.rays)]
     options += [option for name, value in design.at.items() for option in ("--at", f"{name}={value}")]
-    taken = []
+    times = []
     with tempfile.TemporaryDirectory() as folder:
         for path in needed:
             shutil.copy(path, folder)
@@ -114,8 +114,8 @@ def _command_seconds(run: Path, design: DesignSpec) -> float | None:
             started = time.perf_counter()
             if subprocess.run(command, check=False, capture_output=True).returncode:
                 return None
-            taken.append(time.perf_counter() - started)
-    return min(taken)
+            times.append(time.perf_counter() - started)
+    return min(times)
 
 
 def _samples(request: AccuracyRequest, design: DesignSpec) -> Samples | None:

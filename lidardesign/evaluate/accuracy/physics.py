@@ -104,13 +104,13 @@ def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     note += "" if several else ", so that differences between scenes are not known"
     if planner.detector is not own:
         note += f", measured by {STAND_IN}: the detector of this evaluation, {own.name}, asks for nothing"
-        if not _heard(positions, request.request.test[0], planner.detector):
+        if not _covers_gates(positions, request.request.test[0], planner.detector):
             return []
     found = [_footprint(bench, note, own)] if planner.detector.divergence_rad > 0 else []
     return [*found, *_effects(bench, note, own)]
 
 
-def _heard(positions: Positions, scene: Scene, detector: Detector) -> bool:
+def _covers_gates(positions: Positions, scene: Scene, detector: Detector) -> bool:
     """Whether a detector's histogram covers the gates of all rays."""
     try:
         for rays in positions:
@@ -271,8 +271,8 @@ def _effect_measurements(bench: Bench, there: Sequence[str], *, marks: bool) -> 
     measurements = [_measure(name, found[name], full, changes.get(name, {})) for name in settings if name != "all"]
     measurements.sort(key=lambda measurement: -measurement.error)
     measurements.append(replace(_measure("all", full, full, {}), reference=True))
-    taken = next(name for name, choice in settings.items() if choice == planned)
-    return [replace(measurement, default=marks and measurement.setting == taken) for measurement in measurements]
+    planned_name = next(name for name, choice in settings.items() if choice == planned)
+    return [replace(measurement, default=marks and measurement.setting == planned_name) for measurement in measurements]
 
 
 def _measure(setting: str, found: _Pass, full: _Pass, changes: Mapping[str, tuple[float, float]]) -> Measurement:

@@ -130,8 +130,8 @@ class Sweep:
             return f"{chosen.setting}, the setting of this run, is the one to choose"
         ratio = default.seconds / max(chosen.seconds, TINY)
         if default.error + default.uncertainty > self.tolerance:
-            told = "is needed" if chosen.seconds > default.seconds else "is good enough"
-            return f"{chosen.setting} {told}: {default.setting}, as this run has it, may be outside the tolerance"
+            verdict = "is needed" if chosen.seconds > default.seconds else "is good enough"
+            return f"{chosen.setting} {verdict}: {default.setting}, as this run has it, may be outside the tolerance"
         if ratio <= SAME_COST:
             return f"{chosen.setting} costs the same as {default.setting}, the setting of this run, and errs less"
         return f"{chosen.setting} suffices, {ratio:.2g} times cheaper than {default.setting}, the setting of this run"
@@ -192,12 +192,12 @@ def timed(call: Callable[[], Value]) -> tuple[Value, float, int | None]:
     first = time.perf_counter() - started
     if first > 10 * TIMED_SECONDS:
         return value, first, memory
-    taken: list[float] = []
-    while len(taken) < MOST_REPEATS and sum(taken) < TIMED_SECONDS:
+    times: list[float] = []
+    while len(times) < MOST_REPEATS and sum(times) < TIMED_SECONDS:
         started = time.perf_counter()
         call()
-        taken.append(time.perf_counter() - started)
-    return value, float(np.median(taken)), memory
+        times.append(time.perf_counter() - started)
+    return value, float(np.median(times)), memory
 
 
 def with_memory(call: Callable[[], Value]) -> tuple[Value, int | None]:

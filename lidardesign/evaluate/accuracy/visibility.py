@@ -91,7 +91,7 @@ WARM_UP_PROBES = 32
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class VisibilityCase:
     """Scenes and what visibility is measured on there.
 
     Arguments:
@@ -114,7 +114,7 @@ class Case:
     @classmethod
     def of(
         cls, scenes: list[Scene], space: DesignSpace, settings: DensitySettings, seed: int, batch: int = 1024
-    ) -> Case:
+    ) -> VisibilityCase:
         """The targets of scenes, and probes.
 
         Arguments:
@@ -163,7 +163,7 @@ def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     """Ways against opaque geometry, and points of the quadrature against many; empty where no ray sees a target."""
     scenes, config = list(request.request.train), request.config
     few = affordable_scenes(scenes)
-    case = Case.of(few, config.space, config.density, config.seed, config.learning.batch)
+    case = VisibilityCase.of(few, config.space, config.density, config.seed, config.learning.batch)
     if case.is_blind:
         return []
     default, points = _own_setting(request)
@@ -175,7 +175,7 @@ def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
     ]
 
 
-def visibility_sweep(case: Case, points: int, default: str) -> Sweep:
+def visibility_sweep(case: VisibilityCase, points: int, default: str) -> Sweep:
     """No visibility, the quadrature with its own points, and ray casting.
 
     Arguments:
@@ -201,7 +201,7 @@ def visibility_sweep(case: Case, points: int, default: str) -> Sweep:
     )
 
 
-def points_sweep(case: Case, default: int | None) -> Sweep:
+def points_sweep(case: VisibilityCase, default: int | None) -> Sweep:
     """Midpoints of the quadrature against many of them; `default` is what the run uses, None without quadrature."""
     probes = case.probes.first(case.few).points
     exact = case.quadrature(REFERENCE_POINTS).log_density(probes)

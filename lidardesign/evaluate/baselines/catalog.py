@@ -170,8 +170,8 @@ class PosedPart:
             return list(range(len(self.places_m)))
         everything = np.ones(len(self._points))
         first = [self._fit(place, 1, everything)[0] for place in range(len(self.places_m))]
-        worth = [self._worth(self._density(pose, everything)) for pose in first]
-        return sorted(np.argsort(-np.array(worth), kind="stable")[:CLOSER_PLACES].tolist())
+        likelihood = [self._log_likelihood(self._density(pose, everything)) for pose in first]
+        return sorted(np.argsort(-np.array(likelihood), kind="stable")[:CLOSER_PLACES].tolist())
 
     def _at(self, place: int, number: int) -> list[Pose]:
         one = self._fitted(place, 1)
@@ -200,7 +200,7 @@ class PosedPart:
         inside[inside] = in_part_view(self.part, (offset[inside] / range_m[inside, None]) @ pose.frame.T)
         return np.where(inside, visible, 0.0) / np.where(inside, np.square(range_m), 1.0)
 
-    def _worth(self, density: np.ndarray) -> float:
+    def _log_likelihood(self, density: np.ndarray) -> float:
         """Mean log density over the scene points [nats]; the clutter is that of the middle of the design space."""
         middle = (self.scene.space.low[RANGE] + self.scene.space.high[RANGE]) / 2
         return float(np.log((1 - CLUTTER) * density + CLUTTER / middle**2).mean())
@@ -210,8 +210,8 @@ class PosedPart:
         total = np.zeros(proposals.density.shape[1])
         for count in range(1, number + 1):
             # a part counts once it is there: the shares of the first ones are not those of the last
-            worth = [self._worth((total + one) / count) for one in proposals.density]
-            taken.append(int(np.argmax(worth)))
+            likelihood = [self._log_likelihood((total + one) / count) for one in proposals.density]
+            taken.append(int(np.argmax(likelihood)))
             total = total + proposals.density[taken[-1]]
         # the same poses; parts that have one in common fire between each other's rays
         poses = [proposals.poses[index] for index in taken]

@@ -98,14 +98,14 @@ class AimedPoints:
         self._grid, self._seed, self._number = grid, seed, number
         self._blocks: list[tuple[np.ndarray, np.ndarray]] = []
 
-    def first(self, worth: int) -> tuple[np.ndarray, np.ndarray]:
+    def first(self, effective_samples: int) -> tuple[np.ndarray, np.ndarray]:
         """The first points (N, 6) worth so many of equal weight, and their weights (N,); fewer where there are not.
 
         How many were asked for before changes nothing.
         """
         chosen: list[tuple[np.ndarray, np.ndarray]] = []
         total = squares = 0.0
-        while len(chosen) < 128 and total**2 < worth * max(squares, TINY):
+        while len(chosen) < 128 and total**2 < effective_samples * max(squares, TINY):
             if len(chosen) == HOPELESS_BLOCKS and total == 0.0:
                 break
             if len(chosen) == len(self._blocks):
@@ -146,9 +146,9 @@ def occupancy(space: DesignSpace, train: Sequence[Scene], seed: int) -> Baseline
     def place(count: int, spot: Spot) -> np.ndarray:
         aimed = known.setdefault(spot.number, AimedPoints(grid, spot.space, seed, 1 + spot.number))
         generator = random_generator(seed, "occupancy baseline", count, spot.scene, spot.number)
-        found, worth = aimed.first(POINTS_PER_RAY * count)
+        found, weights = aimed.first(POINTS_PER_RAY * count)
         if not len(found):
             return spot.space.sample(count, generator)
-        return found[generator.choice(len(found), count, p=worth / worth.sum())]
+        return found[generator.choice(len(found), count, p=weights / weights.sum())]
 
     return BaselineLayout("occupancy", place, opened_gate(float(nearest), float(furthest)), drawn_anew=True)

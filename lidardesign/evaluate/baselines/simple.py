@@ -146,7 +146,7 @@ class Baselines:
         space: The design space.
         train: Training scenes.
         seed: Root of the baselines that are drawn.
-        judge: What lists of rays are worth on training scenes, lower is better; None counts missing returns.
+        judge: What lists of rays score on training scenes, lower is better; None counts missing returns.
         conditions: The condition values that rays are laid out at.
         without_visibility: Makes the layout that stands for `no-visibility`; called when that is asked for.
         density: What a run has learned, or None where it has no samples; called when a baseline looks there.
@@ -171,7 +171,7 @@ class Baselines:
         self.without_visibility, self.density, self.optimised = without_visibility, density, optimised
         self._judge = judge or self.views.missing_returns
         self._candidates: dict[str, list[Candidate]] = {}
-        self._worth: dict[tuple[str, str, int], float] = {}
+        self._scores: dict[tuple[str, str, int], float] = {}
 
     @cached_property
     def scene_points(self) -> ScenePoints:
@@ -207,7 +207,7 @@ class Baselines:
 
     @phase("baselines")
     def best(self, choices: Sequence[tuple[str, list[Option]]]) -> list[Option]:
-        """Of each baseline's options the one that is worth most on training scenes, the first of equals.
+        """Of each baseline's options the one that scores best on training scenes, the first of equals.
 
         All that still have to be judged are judged together.
         """
@@ -215,12 +215,12 @@ class Baselines:
             key: option.positions
             for name, options in choices
             for key, option in _keyed(name, options)
-            if len(options) > 1 and key not in self._worth
+            if len(options) > 1 and key not in self._scores
         }
         if unknown:
-            self._worth.update(zip(unknown, self._judge(list(unknown.values())), strict=True))
+            self._scores.update(zip(unknown, self._judge(list(unknown.values())), strict=True))
         return [
-            min(_keyed(name, options), key=lambda one: self._worth.get(one[0], 0.0))[1] for name, options in choices
+            min(_keyed(name, options), key=lambda one: self._scores.get(one[0], 0.0))[1] for name, options in choices
         ]
 
 

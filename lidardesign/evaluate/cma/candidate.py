@@ -22,7 +22,7 @@ from lidardesign.design.files import design_document
 from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import MOST_RAYS, DesignSpec
 from lidardesign.evaluate.baselines.candidates import Positions, TrainingViews, dense_points, opened_gate, whole_range
-from lidardesign.evaluate.cma.model import DesignModel, RayBudget, Way
+from lidardesign.evaluate.cma.model import DesignModel, RayAllowance, Way
 from lidardesign.evaluate.cma.parameters import SearchRules
 from lidardesign.evaluate.cma.search import Budget, Progress, Search, SearchResult, TrainingObjective
 from lidardesign.evaluate.cma.starts import scan_starts, starts
@@ -140,22 +140,22 @@ class CmaCandidate:
 
     def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
         """See `lidardesign.evaluate.baselines.candidates.Candidate`."""
-        return self._searched((count, None), RayBudget(count))
+        return self._searched((count, None), RayAllowance(count))
 
     def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
         """See `lidardesign.evaluate.baselines.candidates.Candidate`: the number of rays is part of what is searched."""
-        return self._searched((None, limit_mbps), RayBudget(None, limit_mbps, bandwidth))
+        return self._searched((None, limit_mbps), RayAllowance(None, limit_mbps, bandwidth))
 
     @phase("cma")
-    def _searched(self, key: tuple[int | None, float | None], rays: RayBudget) -> Positions:
+    def _searched(self, key: tuple[int | None, float | None], rays: RayAllowance) -> Positions:
         if key not in self._known:
             budget = self.settings.budget
             began = budget.clock()
             models = self._models(rays)
             generator = random_generator(self.seed, "cma", str(key))
             label = f"cma, {rays.count} rays" if rays.count else f"cma, {rays.limit_mbps:.3g} Mbit/s"
-            told = self.settings.show
-            show = None if told is None else (lambda progress: told(label, progress))
+            show_search = self.settings.show
+            show = None if show_search is None else (lambda progress: show_search(label, progress))
             found = Search(models, rays, self.objective, budget, generator, show, began).run()
             if not self._varies_gates(rays):
                 found = self._cropped(found, rays)
@@ -166,14 +166,14 @@ class CmaCandidate:
         """How these rays were found."""
         return next((record for known, record in self._known.values() if known is positions), None)
 
-    def _varies_gates(self, rays: RayBudget) -> bool:
+    def _varies_gates(self, rays: RayAllowance) -> bool:
         """Whether a wider gate could be worse: where it costs, where it is bounded, or where light is counted."""
         one = self._constraints()
         bounded = one.gate != Gate() or any(other.gate != Gate() for other in one.each)
         ideal = self.objective.planner.detector == IDEAL
         return not ideal or bounded or rays.limit_mbps is not None or one.budget.bandwidth_mbps is not None
 
-    def _cropped(self, found: SearchResult, rays: RayBudget) -> SearchResult:
+    def _cropped(self, found: SearchResult, rays: RayAllowance) -> SearchResult:
         """The same rays with gates from the nearest to the furthest return that their sensor had."""
         positions = found.model.positions(found.vector, rays)
         sensor, range_m = self.objective.returned(positions, range(found.scenes))
@@ -185,7 +185,7 @@ class CmaCandidate:
         model = found.model.with_gates(found.vector, gates)
         return replace(found, model=model, vector=model.zero)
 
-    def _record(self, found: SearchResult, rays: RayBudget) -> SearchRecord:
+    def _record(self, found: SearchResult, rays: RayAllowance) -> SearchRecord:
         design = found.model.design(found.vector, rays)
         broken = []
         if design.rays:
@@ -196,7 +196,7 @@ class CmaCandidate:
     def _constraints(self) -> Constraints:
         return Constraints.from_mapping(self._document(), where=f"constraints of {self.followed.name}")
 
-    def _rules(self, rays: RayBudget) -> SearchRules:
+    def _rules(self, rays: RayAllowance) -> SearchRules:
         design = self.followed
         layout = design.layout if layout_of(design).follows_from_sensors else "grid"
         space = self.space
@@ -212,7 +212,7 @@ class CmaCandidate:
             document["budget"] = {key: value for key, value in document["budget"].items() if key != "rays"}
         return document
 
-    def _models(self, rays: RayBudget) -> list[DesignModel]:
+    def _models(self, rays: RayAllowance) -> list[DesignModel]:
         """Every start as a model whose vector 0 it is."""
         rules, views, document = self._rules(rays), self.views, self._document()
         if rules.space != views.space:
@@ -230,7 +230,7 @@ class CmaCandidate:
             count = self._scan_rays(rays)
         return [DesignModel(rules, start, self.conditions, document) for start in starts(rules, views, count)]
 
-    def _scan_rays(self, rays: RayBudget) -> int:
+    def _scan_rays(self, rays: RayAllowance) -> int:
         """The number of rays of a scan: as asked, or what a bandwidth pays for at the followed design's gates."""
         if rays.count is not None:
             return rays.count

@@ -53,7 +53,7 @@ class Way:
     places: np.ndarray
 
 
-class RayBudget:
+class RayAllowance:
     """How many rays a design fires: a number, or as many as a bandwidth pays for.
 
     Arguments:
@@ -222,7 +222,7 @@ class DesignModel:
         bounds = self._bounds if math.isinf(narrowed_m) else self._bounds.narrowed(narrowed_m)
         return replace(start, **changes).projected(self.rules, bounds)
 
-    def design(self, vector: np.ndarray, budget: RayBudget) -> DesignSpec:
+    def design(self, vector: np.ndarray, budget: RayAllowance) -> DesignSpec:
         """The design of a projected vector; its number of rays may be 0 where a bandwidth pays for none."""
         found = self.parameters(vector)
         count = self._count(found, budget)
@@ -244,7 +244,7 @@ class DesignModel:
             design = more
         return design
 
-    def positions(self, vector: np.ndarray, budget: RayBudget) -> Positions:
+    def positions(self, vector: np.ndarray, budget: RayAllowance) -> Positions:
         """The rays of that design at every condition value."""
         return self.laid_out(self.design(vector, budget))
 
@@ -275,7 +275,7 @@ class DesignModel:
         widths = np.diff(found.gate, axis=1)[:, 0]
         return widths if self.way is None else widths.reshape(len(self.way.places), -1).max(axis=0)
 
-    def _count(self, found: SensorParameters, budget: RayBudget) -> int:
+    def _count(self, found: SensorParameters, budget: RayAllowance) -> int:
         widths = self._widths(found)
         if self.rules.one_sensor_per_ray:
             return len(widths)

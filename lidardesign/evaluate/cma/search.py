@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.evaluate.baselines.candidates import Positions
-from lidardesign.evaluate.cma.model import DesignModel, RayBudget
+from lidardesign.evaluate.cma.model import DesignModel, RayAllowance
 from lidardesign.evaluate.scene_scores import score_lists
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.numerics import TINY
@@ -206,7 +206,7 @@ class Search:
     def __init__(
         self,
         starts: Sequence[DesignModel],
-        rays: RayBudget,
+        rays: RayAllowance,
         objective: TrainingObjective,
         budget: Budget,
         generator: np.random.Generator,

@@ -116,8 +116,8 @@ def field_picture(view: DensityView) -> Figure:
         bar.set_label(plane.unit.replace("2", "²"))
         bar.outline.set_visible(False)
         axes.spines[["top", "right"]].set_visible(False)
-    told = f"what the density observes, over {plain_label(view.scene)} (outlined: its bodies)"
-    figure.text(0.5, 1 - 0.5 * HEAD_INCHES / height, told, fontsize=SMALL_POINTS, color=SOFT, ha="center", va="center")
+    title = f"what the density observes, over {plain_label(view.scene)} (outlined: its bodies)"
+    figure.text(0.5, 1 - 0.5 * HEAD_INCHES / height, title, fontsize=SMALL_POINTS, color=SOFT, ha="center", va="center")
     return figure
 
 

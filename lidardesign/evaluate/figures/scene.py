@@ -242,7 +242,7 @@ def scene_picture(shown: SceneFigure) -> Figure:
     kinds = [int(kind) for one in designs for kind in np.unique(one.outcome[place, step])]
     _legend(figure, kinds, receiver=receiver is not None)
     figure.suptitle(
-        _told(shown, place, step) + "; cut open before the sensors" * cut, fontsize=SMALL_POINTS, color=SOFT
+        _caption(shown, place, step) + "; cut open before the sensors" * cut, fontsize=SMALL_POINTS, color=SOFT
     )
     return figure
 
@@ -315,8 +315,10 @@ def _draw_design(axes: Axes, one: DrawnDesign, place: int, step: int, image: Sha
     _draw_sensors(axes, one.placed[place].sensors, rays.origin_m[keep], view)
     returned = int((outcome == Outcome.RETURN).sum())
     drawn = "" if len(outcome) == one.fired else f" of {len(outcome)} of {one.fired} rays drawn"
-    told = drawn or f" of {one.fired} rays"
-    axes.set_title(f"{plain_label(one.design.name)}: {returned}{told} return", fontsize=SMALL_POINTS, color=INK, pad=2)
+    share = drawn or f" of {one.fired} rays"
+    axes.set_title(
+        f"{plain_label(one.design.name)}: {returned}{share} return", fontsize=SMALL_POINTS, color=INK, pad=2
+    )
 
 
 def _draw_lines(
@@ -383,13 +385,13 @@ def _legend(figure: Figure, kinds: Sequence[int], *, receiver: bool) -> None:
     figure.legend(handles, names, loc="outside lower center", **look)
 
 
-def _told(shown: SceneFigure, place: int, step: int) -> str:
+def _caption(shown: SceneFigure, place: int, step: int) -> str:
     """Which scene it is, when and where."""
-    told = f"held-out scene {plain_label(shown.scene.name)}"
+    caption = f"held-out scene {plain_label(shown.scene.name)}"
     if shown.scene.frames > 1:
-        told += f", frame {shown.frames[step] + 1} of {shown.scene.frames}"
+        caption += f", frame {shown.frames[step] + 1} of {shown.scene.frames}"
     at = shown.places[place] if shown.places else {}
     if at:
-        told += ", seen from " + ", ".join(f"{name}={value:g}" for name, value in at.items())
+        caption += ", seen from " + ", ".join(f"{name}={value:g}" for name, value in at.items())
     left_out = len(shown.designs) - MOST_DESIGNS
-    return f"{told}; {left_out} more designs are not drawn" if left_out > 0 else told
+    return f"{caption}; {left_out} more designs are not drawn" if left_out > 0 else caption

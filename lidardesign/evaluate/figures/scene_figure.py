@@ -166,8 +166,8 @@ def _outcomes(
             returns = next(measured)
             for step, frame in enumerate(frames):
                 outcome[place, step] = returns[frame].outcome
-                heard = returns[frame].returned
-                length_m[place, step][heard] = returns[frame].range_m[heard]
+                returned = returns[frame].returned
+                length_m[place, step][returned] = returns[frame].range_m[returned]
     return found
 
 

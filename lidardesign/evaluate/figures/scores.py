@@ -92,8 +92,8 @@ def _dress_curves(axes: Axes, evaluation: Evaluation, curves: list[Series], agai
     scenes = f"{evaluation.scenes} held-out scene{'s' if evaluation.scenes != 1 else ''}"
     axes.set_xlabel(across)
     axes.set_ylabel(plain_label(up, longest=40))
-    told = f"{evaluation.metric.better} is better; {scenes}, 95 % intervals"
-    axes.set_title(told, fontsize=SMALL_POINTS, loc="left", color=SOFT)
+    title = f"{evaluation.metric.better} is better; {scenes}, 95 % intervals"
+    axes.set_title(title, fontsize=SMALL_POINTS, loc="left", color=SOFT)
     places = [position(row, against) for row in rows]
     if logarithmic(places):
         axes.set_xscale("log")
@@ -108,7 +108,7 @@ def _dress_curves(axes: Axes, evaluation: Evaluation, curves: list[Series], agai
 
 def differences_picture(evaluation: Evaluation) -> Figure:
     """Every paired difference with its interval, a page wide: what the scenes can tell apart, and what they cannot."""
-    pairs, told = drawn_pairs(evaluation)
+    pairs, title = drawn_pairs(evaluation)
     figure = new_figure(PAGE_INCHES, MARGIN_INCHES + max(len(pairs), 2) * ROW_INCHES)
     axes = figure.add_subplot()
     for place, pair in enumerate(pairs):
@@ -124,7 +124,7 @@ def differences_picture(evaluation: Evaluation) -> Figure:
     metric = evaluation.metric
     axes.set_xlabel(plain_label(f"a - b: {metric.name} [{metric.unit}], {metric.better} is better", longest=90))
     plain_axes(axes, grid="x")
-    axes.set_title(told, fontsize=SMALL_POINTS, loc="left", color=SOFT)
+    axes.set_title(title, fontsize=SMALL_POINTS, loc="left", color=SOFT)
     from matplotlib.lines import Line2D
 
     handles = [
@@ -139,17 +139,17 @@ def drawn_pairs(evaluation: Evaluation) -> tuple[list[Paired], str]:
     """The pairs that a picture holds, by design, and a line that says which they are."""
     order = {name: place for place, name in enumerate(dict.fromkeys(row.design for row in evaluation.rows))}
     pairs = sorted(evaluation.paired, key=lambda pair: (order.get(pair.a, -1), order.get(pair.b, -1), pair.rays))
-    told = f"paired over {evaluation.scenes} held-out scenes, 95 % bootstrap intervals"
+    title = f"paired over {evaluation.scenes} held-out scenes, 95 % bootstrap intervals"
     if len(pairs) <= MOST_ROWS:
-        return pairs, told
+        return pairs, title
     most = {name: max(pair.rays for pair in pairs if pair.a == name) for name in {pair.a for pair in pairs}}
     pairs = [pair for pair in pairs if pair.rays == most[pair.a]]
-    told += "; at the most rays"
+    title += "; at the most rays"
     if len(pairs) <= MOST_ROWS:
-        return pairs, told
+        return pairs, title
     baselines = {row.design for row in evaluation.rows if row.baseline}
     pairs = [pair for pair in pairs if pair.b in baselines]
-    return pairs[:MOST_ROWS], f"{told}, against baselines" + (f"; the first {MOST_ROWS}" * (len(pairs) > MOST_ROWS))
+    return pairs[:MOST_ROWS], f"{title}, against baselines" + (f"; the first {MOST_ROWS}" * (len(pairs) > MOST_ROWS))
 
 
 def _pair_label(pair: Paired) -> str:
@@ -238,12 +238,12 @@ def constraints_picture(tightness: Mapping[str, Sequence[ConstraintSlack]]) -> F
         return None
     shown = dict(list(designs.items())[:MOST_DESIGNS])
     labels = list(dict.fromkeys(bound_label(row) for rows in shown.values() for row in rows))
-    told = "of the closest sensor; at 0 the design leans on the bound"
+    title = "of the closest sensor; at 0 the design leans on the bound"
     if len(labels) > MOST_ROWS:
-        told += f"; the first {MOST_ROWS} of {len(labels)} bounds"
+        title += f"; the first {MOST_ROWS} of {len(labels)} bounds"
         labels = labels[:MOST_ROWS]
     if len(designs) > len(shown):
-        told += f"; the first {len(shown)} of {len(designs)} designs"
+        title += f"; the first {len(shown)} of {len(designs)} designs"
     row_inches = max(BOUND_ROW_INCHES, len(shown) * DESIGN_INCHES)
     figure = new_figure(PAGE_INCHES, BOUND_MARGIN_INCHES + max(len(labels), 2) * row_inches)
     axes = figure.add_subplot()
@@ -255,7 +255,7 @@ def constraints_picture(tightness: Mapping[str, Sequence[ConstraintSlack]]) -> F
     axes.set_xlim(LEAST_ROOM, MOST_ROOM)
     axes.set_xlabel("room left [% of the bound]; negative: broken")
     plain_axes(axes, grid="both")
-    axes.set_title(told, fontsize=SMALL_POINTS, loc="left", color=SOFT)
+    axes.set_title(title, fontsize=SMALL_POINTS, loc="left", color=SOFT)
     figure.legend(*_room_legend(list(shown)), loc="outside lower center", ncols=4, frameon=False)
     return figure
 
@@ -357,8 +357,10 @@ def effects_picture(effects: Sequence[EffectSummary]) -> Figure | None:
     axes.set_ylim(len(effects) - 0.4, -0.6)
     axes.set_xlabel("most that it could change / tolerated together")
     plain_axes(axes, grid="both")
-    told = f"tolerated together (dashed): {MILLIMETRES * tolerance.range_m:.3g} mm, {tolerance.lost:.2g} of the returns"
-    axes.set_title(told, fontsize=SMALL_POINTS, loc="left", color=SOFT)
+    title = (
+        f"tolerated together (dashed): {MILLIMETRES * tolerance.range_m:.3g} mm, {tolerance.lost:.2g} of the returns"
+    )
+    axes.set_title(title, fontsize=SMALL_POINTS, loc="left", color=SOFT)
     figure.legend(*_effect_legend(), loc="outside lower center", ncols=3, frameon=False)
     return figure
 

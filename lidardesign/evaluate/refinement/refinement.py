@@ -32,7 +32,7 @@ from lidardesign.task import Task
 # So many rounds in a row without a gain end it.
 PATIENCE = 2
 # A wider interval costs bandwidth: ten percent more of it have to bring at least one percent of the score.
-WORTH_SHARE = 0.1
+SCORE_PER_BANDWIDTH = 0.1
 # Levels that are tried, and how far samples are spread in range, in the density's own sigma.
 LEVELS = (0.8, 0.9, 0.95, 0.98, 0.99, 0.999)
 SPREADS = (0.0, 2.0, 4.0)
@@ -192,16 +192,16 @@ class Refiner:
         Raises:
             InfeasibleError, ConfigError: The design that it starts with cannot be fitted.
         """
-        best = self._started(shape, np.zeros(len(self.attention.points_m)) if log_factors is None else log_factors)
+        best = self._start(shape, np.zeros(len(self.attention.points_m)) if log_factors is None else log_factors)
         step, idle, gains = 0.5, 0, None
         for number in range(1, rounds + 1):
             before = best
             if number == 1 and (len(best.trial.positions) == 1 and has_ray_gates(best.trial.result.design)):
                 shape = replace(best.shape, traced_gates=True)
-                best = self._tried(number, "gates by traced returns", best, shape=shape)
-            best = self._climbed(number, best, "range_spread_m" if number % 2 else "level")
+                best = self._try(number, "gates by traced returns", best, shape=shape)
+            best = self._best_interval(number, best, "range_spread_m" if number % 2 else "level")
             gains = self._gains(best) if gains is None or best is not before else gains
-            found = self._stepped(number, best, gains, step)
+            found = self._step_to_error(number, best, gains, step)
             idle = idle + 1 if found is before else 0
             if found is best:
                 step /= 2
@@ -215,14 +215,14 @@ class Refiner:
     def _reweighting(self, log_factors: np.ndarray) -> Reweighting | None:
         return self.attention.reweighting(log_factors) if np.any(log_factors) else None
 
-    def _started(self, shape: Shape, log_factors: np.ndarray) -> _State:
+    def _start(self, shape: Shape, log_factors: np.ndarray) -> _State:
         started = time.perf_counter()
         first = self.refit(self._reweighting(log_factors), shape)
         best = _State(first, self._score(first), log_factors, shape)
         self._note(Round(0, "start", self.sign * best.score, first.bandwidth_mbps, True, _since(started)))
         return best
 
-    def _climbed(self, number: int, best: _State, name: str) -> _State:
+    def _best_interval(self, number: int, best: _State, name: str) -> _State:
         """Wider intervals as long as they are worth it; narrower ones where the first wider one is not."""
         ladder = np.array(LEVELS if name == "level" else self.spreads)
         place = int(np.argmin(np.abs(ladder - getattr(best.shape, name))))
@@ -230,7 +230,7 @@ class Refiner:
             before = best
             while 0 <= place + direction < len(ladder):
                 value = float(ladder[place + direction])
-                found = self._tried(number, _words(name, value), best, shape=replace(best.shape, **{name: value}))
+                found = self._try(number, _words(name, value), best, shape=replace(best.shape, **{name: value}))
                 if found is best:
                     break
                 best, place = found, place + direction
@@ -246,19 +246,19 @@ class Refiner:
             seen.append((checked_residuals(self.task, scene, returns), returns))
         return self.attention.gains(seen)
 
-    def _stepped(self, number: int, best: _State, gains: dict[str, np.ndarray], step: float) -> _State:
+    def _step_to_error(self, number: int, best: _State, gains: dict[str, np.ndarray], step: float) -> _State:
         """The design after a step towards its error, where that is better; what was better last goes first."""
         for name in sorted(gains, key=lambda name: name != self._favoured):
             factors = self.attention.moved(best.log_factors, gains[name], step)
             if not np.any(factors - best.log_factors):
                 continue
-            found = self._tried(number, f"towards {name}, step {step:g}", best, log_factors=factors)
+            found = self._try(number, f"towards {name}, step {step:g}", best, log_factors=factors)
             if found is not best:
                 self._favoured = name
                 return found
         return best
 
-    def _tried(self, number: int, change: str, best: _State, **changed: Any) -> _State:
+    def _try(self, number: int, change: str, best: _State, **changed: Any) -> _State:
         """The better of a design and a changed one; more bandwidth has to be worth it."""
         started = time.perf_counter()
         wanted = replace(best, **changed)
@@ -273,7 +273,7 @@ class Refiner:
             return best
         found = replace(wanted, trial=trial, score=self._score(trial))
         more = trial.bandwidth_mbps / best.trial.bandwidth_mbps - 1 if wanted.shape != best.shape else 0.0
-        kept = found.score < best.score - WORTH_SHARE * max(more, 0.0) * abs(best.score)
+        kept = found.score < best.score - SCORE_PER_BANDWIDTH * max(more, 0.0) * abs(best.score)
         self._note(Round(number, change, self.sign * found.score, trial.bandwidth_mbps, kept, _since(started)))
         return found if kept else best
 

@@ -56,8 +56,8 @@ class Gating:
             rays: Its own rays.
             spread_m: Standard deviation by which the design's samples are spread in range [m]; returns are, too.
         """
-        heard = self._heard(rays, max(spread_m, self.sigma_m))
-        known = np.flatnonzero(np.bincount(heard.ray, minlength=len(rays)))
+        ranges = self._ranges(rays, max(spread_m, self.sigma_m))
+        known = np.flatnonzero(np.bincount(ranges.ray, minlength=len(rays)))
         if not len(known):
             return design
         place = np.full(len(rays), -1)
@@ -69,15 +69,15 @@ class Gating:
         model, limit = bandwidth_limit(constraints, len(rays))
         bins = model.bins(np.diff(rays.gate_m, axis=1)[:, 0])
         most = (int(bins.sum()) if limit is None else limit) - int(bins.sum() - bins[known].sum())
-        own = RayRanges(heard.range_m, heard.weights, place[heard.ray], len(known))
+        own = RayRanges(ranges.range_m, ranges.weights, place[ranges.ray], len(known))
         gates = rays.gate_m.copy()
         gates[known] = gates_within(own, bounds, EVERYTHING, model, most)
         too_wide = int(model.bins(gates[:, 1] - gates[:, 0])[known].sum()) > most
-        if too_wide or heard.held_by(gates) < heard.held_by(rays.gate_m):
+        if too_wide or ranges.held_by(gates) < ranges.held_by(rays.gate_m):
             return design
         return _with_gates(design, gates)
 
-    def _heard(self, rays: Rays, spread_m: float) -> RayRanges:
+    def _ranges(self, rays: Rays, spread_m: float) -> RayRanges:
         """The targets that rays meet with open gates, over all scenes and their frames."""
         low, high = self.space.low[RANGE], self.space.high[RANGE]
         gates = np.tile([low, high], (len(rays), 1))

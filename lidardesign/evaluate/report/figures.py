@@ -316,7 +316,7 @@ def _marks(panel: Panel) -> dict[str, Any]:
             "width": 0,
             "color": LINE,
         },
-        "customdata": [_told(mark, panel.sweep) for mark in marks],
+        "customdata": [_hover_text(mark, panel.sweep) for mark in marks],
         "hovertemplate": "%{customdata}<extra></extra>",
     }
 
@@ -344,7 +344,7 @@ def _settings(panel: Panel, name: str) -> list[dict[str, Any]]:
     ]
 
 
-def _told(mark: Mark, sweep: Sweep) -> str:
+def _hover_text(mark: Mark, sweep: Sweep) -> str:
     measurement, unit = mark.measurement, html.escape(sweep.unit)
     error = (
         "the reference"

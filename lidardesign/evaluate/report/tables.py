@@ -58,10 +58,10 @@ def summary_sentences(evaluation: Evaluation) -> list[str]:
     for name in dict.fromkeys(row.design for row in evaluation.rows if not row.baseline):
         most = max(row.rays for row in evaluation.rows if row.design == name)
         pairs = [p for p in evaluation.paired if p.a == name and p.rays == most and p.b in baselines]
-        told = ", ".join(_comparison(evaluation, pair, values[pair.b, most]) for pair in pairs)
+        comparisons = ", ".join(_comparison(evaluation, pair, values[pair.b, most]) for pair in pairs)
         sentences.append(
             f"{name} with {most} rays: {four_digits(values[name, most])} {metric.unit}"
-            + (f"; {told}." if told else ".")
+            + (f"; {comparisons}." if comparisons else ".")
         )
     return sentences
 
@@ -193,9 +193,9 @@ def table(
     body = "".join(_line(cells, word, words, first, text_columns) for cells, word, first in lines)
     title = html.escape(caption)
     named = f' role="region" aria-label="{title}"' if title else ""
-    told = f"<caption><span>{title}</span></caption>" if title else ""
+    heading = f"<caption><span>{title}</span></caption>" if title else ""
     return (
-        f'<div class="scroll" tabindex="0"{named}><table>{told}<thead><tr>{head}</tr></thead><tbody>{body}</tbody>'
+        f'<div class="scroll" tabindex="0"{named}><table>{heading}<thead><tr>{head}</tr></thead><tbody>{body}</tbody>'
         "</table></div>"
     )
 
