@@ -143,7 +143,6 @@ def test_folders_are_small_enough_to_overlook():
     assert not crowded
 
 
-@pytest.mark.xfail(reason="the rooms are tidied one by one")
 def test_a_public_class_name_stands_for_one_thing():
     homes = collections.defaultdict(list)
     for name, tree in package().items():
