@@ -243,7 +243,20 @@ def design_from_document(
     if isinstance(locate, Document):
         locate = locate.locate
     root = Node(document, (), locate or (lambda _path: where))
-    keys = _versioned(root).mapping(REQUIRED, OPTIONAL)
+    # The root, once it is known to be a design of a version that this program reads
+    if not isinstance(root.value, dict) or "sensors" not in root.value:
+        raise ConfigError(
+            "this is no design: it has no key `sensors`",
+            where=root.locate(()),
+            hint="docs/design-file.md shows a design written by hand",
+        )
+    version = root.value.get("schema_version", SCHEMA_VERSION)
+    if type(version) is not int or version < SCHEMA_VERSION:
+        raise root.child("schema_version").wrong(str(SCHEMA_VERSION))
+    if version > SCHEMA_VERSION:
+        hint = "use a newer version of lidardesign"
+        raise root.child("schema_version").error(f"is {version}", allowed=str(SCHEMA_VERSION), hint=hint)
+    keys = root.mapping(REQUIRED, OPTIONAL)
     level = keys["level"].number(*LEVELS) if "level" in keys else DEFAULT_LEVEL
     sensors = _sensors(keys["sensors"], level)
     rays = keys["rays"].integer(0, MOST_RAYS) if "rays" in keys else None
@@ -265,23 +278,6 @@ def design_from_document(
     )
 
 
-def _versioned(root: Node) -> Node:
-    """The root, once it is known to be a design of a version that this program reads."""
-    if not isinstance(root.value, dict) or "sensors" not in root.value:
-        raise ConfigError(
-            "this is no design: it has no key `sensors`",
-            where=root.locate(()),
-            hint="docs/design-file.md shows a design written by hand",
-        )
-    version = root.value.get("schema_version", SCHEMA_VERSION)
-    if type(version) is not int or version < SCHEMA_VERSION:
-        raise root.child("schema_version").wrong(str(SCHEMA_VERSION))
-    if version > SCHEMA_VERSION:
-        hint = "use a newer version of lidardesign"
-        raise root.child("schema_version").error(f"is {version}", allowed=str(SCHEMA_VERSION), hint=hint)
-    return root
-
-
 def _sensors(node: Node, level: float) -> tuple[Sensor, ...]:
     nodes = node.items()
     if not nodes:
@@ -292,11 +288,7 @@ def _sensors(node: Node, level: float) -> tuple[Sensor, ...]:
         if sensor.name in first:
             raise nodes[index].error(f"has the name of sensors[{first[sensor.name]}], {sensor.name!r}")
         first[sensor.name] = index
-    return _weighted(node, nodes, sensors)
-
-
-def _weighted(node: Node, nodes: list[Node], sensors: tuple[Sensor, ...]) -> tuple[Sensor, ...]:
-    """Sensors with shares that sum to 1: equal where no sensor has a weight, else in their proportion."""
+    # Sensors with shares that sum to 1: equal where no sensor has a weight, else in their proportion
     given = [item.value.get("weight") is not None for item in nodes]
     if not any(given):
         return tuple(replace(sensor, weight=1 / len(sensors)) for sensor in sensors)
@@ -315,7 +307,21 @@ def _sensor(node: Node, index: int, level: float) -> Sensor:
     keys = node.mapping(SENSOR_REQUIRED, SENSOR_OPTIONAL)
     mean, covariance = _origin(keys["origin_m"])
     boresight = keys["boresight"].mapping(("azimuth_rad", "elevation_rad"), ("roll_rad",))
-    horizontal, vertical = _angular_spreads(node, keys, level)
+    spreads = keys["spread"].mapping((), ("horizontal_rad", "vertical_rad", "range_m")) if "spread" in keys else {}
+    fields = keys["field_of_view_rad"].mapping((), ("horizontal", "vertical")) if "field_of_view_rad" in keys else {}
+    full = 2 * interval_factor(level)
+    found = []
+    for axis in ("horizontal", "vertical"):
+        spread, field = spreads.get(f"{axis}_rad"), fields.get(axis)
+        if spread is not None:
+            found.append(spread.number(0))
+            if field is not None:
+                _agree(field, full * found[-1], "radians", level)
+        elif field is not None:
+            found.append(field.number(0, 2 * math.pi) / full)
+        else:
+            raise node.error(f"has neither field_of_view_rad.{axis} nor spread.{axis}_rad", hint="give one of them")
+    horizontal, vertical = found[0], found[1]
     range_m, spread_range = _range(node, keys, level)
     sensor = Sensor(
         name=keys["name"].text() if "name" in keys else f"sensor_{index + 1}",
@@ -391,32 +397,6 @@ def _origin(node: Node) -> tuple[np.ndarray, np.ndarray]:
     if np.linalg.eigvalsh(covariance).min() < -slack:
         raise keys["covariance"].error("has a negative eigenvalue", allowed="a covariance matrix [m^2]")
     return mean, covariance
-
-
-def _angular_spreads(node: Node, keys: dict[str, Node], level: float) -> tuple[float, float]:
-    spreads = (
-        keys["spread"].mapping((), ("horizontal_rad", "vertical_rad", "range_m")) if "spread" in keys else {}
-    )
-    fields = (
-        keys["field_of_view_rad"].mapping((), ("horizontal", "vertical"))
-        if "field_of_view_rad" in keys
-        else {}
-    )
-    full = 2 * interval_factor(level)
-    found = []
-    for axis in ("horizontal", "vertical"):
-        spread, field = spreads.get(f"{axis}_rad"), fields.get(axis)
-        if spread is not None:
-            found.append(spread.number(0))
-            if field is not None:
-                _agree(field, full * found[-1], "radians", level)
-        elif field is not None:
-            found.append(field.number(0, 2 * math.pi) / full)
-        else:
-            raise node.error(
-                f"has neither field_of_view_rad.{axis} nor spread.{axis}_rad", hint="give one of them"
-            )
-    return found[0], found[1]
 
 
 def _range(node: Node, keys: dict[str, Node], level: float) -> tuple[float, float]:

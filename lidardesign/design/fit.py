@@ -317,21 +317,16 @@ def _error_estimates(
     estimates = {"log_likelihood": log_likelihood, "ess": ess}
     if all(support.mass is not None for support in supports):
         widest = max(supports, key=lambda support: support.total)
-        estimates["admissible_mass"] = Estimate(widest.total, _mass_error(widest, samples))
+        # The standard error of the share m of the density inside the constraints, of weights that sum to 1 in all
+        inside = float(np.square(widest.weights).sum())
+        everything = float(np.square(samples.weights).sum())
+        mass = widest.total
+        estimates["admissible_mass"] = Estimate(
+            widest.total, math.sqrt((1 - mass) ** 2 * inside + mass**2 * max(everything - inside, 0.0))
+        )
     counts = [sensor.rays for sensor in sensors]
     if None not in counts:
         rays = np.array(counts, dtype=np.float64)
         wanted = rays.sum() * np.array([sensor.weight for sensor in sensors])
         estimates["rays"] = Estimate(float(rays.sum()), float(np.abs(rays - wanted).sum() / 2), "rays", ROUNDING)
     return estimates
-
-
-def _mass_error(support: Support, samples: Samples) -> float:
-    """The standard error of the share m of the density inside the constraints, of weights that sum to 1 in all.
-
-    sum over all samples of (w (inside - m))^2, by the sums of squares of the weights inside and outside.
-    """
-    inside = float(np.square(support.weights).sum())
-    everything = float(np.square(samples.weights).sum())
-    mass = support.total
-    return math.sqrt((1 - mass) ** 2 * inside + mass**2 * max(everything - inside, 0.0))

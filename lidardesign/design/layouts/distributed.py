@@ -33,7 +33,7 @@ import math
 import numpy as np
 from scipy.special import chdtri, ndtri
 
-from lidardesign.design.constraints.document import Constraints, SensorRules, rules_of
+from lidardesign.design.constraints.document import Constraints, rules_of
 from lidardesign.design.constraints.origins import box_around, free_boxes, inside_excluded, origin_box
 from lidardesign.design.layouts.fields import FIELD_ROUNDING_RAD, SMALLEST_ANGLE_RAD, SMALLEST_LENGTH
 from lidardesign.design.layouts.gates import SMALLEST_CELL, bounded_gates, central_intervals
@@ -208,7 +208,16 @@ class DistributedLayout(Layout):
             bounds = bounds_of(constraints.rules, space, (index,), interval_factor(spec.level))
             own, number = fired[index], int(own_count)
             if samples is None or number == 0 or len(np.unique(own[:, :RANGE], axis=0)) < number:
-                box = _own_box(sensor, rules_of(constraints.rules, index), space)
+                # Lowest and highest origins of a sensor's rays, outside the excluded boxes, shape (2, 3) [m]
+                one = rules_of(constraints.rules, index)
+                low, high = origin_box(one, space)
+                free = free_boxes(one, space)
+                if len(free.low_m):
+                    reach = interval_factor(sensor.level) * np.sqrt(np.diag(sensor.origin_covariance_m2))
+                    beside, beyond = box_around(np.asarray(sensor.origin_m), reach, free)
+                    low = np.clip(beside, low, high)
+                    high = np.clip(beyond, low, high)
+                box = np.stack([low, high])
                 parts.append(_gaussian_rays(sensor, number, bounds, box, space))
             else:
                 generator = random_generator(seed, "distributed layout", index)
@@ -232,18 +241,6 @@ def _space_of(design: DesignSpec) -> DesignSpace:
     return DesignSpace((*low, 0.0, -math.pi / 2, 0.0), (*high, FULL_TURN, math.pi / 2, farthest))
 
 
-def _own_box(sensor: Sensor, one: SensorRules, space: DesignSpace) -> np.ndarray:
-    """Lowest and highest origins of a sensor's rays, outside the excluded boxes, shape (2, 3) [m]."""
-    low, high = origin_box(one, space)
-    free = free_boxes(one, space)
-    if len(free.low_m):
-        reach = interval_factor(sensor.level) * np.sqrt(np.diag(sensor.origin_covariance_m2))
-        beside, beyond = box_around(np.asarray(sensor.origin_m), reach, free)
-        low = np.clip(beside, low, high)
-        high = np.clip(beyond, low, high)
-    return np.stack([low, high])
-
-
 def _sampled_rays(
     sensor: Sensor,
     count: int,
@@ -262,7 +259,17 @@ def _sampled_rays(
     part = Features.of(fired[chosen], weights, Axes.of(samples.space), samples.space)
     rays = part.points[_picked(part, samples.log_target[members[chosen]], count, generator)]
     looking = direction(rays[:, AZIMUTH], rays[:, ELEVATION])
-    return rays[:, :3], looking, _gates(part, rays[:, :3], looking, sensor, bounds)
+    # The central level of the scene points nearest to each ray, along it and inside bounds, (K, 2) [m]
+    origins = rays[:, :3]
+    scene = observed_point(part.points)
+    ray, _ = nearest_lines(scene, origins, looking)
+    along = ((scene - origins[ray]) * looking[ray]).sum(axis=1)
+    wanted, effective = central_intervals(along, part.weights, ray, len(origins), sensor.level)
+    gate = np.tile(sensor.gate_m, (len(origins), 1))
+    wanted = np.clip(wanted, *sensor.gate_m)
+    known = np.flatnonzero((effective >= SMALLEST_CELL) & (np.diff(wanted, axis=1)[:, 0] > 0))
+    gate[known] = bounded_gates(wanted[known], sensor, bounds.take(np.zeros(len(known), dtype=np.int64)))
+    return rays[:, :3], looking, gate
 
 
 def _picked(part: Features, log_target: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
@@ -308,19 +315,6 @@ def _best_near(labels: np.ndarray, away: np.ndarray, log_target: np.ndarray, sha
     near = rank < np.maximum(np.ceil(share * sizes[labels]), 1)
     ranked = np.lexsort((away, np.where(near, -log_target, np.inf), labels))
     return ranked[starts[sizes > 0]]
-
-
-def _gates(part: Features, origins: np.ndarray, looking: np.ndarray, sensor: Sensor, bounds: Bounds) -> np.ndarray:
-    """The central level of the scene points nearest to each ray, along it and inside bounds, (K, 2) [m]."""
-    scene = observed_point(part.points)
-    ray, _ = nearest_lines(scene, origins, looking)
-    along = ((scene - origins[ray]) * looking[ray]).sum(axis=1)
-    wanted, effective = central_intervals(along, part.weights, ray, len(origins), sensor.level)
-    gate = np.tile(sensor.gate_m, (len(origins), 1))
-    wanted = np.clip(wanted, *sensor.gate_m)
-    known = np.flatnonzero((effective >= SMALLEST_CELL) & (np.diff(wanted, axis=1)[:, 0] > 0))
-    gate[known] = bounded_gates(wanted[known], sensor, bounds.take(np.zeros(len(known), dtype=np.int64)))
-    return gate
 
 
 def _gaussian_rays(

@@ -42,24 +42,20 @@ class Nearest:
         if len(centres) == 1 or centres.shape != self._centres.shape:
             distance = self._search(centres)
         else:
-            distance = self._bounded(centres)
+            moved = np.sqrt(np.square(centres - self._centres).sum(axis=1))
+            farthest = int(moved.argmax())
+            others = np.full(len(centres), moved[farthest])
+            # the centre that moved farthest is not among its own others
+            others[farthest] = np.partition(moved, -2)[-2]
+            self._others -= others[self._labels]
+            distance = np.sqrt(np.square(self._points - centres[self._labels]).sum(axis=1))
+            doubtful = np.flatnonzero(distance + self._slack >= self._others)
+            if len(doubtful):
+                found, labels = cKDTree(centres).query(self._points[doubtful], k=2)
+                distance[doubtful], self._others[doubtful] = found.T
+                self._labels[doubtful] = labels[:, 0]
         self._centres = centres.copy()
         return distance, self._labels.copy()
-
-    def _bounded(self, centres: np.ndarray) -> np.ndarray:
-        moved = np.sqrt(np.square(centres - self._centres).sum(axis=1))
-        farthest = int(moved.argmax())
-        others = np.full(len(centres), moved[farthest])
-        # the centre that moved farthest is not among its own others
-        others[farthest] = np.partition(moved, -2)[-2]
-        self._others -= others[self._labels]
-        distance = np.sqrt(np.square(self._points - centres[self._labels]).sum(axis=1))
-        doubtful = np.flatnonzero(distance + self._slack >= self._others)
-        if len(doubtful):
-            found, labels = cKDTree(centres).query(self._points[doubtful], k=2)
-            distance[doubtful], self._others[doubtful] = found.T
-            self._labels[doubtful] = labels[:, 0]
-        return distance
 
     def _search(self, centres: np.ndarray) -> np.ndarray:
         found, labels = cKDTree(centres).query(self._points, k=min(2, len(centres)))

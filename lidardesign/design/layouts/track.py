@@ -37,7 +37,36 @@ def placed(design: DesignSpec, at: Mapping[str, float]) -> DesignSpec:
         ConfigError: A track without a value of its dimension, or one beyond its ends; a name that is no coordinate.
     """
     if design.track is not None:
-        return _on_track(design, design.track, at)
+        # The rays of a track at a position, as a scan with an explicit table
+        unknown = [name for name in at if name != design.track.dimension and at[name] != design.at.get(name)]
+        if unknown:
+            raise ConfigError(
+                f"the track of {design.name} does not follow {condition_text({unknown[0]: at[unknown[0]]})}",
+                where="--at",
+                allowed=design.track.dimension,
+            )
+        if design.track.dimension not in at:
+            first, last = travels(design.track)
+            raise ConfigError(
+                f"{design.name} has rays for every {design.track.dimension}: it needs to know where",
+                where="--at",
+                allowed=f"{design.track.dimension} from {first:g} to {last:g}",
+                hint=f"give --at {design.track.dimension}={(first + last) / 2:g}",
+            )
+        value = float(at[design.track.dimension])
+        azimuth, elevation, gate = interpolated(design.track, value)
+        move = {DIMENSIONS.index(design.track.dimension): value}
+        means = np.array([sensor.origin_m for sensor in design.sensors], dtype=np.float64)
+        table = Rays.from_angles(
+            _moved(means[design.track.sensor], move), azimuth, elevation, gate, design.track.sensor
+        )
+        sensors = tuple(
+            _turned(
+                sensor, design.track, value, np.flatnonzero(design.track.sensor == index), (azimuth, elevation, gate)
+            )
+            for index, sensor in enumerate(design.sensors)
+        )
+        return replace(design, sensors=sensors, ray_table=table, track=None, at={**design.at, **at})
     moves = _moves(design, at)
     table = design.ray_table
     if table is not None:
@@ -86,35 +115,6 @@ def boresight_azimuth(unrolled_rad: float) -> float:
 def travels(track: Track) -> tuple[float, float]:
     """The ends of a track [m]."""
     return float(track.knots[0]), float(track.knots[-1])
-
-
-def _on_track(design: DesignSpec, track: Track, at: Mapping[str, float]) -> DesignSpec:
-    """The rays of a track at a position, as a scan with an explicit table."""
-    unknown = [name for name in at if name != track.dimension and at[name] != design.at.get(name)]
-    if unknown:
-        raise ConfigError(
-            f"the track of {design.name} does not follow {condition_text({unknown[0]: at[unknown[0]]})}",
-            where="--at",
-            allowed=track.dimension,
-        )
-    if track.dimension not in at:
-        first, last = travels(track)
-        raise ConfigError(
-            f"{design.name} has rays for every {track.dimension}: it needs to know where",
-            where="--at",
-            allowed=f"{track.dimension} from {first:g} to {last:g}",
-            hint=f"give --at {track.dimension}={(first + last) / 2:g}",
-        )
-    value = float(at[track.dimension])
-    azimuth, elevation, gate = interpolated(track, value)
-    move = {DIMENSIONS.index(track.dimension): value}
-    means = np.array([sensor.origin_m for sensor in design.sensors], dtype=np.float64)
-    table = Rays.from_angles(_moved(means[track.sensor], move), azimuth, elevation, gate, track.sensor)
-    sensors = tuple(
-        _turned(sensor, track, value, np.flatnonzero(track.sensor == index), (azimuth, elevation, gate))
-        for index, sensor in enumerate(design.sensors)
-    )
-    return replace(design, sensors=sensors, ray_table=table, track=None, at={**design.at, **at})
 
 
 def _turned(

@@ -113,7 +113,9 @@ def aimed_rays(along: TrackSamples, count: int, generator: np.random.Generator) 
         pulls = weighted.weights / np.maximum(distance, max(nearest_m, ROUNDING))
         centres = _smoothed(along, surface, pulls, labels, centres, stiffness)
         labels, distance = _nearest(along, surface, centres)
-    order = _upwards(centres)
+    # Rays by where they look on average: an order that does not depend on the seeding
+    azimuth, elevation = angles(centres.mean(axis=0))
+    order = np.lexsort((azimuth, np.round(elevation, ORDER_DECIMALS)))
     return centres[:, order], np.argsort(order)[labels]
 
 
@@ -121,12 +123,6 @@ def _cost(along: TrackSamples, distance: np.ndarray, centres: np.ndarray, stiffn
     """What every sweep lowers: the weighted mean distance and the cost of bends [m]."""
     bends = np.square(np.diff(centres, n=2, axis=0)).sum()
     return float(along.weights @ distance) + stiffness / 2 * float(bends)
-
-
-def _upwards(centres: np.ndarray) -> np.ndarray:
-    """Rays by where they look on average: an order that does not depend on the seeding."""
-    azimuth, elevation = angles(centres.mean(axis=0))
-    return np.lexsort((azimuth, np.round(elevation, ORDER_DECIMALS)))
 
 
 def _started(along: TrackSamples, surface: np.ndarray, count: int, generator: np.random.Generator) -> np.ndarray:
@@ -218,12 +214,8 @@ def _smoothed(
     normal = matrix.reshape(count, knots, knots)
     # a ray that sees nothing anywhere stays where it was
     still = SMALLEST_STIFFNESS * stiffness
-    normal += stiffness * _bending(knots) + still * np.eye(knots)
+    # The quadratic form of summed squared second differences, shape (P, P)
+    second = np.diff(np.eye(knots), n=2, axis=0)
+    normal += stiffness * (second.T @ second) + still * np.eye(knots)
     wanted = np.stack(right, axis=-1).reshape(count, knots, 3) + still * centres.transpose(1, 0, 2)
     return np.linalg.solve(normal, wanted).transpose(1, 0, 2)
-
-
-def _bending(knots: int) -> np.ndarray:
-    """The quadratic form of summed squared second differences, shape (P, P)."""
-    second = np.diff(np.eye(knots), n=2, axis=0)
-    return second.T @ second
