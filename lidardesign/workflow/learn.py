@@ -243,6 +243,24 @@ def learning_advice(result: LearnResult) -> list[str]:
     return advice
 
 
+def result_document(result: LearnResult) -> dict[str, Any]:
+    """What `lidardesign learn --json` prints of a result."""
+    return {
+        "run": str(result.run),
+        "task": result.task,
+        "seconds": result.seconds,
+        "steps": result.steps,
+        "ess": result.ess,
+        "kl_nats": result.kl_nats,
+        "log_z": result.log_z,
+        "coverage": result.coverage,
+        "misplaced": result.misplaced,
+        "goal": result.goal,
+        "notes": list(result.notes),
+        "error_estimates": result.as_dict()["error_estimates"],
+    }
+
+
 def _time_of_twin(run: Path, settings: Mapping[str, Any]) -> EarlierRun | None:
     """How long learning took in another run in the same folder, whose configuration has the same sections."""
     for manifest in sorted(run.absolute().parent.glob(f"*/{MANIFEST}")):

@@ -70,7 +70,7 @@ def learn(
     """Learn where rays are worth firing for TASK, into a run folder."""
     with command(json=json, quiet=quiet, debug=debug) as output:
         with phase("libraries"):
-            from lidardesign.workflow.learn import LearnOptions, LearnRequest, learning_advice
+            from lidardesign.workflow.learn import LearnOptions, LearnRequest, learning_advice, result_document
             from lidardesign.workflow.learning_budget import check_met
 
         chosen = LearnOptions(
@@ -97,7 +97,7 @@ def learn(
         keep_times(request.folder, "learn", output, wait_s=WAIT_S)
         result = replace(result, notes=(*result.notes, *learning_advice(result)))
         further = [] if output.quiet else [note for note in result.notes if note not in task_notes]
-        output.result(_document(result), lambda rich: _show(result, further, rich))
+        output.result(result_document(result), lambda rich: _show(result, further, rich))
         check_met(result, request.goal)
 
 
@@ -126,23 +126,6 @@ def _progress(output: Output) -> Iterator[Callable[[LearnProgress], None]]:
             phase = now.phase
 
         yield show
-
-
-def _document(result: LearnResult) -> dict[str, Any]:
-    return {
-        "run": str(result.run),
-        "task": result.task,
-        "seconds": result.seconds,
-        "steps": result.steps,
-        "ess": result.ess,
-        "kl_nats": result.kl_nats,
-        "log_z": result.log_z,
-        "coverage": result.coverage,
-        "misplaced": result.misplaced,
-        "goal": result.goal,
-        "notes": list(result.notes),
-        "error_estimates": result.as_dict()["error_estimates"],
-    }
 
 
 def _show(result: LearnResult, notes: list[str], rich: RichConsole) -> None:
