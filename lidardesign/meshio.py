@@ -72,7 +72,12 @@ def turned_to_agree(faces: np.ndarray, areas: np.ndarray) -> tuple[np.ndarray, i
         faces: Vertex indices, shape (F, 3).
         areas: Of the faces, in any unit, shape (F,).
     """
-    first, second, agree = _neighbours(faces)
+    # Pairs of faces that alone share an edge, and whether they run along it in opposite directions, (P,) each
+    edge, upwards, count = _edges(faces)
+    order = np.argsort(edge, kind="stable")
+    starts = np.concatenate([[0], np.cumsum(count)[:-1]])[count == 2]
+    one, other = order[starts], order[starts + 1]
+    first, second, agree = one // 3, other // 3, upwards[one] != upwards[other]
     side = _sides(len(faces), first, second, agree)
     if side is None:
         return faces, 0
@@ -81,15 +86,6 @@ def turned_to_agree(faces: np.ndarray, areas: np.ndarray) -> tuple[np.ndarray, i
     share = np.bincount(part, weights=np.where(flipped, areas, -areas))
     turn = flipped ^ (share[part] > 0)
     return np.where(turn[:, None], faces[:, ::-1], faces), int(turn.sum())
-
-
-def _neighbours(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs of faces that alone share an edge, and whether they run along it in opposite directions, (P,) each."""
-    edge, upwards, count = _edges(faces)
-    order = np.argsort(edge, kind="stable")
-    starts = np.concatenate([[0], np.cumsum(count)[:-1]])[count == 2]
-    one, other = order[starts], order[starts + 1]
-    return one // 3, other // 3, upwards[one] != upwards[other]
 
 
 def _sides(
@@ -225,17 +221,13 @@ def list_mesh_files(folder: str | Path) -> list[Path]:
     if not folder.is_dir():
         raise DataError("is not a folder", where=str(folder), hint="name a folder that holds mesh files")
     entries = sorted(folder.iterdir())
-    files = [
-        p for p in entries if p.suffix.lower() in SUFFIXES and p.is_file() and not p.name.startswith(".")
-    ]
+    files = [p for p in entries if p.suffix.lower() in SUFFIXES and p.is_file() and not p.name.startswith(".")]
     if not files:
         raise DataError("holds no mesh file", where=str(folder), allowed=", ".join(SUFFIXES))
     return files
 
 
-def load_mesh(
-    path: str | Path, *, sign: Sign = "auto", scale: float = 1.0, painted: Painted | None = None
-) -> Mesh:
+def load_mesh(path: str | Path, *, sign: Sign = "auto", scale: float = 1.0, painted: Painted | None = None) -> Mesh:
     """A checked mesh from a file; all geometry in it becomes one mesh.
 
     Arguments:
@@ -250,9 +242,7 @@ def load_mesh(
     """
     path = Path(path)
     if not (np.isfinite(scale) and scale > 0):
-        raise DataError(
-            f"the scale {scale} is no factor to metres", where=str(path), allowed="a positive number"
-        )
+        raise DataError(f"the scale {scale} is no factor to metres", where=str(path), allowed="a positive number")
     vertices, faces, importance = _read(path, painted)
     with np.errstate(over="ignore", invalid="ignore"):  # what is too large is refused below
         vertices = vertices * scale
@@ -303,9 +293,7 @@ def check_mesh(
 
 def _refuse_unusable(vertices: np.ndarray, faces: np.ndarray, where: str) -> None:
     if vertices.size == 0 or faces.size == 0:
-        raise DataError(
-            "has no faces (an empty or unreadable mesh)", where=where, hint="open it in a mesh viewer"
-        )
+        raise DataError("has no faces (an empty or unreadable mesh)", where=where, hint="open it in a mesh viewer")
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         raise DataError(
             f"vertices and faces have shapes {vertices.shape} and {faces.shape}",
@@ -412,9 +400,7 @@ def _read(path: Path, painted: Painted | None) -> tuple[np.ndarray, np.ndarray, 
     try:
         data = path.read_bytes() if path.stat().st_size <= LARGEST_FILE_BYTES else None
     except OSError as error:
-        raise DataError(
-            f"cannot be read ({error.strerror or error})", where=where, hint="check the path"
-        ) from error
+        raise DataError(f"cannot be read ({error.strerror or error})", where=where, hint="check the path") from error
     if data is None:
         raise DataError("is larger than 2 GiB", where=where, hint="simplify the mesh")
     if not data.strip():
@@ -441,21 +427,15 @@ def _reason(error: Exception) -> str:
     return f"{type(error).__name__}: {(str(error) or 'no reason given').splitlines()[0]}"
 
 
-def _geometry(
-    path: Path, data: bytes, painted: Painted | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def _geometry(path: Path, data: bytes, painted: Painted | None) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """All triangles of a file as one mesh, each part at its place in the file's scene; weights where asked for."""
     import trimesh
 
     suffix = path.suffix.lower()[1:]
     if suffix == "gltf":
-        json.loads(
-            data
-        )  # on garbage trimesh would silently read a file called model.gltf from the same folder
+        json.loads(data)  # on garbage trimesh would silently read a file called model.gltf from the same folder
     options = {"skip_materials": True} if suffix in ("glb", "gltf", "obj") else {}
-    scene = trimesh.load_scene(
-        io.BytesIO(data), file_type=suffix, resolver=_SameFolder(path), process=False, **options
-    )
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix, resolver=_SameFolder(path), process=False, **options)
     vertices, faces, weights, count = [np.zeros((0, 3))], [np.zeros((0, 3), dtype=np.int64)], [np.zeros(0)], 0
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]

@@ -217,22 +217,20 @@ def conditions_of(task: Task, config: Any, space: DesignSpace) -> list[dict[str,
         return [{}]
     if hasattr(task, "conditions"):
         named = [{name: float(value) for name, value in one.items()} for one in task.conditions(config)]
-        _check_conditions(task, named, space)
+        where = f"task {task.name}, conditions"
+        if not named:
+            raise PluginError("no condition value is named", where=where, allowed="1 or more")
+        for one in named:
+            try:
+                space.at(one)
+            except ConfigError as error:
+                raise ConfigError(error.message, where=where, allowed=error.allowed) from None
+            missing = [DIMENSIONS[i] for i in space.conditioned if DIMENSIONS[i] not in one]
+            if missing:
+                raise PluginError(
+                    f"{dict(one)} leaves {missing[0]} open", where=where, allowed="every condition has one"
+                )
         return named
     shares = (np.arange(EVEN_CONDITIONS) + 0.5) / EVEN_CONDITIONS
     low, high = np.array(space.low), np.array(space.high)
     return [{DIMENSIONS[i]: float(low[i] + share * (high - low)[i]) for i in space.conditioned} for share in shares]
-
-
-def _check_conditions(task: Task, named: Sequence[Mapping[str, float]], space: DesignSpace) -> None:
-    where = f"task {task.name}, conditions"
-    if not named:
-        raise PluginError("no condition value is named", where=where, allowed="1 or more")
-    for one in named:
-        try:
-            space.at(one)
-        except ConfigError as error:
-            raise ConfigError(error.message, where=where, allowed=error.allowed) from None
-        missing = [DIMENSIONS[i] for i in space.conditioned if DIMENSIONS[i] not in one]
-        if missing:
-            raise PluginError(f"{dict(one)} leaves {missing[0]} open", where=where, allowed="every condition has one")

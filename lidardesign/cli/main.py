@@ -119,24 +119,20 @@ def _invoke(arguments: list[str]) -> int:
     except Exception as error:
         if not hasattr(error, "format_message"):
             return report_error(error, output)
-        return _report_usage(error, output, arguments)
+        # One message for what typer finds wrong with the command line
+        context = getattr(error, "ctx", None)
+        path = context.command_path if context else PROGRAM
+        message = error.format_message().rstrip()
+        hint = _similar_line(arguments, typer.main.get_command(app)) or f"{path} --help"
+        if type(error).__name__ == "NoArgsIsHelpError":
+            print_message(message)
+            message = "no command was given"
+        if output.json:
+            document = {"kind": "usage", "message": message, "where": path, "hint": hint}
+            print_json({"error": document, "exit_code": EXIT_USAGE})
+        print_message(f"usage error: {path}: {message}\n  try: {hint}")
+        return EXIT_USAGE
     return code if isinstance(code, int) else 0
-
-
-def _report_usage(error: Any, output: Output, arguments: list[str]) -> int:
-    """One message for what typer finds wrong with the command line."""
-    context = getattr(error, "ctx", None)
-    path = context.command_path if context else PROGRAM
-    message = error.format_message().rstrip()
-    hint = _similar_line(arguments, typer.main.get_command(app)) or f"{path} --help"
-    if type(error).__name__ == "NoArgsIsHelpError":
-        print_message(message)
-        message = "no command was given"
-    if output.json:
-        document = {"kind": "usage", "message": message, "where": path, "hint": hint}
-        print_json({"error": document, "exit_code": EXIT_USAGE})
-    print_message(f"usage error: {path}: {message}\n  try: {hint}")
-    return EXIT_USAGE
 
 
 def _similar_line(words: Sequence[str], root: Any) -> str | None:

@@ -60,7 +60,14 @@ def short_tour(points: np.ndarray) -> np.ndarray:
     count = len(points)
     if count < 4:
         return np.arange(count)
-    near = _neighbours(points)
+    # The nearest other stops of each, shape (N, K)
+    from scipy.spatial import cKDTree
+
+    found = cKDTree(points).query(points, k=min(NEIGHBOURS + 1, len(points)), p=np.inf)[1]
+    # where many stops are at one place, a stop need not be the first of its own neighbours
+    own = found == np.arange(len(points))[:, None]
+    own[~own.any(axis=1), -1] = True
+    near = found[~own].reshape(len(points), -1)
     starts = [_nearest] if count <= MOST_NEAREST else []
     if count <= MOST_TWICE or not starts:
         starts.append(_rows)
@@ -77,17 +84,6 @@ def travel(stops: np.ndarray) -> float:
 
 def _lengths(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.abs(first - second).max(axis=-1)
-
-
-def _neighbours(points: np.ndarray) -> np.ndarray:
-    """The nearest other stops of each, shape (N, K)."""
-    from scipy.spatial import cKDTree
-
-    found = cKDTree(points).query(points, k=min(NEIGHBOURS + 1, len(points)), p=np.inf)[1]
-    # where many stops are at one place, a stop need not be the first of its own neighbours
-    own = found == np.arange(len(points))[:, None]
-    own[~own.any(axis=1), -1] = True
-    return found[~own].reshape(len(points), -1)
 
 
 def _rows(points: np.ndarray) -> np.ndarray:
@@ -236,7 +232,12 @@ def write_galvo(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
             later than a whole number of picoseconds says.
     """
     positions = plan(design, rays)
-    _refuse_late_gates(design, rays)
+    latest_m = float(gate_m(np.array([[MOST_WHOLE, 0]]))[0, 1])
+    end_m = rays.gate_m[:, 1].max(initial=0.0)
+    if end_m > latest_m:
+        raise ConfigError(
+            f"a gate ends at {end_m:.4g} m", where=design.name, allowed=f"at most {latest_m:.4g} m, in picoseconds"
+        )
     gates = gate_ps(rays.gate_m)
     lines = [",".join(COLUMNS)]
     for number, one in enumerate(positions):
@@ -262,7 +263,15 @@ def plan(design: DesignSpec, rays: Rays) -> list[Position]:
     """
     origins, first, place = np.unique(rays.origin_m, axis=0, return_index=True, return_inverse=True)
     place = place.reshape(-1)
-    _refuse_spread_origins(design, rays, place)
+    for index, sensor in enumerate(design.sensors):
+        places = len(np.unique(place[rays.sensor == index]))
+        if places > 1:
+            raise ConfigError(
+                f"the rays of sensor {sensor.name!r} start at {places} places, and a steering mirror stands at one",
+                where=design.name,
+                allowed="one origin per sensor",
+                hint="lidardesign constrain RUN --layout grid, or with origin.fixed_m in the constraints",
+            )
     found = [_position(origins[here], rays, np.flatnonzero(place == here)) for here in np.argsort(first)]
     _refuse_far_rays(design, rays, found)
     return found
@@ -313,18 +322,6 @@ def _position(origin_m: np.ndarray, rays: Rays, chosen: np.ndarray) -> Position:
     return Position(origin_m, boresight, chosen[order], angles_deg[order], travel(angles_deg))
 
 
-def _refuse_spread_origins(design: DesignSpec, rays: Rays, place: np.ndarray) -> None:
-    for index, sensor in enumerate(design.sensors):
-        places = len(np.unique(place[rays.sensor == index]))
-        if places > 1:
-            raise ConfigError(
-                f"the rays of sensor {sensor.name!r} start at {places} places, and a steering mirror stands at one",
-                where=design.name,
-                allowed="one origin per sensor",
-                hint="lidardesign constrain RUN --layout grid, or with origin.fixed_m in the constraints",
-            )
-
-
 def _refuse_far_rays(design: DesignSpec, rays: Rays, positions: list[Position]) -> None:
     """Refuse the design where mirrors would have to turn beyond `LIMIT_DEG`, with how many rays and the worst."""
     ray = np.concatenate([one.ray for one in positions] or [np.zeros(0, dtype=np.int64)])
@@ -342,15 +339,6 @@ def _refuse_far_rays(design: DesignSpec, rays: Rays, positions: list[Position]) 
         allowed=f"+-{LIMIT_DEG:g} degrees of optical scan angle per axis",
         hint="constrain field_of_view and boresight, as boresight.elevation_deg.max=20, or fewer sensors apart",
     )
-
-
-def _refuse_late_gates(design: DesignSpec, rays: Rays) -> None:
-    latest_m = float(gate_m(np.array([[MOST_WHOLE, 0]]))[0, 1])
-    end_m = rays.gate_m[:, 1].max(initial=0.0)
-    if end_m > latest_m:
-        raise ConfigError(
-            f"a gate ends at {end_m:.4g} m", where=design.name, allowed=f"at most {latest_m:.4g} m, in picoseconds"
-        )
 
 
 def _summary(positions: list[Position]) -> list[str]:

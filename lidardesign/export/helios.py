@@ -52,7 +52,22 @@ def write_helios(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> 
     surveys = {}
     for mount in mounted:
         _add_scanner(scanners, mount, rays.subset(mount.ray), pulse_hz)
-        surveys[f"{mount.name}{SURVEY}"] = document(_survey(design, mount, rays, pulse_hz))
+        # One leg of one pulse, at the place where the sensor's first ray starts
+        root = element("document")
+        survey = child(
+            root, "survey", name=f"{design.name}: {mount.sensor.name}", scene=SCENE,
+            platform=f"{PLATFORMS}#fixed", scanner=f"{SCANNERS}#{mount.name}",
+        )  # fmt: skip
+        child(survey, "FWFSettings", beamSampleQuality=1, binSize_ns=BIN_NS, winSize_ns=WINDOW_NS)
+        leg = child(survey, "leg")
+        x, y, z = rays.origin_m[mount.ray[0]].tolist()
+        child(leg, "platformSettings", x=x, y=y, z=z, onGround=False)
+        child(
+            leg, "scannerSettings", active=True, pulseFreq_hz=pulse_hz, scanAngle_deg=1, scanFreq_hz=0,
+            verticalAngleMin_deg=-1, verticalAngleMax_deg=1, headRotatePerSec_deg=pulse_hz,
+            headRotateStart_deg=-1, headRotateStop_deg=-0.5,
+        )  # fmt: skip
+        surveys[f"{mount.name}{SURVEY}"] = document(root)
     files = {SCANNERS: document(scanners), PLATFORMS: document(_platforms()), **surveys}
     notes = [*write_folder(path, files), *_notes(rays, rate_hz, pulse_hz)]
     return [*notes, *design_losses(design, mounted)]
@@ -95,25 +110,6 @@ def _platforms() -> Element:
     root = element("document")
     platform = child(root, "platform", id="fixed", name="fixed", type="static")
     child(platform, "scannerMount", x=0, y=0, z=0)
-    return root
-
-
-def _survey(design: DesignSpec, mount: Mount, rays: Rays, pulse_hz: int) -> Element:
-    """One leg of one pulse, at the place where the sensor's first ray starts."""
-    root = element("document")
-    survey = child(
-        root, "survey", name=f"{design.name}: {mount.sensor.name}", scene=SCENE,
-        platform=f"{PLATFORMS}#fixed", scanner=f"{SCANNERS}#{mount.name}",
-    )  # fmt: skip
-    child(survey, "FWFSettings", beamSampleQuality=1, binSize_ns=BIN_NS, winSize_ns=WINDOW_NS)
-    leg = child(survey, "leg")
-    x, y, z = rays.origin_m[mount.ray[0]].tolist()
-    child(leg, "platformSettings", x=x, y=y, z=z, onGround=False)
-    child(
-        leg, "scannerSettings", active=True, pulseFreq_hz=pulse_hz, scanAngle_deg=1, scanFreq_hz=0,
-        verticalAngleMin_deg=-1, verticalAngleMax_deg=1, headRotatePerSec_deg=pulse_hz,
-        headRotateStart_deg=-1, headRotateStop_deg=-0.5,
-    )  # fmt: skip
     return root
 
 

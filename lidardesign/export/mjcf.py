@@ -76,7 +76,15 @@ def _body(mount: Mount, name: str, rays: Rays, sites: np.ndarray) -> Element:
     """The body of a sensor at its mount, with the sites of its rays in its frame."""
     frame = mount.sensor.frame
     places = (rays.origin_m[mount.ray] - mount.origin_m) @ frame.T
-    turns = _turns_of_z(rays.direction[mount.ray] @ frame.T)
+    # The shortest rotations of +z to unit vectors (N, 3), as quaternions (w, x, y, z), shape (N, 4)
+    directions = rays.direction[mount.ray] @ frame.T
+    x, y, z = directions.T
+    across = np.hypot(x, y)
+    half = np.arctan2(across, z) / 2
+    # straight down any axis across will do
+    along = np.where(across > 0, across, 1.0)
+    axis_x, axis_y = np.where(across > 0, -y / along, 1.0), x / along
+    turns = np.stack([np.cos(half), np.sin(half) * axis_x, np.sin(half) * axis_y, np.zeros(len(x))], axis=1)
     made = [
         element(
             "site",
@@ -86,17 +94,6 @@ def _body(mount: Mount, name: str, rays: Rays, sites: np.ndarray) -> Element:
     ]
     pose = {"pos": numbers(mount.origin_m), "quat": numbers(mount.quaternion)}
     return element("body", {"name": name, **pose}, made)
-
-
-def _turns_of_z(directions: np.ndarray) -> np.ndarray:
-    """The shortest rotations of +z to unit vectors (N, 3), as quaternions (w, x, y, z), shape (N, 4)."""
-    x, y, z = directions.T
-    across = np.hypot(x, y)
-    half = np.arctan2(across, z) / 2
-    # straight down any axis across will do
-    along = np.where(across > 0, across, 1.0)
-    axis_x, axis_y = np.where(across > 0, -y / along, 1.0), x / along
-    return np.stack([np.cos(half), np.sin(half) * axis_x, np.sin(half) * axis_y, np.zeros(len(x))], axis=1)
 
 
 def _rangefinder(site: str, rays: Rays, ray: int) -> Element:

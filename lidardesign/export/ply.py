@@ -107,7 +107,15 @@ def _beams(rays: Rays, comments: list[str]) -> bytes:
 
 def _frusta(sensors: list[tuple[int, Sensor]], comments: list[str]) -> bytes:
     """Fields of view between the gates' ends: two shells and four sides each, as quadrilaterals."""
-    corners = _shell_faces()
+    # Corners of the faces of `_frustum`, seen from outside against the clock, shape (F, 4)
+    side = PARTS + 1
+    near = np.arange(side * side).reshape(side, side)
+    far = near + side * side
+    inner = np.stack([near[:-1, :-1], near[1:, :-1], near[1:, 1:], near[:-1, 1:]], axis=-1).reshape(-1, 4)
+    outer = np.stack([far[:-1, :-1], far[:-1, 1:], far[1:, 1:], far[1:, :-1]], axis=-1).reshape(-1, 4)
+    rim = [near[0], near[:, -1], near[-1, ::-1], near[::-1, 0]]
+    walls = [np.stack([one[:-1], one[1:], one[1:] + side * side, one[:-1] + side * side], axis=-1) for one in rim]
+    corners = np.concatenate([inner, outer, *walls])
     points, faces = [], []
     for number, (index, sensor) in enumerate(sensors):
         places = _frustum(sensor)
@@ -124,18 +132,6 @@ def _frustum(sensor: Sensor) -> np.ndarray:
     tangent = np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2)
     looking = tangent_directions(sensor.frame, tangent)
     return np.concatenate([np.asarray(sensor.origin_m) + end * looking for end in sensor.gate_m])
-
-
-def _shell_faces() -> np.ndarray:
-    """Corners of the faces of `_frustum`, seen from outside against the clock, shape (F, 4)."""
-    side = PARTS + 1
-    near = np.arange(side * side).reshape(side, side)
-    far = near + side * side
-    inner = np.stack([near[:-1, :-1], near[1:, :-1], near[1:, 1:], near[:-1, 1:]], axis=-1).reshape(-1, 4)
-    outer = np.stack([far[:-1, :-1], far[:-1, 1:], far[1:, 1:], far[1:, :-1]], axis=-1).reshape(-1, 4)
-    rim = [near[0], near[:, -1], near[-1, ::-1], near[::-1, 0]]
-    walls = [np.stack([one[:-1], one[1:], one[1:] + side * side, one[:-1] + side * side], axis=-1) for one in rim]
-    return np.concatenate([inner, outer, *walls])
 
 
 def read_ply(path: Path) -> Rays:

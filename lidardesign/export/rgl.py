@@ -38,7 +38,6 @@ from lidardesign.space import angles
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-    from lidardesign.export.common.poses import Part
 
 MODEL, PATTERN, RANGES, TIMES = "model.sdf", ".mat3x4f", ".range2f", ".time1f"
 MS_PER_S = 1000.0
@@ -65,7 +64,20 @@ def write_rgl(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
         files[f"{mount.name}{TIMES}"] = times_ms[mount.ray].astype("<f4").tobytes()
         files[f"{mount.name}{PATTERN}"] = _matrices(mount, rays.subset(mount.ray)).astype("<f4").tobytes()
         files[f"{mount.name}{RANGES}"] = rays.gate_m[mount.ray].astype("<f4").tobytes()
-        _add_sensor(link, mount, rays, path.resolve() / f"{mount.name}{PATTERN}", rate_hz)
+        # A sensor with the plugin that fires its pattern
+        pattern = path.resolve() / f"{mount.name}{PATTERN}"
+        sensor = child(link, "sensor", name=mount.name, type="custom")
+        child(sensor, "pose", text=numbers([*rays.origin_m[mount.ray[0]], *mount.roll_pitch_yaw_rad]))
+        plugin = child(sensor, "plugin", filename="RGLServerPluginInstance", name="rgl::RGLServerPluginInstance")
+        start, end = mount.gate_m
+        limits = child(plugin, "range")
+        child(limits, "min", text=start)
+        child(limits, "max", text=end)
+        child(plugin, "update_rate", text=float(rate_hz))
+        child(plugin, "update_on_paused_sim", text=False)
+        child(plugin, "topic", text=f"rgl/{mount.name}")
+        child(plugin, "frame", text=mount.name)
+        child(plugin, "pattern_preset_path", text=pattern)
     notes = write_folder(path, {MODEL: document(root), **files})
     return [*notes, *_notes(design, mounted, path)]
 
@@ -92,22 +104,6 @@ def _matrices(mount: Mount, rays: Rays) -> np.ndarray:
     return np.stack([np.cross(across, looking), across, looking, offset], axis=2)
 
 
-def _add_sensor(link: Element, mount: Mount, rays: Rays, pattern: Path, rate_hz: float) -> None:
-    """A sensor with the plugin that fires its pattern."""
-    sensor = child(link, "sensor", name=mount.name, type="custom")
-    child(sensor, "pose", text=numbers([*rays.origin_m[mount.ray[0]], *mount.roll_pitch_yaw_rad]))
-    plugin = child(sensor, "plugin", filename="RGLServerPluginInstance", name="rgl::RGLServerPluginInstance")
-    start, end = mount.gate_m
-    limits = child(plugin, "range")
-    child(limits, "min", text=start)
-    child(limits, "max", text=end)
-    child(plugin, "update_rate", text=float(rate_hz))
-    child(plugin, "update_on_paused_sim", text=False)
-    child(plugin, "topic", text=f"rgl/{mount.name}")
-    child(plugin, "frame", text=mount.name)
-    child(plugin, "pattern_preset_path", text=pattern)
-
-
 def read_rgl(path: Path, design: DesignSpec, rays: Rays) -> tuple[Rays, float]:
     """The rays of a folder that `write_rgl` made of a design and its rays, with their sensors, and the frame rate [Hz].
 
@@ -119,7 +115,11 @@ def read_rgl(path: Path, design: DesignSpec, rays: Rays) -> tuple[Rays, float]:
     times_s, rates_hz, parts = np.zeros(len(rays)), [], []
     for mount in mounts(design, rays):
         pose, rate_hz = _pose_and_rate(found.get(mount.name), mount, path)
-        parts.append(_part(mount, path, pose))
+        # The rays of one sensor: its pose, and its pattern in the frame of that
+        matrices = _floats(path / f"{mount.name}{PATTERN}", (3, 4))
+        gate = _floats(path / f"{mount.name}{RANGES}", (2,))
+        turn = rotations_of_quaternions(np.array(quaternion(*pose[3:])))
+        parts.append(mount.ray, pose[:3] + matrices[:, :, 3] @ turn.T, unit_vectors(matrices[:, :, 2] @ turn.T), gate)
         rates_hz.append(rate_hz)
         times = _floats(path / f"{mount.name}{TIMES}", ()) / MS_PER_S
         if len(times) != len(mount.ray):
@@ -138,14 +138,6 @@ def _pose_and_rate(sensor: Element | None, mount: Mount, path: Path) -> tuple[li
     if len(pose) != POSE_NUMBERS:
         raise DataError(f"holds no pose of {mount.name}", where=str(path / MODEL), hint="export it again")
     return pose, rate_hz
-
-
-def _part(mount: Mount, path: Path, pose: list[float]) -> Part:
-    """The rays of one sensor: its pose, and its pattern in the frame of that."""
-    matrices = _floats(path / f"{mount.name}{PATTERN}", (3, 4))
-    gate = _floats(path / f"{mount.name}{RANGES}", (2,))
-    turn = rotations_of_quaternions(np.array(quaternion(*pose[3:])))
-    return mount.ray, pose[:3] + matrices[:, :, 3] @ turn.T, unit_vectors(matrices[:, :, 2] @ turn.T), gate
 
 
 def _floats(path: Path, shape: tuple[int, ...]) -> np.ndarray:

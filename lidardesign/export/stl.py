@@ -47,7 +47,9 @@ def write_stl(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
 
 
 def _solid(index: int, sensor: Sensor) -> str:
-    name = _solid_name(index, sensor.name)
+    # A name that no reader takes for a word of the format
+    word = identifier(sensor.name)
+    name = f"sensor_{index}" if any(key in word.lower() for key in KEYWORDS) else f"sensor_{index}_{word}"
     corners = MM_PER_M * np.asarray(sensor.origin_m) + CORNERS_MM @ sensor.frame
     facets = []
     for triangle in corners[FACETS]:
@@ -55,12 +57,6 @@ def _solid(index: int, sensor: Sensor) -> str:
         vertices = "".join(f"   vertex {_numbers(corner)}\n" for corner in triangle)
         facets.append(f" facet normal {_numbers(normal)}\n  outer loop\n{vertices}  endloop\n endfacet\n")
     return f"solid {name}\n{''.join(facets)}endsolid {name}\n"
-
-
-def _solid_name(index: int, name: str) -> str:
-    """A name that no reader takes for a word of the format."""
-    word = identifier(name)
-    return f"sensor_{index}" if any(key in word.lower() for key in KEYWORDS) else f"sensor_{index}_{word}"
 
 
 def _numbers(values: np.ndarray) -> str:

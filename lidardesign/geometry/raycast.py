@@ -109,7 +109,30 @@ def trace_each(
             for caster, begin, end in zip(casters, starts[:-1], starts[1:], strict=True)
         ]
         return Hits.joined(parts)
-    return _traced_at_rest(resting, starts, origins, directions, limit_m)
+    # `trace_each` for meshes at rest: everything but Embree's calls is done for all rays together
+    counts = np.diff(starts)
+    local = origins - np.repeat([one.triangles.centre for one in resting], counts, axis=0)
+    advance_m = advances_m(local, directions, np.repeat([one.radius_m for one in resting], counts))
+    local = (local + advance_m[:, None] * directions).astype(np.float32)
+    toward, limit = directions.astype(np.float32), np.clip(limit_m - advance_m, 0.0, FARTHEST_M).astype(np.float32)
+    hits = Hits.none(len(origins))
+    rows, ranges, normals = [], [], []
+    for one, begin, end in zip(resting, starts[:-1], starts[1:], strict=True):
+        if begin == end:
+            continue
+        found = one.triangles.run(local[begin:end], toward[begin:end], limit[begin:end])
+        hit = np.flatnonzero(found["primID"] >= 0)
+        rows.append(begin + hit)
+        ranges.append(found["tfar"][hit])
+        normals.append(found["Ng"][hit])
+        hits.body[begin + hit] = one.body_of_geometry[found["geomID"][hit]]
+    if rows:
+        hit = np.concatenate(rows)
+        hits.range_m[hit] = np.concatenate(ranges) + advance_m[hit]
+        hits.normal[hit] = _facing(unit_vectors(np.concatenate(normals).astype(np.float64)), directions[hit])
+    beyond = hits.range_m >= limit_m
+    hits.range_m[beyond], hits.body[beyond], hits.normal[beyond] = np.inf, -1, 0.0
+    return hits
 
 
 def _chosen(scene: Scene, only: Only) -> list[tuple[int, Body]]:
@@ -162,35 +185,6 @@ class _AtRest:
         return hits
 
 
-def _traced_at_rest(
-    meshes: Sequence[_AtRest], starts: np.ndarray, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray
-) -> Hits:
-    """`trace_each` for meshes at rest: everything but Embree's calls is done for all rays together."""
-    counts = np.diff(starts)
-    local = origins - np.repeat([one.triangles.centre for one in meshes], counts, axis=0)
-    advance_m = advances_m(local, directions, np.repeat([one.radius_m for one in meshes], counts))
-    local = (local + advance_m[:, None] * directions).astype(np.float32)
-    toward, limit = directions.astype(np.float32), np.clip(limit_m - advance_m, 0.0, FARTHEST_M).astype(np.float32)
-    hits = Hits.none(len(origins))
-    rows, ranges, normals = [], [], []
-    for one, begin, end in zip(meshes, starts[:-1], starts[1:], strict=True):
-        if begin == end:
-            continue
-        found = one.triangles.run(local[begin:end], toward[begin:end], limit[begin:end])
-        hit = np.flatnonzero(found["primID"] >= 0)
-        rows.append(begin + hit)
-        ranges.append(found["tfar"][hit])
-        normals.append(found["Ng"][hit])
-        hits.body[begin + hit] = one.body_of_geometry[found["geomID"][hit]]
-    if rows:
-        hit = np.concatenate(rows)
-        hits.range_m[hit] = np.concatenate(ranges) + advance_m[hit]
-        hits.normal[hit] = _facing(unit_vectors(np.concatenate(normals).astype(np.float64)), directions[hit])
-    beyond = hits.range_m >= limit_m
-    hits.range_m[beyond], hits.body[beyond], hits.normal[beyond] = np.inf, -1, 0.0
-    return hits
-
-
 # By the first of its bodies: what they are in their scene, and what was built of them.
 _at_rest: WeakKeyDictionary[Body, list[tuple[list[tuple[int, ref[Body]]], _AtRest]]] = WeakKeyDictionary()
 
@@ -229,7 +223,16 @@ class _Moving:
         """Enter the hits that are nearer than what `hits` holds."""
         for number, caster in enumerate(self._casters):
             bound = np.minimum(hits.range_m, limit_m)
-            rows = np.flatnonzero(self._passes(number, origins, directions, bound))
+            # Which rays pass a mesh's ball before their limit, shape (N,)
+            offset = self._centres[number] - origins
+            along = np.einsum("nk,nk->n", offset, directions)
+            squared = np.einsum("nk,nk->n", offset, offset)
+            slack = BALL_SLACK * squared
+            radius_m = self._radii_m[number]
+            reach = radius_m + np.sqrt(slack)
+            rows = np.flatnonzero(
+                (squared - along**2 <= radius_m**2 + slack) & (along >= -reach) & (along - reach <= bound)
+            )
             if not len(rows):
                 continue
             rotation = self._rotation[number]
@@ -239,16 +242,6 @@ class _Moving:
             won = rows[hit]
             hits.range_m[won], hits.body[won] = range_m[hit], self._body[number]
             hits.normal[won] = _turned(normal[hit], rotation)
-
-    def _passes(self, number: int, origins: np.ndarray, directions: np.ndarray, limit_m: np.ndarray) -> np.ndarray:
-        """Which rays pass a mesh's ball before their limit, shape (N,)."""
-        offset = self._centres[number] - origins
-        along = np.einsum("nk,nk->n", offset, directions)
-        squared = np.einsum("nk,nk->n", offset, offset)
-        slack = BALL_SLACK * squared
-        radius_m = self._radii_m[number]
-        reach = radius_m + np.sqrt(slack)
-        return (squared - along**2 <= radius_m**2 + slack) & (along >= -reach) & (along - reach <= limit_m)
 
 
 class _Meshes:

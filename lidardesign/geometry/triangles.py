@@ -98,7 +98,16 @@ class Triangles:
         toward, first_m = directions[doubtful], found["tfar"][doubtful]
         behind_m = first_m - NEARER_SHARE * np.maximum(first_m, self.radius_m)
         until = np.where(missed[doubtful], limit_m[doubtful], np.maximum(behind_m, 0.0)).astype(np.float32)
-        beside = near[doubtful] + BESIDE_SHARE * self.radius_m * _across(toward)
+        # A vector of about unit length across each direction, (N, 3) to (N, 3)
+        x, y, z = toward.T
+        sign = np.copysign(1.0, z)
+        share = -1.0 / (sign + z)
+        mixed = x * y * share
+        across = np.empty_like(toward)
+        across[:, 0] = 1.0 + sign * x * x * share + BESIDE_SLANT * mixed
+        across[:, 1] = sign * mixed + BESIDE_SLANT * (sign + y * y * share)
+        across[:, 2] = -sign * x - BESIDE_SLANT * y
+        beside = near[doubtful] + BESIDE_SHARE * self.radius_m * across
         again = self.run(beside.astype(np.float32), toward.astype(np.float32), until)
         nearer = again["primID"] >= 0
         counted.found += int(nearer.sum())
@@ -117,22 +126,6 @@ def advances_m(local: np.ndarray, directions: np.ndarray, radius_m: np.ndarray |
         return np.zeros(len(local))
     closest = -np.einsum("nk,nk->n", local, directions)
     return np.where(far, np.maximum(closest - 2 * radius_m, 0.0), 0.0)
-
-
-def _across(directions: np.ndarray) -> np.ndarray:
-    """A vector of about unit length across each direction, (N, 3) to (N, 3).
-
-    Of the orthonormal basis of Duff et al., Building an Orthonormal Basis, Revisited (2017).
-    """
-    x, y, z = directions.T
-    sign = np.copysign(1.0, z)
-    share = -1.0 / (sign + z)
-    mixed = x * y * share
-    across = np.empty_like(directions)
-    across[:, 0] = 1.0 + sign * x * x * share + BESIDE_SLANT * mixed
-    across[:, 1] = sign * mixed + BESIDE_SLANT * (sign + y * y * share)
-    across[:, 2] = -sign * x - BESIDE_SLANT * y
-    return across
 
 
 class MeshCaster:

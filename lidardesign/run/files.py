@@ -74,7 +74,25 @@ def write_atomic(path: Path, content: bytes | str) -> None:
         if path.exists() and not path.is_file():
             path.write_bytes(payload)
         else:
-            _replace(path, payload)
+            temporary = temporary_beside(path)
+            _remove_abandoned(temporary)
+            try:
+                with temporary.open("xb") as file:
+                    file.write(payload)
+                    file.flush()
+                    os.fsync(file.fileno())
+                os.replace(temporary, path)
+            except BaseException:
+                with contextlib.suppress(OSError):
+                    temporary.unlink(missing_ok=True)
+                raise
+            # Make the rename itself durable, where the system can open folders
+            with contextlib.suppress(OSError):
+                descriptor = os.open(path.parent, os.O_RDONLY)
+                try:
+                    os.fsync(descriptor)
+                finally:
+                    os.close(descriptor)
     except OSError as error:
         raise _unwritten(path, error) from error
 
@@ -103,22 +121,6 @@ def temporary_beside(path: Path) -> Path:
     return path.with_name(f".{name}.{host_mark()}-{os.getpid()}.{secrets.token_hex(4)}{TEMPORARY_SUFFIX}")
 
 
-def _replace(path: Path, payload: bytes) -> None:
-    temporary = temporary_beside(path)
-    _remove_abandoned(temporary)
-    try:
-        with temporary.open("xb") as file:
-            file.write(payload)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise
-    _sync_folder(path.parent)
-
-
 def _remove_abandoned(temporary: Path) -> None:
     """Remove the temporary files of the same target that processes of this computer left when they were killed."""
     beginning = temporary.name.rsplit("-", 1)[0]
@@ -127,16 +129,6 @@ def _remove_abandoned(temporary: Path) -> None:
         if found and is_gone(int(found["pid"])):
             with contextlib.suppress(OSError):
                 temporary.with_name(name).unlink()
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make the rename itself durable, where the system can open folders."""
-    with contextlib.suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 def is_temporary(name: str) -> bool:

@@ -71,21 +71,13 @@ def read_manifest(run: Path) -> dict[str, Any]:
         raise DataError(f"the manifest cannot be read: {error}", where=str(path), hint="learn the run again") from None
     if not isinstance(manifest, dict) or not isinstance(manifest.get("files"), dict):
         raise DataError("the manifest lists no files", where=str(path), hint="learn the run again")
-    _check_parts(manifest, path)
-    found = manifest.get("schema_version")
-    if found != SCHEMA_VERSION:
-        raise DataError(
-            f"the manifest has schema version {found!r}", where=str(path), allowed=str(SCHEMA_VERSION),
-            hint="use the version of lidardesign that made the run, or a newer one",
-        )  # fmt: skip
-    return manifest
-
-
-def _check_parts(manifest: dict[str, Any], path: Path) -> None:
-    """Refuse entries that nothing of this program writes, before anybody works with them."""
+    # Refuse entries that nothing of this program writes, before anybody works with them
     for name, entry in manifest["files"].items():
         versions_of_it = [entry, entry.get("replaces") or entry] if isinstance(entry, dict) else [entry]
-        if not all(_is_entry(one) for one in versions_of_it):
+        if not all(
+            (isinstance(one, dict) and isinstance(one.get("sha256"), str) and isinstance(one.get("bytes"), int))
+            for one in versions_of_it
+        ):
             raise DataError(f"the manifest's entry of {name} is damaged", where=str(path), hint=DAMAGED_HINT)
     decided = manifest.get("visibility")
     if decided is not None and decided not in VISIBILITIES:
@@ -96,10 +88,13 @@ def _check_parts(manifest: dict[str, Any], path: Path) -> None:
     for name in MAPPINGS:
         if not isinstance(manifest.get(name) or {}, dict):
             raise DataError(f"the manifest's {name!r} is damaged", where=str(path), hint=DAMAGED_HINT)
-
-
-def _is_entry(entry: Any) -> bool:
-    return isinstance(entry, dict) and isinstance(entry.get("sha256"), str) and isinstance(entry.get("bytes"), int)
+    found = manifest.get("schema_version")
+    if found != SCHEMA_VERSION:
+        raise DataError(
+            f"the manifest has schema version {found!r}", where=str(path), allowed=str(SCHEMA_VERSION),
+            hint="use the version of lidardesign that made the run, or a newer one",
+        )  # fmt: skip
+    return manifest
 
 
 def write_manifest(run: Path, manifest: dict[str, Any]) -> None:

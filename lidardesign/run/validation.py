@@ -116,7 +116,7 @@ def anchor_paths(values: Any, given: Any, model: type[BaseModel], base: Path) ->
         nested = nested_model(info.annotation)
         if isinstance(value, dict) and nested:
             anchor_paths(values[name], value, nested, base)
-        elif _holds_path(info.annotation):
+        elif any(isinstance(part, type) and issubclass(part, Path) for part in parts(info.annotation)):
             values[name] = _absolute(values[name], base)
 
 
@@ -126,10 +126,6 @@ def _absolute(value: Any, base: Path) -> Any:
     if isinstance(value, list):
         return [_absolute(item, base) for item in value]
     return value
-
-
-def _holds_path(annotation: Any) -> bool:
-    return any(isinstance(part, type) and issubclass(part, Path) for part in parts(annotation))
 
 
 def _explain(
@@ -158,7 +154,7 @@ def _explain(
         return ConfigError(f"{name} is missing", where=where, hint=f"--set {name.removeprefix('task.')}=VALUE")
     text = detail["msg"].removeprefix("Value error, ")
     found = "" if detail["type"] == "value_error" and not path else f": found {_short(detail['input'])}"
-    more = f" (and {len(details) - 1} more)" if len(details) > 1 and not _is_union(detail["loc"], path) else ""
+    more = f" (and {len(details) - 1} more)" if len(details) > 1 and len(detail["loc"]) == len(path) else ""
     if detail["type"] in ("value_error", "assertion_error"):
         return ConfigError(f"{name}: {text}{found if path else ''}{more}", where=where)
     return ConfigError(f"{name}{found}{more}", where=where, allowed=_allowed(detail["type"], text))
@@ -184,10 +180,6 @@ def _real_path(location: tuple[Any, ...], values: Any) -> KeyPath:
         elif last and isinstance(values, Mapping):
             path.append(key)
     return tuple(path)
-
-
-def _is_union(location: tuple[Any, ...], path: KeyPath) -> bool:
-    return len(location) != len(path)
 
 
 def _fields_at(model: type[BaseModel], path: KeyPath) -> list[str]:

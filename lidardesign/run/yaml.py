@@ -189,7 +189,17 @@ class _Builder:
             if self._documents > 1:
                 raise self._error(event, "a second document starts here", "one document per file")
         elif isinstance(event, yaml.AliasEvent):
-            self._alias(event)
+            anchor = self._anchors.get(event.anchor)
+            if anchor is None:
+                raise self._error(event, f"the alias *{event.anchor} has no complete anchor before it")
+            if self._expects_key():
+                raise self._error(event, "an alias cannot be a key", "names as keys")
+            if len(self._stack) + anchor.height > MAX_DEPTH:
+                raise self._error(event, "nested too deeply", f"at most {MAX_DEPTH} levels")
+            self._count(event, anchor.nodes)
+            self._put(copy.deepcopy(anchor.value), event)
+            if self._stack:
+                self._stack[-1].height = max(self._stack[-1].height, anchor.height + 1)
         elif isinstance(event, yaml.ScalarEvent):
             self._scalar(event)
         elif isinstance(event, yaml.CollectionStartEvent):
@@ -201,7 +211,24 @@ class _Builder:
         self._check_tag(event)
         plain = not event.style and event.implicit[0]
         if self._expects_key():
-            self._key(event)
+            key, frame = event.value, self._stack[-1]
+            if not event.style:
+                try:
+                    text = isinstance(resolve_scalar(key), str)
+                except ValueError:
+                    text = False
+                if not text:
+                    raise self._error(
+                        event, f"the key {key or 'null'!r} is not text", "names as keys; quote it to make it text"
+                    )
+                if key == "<<":
+                    raise self._error(event, "merge keys are not supported", hint="write the keys out")
+            if key in frame.value:
+                first = self.keys[(*frame.path, key)]
+                raise self._error(event, f"the key {key!r} was given before, in line {first[0]}", "each key once")
+            frame.key = key
+            self.keys[(*frame.path, key)] = _position(event)
+            self._count(event, 1)
             return
         try:
             value = resolve_scalar(event.value) if plain else event.value
@@ -212,26 +239,6 @@ class _Builder:
         self._put(value, event)
         if event.anchor:
             self._anchors[event.anchor] = _Anchor(value, 1, 0)
-
-    def _key(self, event: yaml.ScalarEvent) -> None:
-        key, frame = event.value, self._stack[-1]
-        if not event.style:
-            try:
-                text = isinstance(resolve_scalar(key), str)
-            except ValueError:
-                text = False
-            if not text:
-                raise self._error(
-                    event, f"the key {key or 'null'!r} is not text", "names as keys; quote it to make it text"
-                )
-            if key == "<<":
-                raise self._error(event, "merge keys are not supported", hint="write the keys out")
-        if key in frame.value:
-            first = self.keys[(*frame.path, key)]
-            raise self._error(event, f"the key {key!r} was given before, in line {first[0]}", "each key once")
-        frame.key = key
-        self.keys[(*frame.path, key)] = _position(event)
-        self._count(event, 1)
 
     def _open(self, event: yaml.CollectionStartEvent) -> None:
         self._check_tag(event)
@@ -251,19 +258,6 @@ class _Builder:
             self._stack[-1].height = max(self._stack[-1].height, frame.height + 1)
         if frame.anchor:
             self._anchors[frame.anchor] = _Anchor(frame.value, self._nodes - frame.nodes_before, frame.height)
-
-    def _alias(self, event: yaml.AliasEvent) -> None:
-        anchor = self._anchors.get(event.anchor)
-        if anchor is None:
-            raise self._error(event, f"the alias *{event.anchor} has no complete anchor before it")
-        if self._expects_key():
-            raise self._error(event, "an alias cannot be a key", "names as keys")
-        if len(self._stack) + anchor.height > MAX_DEPTH:
-            raise self._error(event, "nested too deeply", f"at most {MAX_DEPTH} levels")
-        self._count(event, anchor.nodes)
-        self._put(copy.deepcopy(anchor.value), event)
-        if self._stack:
-            self._stack[-1].height = max(self._stack[-1].height, anchor.height + 1)
 
     def _expects_key(self) -> bool:
         return bool(self._stack) and isinstance(self._stack[-1].value, dict) and self._stack[-1].key is None

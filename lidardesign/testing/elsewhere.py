@@ -81,16 +81,12 @@ def answer(request: dict[str, Any]) -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     try:
         with plugin_guard(request["name"]), Watch(all_threads=True).during("scenes"):
-            found: dict[str, Any] = _fingerprints(request)
+            task = attrgetter(request["name"])(importlib.import_module(request["module"]))()
+            config, space = task.Config(**request["task"]), DesignSpace.from_dict(request["space"])
+            found: dict[str, Any] = {
+                split: [fingerprint(scene) for scene in scenes_of(task, config, split, request["seed"], space)]
+                for split in ("train", "test")
+            }
     except LidardesignError as error:
         found = {"error": error.message}
     probe.answer(result, found)
-
-
-def _fingerprints(request: dict[str, Any]) -> dict[str, list[str]]:
-    task = attrgetter(request["name"])(importlib.import_module(request["module"]))()
-    config, space = task.Config(**request["task"]), DesignSpace.from_dict(request["space"])
-    return {
-        split: [fingerprint(scene) for scene in scenes_of(task, config, split, request["seed"], space)]
-        for split in ("train", "test")
-    }

@@ -143,17 +143,17 @@ def place_of(error: BaseException) -> str:
     """
     while error.__cause__ is not None:
         error = error.__cause__
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not _is_of_program(frame.filename)]
-    own = [frame for frame in frames if not _is_library(frame.filename)] or frames
+    frames = [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)
+        if not (frame.filename.startswith("<") or Path(frame.filename).is_relative_to(PACKAGE))
+    ]
+    own = [
+        frame
+        for frame in frames
+        if not any(name in Path(frame.filename).parts for name in (*LIBRARIES, "importlib", "contextlib.py"))
+    ] or frames
     return f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""
-
-
-def _is_of_program(file: str) -> bool:
-    return file.startswith("<") or Path(file).is_relative_to(PACKAGE)
-
-
-def _is_library(file: str) -> bool:
-    return any(name in Path(file).parts for name in (*LIBRARIES, "importlib", "contextlib.py"))
 
 
 # The geometry and the scores of so many training scenes are looked at.

@@ -42,7 +42,21 @@ def new_task(name: str, folder: Path | None = None) -> list[Path]:
         ConfigError: The name cannot be one, or is taken.
         DataError: The folder holds something, or cannot be written.
     """
-    tokens = _tokens(_checked(name))
+    allowed = f"small letters, digits and single underscores, up to {LONGEST_NAME}, as landmark or drone_landing"
+    if not NAME.fullmatch(name) or len(name) > LONGEST_NAME:
+        raise ConfigError(f"{name!r} is no name for a task", where="NAME", allowed=allowed)
+    if name in registry.task_names():
+        raise ConfigError(f"a task {name!r} is installed already", where="NAME", hint="choose another name")
+    if find_spec(f"lidardesign_{name}") is not None:
+        raise ConfigError(f"a module lidardesign_{name} is installed already", where="NAME", hint="choose another name")
+    tokens = {
+        "name": name,
+        "package": f"lidardesign-{name.replace('_', '-')}",
+        "module": f"lidardesign_{name}",
+        "class": "".join(part.capitalize() for part in name.split("_")),
+        "version": __version__,
+        "api_version": str(API_VERSION),
+    }
     folder = Path(tokens["package"]) if folder is None else folder
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise DataError("is there already", where=str(folder), allowed="a new or an empty folder", hint="--out DIR")
@@ -54,28 +68,6 @@ def new_task(name: str, folder: Path | None = None) -> list[Path]:
         write_atomic(path, _filled((templates / template).read_text(encoding="utf-8"), tokens).encode())
         written.append(path)
     return written
-
-
-def _checked(name: str) -> str:
-    allowed = f"small letters, digits and single underscores, up to {LONGEST_NAME}, as landmark or drone_landing"
-    if not NAME.fullmatch(name) or len(name) > LONGEST_NAME:
-        raise ConfigError(f"{name!r} is no name for a task", where="NAME", allowed=allowed)
-    if name in registry.task_names():
-        raise ConfigError(f"a task {name!r} is installed already", where="NAME", hint="choose another name")
-    if find_spec(f"lidardesign_{name}") is not None:
-        raise ConfigError(f"a module lidardesign_{name} is installed already", where="NAME", hint="choose another name")
-    return name
-
-
-def _tokens(name: str) -> dict[str, str]:
-    return {
-        "name": name,
-        "package": f"lidardesign-{name.replace('_', '-')}",
-        "module": f"lidardesign_{name}",
-        "class": "".join(part.capitalize() for part in name.split("_")),
-        "version": __version__,
-        "api_version": str(API_VERSION),
-    }
 
 
 def _filled(text: str, tokens: dict[str, str]) -> str:

@@ -66,7 +66,10 @@ class Watch:
     @contextlib.contextmanager
     def during(self, what: str) -> Iterator[None]:
         """Watch the code inside; global random states and the environment are put back afterwards."""
-        _install_hook()
+        # Audit hooks stay for good: one is enough, and it looks only while some task is watched
+        if not _HOOKED:
+            _HOOKED.append(True)
+            sys.addaudithook(_audit)
         before, surroundings = _random_states(), _Surroundings()
         _ACTIVE.append((self, threading.get_ident()))
         try:
@@ -106,13 +109,6 @@ def _note(notes: list[str], found: list[str]) -> None:
     for text in found:
         if text not in notes and len(notes) < MOST_NOTES:
             notes.append(text)
-
-
-def _install_hook() -> None:
-    """Audit hooks stay for good: one is enough, and it looks only while some task is watched."""
-    if not _HOOKED:
-        _HOOKED.append(True)
-        sys.addaudithook(_audit)
 
 
 def _audit(event: str, arguments: tuple[Any, ...]) -> None:
@@ -188,7 +184,12 @@ class _Surroundings:
             changed.append("the working folder")
             os.chdir(self._folder)
         if dict(os.environ) != self._environment:
-            changed += self._restored_environment()
+            now, before = dict(os.environ), self._environment
+            names = [name for name in sorted({*now, *before}) if now.get(name) != before.get(name)]
+            named = [name for name in names if name in before or not name.startswith(LIBRARIES_OWN)]
+            os.environ.clear()
+            os.environ.update(before)
+            changed += [f"the environment ({', '.join(named)})"] if named else []
         if locale.setlocale(locale.LC_ALL) != self._locale:
             changed.append("the locale")
             locale.setlocale(locale.LC_ALL, self._locale)
@@ -196,14 +197,6 @@ class _Surroundings:
             changed.append("numpy's error settings")
             np.seterr(**self._errors)
         return changed + self._restored_signals()
-
-    def _restored_environment(self) -> list[str]:
-        now, before = dict(os.environ), self._environment
-        names = [name for name in sorted({*now, *before}) if now.get(name) != before.get(name)]
-        named = [name for name in names if name in before or not name.startswith(LIBRARIES_OWN)]
-        os.environ.clear()
-        os.environ.update(before)
-        return [f"the environment ({', '.join(named)})"] if named else []
 
     def _restored_signals(self) -> list[str]:
         changed = [number for number, heard in self._heard.items() if signal.getsignal(number) != heard]

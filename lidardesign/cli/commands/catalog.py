@@ -16,7 +16,6 @@ from lidardesign.run.clock import phase
 
 if TYPE_CHECKING:
     from lidardesign.design.catalog.part import Part
-    from lidardesign.design.catalog.placing import Pose
     from lidardesign.design.sensor import DesignSpec
 
 # How several parts at one place are turned against each other.
@@ -211,21 +210,7 @@ def _placed(part: Part, given: dict[str, Any], name: str, output: Output) -> Des
     needed = number or (1 if count is None else parts_for(part, count))
     if needed == 1 and given["--arrange"] is not None:
         raise ConfigError("is for several parts", where="--arrange", hint="--parts N")
-    pose = _pose(given)
-    poses = interleaved(part, pose, needed) if arrange == "interleaved" else side_by_side(part, pose, needed)
-    if count is None and part.rays * needed > MOST_RAYS:
-        raise ConfigError(f"{part.rays * needed} rays", where="--parts", hint="--rays N takes an even subset")
-    if needed > 1 and number is None:
-        output.note(f"note: {count} rays take {needed} x {part.name}, {arrange}")
-    return part_design(part, poses, count, name=name)
-
-
-def _pose(given: dict[str, Any]) -> Pose:
-    """Where the options put the first part.
-
-    Raises:
-        ConfigError: A place that is none, angles that are not finite or beyond the zenith.
-    """
+    # Where the options put the first part
     import numpy as np
 
     from lidardesign.design.catalog.placing import Pose
@@ -244,4 +229,10 @@ def _pose(given: dict[str, Any]) -> Pose:
     if origin.shape != (3,) or not np.isfinite(origin).all() or np.abs(origin).max() > FARTHEST_M:
         allowed = f"three numbers, as 0.5,0,1.8 [m], each at most {FARTHEST_M:g}"
         raise ConfigError(f"found {text!r}", where="--at-origin", allowed=allowed)
-    return Pose(origin, *(math.radians(value) for value in degrees.values()))
+    pose = Pose(origin, *(math.radians(value) for value in degrees.values()))
+    poses = interleaved(part, pose, needed) if arrange == "interleaved" else side_by_side(part, pose, needed)
+    if count is None and part.rays * needed > MOST_RAYS:
+        raise ConfigError(f"{part.rays * needed} rays", where="--parts", hint="--rays N takes an even subset")
+    if needed > 1 and number is None:
+        output.note(f"note: {count} rays take {needed} x {part.name}, {arrange}")
+    return part_design(part, poses, count, name=name)

@@ -44,7 +44,30 @@ def show_evaluation(document: dict[str, Any], written: Sequence[Path], rich: Ric
     _show_grid(title, [(row["matched_to"], row["matched_rays"], row["design"]) for row in matched], cells, rich)
     _show_effects(document, rich)
     if "audit" in document:
-        _show_audit(document, rich)
+        from rich.markup import escape
+
+        audit = document["audit"]
+        unit = audit["unit"]
+        there = {effect["name"] for effect in document["effects"] if effect["bound"] or effect["lost"]}
+        skipped = ", ".join(_words(name) for name in audit["skipped"] if name in there) or "nothing that is there"
+        verdict = "passed" if audit["passed"] else "failed"
+        title = f"audit {verdict}: the plan skips {skipped}; rows may move by {audit['tolerance']:g} {unit}"
+        planned, everything = f"planned\n[{unit}]", f"all effects\n[{unit}]"
+        moves = "difference (95 % interval)"
+        headings = ("design", "bandwidth\nof", "rays", planned, everything, moves, "seconds\nof both")
+        # as many as show hundredths of what is tolerated
+        tolerance = audit["tolerance"]
+        decimals = max(0, 2 - math.floor(math.log10(tolerance))) if tolerance > 0 else DECIMALS
+        lines = []
+        for row in audit["rows"]:
+            # adding zero takes the sign from a rounded -0
+            figures = (round(row[name], decimals) + 0.0 for name in ("difference", "ci_low", "ci_high"))
+            moved, low, high = (f"{value:.{decimals}f}" for value in figures)
+            times = f"{number(row['seconds'], 2)}, {number(row['seconds_everything'], 2)}"
+            scores = (number(row["planned"]), number(row["everything"]))
+            matched = row.get("matched_to", "-")
+            lines.append([row["design"], matched, str(row["rays"]), *scores, f"{moved} ({low} to {high})", times])
+        print_table(escape(title), headings, lines, rich, text=headings[:2])
     for note in document.get("notes", []):
         rich.print(f"note: {escape(note)}", soft_wrap=True)
     for path in written:
@@ -121,30 +144,3 @@ def _show_effects(document: Entry, rich: RichConsole) -> None:
 
 def _words(name: str) -> str:
     return name.replace("_", " ")
-
-
-def _show_audit(document: Entry, rich: RichConsole) -> None:
-    from rich.markup import escape
-
-    audit = document["audit"]
-    unit = audit["unit"]
-    there = {effect["name"] for effect in document["effects"] if effect["bound"] or effect["lost"]}
-    skipped = ", ".join(_words(name) for name in audit["skipped"] if name in there) or "nothing that is there"
-    verdict = "passed" if audit["passed"] else "failed"
-    title = f"audit {verdict}: the plan skips {skipped}; rows may move by {audit['tolerance']:g} {unit}"
-    planned, everything = f"planned\n[{unit}]", f"all effects\n[{unit}]"
-    moves = "difference (95 % interval)"
-    headings = ("design", "bandwidth\nof", "rays", planned, everything, moves, "seconds\nof both")
-    # as many as show hundredths of what is tolerated
-    tolerance = audit["tolerance"]
-    decimals = max(0, 2 - math.floor(math.log10(tolerance))) if tolerance > 0 else DECIMALS
-    lines = []
-    for row in audit["rows"]:
-        # adding zero takes the sign from a rounded -0
-        figures = (round(row[name], decimals) + 0.0 for name in ("difference", "ci_low", "ci_high"))
-        moved, low, high = (f"{value:.{decimals}f}" for value in figures)
-        times = f"{number(row['seconds'], 2)}, {number(row['seconds_everything'], 2)}"
-        scores = (number(row["planned"]), number(row["everything"]))
-        matched = row.get("matched_to", "-")
-        lines.append([row["design"], matched, str(row["rays"]), *scores, f"{moved} ({low} to {high})", times])
-    print_table(escape(title), headings, lines, rich, text=headings[:2])

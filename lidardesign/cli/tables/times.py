@@ -41,31 +41,26 @@ def show_accuracy(accuracy: Accuracy, rich: RichConsole) -> None:
     from rich.markup import escape
 
     for sweep in accuracy.sweeps:
-        _show_sweep(sweep, rich)
+
+        unit = f" [{sweep.unit}]" if sweep.unit else ""
+        title = f"{sweep.knob}: {sweep.error_of}{unit}, against {sweep.against}; seconds of {sweep.work}"
+        further = list(dict.fromkeys(name for measurement in sweep.measurements for name in measurement.values))
+        lines = [
+            (*_cells(measurement, sweep), *(_figure(measurement.values.get(name)) for name in further))
+            for measurement in sweep.measurements
+        ]
+        # a sentence, which wraps like those below the table
+        rich.print(f"[italic]{escape(title)}[/italic]")
+        print_table(None, ("setting", "error", "+-", "seconds", "memory", *further), lines, rich, text=("setting",))
+        rich.print(f"{escape(sweep.verdict)}; tolerance {sweep.tolerance:.3g}{escape(unit)}: {escape(sweep.because)}")
+        if sweep.note:
+            rich.print(f"note: {escape(sweep.note)}")
+        rich.print()
     taken = sum(accuracy.seconds.values())
     rich.print(f"accuracy measured in {taken:.0f} s; [bold]*[/bold] is what to choose, (run) what this run does")
     off = [sweep for sweep in accuracy.sweeps if sweep.default is not None and sweep.chosen is not sweep.default]
     for sweep in off:
         rich.print(f"note: {escape(sweep.knob)}: {escape(sweep.verdict)}")
-
-
-def _show_sweep(sweep: Sweep, rich: RichConsole) -> None:
-    from rich.markup import escape
-
-    unit = f" [{sweep.unit}]" if sweep.unit else ""
-    title = f"{sweep.knob}: {sweep.error_of}{unit}, against {sweep.against}; seconds of {sweep.work}"
-    further = list(dict.fromkeys(name for measurement in sweep.measurements for name in measurement.values))
-    lines = [
-        (*_cells(measurement, sweep), *(_figure(measurement.values.get(name)) for name in further))
-        for measurement in sweep.measurements
-    ]
-    # a sentence, which wraps like those below the table
-    rich.print(f"[italic]{escape(title)}[/italic]")
-    print_table(None, ("setting", "error", "+-", "seconds", "memory", *further), lines, rich, text=("setting",))
-    rich.print(f"{escape(sweep.verdict)}; tolerance {sweep.tolerance:.3g}{escape(unit)}: {escape(sweep.because)}")
-    if sweep.note:
-        rich.print(f"note: {escape(sweep.note)}")
-    rich.print()
 
 
 def _cells(measurement: Measurement, sweep: Sweep) -> tuple[str, ...]:

@@ -79,7 +79,14 @@ def detect(
     light = ArrivingLight.of(windows_m, echoes, background, physics)
     for begin, end in light.bins.chunks():
         path_m[begin:end] = _from_photons(scene, frame, light.part(begin, end), physics)
-    return Detections(path_m, _explained(path_m, windows_m, echoes, light.bins.width_m, physics))
+    # The body of the strongest echo near each detected half path, -1 where there is none
+    tolerance = EXPLAINED_SIGMAS * metres(physics.detector.timing_sigma_s) + light.bins.width_m / 2
+    with np.errstate(invalid="ignore"):
+        near = np.flatnonzero((np.abs(echoes.path_m - path_m[echoes.ray]) <= tolerance) & (echoes.gain > 0))
+    rising = near[np.argsort(echoes.gain[near], kind="stable")]
+    body = np.full(len(windows_m), -1)
+    body[echoes.ray[rising]] = echoes.body[rising]
+    return Detections(path_m, body)
 
 
 def _from_photons(scene: Scene, frame: int, light: ArrivingLight, physics: Physics) -> np.ndarray:
@@ -126,7 +133,15 @@ def _strongest(scene: Scene, frame: int, windows_m: np.ndarray, echoes: Echoes, 
     found = best >= 0
     path_m, body = np.full(count, np.nan), np.full(count, -1)
     path_m[found], body[found] = echoes.path_m[best[found]], echoes.body[best[found]]
-    path_m += _merging(path_m, best, echoes, resolution_m(detector))
+    # How far echoes near the strongest one (index `best`, -1: none) move each ray's range [m]
+    resolution = resolution_m(detector)
+    away = echoes.path_m - path_m[echoes.ray]
+    near = np.abs(away) <= resolution
+    ray = echoes.ray[near]
+    weight = echoes.gain[near] / echoes.gain[best[ray]]
+    moved = np.bincount(ray, weights=weight * away[near], minlength=len(path_m))
+    total = np.bincount(ray, weights=weight, minlength=len(path_m))
+    path_m += moved / np.where(total > 0, total, 1.0)
     if "jitter" in physics.effects:
         key = physics.stream("jitter", scene, frame)
         path_m = add_timing_errors(path_m, np.arange(count), np.zeros(count, int), detector, key)
@@ -134,30 +149,6 @@ def _strongest(scene: Scene, frame: int, windows_m: np.ndarray, echoes: Echoes, 
     if "quantisation" in physics.effects:
         path_m = round_to_bins(path_m, windows_m, detector)
     return Detections(path_m, body)
-
-
-def _merging(path_m: np.ndarray, best: np.ndarray, echoes: Echoes, resolution: float) -> np.ndarray:
-    """How far echoes near the strongest one (index `best`, -1: none) move each ray's range [m]."""
-    away = echoes.path_m - path_m[echoes.ray]
-    near = np.abs(away) <= resolution
-    ray = echoes.ray[near]
-    weight = echoes.gain[near] / echoes.gain[best[ray]]
-    moved = np.bincount(ray, weights=weight * away[near], minlength=len(path_m))
-    total = np.bincount(ray, weights=weight, minlength=len(path_m))
-    return moved / np.where(total > 0, total, 1.0)
-
-
-def _explained(
-    path_m: np.ndarray, windows_m: np.ndarray, echoes: Echoes, width_m: float, physics: Physics
-) -> np.ndarray:
-    """The body of the strongest echo near each detected half path, -1 where there is none."""
-    tolerance = EXPLAINED_SIGMAS * metres(physics.detector.timing_sigma_s) + width_m / 2
-    with np.errstate(invalid="ignore"):
-        near = np.flatnonzero((np.abs(echoes.path_m - path_m[echoes.ray]) <= tolerance) & (echoes.gain > 0))
-    rising = near[np.argsort(echoes.gain[near], kind="stable")]
-    body = np.full(len(windows_m), -1)
-    body[echoes.ray[rising]] = echoes.body[rising]
-    return body
 
 
 @dataclass(frozen=True, eq=False)

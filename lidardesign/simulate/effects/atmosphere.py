@@ -135,34 +135,29 @@ class _Haze:
         middle, half = (ranges[:, 1:] + ranges[:, :-1]) / 2, (ranges[:, 1:] - ranges[:, :-1]) / 2
         gain = np.zeros_like(middle)
         for node, weight in zip(nodes, weights, strict=True):
-            gain += weight * half * self._profile(middle + node * half)
+            # What haze at ranges (N, C) sends into the aperture and the pixel per metre [1/m]
+            range_m = middle + node * half
+            # The share of the light in the aperture that falls on the pixel which looks along the ray, (N, C)
+            blurred = 1 - safe_divide(range_m, np.broadcast_to(self.focus_m[:, None], range_m.shape), 1.0)
+            sharp = self.photons.field_of_view_sr * range_m**2
+            overlap, back_m, seen = (
+                np.minimum(safe_divide(sharp, self.photons.aperture_m2 * blurred**2, 1.0), 1.0),
+                range_m,
+                1.0,
+            )
+            if self.receiver is not None:
+                place = np.asarray(self.receiver.origin_m)
+                points = self.rays.origin_m[:, None] + range_m[..., None] * self.rays.direction[:, None]
+                back_m, seen = np.linalg.norm(points - place, axis=-1), in_view(self.receiver, points)
+                overlap = np.where((self.rays.origin_m == place).all(axis=1)[:, None], overlap, 1.0)
+            faded = np.exp(-self.medium.extinction_per_m * (range_m + back_m))
+            # The solid angle of a disc seen from its axis: area / distance^2 from afar, half of all around on it
+            squared = self.photons.aperture_m2 / math.pi
+            slant = np.sqrt(back_m**2 + squared)
+            # 2 pi (1 - d / slant) without its cancellation from afar
+            caught_sr = (2 * math.pi * squared / (slant * (slant + back_m))) * overlap
+            gain += weight * half * (self.medium.backscatter_per_m_sr * caught_sr * faded * seen)
         return gain
-
-    def _profile(self, range_m: np.ndarray) -> np.ndarray:
-        """What haze at ranges (N, C) sends into the aperture and the pixel per metre [1/m]."""
-        overlap, back_m, seen = self._overlap(range_m), range_m, 1.0
-        if self.receiver is not None:
-            place = np.asarray(self.receiver.origin_m)
-            points = self.rays.origin_m[:, None] + range_m[..., None] * self.rays.direction[:, None]
-            back_m, seen = np.linalg.norm(points - place, axis=-1), in_view(self.receiver, points)
-            overlap = np.where((self.rays.origin_m == place).all(axis=1)[:, None], overlap, 1.0)
-        faded = np.exp(-self.medium.extinction_per_m * (range_m + back_m))
-        caught_sr = _solid_angle_sr(back_m, self.photons.aperture_m2) * overlap
-        return self.medium.backscatter_per_m_sr * caught_sr * faded * seen
-
-    def _overlap(self, range_m: np.ndarray) -> np.ndarray:
-        """The share of the light in the aperture that falls on the pixel which looks along the ray, (N, C)."""
-        blurred = 1 - safe_divide(range_m, np.broadcast_to(self.focus_m[:, None], range_m.shape), 1.0)
-        sharp = self.photons.field_of_view_sr * range_m**2
-        return np.minimum(safe_divide(sharp, self.photons.aperture_m2 * blurred**2, 1.0), 1.0)
-
-
-def _solid_angle_sr(distance_m: np.ndarray, aperture_m2: float) -> np.ndarray:
-    """The solid angle of a disc seen from its axis: area / distance^2 from afar, half of all around on it."""
-    squared = aperture_m2 / math.pi
-    slant = np.sqrt(distance_m**2 + squared)
-    # 2 pi (1 - d / slant) without its cancellation from afar
-    return 2 * math.pi * squared / (slant * (slant + distance_m))
 
 
 def why_absent(detector: Detector, scene: Scene, lists: Sequence[Rays]) -> str | None:

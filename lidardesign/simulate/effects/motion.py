@@ -63,7 +63,15 @@ class Screw:
 
     def at(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rotations (N, 3, 3) and translations (N, 3) of the body at times (N,) [s]."""
-        turned, moved = _turns(self.turn_rad_s, time_s), _translations(self.turn_rad_s, time_s) @ self.drift_m_s
+        # Rotations exp(t [w]) for a rate w (3,) and times (N,), shape (N, 3, 3) (Rodrigues 1840)
+        speed = float(np.linalg.norm(self.turn_rad_s))
+        axis = _cross_matrix(self.turn_rad_s / speed if speed else self.turn_rad_s)
+        angle = (speed * time_s)[:, None, None]
+        # 1 - cos written without its cancellation
+        turned, moved = (
+            (np.eye(3) + np.sin(angle) * axis + 2 * np.sin(angle / 2) ** 2 * (axis @ axis)),
+            _translations(self.turn_rad_s, time_s) @ self.drift_m_s,
+        )
         return turned @ self.pose[:3, :3], turned @ self.pose[:3, 3] + moved
 
     def speed_m_s(self, point: np.ndarray) -> float:
@@ -75,15 +83,6 @@ class Screw:
 def _cross_matrix(vector: np.ndarray) -> np.ndarray:
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
-def _turns(turn: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Rotations exp(t [w]) for a rate w (3,) and times (N,), shape (N, 3, 3) (Rodrigues 1840)."""
-    speed = float(np.linalg.norm(turn))
-    axis = _cross_matrix(turn / speed if speed else turn)
-    angle = (speed * time)[:, None, None]
-    # 1 - cos written without its cancellation
-    return np.eye(3) + np.sin(angle) * axis + 2 * np.sin(angle / 2) ** 2 * (axis @ axis)
 
 
 def _translations(turn: np.ndarray, time: np.ndarray) -> np.ndarray:

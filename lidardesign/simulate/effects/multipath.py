@@ -143,7 +143,12 @@ class _View:
         apart_m = float(np.linalg.norm(np.ptp(rays.origin_m[number], axis=0))) if len(number) else 0.0
         earliest_m = np.maximum(windows_m[number, 0], direct.path_m - apart_m)
         reach_m = float((windows_m[number, 1] - earliest_m).max(initial=0.0))
-        bins = _bins(physics.detector, reach_m)
+        # Bins of whole paths that cover twice a reach of half paths, and half a bin on either side of it
+        told_apart_m = 2 * resolution_m(physics.detector) / CELLS_PER_RESOLUTION
+        finest_m = max(told_apart_m, 2 * reach_m / MOST_CELLS, EPSILON_FLOAT32)
+        width_m = 10 ** (math.ceil(math.log10(finest_m) * WIDTHS_PER_DECADE) / WIDTHS_PER_DECADE)
+        count = math.ceil(2 * reach_m / width_m) + 1
+        bins = PathBins(width_m, 1 << (count - 1).bit_length())
         return cls(
             scene,
             frame,
@@ -225,15 +230,6 @@ def _pixel_sr(detector: Detector) -> float:
     if detector.photons is not None:
         return detector.photons.field_of_view_sr
     return math.pi * (detector.divergence_rad / 2) ** 2
-
-
-def _bins(detector: Detector, reach_m: float) -> PathBins:
-    """Bins of whole paths that cover twice a reach of half paths, and half a bin on either side of it."""
-    told_apart_m = 2 * resolution_m(detector) / CELLS_PER_RESOLUTION
-    finest_m = max(told_apart_m, 2 * reach_m / MOST_CELLS, EPSILON_FLOAT32)
-    width_m = 10 ** (math.ceil(math.log10(finest_m) * WIDTHS_PER_DECADE) / WIDTHS_PER_DECADE)
-    count = math.ceil(2 * reach_m / width_m) + 1
-    return PathBins(width_m, 1 << (count - 1).bit_length())
 
 
 MOST_POINTS, AT_ONCE = 64, 8

@@ -67,18 +67,7 @@ def bound(first_hits: FirstHits, counts: Counts) -> EffectBound:
     sigma_m = first_hits.sigma_m()
     blind = Blindness.of(counts)
     squared = (sigma_m * blind.early) ** 2 + variance_of_missing(counts, counts.in_air, blind.left, sigma_m)
-    lost = np.where(first_hits.returned, _beaten(counts, blind, sigma_m), _invented(counts, blind))
-    typical = float(np.median(blind.per_pulse[first_hits.returned] if first_hits.returned.any() else blind.per_pulse))
-    dead_ns = 1e9 * first_hits.detector.photons.dead_s
-    return EffectBound(squared, lost, f"{count_text(typical)} counts a pulse, {dead_ns:.3g} ns blind after each")
-
-
-def _beaten(counts: Counts, blind: Blindness, sigma_m: np.ndarray) -> np.ndarray:
-    """How much more often what is left of an echo is missed or mistaken.
-
-    With Y Poisson of mean m and f(Y) the probability that Y counts are beaten, which falls with Y,
-    |d/dm E f(Y)| = E[f(Y) - f(Y + 1)] <= E f(Y): what is gone makes at most its number times that more mistakes.
-    """
+    # How much more often what is left of an echo is missed or mistaken
     per_bin, haze = counts.per_bin, [counts.pulses * part for part in counts.haze_per_pulse]
     gone = counts.in_air - blind.left + counts.pulse_bins * per_bin * (1 - blind.under)
     in_light = missed_behind(counts, blind, sigma_m) - counts.missed(counts.in_air, per_bin, sigma_m)
@@ -86,7 +75,14 @@ def _beaten(counts: Counts, blind: Blindness, sigma_m: np.ndarray) -> np.ndarray
     missed = np.maximum(np.maximum(in_light, in_the_dark), 0.0)
     any_count = -np.expm1(-counts.bins * per_bin - haze[0])
     mistaken = counts.mistaken(blind.left, per_bin + haze[1], per_bin * blind.under, sigma_m)
-    return np.minimum(missed + np.clip(gone, 0.0, 1.0) * np.minimum(mistaken, any_count), 1.0)
+    lost = np.where(
+        first_hits.returned,
+        np.minimum(missed + np.clip(gone, 0.0, 1.0) * np.minimum(mistaken, any_count), 1.0),
+        _invented(counts, blind),
+    )
+    typical = float(np.median(blind.per_pulse[first_hits.returned] if first_hits.returned.any() else blind.per_pulse))
+    dead_ns = 1e9 * first_hits.detector.photons.dead_s
+    return EffectBound(squared, lost, f"{count_text(typical)} counts a pulse, {dead_ns:.3g} ns blind after each")
 
 
 def _invented(counts: Counts, blind: Blindness) -> np.ndarray:

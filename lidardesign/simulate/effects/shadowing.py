@@ -43,23 +43,19 @@ def clearance_m(scene: Scene, distance_m: np.ndarray) -> np.ndarray:
         distance_m: How far the ray has gone so far, shape (N,) [m].
     """
     if scene not in _mesh_radii_m:
-        _mesh_radii_m[scene] = _mesh_radius_m(scene)
+        # Half the diagonal around what is traced as one: each moving mesh, or all that rest [m]
+        radii_m, resting = [0.0], []
+        for body in scene.bodies:
+            if isinstance(body.shape, Mesh):
+                low, high = body.shape.bounds_m
+                radii_m.append(float(np.linalg.norm(high - low)) / 2)
+                if body.poses.ndim == 2:
+                    middle = body.poses[:3, :3] @ (low + high) / 2 + body.poses[:3, 3]
+                    resting += [middle - radii_m[-1], middle + radii_m[-1]]
+        if resting:
+            radii_m.append(float(np.linalg.norm(np.ptp(resting, axis=0))) / 2)
+        _mesh_radii_m[scene] = max(radii_m)
     return CLEARANCE_SHARE * distance_m + MESH_CLEARANCE_SHARE * _mesh_radii_m[scene]
-
-
-def _mesh_radius_m(scene: Scene) -> float:
-    """Half the diagonal around what is traced as one: each moving mesh, or all that rest [m]."""
-    radii_m, resting = [0.0], []
-    for body in scene.bodies:
-        if isinstance(body.shape, Mesh):
-            low, high = body.shape.bounds_m
-            radii_m.append(float(np.linalg.norm(high - low)) / 2)
-            if body.poses.ndim == 2:
-                middle = body.poses[:3, :3] @ (low + high) / 2 + body.poses[:3, 3]
-                resting += [middle - radii_m[-1], middle + radii_m[-1]]
-    if resting:
-        radii_m.append(float(np.linalg.norm(np.ptp(resting, axis=0))) / 2)
-    return max(radii_m)
 
 
 def sight_shares(

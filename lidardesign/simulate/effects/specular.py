@@ -96,7 +96,12 @@ def _detours_of(scene: Scene, beams: Beams, hits: Hits, rows: slice, tracer: Tra
         back = direction - 2 * np.einsum("nk,nk->n", direction, normal)[:, None] * normal
         turned = _followed(scene, front, mirrored, back, tracer)
         straight = _followed(scene, front, passing, front.beams.direction, tracer)
-        front = _joined(turned, straight)
+        front = _Front(
+            Beams.joined([turned.beams, straight.beams]),
+            np.concatenate([turned.number, straight.number]),
+            np.concatenate([turned.passed, straight.passed]),
+            Hits.joined([turned.hits, straight.hits]),
+        )
         if not len(front.beams):
             break
         echoes.append(_received(scene, beams, front, tracer))
@@ -147,15 +152,6 @@ def _received_elsewhere(scene: Scene, front: _Front, tracer: Tracer) -> Echoes:
     point = front.beams.origin_m + front.hits.range_m[:, None] * front.beams.direction
     share = sight_shares(scene, point, front.hits.normal, front.beams.time_s, tracer)
     return replace(echoes, gain=echoes.gain * share).subset(share > 0)
-
-
-def _joined(first: _Front, second: _Front) -> _Front:
-    return _Front(
-        Beams.joined([first.beams, second.beams]),
-        np.concatenate([first.number, second.number]),
-        np.concatenate([first.passed, second.passed]),
-        Hits.joined([first.hits, second.hits]),
-    )
 
 
 def _no_echoes() -> Echoes:

@@ -191,7 +191,18 @@ def _sample(hits: Hits) -> np.ndarray:
 
 def _next(scene: Scene, caster: SceneCaster, ends: _Ends, directions: int) -> _Ends:
     """What is met from the ends of paths, in so many directions each."""
-    direction = _hemispheres(ends.normal, directions)
+    # Directions above surfaces with normals (M, 3), dense as the cosine, turned from each to the next, (M D, 3)
+    number = np.arange(directions)
+    radius = np.sqrt((number + 0.5) / directions)
+    angle = GOLDEN_ANGLE_RAD * (number + directions * np.arange(len(ends.normal))[:, None])
+    other = np.eye(3)[np.abs(ends.normal).argmin(axis=1)]
+    left = np.cross(other, ends.normal)
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    up = np.cross(ends.normal, left)
+    x, y = radius * np.cos(angle), radius * np.sin(angle)
+    height = np.sqrt(1 - radius**2)[:, None]
+    spread = x[..., None] * left[:, None] + y[..., None] * up[:, None] + height * ends.normal[:, None]
+    direction = spread.reshape(-1, 3)
     source = np.repeat(np.arange(len(ends.point)), directions)
     start = _lifted(ends.place, ends.normal)[source]
     found = caster.first_hit(start, direction)
@@ -227,18 +238,3 @@ def _lifted(places: np.ndarray, normal: np.ndarray) -> np.ndarray:
     if not len(places):
         return places
     return places + CLEARANCE * (1 + np.ptp(places, axis=0).max()) * normal
-
-
-def _hemispheres(normal: np.ndarray, directions: int) -> np.ndarray:
-    """Directions above surfaces with normals (M, 3), dense as the cosine, turned from each to the next, (M D, 3)."""
-    number = np.arange(directions)
-    radius = np.sqrt((number + 0.5) / directions)
-    angle = GOLDEN_ANGLE_RAD * (number + directions * np.arange(len(normal))[:, None])
-    other = np.eye(3)[np.abs(normal).argmin(axis=1)]
-    left = np.cross(other, normal)
-    left /= np.linalg.norm(left, axis=1, keepdims=True)
-    up = np.cross(normal, left)
-    x, y = radius * np.cos(angle), radius * np.sin(angle)
-    height = np.sqrt(1 - radius**2)[:, None]
-    spread = x[..., None] * left[:, None] + y[..., None] * up[:, None] + height * normal[:, None]
-    return spread.reshape(-1, 3)

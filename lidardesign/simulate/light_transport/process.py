@@ -116,7 +116,14 @@ def ask(
         (folder / "request.json").write_text(json.dumps(request), encoding="utf-8")
         np.savez(folder / "request.npz", **arrays)
         with _one_at_a_time:
-            _worker().ask(folder, limit_s)
+            reason = missing()
+            if reason is not None:
+                raise ConfigError(f"the light-transport simulator cannot run: {reason}", hint=HINT)
+            if not _running or not _running[0].alive:
+                end_worker()
+                environment = {**os.environ, LLVM_VARIABLE: str(llvm_library())}
+                _running[:] = [Worker([sys.executable, "-m", WORKER], environment)]
+            _running[0].ask(folder, limit_s)
         failure = folder / "error.txt"
         if failure.exists():
             lines = failure.read_text(encoding="utf-8").strip().splitlines()
@@ -198,31 +205,23 @@ class Worker:
                 # for whoever asks again
                 self._lines.put(None)
                 self.end()
-                raise NumericalError(_epitaph(self._process.returncode, printed), hint=HINT)
+                names = {int(number): number.name for number in signal.Signals}
+                cause = (
+                    f"was ended by {names.get(-self._process.returncode, -self._process.returncode)}"
+                    if self._process.returncode < 0
+                    else f"ended with exit code {self._process.returncode}"
+                )
+                errors = [line.strip() for line in printed if "error" in line.lower()]
+                said = "\n".join((errors or [line for line in printed if line.strip()])[-SHOWN_LINES:])
+                raise NumericalError(
+                    f"the light-transport simulator's process {cause}" + (f"; it said:\n{said}" if said else ""),
+                    hint=HINT,
+                )
             printed.append(line)
-
-
-def _epitaph(code: int, printed: list[str]) -> str:
-    names = {int(number): number.name for number in signal.Signals}
-    cause = f"was ended by {names.get(-code, -code)}" if code < 0 else f"ended with exit code {code}"
-    errors = [line.strip() for line in printed if "error" in line.lower()]
-    said = "\n".join((errors or [line for line in printed if line.strip()])[-SHOWN_LINES:])
-    return f"the light-transport simulator's process {cause}" + (f"; it said:\n{said}" if said else "")
 
 
 _running: list[Worker] = []
 _one_at_a_time = threading.Lock()
-
-
-def _worker() -> Worker:
-    reason = missing()
-    if reason is not None:
-        raise ConfigError(f"the light-transport simulator cannot run: {reason}", hint=HINT)
-    if not _running or not _running[0].alive:
-        end_worker()
-        environment = {**os.environ, LLVM_VARIABLE: str(llvm_library())}
-        _running[:] = [Worker([sys.executable, "-m", WORKER], environment)]
-    return _running[0]
 
 
 def end_worker() -> None:

@@ -128,7 +128,16 @@ def _lights(mi: Any, dr: Any) -> type:
             offset = place - it.p
             distance = dr.norm(offset)
             toward = offset / dr.maximum(distance, dr.smallest(mi.Float))
-            strength = _strength(dr, job, index, -toward, distance)
+            # The irradiance of lights at a distance in a direction away from them, on a surface that faces them
+            away = -toward
+            forward, left, up = (dr.dot(away, job.at(f"light_{name}", index)) for name in ("forward", "left", "up"))
+            inside = (forward >= job.at("light_cosine", index)) & (distance > job.at("light_itself", index))
+            inside &= dr.abs(left) <= job.at("light_left_tan", index) * dr.abs(forward)
+            inside &= dr.abs(up) <= job.at("light_up_tan", index) * dr.abs(forward)
+            intensity = job.at("light_intensity", index)
+            intensity *= dr.select(job.at("light_lambert", index) > 0, dr.maximum(forward, 0), 1)
+            near = dr.maximum(distance, job.at("light_radius", index))
+            strength = dr.select(inside, intensity / dr.square(near), 0)
             dark = dr.norm(it.p - mi.Point3f(job.at("dark_place", ray))) < job.at("dark_radius", ray)
             strength = dr.select(dark, 0, strength)
             if not job.own:
@@ -159,38 +168,22 @@ def _lights(mi: Any, dr: Any) -> type:
     return Lights
 
 
-def _strength(dr: Any, job: Job, index: Any, away: Any, distance: Any) -> Any:
-    """The irradiance of lights at a distance in a direction away from them, on a surface that faces them."""
-    forward, left, up = (dr.dot(away, job.at(f"light_{name}", index)) for name in ("forward", "left", "up"))
-    inside = (forward >= job.at("light_cosine", index)) & (distance > job.at("light_itself", index))
-    inside &= dr.abs(left) <= job.at("light_left_tan", index) * dr.abs(forward)
-    inside &= dr.abs(up) <= job.at("light_up_tan", index) * dr.abs(forward)
-    intensity = job.at("light_intensity", index)
-    intensity *= dr.select(job.at("light_lambert", index) > 0, dr.maximum(forward, 0), 1)
-    near = dr.maximum(distance, job.at("light_radius", index))
-    return dr.select(inside, intensity / dr.square(near), 0)
-
-
-def _surface(shape: dict[str, Any]) -> dict[str, Any]:
-    """Matt, mirroring and clear shares of a body's light as one material, the same on both sides."""
-    clear, mirror = shape["transmission"], shape["specular"]
-    solid = max(1.0 - clear, TINY_FLOAT32)
-    matt_share = max(solid - mirror, TINY_FLOAT32)
-    material: dict[str, Any] = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 1.0}}
-    material["reflectance"]["value"] = min(shape["reflectance"] / matt_share, 1.0)
-    if mirror > 0:
-        glossy = {"type": "conductor", "material": "none"}
-        material = {"type": "blendbsdf", "weight": mirror / solid, "matt": material, "glossy": glossy}
-    material = {"type": "twosided", "inner": material}
-    if clear > 0:
-        material = {"type": "mask", "opacity": 1.0 - clear, "inner": material}
-    return material
-
-
 def _shapes(mi: Any, request: dict[str, Any], arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     made: dict[str, Any] = {}
     for number, shape in enumerate(request["shapes"]):
-        surface = _surface(shape)
+        # Matt, mirroring and clear shares of a body's light as one material, the same on both sides
+        clear, mirror = shape["transmission"], shape["specular"]
+        solid = max(1.0 - clear, TINY_FLOAT32)
+        matt_share = max(solid - mirror, TINY_FLOAT32)
+        material: dict[str, Any] = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 1.0}}
+        material["reflectance"]["value"] = min(shape["reflectance"] / matt_share, 1.0)
+        if mirror > 0:
+            glossy = {"type": "conductor", "material": "none"}
+            material = {"type": "blendbsdf", "weight": mirror / solid, "matt": material, "glossy": glossy}
+        material = {"type": "twosided", "inner": material}
+        if clear > 0:
+            material = {"type": "mask", "opacity": 1.0 - clear, "inner": material}
+        surface = material
         name = f"body{number}"
         if shape["kind"] == "mesh":
             made[name] = _mesh(mi, name, surface, arrays[f"vertices{number}"], arrays[f"faces{number}"])
