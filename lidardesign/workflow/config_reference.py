@@ -246,7 +246,20 @@ def schema_of(kind: str, task: Task | None = None) -> dict[str, Any]:
     if kind == "config":
         return _config_schema(task)
     if kind == "constraints":
-        return _constraints_schema()
+        # The schema of `constrain --constraints FILE`, whose keys may all be left empty
+        schema = Constraints.model_json_schema()
+        for part in (schema, *schema.get("$defs", {}).values()):
+            for name, value in part.get("properties", {}).items():
+                if name not in part.get("required", ()):
+                    part["properties"][name] = {"anyOf": [value, NULL]}
+        snap = schema["$defs"]["Snap"]
+        schema["$defs"]["Snap"] = {"anyOf": [{"const": CATALOG}, snap], "description": snap.pop("description", "")}
+        return {
+            "$schema": DIALECT,
+            "$id": "urn:lidardesign:constraints:1",
+            **schema,
+            "title": "Constraints of a design",
+        }
     return json.loads((SCHEMA_FILE if kind == "design" else EVALUATE_SCHEMA).read_text(encoding="utf-8"))
 
 
@@ -297,15 +310,3 @@ def _config_schema(task: Task | None) -> dict[str, Any]:
         },
         "$defs": definitions,
     }
-
-
-def _constraints_schema() -> dict[str, Any]:
-    """The schema of `constrain --constraints FILE`, whose keys may all be left empty."""
-    schema = Constraints.model_json_schema()
-    for part in (schema, *schema.get("$defs", {}).values()):
-        for name, value in part.get("properties", {}).items():
-            if name not in part.get("required", ()):
-                part["properties"][name] = {"anyOf": [value, NULL]}
-    snap = schema["$defs"]["Snap"]
-    schema["$defs"]["Snap"] = {"anyOf": [{"const": CATALOG}, snap], "description": snap.pop("description", "")}
-    return {"$schema": DIALECT, "$id": "urn:lidardesign:constraints:1", **schema, "title": "Constraints of a design"}

@@ -172,7 +172,11 @@ class ScoreRequest:
         run = learned = common_run(name_apart(designs), opened)
         rays = options.rays or usual_numbers([design.specification for design in designs], run.task.defaults.rays)
         if options.accuracy:
-            _check_measurable(learned)
+            # Refuse a run that is unfinished or damaged before it is evaluated, which may take minutes
+            with phase("libraries"):
+                from lidardesign.density.training.snapshot_quality import check_kept
+
+            check_kept(learned.folder)
         overrides = settings_texts(options.settings)
         if overrides:
             run = replace(run, config=with_task_settings(run.task, run.config, overrides))
@@ -530,11 +534,3 @@ def evaluation_request(
         without_visibility=(lambda: twin_without_visibility(*from_runs[0], layouts)) if from_runs else None,
         density=cache(lambda: learned_density(from_runs[0][1] if from_runs else run)),
     )
-
-
-def _check_measurable(run: RunFolder) -> None:
-    """Refuse a run that is unfinished or damaged before it is evaluated, which may take minutes."""
-    with phase("libraries"):
-        from lidardesign.density.training.snapshot_quality import check_kept
-
-    check_kept(run.folder)

@@ -191,7 +191,11 @@ class LearnRequest:
                 check_can_start(folder)  # another process may have been faster
             with self._undone_on_failure():
                 if not self.begun:
-                    self._begin()
+                    # Write what the run is before anything is learned; the configuration last
+                    start_manifest(self.folder, command=list(self.command), seed=self.settings.seed)
+                    if not self.goal.is_none:
+                        note(self.folder, **{GOAL: self.goal.as_dict()})
+                    save_run_config(self.settings, self.folder)
                 learner = Learner(self.task, folder, self.device, progress, outermost_clock() or Clock())
                 try:
                     return learner.learn(self.settings, self.goal, resume=self.has_checkpoint)
@@ -212,13 +216,6 @@ class LearnRequest:
         else:
             return "before the first checkpoint; nothing was kept"
         return f"{rest}\n  continue with: lidardesign learn {self.task.name} --out {self.folder} --resume"
-
-    def _begin(self) -> None:
-        """Write what the run is before anything is learned; the configuration last."""
-        start_manifest(self.folder, command=list(self.command), seed=self.settings.seed)
-        if not self.goal.is_none:
-            note(self.folder, **{GOAL: self.goal.as_dict()})
-        save_run_config(self.settings, self.folder)
 
     @contextlib.contextmanager
     def _undone_on_failure(self) -> Iterator[None]:

@@ -81,16 +81,13 @@ def checked_goal(tolerance: float | None, time_budget_s: float | None, given: Ma
     if STEPS_KEY in keys:
         raise ConfigError(f"the time decides {STEPS_KEY}", where=TIME_BUDGET, hint=f"leave out --set {STEPS_KEY}")
     if given["config_file"] is not None:
-        _refuse_steps_in(given["config_file"])
+        # Refuse a configuration file that sets what the time decides
+        path = given["config_file"]
+        document, key = load_yaml(path), tuple(STEPS_KEY.split("."))
+        if key in dict(leaves(document.value)):
+            where = f"{TIME_BUDGET}, {document.locate(key)}"
+            raise ConfigError(f"the time decides {STEPS_KEY}", where=where, hint=f"leave out {STEPS_KEY} there")
     return Goal(None, time_budget_s)
-
-
-def _refuse_steps_in(path: Path) -> None:
-    """Refuse a configuration file that sets what the time decides."""
-    document, key = load_yaml(path), tuple(STEPS_KEY.split("."))
-    if key in dict(leaves(document.value)):
-        where = f"{TIME_BUDGET}, {document.locate(key)}"
-        raise ConfigError(f"the time decides {STEPS_KEY}", where=where, hint=f"leave out {STEPS_KEY} there")
 
 
 def resumed_goal(asked: Goal, run: Path) -> Goal:
@@ -110,9 +107,7 @@ def resumed_goal(asked: Goal, run: Path) -> Goal:
     (key, value), begun = next(iter(asked.as_dict().items())), "neither goal"
     if not stored.is_none:
         begun = " = ".join(str(part) for part in next(iter(stored.as_dict().items())))
-    raise ConfigError(
-        f"the run was started with {begun}, not {key} = {value:g}", where=where, hint="resume without it"
-    )
+    raise ConfigError(f"the run was started with {begun}, not {key} = {value:g}", where=where, hint="resume without it")
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,9 +137,7 @@ class Learner:
             return self._to_tolerance(config, goal, resume)
         if goal.time_budget_s is not None and not resume:
             return self._within(config, goal.time_budget_s)
-        result = learn_density(
-            self.task, config, self.run, resume=resume, device=self.device, progress=self.progress
-        )
+        result = learn_density(self.task, config, self.run, resume=resume, device=self.device, progress=self.progress)
         return result if goal.is_none else replace(result, goal=read_manifest(self.run)[GOAL])
 
     def _to_tolerance(self, config: RunConfig, goal: Goal, resume: bool) -> LearnResult:

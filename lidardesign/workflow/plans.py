@@ -52,7 +52,9 @@ class RequestPlan:
             "dry_run": True,
             "command": self.command,
             "steps": list(self.steps),
-            "reads": [{"path": str(path), "bytes": _file_bytes(path)} for path in self.reads],
+            "reads": [
+                {"path": str(path), "bytes": (os.path.getsize(path) if _is_file(path) else None)} for path in self.reads
+            ],
             "writes": [{"path": str(path), "replaces": _is_file(path)} for path in self.writes],
             "settings": dict(self.settings),
             "before": None if self.before is None else {"seconds": self.before.seconds, "of": self.before.name},
@@ -66,29 +68,23 @@ class RequestPlan:
         """
         for path in self.writes:
             if str(path) != STDIO:
-                _check_writable(path)
-
-
-def _check_writable(path: Path | str) -> None:
-    is_folder = str(path).endswith("/")
-    target = Path(path)
-    if target.is_dir() and not is_folder:
-        raise DataError("is a folder", where=str(path), hint="give the name of a file")
-    if target.is_file() and is_folder:
-        raise DataError("is a file", where=str(target), hint="give a new folder, or one that is there")
-    there = next(parent for parent in (target, *target.absolute().parents) if parent.exists())
-    if there != target and not there.is_dir():
-        raise DataError(f"cannot be made: {there} is a file", where=str(path), hint="give another place")
-    if not os.access(there, os.W_OK):
-        raise DataError(f"cannot be written: {there} is read-only", where=str(path), hint="give another place")
+                is_folder = str(path).endswith("/")
+                target = Path(path)
+                if target.is_dir() and not is_folder:
+                    raise DataError("is a folder", where=str(path), hint="give the name of a file")
+                if target.is_file() and is_folder:
+                    raise DataError("is a file", where=str(target), hint="give a new folder, or one that is there")
+                there = next(parent for parent in (target, *target.absolute().parents) if parent.exists())
+                if there != target and not there.is_dir():
+                    raise DataError(f"cannot be made: {there} is a file", where=str(path), hint="give another place")
+                if not os.access(there, os.W_OK):
+                    raise DataError(
+                        f"cannot be written: {there} is read-only", where=str(path), hint="give another place"
+                    )
 
 
 def _is_file(path: Path | str) -> bool:
     return str(path) != STDIO and os.path.isfile(path)
-
-
-def _file_bytes(path: Path | str) -> int | None:
-    return os.path.getsize(path) if _is_file(path) else None
 
 
 def last_time(run: Path | None, command: str) -> EarlierRun | None:

@@ -177,7 +177,16 @@ def fit_design(
         refinement = _refined(request, request.refine, progress, notes)
         result = refinement.trial.result
         weighting = Weighting(weighting.settings, refinement.reweighting, refinement.shape.range_spread_m)
-        document = _document(refinement, run.task.metric.unit)
+        document = {
+            "start": refinement.start,
+            "end": refinement.end,
+            "unit": run.task.metric.unit,
+            "level": refinement.shape.level,
+            "range_spread_m": refinement.shape.range_spread_m,
+            "traced_gates": refinement.shape.traced_gates,
+            "scenes": {"looked_at": refinement.looked_at, "judged_on": refinement.judged_on},
+            "rounds": [entry.as_dict() for entry in refinement.rounds],
+        }
     for note in result.notes:
         notes(note)
     design, further = result.design, {KEY: weighting.as_document()} if weighting else {}
@@ -222,9 +231,7 @@ def refuse_broken(checks: Sequence[ConstraintCheck]) -> None:
         )
 
 
-def _refined(
-    request: FitRequest, rounds: int, progress: Callable[[Round], None] | None, notes: Notes
-) -> Refinement:
+def _refined(request: FitRequest, rounds: int, progress: Callable[[Round], None] | None, notes: Notes) -> Refinement:
     """The best design of so many rounds.
 
     Raises:
@@ -331,16 +338,3 @@ def refinement_scenes(request: FitRequest) -> tuple[list[Scene], list[Scene]]:
         )  # fmt: skip
     looked = min(max(round(LOOK_SHARE * len(scenes)), 1), len(scenes) - 1)
     return scenes[:looked], scenes[looked:]
-
-
-def _document(refinement: Refinement, unit: str) -> dict[str, Any]:
-    return {
-        "start": refinement.start,
-        "end": refinement.end,
-        "unit": unit,
-        "level": refinement.shape.level,
-        "range_spread_m": refinement.shape.range_spread_m,
-        "traced_gates": refinement.shape.traced_gates,
-        "scenes": {"looked_at": refinement.looked_at, "judged_on": refinement.judged_on},
-        "rounds": [entry.as_dict() for entry in refinement.rounds],
-    }

@@ -234,7 +234,23 @@ def place_bodies(entries: Sequence[Entry], columns: int, build_grid: BuildGrid) 
     grids, grid = _grids(entries, build_grid)
     kinds = np.array([KINDS[type(body.shape)] for _, body, _ in entries], dtype=np.int64)
     sizes = np.array([size_of(body) for _, body, _ in entries], dtype=np.float64).reshape(-1, 3)
-    low, high = _world_bounds(kinds, sizes, grid, grids, poses)
+    # World boxes around every body, shape (B, 3) each; of a mesh, around its whole grid
+    centre, half = np.zeros((len(kinds), 3)), sizes.copy()
+    sphere, capsule = kinds == SPHERE, kinds == CAPSULE
+    half[sphere] = sizes[sphere, :1]
+    half[capsule] = np.stack(
+        [sizes[capsule, 0], sizes[capsule, 0], sizes[capsule, 0] + sizes[capsule, 1]], axis=1
+    ).reshape(-1, 3)
+    mesh = kinds == GRID
+    centre[mesh] = (grids.lows[grid[mesh]] + grids.high[grid[mesh]]) / 2
+    half[mesh] = (grids.high[grid[mesh]] - grids.lows[grid[mesh]]) / 2
+    rotation = poses[:, :3, :3]
+    middle = np.einsum("bij,bj->bi", rotation, centre) + poses[:, :3, 3]
+    reach = np.einsum("bij,bj->bi", np.abs(rotation), half)
+    # a sphere is as wide in every turned frame
+    reach[sphere] = half[sphere]
+    reach[kinds == PLANE] = np.inf
+    low, high = np.ascontiguousarray(middle - reach), np.ascontiguousarray(middle + reach)
     return Bodies(
         kinds=kinds,
         sizes=sizes,
@@ -293,25 +309,3 @@ def _grids(entries: Sequence[Entry], build_grid: BuildGrid) -> tuple[Grids, np.n
         meshes=tuple(meshes),
     )
     return grids, row
-
-
-def _world_bounds(
-    kinds: np.ndarray, sizes: np.ndarray, grid: np.ndarray, grids: Grids, poses: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """World boxes around every body, shape (B, 3) each; of a mesh, around its whole grid."""
-    centre, half = np.zeros((len(kinds), 3)), sizes.copy()
-    sphere, capsule = kinds == SPHERE, kinds == CAPSULE
-    half[sphere] = sizes[sphere, :1]
-    half[capsule] = np.stack(
-        [sizes[capsule, 0], sizes[capsule, 0], sizes[capsule, 0] + sizes[capsule, 1]], axis=1
-    ).reshape(-1, 3)
-    mesh = kinds == GRID
-    centre[mesh] = (grids.lows[grid[mesh]] + grids.high[grid[mesh]]) / 2
-    half[mesh] = (grids.high[grid[mesh]] - grids.lows[grid[mesh]]) / 2
-    rotation = poses[:, :3, :3]
-    middle = np.einsum("bij,bj->bi", rotation, centre) + poses[:, :3, 3]
-    reach = np.einsum("bij,bj->bi", np.abs(rotation), half)
-    # a sphere is as wide in every turned frame
-    reach[sphere] = half[sphere]
-    reach[kinds == PLANE] = np.inf
-    return np.ascontiguousarray(middle - reach), np.ascontiguousarray(middle + reach)

@@ -102,9 +102,7 @@ class _Block(nn.Module):
             seen = known[:1] if turn == 0 and context is None else known
             parameters = self._of_dimension(dimension, layer, seen).expand(len(outputs), -1, -1)
             column = slice(dimension, dimension + 1)
-            columns[dimension], log_slope = spline(
-                outputs[:, column], parameters, self.periodic[column], inverted=True
-            )
+            columns[dimension], log_slope = spline(outputs[:, column], parameters, self.periodic[column], inverted=True)
             total = total + log_slope[:, 0]
         return torch.cat(columns, dim=-1), total
 
@@ -157,9 +155,6 @@ class DesignFlow(nn.Module):
                 circular = [self._periodic[i] for i in dimensions]
                 self.blocks.append(_Block(dimensions, width, layers, hidden, bins, circular))
                 seen += dimensions
-        self._initialise(generator)
-
-    def _initialise(self, generator: torch.Generator) -> None:
         for parameter in self.parameters():
             bound = 1 / math.sqrt(parameter.shape[-1])
             with torch.no_grad():

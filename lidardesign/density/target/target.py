@@ -25,7 +25,6 @@ from lidardesign.density.target.visibility import (
     NoVisibility,
     Optics,
     RayBatch,
-    RayGradient,
     Visibility,
     common_receiver,
 )
@@ -102,9 +101,7 @@ class Target:
         return self._in_chunks(points, sigma_m, gradient=True)
 
     @phase("target")
-    def _in_chunks(
-        self, points: np.ndarray, sigma_m: float | None, gradient: bool
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _in_chunks(self, points: np.ndarray, sigma_m: float | None, gradient: bool) -> tuple[np.ndarray, np.ndarray]:
         points = np.asarray(points, dtype=np.float64)
         if wrong := unusable(points):
             raise NumericalError(wrong, where="target density")
@@ -128,9 +125,6 @@ class Target:
             return values, None
         by_point, by_ray = near.gradient(shares), passed.gradient(shares)
         by_ray.add_by_point(by_point, rays)
-        return values, self._by_chart(points, by_ray)
-
-    def _by_chart(self, points: np.ndarray, by_ray: RayGradient) -> np.ndarray:
         sin_a, cos_a = np.sin(points[:, AZIMUTH]), np.cos(points[:, AZIMUTH])
         sin_e, cos_e = np.sin(points[:, ELEVATION]), np.cos(points[:, ELEVATION])
         by_elevation = np.stack([-sin_e * cos_a, -sin_e * sin_a, cos_e], axis=1)
@@ -142,7 +136,7 @@ class Target:
         by_chart[:, AZIMUTH] = np.einsum("nk,nk->n", by_ray.directions, by_azimuth)
         by_chart[:, ELEVATION] = np.einsum("nk,nk->n", by_ray.directions, by_elevation)
         by_chart[:, RANGE] = by_ray.ranges
-        return by_chart
+        return values, by_chart
 
 
 def nearby_order(points: np.ndarray) -> np.ndarray:

@@ -317,29 +317,24 @@ class BodyRaycast(OneWay):
         hits, normals = np.empty(count), np.zeros((count, 3))
         body_kernels.first_hits(self.bodies.arrays, pairs.row_starts, pairs.columns, lines, hits, normals)
         if self.bodies.grids.meshes:
-            self._add_meshes(rays, pairs, limit_m, hits, normals)
+            rows, chosen, body = self._candidates(rays, pairs, limit_m)
+            row_of_grid = self.bodies.grid[body]
+            for number, caster in enumerate(self._casters, start=1):
+                mine = np.flatnonzero(row_of_grid == number)
+                if not len(mine):
+                    continue
+                pose, ray, pair = self.bodies.to_body[body[mine]], rows[mine], chosen[mine]
+                origins = np.einsum("pij,pj->pi", pose[:, :, :3], rays.origins[ray]) + pose[:, :, 3]
+                directions = np.einsum("pij,pj->pi", pose[:, :, :3], rays.directions[ray])
+                range_m, normal = caster.trace(origins, directions, np.minimum(limit_m[ray], hits[pair]))
+                nearer = np.flatnonzero(range_m < hits[pair])
+                # a pair may meet the same mesh in two poses: the nearest is written last
+                nearer = nearer[np.argsort(-range_m[nearer], kind="stable")]
+                facing = np.sign(np.einsum("pk,pk->p", normal[nearer], directions[nearer]))
+                turned = np.einsum("pij,pi->pj", pose[nearer, :, :3], normal[nearer])
+                hits[pair[nearer]] = range_m[nearer]
+                normals[pair[nearer]] = -np.where(facing == 0, 1.0, facing)[:, None] * turned
         return hits, normals
-
-    def _add_meshes(
-        self, rays: RayBatch, pairs: Pairs, limit_m: np.ndarray, hits: np.ndarray, normals: np.ndarray
-    ) -> None:
-        rows, chosen, body = self._candidates(rays, pairs, limit_m)
-        row_of_grid = self.bodies.grid[body]
-        for number, caster in enumerate(self._casters, start=1):
-            mine = np.flatnonzero(row_of_grid == number)
-            if not len(mine):
-                continue
-            pose, ray, pair = self.bodies.to_body[body[mine]], rows[mine], chosen[mine]
-            origins = np.einsum("pij,pj->pi", pose[:, :, :3], rays.origins[ray]) + pose[:, :, 3]
-            directions = np.einsum("pij,pj->pi", pose[:, :, :3], rays.directions[ray])
-            range_m, normal = caster.trace(origins, directions, np.minimum(limit_m[ray], hits[pair]))
-            nearer = np.flatnonzero(range_m < hits[pair])
-            # a pair may meet the same mesh in two poses: the nearest is written last
-            nearer = nearer[np.argsort(-range_m[nearer], kind="stable")]
-            facing = np.sign(np.einsum("pk,pk->p", normal[nearer], directions[nearer]))
-            turned = np.einsum("pij,pi->pj", pose[nearer, :, :3], normal[nearer])
-            hits[pair[nearer]] = range_m[nearer]
-            normals[pair[nearer]] = -np.where(facing == 0, 1.0, facing)[:, None] * turned
 
     def _candidates(
         self, rays: RayBatch, pairs: Pairs, limit_m: np.ndarray

@@ -165,7 +165,14 @@ def learn_to_tolerance(
     for steps in sorted(later | ({first} if first else set())):
         staged = with_steps(config, steps)
         if not resume:
-            _begin(run, staged, goal)
+            # Take away what the stage before left and enter the next one; killed in between, that stage is learned
+            # again
+            forget(run, [CHECKPOINT, PROGRESS, FLOW, SAMPLES])
+            clear_snapshots(run)
+            manifest = read_manifest(run)
+            manifest.pop("learn", None)
+            write_manifest(run, {**manifest, GOAL: goal.as_dict()})
+            save_run_config(staged, run)
         result = learn_once(staged, resume)
         resume = False
         error = result.error_estimates["misplaced"].error or 0.0
@@ -174,16 +181,6 @@ def learn_to_tolerance(
         if goal.met or goal.hopeless:
             break
     return result, goal
-
-
-def _begin(run: Path, config: RunConfig, goal: ToleranceGoal) -> None:
-    """Take away what the stage before left and enter the next one; killed in between, that stage is learned again."""
-    forget(run, [CHECKPOINT, PROGRESS, FLOW, SAMPLES])
-    clear_snapshots(run)
-    manifest = read_manifest(run)
-    manifest.pop("learn", None)
-    write_manifest(run, {**manifest, GOAL: goal.as_dict()})
-    save_run_config(config, run)
 
 
 Value = TypeVar("Value")

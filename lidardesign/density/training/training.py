@@ -198,30 +198,40 @@ class Trainer:
     def train(self, progress: Callable[[LearnProgress], None] | None = None) -> None:
         """Run the remaining steps, with checkpoints, one of them when it is interrupted; raises DivergenceError."""
         try:
-            self._run_steps(progress)
+            checkpointed = time.perf_counter()
+            while self.step < self.settings.steps:
+                if self.step % SNAPSHOT_STEPS == 0 or self.step == self.pathwise_steps:
+                    self._check_round_trip()
+                if self.step % SNAPSHOT_STEPS == 0 or self._snapshot is None:
+                    self._snapshot = self._taken()
+                    if time.perf_counter() - checkpointed > self.settings.checkpoint_seconds:
+                        self._save(self._snapshot)
+                        checkpointed = time.perf_counter()
+                if self.replan is not None and self.step == self.pathwise_steps:
+                    self.settings, self.replan = self.replan(self), None
+                loss, ess = self._advance()
+                if self.step in snapshot_steps(self.settings):
+                    save_snapshot(self.flow, self.run, self.step)
+                if self.step % PROGRESS_STEPS == 0 or self.step == self.settings.steps:
+                    seconds = self.seconds
+                    left = seconds / self.step * (self.settings.steps - self.step)
+                    row = {
+                        "step": self.step,
+                        "loss": loss if math.isfinite(loss) else None,
+                        "ess": ess if math.isfinite(ess) else None,
+                        "sigma_m": self.sigma_m(self.step),
+                        "rate": self._rate(),
+                        "skipped": self.skipped,
+                        "seconds": round(seconds, 3),
+                    }
+                    append_line(self.run / PROGRESS, json.dumps(row))
+                    if progress:
+                        progress(LearnProgress(self.step, self.settings.steps, loss, ess, seconds, left))
         except KeyboardInterrupt:
             if self._snapshot is not None:
                 self._save(self._snapshot)
             raise
         self._save(self._taken())
-
-    def _run_steps(self, progress: Callable[[LearnProgress], None] | None) -> None:
-        checkpointed = time.perf_counter()
-        while self.step < self.settings.steps:
-            if self.step % SNAPSHOT_STEPS == 0 or self.step == self.pathwise_steps:
-                self._check_round_trip()
-            if self.step % SNAPSHOT_STEPS == 0 or self._snapshot is None:
-                self._snapshot = self._taken()
-                if time.perf_counter() - checkpointed > self.settings.checkpoint_seconds:
-                    self._save(self._snapshot)
-                    checkpointed = time.perf_counter()
-            if self.replan is not None and self.step == self.pathwise_steps:
-                self.settings, self.replan = self.replan(self), None
-            loss, ess = self._advance()
-            if self.step in snapshot_steps(self.settings):
-                save_snapshot(self.flow, self.run, self.step)
-            if self.step % PROGRESS_STEPS == 0 or self.step == self.settings.steps:
-                self._report(loss, ess, progress)
 
     def _advance(self) -> tuple[float, float]:
         self.optimiser.rate = self._rate()
@@ -295,22 +305,6 @@ class Trainer:
                 hint="a smaller learning.rate, a larger density.sigma_m, or learning.dtype=float64",
             )
         self._restore_arrays(self._snapshot.arrays)
-
-    def _report(self, loss: float, ess: float, progress: Callable[[LearnProgress], None] | None) -> None:
-        seconds = self.seconds
-        left = seconds / self.step * (self.settings.steps - self.step)
-        row = {
-            "step": self.step,
-            "loss": loss if math.isfinite(loss) else None,
-            "ess": ess if math.isfinite(ess) else None,
-            "sigma_m": self.sigma_m(self.step),
-            "rate": self._rate(),
-            "skipped": self.skipped,
-            "seconds": round(seconds, 3),
-        }
-        append_line(self.run / PROGRESS, json.dumps(row))
-        if progress:
-            progress(LearnProgress(self.step, self.settings.steps, loss, ess, seconds, left))
 
     def _state_arrays(self) -> dict[str, np.ndarray]:
         arrays = {f"flow.{name}": value.detach().cpu().numpy().copy() for name, value in self.flow.state_dict().items()}

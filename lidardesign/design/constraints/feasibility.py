@@ -44,27 +44,6 @@ def check_feasible(
     Raises:
         InfeasibleError: With the conflicting names.
     """
-    _check_count(constraints, sensors)
-    least = _least_sensors(constraints, sensors)
-    _check_mount_count(constraints.rules, least)
-    # the last rules are those of sensors beyond the entries of `each`
-    needed = constraints.rules if least.value > len(constraints.each) else constraints.rules[:-1]
-    for rules in needed:
-        _check_origin(rules, space)
-        _check_mounts(rules, space)
-        _check_excluded(rules, space)
-        _check_boresight(rules, space)
-        _check_field(rules, space)
-        _check_gate(rules, space)
-    _check_budget(constraints, needed, least, rays)
-
-
-def _refuse(message: str, conflicts: Sequence[str]) -> None:
-    names = [name for name in dict.fromkeys(conflicts) if name]
-    raise InfeasibleError(f"{message} ({', '.join(names)})", conflicts=names, hint="relax one of the constraints named")
-
-
-def _check_count(constraints: Constraints, sensors: int | None) -> None:
     count = constraints.sensors
     if count.min is not None and count.max is not None and count.min > count.max:
         _refuse(f"at least {count.min} and at most {count.max} sensors", ["sensors.min", "sensors.max"])
@@ -75,6 +54,41 @@ def _check_count(constraints: Constraints, sensors: int | None) -> None:
         for high_name, _, high in named:
             if low is not None and high is not None and low > high:
                 _refuse(f"{low} sensors wanted, but at most {high} admitted", [low_name, high_name])
+    least = _least_sensors(constraints, sensors)
+    # Every mounted sensor needs a mount of its own
+    most = most_mounted(constraints.rules)
+    if most is not None and most < least.value:
+        # the common rules name mounts only where no entry of `each` does
+        own = constraints.rules[:-1] or constraints.rules
+        mounted = [one.path("origin.mounts_m") for one in own if one.origin.mounts_m]
+        lost = [one.path("origin.exclude") for one in own if len(mounts_of(one)) < len(one.origin.mounts_m or [])]
+        _refuse(f"{least.value:g} sensors for {most} mounts", [least.name or "sensors", *mounted, *lost])
+    # the last rules are those of sensors beyond the entries of `each`
+    needed = constraints.rules if least.value > len(constraints.each) else constraints.rules[:-1]
+    for rules in needed:
+        _check_origin(rules, space)
+        # Mounts are alternatives to a fixed origin, inside the design space and the box
+        name = rules.path("origin.mounts_m")
+        if rules.origin.mounts_m is not None and rules.origin.fixed_m is not None:
+            _refuse("an origin is fixed, or at one of several mounts", [rules.path("origin.fixed_m"), name])
+        for number, mount in enumerate(rules.origin.mounts_m or []):
+            for axis, value in enumerate(mount):
+                lows, highs = _origin_limits(rules, axis, space)
+                beyond = [low for low in lows if value < low.value - AGREEMENT]
+                beyond += [high for high in highs if value > high.value + AGREEMENT]
+                if beyond:
+                    text = f"{DIMENSIONS[axis]} of a mount is {value:g}, beyond {beyond[0].value:g}"
+                    _refuse(text, [f"{name}[{number}]", beyond[0].name])
+        _check_excluded(rules, space)
+        _check_boresight(rules, space)
+        _check_field(rules, space)
+        _check_gate(rules, space)
+    _check_budget(constraints, needed, least, rays)
+
+
+def _refuse(message: str, conflicts: Sequence[str]) -> None:
+    names = [name for name in dict.fromkeys(conflicts) if name]
+    raise InfeasibleError(f"{message} ({', '.join(names)})", conflicts=names, hint="relax one of the constraints named")
 
 
 def _origin_limits(rules: SensorRules, axis: int, space: DesignSpace) -> tuple[list[_Bound], list[_Bound]]:
@@ -100,32 +114,6 @@ def _check_origin(rules: SensorRules, space: DesignSpace) -> None:
             if low.value > high.value + AGREEMENT:
                 text = f"{DIMENSIONS[axis]} of the origin is at least {low.value:g} and at most {high.value:g}"
                 _refuse(text, [low.name, high.name])
-
-
-def _check_mounts(rules: SensorRules, space: DesignSpace) -> None:
-    """Mounts are alternatives to a fixed origin, inside the design space and the box."""
-    name = rules.path("origin.mounts_m")
-    if rules.origin.mounts_m is not None and rules.origin.fixed_m is not None:
-        _refuse("an origin is fixed, or at one of several mounts", [rules.path("origin.fixed_m"), name])
-    for number, mount in enumerate(rules.origin.mounts_m or []):
-        for axis, value in enumerate(mount):
-            lows, highs = _origin_limits(rules, axis, space)
-            beyond = [low for low in lows if value < low.value - AGREEMENT]
-            beyond += [high for high in highs if value > high.value + AGREEMENT]
-            if beyond:
-                text = f"{DIMENSIONS[axis]} of a mount is {value:g}, beyond {beyond[0].value:g}"
-                _refuse(text, [f"{name}[{number}]", beyond[0].name])
-
-
-def _check_mount_count(rules: Sequence[SensorRules], least: _Bound) -> None:
-    """Every mounted sensor needs a mount of its own."""
-    most = most_mounted(rules)
-    if most is not None and most < least.value:
-        # the common rules name mounts only where no entry of `each` does
-        own = rules[:-1] or rules
-        mounted = [one.path("origin.mounts_m") for one in own if one.origin.mounts_m]
-        lost = [one.path("origin.exclude") for one in own if len(mounts_of(one)) < len(one.origin.mounts_m or [])]
-        _refuse(f"{least.value:g} sensors for {most} mounts", [least.name or "sensors", *mounted, *lost])
 
 
 def _check_excluded(rules: SensorRules, space: DesignSpace) -> None:
@@ -252,9 +240,7 @@ def _least_sensors(constraints: Constraints, sensors: int | None) -> _Bound:
     return max(bounds, key=lambda b: b.value, default=_Bound(1, ""))
 
 
-def _check_budget(
-    constraints: Constraints, needed: Sequence[SensorRules], least: _Bound, asked: int | None
-) -> None:
+def _check_budget(constraints: Constraints, needed: Sequence[SensorRules], least: _Bound, asked: int | None) -> None:
     """Rays for all sensors, and a bandwidth that pays for their narrowest gates."""
     budget = constraints.budget
     if asked is not None and budget.rays is not None and asked != budget.rays:

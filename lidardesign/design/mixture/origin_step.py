@@ -225,7 +225,11 @@ def _best_axis(
     slopes = np.stack([mean - low, mean - mean_low, high - mean, mean_high - mean])
     shape = (4, *[1] * mean.ndim)
     offsets, signs = box.interval * np.reshape([-1.0, 0.0, -1.0, 0.0], shape), np.reshape([1.0, 1.0, -1.0, -1.0], shape)
-    least = _least_precision(slopes, box)
+    # The smallest p that the largest variance admits and at which the lower lines lie below the upper ones
+    widths = np.maximum(slopes[[0, 0, 1]] + slopes[[2, 3, 2]], SMALLEST_WIDTH_M)
+    factors = box.interval * np.reshape([2.0, 1.0, 1.0], (3, *[1] * (slopes.ndim - 1)))
+    narrowest = 1 / np.sqrt(box.most).reshape(-1, *[1] * (slopes.ndim - 2))
+    least = np.maximum((factors / widths).max(axis=0), narrowest)
     # a line that is nowhere near bends nothing
     bent = signs * np.where(np.isfinite(slopes), slopes, 0.0)
     first = np.concatenate([square[None], square + shift_square * np.square(bent)])
@@ -244,14 +248,6 @@ def _best_axis(
     value += shift * (shift_square * shift + 2 * shift_linear)
     best = value.argmin(axis=0)[None]
     return np.take_along_axis(precision, best, axis=0)[0], np.take_along_axis(shift, best, axis=0)[0]
-
-
-def _least_precision(slopes: np.ndarray, box: OriginLimits) -> np.ndarray:
-    """The smallest p that the largest variance admits and at which the lower lines lie below the upper ones."""
-    widths = np.maximum(slopes[[0, 0, 1]] + slopes[[2, 3, 2]], SMALLEST_WIDTH_M)
-    factors = box.interval * np.reshape([2.0, 1.0, 1.0], (3, *[1] * (slopes.ndim - 1)))
-    narrowest = 1 / np.sqrt(box.most).reshape(-1, *[1] * (slopes.ndim - 2))
-    return np.maximum((factors / widths).max(axis=0), narrowest)
 
 
 def best_origins(
