@@ -32,8 +32,7 @@ from lidardesign.density.training.snapshot_quality import (
 )
 from lidardesign.errors import NumericalError
 from lidardesign.evaluate.accuracy import fields, visibility
-from lidardesign.evaluate.accuracy import steps as precision
-from lidardesign.evaluate.accuracy import steps as scenes
+from lidardesign.evaluate.accuracy import steps as learning_steps
 from lidardesign.evaluate.accuracy.fields import ExactField, InterpolatedField, fresh_table
 from lidardesign.evaluate.accuracy.probes import AccuracyRequest, draw_probes, few_columns, with_frames
 from lidardesign.evaluate.accuracy.visibility import LOG_OPAQUE, opaque_target
@@ -423,9 +422,9 @@ class TestPrecisionSweep:
         assert drawn.round_trip_nats(steps.flow) < 1e-8
 
     def test_rounding_is_far_below_the_noise_of_a_batch(self, steps, monkeypatch):
-        monkeypatch.setattr(precision, "DTYPE_BATCHES", 4)
-        monkeypatch.setattr(precision, "SAMPLES", 500)
-        sweep = precision.dtype_sweep(steps, 0)
+        monkeypatch.setattr(learning_steps, "DTYPE_BATCHES", 4)
+        monkeypatch.setattr(learning_steps, "SAMPLES", 500)
+        sweep = learning_steps.dtype_sweep(steps, 0)
         rough, exact = sweep.measurements
         assert (rough.setting, exact.setting) == ("float32", "float64")
         assert rough.default
@@ -437,9 +436,9 @@ class TestPrecisionSweep:
 
 class TestScenesSweep:
     def test_more_scenes_err_less(self, steps, monkeypatch):
-        monkeypatch.setattr(scenes, "POWERS", (1, 4))
-        monkeypatch.setattr(scenes, "FRAMES_BATCHES", 8)
-        sweep = scenes.frames_sweep(steps, 0)
+        monkeypatch.setattr(learning_steps, "POWERS", (1, 4))
+        monkeypatch.setattr(learning_steps, "FRAMES_BATCHES", 8)
+        sweep = learning_steps.frames_sweep(steps, 0)
         assert [measurement.setting for measurement in sweep.measurements] == ["1", "2", "4", "6"]
         assert sweep.falls
         assert sweep.measurements[0].error > sweep.measurements[2].error > sweep.measurements[3].error == 0
@@ -447,8 +446,8 @@ class TestScenesSweep:
         assert sweep.measurements[3].reference
 
     def test_settings_beyond_all_scenes_are_all_scenes(self):
-        assert scenes.counts(50, 50) == [4, 16, 50]
-        assert scenes.counts(2000, 256) == [4, 16, 64, 256, 2000]
+        assert learning_steps.counts(50, 50) == [4, 16, 50]
+        assert learning_steps.counts(2000, 256) == [4, 16, 64, 256, 2000]
 
 
 class TestRuns:
@@ -473,16 +472,24 @@ class TestRuns:
         asked = EvaluationRequest(task, config.task, config.space, config.seed, (), [12], train=train)
         return AccuracyRequest(config, place, asked, None)
 
-    @pytest.mark.parametrize("module", [visibility, fields, precision, scenes])
-    def test_have_sweeps_whose_errors_fall(self, request_of, module, monkeypatch):
+    @pytest.mark.parametrize(
+        ("sweeps", "count"),
+        [
+            (visibility.sweeps, 2),
+            (fields.sweeps, 0),
+            (learning_steps.dtype_sweeps, 1),
+            (learning_steps.frames_sweeps, 1),
+        ],
+    )
+    def test_have_sweeps_whose_errors_fall(self, request_of, sweeps, count, monkeypatch):
         monkeypatch.setattr(visibility, "PROBES", 2048)
         monkeypatch.setattr(visibility, "BODY_PROBES", 256)
         monkeypatch.setattr(visibility, "REFERENCE_POINTS", 128)
         monkeypatch.setattr(visibility, "POINTS", (16, 32))
-        for number in (precision, scenes):
-            monkeypatch.setattr(number, "BATCHES", 4)
-        found = module.sweeps(request_of)
-        assert len(found) == {visibility: 2, fields: 0, precision: 1, scenes: 1}[module]
+        monkeypatch.setattr(learning_steps, "DTYPE_BATCHES", 4)
+        monkeypatch.setattr(learning_steps, "FRAMES_BATCHES", 4)
+        found = sweeps(request_of)
+        assert len(found) == count
         for sweep in found:
             assert sweep.falls
             assert all(measurement.seconds > 0 and measurement.uncertainty >= 0 for measurement in sweep.measurements)

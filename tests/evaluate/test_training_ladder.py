@@ -21,7 +21,6 @@ from lidardesign.density.training.snapshot_quality import load_flow, remeasured,
 from lidardesign.density.training.training import Trainer
 from lidardesign.design.fit import fit
 from lidardesign.errors import DataError, NumericalError
-from lidardesign.evaluate import score
 from lidardesign.evaluate.accuracy import sweeps as accuracy
 from lidardesign.evaluate.accuracy import training
 from lidardesign.evaluate.accuracy.probes import AccuracyRequest, run_target
@@ -31,6 +30,7 @@ from lidardesign.registry import load_task
 from lidardesign.run.manifest import note, read_manifest, record, start_manifest
 from lidardesign.samples import load_samples
 from lidardesign.task import random_generator, scenes_of
+from lidardesign.workflow import evaluate as scoring
 
 SMALL = (
     "learning.batch=128", "learning.layers=1", "learning.hidden=16", "learning.bins=8", "learning.samples=2000",
@@ -171,7 +171,7 @@ def fitted(runs, lidardesign, tmp_path):
 
 @pytest.mark.parametrize("name", ["flow.safetensors", "progress.jsonl", "snapshots/step-000040.safetensors"])
 def test_accuracy_of_a_damaged_run_is_refused_before_anything_is_evaluated(fitted, lidardesign, name, monkeypatch):
-    monkeypatch.setattr(score, "evaluate", lambda *_, **__: pytest.fail("was evaluated"))
+    monkeypatch.setattr(scoring, "score_designs", lambda *_, **__: pytest.fail("was evaluated"))
     (fitted / name).write_bytes(b"{")
     done = lidardesign("evaluate", "run", "--accuracy", "--json")
     assert done.code == 3
