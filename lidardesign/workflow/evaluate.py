@@ -16,7 +16,7 @@ from lidardesign.design.compare import outside_notes
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.evaluate.baselines.simple import baseline_of
 from lidardesign.evaluate.cma.candidate import DEFAULT_SECONDS, CmaSettings
-from lidardesign.evaluate.cma.search import Budget
+from lidardesign.evaluate.cma.search import SearchBudget
 from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, left_out, usual_numbers
 from lidardesign.evaluate.results import Evaluation, Paired, Row, write_csv
 from lidardesign.evaluate.score import evaluate as score_designs
@@ -254,7 +254,7 @@ class ScoreRequest:
             searching: Called with how the searches of the baseline cma stand.
         """
         request = evaluation_request(self.run, self.designs, self.rays, self.baselines, self.seed)
-        cma = CmaSettings(Budget(self.cma_seconds), searching)
+        cma = CmaSettings(SearchBudget(self.cma_seconds), searching)
         return replace(request, planner=self.planner, audit=self.audit, cma=cma)
 
     def score(self, progress: Progress | None = None, searching: Show | None = None) -> Scores:

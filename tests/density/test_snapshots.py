@@ -14,11 +14,11 @@ from lidardesign.density.learn import learn
 from lidardesign.density.training.checkpoint import (
     FOLDER,
     clear_snapshots,
-    kept_snapshots,
     load_arrays,
     measured_steps,
     snapshot_name,
     snapshot_steps,
+    stored_snapshots,
     twin_step,
 )
 from lidardesign.run.manifest import verify
@@ -63,12 +63,12 @@ def test_rungs_ascend_to_the_last_step_and_twins_lie_between_the_first_rung_and_
 
 def test_nothing_is_kept_before_sigma_has_its_final_value(tmp_path):
     learn(BallTask(), config_of(steps=40, balance=0.0, anneal=0.5), tmp_path)
-    assert list(kept_snapshots(tmp_path)) == [20, 24, 25, 29, 30]
+    assert list(stored_snapshots(tmp_path)) == [20, 24, 25, 29, 30]
 
 
 def test_a_run_lists_its_snapshots_with_their_hashes(finished):
-    assert kept_snapshots(finished) == {step: snapshot_name(step) for step in (60, 73, 75, 88, 90)}
-    for name in kept_snapshots(finished).values():
+    assert stored_snapshots(finished) == {step: snapshot_name(step) for step in (60, 73, 75, 88, 90)}
+    for name in stored_snapshots(finished).values():
         verify(finished, name)
 
 
@@ -98,7 +98,7 @@ def test_clearing_keeps_earlier_snapshots_and_removes_what_a_killed_process_left
     (tmp_path / FOLDER / ".step-000060.safetensors.1.aa.tmp").write_bytes(b"half")
     clear_snapshots(tmp_path, beyond=74)
     assert sorted(contents(tmp_path)) == ["step-000060.safetensors", "step-000073.safetensors"]
-    assert list(kept_snapshots(tmp_path)) == [60, 73]
+    assert list(stored_snapshots(tmp_path)) == [60, 73]
     clear_snapshots(tmp_path)
     assert not contents(tmp_path)
-    assert not kept_snapshots(tmp_path)
+    assert not stored_snapshots(tmp_path)

@@ -24,7 +24,7 @@ from lidardesign.evaluate.baselines.candidates import TrainingViews, dense_point
 from lidardesign.evaluate.cma.candidate import CmaCandidate, CmaSettings
 from lidardesign.evaluate.cma.model import DesignModel, RayAllowance, Way, widest_bins
 from lidardesign.evaluate.cma.parameters import SearchRules, exp_matrix, log_matrix
-from lidardesign.evaluate.cma.search import Budget, OutOfTimeError, Search, TrainingObjective
+from lidardesign.evaluate.cma.search import OutOfTimeError, Search, SearchBudget, TrainingObjective
 from lidardesign.evaluate.cma.starts import starts, tiles
 from lidardesign.evaluate.request import EvaluationRequest
 from lidardesign.evaluate.score import evaluate
@@ -41,7 +41,7 @@ FLAT = DesignSpace((0, 0, 0, math.pi / 4, 0, 0), (1, 0, 0, 3 * math.pi / 4, 0, 1
 AISLE = DesignSpace(
     (0.0, 0, 0, 0.0, -0.5, 0.05), (1.0, 0, 0, 0.0, 0.5, 4.0), condition=("x_m",), measure="angles"
 )  # fmt: skip
-FAST = Budget(math.inf, evaluations=300)
+FAST = SearchBudget(math.inf, evaluations=300)
 
 
 def balls(centre, radius=0.4, jitter=0.05, count=3):
@@ -260,7 +260,7 @@ class Distance:
 
 
 def search(objective, starts, evaluations=1500, seed=0, **options):
-    budget = Budget(math.inf, evaluations)
+    budget = SearchBudget(math.inf, evaluations)
     return Search(starts, RayAllowance(1), objective, budget, np.random.default_rng(seed), **options).run()
 
 
@@ -307,7 +307,7 @@ def test_the_curve_falls_as_long_as_the_scenes_are_the_same():
 def test_a_search_ends_when_its_time_is_up_by_its_own_clock():
     now = itertools.count()
     objective = Distance(np.zeros((40, 4)))
-    budget = Budget(200.0, clock=lambda: float(next(now)))
+    budget = SearchBudget(200.0, clock=lambda: float(next(now)))
     found = Search([Bowl([2.0] * 4)], RayAllowance(1), objective, budget, np.random.default_rng(0)).run()
     assert 100 < found.seconds <= 220
 
@@ -408,7 +408,7 @@ def test_every_kind_of_design_is_followed_and_what_is_found_keeps_its_constraint
 
 @pytest.mark.parametrize("task", [MissTask(), HitTask()])
 def test_the_search_gains_in_the_direction_of_the_metric_and_no_less_than_bounding(task):
-    evaluation = evaluate(request_of("grid", task, cma=CmaSettings(Budget(math.inf, 1500))))
+    evaluation = evaluate(request_of("grid", task, cma=CmaSettings(SearchBudget(math.inf, 1500))))
     value = {row.design: row.value for row in evaluation.rows}
     sign = 1.0 if task.metric.better == "lower" else -1.0
     assert sign * value["cma"] < sign * value["bounding"]
@@ -427,7 +427,7 @@ def candidate_of(name, settings=None):
 
 @each_row("name", list(FOLLOWED))
 def test_what_is_found_within_a_bandwidth_stays_within_it(name):
-    source = candidate_of(name, CmaSettings(Budget(math.inf, 60)))
+    source = candidate_of(name, CmaSettings(SearchBudget(math.inf, 60)))
     for limit in (0.02, 0.5):
         positions = source.positions_within([], limit, Bandwidth())
         assert mean_mbps(positions, Bandwidth()) <= limit * (1 + 1e-12)

@@ -35,7 +35,7 @@ def rerecord(run: Path, name: str, content: bytes) -> None:
 def open_manifests(folder: Path) -> Read:
     """As every command does that is given a run."""
     from lidardesign import open_run
-    from lidardesign.density.training.checkpoint import kept_snapshots
+    from lidardesign.density.training.checkpoint import stored_snapshots
     from lidardesign.run.manifest import verify
 
     run = make_run(folder / "run", count=50)
@@ -44,7 +44,7 @@ def open_manifests(folder: Path) -> Read:
         (run / "manifest.json").write_bytes(content)
         opened = open_run(run)
         verify(run, "samples.npz")
-        return opened.config.space, kept_snapshots(run)
+        return opened.config.space, stored_snapshots(run)
 
     return read
 

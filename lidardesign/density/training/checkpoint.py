@@ -179,7 +179,7 @@ def save_snapshot(flow: DesignFlow, run: Path, step: int) -> None:
     save_arrays(run, snapshot_name(step), weights, {"step": step, "features": flow.features, "context": flow.context})
 
 
-def kept_snapshots(run: Path) -> dict[int, str]:
+def stored_snapshots(run: Path) -> dict[int, str]:
     """The run's snapshots, step to file, ascending; empty for a run that kept none."""
     found = (_NAME.fullmatch(name) for name in read_manifest(run)["files"])
     return dict(sorted((int(match[1]), match[0]) for match in found if match))
@@ -191,4 +191,4 @@ def clear_snapshots(run: Path, *, beyond: int = 0) -> None:
     if not folder.is_dir():
         return
     remove_stray_temporaries(folder)
-    forget(run, [name for step, name in kept_snapshots(run).items() if step > beyond])
+    forget(run, [name for step, name in stored_snapshots(run).items() if step > beyond])

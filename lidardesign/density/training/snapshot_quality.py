@@ -23,7 +23,7 @@ from lidardesign.density.flow.objective import Coordinates
 from lidardesign.density.learn import FLOW, make_flow
 from lidardesign.density.target.target import Target
 from lidardesign.density.target.visibility import Optics
-from lidardesign.density.training.checkpoint import kept_snapshots, load_arrays, measured_steps, twin_step
+from lidardesign.density.training.checkpoint import load_arrays, measured_steps, stored_snapshots, twin_step
 from lidardesign.density.training.losses import Pool, balancing_loss, draw_conditions, pathwise_loss
 from lidardesign.density.training.quality import IndependentProbes, measure
 from lidardesign.density.training.training import PROGRESS, SIGMA_START_RATIO
@@ -79,7 +79,7 @@ def check_kept(run: Path) -> None:
     Raises:
         DataError: The run is unfinished or damaged.
     """
-    for name in (FLOW, PROGRESS, *kept_snapshots(run).values()):
+    for name in (FLOW, PROGRESS, *stored_snapshots(run).values()):
         verify(run, name)
 
 
@@ -101,7 +101,7 @@ def remeasured(
     Raises:
         DataError: The run is unfinished or damaged.
     """
-    files = {**kept_snapshots(run), config.learning.steps: FLOW}
+    files = {**stored_snapshots(run), config.learning.steps: FLOW}
     rungs = [step for step in measured_steps(config.learning) if step in files]
     seconds, found = seconds_at(run, rungs), []
     for step in rungs:

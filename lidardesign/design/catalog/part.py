@@ -19,7 +19,7 @@ import numpy as np
 
 from lidardesign.design.catalog.statements import (
     Even,
-    FieldOfView,
+    PartFieldOfView,
     PartFile,
     Pixels,
     Rings,
@@ -41,7 +41,7 @@ BITS_PER_BYTE = 8
 CONDITIONS = ("reflectance_percent", "illuminance_klux", "detection_percent", "at")
 
 
-def projection_of(pattern: Any, view: FieldOfView) -> Projection:
+def projection_of(pattern: Any, view: PartFieldOfView) -> Projection:
     """What the two angles of a part's field of view are."""
     if isinstance(pattern, Pixels):
         return "plane"
@@ -71,7 +71,7 @@ def to_directions(projection: Projection, angles: np.ndarray) -> np.ndarray:
     return plane / np.linalg.norm(plane, axis=1, keepdims=True)
 
 
-def pattern_directions(pattern: Any, view: FieldOfView, rate_hz: float) -> np.ndarray:
+def pattern_directions(pattern: Any, view: PartFieldOfView, rate_hz: float) -> np.ndarray:
     """The unit vectors of a frame in the part's frame, in the order in which they fire, shape (M, 3)."""
     (left, right), (bottom, top) = view.azimuth, view.elevation
     if isinstance(pattern, Rosette):
@@ -112,7 +112,7 @@ def _ends_included(low: float, high: float, count: int) -> np.ndarray:
     return np.linspace(low, high, count) if count > 1 else np.array([(low + high) / 2])
 
 
-def _even_angles(count: int, view: FieldOfView) -> np.ndarray:
+def _even_angles(count: int, view: PartFieldOfView) -> np.ndarray:
     """Points that fill the field evenly per solid angle (a disc in its tangent plane), shape (count, 2) [degrees]."""
     unit = low_discrepancy(count, 2)
     (left, right), (bottom, top) = view.azimuth, view.elevation
@@ -182,7 +182,7 @@ class Part:
         return self.figures["pattern"][0]
 
     @property
-    def view(self) -> FieldOfView:
+    def view(self) -> PartFieldOfView:
         """Its field of view, in degrees from its forward axis."""
         return self.figures["field_of_view_deg"][0]
 

@@ -86,7 +86,7 @@ class Whole(Statement):
     value: Count
 
 
-class FieldOfView(Statement):
+class PartFieldOfView(Statement):
     """From where to where a part sees, relative to its forward axis.
 
     An `ellipse` touches its intervals in the middle; a `rectangle` fills them.
@@ -97,7 +97,7 @@ class FieldOfView(Statement):
     shape: Literal["rectangle", "ellipse"] = "rectangle"
 
     @model_validator(mode="after")
-    def _ordered(self) -> FieldOfView:
+    def _ordered(self) -> PartFieldOfView:
         for name, (low, high) in (("azimuth", self.azimuth), ("elevation", self.elevation)):
             if low > high:
                 raise ValueError(f"{name} runs from {low:g} down to {high:g}")
@@ -196,7 +196,7 @@ class Figures(_Keys):
     """
 
     pattern: Annotated[list[Pattern], Field(min_length=1)] | None = None
-    field_of_view_deg: Annotated[list[FieldOfView], Field(min_length=1)] | None = None
+    field_of_view_deg: Annotated[list[PartFieldOfView], Field(min_length=1)] | None = None
     near_m: Limits | None = None
     far_m: Values | None = None
     rate_hz: Values | None = None
@@ -233,7 +233,7 @@ def ray_count(pattern: Any, rate_hz: float) -> int:
     return pattern.columns * pattern.rows
 
 
-def check_pattern(pattern: Any, view: FieldOfView, rate_hz: float, of_mode: str) -> None:
+def check_pattern(pattern: Any, view: PartFieldOfView, rate_hz: float, of_mode: str) -> None:
     """Refuse a pattern that its field of view cannot hold.
 
     Raises:

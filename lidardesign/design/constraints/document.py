@@ -143,7 +143,7 @@ class Boresight(_Keys):
     elevation_deg: ElevationRange = ElevationRange()
 
 
-class FieldOfViewRange(_Keys):
+class FieldOfView(_Keys):
     """How wide it may see, horizontally and vertically in its own frame."""
 
     horizontal_deg: FieldRange = FieldRange()
@@ -158,7 +158,7 @@ class Gate(_Keys):
     width_m: DistanceRange = DistanceRange()
 
 
-class RayBudget(_Keys):
+class Budget(_Keys):
     """Rays per frame and the read-out of the whole design."""
 
     rays: Annotated[int, Field(ge=1, le=MOST_RAYS)] | None = None
@@ -199,7 +199,7 @@ class SensorConstraints(_Keys):
 
     origin: Origin = Origin()
     boresight: Boresight = Boresight()
-    field_of_view: FieldOfViewRange = FieldOfViewRange()
+    field_of_view: FieldOfView = FieldOfView()
     gate: Gate = Gate()
     snap: Snap | None = None
 
@@ -216,7 +216,7 @@ class SensorRules:
 
     origin: Origin
     boresight: Boresight
-    field_of_view: FieldOfViewRange
+    field_of_view: FieldOfView
     gate: Gate
     snap: Snap | None
     index: int
@@ -245,8 +245,10 @@ class Constraints(SensorConstraints):
         {'width_m': {'max': 0.1}}
     """
 
+    model_config = ConfigDict(json_schema_extra={"description": "A whole constraint file; every key is optional."})
+
     sensors: SensorCount = SensorCount()
-    budget: RayBudget = RayBudget()
+    budget: Budget = Budget()
     each: list[SensorConstraints] = []
 
     @classmethod

@@ -24,7 +24,7 @@ from lidardesign.design.sensor import MOST_RAYS, DesignSpec
 from lidardesign.evaluate.baselines.candidates import Positions, TrainingViews, dense_points, opened_gate, whole_range
 from lidardesign.evaluate.cma.model import DesignModel, RayAllowance, Way
 from lidardesign.evaluate.cma.parameters import SearchRules
-from lidardesign.evaluate.cma.search import Budget, Progress, Search, SearchResult, TrainingObjective
+from lidardesign.evaluate.cma.search import Progress, Search, SearchBudget, SearchResult, TrainingObjective
 from lidardesign.evaluate.cma.starts import scan_starts, starts
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.run.clock import phase
@@ -50,7 +50,7 @@ class CmaSettings:
         show: Told where each search stands, with what it is for.
     """
 
-    budget: Budget = field(default_factory=lambda: Budget(DEFAULT_SECONDS))
+    budget: SearchBudget = field(default_factory=lambda: SearchBudget(DEFAULT_SECONDS))
     show: Show | None = None
 
 

@@ -122,7 +122,7 @@ class TrainingObjective:
 
 
 @dataclass(frozen=True)
-class Budget:
+class SearchBudget:
     """When a search ends: after some seconds, or so many evaluations, whichever comes first.
 
     Arguments:
@@ -208,7 +208,7 @@ class Search:
         starts: Sequence[DesignModel],
         rays: RayAllowance,
         objective: TrainingObjective,
-        budget: Budget,
+        budget: SearchBudget,
         generator: np.random.Generator,
         show: Callable[[Progress], None] | None = None,
         began: float | None = None,
