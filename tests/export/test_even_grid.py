@@ -1,7 +1,6 @@
 """Even grids that stand for rays, names that other programs take, and poses of sensors."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.rigs import even, farthest_nearest, sensor
@@ -53,7 +52,7 @@ def test_any_rays_are_near_the_grid_by_no_more_than_is_said(count, seed):
     assert far <= grid.distance_rad(azimuth, elevation).max() + 1e-12
 
 
-@pytest.mark.parametrize("wide_deg", [5, 20, 40])
+@each_row("wide_deg", [5, 20, 40])
 def test_our_own_grids_are_nearly_even(wide_deg):
     """The tangent plane's grid is off by the third power of the angle."""
     field = np.radians(wide_deg)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 from support.rigs import farthest_nearest, rig, spinning
+from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.export.registry import EXPORTERS
@@ -192,7 +193,7 @@ def test_usd_places_every_ray_with_its_gate(stage):
         check_emitters(core, ranges, mine, turn)
 
 
-@pytest.mark.parametrize("name", ["isaac-json", "isaac-usd"])
+@each_row("name", ["isaac-json", "isaac-usd"])
 def test_frames_are_whole_numbers_per_second(tmp_path, name):
     with pytest.raises(ConfigError, match=r"0\.3 frames per second"):
         EXPORTERS[name].write(DESIGN, RAYS, tmp_path / "slow", 0.3)
@@ -231,8 +232,8 @@ def swept(sensor, step_s):
     return np.array(found)
 
 
-@pytest.mark.parametrize(("design", "rays"), [(DESIGN, RAYS), spinning()])
-@pytest.mark.parametrize("rate_hz", [10.0, 12.5])
+@each_row(("design", "rays"), [(DESIGN, RAYS), spinning()])
+@each_row("rate_hz", [10.0, 12.5])
 def test_carla_sweeps_the_rays_that_are_on_even_grids(tmp_path, design, rays, rate_hz):
     path = tmp_path / "rig.carla.json"
     EXPORTERS["carla"].write(design, rays, path, rate_hz)

@@ -151,7 +151,7 @@ def test_no_name_is_a_word_of_the_format(reader, tmp_path):
             check_gazebo(read_sdf(reader, path), design, rays, 1e-9)
 
 
-@pytest.mark.parametrize("name", ["mjcf", "sdf"])
+@each_row("name", ["mjcf", "sdf"])
 def test_what_is_written_for_a_simulator_is_a_design_again(tmp_path, name):
     design, rays = spinning()
     path = tmp_path / f"spin{EXPORTERS[name].suffix}"
@@ -224,7 +224,7 @@ def test_urdfdom_finds_a_link_per_sensor(exported):
     assert check_urdf(exported["urdf"][0]) == {"lidar_base", *(f"{name}_link" for name in NAMES)}
 
 
-@pytest.mark.parametrize("name", ["lidar_base", "World", "world link"])
+@each_row("name", ["lidar_base", "World", "world link"])
 def test_no_sensor_takes_the_name_of_what_holds_it(tmp_path, name):
     one = replace(DESIGN.sensors[0], name=name)
     path = tmp_path / "named.urdf"
@@ -271,7 +271,7 @@ def test_what_a_format_holds_comes_back(exported, name):
         assert not any("gates of their own" in note for note in notes)
 
 
-@pytest.mark.parametrize("name", GRIDS)
+@each_row("name", GRIDS)
 def test_what_is_not_on_a_grid_is_counted_and_measured(exported, name):
     path, notes = exported[name]
     note = next(one for one in notes if "even grid" in one)
@@ -360,7 +360,7 @@ def test_a_document_type_is_refused(tmp_path):
         mjcf.read_mjcf(path)
 
 
-@pytest.mark.parametrize("name", ["mjcf", "sdf", "urdf", "xacro"])
+@each_row("name", ["mjcf", "sdf", "urdf", "xacro"])
 def test_names_cannot_leave_their_attribute(exported, name):
     path, notes = exported[name]
     text = path.read_text(encoding="utf-8")

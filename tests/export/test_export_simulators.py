@@ -113,7 +113,7 @@ def test_names_of_files_are_plain_whatever_the_sensors_are_called(written, name)
         assert len({one.lower() for one in files}) == len(files)
 
 
-@pytest.mark.parametrize("name", ["helios", "osi", "rgl", "mitsuba"])
+@each_row("name", ["helios", "osi", "rgl", "mitsuba"])
 def test_formats_made_of_rays_refuse_a_design_without_them(tmp_path, name):
     none = CASES["mounted"].subset(np.arange(0))
     with pytest.raises(DataError, match="no rays"):
@@ -121,14 +121,14 @@ def test_formats_made_of_rays_refuse_a_design_without_them(tmp_path, name):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["ply", "stl"])
+@each_row("name", ["ply", "stl"])
 def test_formats_of_more_than_rays_take_a_design_without_them(tmp_path, name):
     none = CASES["mounted"].subset(np.arange(0))
     EXPORTERS[name].write(DESIGN, none, tmp_path / "out")
     assert all(error.error < EXACT * 100 for error in EXPORTERS[name].rounding(DESIGN, none, tmp_path / "out").values())
 
 
-@pytest.mark.parametrize("name", ["helios", "osi", "rgl", "mitsuba"])
+@each_row("name", ["helios", "osi", "rgl", "mitsuba"])
 def test_sensors_that_fire_nothing_are_left_out_and_told(tmp_path, name):
     rays = CASES["mounted"].subset(CASES["mounted"].sensor % 2 == 0)
     notes = EXPORTERS[name].write(DESIGN, rays, tmp_path / "out")
@@ -166,7 +166,7 @@ def test_files_that_an_earlier_export_left_in_a_folder_are_told(tmp_path):
     assert (path / "scene.xml").exists()
 
 
-@pytest.mark.parametrize("name", ["mitsuba", "ply", "stl"])
+@each_row("name", ["mitsuba", "ply", "stl"])
 def test_formats_without_a_frame_rate_refuse_one(tmp_path, name):
     with pytest.raises(ConfigError, match="no frame rate"):
         EXPORTERS[name].write(DESIGN, CASES["mounted"], tmp_path / "out", rate_hz=5.0)
@@ -210,7 +210,7 @@ def helios_pulses(folder, survey):
     return fired
 
 
-@pytest.mark.parametrize("case", CASES)
+@each_row("case", CASES)
 def test_helios_fires_every_ray_once_with_its_own_gate(written, case):
     folder, _ = written["helios", case]
     rays, surveys = CASES[case], sorted(folder.glob("*.survey.xml"))
@@ -224,7 +224,7 @@ def test_helios_fires_every_ray_once_with_its_own_gate(written, case):
     assert len(set(nearest.argmin(axis=1))) == len(rays)
 
 
-@pytest.mark.parametrize("case", CASES)
+@each_row("case", CASES)
 def test_helios_files_are_valid(written, case):
     etree = pytest.importorskip("lxml.etree", reason="lxml is not installed")
     folder, _ = written["helios", case]
@@ -329,7 +329,7 @@ def test_osi_times_follow_the_frame_rate(tmp_path):
     assert EXPORTERS["osi"].rounding(DESIGN, rays, path)["time_s"].error <= 0.5e-6 + EXACT
 
 
-@pytest.mark.parametrize("rate_hz", [1e-5, 1e10])
+@each_row("rate_hz", [1e-5, 1e10])
 def test_osi_refuses_frames_whose_times_it_cannot_count(tmp_path, rate_hz):
     with pytest.raises(ConfigError, match="rate-hz"):
         EXPORTERS["osi"].write(DESIGN, CASES["mounted"], tmp_path / "out", rate_hz=rate_hz)
@@ -338,7 +338,7 @@ def test_osi_refuses_frames_whose_times_it_cannot_count(tmp_path, rate_hz):
 # Robotec GPU Lidar --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("case", CASES)
+@each_row("case", CASES)
 def test_rgl_patterns_look_along_the_third_axis_of_proper_poses(written, case):
     folder, _ = written["rgl", case]
     rays, rows = CASES[case], []
@@ -546,7 +546,7 @@ def test_ply_leaves_out_frusta_that_have_no_width(tmp_path):
     assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["beams.ply", "rays.ply"]
 
 
-@pytest.mark.parametrize("file", ["rays.ply", "beams.ply"])
+@each_row("file", ["rays.ply", "beams.ply"])
 def test_point_files_are_loaded_by_another_program(written, file):
     trimesh = pytest.importorskip("trimesh")
     path, _ = written["ply", "mounted"]
@@ -586,7 +586,7 @@ def test_names_that_look_like_the_format_do_not_become_part_of_it(tmp_path):
     assert len(trimesh.load(tmp_path / "out.ply.d" / "rays.ply", process=False).vertices) == len(rays)
 
 
-@pytest.mark.parametrize(("name", "what"), [("stl", "solids"), ("ply", "frusta")])
+@each_row(("name", "what"), [("stl", "solids"), ("ply", "frusta")])
 def test_shapes_of_sensors_that_are_regions_stand_in_their_middles_and_say_so(tmp_path, name, what):
     wide = Sensor("wide", 1.0, np.zeros(3), np.diag([1.0, 0, 0]), 0.0, 0.0, 0.0, 0.1, 0.1, 1.0, 0.1)
     some = DesignSpec("region", (wide,))

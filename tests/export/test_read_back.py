@@ -80,13 +80,13 @@ def test_differences_are_the_largest_of_their_kind():
     assert found["direction_rad"].error == 0
 
 
-@pytest.mark.parametrize("angle", [1e-12, 1e-6, 0.3, np.pi])
+@each_row("angle", [1e-12, 1e-6, 0.3, np.pi])
 def test_angles_are_exact_from_the_smallest_to_the_largest(angle):
     first, second = np.array([[1.0, 0, 0]]), np.array([[np.cos(angle), np.sin(angle), 0]])
     assert angles_between(first, second)[0] == pytest.approx(angle, rel=1e-7)
 
 
-@pytest.mark.parametrize("name", ["csv", "npz"])
+@each_row("name", ["csv", "npz"])
 def test_damage_is_found(tmp_path, name):
     path = tmp_path / "rays"
     EXPORTERS[name].write(design(), RAYS, path)

@@ -43,7 +43,7 @@ def test_good_files_are_read_and_damaged_ones_read_or_refused(tmp_path, name):
         assert fault is None, f"input {number}, {content[:300]!r}: {fault}"
 
 
-@pytest.mark.parametrize("path", sorted(FOUND.glob("*/*")), ids=lambda path: f"{path.parent.name}/{path.name}")
+@each_row("path", sorted(FOUND.glob("*/*")), ids=lambda path: f"{path.parent.name}/{path.name}")
 def test_what_a_long_run_found_is_read_or_refused(tmp_path, path):
     folder = path.parent.name
     fuzzer = Fuzzer(next(target for target in TARGETS if _folder(target.name) == folder), tmp_path, seed=0)
@@ -61,7 +61,7 @@ def test_everything_that_was_found_belongs_to_a_target():
 COMMANDS_IN_THE_SUITE = ("show DESIGN", "constrain --constraints", "fit, samples changed")
 
 
-@pytest.mark.parametrize("name", COMMANDS_IN_THE_SUITE)
+@each_row("name", COMMANDS_IN_THE_SUITE)
 def test_whole_commands_end_with_a_message_and_nothing_half_written(tmp_path, name):
     fuzzer = Fuzzer(next(target for target in COMMANDS if target.name == name), tmp_path, seed=2026)
     for _ in range(4):
@@ -150,7 +150,7 @@ if first == 0:
 """
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("what", "words"),
     [
         ("os.abort()", "ended with -6"),

@@ -14,6 +14,7 @@ import threading
 import time
 
 import pytest
+from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.run import files, lock
@@ -52,7 +53,7 @@ def test_a_write_makes_folders_and_leaves_only_the_file(tmp_path):
 
 
 @pytest.mark.hard_case("38")
-@pytest.mark.parametrize("failing", ["fsync", "replace"])
+@each_row("failing", ["fsync", "replace"])
 def test_a_write_that_fails_leaves_the_old_file_and_no_temporary(tmp_path, monkeypatch, failing):
     path = tmp_path / "file"
     write_atomic(path, b"old")
@@ -97,7 +98,7 @@ def test_stray_temporaries_of_killed_writers_are_removed(tmp_path):
 
 
 @pytest.mark.hard_case("38")
-@pytest.mark.parametrize("name", ["samples.npz", "größe " * 14 + ".npz"])
+@each_row("name", ["samples.npz", "größe " * 14 + ".npz"])
 def test_the_next_writer_of_a_file_removes_what_a_killed_one_left(tmp_path, name):
     left = files.temporary_beside(tmp_path / name)
     abandoned = left.with_name(left.name.replace(f"-{os.getpid()}.", f"-{GONE}."))
@@ -242,7 +243,7 @@ def test_the_lock_of_a_killed_process_is_free(tmp_path):
     assert os.listdir(tmp_path) == []
 
 
-@pytest.mark.parametrize("content", ["", "{}", "[]", json.dumps({"pid": 1, "host": "elsewhere"})])
+@each_row("content", ["", "{}", "[]", json.dumps({"pid": 1, "host": "elsewhere"})])
 def test_a_lock_file_that_nobody_holds_is_no_obstacle(tmp_path, content):
     (tmp_path / lock.FILE_NAME).write_text(content)
     assert lock.writer(tmp_path) == ("process 1 on elsewhere" if "host" in content else "another process")

@@ -174,7 +174,7 @@ def test_numpy_values_and_tuples_are_written_as_plain_ones():
     assert parse_yaml(text, where="f").value == {"a": 0.1, "b": [0, 1, 2], "c": [1, 2], "d": True}
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf, np.array([1.0, -np.inf])])
+@each_row("value", [math.nan, math.inf, np.array([1.0, -np.inf])])
 def test_numbers_that_are_not_finite_are_never_written(value):
     with pytest.raises(NumericalError, match="a"):
         dump_yaml({"a": {"b": value}})

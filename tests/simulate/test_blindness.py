@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.planning import SIMULATED, SINGLE, counts, errors, facing_wall, grid
+from support.tables import each_row
 
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Ambient, Body, Box, Medium, Scene, rigid
@@ -53,7 +54,7 @@ def test_without_dead_time_everything_is_left():
     assert (unevenness(found, blind) == 0).all()
 
 
-@pytest.mark.parametrize("field_of_view_sr", [1e-6, 1e-5])
+@each_row("field_of_view_sr", [1e-6, 1e-5])
 def test_what_is_left_is_what_is_counted(field_of_view_sr):
     """Against histograms: the echo's counts within 5 %, the background at the gate's start within 3 %."""
     scene, detector = facing_wall(), counting(field_of_view_sr=field_of_view_sr, pulse_energy_j=3e-13)

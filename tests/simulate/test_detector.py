@@ -39,12 +39,12 @@ def test_the_ideal_preset_is_the_ideal_detector():
     assert load_detector("ideal") == IDEAL
 
 
-@pytest.mark.parametrize("name", detector_names())
+@each_row("name", detector_names())
 def test_presets_load_and_bear_their_own_name(name):
     assert load_detector(name).name == name
 
 
-@pytest.mark.parametrize("name", detector_names())
+@each_row("name", detector_names())
 def test_every_number_of_a_preset_has_its_reason_beside_it(name):
     for line in (FOLDER / f"{name}.yaml").read_text(encoding="utf-8").splitlines():
         if re.match(r"\w+: *[0-9.]+", line) and not line.startswith("false_alarm"):

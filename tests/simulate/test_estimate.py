@@ -69,7 +69,7 @@ def test_the_matched_filter_finds_a_pulse_anywhere_in_a_bin(centre):
     assert found(pulse(60, centre, 1e5)) == pytest.approx(centre, abs=0.02)
 
 
-@pytest.mark.parametrize("centre", [0.5, 1.5, 58.5, 59.5])
+@each_row("centre", [0.5, 1.5, 58.5, 59.5])
 def test_pulses_that_the_gate_cuts_are_found_where_they_are(centre):
     """Within a bin: without the likelihood's second term, cut pulses would be taken for ones further inside."""
     counts = pulse(60, centre, 1000) + 2
@@ -82,7 +82,7 @@ def log_likelihood(counts, place, signal, level):
     return np.sum(counts * np.log(expected) - expected)
 
 
-@pytest.mark.parametrize("photons", [20, 100])
+@each_row("photons", [20, 100])
 def test_the_matched_filter_agrees_with_the_largest_likelihood(photons):
     generator = np.random.default_rng(photons)
     size, level, off = 100, 0.5, []
@@ -114,7 +114,7 @@ def test_one_photon_is_a_return_in_darkness_and_none_in_light():
     assert np.isnan(found(counts, known=1e-3))
 
 
-@pytest.mark.parametrize("matched", [True, False])
+@each_row("matched", [True, False])
 def test_it_takes_as_many_photons_as_background_seldom_brings(matched):
     """bins * P(Poisson(5 b) >= n) <= 0.01 for the 5 bins within the pulse's width."""
     size, level = 200, 3
@@ -138,7 +138,7 @@ def test_parts_of_bins_count_as_parts():
     assert np.isnan(found(counts, ends=whole))
 
 
-@pytest.mark.parametrize("matched", [True, False])
+@each_row("matched", [True, False])
 def test_any_histogram_gives_a_place_inside_or_none(matched):
     generator = np.random.default_rng(2)
     for size in (1, 2, 3, 7, 50):
@@ -202,7 +202,7 @@ class TestCorrected:
         assert found(counts) < 30.3 - 0.4 * SIGMA
         assert found_corrected(counts, dead=1e3, pulses=1e5) == pytest.approx(30.3, abs=0.1 * SIGMA)
 
-    @pytest.mark.parametrize("matched", [True, False])
+    @each_row("matched", [True, False])
     def test_any_histogram_gives_a_place_inside_or_none(self, matched):
         generator = np.random.default_rng(2)
         for size in (1, 2, 3, 7, 50):

@@ -103,7 +103,7 @@ def test_the_mean_range_on_a_tilted_plane_is_that_of_the_cone():
     assert echoes.path_m.std() == pytest.approx(tangent * HALF_RAD, rel=5e-3)
 
 
-@pytest.mark.parametrize("inside", [0.15, 0.5, 0.8])
+@each_row("inside", [0.15, 0.5, 0.8])
 def test_at_an_edge_both_depths_get_their_share_of_the_disc(inside):
     # a near plate covers all lateral angles above an edge that cuts the disc at offset h: a circle's segment
     h = math.cos(math.pi * inside)

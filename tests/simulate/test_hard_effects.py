@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pytest
 from support.tables import each_row
 
 from lidardesign.geometry.raycast import SceneCaster
@@ -83,7 +82,7 @@ def test_a_scene_of_mirrors_alone_returns_nothing():
     assert (returns.outcome[:2] == Outcome.NOT_DETECTED).all()
 
 
-@pytest.mark.parametrize(("reflectance", "gain"), [(0.0, 0.0), (0.5, np.finfo(float).max)])
+@each_row(("reflectance", "gain"), [(0.0, 0.0), (0.5, np.finfo(float).max)])
 def test_a_surface_that_touches_the_sensor_blinds_it_unless_it_is_black(reflectance, gain):
     floor = Scene((Body(Plane(), reflectance=reflectance),))
     down = Rays(np.zeros((1, 3)), np.array([[0.0, 0.0, -1.0]]), np.array([[0.0, 1.0]]), np.zeros(1), np.zeros(1))

@@ -58,7 +58,7 @@ def test_signal_counts_follow_the_radar_equation(distance, tilt, reflectance, em
     assert abs(found - 50 * expected) < STANDARD_ERRORS * math.sqrt(50 * expected)
 
 
-@pytest.mark.parametrize("illuminance", [300.0, 100_000.0])
+@each_row("illuminance", [300.0, 100_000.0])
 def test_ambient_counts_follow_radiance_aperture_and_solid_angle(illuminance):
     scene = ceiling(2.0, ambient=Ambient(illuminance, "sun"))
     rays = rays_towards(np.tile([0.0, 0.0, 1.0], (100, 1)), (0.5, 1.5))
@@ -94,7 +94,7 @@ def photopic(wavelength_nm):
     return 1.019 * np.exp(-285.4 * (wavelength_nm / 1000 - 0.559) ** 2)
 
 
-@pytest.mark.parametrize(("table", "lux"), [(SUN_AT_100_KLUX, 1e5), (LED_AT_1_LUX, 1.0)])
+@each_row(("table", "lux"), [(SUN_AT_100_KLUX, 1e5), (LED_AT_1_LUX, 1.0)])
 def test_the_spectra_have_the_illuminance_that_they_are_for(table, lux):
     wavelength_nm = FIRST_NM + STEP_NM * np.arange(len(table))
     assert 683 * STEP_NM * np.sum(table * photopic(wavelength_nm)) == pytest.approx(lux, rel=0.03)
@@ -218,7 +218,7 @@ def test_noise_that_is_taken_for_a_return_belongs_to_no_body():
     assert set(found.outcome.tolist()) == {Outcome.RETURN, Outcome.MISS}
 
 
-@pytest.mark.parametrize("choice", ["auto", "none", "all"])
+@each_row("choice", ["auto", "none", "all"])
 def test_gates_that_a_detector_cannot_hear_are_refused_whatever_is_simulated(choice):
     scene, directions = face_like()
     short = replace(DETECTOR, bins=100)

@@ -165,7 +165,7 @@ def test_meshes_are_shaded_on_both_sides_and_follow_their_poses():
 
 
 @needs_simulator
-@pytest.mark.parametrize("bounces", [1, 2, 4, 7])
+@each_row("bounces", [1, 2, 4, 7])
 def test_light_within_a_ball_adds_up_to_the_geometric_series(bounces):
     """Inside a matt ball every bounce lights all of it evenly: E_k = rho^k Phi / (4 pi R^2), Ulbricht's sphere."""
     radius_m, reflectance = 1.5, 0.6
@@ -230,14 +230,14 @@ def test_a_camera_fills_its_field_of_view():
     np.testing.assert_allclose(mean / np.linalg.norm(mean), ahead, atol=1e-6)
 
 
-@pytest.mark.parametrize("numbers", [{"bounces": 0}, {"samples": 0}, {"own_light": True}])
+@each_row("numbers", [{"bounces": 0}, {"samples": 0}, {"own_light": True}])
 def test_impossible_requests_are_refused_before_anything_runs(numbers):
     rays = rays_from((0, 0, 0), spiral(3, 0.1))
     with pytest.raises(ConfigError, match="allowed"):
         render_transient(sphere_scene(), 0, rays, Lights.flood(np.zeros((1, 3))), PathBins(0.1, 10), **numbers)
 
 
-@pytest.mark.parametrize("numbers", [(0.0, 10), (math.nan, 10), (0.1, 0), (0.1, 10, math.inf)])
+@each_row("numbers", [(0.0, 10), (math.nan, 10), (0.1, 0), (0.1, 10, math.inf)])
 def test_bins_have_a_width_and_a_number(numbers):
     with pytest.raises(ConfigError, match="allowed"):
         PathBins(*numbers)

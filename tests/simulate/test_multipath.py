@@ -108,7 +108,7 @@ def test_a_scanned_pixel_hears_its_own_spot_by_way_of_the_wall_as_in_closed_form
 
 
 @needs_simulator
-@pytest.mark.parametrize("count", [400, 3000])
+@each_row("count", [400, 3000])
 def test_a_flood_of_rays_hears_what_a_lamp_of_the_same_cone_shows(count):
     """The spots of rays, even in solid angle, stand for a lamp that lights the cone evenly."""
     rays = into_the_corner(count)

@@ -42,7 +42,7 @@ def even_light(per_bin, **options):
     return seen(per_bin, {"ambient", "pile_up"}, **options)
 
 
-@pytest.mark.parametrize("per_bin", [0.002, 0.03, 0.3])
+@each_row("per_bin", [0.002, 0.03, 0.3])
 def test_the_first_photon_of_a_pulse_follows_its_distribution(per_bin):
     counts = even_light(per_bin).sum(axis=0)
     observed = np.append(counts, RAYS * PULSES - counts.sum())
@@ -124,7 +124,7 @@ def test_dead_times_within_pulses_agree_with_a_naive_loop_on_average(dead, per_b
     assert ours.sum(axis=1).std() == pytest.approx(naive.sum(axis=1).std(), rel=0.4, abs=0.2)
 
 
-@pytest.mark.parametrize("follow", [_within_pulses, _across_pulses])
+@each_row("follow", [_within_pulses, _across_pulses])
 def test_a_photon_more_changes_nothing_in_bins_that_its_pulse_does_not_blind(follow):
     arrived = np.random.default_rng(8).poisson(3.0, BINS)
     one_more = arrived.copy()
@@ -167,7 +167,7 @@ def test_the_last_pulses_are_hit_as_often_as_they_should(alive, pulses, photons)
     assert mean == pytest.approx(alive * (1 - (1 - 1 / pulses) ** photons), rel=0.01)
 
 
-@pytest.mark.parametrize(("alive", "pulses", "photons"), [(0, 10, 50), (1, 1, 10**12), (2, 2, 100), (10, 10, 10**12)])
+@each_row(("alive", "pulses", "photons"), [(0, 10, 50), (1, 1, 10**12), (2, 2, 100), (10, 10, 10**12)])
 def test_light_that_hits_every_pulse_is_counted_in_every_pulse_that_is_alive(alive, pulses, photons):
     for z in (-3.0, 0.0, 3.0):
         assert _hit_pulses(photons, alive, pulses, z) == alive
@@ -232,7 +232,7 @@ def test_coates_knows_nothing_after_the_last_pulse_is_used_up():
     assert np.isnan(corrected[1:]).all()
 
 
-@pytest.mark.parametrize("counts", [[6, 5], [-1, 2]])
+@each_row("counts", [[6, 5], [-1, 2]])
 def test_coates_refuses_counts_that_no_single_photon_detector_gives(counts):
     with pytest.raises(ConfigError, match="at most one photon per pulse"):
         coates(np.array(counts), 10)

@@ -157,7 +157,7 @@ def test_a_choice_does_not_stand_among_names():
             parse_effects(text)
 
 
-@pytest.mark.parametrize("bad", [0.0, -1.0, float("nan"), float("inf")])
+@each_row("bad", [0.0, -1.0, float("nan"), float("inf")])
 def test_tolerances_are_finite_and_above_zero(bad):
     for values in ((bad, 0.001), (0.001, bad)):
         with pytest.raises(ConfigError, match="tolerance"):

@@ -64,7 +64,7 @@ def test_the_shadow_of_a_ball_on_a_wall_is_its_cone():
     assert np.array_equal(lit.ray[aside > 0.3], kept.ray[kept.body == 0])
 
 
-@pytest.mark.parametrize(
+@each_row(
     "change",
     [{"horizontal_rad": 0.4}, {"vertical_rad": 0.4}, {"range_m": (0.0, 4.1)}, {"range_m": (4.2, 9.0)}],
 )
@@ -139,7 +139,7 @@ def test_turning_the_world_changes_nothing_that_is_heard():
     assert there.gain == pytest.approx(here.gain, rel=1e-9)
 
 
-@pytest.mark.parametrize("radius_m", [1.0, 30.0, 1000.0])
+@each_row("radius_m", [1.0, 30.0, 1000.0])
 def test_a_receiver_just_above_a_large_mesh_sees_all_that_is_lit_there(radius_m):
     room = trimesh.creation.box(extents=[2 * radius_m] * 3)
     mesh = Mesh(np.array(room.vertices), np.array(room.faces), "unsigned")

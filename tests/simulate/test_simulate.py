@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
+from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.raycast import SceneCaster
@@ -77,7 +78,7 @@ def test_a_wrong_number_of_casters_is_refused():
         simulate(scene, make_rays((0, 0, 0), fan(3)), casters=[SceneCaster(scene)] * 2)
 
 
-@pytest.mark.parametrize("with_mesh", [False, True])
+@each_row("with_mesh", [False, True])
 def test_no_rays_give_no_returns(with_mesh):
     triangle = Mesh(np.eye(3), np.array([[0, 1, 2]]), "unsigned")
     scene = Scene((Body(triangle),) if with_mesh else (ball(),))

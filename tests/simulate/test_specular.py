@@ -58,7 +58,7 @@ def fan(count=100, spread=0.2, seed=0):
     return direction(generator.uniform(-spread, spread, count), generator.uniform(-spread, spread, count))
 
 
-@pytest.mark.parametrize("made", [lambda body: body, meshed], ids=["box", "mesh"])
+@each_row("made", [lambda body: body, meshed], ids=["box", "mesh"])
 def test_a_flat_mirror_shows_the_image_of_the_scene_at_its_whole_distance(made):
     mirror = made(slab(2.0, yaw_rad=math.radians(45), reflectance=0.0, specular=0.7))
     # the mirror x + ... turned by 45 degrees sends x to -y: the ball is seen as if it lay behind the mirror
@@ -227,7 +227,7 @@ def test_a_beam_that_starts_on_a_mirror_comes_back_finite():
     assert np.isfinite(led.path_m).all()
 
 
-@pytest.mark.parametrize("at_once", [1, 7, 50])
+@each_row("at_once", [1, 7, 50])
 def test_beams_that_are_followed_in_groups_have_the_echoes_that_they_have_together(monkeypatch, at_once):
     window = slab(1.0, specular=0.3, transmission=0.6, reflectance=0.1)
     scene = Scene((window, slab(2.0, specular=0.4, reflectance=0.5)))

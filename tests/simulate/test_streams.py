@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from scipy.special import ndtri
 from scipy.stats import chi2, kstest, poisson
 from support.references import STANDARD_ERRORS
@@ -49,7 +48,7 @@ def test_numbers_are_uniform_along_rows_draws_and_keys(direction, key):
     assert kstest(values, "uniform").pvalue > UNLIKELY
 
 
-@pytest.mark.parametrize("direction", DIRECTIONS)
+@each_row("direction", DIRECTIONS)
 def test_neighbours_fill_the_square_evenly(direction):
     values = DIRECTIONS[direction](11)
     cells = (values[:-1] * 32).astype(int) * 32 + (values[1:] * 32).astype(int)
@@ -104,13 +103,13 @@ def test_normal_quantiles_agree_with_scipy():
     np.testing.assert_allclose(ours, ndtri(shares), rtol=1e-13, atol=1e-15)
 
 
-@pytest.mark.parametrize("mean", [1e-9, 0.3, 4.0, 31.9])
+@each_row("mean", [1e-9, 0.3, 4.0, 31.9])
 def test_small_poisson_quantiles_are_exact(mean):
     shares = along_rows(8)[:5000]
     assert np.array_equal([poisson_quantile(mean, share) for share in shares], poisson.ppf(shares, mean))
 
 
-@pytest.mark.parametrize("mean", [32.1, 500.0, 1e6])
+@each_row("mean", [32.1, 500.0, 1e6])
 def test_large_poisson_quantiles_are_off_by_one_count_at_most_and_seldom(mean):
     shares = along_rows(8)[:20_000]
     off = np.array([poisson_quantile(mean, share) for share in shares]) - poisson.ppf(shares, mean)
@@ -118,13 +117,13 @@ def test_large_poisson_quantiles_are_off_by_one_count_at_most_and_seldom(mean):
     assert np.mean(off != 0) < 0.02
 
 
-@pytest.mark.parametrize("mean", [0.0, -1.0, np.inf])
+@each_row("mean", [0.0, -1.0, np.inf])
 def test_poisson_quantiles_of_no_light_and_of_endless_light_are_counts(mean):
     count = poisson_quantile(mean, 0.5)
     assert count == 0 if mean <= 0 else abs(count - MOST_COUNTS) < 10
 
 
-@pytest.mark.parametrize("share", [1e-17, 1 - 2.0**-54])
+@each_row("share", [1e-17, 1 - 2.0**-54])
 def test_poisson_quantiles_of_extreme_shares_are_finite(share):
     for mean in (1e-12, 1.0, 30.0, 1e9):
         assert 0 <= poisson_quantile(mean, share) < mean + 100 + 20 * np.sqrt(mean)

@@ -207,7 +207,7 @@ def test_outcomes_tell_refusals_from_whole_runs_and_faults():
     ]
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("code", "words"), [("import os; os._exit(3)", "ended with 3"), ("import time; time.sleep(60)", "hung")]
 )
 def test_a_run_that_takes_its_process_down_or_hangs_is_a_fault_and_the_others_go_on(tmp_path, monkeypatch, code, words):

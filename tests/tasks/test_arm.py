@@ -26,6 +26,7 @@ from lidardesign_tasks.arm_motion import (
     phase_shares,
 )
 from lidardesign_tasks.arm_robot import load_robot
+from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.geometry.raycast import SceneCaster
@@ -148,7 +149,7 @@ def test_phases_pass_their_waypoints_at_rest_and_in_order():
     assert final[2] - place[2] == pytest.approx(FINAL_DESCENT_M)
 
 
-@pytest.mark.parametrize("jitter_m", [0.02, 0.1, 0.3])
+@each_row("jitter_m", [0.02, 0.1, 0.3])
 def test_pick_and_place_points_differ_by_the_jitter_and_stay_above_the_floor(jitter_m):
     drawn = np.stack([draw_waypoints(jitter_m, np.random.default_rng(seed)) for seed in range(200)])
     for column, nominal in ((2, PICK_M), (6, PLACE_M)):

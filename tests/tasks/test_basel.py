@@ -92,7 +92,7 @@ def test_fewer_modes_are_the_first_ones(tmp_path):
     np.testing.assert_array_equal(load_model(path, modes=2).modes, load_model(path).modes[:2])
 
 
-@pytest.mark.parametrize("name", ["model/mean", "model/pcaBasis", "model/pcaVariance", "representer/cells"])
+@each_row("name", ["model/mean", "model/pcaBasis", "model/pcaVariance", "representer/cells"])
 def test_a_missing_dataset_is_named(tmp_path, name):
     with pytest.raises(DataError, match=rf"m\.h5: dataset shape/{name}: is missing"):
         load_model(write(tmp_path / "m.h5", parts(), skip=name))
@@ -135,7 +135,7 @@ def test_damaged_content_is_refused_with_file_and_dataset(tmp_path, case):
     assert caught.value.exit_code == 3
 
 
-@pytest.mark.parametrize("content", [b"", b"this is no HDF5 file", b"\x89HDF\r\n\x1a\n" + bytes(200)])
+@each_row("content", [b"", b"this is no HDF5 file", b"\x89HDF\r\n\x1a\n" + bytes(200)])
 def test_a_file_that_is_not_hdf5_is_refused(tmp_path, content):
     path = tmp_path / "model.h5"
     path.write_bytes(content)

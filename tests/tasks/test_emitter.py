@@ -70,7 +70,7 @@ def heads():
 # ranges from whole paths
 
 
-@pytest.mark.parametrize("baseline_m", [1e-9, 1e-3, 0.1, 1.0])
+@each_row("baseline_m", [1e-9, 1e-3, 0.1, 1.0])
 def test_ranges_follow_from_paths_in_closed_form(baseline_m):
     rays, range_m = random_rays()
     generator = np.random.default_rng(1)

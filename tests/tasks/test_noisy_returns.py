@@ -15,6 +15,7 @@ from lidardesign_tasks.meshes import MeshesTask
 from lidardesign_tasks.surface import surface_score, with_visible_truth
 from lidardesign_tasks.warehouse import WarehouseTask
 from support.meshes import write_ball
+from support.tables import each_row
 
 from lidardesign.evaluate.baselines.candidates import rays_at
 from lidardesign.evaluate.scene_scores import checked_score, score_lists
@@ -114,7 +115,7 @@ def test_noise_is_not_told_from_the_ball_that_a_robot_carries():
     assert task.score(scene, noisy).value > 0.1
 
 
-@pytest.mark.parametrize("radius_m", [0.1, 3.0])
+@each_row("radius_m", [0.1, 3.0])
 def test_outliers_are_returns_off_the_surface_however_large_it_is(radius_m):
     ball = trimesh.creation.icosphere(subdivisions=4, radius=radius_m)
     space = DesignSpace(

@@ -62,7 +62,7 @@ def weight_at(mesh, places):
     return mesh.importance[apart.argmin(axis=0)]
 
 
-@pytest.mark.parametrize("suffix", COLOURED)
+@each_row("suffix", COLOURED)
 def test_the_brightness_of_vertex_colours_is_the_weight_in_every_format_that_has_them(tmp_path, suffix):
     mesh = painted_ball(lambda v: 127.5 * (1 + v[:, 2]))
     loaded = load_mesh(save(mesh, tmp_path / f"ball.{suffix}"), painted=Painted("colours", 100.0))
@@ -84,7 +84,7 @@ def test_green_is_brighter_than_blue_as_eyes_and_television_have_it(tmp_path):
     assert found == pytest.approx([0.2126, 0.7152, 0.0722])
 
 
-@pytest.mark.parametrize("encoding", ["binary", "ascii"])
+@each_row("encoding", ["binary", "ascii"])
 def test_a_property_of_a_ply_file_is_the_weight_itself(tmp_path, encoding):
     mesh = ball()
     mesh.vertex_attributes["scalar_care"] = np.exp(mesh.vertices[:, 0]).astype(np.float32)
@@ -112,7 +112,7 @@ def test_a_property_that_is_not_there_is_answered_with_those_that_are(tmp_path):
     assert "ball.ply" in str(refused.value)
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("paint", "words"),
     [
         (lambda mesh: None, "no colours"),
@@ -149,7 +149,7 @@ def test_vertices_that_become_one_count_as_their_geometric_mean_and_lost_ones_no
         check_mesh(vertices, [(0, 1, 2), (3, 5, 4)], importance=weights[:5])
 
 
-@pytest.mark.parametrize("radius", [0.05, 0.2])
+@each_row("radius", [0.05, 0.2])
 def test_the_roughness_of_a_ball_is_the_spread_of_heights_of_its_caps(radius):
     # a cap that a ball of radius r cuts is r^2 / (2 R) high, and evenly so in area (Archimedes)
     made = ball(radius=1.0, subdivisions=5)
@@ -241,8 +241,8 @@ def test_the_rim_of_a_ball_counts_no_more_than_tenfold():
     assert relative.max() == pytest.approx(10.0, rel=1e-3)
 
 
-@pytest.mark.parametrize("shape", [{"region_radius_m": 0.1}, {"region_half_size_m": (0.1, 0.1, 0.1)}])
-@pytest.mark.parametrize("edge", [0.0, 0.05])
+@each_row("shape", [{"region_radius_m": 0.1}, {"region_half_size_m": (0.1, 0.1, 0.1)}])
+@each_row("edge", [0.0, 0.05])
 def test_a_region_counts_its_weight_inside_and_nothing_more_beyond_its_edge(shape, edge):
     config = Importance(region_centre_m=(1, 2, 3), region_weight=9.0, region_edge_m=edge, **shape)
     along = np.array([0.0, 0.09, 0.0999, 0.125, 0.1501, 1.0])
@@ -274,7 +274,7 @@ def test_half_a_region_and_impossible_numbers_are_refused(kind, keys):
         kind(**keys)
 
 
-@pytest.mark.parametrize(("task", "kind"), [(FaceTask(), FaceConfig), (EmitterTask(), EmitterConfig)])
+@each_row(("task", "kind"), [(FaceTask(), FaceConfig), (EmitterTask(), EmitterConfig)])
 def test_all_heads_of_a_model_count_alike_vertex_by_vertex(task, kind):
     config = kind(train=2, test=1, roughness_exponent=0.5, region_centre_m=(0, 0, 0), region_radius_m=0.03)
     meshes = [scene.bodies[0].shape for split in ("train", "test") for scene in task.scenes(config, split, 0)]
@@ -352,7 +352,7 @@ def test_the_example_of_the_page_paints_a_mesh_that_loads(tmp_path, monkeypatch)
     assert np.allclose(mesh.importance, np.where(mesh.vertices[:, 1] > 0.04, 10.0, 1.0))
 
 
-@pytest.mark.parametrize("kind", [FaceConfig, EmitterConfig, MeshesConfig])
+@each_row("kind", [FaceConfig, EmitterConfig, MeshesConfig])
 def test_every_key_of_importance_is_on_the_page(kind):
     page = (Path(__file__).parents[2] / "docs" / "importance.md").read_text(encoding="utf-8")
     inherited = set(kind.model_fields) & set(Importance.model_fields) - set(Surroundings.model_fields)

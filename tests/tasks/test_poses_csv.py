@@ -227,7 +227,7 @@ def test_occluders_and_single_objects_move_by_their_names(folder):
     np.testing.assert_allclose(bodies["post.stl"].poses[:, 1, 3], [0, 1, 1])
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("rows", "message"),
     [
         ("0,cup,0,0,0\n", "no mesh is called 'cup'"),
@@ -257,7 +257,7 @@ def test_the_description_of_a_motion_names_the_columns_that_are_taken():
     assert [name for name in COLUMNS if name not in told.replace(",", " ").split()] == []
 
 
-@pytest.mark.parametrize(("count", "cut"), [(11, False), (12, True), (30, True)])
+@each_row(("count", "cut"), [(11, False), (12, True), (30, True)])
 def test_a_list_of_bodies_that_is_cut_ends_in_dots(tmp_path, count, cut):
     way = write(tmp_path / "wrong.csv", f"{HEADER}\n0,cup,0,0,0\n")
     with pytest.raises(DataError) as refused:

@@ -94,7 +94,7 @@ def same(one, other):
     return np.array_equal(one, other) if isinstance(one, np.ndarray) else one == other
 
 
-@pytest.mark.parametrize("name", ["face", "meshes"])
+@each_row("name", ["face", "meshes"])
 def test_bodies_of_different_scenes_move_in_different_directions_at_one_speed(name, folder):
     task = TASKS[name]
     given = {"folder": folder, "poses": 6} if name == "meshes" else {"test": 6}

@@ -356,7 +356,7 @@ def test_meshes_that_are_held_out_are_so_with_every_seed(folders):
         assert not trained & held_out
 
 
-@pytest.mark.parametrize("up", ["x", "y", "z"])
+@each_row("up", ["x", "y", "z"])
 def test_turning_the_up_axis_keeps_handedness(folders, up):
     config = MeshesTask.Config(folder=str(folders / "one"), up=up, truth_points=100, poses=1)
     mesh = MeshesTask().scenes(config, "train", 0)[0].bodies[0].shape

@@ -82,7 +82,7 @@ def test_boxes_stand_on_boards_within_the_shelf_and_have_the_sizes_asked_for(she
                 assert 0.2 - ROUNDING_M <= high[0] - low[0] <= 0.6 + ROUNDING_M
 
 
-@pytest.mark.parametrize(
+@each_row(
     "values",
     [
         {},
@@ -116,7 +116,7 @@ def test_a_shelf_has_four_levels_poles_in_front_and_spans_the_aisle(shelves):
             assert cut.high[boards, 0].max() < 1.3 + SHELF_DEPTH_M
 
 
-@pytest.mark.parametrize(("bays", "at_least"), [(2, 2), (4, 4), (8, 7)])
+@each_row(("bays", "at_least"), [(2, 2), (4, 4), (8, 7)])
 def test_more_bays_mean_more_poles(bays, at_least):
     plan = WarehouseConfig(bays=bays).plan
     for seed in range(5):
@@ -132,7 +132,7 @@ def test_the_full_size_has_the_counts_of_the_paper_and_explicit_ones_win():
     assert len(TASK.conditions(WarehouseConfig(size="small", positions=0))) == len(PAPER_POSITIONS_M)
 
 
-@pytest.mark.parametrize("config", [WarehouseConfig(), SMALL, WarehouseConfig(positions=100)])
+@each_row("config", [WarehouseConfig(), SMALL, WarehouseConfig(positions=100)])
 def test_designs_are_evaluated_at_the_papers_positions_and_others_all_inside_the_aisle(config):
     values = [one["x_m"] for one in conditions_of(TASK, config, TASK.space(config))]
     assert tuple(values[:4]) == PAPER_POSITIONS_M
@@ -289,7 +289,7 @@ def test_a_return_on_a_board_just_below_a_box_is_not_the_box():
     assert TASK.score(scene, returns_of(scene, [math.atan2(0.41, 1.0)])).value == 0.0
 
 
-@pytest.mark.parametrize(("error", "value"), [(0.9, 0.0), (-0.9, 0.0), (-2.0, 100.0)])
+@each_row(("error", "value"), [(0.9, 0.0), (-0.9, 0.0), (-2.0, 100.0)])
 def test_a_small_range_error_still_lies_on_the_face_and_a_large_one_does_not(error, value):
     scene = scene_with([block((-1, -1.6, -0.1), (1, -1.0, 0.4))])
     (one,) = returns_of(scene, [0.0])
@@ -340,14 +340,14 @@ def test_a_return_per_position_is_asked_for(shelves):
         TASK.score(shelves[0], returns[:-1])
 
 
-@pytest.mark.parametrize("name", ["y_m", "z_m", "azimuth_rad"])
+@each_row("name", ["y_m", "z_m", "azimuth_rad"])
 def test_a_space_without_a_fixed_plane_is_refused(name):
     values = {**SPACE.as_dict(), name: [-2.0, 0.5]}
     with pytest.raises(ConfigError, match="vertical plane"):
         TASK.scenes(SMALL, "train", 0, space=DesignSpace.from_dict(values))
 
 
-@pytest.mark.parametrize("bounds", [[0.0, 2.0], [-0.5, 6.0], 4.5])
+@each_row("bounds", [[0.0, 2.0], [-0.5, 6.0], 4.5])
 def test_a_space_beyond_or_short_of_the_aisle_is_refused_with_the_bounds(bounds):
     with pytest.raises(ConfigError, match=r"-0\.5 to 4 m"):
         TASK.scenes(SMALL, "train", 0, space=DesignSpace.from_dict({**SPACE.as_dict(), "x_m": bounds}))

@@ -197,7 +197,7 @@ SHIPPED = {
 }
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@each_row("name", SHIPPED)
 def test_the_shipped_tasks_keep_the_contract(name):
     contract = contract_of(load_task(name), overrides=SHIPPED[name])
     for law in LAWS:

@@ -101,7 +101,7 @@ def test_the_guide_lists_every_law_and_shows_the_tests_that_are_written():
     assert shown["tests/test_contract.py"] in (TEMPLATES / "test_contract.py.txt").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("name", ["a", "drone_landing", "abcdefghij_klmnopqrst_uvwxyz_9"])
+@each_row("name", ["a", "drone_landing", "abcdefghij_klmnopqrst_uvwxyz_9"])
 def test_a_new_package_is_clean_whatever_the_length_of_its_name(tmp_path, name):
     ruff = shutil.which("ruff", path=str(Path(sys.executable).parent)) or shutil.which("ruff")
     if ruff is None:
@@ -140,7 +140,7 @@ def test_a_name_that_is_no_name_is_refused_and_nothing_is_written(tmp_path, monk
     assert files_under(tmp_path) == {}
 
 
-@pytest.mark.parametrize(
+@each_row(
     ("name", "words"), [("face", "a task 'face' is installed"), ("tasks", "module lidardesign_tasks")]
 )
 def test_a_name_that_is_taken_is_refused(tmp_path, monkeypatch, name, words):
