@@ -12,21 +12,18 @@ from __future__ import annotations
 import argparse
 import functools
 import itertools
-import os
-import platform
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from datetime import datetime, timezone
 from pathlib import Path
 
 import numpy as np
+from support.result_pages import heading, table, write_page
 
 from faults.processes import Ended, Fork, forked, fresh, import_all
 from faults.runs import COMMANDS, FINISHED, LEARN, STAGED, Straight, contents, strays, unreadable
@@ -205,33 +202,23 @@ def spread(last: int, count: int) -> list[int]:
     return sorted({round(number) for number in np.linspace(0, last + 1, min(count, last) + 2)[1:-1]})
 
 
-def page(tally: Tally, seed: int, minutes: float, source: str) -> str:
-    """The result as Markdown."""
-    lines = [
-        "# Kills", "", "Made by `python -m faults.kills`; see its first lines for what is done.", "",
-        f"- date: {datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC, {minutes:.0f} minutes",
-        f"- source: {source}, seed {seed}",
-        f"- machine: {platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
-        f"- killed or terminated: {_sum(tally.sent)}, of them while the command was at work: {_sum(tally.early)}",
-        f"- two at once: {_sum(tally.sent, pairs=True)}, of them both worked: {_sum(tally.early, pairs=True)}",
-        f"- not recovered: {len(tally.faults)}", "",
-        "| how | command | times | at work, or both worked |", "|---|---|---:|---:|",
-    ]  # fmt: skip
-    for (way, name), count in sorted(tally.sent.items()):
-        lines.append(f"| {WAYS[way]} | {name} | {count} | {tally.early[way, name]} |")
-    lines += ["", *(tally.faults or [RECOVERED])]
-    return "\n".join(lines) + "\n"
-
-
-def _sum(counted: Counter[tuple[str, str]], *, pairs: bool = False) -> int:
-    return sum(count for (way, _), count in counted.items() if (way == "pair") == pairs)
-
-
-def source_version() -> str:
-    """The commit that is tested, and whether files differ from it."""
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
-    told = subprocess.run(command, capture_output=True, text=True, check=False)
-    return f"commit {told.stdout.strip()}" if told.returncode == 0 else "no repository"
+def page(tally: Tally, seed: int, minutes: float) -> list[str]:
+    """The parts of the result's page."""
+    rows = [
+        (WAYS[way], name, count, tally.early[way, name]) for (way, name), count in sorted(tally.sent.items())
+    ]
+    killed, met, both, worked = (
+        sum(count for (way, _), count in counted.items() if (way == "pair") == pairs)
+        for pairs in (False, True)
+        for counted in (tally.sent, tally.early)
+    )
+    return [
+        heading("Kills", f"python -m faults.kills --seed {seed}"),
+        f"- {minutes:.0f} minutes\n- killed or terminated: {killed}, of them while the command was at work: {met}\n"
+        f"- two at once: {both}, of them both worked: {worked}\n- not recovered: {len(tally.faults)}",
+        table(("how", "command", "times", "at work, or both worked"), rows),
+        "\n".join(tally.faults) or RECOVERED,
+    ]
 
 
 def main() -> None:
@@ -243,7 +230,6 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=10_000, help="at most so many steps of each command")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=None, help="write the result as Markdown")
-    parser.add_argument("--source", default=None, help="what is tested, in words")
     asked = parser.parse_args()
     started, generator, tally = time.monotonic(), np.random.default_rng(asked.seed), Tally()
     import_all()
@@ -257,11 +243,10 @@ def main() -> None:
             seconds = killing.straight.measure_fresh(folder)
             at_random(killing, "SIGKILL", asked.kills, generator, seconds)
             at_random(killing, "SIGTERM", asked.terms, generator, seconds)
-    text = page(tally, asked.seed, (time.monotonic() - started) / 60, asked.source or source_version())
-    print(text)
+    parts = page(tally, asked.seed, (time.monotonic() - started) / 60)
+    print("\n\n".join(parts))
     if asked.out is not None:
-        asked.out.parent.mkdir(parents=True, exist_ok=True)
-        asked.out.write_text(text, encoding="utf-8")
+        write_page(asked.out, parts)
     sys.exit(1 if killing.tally.faults else 0)
 
 

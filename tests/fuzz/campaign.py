@@ -13,21 +13,19 @@ import hashlib
 import json
 import math
 import os
-import platform
 import shutil
 import subprocess
 import sys
 import tempfile
-import textwrap
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
-from importlib.metadata import version
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
+from support.result_pages import ROOT, heading, paragraph, table, write_page
+
 WORKER = Path(__file__).with_name("fuzz_worker.py")
 BATCH = 2500
 COMMAND_BATCH = 60
@@ -36,7 +34,6 @@ COMMAND_BATCH = 60
 HANG_PROCESSOR_S, HANG_S = 150.0, 1200.0
 POLL_S = 0.2
 ALL_SHARES = 100_000
-WIDTH = 120
 
 
 @dataclass
@@ -208,51 +205,39 @@ def together(parts: list[tuple[Job, Found]]) -> dict[str, Found]:
     return result
 
 
-def report(found: dict[str, Found], arguments: argparse.Namespace, seconds: float) -> str:
-    """The result as a page."""
+def report(found: dict[str, Found], arguments: argparse.Namespace, seconds: float) -> list[str]:
+    """The parts of the result's page."""
     total = {name: sum(getattr(one, name) for one in found.values()) for name in ("inputs", "read", "refused")}
     faults = {path: reason for one in found.values() for path, reason in one.faults.items()}
-    packages = ("numpy", "pyyaml", "pydantic", "trimesh", "h5py", "scipy", "safetensors", "torch", "mujoco")
-    texts = (
-        f"`make fuzz`, seed {arguments.seed}, on {datetime.now(timezone.utc):%Y-%m-%d %H:%M} UTC, commit {_commit()}, "
-        f"{seconds / 60:.0f} minutes with {arguments.workers} processes at a time on {os.cpu_count()} cores, Python "
-        f"{platform.python_version()}, {', '.join(f'{name} {version(name)}' for name in packages)}.",
-        f"**{total['inputs']:,} damaged files: {total['read']:,} were read, {total['refused']:,} refused with a "
-        f"message, {len(faults)} ended otherwise** (a traceback, a warning, a process that crashed or hung, a number "
-        "that is not finite, too much memory, code of the file that ran, a file that was left or half-written).",
-        "Good files of every kind, made by the program, are damaged by a seeded generator: bytes, numbers, words and "
-        "lines, keys and values of documents, arrays and headers inside archives whose checksums are right again. An "
-        "input that is refused at a new place of the program is damaged further. Each goes through the function by "
-        "which commands read such files; the last rows are whole commands. Processes may take 2 GiB of memory beyond "
-        "what they begin with; an input may take 5 s of processor time, a command 60 s.",
-    )
-    lines = ["# Damaged files", ""]
-    for text in texts:
-        lines += [textwrap.fill(text, WIDTH, break_long_words=False, break_on_hyphens=False), ""]
-    lines += [
-        "| file | inputs | read | refused | places of refusal | mean [ms] | slowest [s] | memory [MiB] | faults |",
-        "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
+    columns = ("file", "inputs", "read", "refused", "places of refusal", "mean [ms]", "slowest [s]", "memory [MiB]")
+    rows = [
+        (name, f"{one.inputs:,}", f"{one.read:,}", f"{one.refused:,}", len(one.places),
+         f"{1000 * one.seconds / max(one.inputs, 1):.1f}", f"{one.slowest_s:.2f}", f"{one.memory_mib:.0f}",
+         len(one.faults))
+        for name, one in found.items()
+    ]  # fmt: skip
+    return [
+        heading("Damaged files", f"make fuzz, seed {arguments.seed}"),
+        paragraph(
+            f"**{total['inputs']:,} damaged files in {seconds / 60:.0f} minutes with {arguments.workers} processes at "
+            f"a time: {total['read']:,} were read, {total['refused']:,} refused with a message, {len(faults)} ended "
+            "otherwise** (a traceback, a warning, a process that crashed or hung, a number that is not finite, too "
+            "much memory, code of the file that ran, a file that was left or half-written)."
+        ),
+        paragraph(
+            "Good files of every kind, made by the program, are damaged by a seeded generator: bytes, numbers, words "
+            "and lines, keys and values of documents, arrays and headers inside archives whose checksums are right "
+            "again. An input that is refused at a new place of the program is damaged further. Each goes through the "
+            "function by which commands read such files; the last rows are whole commands. Processes may take 2 GiB "
+            "of memory beyond what they begin with; an input may take 5 s of processor time, a command 60 s."
+        ),
+        table((*columns, "faults"), rows),
+        *(f"`{Path(path).name}`: {_last_line(reason)}" for path, reason in faults.items()),
     ]
-    for name, one in found.items():
-        mean = 1000 * one.seconds / max(one.inputs, 1)
-        lines.append(
-            f"| {name} | {one.inputs:,} | {one.read:,} | {one.refused:,} | {len(one.places)} | {mean:.1f} | "
-            f"{one.slowest_s:.2f} | {one.memory_mib:.0f} | {len(one.faults)} |"
-        )
-    for path, reason in faults.items():
-        last = (reason.strip().splitlines() or ["no reason"])[-1][:300]
-        lines += ["", f"`{Path(path).name}`: {last}"]
-    return "\n".join([*lines, ""])
 
 
-def _commit() -> str:
-    """The commit of the working tree, and whether the program differs from it."""
-
-    def git(*arguments: str) -> str:
-        return subprocess.run(["git", *arguments], capture_output=True, text=True, cwd=ROOT).stdout.strip()
-
-    number = git("rev-parse", "--short", "HEAD") or "unknown"
-    return f"{number} with changes" if git("status", "--porcelain", "--", "lidardesign", "tasks") else number
+def _last_line(reason: str) -> str:
+    return (reason.strip().splitlines() or ["no reason"])[-1][:300]
 
 
 def main() -> int:
@@ -272,13 +257,12 @@ def main() -> int:
             parts.append((job, found))
             print(f"{job.name}: {found.inputs} inputs, {len(found.faults)} faults", flush=True)
             for path, reason in found.faults.items():
-                print(f"  {path}: {(reason.strip().splitlines() or ['?'])[-1][:200]}", flush=True)
+                print(f"  {path}: {_last_line(reason)}", flush=True)
     found = together(parts)
-    text = report(found, arguments, time.monotonic() - began)
-    print(text)
+    parts = report(found, arguments, time.monotonic() - began)
+    print("\n\n".join(parts))
     if arguments.out:
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        (arguments.out / f"fuzz-{datetime.now(timezone.utc):%Y-%m-%d}.md").write_text(text, encoding="utf-8")
+        write_page(arguments.out / f"fuzz-{datetime.now(timezone.utc):%Y-%m-%d}.md", parts)
     return int(any(one.faults for one in found.values()))
 
 

@@ -12,8 +12,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from soak.batches import do_batch, records_in, soak
-from soak.pages import ROOT
+from support.result_pages import ROOT
+
+from soak.batches import keep, soak
 from soak.plans import random_plan
 from soak.runs_page import runs_page
 from soak.scaled_flatland import offer
@@ -28,20 +29,17 @@ TODAY = datetime.datetime.now(datetime.timezone.utc).date().isoformat()
 def main(arguments: list[str] | None = None) -> int:
     """Do what the command line says."""
     given = _parser().parse_args(arguments)
-    if given.command == "batch":
-        do_batch(given.seed, given.lines, given.folder, repeat_every=given.repeat_every)
-        return 0
     if given.folder is not None:
-        return _DO[given.command](given, given.folder)
+        return given.do(given, given.folder)
     with tempfile.TemporaryDirectory(prefix="lidardesign-soak-") as folder:
-        return _DO[given.command](given, Path(folder))
+        return given.do(given, Path(folder))
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m soak", description=__doc__)
-    commands = parser.add_subparsers(dest="command", required=True)
+    commands = parser.add_subparsers(required=True)
     runs = commands.add_parser("runs", help="random whole runs")
-    runs.add_argument("--whole", type=int, default=200, help="until so many were whole")
+    runs.add_argument("--whole", type=int, default=200, help="until so many were whole; 0: the page of what is done")
     runs.add_argument("--first", type=int, default=0, help="the first seed")
     runs.add_argument("--repeat-every", type=int, default=1, help="do every n-th run twice; 0: none")
     runs.add_argument("--page", type=Path, default=PAGES / f"runs-{TODAY}.md")
@@ -49,20 +47,14 @@ def _parser() -> argparse.ArgumentParser:
     seeds.add_argument("tasks", nargs="*", default=list(LEAST_ESS), metavar="TASK")
     seeds.add_argument("--count", type=int, default=20, help="seeds 0 to N - 1")
     seeds.add_argument("--page", type=Path, default=PAGES / f"seeds-{TODAY}.md")
-    page = commands.add_parser(
-        "page", help="the page of what `runs --folder` has done until now, or until it was ended"
-    )
-    page.add_argument("--page", type=Path, default=PAGES / f"runs-{TODAY}.md")
     one = commands.add_parser("one", help="one random run, with its configuration")
     one.add_argument("seed", type=int)
-    batch = commands.add_parser("batch", help="runs in this process, as `runs` starts them")
-    batch.add_argument("seed", type=int, nargs="+")
-    batch.add_argument("--lines", type=Path, required=True)
-    batch.add_argument("--repeat-every", type=int, default=0)
-    for command in (runs, seeds):
-        command.add_argument("--jobs", type=int, default=1, help="processes at once")
-    for command in (runs, seeds, one, batch, page):
-        command.add_argument("--folder", type=Path, required=command is page, help="where runs are kept")
+    one.add_argument("--repeat", action="store_true", help="do it twice")
+    for command, do in ((runs, _runs), (seeds, _seeds), (one, _one)):
+        command.set_defaults(do=do)
+        command.add_argument("--folder", type=Path, help="where runs are kept")
+        if command is not one:
+            command.add_argument("--jobs", type=int, default=1, help="processes at once")
     return parser
 
 
@@ -77,12 +69,6 @@ def _runs(given: argparse.Namespace, folder: Path) -> int:
     return int(faults > 0)
 
 
-def _page(given: argparse.Namespace, folder: Path) -> int:
-    records = records_in(folder)
-    runs_page(given.page, records, "python -m soak runs")
-    return int(any(record["faults"] for record in records))
-
-
 def _seeds(given: argparse.Namespace, folder: Path) -> int:
     learned = learn_seeds(given.tasks, range(given.count), folder, jobs=given.jobs, tell=_tell)
     seeds_page(given.page, learned, f"python -m soak seeds {' '.join(given.tasks)} --count {given.count}")
@@ -92,9 +78,16 @@ def _seeds(given: argparse.Namespace, folder: Path) -> int:
 
 
 def _one(given: argparse.Namespace, folder: Path) -> int:
-    sys.path.insert(0, str(offer(folder / "offered")))
+    # a folder of its own: another run may be reading
+    sys.path.insert(0, str(offer(folder / f"offered{given.seed}")))
     print("\n".join(plan_lines(given.seed)))
-    record = whole_run(random_plan(given.seed), folder / f"run{given.seed}")
+    plan, place = random_plan(given.seed), folder / f"run{given.seed}"
+    record = whole_run(plan, place)
+    if given.repeat:
+        again = record.differences(whole_run(plan, place))
+        record.repeated = not again
+        record.faults += [f"a second run did not repeat: {', '.join(again)}"] if again else []
+    keep(record, folder)
     for command, asked, code, seconds in record.steps:
         print(f"{command} {asked}: exit {code}, {seconds} s of processor time")
     print("\n".join([record.outcome, *record.faults]))
@@ -104,8 +97,6 @@ def _one(given: argparse.Namespace, folder: Path) -> int:
 def _tell(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
-
-_DO = {"runs": _runs, "seeds": _seeds, "one": _one, "page": _page}
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from soak.pages import heading, paragraph, table, write_page
+from support.result_pages import heading, paragraph, table, write_page
+
 from soak.whole_runs import BLIND, DONE, INFEASIBLE, ROUGH, USAGE, WHOLE
 
 COLUMNS = ("seed", "width [m]", "sigma / width", "free", "sensors", "layout", "ESS", "bounds", "outcome", "constrain")

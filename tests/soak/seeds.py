@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from soak.pages import heading, paragraph, table, write_page
+from support.result_pages import heading, paragraph, table, write_page
 
 # The least effective sample size that every seed has to reach.
 LEAST_ESS = {"face": 0.3, "arm": 0.15}

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import json
 import math
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from support.result_pages import table
 from support.tables import each_row
 
 from lidardesign.config import resolve
@@ -24,7 +24,6 @@ from lidardesign.space import DesignSpace
 from soak import batches
 from soak.keeping import broken_bounds
 from soak.limits import Bounds, contradictions, drawn, kept_already
-from soak.pages import table
 from soak.plans import MOST_SENSORS, SIGMA_SHARES, SIZES_M, random_plan
 from soak.runs_page import runs_page
 from soak.scaled_flatland import NAME, ScaledFlatlandTask, offer
@@ -211,27 +210,24 @@ def test_outcomes_tell_refusals_from_whole_runs_and_faults():
     ("code", "words"), [("import os; os._exit(3)", "ended with 3"), ("import time; time.sleep(60)", "hung")]
 )
 def test_a_run_that_takes_its_process_down_or_hangs_is_a_fault_and_the_others_go_on(tmp_path, monkeypatch, code, words):
+    def started(seed, folder, _):
+        if seed != 8:
+            batches.keep(record_of(seed, ess=0.5), folder)
+        with (folder / f"record-{seed}.log").open("wb") as log:
+            return subprocess.Popen([sys.executable, "-c", code if seed == 8 else "pass"], stdout=log, stderr=log)
+
     monkeypatch.setattr(batches, "LONGEST_RUN_S", 0.5 if words == "hung" else 600.0)
-    path = tmp_path / "batch.jsonl"
-    done = {**record_of(7).as_dict(), "outcome": WHOLE}
-    path.write_text("".join(json.dumps(line) + "\n" for line in ({"started": 7}, done, {"started": 8})))
-    path.with_suffix(".log").write_text("")
-    batch = batches.Batch([7, 8, 9, 10], path, subprocess.Popen([sys.executable, "-c", code]))
-    found, left = {}, None
-    while left is None:
-        left = batches.collected(batch, found, lambda _: None)
-    assert left == [9, 10]
-    assert found[7]["outcome"] == WHOLE
-    assert words in found[8]["faults"][0]
+    monkeypatch.setattr(batches, "_started", started)
+    records = batches.soak(2, tmp_path, first=7, jobs=1, repeat_every=0, tell=lambda _: None)
+    assert [(record["seed"], record["outcome"]) for record in records] == [(7, WHOLE), (8, "fault"), (9, WHOLE)]
+    assert words in records[1]["faults"][0]
 
 
 def test_what_an_ended_soak_did_is_read_and_its_page_names_the_runs_that_are_missing(tmp_path):
-    for seeds in ([20, 21], [22, 24], [30]):
-        lines = [{"started": seeds[0]}, *({**record_of(seed).as_dict(), "outcome": WHOLE} for seed in seeds)]
-        (tmp_path / f"batch-{seeds[0]}.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    records = batches.records_in(tmp_path)
-    assert [record["seed"] for record in records] == [20, 21, 22, 24, 30]
-    runs_page(tmp_path / "runs.md", records, "soak page")
+    for seed in (30, 20, 21, 22, 24):
+        batches.keep(record_of(seed, ess=0.5), tmp_path)
+    records = batches.soak(0, tmp_path, first=0, jobs=1, repeat_every=0, tell=lambda _: None)
+    runs_page(tmp_path / "runs.md", records, "soak runs")
     assert "seeds 23, 25, 26, 27, 28, 29." in (tmp_path / "runs.md").read_text()
 
 

@@ -78,6 +78,12 @@ class Record:
     repeated: bool | None = None
     seconds: float = 0.0
 
+    @classmethod
+    def of(cls, plan: RunPlan) -> Record:
+        """Of a run that is about to be done."""
+        layout = plan.fit[plan.fit.index("--layout") + 1]
+        return cls(plan.seed, plan.size_m, plan.sigma_share, len(plan.free), plan.sensors, layout)
+
     def differences(self, other: Record) -> list[str]:
         """What two runs of one seed did not repeat: commands whose document, and files whose bytes differ."""
         names = [*self.digests, *(name for name in other.digests if name not in self.digests)]
@@ -108,8 +114,7 @@ def whole_run(plan: RunPlan, folder: Path) -> Record:
 
     The task of `scaled_flatland` has to be on offer.
     """
-    layout = plan.fit[plan.fit.index("--layout") + 1]
-    record = Record(plan.seed, plan.size_m, plan.sigma_share, len(plan.free), plan.sensors, layout)
+    record = Record.of(plan)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     started = time.process_time()
