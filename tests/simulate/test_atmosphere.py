@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.special import exp1
+from support.rays import rays_along
 from support.tables import each_row
 
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Rays
 from lidardesign.geometry.receiver import path_windows
 from lidardesign.scene import Body, Box, Medium, Receiver, Scene, rigid
 from lidardesign.simulate.detector.detector import IDEAL, Detector, Photons
@@ -25,14 +25,9 @@ from lidardesign.simulate.light import Background, Beams, direct_echoes
 
 PHOTONS = Photons(905e-9, 1e-6, 1e4, "scanned", 1e6, 1e-6, 1e-4, 0.2, 1e-9, 1e3, 0.0)
 COUNTING = Detector("counting", photons=PHOTONS)
+GATE_M = (0.5, 8.0)
 FOG = Medium(extinction_per_m=0.3, backscatter_per_m_sr=0.015)
 WALL = Body(Box((0.1, 20, 20)), poses=rigid(translation_m=(5.1, 0, 0)))
-
-
-def rays_along(directions, gate_m=(0.5, 8.0), origin=(0.0, 0.0, 0.0)):
-    directions = np.atleast_2d(np.asarray(directions, float))
-    count = len(directions)
-    return Rays(np.tile(origin, (count, 1)), directions, np.tile(gate_m, (count, 1)), np.zeros(count), np.zeros(count))
 
 
 def in_air(scene, rays, detector=COUNTING):
@@ -56,14 +51,14 @@ def integral(low_m, high_m, medium=FOG):
 
 def test_clear_air_leaves_echoes_and_background_the_same_objects():
     scene = Scene((WALL,))
-    echoes, faded, background = in_air(scene, rays_along([[1.0, 0, 0]]))
+    echoes, faded, background = in_air(scene, rays_along([[1.0, 0, 0]], GATE_M))
     assert faded is echoes
     assert background.edges_m is None
 
 
 def test_light_fades_over_its_way_out_and_back():
     for receiver in (None, Receiver((0.0, 2.0, 0.0), 0.0, 0.0, 3.0, 3.0, (0.0, 99.0))):
-        echoes, faded, _ = in_air(Scene((WALL,), medium=FOG, receiver=receiver), rays_along([[1.0, 0, 0]]))
+        echoes, faded, _ = in_air(Scene((WALL,), medium=FOG, receiver=receiver), rays_along([[1.0, 0, 0]], GATE_M))
         whole = 10.0 if receiver is None else 5.0 + math.hypot(5.0, 2.0)
         assert faded.gain == pytest.approx(echoes.gain * math.exp(-0.3 * whole))
         assert np.array_equal(faded.path_m, echoes.path_m)
@@ -71,7 +66,7 @@ def test_light_fades_over_its_way_out_and_back():
 
 def test_haze_up_to_the_surface_sends_back_the_integral_of_the_lidar_equation():
     directions = [[1.0, 0, 0], [math.cos(0.5), math.sin(0.5), 0], [-1.0, 0, 0]]
-    _, _, background = in_air(Scene((WALL,), medium=FOG), rays_along(directions))
+    _, _, background = in_air(Scene((WALL,), medium=FOG), rays_along(directions, GATE_M))
     unit = PHOTONS.emitted(3) * PHOTONS.efficiency * PHOTONS.aperture_m2 * FOG.backscatter_per_m_sr
     ends = [5.0, 5.0 / math.cos(0.5), 8.0]
     assert background.edges_m[:, 0] == pytest.approx(np.full(3, 0.5))
@@ -116,7 +111,7 @@ def test_gates_behind_the_surface_and_gates_without_width_hear_no_haze():
 
 
 def test_detectors_without_photons_count_no_haze():
-    _, faded, background = in_air(Scene((WALL,), medium=FOG), rays_along([[1.0, 0, 0]]), IDEAL)
+    _, faded, background = in_air(Scene((WALL,), medium=FOG), rays_along([[1.0, 0, 0]], GATE_M), IDEAL)
     assert len(faded) == 1
     assert background.counts is None
 
@@ -124,8 +119,8 @@ def test_detectors_without_photons_count_no_haze():
 def test_behind_an_edge_only_the_light_that_passed_it_is_sent_back():
     plate = Body(Box((0.001, 5.0, 5.0)), poses=rigid(translation_m=(2.001, 5.0, 0.0)))
     wide = Detector("wide", divergence_rad=0.02, footprint_rays=64, photons=PHOTONS)
-    _, _, whole = in_air(Scene((WALL,), medium=FOG), rays_along([[1.0, 0, 0]]), wide)
-    _, _, background = in_air(Scene((plate, WALL), medium=FOG), rays_along([[1.0, 0, 0]]), wide)
+    _, _, whole = in_air(Scene((WALL,), medium=FOG), rays_along([[1.0, 0, 0]], GATE_M), wide)
+    _, _, background = in_air(Scene((plate, WALL), medium=FOG), rays_along([[1.0, 0, 0]], GATE_M), wide)
     assert np.array_equal(whole.edges_m, background.edges_m)
     before, behind = whole.edges_m[0, 1:] < 2.0, whole.edges_m[0, :-1] > 2.001
     assert background.counts[0, before] == pytest.approx(whole.counts[0, before], rel=1e-12)
@@ -148,7 +143,7 @@ def test_a_receiver_elsewhere_hears_the_haze_in_its_view_by_the_whole_path():
 
 def test_a_receiver_at_the_emitter_hears_the_same_haze():
     here = Receiver((0.0, 0.0, 0.0), 0.0, 0.0, 3.0, 3.0, (0.0, 99.0))
-    rays = rays_along([[1.0, 0, 0], [0.8, 0.6, 0]])
+    rays = rays_along([[1.0, 0, 0], [0.8, 0.6, 0]], GATE_M)
     _, alone, mono = in_air(Scene((WALL,), medium=FOG), rays)
     _, both, bistatic = in_air(Scene((WALL,), medium=FOG, receiver=here), rays)
     assert np.array_equal(mono.edges_m, bistatic.edges_m)
@@ -157,7 +152,7 @@ def test_a_receiver_at_the_emitter_hears_the_same_haze():
 
 
 def test_a_rays_haze_depends_on_no_other_ray_but_for_the_shared_energy():
-    many = rays_along([[1.0, 0, 0], [0.8, 0.6, 0], [0.0, 0.0, 1.0]])
+    many = rays_along([[1.0, 0, 0], [0.8, 0.6, 0], [0.0, 0.0, 1.0]], GATE_M)
     _, _, together = in_air(Scene((WALL,), medium=FOG), many)
     _, _, alone = in_air(Scene((WALL,), medium=FOG), many.subset(np.array([1])))
     assert np.array_equal(together.edges_m[1], alone.edges_m[0])

@@ -11,10 +11,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm, poisson
 from support.planning import CONSUMER, SINGLE, TIMED, counts, decisions, facing_wall, grid, room, sight
+from support.rays import rays_along
 from support.tables import each_row
 
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Ambient, Body, Box, Capsule, Medium, Mesh, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.detector.detector import metres
 from lidardesign.simulate.effects.expected_counts import estimate_error_m, needed_counts, share_in_bins
@@ -240,7 +240,7 @@ def test_the_spots_of_a_flood_light_each_other_as_two_small_surfaces_do():
     side = Body(Box((5, 0.05, 5)), "side", poses=rigid(translation_m=(0, 0.55, 0)), reflectance=0.4)
     scene = Scene((*facing_wall(reflectance=0.2).bodies, side))
     origin, looking = np.array([[1.0, 0, 0], [1.7, 0, 0]]), np.array([[1.0, 0, 0], [0, 1.0, 0]])
-    rays = Rays(origin, looking, np.tile((0.1, 4.0), (2, 1)), np.zeros(2), np.zeros(2))
+    rays = rays_along(looking, (0.1, 4.0), origin)
     detector = replace(CONSUMER, divergence_rad=0.0, footprint_rays=1)
     ahead_m, aside_m = 0.3, 0.5
     apart_m = math.hypot(ahead_m, aside_m)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
+from support.rays import rays_along
 from support.tables import each_row
 
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Outcome, Rays
+from lidardesign.geometry.rays import Outcome
 from lidardesign.scene import Ambient, Body, Medium, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.detector.detector import IDEAL
 from lidardesign.simulate.detector.files import load_detector
@@ -39,10 +41,8 @@ RECEIVERS = {
 
 def rays_of(directions, origin=(0.0, 0.0, 0.0), gate=(0.0, 2.5)):
     directions = np.asarray(directions, dtype=float).reshape(-1, 3)
-    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    count = len(directions)
-    places, gates = np.tile(np.asarray(origin, float), (count, 1)), np.tile(np.asarray(gate, float), (count, 1))
-    return Rays(places, directions, gates, np.zeros(count), np.linspace(0.0, 0.1, count))
+    rays = rays_along(directions / np.linalg.norm(directions, axis=1, keepdims=True), gate, origin)
+    return replace(rays, time_s=np.linspace(0.0, 0.1, len(rays)))
 
 
 RAYS = {
@@ -85,7 +85,7 @@ def test_a_scene_of_mirrors_alone_returns_nothing():
 @each_row(("reflectance", "gain"), [(0.0, 0.0), (0.5, np.finfo(float).max)])
 def test_a_surface_that_touches_the_sensor_blinds_it_unless_it_is_black(reflectance, gain):
     floor = Scene((Body(Plane(), reflectance=reflectance),))
-    down = Rays(np.zeros((1, 3)), np.array([[0.0, 0.0, -1.0]]), np.array([[0.0, 1.0]]), np.zeros(1), np.zeros(1))
+    down = rays_along([0.0, 0.0, -1.0], (0.0, 1.0))
     hits = SceneCaster(floor).first_hit(down.origin_m, down.direction)
     assert hits.range_m == 0
     assert direct_echoes(floor, Beams.of(down), hits).gain == gain

@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.rays import rays_along
 from support.references import STANDARD_ERRORS
 from support.synthetic_light import PHOTON_EFFECTS
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError
-from lidardesign.geometry.rays import Outcome, Rays
+from lidardesign.geometry.rays import Outcome
 from lidardesign.scene import SPEED_OF_LIGHT_M_S, Ambient, Body, Box, Plane, Scene, Sphere, rigid
 from lidardesign.simulate.detector.detector import PLANCK_J_S, metres
 from lidardesign.simulate.detector.files import load_detector
@@ -28,9 +29,7 @@ UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 
 def rays_towards(directions, gate_m):
     directions = np.asarray(directions, float)
-    directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    count = len(directions)
-    return Rays(np.zeros((count, 3)), directions, np.tile(gate_m, (count, 1)), np.zeros(count), np.zeros(count))
+    return rays_along(directions / np.linalg.norm(directions, axis=1, keepdims=True), gate_m)
 
 
 def ceiling(distance_m, reflectance=0.6, **scene):
@@ -172,10 +171,8 @@ def test_captures_hold_the_photons_that_returns_are_read_from():
 
 def test_captures_are_as_long_as_each_gate():
     scene, _ = face_like()
-    rays = rays_towards(np.tile([1.0, 0.0, 0.0], (3, 1)), (0.3, 0.6))
     gates = np.array([[0.3, 0.6], [0.5, 0.5], [0.39, 0.41]])
-    rays = Rays(rays.origin_m, rays.direction, gates, rays.sensor, rays.time_s)
-    histograms = captured(scene, rays, PHOTON_EFFECTS)
+    histograms = captured(scene, rays_along(np.tile([1.0, 0.0, 0.0], (3, 1)), gates), PHOTON_EFFECTS)
     assert np.array_equal(histograms.number, np.ceil(np.diff(gates)[:, 0] / histograms.width_m))
     assert histograms.counts.shape == (3, histograms.number.max())
     assert histograms.counts[2, histograms.number[2] :].sum() == 0

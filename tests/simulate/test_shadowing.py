@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
+from support.rays import random_fan, rays_along
 from support.tables import each_row
 
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.effects.shadowing import visible_echoes
 from lidardesign.simulate.light import Beams, direct_echoes
@@ -21,18 +21,13 @@ from lidardesign.space import direction
 BESIDE = Receiver((0.0, 1.0, 0.0), 0.0, 0.0, 3.0, 3.0, (0.0, 1e6))
 
 
-def fan(count=400, spread=0.5, seed=0):
-    generator = np.random.default_rng(seed)
-    return direction(generator.uniform(-spread, spread, count), generator.uniform(-spread, spread, count))
+def fan(count=400):
+    return random_fan(count, 0.5)
 
 
 def both(scene, directions, origin=(0.0, 0.0, 0.0)):
     """Direct echoes, and those of them that are heard."""
-    count = len(directions)
-    rays = Rays(
-        np.tile(origin, (count, 1)), directions, np.tile([0.0, 99.0], (count, 1)), np.zeros(count), np.zeros(count)
-    )
-    beams, caster = Beams.of(rays), SceneCaster(scene)
+    beams, caster = Beams.of(rays_along(directions, origin=origin)), SceneCaster(scene)
 
     def tracer(origins, directions, time_s):
         return caster.first_hit(origins, directions)

@@ -7,21 +7,18 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
+from support.rays import random_fan, rays_along
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Outcome, Rays
+from lidardesign.geometry.rays import Outcome
 from lidardesign.scene import Body, Box, Capsule, Mesh, Scene, Sphere, rigid
 from lidardesign.simulate.simulate import build_casters, simulate, simulate_many
-from lidardesign.space import direction
 
 
 def make_rays(origins, directions, gate=(0.0, 10.0)):
-    directions = np.atleast_2d(np.asarray(directions, float))
-    origins = np.broadcast_to(np.asarray(origins, float), directions.shape)
-    count = len(directions)
-    return Rays(origins, directions, np.broadcast_to(gate, (count, 2)), np.zeros(count), np.zeros(count))
+    return rays_along(directions, gate, origins)
 
 
 def unit(vectors):
@@ -32,9 +29,8 @@ def ball(radius=0.5, centre=(3.0, 0.0, 0.0), role="both"):
     return Body(Sphere(radius), "ball", role, rigid(translation_m=centre))
 
 
-def fan(count=400, spread=0.3):
-    generator = np.random.default_rng(1)
-    return direction(generator.uniform(-spread, spread, count), generator.uniform(-spread, spread, count))
+def fan(count=400):
+    return random_fan(count, 0.3, seed=1)
 
 
 def test_ranges_on_a_sphere_are_the_closed_form():
@@ -82,8 +78,7 @@ def test_a_wrong_number_of_casters_is_refused():
 def test_no_rays_give_no_returns(with_mesh):
     triangle = Mesh(np.eye(3), np.array([[0, 1, 2]]), "unsigned")
     scene = Scene((Body(triangle),) if with_mesh else (ball(),))
-    none = Rays(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
-    (returns,) = simulate(scene, none)
+    (returns,) = simulate(scene, rays_along(np.zeros((0, 3))))
     assert len(returns.outcome) == 0
     assert len(returns.points_m) == 0
 

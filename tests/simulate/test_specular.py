@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
+from support.rays import random_fan, rays_along
 from support.tables import each_row
 
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate.detector.detector import Detector
 from lidardesign.simulate.effects import specular
@@ -24,10 +24,7 @@ EVERYWHERE = {"azimuth_rad": 0.0, "elevation_rad": 0.0, "horizontal_rad": 3.1, "
 
 
 def beams_along(directions, origins=(0.0, 0.0, 0.0)):
-    directions = np.atleast_2d(np.asarray(directions, float))
-    origins = np.broadcast_to(np.asarray(origins, float), directions.shape)
-    count = len(directions)
-    return Beams.of(Rays(origins, directions, np.tile([0.0, 99.0], (count, 1)), np.zeros(count), np.zeros(count)))
+    return Beams.of(rays_along(directions, origin=origins))
 
 
 def traced(scene, beams):
@@ -54,8 +51,7 @@ def meshed(body):
 
 
 def fan(count=100, spread=0.2, seed=0):
-    generator = np.random.default_rng(seed)
-    return direction(generator.uniform(-spread, spread, count), generator.uniform(-spread, spread, count))
+    return random_fan(count, spread, seed)
 
 
 @each_row("made", [lambda body: body, meshed], ids=["box", "mesh"])

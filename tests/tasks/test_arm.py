@@ -26,11 +26,12 @@ from lidardesign_tasks.arm_motion import (
     phase_shares,
 )
 from lidardesign_tasks.arm_robot import load_robot
+from support.rays import rays_along
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Outcome, Rays, Returns
+from lidardesign.geometry.rays import Outcome, Returns
 from lidardesign.scene import Mesh
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import ELEVATION, aim
@@ -63,7 +64,7 @@ def exact_returns(scene, places, frames=None, target=0):
     returns = []
     for frame in range(scene.frames) if frames is None else frames:
         origin = places[frame] + np.array([0.0, 0.0, 0.5])
-        rays = Rays(origin[None], np.array([[0.0, 0.0, -1.0]]), np.array([[0.0, 2.0]]), np.zeros(1), np.zeros(1))
+        rays = rays_along([0.0, 0.0, -1.0], (0.0, 2.0), origin)
         range_m = np.array([0.5 - 2 / 3 * radius])
         returns.append(Returns(rays, np.array([Outcome.RETURN]), range_m, np.array([target]), frame))
     return returns
@@ -244,7 +245,7 @@ def test_a_score_uses_time_stamps_and_not_the_order_of_returns(scenes):
 
 def test_fewer_than_two_tracked_frames_fail_with_the_worst_value(scenes):
     scene = scenes["test"][0]
-    none = simulate(scene, Rays(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0), np.zeros(0)))
+    none = simulate(scene, rays_along(np.zeros((0, 3))))
     for returns in (none, exact_returns(scene, scene.truth["ball_m"], frames=[5])):
         score = TASK.score(scene, returns)
         assert score.failed
@@ -316,8 +317,7 @@ def test_dense_rays_from_around_track_the_ball_in_every_frame_within_its_radius(
     design = aim(origins, np.broadcast_to(balls, (30, 12, 3)).reshape(-1, 3))
     assert TASK.space(config).contains(design).all()
     direction = (np.broadcast_to(balls, (30, 12, 3)).reshape(-1, 3) - origins) / design[:, 5:]
-    rays = Rays(origins, direction, np.tile([0.1, 2.0], (360, 1)), np.zeros(360), np.zeros(360))
-    score = TASK.score(scene, simulate(scene, rays))
+    score = TASK.score(scene, simulate(scene, rays_along(direction, (0.1, 2.0), origins)))
     assert score.details["tracked_share"] == 1
     assert score.value < 0.02
 

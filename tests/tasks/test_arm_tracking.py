@@ -5,15 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from lidardesign_tasks.arm_tracking import filled_path, tracked_places
+from support.rays import rays_along, rays_of_points
 from support.references import recursive_frechet
 from support.tables import each_row
 
 from lidardesign.evaluate.metrics import discrete_frechet_m
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Outcome, Rays, Returns
+from lidardesign.geometry.rays import Outcome, Returns
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.simulate.simulate import simulate
-from lidardesign.space import aim, direction
+from lidardesign.space import aim
 
 RADIUS_M = 0.02
 STANDARD_ERRORS = 4
@@ -71,7 +72,7 @@ def even_disc_rays(origin, places, count, seed):
     across = np.cross(axis, generator.normal(size=(count, 3)))
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     starts = origin + RADIUS_M * np.sqrt(generator.uniform(0, 1, (count, 1))) * across
-    return Rays(starts, axis, np.tile([0.0, 10.0], (count, 1)), np.zeros(count), np.zeros(count))
+    return rays_along(axis, (0.0, 10.0), starts)
 
 
 def test_the_place_of_a_ball_is_unbiased_when_its_disc_is_hit_evenly():
@@ -89,13 +90,7 @@ def test_returns_from_other_bodies_and_lost_rays_do_not_move_the_ball():
     ball = aim(np.tile(origin, (5, 1)), place + np.linspace(-0.01, 0.01, 5)[:, None])
     other = aim(np.tile(origin, (3, 1)), np.array([[0.0, 0.0, 0.3], [0.02, 0.0, 0.3], [3.0, 0.0, 0.0]]))
     points = np.concatenate([ball, other])
-    rays = Rays(
-        points[:, :3],
-        direction(points[:, 3], points[:, 4]),
-        np.tile([0.0, 9.0], (8, 1)),
-        np.zeros(8),
-        np.zeros(8),
-    )
+    rays = rays_of_points(points, (0.0, 9.0))
     everything, alone = simulate(scene, rays), simulate(scene, rays.subset(np.arange(5)))
     np.testing.assert_allclose(tracked_places(everything, 1, RADIUS_M)[1], tracked_places(alone, 1, RADIUS_M)[1])
     (frame,) = everything

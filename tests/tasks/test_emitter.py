@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from lidardesign_tasks.emitter import EmitterTask
 from lidardesign_tasks.face import FaceTask
+from support.rays import rays_of_points
 from support.tables import each_row
 
 from lidardesign.config import DensitySettings
@@ -21,7 +22,7 @@ from lidardesign.design.fit import fit
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.evaluate.metrics import is_received, is_visible, trial_origins
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.rays import Outcome, Rays
+from lidardesign.geometry.rays import Outcome
 from lidardesign.geometry.receiver import in_view, path_of_range, path_windows, range_of_path
 from lidardesign.run.yaml import parse_yaml
 from lidardesign.samples import Samples
@@ -34,7 +35,7 @@ from lidardesign.simulate.effects.multipath import _hidden, bound
 from lidardesign.simulate.light import Beams, direct_echoes
 from lidardesign.simulate.physics import EFFECTS, Physics
 from lidardesign.simulate.simulate import simulate
-from lidardesign.space import RANGE, aim, direction
+from lidardesign.space import RANGE, aim
 
 SMALL = {"train": 4, "test": 2, "truth_points": 800}
 SHADOWED = Physics(IDEAL, frozenset({"shadowing"}))
@@ -47,10 +48,7 @@ def receiver_at(place, **changes):
 
 def rays_from(origins, targets, gate_m=(0.0, 5.0)):
     """Rays from origins (3,) or (N, 3) at targets (N, 3)."""
-    design = aim(np.broadcast_to(origins, targets.shape), targets)
-    count = len(design)
-    gates = np.broadcast_to(gate_m, (count, 2))
-    return Rays(design[:, :3], direction(design[:, 3], design[:, 4]), gates, np.zeros(count), np.zeros(count))
+    return rays_of_points(aim(np.broadcast_to(origins, targets.shape), targets), gate_m)
 
 
 def random_rays(count=2000, seed=0):

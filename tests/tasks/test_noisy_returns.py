@@ -15,16 +15,17 @@ from lidardesign_tasks.meshes import MeshesTask
 from lidardesign_tasks.surface import surface_score, with_visible_truth
 from lidardesign_tasks.warehouse import WarehouseTask
 from support.meshes import write_ball
+from support.rays import rays_along, rays_of_points
 from support.tables import each_row
 
 from lidardesign.evaluate.baselines.candidates import rays_at
 from lidardesign.evaluate.scene_scores import checked_score, score_lists
-from lidardesign.geometry.rays import Outcome, Rays
+from lidardesign.geometry.rays import Outcome
 from lidardesign.scene import Body, Box, Mesh, Scene, rigid
 from lidardesign.simulate.detector.detector import Detector
 from lidardesign.simulate.physics import Physics
 from lidardesign.simulate.simulate import build_casters, simulate
-from lidardesign.space import DIMENSIONS, RANGE, DesignSpace, direction
+from lidardesign.space import DIMENSIONS, RANGE, DesignSpace
 from lidardesign.task import Metric, Score, conditions_of, scenes_of
 
 TASKS = {
@@ -37,14 +38,13 @@ TASKS = {
 }
 
 
-@pytest.fixture(params=sorted(TASKS))
-def measured(request, tmp_path):
+def measure(name, tmp_path):
     """A task, a scene of it, and what even rays return there, one list per condition value and frame."""
-    make, options = TASKS[request.param]
+    make, options = TASKS[name]
     task = make()
     if "folder" in options:
-        for name in ("one", "two", "three"):
-            write_ball(tmp_path / "balls" / f"{name}.stl", (0.1, 0.12, 0.2))
+        for number in range(3):
+            write_ball(tmp_path / "balls" / f"{number}.stl", (0.1, 0.12, 0.2))
         options = {**options, "folder": tmp_path / "balls"}
     config = task.Config(**options)
     space = task.space(config)
@@ -54,10 +54,7 @@ def measured(request, tmp_path):
         points = space.sample(300, np.random.default_rng(1))
         for name, value in condition.items():
             points[:, DIMENSIONS.index(name)] = value
-        gates = np.tile((space.low[RANGE], space.high[RANGE]), (len(points), 1))
-        looking = direction(points[:, 3], points[:, 4])
-        rays = Rays(points[:, :3], looking, gates, np.zeros(len(points)), np.zeros(len(points)))
-        returns += simulate(scene, rays)
+        returns += simulate(scene, rays_of_points(points, (space.low[RANGE], space.high[RANGE])))
     return task, scene, returns
 
 
@@ -72,15 +69,17 @@ def turned(returns, chosen, outcome, range_m):
     )
 
 
-def test_without_a_single_detection_a_design_fails_at_the_worst_value(measured):
-    task, scene, returns = measured
+@each_row("name", TASKS)
+def test_without_a_single_detection_a_design_fails_at_the_worst_value(name, tmp_path):
+    task, scene, returns = measure(name, tmp_path)
     score = checked_score(task, scene, [turned(one, True, Outcome.NOT_DETECTED, np.nan) for one in returns])
     assert score.failed
     assert score.value == task.metric.worst
 
 
-def test_invented_returns_are_scored_as_returns_of_no_body(measured):
-    task, scene, returns = measured
+@each_row("name", TASKS)
+def test_invented_returns_are_scored_as_returns_of_no_body(name, tmp_path):
+    task, scene, returns = measure(name, tmp_path)
     generator = np.random.default_rng(2)
     noisy = []
     for one in returns:
@@ -106,7 +105,7 @@ def test_noise_is_not_told_from_the_ball_that_a_robot_carries():
     for frame, place in enumerate(places):
         origins = place + aside
         looking = (place - origins) / np.linalg.norm(place - origins, axis=1, keepdims=True)
-        rays = Rays(origins, looking, np.tile((0.0, 3.0), (3, 1)), np.zeros(3), np.zeros(3))
+        rays = rays_along(looking, (0.0, 3.0), origins)
         found.append(replace(simulate(Scene((ball,)), rays, casters=None)[frame], frame=frame))
     index = scene.bodies.index(ball)
     clean = [replace(one, body=np.where(one.returned, index, -1)) for one in found]
@@ -149,8 +148,7 @@ class Remembering:
 def test_chance_is_the_same_for_rival_rays_and_another_one_at_each_position():
     wall = Body(Box((0.05, 2, 2)), "wall", poses=rigid(translation_m=(1.05, 0, 0)))
     scene, count = Scene((wall,)), 50
-    along = np.tile((1.0, 0.0, 0.0), (count, 1))
-    rays = Rays(np.zeros((count, 3)), along, np.tile((0.5, 2.0), (count, 1)), np.zeros(count), np.zeros(count))
+    rays = rays_along(np.tile((1.0, 0.0, 0.0), (count, 1)), (0.5, 2.0))
     task, detector = Remembering(), Detector("timed", jitter_sigma_s=1e-11)
     jobs = [(rays, rays), (rays, rays)]
     list(score_lists(task, scene, jobs, build_casters(scene), Physics(detector, frozenset({"jitter"}))))

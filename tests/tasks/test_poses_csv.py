@@ -16,14 +16,14 @@ from lidardesign_tasks.moving_surface import SURFACES
 from lidardesign_tasks.pose import rotation_matrix
 from lidardesign_tasks.poses_csv import COLUMNS, interpolated, read_poses, rotation_vector
 from pydantic import ValidationError
+from support.rays import rays_of_points
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.geometry.rays import Rays
 from lidardesign.geometry.rotation import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.scene import rigid
 from lidardesign.simulate.simulate import simulate
-from lidardesign.space import aim, direction
+from lidardesign.space import aim
 
 EXACT = 1e-9
 HEADER = "time_s,body,x_m,y_m,z_m"
@@ -175,8 +175,7 @@ def rays_at(scene, frame, count=150):
     points = scene.truth[SURFACES][frame].points
     points = points[np.linspace(0, len(points) - 1, count).astype(int)]
     seen = aim(np.array([1.5, 0.0, 0.0]), points)
-    gates = seen[:, 5:] + np.array([-0.02, 0.02])
-    return Rays(seen[:, :3], direction(seen[:, 3], seen[:, 4]), gates, np.zeros(count), np.zeros(count))
+    return rays_of_points(seen, seen[:, 5:] + np.array([-0.02, 0.02]))
 
 
 def test_every_frame_is_judged_by_where_the_object_is_then(folder):

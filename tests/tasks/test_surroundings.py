@@ -17,10 +17,10 @@ from lidardesign_tasks.meshes import MeshesTask
 from lidardesign_tasks.surroundings import fog
 from lidardesign_tasks.warehouse import WarehouseTask
 from pydantic import ValidationError
+from support.rays import rays_along
 from support.tables import each_row
 
 from lidardesign.geometry.raycast import shared_caster
-from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Ambient
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.physics import Physics
@@ -140,9 +140,7 @@ def test_the_guides_surroundings_change_what_a_photon_counter_reports(folder):
     assert outdoors.truth is calm.truth
     turn = np.linspace(-0.25, 0.25, 12)
     azimuth, elevation = map(np.ravel, np.meshgrid(math.pi + turn, turn))
-    looking, count = direction(azimuth, elevation), len(azimuth)
-    places = np.tile([0.4, 0.0, 0.0], (count, 1))
-    rays = Rays(places, looking, np.tile([0.05, 1.05], (count, 1)), np.zeros(count), np.zeros(count))
+    rays = rays_along(direction(azimuth, elevation), (0.05, 1.05), (0.4, 0.0, 0.0))
     planner = Planner(load_detector("single-photon"))
     names = {"ambient", "atmosphere", "specular", "pile_up"}
     assert names <= planner.plan(outdoors, [rays]).effects

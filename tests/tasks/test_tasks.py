@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +18,14 @@ from lidardesign_tasks.meshes import MeshesTask
 from lidardesign_tasks.pose import jittered_pose
 from lidardesign_tasks.warehouse import WarehouseTask
 from support.meshes import write_ball
+from support.rays import rays_of_points
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.geometry.rays import Outcome, Rays, Returns
 from lidardesign.scene import Scene
 from lidardesign.simulate.simulate import simulate
-from lidardesign.space import aim, direction
+from lidardesign.space import aim
 from lidardesign.task import Task, conditions_of, notes_of, scenes_of
 
 REAL_MODEL = Path(__file__).parents[3] / "shared" / "data" / "ict_face.h5"
@@ -55,15 +57,23 @@ def folders(tmp_path_factory):
     return root
 
 
-@pytest.fixture(scope="module", params=CASES)
-def case(request, folders):
-    """Task, configuration, and its scenes by split."""
-    kind, values = CASES[request.param]
-    if values.get("model") == str(REAL_MODEL) and not REAL_MODEL.exists():
-        pytest.skip("../shared/data/ict_face.h5 is not here")
-    paths = {key: str(folders / values[key]) for key in ("folder", "occluders") if key in values}
-    task, config = kind(), kind.Config(**{**values, **paths})
-    return task, config, {split: list(task.scenes(config, split, 0)) for split in ("train", "test")}
+if not REAL_MODEL.exists():
+    del CASES["face of the real model"]
+each_case = each_row("name", CASES)
+
+
+@pytest.fixture(scope="module")
+def case(folders):
+    """Task, configuration, and its scenes by split, by name."""
+
+    @cache
+    def made(name):
+        kind, values = CASES[name]
+        paths = {key: str(folders / values[key]) for key in ("folder", "occluders") if key in values}
+        task, config = kind(), kind.Config(**{**values, **paths})
+        return task, config, {split: list(task.scenes(config, split, 0)) for split in ("train", "test")}
+
+    return made
 
 
 def truth_points(scene: Scene) -> np.ndarray:
@@ -79,7 +89,7 @@ def rays_at_truth(task, config, scene, count) -> Rays:
     origins = task.space(config).sample(count, np.random.default_rng(3))[:, :3]
     design = aim(origins, points)
     gates = np.clip(design[:, 5:] + np.array([-HALF_GATE_M, HALF_GATE_M]), 0, None)
-    return Rays(origins, direction(design[:, 3], design[:, 4]), gates, np.zeros(count), np.zeros(count))
+    return rays_of_points(design, gates)
 
 
 def score(task, scene, rays):
@@ -96,8 +106,9 @@ def bodies_equal(first: Scene, second: Scene) -> bool:
     return content(first) == content(second)
 
 
-def test_the_task_keeps_the_contract(case):
-    task, _, scenes = case
+@each_case
+def test_the_task_keeps_the_contract(case, name):
+    task, _, scenes = case(name)
     assert isinstance(task, Task)
     assert task.metric.better == "lower"
     assert task.api_version == 1
@@ -105,8 +116,9 @@ def test_the_task_keeps_the_contract(case):
     assert all(scene.frames == 1 for split in scenes.values() for scene in split)
 
 
-def test_every_scene_has_a_target_and_a_truth_inside_the_design_space(case):
-    task, config, scenes = case
+@each_case
+def test_every_scene_has_a_target_and_a_truth_inside_the_design_space(case, name):
+    task, config, scenes = case(name)
     space = task.space(config)
     fixed = space.low[:3] == space.high[:3]
     for scene in scenes["train"]:
@@ -118,8 +130,9 @@ def test_every_scene_has_a_target_and_a_truth_inside_the_design_space(case):
             assert space.contains(aim(np.array(space.low[:3]), points)).all()
 
 
-def test_scenes_are_the_same_for_the_same_seed_and_differ_for_another(case):
-    task, config, scenes = case
+@each_case
+def test_scenes_are_the_same_for_the_same_seed_and_differ_for_another(case, name):
+    task, config, scenes = case(name)
     again, other = task.scenes(config, "train", 0), task.scenes(config, "train", 1)
     for first, second in zip(scenes["train"], again, strict=True):
         assert bodies_equal(first, second)
@@ -127,14 +140,16 @@ def test_scenes_are_the_same_for_the_same_seed_and_differ_for_another(case):
     assert not any(bodies_equal(first, second) for first, second in zip(scenes["train"], other, strict=False))
 
 
-def test_training_and_held_out_scenes_are_disjoint(case):
-    _, _, scenes = case
+@each_case
+def test_training_and_held_out_scenes_are_disjoint(case, name):
+    _, _, scenes = case(name)
     for train in scenes["train"]:
         assert not any(bodies_equal(train, test) for test in scenes["test"])
 
 
-def test_more_rays_on_the_truth_score_better(case):
-    task, config, scenes = case
+@each_case
+def test_more_rays_on_the_truth_score_better(case, name):
+    task, config, scenes = case(name)
     for scene in scenes["train"]:
         sparse, dense = (score(task, scene, rays_at_truth(task, config, scene, n)) for n in (12, 600))
         assert not dense.failed
@@ -142,8 +157,9 @@ def test_more_rays_on_the_truth_score_better(case):
         assert all(np.isfinite(value) for value in dense.details.values())
 
 
-def test_noise_makes_the_score_worse(case):
-    task, config, scenes = case
+@each_case
+def test_noise_makes_the_score_worse(case, name):
+    task, config, scenes = case(name)
     for scene in scenes["train"]:
         returns = simulate(scene, rays_at_truth(task, config, scene, 300))
         noise = NOISE_M * np.random.default_rng(5).normal(size=300)
@@ -151,16 +167,18 @@ def test_noise_makes_the_score_worse(case):
         assert task.score(scene, noisy).value > task.score(scene, returns).value
 
 
-def test_the_order_of_rays_does_not_matter(case):
-    task, config, scenes = case
+@each_case
+def test_the_order_of_rays_does_not_matter(case, name):
+    task, config, scenes = case(name)
     scene = scenes["train"][0]
     rays = rays_at_truth(task, config, scene, 120)
     shuffled = rays.subset(np.random.default_rng(6).permutation(120))
     assert score(task, scene, shuffled).value == pytest.approx(score(task, scene, rays).value, rel=1e-9)
 
 
-def test_rays_without_a_return_do_not_change_the_reconstruction(case):
-    task, config, scenes = case
+@each_case
+def test_rays_without_a_return_do_not_change_the_reconstruction(case, name):
+    task, config, scenes = case(name)
     scene = scenes["train"][0]
     (returns,) = simulate(scene, rays_at_truth(task, config, scene, 120))
     lost = Returns(
@@ -172,23 +190,26 @@ def test_rays_without_a_return_do_not_change_the_reconstruction(case):
     assert task.score(scene, [lost]).value == task.score(scene, [returns]).value
 
 
-def test_scenes_survive_the_way_to_a_worker_process(case):
-    task, config, scenes = case
+@each_case
+def test_scenes_survive_the_way_to_a_worker_process(case, name):
+    task, config, scenes = case(name)
     scene = pickle.loads(pickle.dumps(scenes["train"][0]))
     rays = rays_at_truth(task, config, scene, 60)
     assert score(task, scene, rays).value == score(task, scenes["train"][0], rays).value
 
 
-def test_a_score_reads_only_rays_and_ranges_not_what_was_hit(case):
-    task, config, scenes = case
+@each_case
+def test_a_score_reads_only_rays_and_ranges_not_what_was_hit(case, name):
+    task, config, scenes = case(name)
     scene = scenes["train"][0]
     (returns,) = simulate(scene, rays_at_truth(task, config, scene, 120))
     blind = Returns(returns.rays, returns.outcome, returns.range_m, np.zeros_like(returns.body))
     assert task.score(scene, [blind]).value == task.score(scene, [returns]).value
 
 
-def test_residuals_add_up_to_the_score(case):
-    task, config, scenes = case
+@each_case
+def test_residuals_add_up_to_the_score(case, name):
+    task, config, scenes = case(name)
     for scene in scenes["train"]:
         returns = simulate(scene, rays_at_truth(task, config, scene, 120))
         found, judged = task.residuals(scene, returns), task.score(scene, returns)
@@ -198,8 +219,9 @@ def test_residuals_add_up_to_the_score(case):
         assert ((found.points_m >= low) & (found.points_m <= high)).all()
 
 
-def test_a_design_that_fails_is_equally_wrong_everywhere(case):
-    task, config, scenes = case
+@each_case
+def test_a_design_that_fails_is_equally_wrong_everywhere(case, name):
+    task, config, scenes = case(name)
     scene = scenes["train"][0]
     nothing = simulate(scene, rays_at_truth(task, config, scene, 0))
     assert task.score(scene, nothing).failed
@@ -208,8 +230,9 @@ def test_a_design_that_fails_is_equally_wrong_everywhere(case):
     np.testing.assert_allclose(found.values, task.metric.worst / len(truth_points(scene)))
 
 
-def test_residuals_are_where_no_ray_was_fired(case):
-    task, config, scenes = case
+@each_case
+def test_residuals_are_where_no_ray_was_fired(case, name):
+    task, config, scenes = case(name)
     for scene in scenes["train"]:
         rays = rays_at_truth(task, config, scene, 600)
         (everywhere,) = simulate(scene, rays)
@@ -234,18 +257,16 @@ SEEN_OFTEN = {
 }
 
 
-@pytest.fixture(scope="module", params=SEEN_OFTEN)
-def often(request):
+@cache
+def often(name):
     """Task, configuration, a list of uniform rays for each condition value, and scenes by split."""
-    kind, values = SEEN_OFTEN[request.param]
+    kind, values = SEEN_OFTEN[name]
     task, config = kind(), kind.Config(**values)
     space, generator = task.space(config), np.random.default_rng(2)
     lists, conditions = [], conditions_of(task, config, space)
     for condition in conditions:
         points = space.at(condition).sample(UNIFORM_RAYS // len(conditions), generator)
-        gates = np.tile([space.low[5], space.high[5]], (len(points), 1))
-        looking = direction(points[:, 3], points[:, 4])
-        lists.append(Rays(points[:, :3], looking, gates, np.zeros(len(points)), np.zeros(len(points))))
+        lists.append(rays_of_points(points, (space.low[5], space.high[5])))
     return task, config, lists, {split: task.scenes(config, split, 0) for split in ("train", "test")}
 
 
@@ -254,8 +275,9 @@ def score_often(task, scene, lists):
     return task.score(scene, [one for rays in lists for one in simulate(scene, rays)])
 
 
-def test_a_task_that_is_seen_often_keeps_the_contract(often):
-    task, _, lists, scenes = often
+@each_row("name", SEEN_OFTEN)
+def test_a_task_that_is_seen_often_keeps_the_contract(name):
+    task, _, lists, scenes = often(name)
     assert isinstance(task, Task)
     assert task.api_version == 1
     assert max(scene.frames for scene in scenes["test"]) * len(lists) > 1
@@ -266,8 +288,9 @@ def test_a_task_that_is_seen_often_keeps_the_contract(often):
         assert all(np.isfinite(value) for value in found.details.values())
 
 
-def test_many_scenes_survive_the_way_to_a_worker_process_and_repeat(often):
-    task, config, lists, scenes = often
+@each_row("name", SEEN_OFTEN)
+def test_many_scenes_survive_the_way_to_a_worker_process_and_repeat(name):
+    task, config, lists, scenes = often(name)
     again = task.scenes(config, "train", 0)
     for scene, other in zip(scenes["train"], again, strict=True):
         value = score_often(task, scene, lists).value
@@ -275,8 +298,9 @@ def test_many_scenes_survive_the_way_to_a_worker_process_and_repeat(often):
         assert score_often(task, other, lists).value == value
 
 
-def test_residuals_of_many_frames_or_positions_add_up_to_the_score(often):
-    task, _, lists, scenes = often
+@each_row("name", SEEN_OFTEN)
+def test_residuals_of_many_frames_or_positions_add_up_to_the_score(name):
+    task, _, lists, scenes = often(name)
     # rays at the first position alone leave something to be missed
     lists = [rays if index == 0 else rays.subset(np.zeros(0, dtype=int)) for index, rays in enumerate(lists)]
     for scene in scenes["train"]:
@@ -341,8 +365,9 @@ def test_each_mesh_is_in_exactly_one_split(folders):
     assert len(names[0] | names[1]) == 3
 
 
-def test_what_is_held_out_stays_held_out_whatever_the_seed_of_training_scenes(case):
-    task, config, scenes = case
+@each_case
+def test_what_is_held_out_stays_held_out_whatever_the_seed_of_training_scenes(case, name):
+    task, config, scenes = case(name)
     for seed in (1, 2, 3):
         for train in task.scenes(config, "train", seed):
             assert not any(bodies_equal(train, test) for test in scenes["test"])

@@ -9,6 +9,7 @@ import pytest
 from lidardesign_tasks.warehouse import AISLE_M, PAPER_POSITIONS_M, WarehouseConfig, WarehouseTask
 from lidardesign_tasks.warehouse_shelf import LEVELS, SHELF_DEPTH_M, build_shelf
 from lidardesign_tasks.warehouse_truth import ON_FACE_M, BoxTruth, cut_scene, visible_boxes
+from support.rays import rays_along
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError
@@ -34,10 +35,7 @@ def shelves() -> list[Scene]:
 def fan(x_m, elevation_rad, gate_m=(0.1, 5.0)) -> Rays:
     """Rays of the robot at x."""
     elevation = np.asarray(elevation_rad, dtype=float)
-    count = len(elevation)
-    directions = direction(np.full(count, -math.pi / 2), elevation)
-    gates = np.broadcast_to(gate_m, (count, 2))
-    return Rays(np.tile([x_m, 0.0, 0.0], (count, 1)), directions, gates, np.zeros(count), np.zeros(count))
+    return rays_along(direction(np.full(len(elevation), -math.pi / 2), elevation), gate_m, (x_m, 0.0, 0.0))
 
 
 def returns_of(scene, elevation_rad, positions=None, **gate) -> list[Returns]:
