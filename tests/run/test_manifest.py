@@ -33,15 +33,21 @@ from lidardesign.run.manifest import (
     write_recorded,
 )
 
+FULL = OSError(errno.ENOSPC, "No space left on device")
 GONE = 2**22 + 1  # beyond the largest process id that Linux gives
+
+
+def recorded(folder):
+    """A run of one file."""
+    start_manifest(folder, command=["lidardesign", "learn"], seed=7)
+    write_atomic(folder / "data.bin", b"0123456789")
+    record(folder, ["data.bin"])
+    return folder
 
 
 @pytest.fixture
 def run(tmp_path):
-    start_manifest(tmp_path, command=["lidardesign", "learn"], seed=7)
-    write_atomic(tmp_path / "data.bin", b"0123456789")
-    record(tmp_path, ["data.bin"])
-    return tmp_path
+    return recorded(tmp_path)
 
 
 def test_a_write_makes_folders_and_leaves_only_the_file(tmp_path):
@@ -53,26 +59,25 @@ def test_a_write_makes_folders_and_leaves_only_the_file(tmp_path):
 
 
 @pytest.mark.hard_case("38")
-@each_row("failing", ["fsync", "replace"])
-def test_a_write_that_fails_leaves_the_old_file_and_no_temporary(tmp_path, monkeypatch, failing):
+@each_row(
+    ("failing", "error", "told", "words"),
+    [
+        ("fsync", FULL, DataError, "No space left"),
+        ("replace", FULL, DataError, "No space left"),
+        ("replace", KeyboardInterrupt, KeyboardInterrupt, None),
+    ],
+)
+def test_a_write_that_fails_or_is_interrupted_leaves_the_old_file_and_no_temporary(
+    tmp_path, monkeypatch, failing, error, told, words
+):
     path = tmp_path / "file"
     write_atomic(path, b"old")
 
-    def full(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
+    def fail(*_):
+        raise error
 
-    monkeypatch.setattr(files.os, failing, full)
-    with pytest.raises(DataError, match="No space left"):
-        write_atomic(path, b"new")
-    assert path.read_bytes() == b"old"
-    assert os.listdir(tmp_path) == ["file"]
-
-
-def test_an_interrupted_write_leaves_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "file"
-    write_atomic(path, b"old")
-    monkeypatch.setattr(files.os, "replace", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-    with pytest.raises(KeyboardInterrupt):
+    monkeypatch.setattr(files.os, failing, fail)
+    with pytest.raises(told, match=words):
         write_atomic(path, b"new")
     assert path.read_bytes() == b"old"
     assert os.listdir(tmp_path) == ["file"]
@@ -146,61 +151,43 @@ def test_notes_merge_into_the_manifest(run):
     assert manifest["learn"] == {"ess": 0.5}
 
 
-def break_run(run, how):
-    data, manifest = run / "data.bin", run / "manifest.json"
-    document = json.loads(manifest.read_text())
-    if how == "missing":
-        data.unlink()
-    elif how == "truncated":
-        data.write_bytes(b"01234")
-    elif how == "changed":
-        data.write_bytes(b"0123456788")
-    elif how == "appended":
-        data.write_bytes(b"0123456789 ")
-    elif how == "unrecorded":
-        write_manifest(run, {**document, "files": {}})
-    elif how == "no manifest":
-        manifest.unlink()
-    elif how == "garbage manifest":
-        manifest.write_text("{")
-    elif how == "newer":
-        write_manifest(run, {**document, "schema_version": 2})
-    elif how in ("timings", "goal", "learn"):
-        write_manifest(run, {**document, how: [5]})
-    elif how in ("visibility", "number of visibility"):
-        write_manifest(run, {**document, "visibility": "words" if how == "visibility" else [5]})
-    elif how == "entry":
-        write_manifest(run, {**document, "files": {"data.bin": 5}})
-    elif how == "empty entry":
-        write_manifest(run, {**document, "files": {"data.bin": {}}})
-    elif how == "replaced entry":
-        write_manifest(run, {**document, "files": {"data.bin": {**document["files"]["data.bin"], "replaces": [1]}}})
+def changed(**changes):
+    """Damage to the manifest's top level."""
+    return lambda run, document: write_manifest(run, {**document, **changes})
 
 
-MESSAGES = {
-    "missing": "is missing",
-    "truncated": "truncated: 5 of 10",
-    "changed": "changed since",
-    "appended": "changed since",
-    "unrecorded": "is not listed",
-    "no manifest": "no run folder",
-    "garbage manifest": "cannot be read",
-    "newer": "schema version 2",
-    "timings": "the manifest's 'timings' is damaged",
-    "goal": "the manifest's 'goal' is damaged",
-    "learn": "the manifest's 'learn' is damaged",
-    "visibility": "visibility 'words'",
-    "number of visibility": "visibility \\[5\\]",
-    "entry": "entry of data.bin is damaged",
-    "empty entry": "entry of data.bin is damaged",
-    "replaced entry": "entry of data.bin is damaged",
-}
+def with_entry(entry):
+    """Damage to the manifest's entry of the file."""
+    return lambda run, document: write_manifest(run, {**document, "files": {"data.bin": entry(document)}})
 
 
-@pytest.mark.parametrize("how", MESSAGES)
-def test_every_damage_has_its_own_message(run, how):
-    break_run(run, how)
-    with pytest.raises(DataError, match=MESSAGES[how]):
+DAMAGE = {
+    "missing": (lambda run, _: (run / "data.bin").unlink(), "is missing"),
+    "truncated": (lambda run, _: (run / "data.bin").write_bytes(b"01234"), "truncated: 5 of 10"),
+    "changed": (lambda run, _: (run / "data.bin").write_bytes(b"0123456788"), "changed since"),
+    "appended": (lambda run, _: (run / "data.bin").write_bytes(b"0123456789 "), "changed since"),
+    "unrecorded": (changed(files={}), "is not listed"),
+    "no manifest": (lambda run, _: (run / "manifest.json").unlink(), "no run folder"),
+    "garbage manifest": (lambda run, _: (run / "manifest.json").write_text("{"), "cannot be read"),
+    "newer": (changed(schema_version=2), "schema version 2"),
+    "timings": (changed(timings=[5]), "the manifest's 'timings' is damaged"),
+    "goal": (changed(goal=[5]), "the manifest's 'goal' is damaged"),
+    "learn": (changed(learn=[5]), "the manifest's 'learn' is damaged"),
+    "visibility": (changed(visibility="words"), "visibility 'words'"),
+    "number of visibility": (changed(visibility=[5]), "visibility \\[5\\]"),
+    "entry": (with_entry(lambda _: 5), "entry of data.bin is damaged"),
+    "empty entry": (with_entry(lambda _: {}), "entry of data.bin is damaged"),
+    "replaced entry": (
+        with_entry(lambda document: {**document["files"]["data.bin"], "replaces": [1]}), "entry of data.bin is damaged"
+    ),
+}  # fmt: skip
+
+
+@each_row("how", DAMAGE)
+def test_every_damage_has_its_own_message(tmp_path, how):
+    run, (damage, message) = recorded(tmp_path), DAMAGE[how]
+    damage(run, json.loads((run / "manifest.json").read_text()))
+    with pytest.raises(DataError, match=message):
         verify(run, "data.bin")
 
 
@@ -296,18 +283,18 @@ def test_a_file_that_somebody_is_still_making_says_to_wait(run):
         verify(run, "samples.npz")
 
 
-@pytest.mark.parametrize("stopped_at", ["announce", "write_atomic", "record"])
-def test_a_kill_while_a_run_s_file_is_written_anew_leaves_one_that_verifies(run, monkeypatch, stopped_at):
+@each_row("stopped_at", ["announce", "write_atomic", "record"])
+def test_a_kill_while_a_run_s_file_is_written_anew_leaves_one_that_verifies(tmp_path, monkeypatch, stopped_at):
+    run = recorded(tmp_path)
     names = ("announce", "write_atomic", "record")
 
     def killed(*_):
         raise KeyboardInterrupt
 
-    with monkeypatch.context() as patched:
-        for name in names[names.index(stopped_at) :]:
-            patched.setattr(manifest_module, name, killed)
-        with pytest.raises(KeyboardInterrupt):
-            write_recorded(run, "data.bin", b"longer than it was")
+    for name in names[names.index(stopped_at) :]:
+        monkeypatch.setattr(manifest_module, name, killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_recorded(run, "data.bin", b"longer than it was")
     verify(run, "data.bin")
 
 

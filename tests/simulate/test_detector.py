@@ -35,17 +35,9 @@ def load(tmp_path, text):
     return load_detector(path)
 
 
-def test_the_ideal_preset_is_the_ideal_detector():
-    assert load_detector("ideal") == IDEAL
-
-
 @each_row("name", detector_names())
-def test_presets_load_and_bear_their_own_name(name):
+def test_presets_load_bear_their_own_name_and_say_why_beside_every_number(name):
     assert load_detector(name).name == name
-
-
-@each_row("name", detector_names())
-def test_every_number_of_a_preset_has_its_reason_beside_it(name):
     for line in (FOLDER / f"{name}.yaml").read_text(encoding="utf-8").splitlines():
         if re.match(r"\w+: *[0-9.]+", line) and not line.startswith("false_alarm"):
             assert "#" in line, line
@@ -68,12 +60,9 @@ def test_a_quantity_is_the_same_in_each_of_its_units(tmp_path):
     assert load(tmp_path, "bin_ps: 250").bin_m == pytest.approx(metres(250e-12))
 
 
-def test_a_file_without_a_name_is_called_as_its_file(tmp_path):
+def test_a_file_without_a_name_is_called_as_its_file_and_one_of_a_name_alone_is_ideal(tmp_path):
     assert load(tmp_path, "bin_ps: 8").name == "mine"
-
-
-def test_an_empty_file_is_an_ideal_detector(tmp_path):
-    assert load(tmp_path, "name: ideal") == IDEAL
+    assert load(tmp_path, "name: ideal") == IDEAL == load_detector("ideal")
 
 
 @each_row("rays", [1, 7, 576])

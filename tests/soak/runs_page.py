@@ -12,7 +12,6 @@ from support.result_pages import heading, paragraph, table, write_page
 from soak.whole_runs import BLIND, DONE, INFEASIBLE, ROUGH, USAGE, WHOLE
 
 COLUMNS = ("seed", "width [m]", "sigma / width", "free", "sensors", "layout", "ESS", "bounds", "outcome", "constrain")
-CONSTRAIN_COLUMNS = ("constraints", "asked", "kept", "refused, exit 4", "too few samples left for a scan, exit 2")
 
 
 def runs_page(path: Path, records: Sequence[dict[str, Any]], command: str) -> None:

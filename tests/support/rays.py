@@ -12,8 +12,8 @@ def rays_along(directions, gate_m=(0.0, 99.0), origin=(0.0, 0.0, 0.0)) -> Rays:
     """Rays in these directions; a gate and an origin may be of all rays or of each."""
     directions = np.atleast_2d(np.asarray(directions, dtype=float))
     count = len(directions)
-    origins = np.broadcast_to(np.asarray(origin, dtype=float), (count, 3))
-    gates = np.broadcast_to(np.asarray(gate_m, dtype=float), (count, 2))
+    origins = np.array(np.broadcast_to(origin, (count, 3)), dtype=float)
+    gates = np.array(np.broadcast_to(gate_m, (count, 2)), dtype=float)
     return Rays(origins, directions, gates, np.zeros(count), np.zeros(count))
 
 

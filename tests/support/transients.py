@@ -11,6 +11,7 @@ from lidardesign.geometry.rays import Rays
 from lidardesign.geometry.receiver import receiver_axes
 from lidardesign.scene import Receiver
 from lidardesign.simulate.light_transport import process
+from support.rays import rays_along
 
 needs_simulator = pytest.mark.skipif(
     process.missing() is not None, reason=f"the light-transport simulator cannot run here: {process.missing()}"
@@ -30,10 +31,7 @@ def spiral(count: int, half_angle_rad: float, axis: tuple[float, ...] = (1.0, 0.
 
 
 def rays_from(origin_m: tuple[float, ...], direction: np.ndarray, far_m: float = 10.0) -> Rays:
-    count = len(direction)
-    zeros = np.zeros(count)
-    gate_m = np.tile([0.0, far_m], (count, 1))
-    return Rays(np.tile(np.asarray(origin_m, dtype=float), (count, 1)), direction, gate_m, zeros, zeros)
+    return rays_along(direction, (0.0, far_m), origin_m)
 
 
 def pixel_rays(receiver: Receiver, columns: int, rows: int) -> tuple[Rays, np.ndarray]:
@@ -50,12 +48,5 @@ def pixel_rays(receiver: Receiver, columns: int, rows: int) -> tuple[Rays, np.nd
     ahead = np.concatenate([np.ones((len(grid), 1)), grid], axis=1)
     length = np.linalg.norm(ahead, axis=1)
     area = 4 * half[0] * half[1] / len(grid)
-    count = len(grid)
-    rays = Rays(
-        np.tile(np.asarray(receiver.origin_m, dtype=float), (count, 1)),
-        (ahead / length[:, None]) @ receiver_axes(receiver),
-        np.tile(np.asarray(receiver.range_m, dtype=float), (count, 1)),
-        np.zeros(count),
-        np.zeros(count),
-    )
-    return rays, area / length**3
+    looking = (ahead / length[:, None]) @ receiver_axes(receiver)
+    return rays_along(looking, receiver.range_m, receiver.origin_m), area / length**3

@@ -84,20 +84,20 @@ def test_green_is_brighter_than_blue_as_eyes_and_television_have_it(tmp_path):
     assert found == pytest.approx([0.2126, 0.7152, 0.0722])
 
 
-@each_row("encoding", ["binary", "ascii"])
-def test_a_property_of_a_ply_file_is_the_weight_itself(tmp_path, encoding):
+@each_row(
+    ("name", "options"),
+    [
+        ("scalar_care", {"file_type": "ply", "encoding": "binary"}),
+        ("scalar_care", {"file_type": "ply", "encoding": "ascii"}),
+        ("_care", {"file_type": "glb"}),
+    ],
+)
+def test_a_property_of_a_file_is_the_weight_itself(tmp_path, name, options):
     mesh = ball()
-    mesh.vertex_attributes["scalar_care"] = np.exp(mesh.vertices[:, 0]).astype(np.float32)
-    path = tmp_path / "ball.ply"
-    path.write_bytes(mesh.export(file_type="ply", encoding=encoding))
-    loaded = load_mesh(path, painted=Painted("scalar_care"))
-    assert np.allclose(weight_at(loaded, mesh.vertices), np.exp(mesh.vertices[:, 0]), rtol=1e-5)
-
-
-def test_a_property_of_a_gltf_file_is_the_weight_itself(tmp_path):
-    mesh = ball()
-    mesh.vertex_attributes["_care"] = np.exp(mesh.vertices[:, 0]).astype(np.float32)
-    loaded = load_mesh(save(mesh, tmp_path / "ball.glb"), painted=Painted("_care"))
+    mesh.vertex_attributes[name] = np.exp(mesh.vertices[:, 0]).astype(np.float32)
+    path = tmp_path / f"ball.{options['file_type']}"
+    path.write_bytes(mesh.export(**options))
+    loaded = load_mesh(path, painted=Painted(name))
     assert np.allclose(weight_at(loaded, mesh.vertices), np.exp(mesh.vertices[:, 0]), rtol=1e-5)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -92,8 +93,9 @@ def test_names_keep_the_line_ends_of_other_scripts(tmp_path):
 
 
 BAD = {
-    "no column": ("time_s,body,x_m,y_m\n0,a,0,0\n", "p.csv:1", "missing columns: z_m"),
+    "no column": ("time_s,body,x_m,y_m\n0,a,0,0\n", "p.csv:1", "^missing columns: z_m$"),
     "another column": (f"{HEADER},colour\n0,a,0,0,0,1\n", "p.csv:1", "colour"),
+    "no angle of ours": (f"{HEADER},roll\n0,a,0,0,0,1\n", "p.csv:1", "^unknown or repeated: roll$"),
     "half a rotation": (f"{HEADER},qw,qx,qy\n0,a,0,0,0,1,0,0\n", "p.csv:1", "qz"),
     "two rotations": (f"{HEADER},roll_deg,pitch_deg,yaw_deg,qw,qx,qy,qz\n", "p.csv:1", "in two ways"),
     "no row": (f"{HEADER}\n", "p.csv", "no pose"),
@@ -116,7 +118,7 @@ def test_a_file_that_cannot_be_used_is_refused_at_its_cell(tmp_path, monkeypatch
     with pytest.raises(DataError) as refused:
         read_poses(type(tmp_path)("p.csv"))
     assert refused.value.where == where
-    assert message in refused.value.message
+    assert re.search(message, refused.value.message)
 
 
 # ------------------------------------------------------------------- the task
@@ -238,17 +240,6 @@ def test_a_motion_that_fits_no_mesh_is_refused(folder, rows, message):
     way = write(folder / "wrong.csv", f"{HEADER}\n{rows}")
     with pytest.raises((DataError, ConfigError), match=message):
         MeshesTask().space(configured(folder, motion=way))
-
-
-def test_a_refused_column_is_told_without_a_list_of_none(tmp_path):
-    path = write(tmp_path / "p.csv", f"{HEADER},roll\n0,a,0,0,0,1\n")
-    with pytest.raises(DataError) as refused:
-        read_poses(path)
-    assert refused.value.message == "unknown or repeated: roll"
-    path = write(tmp_path / "q.csv", "time_s,body,x_m,y_m\n0,a,0,0\n")
-    with pytest.raises(DataError) as refused:
-        read_poses(path)
-    assert refused.value.message == "missing columns: z_m"
 
 
 def test_the_description_of_a_motion_names_the_columns_that_are_taken():
