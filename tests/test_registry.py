@@ -7,11 +7,25 @@ import time
 from importlib.metadata import EntryPoint
 
 import pytest
-from support.broken_plugins import GOOD
 
 from lidardesign import registry
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.registry import list_tasks, load_task, plugin_guard
+
+GOOD = """
+from lidardesign.task import Defaults, Metric, Score, TaskConfig
+
+class GoodTask:
+    name = "good"
+    summary = "a task that keeps the contract"
+    api_version = 1
+    Config = TaskConfig
+    metric = Metric("error", "mm", "lower", 100.0, 0.1)
+    defaults = Defaults()
+    def space(self, config): ...
+    def scenes(self, config, split, seed): ...
+    def score(self, scene, returns): ...
+"""
 
 
 @pytest.fixture

@@ -86,15 +86,21 @@ def mujoco_scene(include):
     return f'<mujoco><include file="{include}"/><asset>{assets}</asset><worldbody>{"".join(geoms)}</worldbody></mujoco>'
 
 
-def test_mujoco_measures_our_distances(exported):
+def simulated(path):
+    """MuJoCo's model of a file, and its state when everything is in place."""
     import mujoco
 
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model, data
+
+
+def test_mujoco_measures_our_distances(exported):
     path, _ = exported["mjcf"]
     main = path.with_name("main.xml")
     main.write_text(mujoco_scene(path.name), encoding="utf-8")
-    model = mujoco.MjModel.from_xml_path(str(main))
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
+    model, data = simulated(main)
     ours = SceneCaster(scene()).first_hit(RAYS.origin_m, RAYS.direction)
     hit = ours.body >= 0
     assert set(ours.body[hit]) == set(range(5))
@@ -111,41 +117,32 @@ def test_mujoco_measures_our_distances(exported):
 
 
 def test_a_ray_along_any_axis_is_a_site_that_looks_there(tmp_path):
-    import mujoco
-
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     rays = type(RAYS)(np.zeros((6, 3)), axes, np.tile((0.0, 0.0), (6, 1)), np.zeros(6), np.zeros(6))
     for index, one in enumerate(DESIGN.sensors):
         design = DesignSpec("axes", (one,))
         path = tmp_path / f"{index}.xml"
         EXPORTERS["mjcf"].write(design, rays, path)
-        model = mujoco.MjModel.from_xml_path(str(path))
-        data = mujoco.MjData(model)
-        mujoco.mj_forward(model, data)
+        _, data = simulated(path)
         np.testing.assert_allclose(data.site_xmat.reshape(-1, 3, 3)[:, :, 2], axes, atol=1e-15)
         np.testing.assert_allclose(data.site_xpos, 0.0, atol=1e-15)
 
 
 def test_two_sensors_of_one_name_are_two_bodies(tmp_path):
-    import mujoco
-
     twins = DesignSpec("twins", (DESIGN.sensors[0], DESIGN.sensors[0]), rays=2)
     path = tmp_path / "twins.xml"
     EXPORTERS["mjcf"].write(twins, lay_out(twins, 2), path)
-    model = mujoco.MjModel.from_xml_path(str(path))
+    model, _ = simulated(path)
     assert {model.body(index).name for index in (1, 2)} == {"front left", "front left 2"}
 
 
 def test_no_name_is_a_word_of_the_format(reader, tmp_path):
-    import mujoco
-
     for name in ("world", "include", "__model__", "a::b", "a\x00\nb", "x" * 5000):
         design = DesignSpec(name, tuple(replace(one, name=name) for one in DESIGN.sensors[:1]))
         rays = RAYS.subset(RAYS.sensor == 0)
         path = tmp_path / "named"
         EXPORTERS["mjcf"].write(design, rays, path)
-        model = mujoco.MjModel.from_xml_path(str(path))
-        assert model.nsensor == len(rays)
+        assert simulated(path)[0].nsensor == len(rays)
         if name in ("world", "__model__"):
             EXPORTERS["sdf"].write(design, rays, path)
             check_gazebo(read_sdf(reader, path), design, rays, 1e-9)

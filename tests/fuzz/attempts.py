@@ -1,4 +1,4 @@
-"""One damaged input through the program: it is read, or refused with a message, or it found a fault."""
+"""Kinds of files that are fuzzed, and one damaged input: it is read, or refused with a message, or it found a fault."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import random
 import time
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from fuzz.fuzz_kinds import Read, Target
+from fuzz.mutators import Mutator
 from lidardesign.errors import LidardesignError
 
 EXECUTED = "EXECUTED"
@@ -26,6 +26,45 @@ GOOD_SHARE = 0.6
 # Of damaged files that are read, so many are damaged further.
 KEPT_SHARE = 0.2
 DEEPEST = 6
+
+
+Read = Callable[[bytes], object]
+
+
+@dataclass(frozen=True)
+class Target:
+    """One kind of file.
+
+    Arguments:
+        name: What it is.
+        share: Inputs out of 100,000.
+        seeds: Good files of this kind; may write into a folder.
+        mutate: How they are damaged.
+        opened: In an empty folder, a function that reads a content as the program would.
+        slow_s: Processor time that reading one may take [s].
+    """
+
+    name: str
+    share: int
+    seeds: Callable[[Path], list[bytes]]
+    mutate: Mutator
+    opened: Callable[[Path], Read]
+    slow_s: float = 5.0
+
+
+def of_file(suffix: str, read: Callable[[Path], object]) -> Callable[[Path], Read]:
+    """A reader of contents that are written to a file first."""
+
+    def opened(folder: Path) -> Read:
+        path = folder / f"input{suffix}"
+
+        def run(content: bytes) -> object:
+            path.write_bytes(content)
+            return read(path)
+
+        return run
+
+    return opened
 
 
 @dataclass

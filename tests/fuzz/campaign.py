@@ -72,6 +72,15 @@ class Found:
     memory_mib: float = 0.0
     faults: dict[str, str] = field(default_factory=dict)
 
+    def add(self, other: Found) -> None:
+        """Count what another found, too."""
+        for name in ("inputs", "read", "refused", "seconds"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        for name in ("slowest_s", "memory_mib"):
+            setattr(self, name, max(getattr(self, name), getattr(other, name)))
+        self.places |= other.places
+        self.faults.update(other.faults)
+
 
 def jobs(inputs: int, only: list[str], seed: int) -> Iterator[Job]:
     """Batches of all targets, inputs in the targets' shares."""
@@ -170,13 +179,9 @@ def _merge(found: Found, folder: Path, kept: Path, job: Job) -> None:
     tally = _read_json(folder / "tally.json")
     if not tally:
         return
-    found.read += tally["read"]
-    found.refused += tally["refused"]
-    found.inputs += tally["read"] + tally["refused"] + tally["broken"]
-    found.places |= set(tally["places"])
-    found.slowest_s = max(found.slowest_s, tally["slowest_s"])
-    found.seconds += tally["seconds"]
-    found.memory_mib = max(found.memory_mib, tally["memory_mib"])
+    inputs = tally["read"] + tally["refused"] + tally.pop("broken")
+    del tally["beat"]
+    found.add(Found(inputs, **{**tally, "places": set(tally["places"])}))
     for path in sorted((folder / "faults").glob("*.input")):
         _keep(found, kept, job, path.read_bytes(), path.with_suffix(".txt").read_text())
 
@@ -195,13 +200,7 @@ def together(parts: list[tuple[Job, Found]]) -> dict[str, Found]:
     """What was found, by target."""
     result: dict[str, Found] = {}
     for job, part in parts:
-        whole = result.setdefault(job.name, Found())
-        for name in ("inputs", "read", "refused", "seconds"):
-            setattr(whole, name, getattr(whole, name) + getattr(part, name))
-        for name in ("slowest_s", "memory_mib"):
-            setattr(whole, name, max(getattr(whole, name), getattr(part, name)))
-        whole.places |= part.places
-        whole.faults.update(part.faults)
+        result.setdefault(job.name, Found()).add(part)
     return result
 
 

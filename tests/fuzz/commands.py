@@ -12,11 +12,11 @@ from pathlib import Path
 from support.command_line import files_under, make_run
 
 from fuzz import corpus
+from fuzz.attempts import Read, Target
 from fuzz.containers import mutate_glb, mutate_hdf5, mutate_npz, mutate_safetensors
-from fuzz.fuzz_kinds import Read, Target
 from fuzz.fuzz_runs import SMALL, checkpoints, rerecord, small_config
 from fuzz.fuzz_targets import TEXTS
-from fuzz.mutators import Mutator, mutate_bytes, mutate_yaml
+from fuzz.mutators import mutate_bytes, mutate_yaml
 from lidardesign.config import save_run_config
 from lidardesign.design.files import save_design
 from lidardesign.errors import LidardesignError
@@ -61,7 +61,9 @@ def checked(arguments: Sequence[str], kept: Path) -> object:
     if code not in KNOWN_CODES or "Traceback" in err or "Warning" in err:
         raise AssertionError(text)
     if code == 0:
-        return None if "NaN" not in out and "Infinity" not in out else _fail(f"not finite: {out[:500]}")
+        if "NaN" in out or "Infinity" in out:
+            raise AssertionError(f"not finite: {out[:500]}")
+        return None
     if not re.search(r"^(\w+) error: .+", err, re.MULTILINE) or len(err.splitlines()) > LONGEST_MESSAGE:
         raise AssertionError(f"no short message: {text}")
     changed = {name for name, content in files_under(kept).items() if before.get(name) != content}
@@ -69,10 +71,6 @@ def checked(arguments: Sequence[str], kept: Path) -> object:
     if changed and code != NUMERICAL:
         raise AssertionError(f"{', '.join(sorted(changed))} was written: {text}")
     raise RefusedError(next(line for line in err.splitlines() if re.match(r"\w+ error: ", line)))
-
-
-def _fail(text: str) -> None:
-    raise AssertionError(text)
 
 
 def command(arguments: str, suffix: str = ".yaml") -> Callable[[Path], Read]:
@@ -132,83 +130,35 @@ def changed_run(name: str, arguments: str) -> Callable[[Path], Read]:
     return opened
 
 
-# Learning takes a while; a command may take so much processor time [s].
-SLOW_S = 60.0
-
-
-def _target(
-    name: str, share: int, seeds: Callable[[Path], list[bytes]], mutate: Mutator, opened: Callable[[Path], Read]
-) -> Target:
-    return Target(name, share, seeds, mutate, opened, SLOW_S)
-
-
-COMMANDS = (
-    _target("show DESIGN", 30, corpus.design_files, mutate_yaml, command("show INPUT --json")),
-    _target(
-        "export DESIGN",
-        50,
-        corpus.design_files,
-        mutate_yaml,
-        command("export INPUT --format csv --out input_out/rays.csv --json"),
-    ),
-    _target(
-        "export TABLE", 30, corpus.sensor_tables, TEXTS, command("export INPUT --format galvo --rays 20 --json", ".csv")
-    ),
-    _target(
-        "constrain --constraints",
-        50,
-        corpus.constraint_files,
-        mutate_yaml,
-        command("constrain run --constraints INPUT --name made --json"),
-    ),
-    _target("evaluate DESIGN", 20, corpus.design_files, mutate_yaml, command("evaluate run INPUT --rays 20 --json")),
-    _target(
-        "evaluate --detector",
-        20,
-        corpus.detectors,
-        mutate_yaml,
-        command("evaluate run good.yaml --detector INPUT --rays 20 --json"),
-    ),
-    _target(
-        "capture FILE", 30, corpus.captures_npz, mutate_npz, command("capture INPUT good.yaml --rays 20 --json", ".npz")
-    ),
-    _target(
-        "capture LIST",
-        30,
-        corpus.steering_lists,
-        TEXTS,
-        command("capture good.npz INPUT --within-deg 90 --json", ".galvo.csv"),
-    ),
-    _target("learn --config", 30, corpus.configurations, mutate_yaml, learning("flatland --config INPUT --json")),
-    _target(
-        "learn meshes",
-        20,
-        lambda _: corpus.mesh_exports("glb"),
-        mutate_glb,
-        learning("meshes --set folder=INPUT --set poses=1 --json", ".glb", inside="input_folder"),
-    ),
-    _target(
-        "learn meshes, STL",
-        15,
-        lambda _: corpus.mesh_exports("stl"),
-        mutate_bytes,
-        learning("meshes --set folder=INPUT --set poses=1 --json", ".stl", inside="input_folder"),
-    ),
-    _target(
-        "fit, samples changed", 30, corpus.samples, mutate_npz, changed_run("samples.npz", "fit run --json --name made")
-    ),
-    _target(
-        "learn --resume",
-        20,
-        checkpoints,
-        mutate_safetensors,
-        changed_run("checkpoint.safetensors", "learn flatland --resume --out run --json"),
-    ),
-    _target(
-        "learn face",
-        10,
-        corpus.face_models,
-        mutate_hdf5,
-        learning("face --set model=INPUT --set train=2 --set test=2 --json", ".h5"),
-    ),
-)
+DESIGNS, MESHES = corpus.design_files, "meshes --set folder=INPUT --set poses=1 --json"
+COMMANDS = tuple(
+    # learning takes a while: a command may take so much processor time [s]
+    Target(name, share, seeds, mutate, opened, slow_s=60.0)
+    for name, share, seeds, mutate, opened in (
+        ("show DESIGN", 30, DESIGNS, mutate_yaml, command("show INPUT --json")),
+        ("export DESIGN", 50, DESIGNS, mutate_yaml,
+         command("export INPUT --format csv --out input_out/rays.csv --json")),
+        ("export TABLE", 30, corpus.sensor_tables, TEXTS,
+         command("export INPUT --format galvo --rays 20 --json", ".csv")),
+        ("constrain --constraints", 50, corpus.constraint_files, mutate_yaml,
+         command("constrain run --constraints INPUT --name made --json")),
+        ("evaluate DESIGN", 20, DESIGNS, mutate_yaml, command("evaluate run INPUT --rays 20 --json")),
+        ("evaluate --detector", 20, corpus.detectors, mutate_yaml,
+         command("evaluate run good.yaml --detector INPUT --rays 20 --json")),
+        ("capture FILE", 30, corpus.captures_npz, mutate_npz,
+         command("capture INPUT good.yaml --rays 20 --json", ".npz")),
+        ("capture LIST", 30, corpus.steering_lists, TEXTS,
+         command("capture good.npz INPUT --within-deg 90 --json", ".galvo.csv")),
+        ("learn --config", 30, corpus.configurations, mutate_yaml, learning("flatland --config INPUT --json")),
+        ("learn meshes", 20, lambda _: corpus.mesh_exports("glb"), mutate_glb,
+         learning(MESHES, ".glb", inside="input_folder")),
+        ("learn meshes, STL", 15, lambda _: corpus.mesh_exports("stl"), mutate_bytes,
+         learning(MESHES, ".stl", inside="input_folder")),
+        ("fit, samples changed", 30, corpus.samples, mutate_npz,
+         changed_run("samples.npz", "fit run --json --name made")),
+        ("learn --resume", 20, checkpoints, mutate_safetensors,
+         changed_run("checkpoint.safetensors", "learn flatland --resume --out run --json")),
+        ("learn face", 10, corpus.face_models, mutate_hdf5,
+         learning("face --set model=INPUT --set train=2 --set test=2 --json", ".h5")),
+    )
+)  # fmt: skip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-import struct
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -189,24 +189,21 @@ def _captured() -> list[dict[str, np.ndarray]]:
     return [{name: np.asarray(value) for name, value in arrays.items()} for arrays in both]
 
 
+def _packed(write: Callable[[io.BytesIO], object]) -> bytes:
+    buffer = io.BytesIO()
+    write(buffer)
+    return buffer.getvalue()
+
+
 def captures_npz(_: Path) -> list[bytes]:
     """Captures as numpy archives."""
-    found = []
-    for arrays in _captured():
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, **arrays)
-        found.append(buffer.getvalue())
-    return found
+    return [_packed(lambda buffer, arrays=arrays: np.savez_compressed(buffer, **arrays)) for arrays in _captured()]
 
 
 def captures_matlab(_: Path) -> list[bytes]:
     """Captures as MATLAB 5 files, packed and not."""
-    found = []
-    for arrays, packed in zip(_captured(), (True, False), strict=True):
-        buffer = io.BytesIO()
-        savemat(buffer, arrays, do_compression=packed)
-        found.append(buffer.getvalue())
-    return found
+    pairs = zip(_captured(), (True, False), strict=True)
+    return [_packed(lambda buffer, one=one: savemat(buffer, one[0], do_compression=one[1])) for one in pairs]
 
 
 def captures_hdf5(_: Path) -> list[bytes]:
@@ -223,25 +220,20 @@ def captures_hdf5(_: Path) -> list[bytes]:
     return found
 
 
-def steering_lists(folder: Path) -> list[bytes]:
-    """Ray lists for a scanner."""
-    design = sample_designs()[0]
-    galvo.write_galvo(design, lay_out(design), folder / "rays.galvo.csv")
-    return [(folder / "rays.galvo.csv").read_bytes()]
+def _exported(write: Callable[..., object], name: str, index: int) -> Callable[[Path], list[bytes]]:
+    """The rays of a design as a list."""
+
+    def good(folder: Path) -> list[bytes]:
+        design = sample_designs()[index]
+        write(design, lay_out(design), folder / name)
+        return [(folder / name).read_bytes()]
+
+    return good
 
 
-def ray_tables(folder: Path) -> list[bytes]:
-    """Ray lists as text."""
-    design = sample_designs()[1]
-    ray_lists.write_csv(design, lay_out(design), folder / "rays.csv")
-    return [(folder / "rays.csv").read_bytes()]
-
-
-def ray_archives(folder: Path) -> list[bytes]:
-    """Ray lists as numpy archives."""
-    design = sample_designs()[1]
-    ray_lists.write_npz(design, lay_out(design), folder / "rays.npz")
-    return [(folder / "rays.npz").read_bytes()]
+steering_lists = _exported(galvo.write_galvo, "rays.galvo.csv", 0)
+ray_tables = _exported(ray_lists.write_csv, "rays.csv", 1)
+ray_archives = _exported(ray_lists.write_npz, "rays.npz", 1)
 
 
 def robots(_: Path) -> list[bytes]:
@@ -287,11 +279,5 @@ def locks(_: Path) -> list[bytes]:
 
 def distance_fields(_: Path) -> list[bytes]:
     """A cached distance field."""
-    buffer = io.BytesIO()
-    np.save(buffer, np.linspace(-1, 1, 64, dtype=np.float32), allow_pickle=False)
-    return [buffer.getvalue()]
-
-
-def header_of(content: bytes) -> dict[str, object]:
-    """The header of a safetensors file."""
-    return json.loads(content[8 : 8 + struct.unpack("<Q", content[:8])[0]])
+    field = np.linspace(-1, 1, 64, dtype=np.float32)
+    return [_packed(lambda buffer: np.save(buffer, field, allow_pickle=False))]

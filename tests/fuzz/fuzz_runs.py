@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 from support.command_line import make_run
 
-from fuzz.fuzz_kinds import Read, of_file
+from fuzz.attempts import Read, of_file
 from lidardesign.config import RunConfig, resolve
 from lidardesign.registry import load_task
 
@@ -49,31 +50,38 @@ def open_manifests(folder: Path) -> Read:
     return read
 
 
-def open_samples(folder: Path) -> Read:
-    """As `fit` does, behind the hash."""
+def _behind_hash(name: str, read: Callable[[Path], object]) -> Callable[[Path], Read]:
+    """A reader of a file of a run whose hash is right."""
+
+    def opened(folder: Path) -> Read:
+        run = make_run(folder / "run", count=50)
+
+        def read_content(content: bytes) -> object:
+            rerecord(run, name, content)
+            return read(run)
+
+        return read_content
+
+    return opened
+
+
+def _read_samples(run: Path) -> object:
+    """As `fit` does."""
     from lidardesign.samples import load_samples
 
-    run = make_run(folder / "run", count=50)
-
-    def read(content: bytes) -> object:
-        rerecord(run, "samples.npz", content)
-        samples = load_samples(run)
-        return samples.points, samples.weights, samples.effective_sample_size
-
-    return read
+    samples = load_samples(run)
+    return samples.points, samples.weights, samples.effective_sample_size
 
 
-def open_progress(folder: Path) -> Read:
-    """As `evaluate --accuracy` does, behind the hash."""
+def _read_progress(run: Path) -> object:
+    """As `evaluate --accuracy` does."""
     from lidardesign.density.training.snapshot_quality import seconds_at
 
-    run = make_run(folder / "run", count=50)
+    return seconds_at(run, [5, 20, 1000])
 
-    def read(content: bytes) -> object:
-        rerecord(run, "progress.jsonl", content)
-        return seconds_at(run, [5, 20, 1000])
 
-    return read
+open_samples = _behind_hash("samples.npz", _read_samples)
+open_progress = _behind_hash("progress.jsonl", _read_progress)
 
 
 def open_locks(folder: Path) -> Read:

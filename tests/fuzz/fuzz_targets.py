@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,15 +10,8 @@ from functools import lru_cache
 from pathlib import Path
 
 from fuzz import corpus
-from fuzz.containers import (
-    mutate_glb,
-    mutate_gltf,
-    mutate_hdf5,
-    mutate_matlab,
-    mutate_npz,
-    mutate_safetensors,
-)
-from fuzz.fuzz_kinds import Read, Target, of_file
+from fuzz.attempts import Read, Target, of_file
+from fuzz.containers import mutate_glb, mutate_gltf, mutate_hdf5, mutate_matlab, mutate_npz, mutate_safetensors
 from fuzz.fuzz_runs import (
     checkpoints,
     open_checkpoints,
@@ -26,7 +20,7 @@ from fuzz.fuzz_runs import (
     open_manifests,
     open_progress,
     open_samples,
-)
+)  # fmt: skip
 from fuzz.mutators import either, mutate_bytes, mutate_json, mutate_text, mutate_yaml
 
 MOST_LAID_OUT = 5000
@@ -114,11 +108,15 @@ def read_design(path: Path) -> object:
     return design
 
 
-def read_detector(path: Path) -> object:
-    """As `evaluate --detector` does."""
-    from lidardesign.simulate.detector.files import load_detector
+def _own(place: str) -> Callable[[Path], object]:
+    """A function of the program, imported when it is called."""
+    module, name = place.split(":")
+    return lambda path: getattr(importlib.import_module(f"lidardesign.{module}"), name)(path)
 
-    return load_detector(path)
+
+read_detector = _own("simulate.detector.files:load_detector")
+read_steering = _own("export.galvo:read_galvo")
+read_ray_table, read_ray_archive = _own("export.ray_lists:read_csv"), _own("export.ray_lists:read_npz")
 
 
 def read_mesh(path: Path) -> object:
@@ -143,27 +141,6 @@ def read_capture(path: Path) -> object:
 
     capture = load_capture(path)
     return replace(capture, true_range_m=None), capture.spacing_rad, capture.background_per_bin
-
-
-def read_steering(path: Path) -> object:
-    """As `capture` does with an exported list."""
-    from lidardesign.export import galvo
-
-    return galvo.read_galvo(path)
-
-
-def read_ray_table(path: Path) -> object:
-    """As `export --format csv` reads back."""
-    from lidardesign.export.ray_lists import read_csv
-
-    return read_csv(path)
-
-
-def read_ray_archive(path: Path) -> object:
-    """As `export --format npz` reads back."""
-    from lidardesign.export.ray_lists import read_npz
-
-    return read_npz(path)
 
 
 def read_robot(path: Path) -> object:

@@ -182,20 +182,23 @@ _TEXT_CHANGES = (
 )  # fmt: skip
 
 
-def mutate_yaml(content: bytes, source: random.Random, others: Sequence[bytes]) -> bytes:
-    """A change of the document as a tree, or of its text."""
-    if source.random() < 0.4:
-        return mutate_text(content, source, others)
-    document = mutate_tree(yaml.load(content, Loader=Loader), source)
-    flow = source.random() < 0.5
-    return yaml.dump(document, Dumper=Dumper, sort_keys=False, default_flow_style=flow).encode()
+def _of_tree(load: Callable[[bytes], object], dump: Callable[[object, random.Random], str]) -> Mutator:
+    """A change of a document as a tree, or of its text."""
+
+    def mutate(content: bytes, source: random.Random, others: Sequence[bytes]) -> bytes:
+        if source.random() < 0.4:
+            return mutate_text(content, source, others)
+        return dump(mutate_tree(load(content), source), source).encode()
+
+    return mutate
 
 
-def mutate_json(content: bytes, source: random.Random, others: Sequence[bytes]) -> bytes:
-    """A change of the document as a tree, or of its text."""
-    if source.random() < 0.4:
-        return mutate_text(content, source, others)
-    return json.dumps(mutate_tree(json.loads(content), source)).encode()
+def _dump_yaml(document: object, source: random.Random) -> str:
+    return yaml.dump(document, Dumper=Dumper, sort_keys=False, default_flow_style=source.random() < 0.5)
+
+
+mutate_yaml = _of_tree(lambda content: yaml.load(content, Loader=Loader), _dump_yaml)
+mutate_json = _of_tree(json.loads, lambda document, _: json.dumps(document))
 
 
 def mutate_tree(document: object, source: random.Random) -> object:

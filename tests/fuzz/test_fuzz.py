@@ -12,10 +12,9 @@ import pytest
 from support.tables import each_row
 
 from fuzz import campaign
-from fuzz.attempts import Fuzzer, Tally, attempt, not_finite
+from fuzz.attempts import Fuzzer, Tally, Target, attempt, not_finite
 from fuzz.campaign import Job, run_job, together
 from fuzz.commands import COMMANDS
-from fuzz.fuzz_kinds import Target
 from fuzz.fuzz_targets import NAMES, TARGETS, target_of
 from fuzz.mutators import mutate_bytes
 from lidardesign.errors import ConfigError, DataError

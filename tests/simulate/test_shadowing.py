@@ -14,6 +14,7 @@ from support.tables import each_row
 
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
+from lidardesign.simulate.effects.motion import still_tracer
 from lidardesign.simulate.effects.shadowing import visible_echoes
 from lidardesign.simulate.light import Beams, direct_echoes
 from lidardesign.space import direction
@@ -27,11 +28,7 @@ def fan(count=400):
 
 def both(scene, directions, origin=(0.0, 0.0, 0.0)):
     """Direct echoes, and those of them that are heard."""
-    beams, caster = Beams.of(rays_along(directions, origin=origin)), SceneCaster(scene)
-
-    def tracer(origins, directions, time_s):
-        return caster.first_hit(origins, directions)
-
+    beams, tracer = Beams.of(rays_along(directions, origin=origin)), still_tracer(SceneCaster(scene))
     hits = tracer(beams.origin_m, beams.direction, beams.time_s)
     direct = direct_echoes(scene, beams, hits)
     return direct, visible_echoes(scene, beams, hits, direct, tracer)

@@ -16,6 +16,7 @@ from lidardesign.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, r
 from lidardesign.simulate.detector.detector import Detector
 from lidardesign.simulate.effects import specular
 from lidardesign.simulate.effects.footprint import split_beams
+from lidardesign.simulate.effects.motion import still_tracer
 from lidardesign.simulate.effects.specular import MAXIMUM_TURNS, detours
 from lidardesign.simulate.light import Beams, direct_echoes
 from lidardesign.space import direction
@@ -28,11 +29,7 @@ def beams_along(directions, origins=(0.0, 0.0, 0.0)):
 
 
 def traced(scene, beams):
-    caster = SceneCaster(scene)
-
-    def tracer(origins, directions, time_s):
-        return caster.first_hit(origins, directions)
-
+    tracer = still_tracer(SceneCaster(scene))
     hits = tracer(beams.origin_m, beams.direction, beams.time_s)
     return direct_echoes(scene, beams, hits), detours(scene, beams, hits, tracer)
 

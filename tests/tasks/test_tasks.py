@@ -336,26 +336,18 @@ def test_the_truth_follows_a_design_space_that_a_run_sets():
     assert narrow.contains(aim(np.array(narrow.low[:3]), truth_points(scene))).all()
 
 
-def test_a_folder_that_is_missing_unset_or_empty_is_refused(tmp_path):
-    task = MeshesTask()
-    with pytest.raises(ConfigError, match="no folder"):
-        task.scenes(MeshesTask.Config(), "train", 0)
-    with pytest.raises(DataError, match="holds no mesh file"):
-        task.space(MeshesTask.Config(folder=str(tmp_path)))
-    with pytest.raises(DataError, match="is not a folder"):
-        task.space(MeshesTask.Config(folder=str(tmp_path / "nowhere")))
-
-
-def test_one_mesh_without_jitter_is_refused_as_both_splits_would_be_the_same(folders):
-    config = MeshesTask.Config(folder=str(folders / "one"), jitter_rotation_deg=0, jitter_translation_m=0)
-    with pytest.raises(ConfigError, match="the same"):
-        MeshesTask().scenes(config, "train", 0)
-
-
-def test_heads_that_are_all_the_same_are_refused():
-    config = FaceTask.Config(identity_scale=0, jitter_rotation_deg=0, jitter_translation_m=0)
-    with pytest.raises(ConfigError, match="all heads are the same"):
-        FaceTask().scenes(config, "train", 0)
+def test_what_gives_no_scenes_or_the_same_ones_everywhere_is_refused(folders, tmp_path):
+    still = {"jitter_rotation_deg": 0, "jitter_translation_m": 0}
+    for task, call, values, error, words in (
+        (MeshesTask(), "scenes", {}, ConfigError, "no folder"),
+        (MeshesTask(), "space", {"folder": str(tmp_path)}, DataError, "holds no mesh file"),
+        (MeshesTask(), "space", {"folder": str(tmp_path / "nowhere")}, DataError, "is not a folder"),
+        (MeshesTask(), "scenes", {"folder": str(folders / "one"), **still}, ConfigError, "the same"),
+        (FaceTask(), "scenes", {"identity_scale": 0, **still}, ConfigError, "all heads are the same"),
+    ):
+        split = ("train", 0) if call == "scenes" else ()
+        with pytest.raises(error, match=words):
+            getattr(task, call)(task.Config(**values), *split)
 
 
 def test_each_mesh_is_in_exactly_one_split(folders):
