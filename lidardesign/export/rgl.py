@@ -119,7 +119,8 @@ def read_rgl(path: Path, design: DesignSpec, rays: Rays) -> tuple[Rays, float]:
         matrices = _floats(path / f"{mount.name}{PATTERN}", (3, 4))
         gate = _floats(path / f"{mount.name}{RANGES}", (2,))
         turn = rotations_of_quaternions(np.array(quaternion(*pose[3:])))
-        parts.append(mount.ray, pose[:3] + matrices[:, :, 3] @ turn.T, unit_vectors(matrices[:, :, 2] @ turn.T), gate)
+        looking = unit_vectors(matrices[:, :, 2] @ turn.T)
+        parts.append((mount.ray, pose[:3] + matrices[:, :, 3] @ turn.T, looking, gate))
         rates_hz.append(rate_hz)
         times = _floats(path / f"{mount.name}{TIMES}", ()) / MS_PER_S
         if len(times) != len(mount.ray):
