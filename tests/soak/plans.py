@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from lidardesign.scene import Body, Capsule, Scene
+from lidardesign.space import DesignSpace, observed_point
 from lidardesign.task import random_generator
-from soak.scaled_flatland import NAME
+from soak.scaled_flatland import NAME, ScaledFlatlandConfig, ScaledFlatlandTask
 
 # What the soak promises to cover, as powers of ten: the width of the scenes, and sigma as a share of it.
 SIZES_M = (-3.0, 4.0)
@@ -229,3 +231,31 @@ def _evaluate_options(generator: np.random.Generator, *, reach_m: float) -> tupl
     if generator.random() < 0.2:
         options += ["--baseline", _pick(generator, ["occupancy", "no-visibility"])]
     return tuple(options)
+
+
+POINTS = 20_000
+# Beyond so many spreads the surface term is below 2e-8.
+NEAR_SIGMAS = 6.0
+
+
+def share_near_targets(plan: RunPlan) -> float:
+    """The share of even design points whose scene point lies near a target of any training scene."""
+    space = DesignSpace.from_dict({"condition": (), **plan.config["space"]})
+    config = ScaledFlatlandConfig.model_validate(plan.config["task"])
+    scenes = ScaledFlatlandTask().scenes(config, "train", plan.seed, space)
+    points = observed_point(space.sample(POINTS, random_generator(plan.seed, "soak", "sight")))
+    near = NEAR_SIGMAS * plan.config["density"]["sigma_m"]
+    return float(np.any([distance_to_targets(scene, points) < near for scene in scenes], axis=0).mean())
+
+
+def distance_to_targets(scene: Scene, points: np.ndarray) -> np.ndarray:
+    """Distances of points (N, 3) from the surface of the nearest target, shape (N,) [m]."""
+    return np.min([np.abs(_signed_distance(body, points)) for body in scene.bodies if body.is_target], axis=0)
+
+
+def _signed_distance(body: Body, points: np.ndarray) -> np.ndarray:
+    pose = body.pose()
+    half_length = body.shape.half_length_m if isinstance(body.shape, Capsule) else 0.0
+    offset = points - pose[:3, 3]
+    along = np.clip(offset @ pose[:3, 2], -half_length, half_length)
+    return np.linalg.norm(offset - along[:, None] * pose[:3, 2], axis=1) - body.shape.radius_m

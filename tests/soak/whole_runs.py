@@ -25,9 +25,8 @@ from lidardesign.run.yaml import dump_yaml, parse_yaml
 from lidardesign.task import random_generator
 from soak.keeping import checked_bounds
 from soak.limits import Bounds, Rules, contradictions, drawn, kept_already
-from soak.plans import RunPlan, random_plan
+from soak.plans import RunPlan, random_plan, share_near_targets
 from soak.scaled_flatland import NAME
-from soak.sight import share_near_targets
 
 # Exit codes (docs): a design was made; the density is too rough to fit to; no design keeps the constraints.
 DONE, TOO_ROUGH, INFEASIBLE = 0, 3, 4
