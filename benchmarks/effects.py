@@ -67,14 +67,14 @@ def troubled(scene: Any) -> Any:
 
 def effects_here() -> list[str]:
     """All effects that can be simulated without a light-transport simulator."""
-    from lidardesign.simulate.physics import EFFECTS
+    from lidardesign.simulate.detector.detector import EFFECTS
 
     return [name for name in EFFECTS if name not in ("multipath", "shadowing")]
 
 
 def by_effect(scenes: list[Any], rays: Any, detector: Any, rounds: int) -> list[list[object]]:
     """Time per scene of each effect alone and of all."""
-    from lidardesign.simulate.physics import Physics
+    from lidardesign.simulate.detector.detector import Physics
     from lidardesign.simulate.simulate import build_casters, simulate
 
     names = effects_here()
@@ -100,7 +100,7 @@ def by_effect(scenes: list[Any], rays: Any, detector: Any, rounds: int) -> list[
 
 def many(scene: Any, count: int, detector: Any, gates: dict[str, tuple[float, float]]) -> list[list[object]]:
     """Seconds for many rays with all effects on."""
-    from lidardesign.simulate.physics import Physics
+    from lidardesign.simulate.detector.detector import Physics
     from lidardesign.simulate.simulate import build_casters, simulate
 
     casters, rows = build_casters(scene), []

@@ -93,8 +93,8 @@ def simulation(options: Any) -> tuple[Table, list[str]]:
     from effects import even_rays
     from lidardesign_tasks.face import FaceTask
 
+    from lidardesign.simulate.detector.detector import Physics
     from lidardesign.simulate.detector.files import load_detector
-    from lidardesign.simulate.physics import Physics
     from lidardesign.simulate.plan import Planner
     from lidardesign.simulate.simulate import build_casters, simulate
 

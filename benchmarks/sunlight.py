@@ -82,7 +82,7 @@ def add_scene(request: Any, entries: list[Any], tallies: list[Tally], scene: Any
 
 def physics_of(request: Any, effects: frozenset[str]) -> Any:
     """Some effects with the evaluation's own random numbers."""
-    from lidardesign.simulate.physics import Physics
+    from lidardesign.simulate.detector.detector import Physics
 
     return Physics(request.planner.detector, effects, request.seed)
 

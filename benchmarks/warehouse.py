@@ -106,7 +106,7 @@ def divergence_nats(run_folder: Path, x_m: float, log_likelihood: float) -> floa
     import numpy as np
 
     from lidardesign import open_run
-    from lidardesign.design.mixture.conditions import MOVED_SAMPLES, at_condition
+    from lidardesign.design.mixture.support import MOVED_SAMPLES, at_condition
     from lidardesign.samples import load_samples
     from lidardesign.task import random_generator
     from lidardesign.workflow.run_samples import RunTarget

@@ -32,10 +32,9 @@ from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.files import write_atomic
 from lidardesign.scene import Mesh, Scene
-from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, Detector
+from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, Detector, Physics
 from lidardesign.simulate.detector.files import load_detector
-from lidardesign.simulate.measure import photon_histograms
-from lidardesign.simulate.physics import Physics
+from lidardesign.simulate.simulate import photon_histograms
 from lidardesign.space import RANGE, DesignSpace
 
 SUNLIGHT = ("illuminance_lux=100000", "light=sun")

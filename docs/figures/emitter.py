@@ -29,8 +29,7 @@ from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import IDEAL
-from lidardesign.simulate.physics import Physics
+from lidardesign.simulate.detector.detector import IDEAL, Physics
 from lidardesign.simulate.simulate import simulate
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))

@@ -198,7 +198,7 @@ def _baselines(context: Any, current: str) -> Items:
 
 def _effects(context: Any, current: str) -> Items:
     """Words for effects, or names between commas."""
-    from lidardesign.simulate.physics import EFFECTS
+    from lidardesign.simulate.detector.detector import EFFECTS
 
     before, comma, _ = current.rpartition(",")
     words = () if comma else ("auto", "all", "none", "audit")

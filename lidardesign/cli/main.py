@@ -14,15 +14,13 @@ import typer
 from lidardesign import __version__
 from lidardesign.cli.commands.capture import capture
 from lidardesign.cli.commands.catalog import catalog_app
-from lidardesign.cli.commands.compare import compare
 from lidardesign.cli.commands.completion import VARIABLE, answer_shell, completion
 from lidardesign.cli.commands.config import config_app
-from lidardesign.cli.commands.constrain import constrain
 from lidardesign.cli.commands.evaluate import evaluate
 from lidardesign.cli.commands.export import export
-from lidardesign.cli.commands.fit import fit
+from lidardesign.cli.commands.fit import constrain, fit
 from lidardesign.cli.commands.learn import learn
-from lidardesign.cli.commands.show import show
+from lidardesign.cli.commands.show import compare, show
 from lidardesign.cli.commands.tasks import tasks_app
 from lidardesign.cli.environment import make_streams_tolerant, set_cache_default, set_thread_defaults, terminate_cleanly
 from lidardesign.cli.manual import ManualCommand

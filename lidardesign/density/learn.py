@@ -23,7 +23,7 @@ from lidardesign.density.training.quality import draw_probes, measure
 from lidardesign.density.training.training import PROGRESS, LearnProgress, Trainer
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
-from lidardesign.geometry.receiver import in_view
+from lidardesign.geometry.frames import in_view
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase, running
 from lidardesign.run.manifest import note, record

@@ -1,19 +1,326 @@
-"""The density that a run has learned, for users: design points and their log densities as numpy arrays."""
+"""The learned density of a run: loaded, sampled, evaluated, and measured at the snapshots that its learning kept.
+
+What learning had reached after a part of its steps, and what its settings cost in accuracy.
+
+The snapshots that a run kept are measured anew. Gradients of steps are compared beside their own noise: a step's
+gradient is an estimate, another batch gives another one. What arithmetic or fewer scenes change in it matters only
+beside that noise, sqrt(E |g - E g|^2) over batches.
+"""
 
 from __future__ import annotations
 
+import copy
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from lidardesign.config import RunConfig
-from lidardesign.density.learn import FLOW
-from lidardesign.density.training.quality import draw_samples, log_density_of
-from lidardesign.density.training.snapshot_quality import LoadedFlow, load_flow
-from lidardesign.errors import ConfigError
+from lidardesign.config import LearningSettings, RunConfig
+from lidardesign.density.flow.flow import DesignFlow
+from lidardesign.density.flow.objective import Coordinates
+from lidardesign.density.learn import FLOW, make_flow
+from lidardesign.density.target.target import Target
+from lidardesign.density.target.visibility import Optics
+from lidardesign.density.training.checkpoint import load_arrays, measured_steps, stored_snapshots, twin_step
+from lidardesign.density.training.losses import Pool, balancing_loss, draw_conditions, pathwise_loss
+from lidardesign.density.training.quality import IndependentProbes, draw_samples, log_density_of, measure
+from lidardesign.density.training.training import PROGRESS, SIGMA_START_RATIO
+from lidardesign.errors import ConfigError, DataError
+from lidardesign.estimates import Estimate
+from lidardesign.numerics import TINY
+from lidardesign.run.manifest import verify
+from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedFlow:
+    """A flow of a run with what it is measured by; see `measure.Learned`."""
+
+    flow: DesignFlow
+    target: Target
+    coordinates: Coordinates
+    generator: torch.Generator
+
+
+@dataclass(frozen=True, eq=False)
+class SnapshotQuality:
+    """What a run's flow was worth after a step.
+
+    Arguments:
+        step: The number of steps done.
+        seconds: What they took [s].
+        estimates: ess, kl_nats, log_z, coverage and misplaced, with standard errors.
+        samples: The samples that these were measured on.
+        twin: The misplaced share of the snapshot shortly before, where one was kept.
+    """
+
+    step: int
+    seconds: float
+    estimates: Mapping[str, Estimate]
+    samples: Samples
+    twin: Estimate | None = None
+
+    @property
+    def misplaced(self) -> Estimate:
+        """The share that flows around this step misplace: the mean of the twins, with half of what they are apart."""
+        own = self.estimates["misplaced"]
+        if self.twin is None:
+            return own
+        error = max(own.error or 0.0, self.twin.error or 0.0)
+        return Estimate((own.value + self.twin.value) / 2, math.hypot(error, (own.value - self.twin.value) / 2))
+
+
+def check_kept(run: Path) -> None:
+    """Check all that a run is measured anew by: its flow, its snapshots and its progress.
+
+    Raises:
+        DataError: The run is unfinished or damaged.
+    """
+    for name in (FLOW, PROGRESS, *stored_snapshots(run).values()):
+        verify(run, name)
+
+
+def remeasured(
+    run: Path, config: RunConfig, target: Target, probes: IndependentProbes, *, count: int, seed: int
+) -> list[SnapshotQuality]:
+    """The figures of every snapshot of a run and of its flow, in the order of steps.
+
+    All are measured on the same base points and the same probes, so that they differ by what was learned.
+
+    Arguments:
+        run: The run's folder.
+        config: Its configuration.
+        target: Its target, or one that another run is to be measured against.
+        probes: Probes of that target.
+        count: Samples of each flow.
+        seed: The root of the base points.
+
+    Raises:
+        DataError: The run is unfinished or damaged.
+    """
+    files = {**stored_snapshots(run), config.learning.steps: FLOW}
+    rungs = [step for step in measured_steps(config.learning) if step in files]
+    seconds, found = seconds_at(run, rungs), []
+    for step in rungs:
+        reached = measure(load_flow(run, files[step], config, target, seed), probes, count)
+        twin = files.get(twin_step(config.learning, step))
+        other = measure(load_flow(run, twin, config, target, seed), probes, count) if twin else None
+        apart = None if other is None else other.estimates["misplaced"]
+        found.append(SnapshotQuality(step, seconds[step], reached.estimates, reached.samples, apart))
+    return found
+
+
+def load_flow(run: Path, name: str, config: RunConfig, target: Target, seed: int) -> LoadedFlow:
+    """A flow of a run from its file, in double precision.
+
+    Raises:
+        DataError: The file is missing, damaged, or of another flow.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    flow = make_flow(config, generator).double()
+    arrays, _ = load_arrays(run, name)
+    try:
+        flow.load_state_dict({key: torch.as_tensor(value) for key, value in arrays.items()})
+    except RuntimeError as error:
+        reason = str(error).splitlines()[-1].strip()
+        raise DataError(f"is of another flow: {reason}", where=str(run / name), hint="learn the run again") from None
+    return LoadedFlow(flow, target, Coordinates(config.space), generator.manual_seed(seed))
+
+
+def seconds_at(run: Path, steps: list[int]) -> dict[int, float]:
+    """How long learning had taken after each step, from the run's progress, interpolated between its rows [s].
+
+    Raises:
+        DataError: The progress is missing or damaged.
+    """
+    verify(run, PROGRESS)
+    try:
+        rows = [json.loads(line) for line in (run / PROGRESS).read_text(encoding="utf-8").splitlines()]
+        done = np.array([0.0, *(float(row["step"]) for row in rows)])
+        taken = np.array([0.0, *(float(row["seconds"]) for row in rows)])
+        if not (np.isfinite(done).all() and np.isfinite(taken).all() and (np.diff(done) > 0).all()):
+            raise ValueError("steps do not ascend, or a number is none")
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
+        raise DataError("is no progress of learning", where=str(run / PROGRESS), hint="learn the run again") from None
+    return {step: float(np.interp(step, done, taken)) for step in steps}
+
+
+Loss = Callable[[DesignFlow, torch.Generator], torch.Tensor]
+DTYPES = ("float32", "float64")
+
+
+@dataclass(frozen=True, eq=False)
+class FlatTarget:
+    """p* = 1 at no cost: what remains of a step's time is the flow's own."""
+
+    optics: Optics
+    space: DesignSpace
+
+    def log_density(self, points: np.ndarray) -> np.ndarray:
+        """See `Target`."""
+        return np.zeros(len(points))
+
+    def log_density_and_gradient(
+        self, points: np.ndarray, sigma_m: float | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See `Target`."""
+        return np.zeros(len(points)), np.zeros(points.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class LearningSteps:
+    """The two kinds of steps of learning, at a flow.
+
+    Arguments:
+        flow: Where the gradients are taken.
+        target: The target density.
+        settings: Of learning.
+        pool: Proposals for balancing.
+    """
+
+    flow: DesignFlow
+    target: Target | FlatTarget
+    settings: LearningSettings
+    pool: Pool
+
+    def without_target(self) -> LearningSteps:
+        """The same steps with a target that costs nothing, to be timed."""
+        return replace(self, target=FlatTarget(self.target.optics, self.target.space))
+
+    @property
+    def sigma_m(self) -> float:
+        """The middle of the annealing on its geometric scale [m]."""
+        final = self.target.optics.sigma_m
+        start = max(self.settings.sigma_start_m or SIGMA_START_RATIO * final, final)
+        return float(np.sqrt(start * final))
+
+    def pathwise(self, target: Target | None = None) -> Loss:
+        """The loss of a path-wise step, with a thinned target where one is given."""
+        target, coordinates = target or self.target, Coordinates(self.target.space)
+        return lambda flow, generator: pathwise_loss(
+            flow, target, coordinates, self.settings.batch, self.sigma_m, 0.0, generator
+        )[0]
+
+    def balancing(self) -> Loss:
+        """The loss of a balancing step."""
+        coordinates = Coordinates(self.target.space)
+        return lambda flow, generator: balancing_loss(
+            flow, self.target, coordinates, self.settings.batch, self.pool, generator
+        )[0]
+
+
+def gradient(flow: DesignFlow, loss: Loss, seed: int, clip_norm: float) -> np.ndarray:
+    """The gradient that a step takes, by all parameters, flat float64; zeros where it is not finite and skipped.
+
+    Arguments:
+        flow: Its arithmetic is the step's.
+        loss: Draws its batch from the generator that it is given.
+        seed: Of the batch: the same one gives the same batch in any arithmetic.
+        clip_norm: The length that steps are clipped to.
+    """
+    parameters = list(flow.parameters())
+    found = torch.autograd.grad(loss(flow, torch.Generator().manual_seed(seed)), parameters, allow_unused=True)
+    parts = [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, found, strict=True)]
+    flat = torch.cat([part.detach().double().reshape(-1) for part in parts]).cpu().numpy()
+    if not np.isfinite(flat).all():
+        return np.zeros_like(flat)
+    return flat * min(1.0, clip_norm / max(np.linalg.norm(flat), TINY))
+
+
+def in_arithmetic(flow: DesignFlow, dtype: str) -> DesignFlow:
+    """A copy of a flow in float32 or float64."""
+    return copy.deepcopy(flow).to(dtype=getattr(torch, dtype))
+
+
+def noise_share(gradients: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> tuple[float, float]:
+    """The rms error of gradients as a share of the noise that the exact ones have anyway, and its standard error.
+
+    Arguments:
+        gradients: Of several batches, shape (P,) each, or (draws, P) of several draws for each batch; the standard
+            error is the jackknife's over batches.
+        exact: Of the same batches, 3 or more.
+    """
+    apart, products = _apart(gradients, exact)
+    count = len(apart)
+    left_out = [_share(apart, products, np.delete(np.arange(count), n)) for n in range(count)]
+    return _share(apart, products, np.arange(count)), float(np.sqrt((count - 1) * np.var(left_out)))
+
+
+def noise_shares(gradients: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> np.ndarray:
+    """The error of every batch's gradient as a share of the noise of exact ones, shape (batches,)."""
+    apart, products = _apart(gradients, exact)
+    variance = _variance(products)
+    return np.sqrt(apart / variance) if variance > 0 else np.zeros(len(apart))
+
+
+def _apart(gradients: Sequence[np.ndarray], exact: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean squared differences by batch (K,), and the products of all exact gradients (K, K)."""
+    apart = [
+        np.square(np.atleast_2d(found) - wanted).sum(axis=1).mean()
+        for found, wanted in zip(gradients, exact, strict=True)
+    ]
+    exact = np.asarray(exact)
+    return np.array(apart), exact @ exact.T
+
+
+def _share(apart: np.ndarray, products: np.ndarray, rows: np.ndarray) -> float:
+    """sqrt(mean |difference|^2 / variance) over some batches."""
+    variance = _variance(products[np.ix_(rows, rows)])
+    return float(np.sqrt(apart[rows].mean() / variance)) if variance > 0 else 0.0
+
+
+def _variance(products: np.ndarray) -> float:
+    """E |g - E g|^2 from the products of gradients (K, K)."""
+    count = len(products)
+    return float((np.trace(products) - products.sum() / count) / (count - 1))
+
+
+@dataclass(frozen=True, eq=False)
+class FlowSamples:
+    """Samples of a flow in float64, to be evaluated in any arithmetic.
+
+    Arguments:
+        base: Base points, shape (N, D).
+        values: The points that they become, shape (N, D).
+        conditions: Shape (N, context), or None.
+        log_prob: Their exact log density, shape (N,).
+    """
+
+    base: torch.Tensor
+    values: torch.Tensor
+    conditions: torch.Tensor | None
+    log_prob: np.ndarray
+
+    @classmethod
+    def of(cls, flow: DesignFlow, count: int, seed: int) -> FlowSamples:
+        """Samples of a float64 flow."""
+        generator = torch.Generator().manual_seed(seed)
+        conditions, base = draw_conditions(flow, count, generator), flow.draw_base(count, generator)
+        with torch.no_grad():
+            values, log_prob = flow(base, conditions)
+        return cls(base, values, conditions, log_prob.numpy())
+
+    def log_densities(self, flow: DesignFlow) -> np.ndarray:
+        """log density of the points in a flow's own arithmetic, shape (N,)."""
+        with torch.no_grad():
+            return flow.log_prob(*self._like(flow, self.values)).double().numpy()
+
+    def round_trip_nats(self, flow: DesignFlow) -> float:
+        """The largest difference of log densities from base to point and back, in a flow's own arithmetic [nats]."""
+        base, conditions = self._like(flow, self.base)
+        with torch.no_grad():
+            values, drawn = flow(base, conditions)
+            return float((drawn - flow.log_prob(values, conditions)).abs().max())
+
+    def _like(self, flow: DesignFlow, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+        like = next(flow.parameters())
+        return values.to(like), None if self.conditions is None else self.conditions.to(like)
 
 
 class _NoTarget:

@@ -18,8 +18,8 @@ import numpy as np
 
 from lidardesign.design.layouts.track import TRAVELLED
 from lidardesign.design.rigs.dispatch import read_rig
+from lidardesign.design.rigs.ray_lists import begins_as_sensor_csv, read_sensor_csv
 from lidardesign.design.rigs.rig import rig_design
-from lidardesign.design.rigs.sensor_csv import begins_as_sensor_csv, read_sensor_csv
 from lidardesign.design.sensor import (
     DEFAULT_LEVEL,
     LEVELS,

@@ -21,8 +21,7 @@ from lidardesign.design.layouts.layout import FittedDesign, Layout, likelihood_e
 from lidardesign.design.layouts.rays import LAYOUTS, gates_of, lay_out, layout_of, own_count
 from lidardesign.design.layouts.sensor_fit import FitProblem, fit_sensors
 from lidardesign.design.mixture.bounds import sensor_groups
-from lidardesign.design.mixture.conditions import conditioned, fixed_conditions
-from lidardesign.design.mixture.support import Retarget, Support
+from lidardesign.design.mixture.support import Retarget, Support, conditioned, fixed_conditions
 from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, DesignSpec, Gates, LayoutName, Sensor
 from lidardesign.design.snap.fit import fix_part_origins, snap_design
 from lidardesign.design.snap.parts import wants_parts

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidardesign.errors import DataError
+from lidardesign.geometry.frames import in_view
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.receiver import in_view
 from lidardesign.geometry.surface import sample_body, sample_triangles
 from lidardesign.numerics import SLACK
 from lidardesign.scene import Receiver, Scene

@@ -17,8 +17,7 @@ from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, PluginError
 from lidardesign.evaluate.baselines.candidates import Positions
 from lidardesign.evaluate.baselines.catalog import Density
-from lidardesign.evaluate.baselines.no_visibility import LayOut
-from lidardesign.evaluate.baselines.simple import baseline_of, is_baseline
+from lidardesign.evaluate.baselines.simple import LayOut, baseline_of, is_baseline
 from lidardesign.evaluate.cma.candidate import CmaSettings
 from lidardesign.evaluate.scene_scores import ScenePass, Scorer, score_here
 from lidardesign.samples import Samples

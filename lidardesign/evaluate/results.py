@@ -20,7 +20,7 @@ from lidardesign.estimates import HALF_INTERVAL, Estimate, as_documents
 from lidardesign.evaluate.accuracy.settings import Accuracy
 from lidardesign.evaluate.statistics import paired_difference
 from lidardesign.run.files import write_atomic
-from lidardesign.simulate.physics import EFFECTS
+from lidardesign.simulate.detector.detector import EFFECTS
 from lidardesign.simulate.plan import Choice, Decision, EffectPlan, Tolerance
 from lidardesign.task import Metric
 

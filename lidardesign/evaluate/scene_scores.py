@@ -25,7 +25,7 @@ from lidardesign.geometry.triangles import SecondCasts
 from lidardesign.registry import plugin_guard
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
-from lidardesign.simulate.physics import Physics
+from lidardesign.simulate.detector.detector import Physics
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.simulate.simulate import build_casters, simulate_many
 from lidardesign.space import DesignSpace

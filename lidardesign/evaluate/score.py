@@ -22,8 +22,7 @@ from lidardesign.design.layouts.track import travels
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.candidates import Candidate, Positions, TrainingViews, mean_mbps
 from lidardesign.evaluate.baselines.catalog import part_notes
-from lidardesign.evaluate.baselines.no_visibility import TwinCandidate
-from lidardesign.evaluate.baselines.simple import CMA, Baselines, Judge, Option
+from lidardesign.evaluate.baselines.simple import CMA, Baselines, Judge, Option, TwinCandidate
 from lidardesign.evaluate.cma.candidate import CmaCandidate, SearchRecord
 from lidardesign.evaluate.cma.search import TrainingObjective
 from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, left_out

@@ -16,9 +16,8 @@ import numpy as np
 
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
-from lidardesign.export.common.names import write_folder
+from lidardesign.export.common.names import child, document, element, read_xml, write_folder
 from lidardesign.export.common.poses import Mount, design_losses, mounts, rays_of_parts, rays_rounding, require_rays
-from lidardesign.export.common.xml import child, document, element, read_xml
 from lidardesign.geometry.rays import Rays
 from lidardesign.scene import SPEED_OF_LIGHT_M_S
 from lidardesign.space import angles, direction

@@ -29,8 +29,8 @@ from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.names import renamed_note, write_folder
 from lidardesign.export.common.poses import Mount, design_losses, fire_times_s, mounts, origin_losses, rays_rounding
+from lidardesign.geometry.frames import rotations_of_quaternions
 from lidardesign.geometry.rays import Rays
-from lidardesign.geometry.rotation import rotations_of_quaternions
 from lidardesign.run.files import write_atomic
 from lidardesign.space import direction
 

@@ -15,7 +15,7 @@ import numpy as np
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
-from lidardesign.export.common.names import write_folder
+from lidardesign.export.common.names import child, document, element, read_xml, write_folder
 from lidardesign.export.common.poses import (
     Place,
     design_losses,
@@ -25,7 +25,6 @@ from lidardesign.export.common.poses import (
     rays_rounding,
     require_rays,
 )
-from lidardesign.export.common.xml import child, document, element, read_xml
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import unit_vectors
 

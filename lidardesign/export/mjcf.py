@@ -17,11 +17,10 @@ import numpy as np
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
-from lidardesign.export.common.names import distinct, xml_text
+from lidardesign.export.common.names import distinct, element, number, numbers, read_xml, write_xml, xml_text
 from lidardesign.export.common.poses import Mount, design_losses, mounts, rays_rounding
-from lidardesign.export.common.xml import element, number, numbers, read_xml, write_xml
+from lidardesign.geometry.frames import rotations_of_quaternions
 from lidardesign.geometry.rays import Rays
-from lidardesign.geometry.rotation import rotations_of_quaternions
 from lidardesign.numerics import SLACK, unit_vectors
 
 # In the user data of each rangefinder: gate start and end [m], number of the sensor, firing time [s].

@@ -28,8 +28,8 @@ from lidardesign.export.common.poses import (
     rays_rounding,
     require_rays,
 )
+from lidardesign.geometry.frames import rotation_of_rpy
 from lidardesign.geometry.rays import Rays
-from lidardesign.geometry.rotation import rotation_of_rpy
 from lidardesign.numerics import FULL_TURN, unit_vectors
 from lidardesign.run.files import write_atomic
 from lidardesign.space import angles

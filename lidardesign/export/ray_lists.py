@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidardesign.design.rigs.sensor_csv import read_sensor_csv, write_sensor_csv
+from lidardesign.design.rigs.ray_lists import read_sensor_csv, write_sensor_csv
 from lidardesign.design.sensor import MOST_RAYS, DesignSpec
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate

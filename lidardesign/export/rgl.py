@@ -17,7 +17,16 @@ import numpy as np
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
-from lidardesign.export.common.names import identifier, renamed_note, write_folder
+from lidardesign.export.common.names import (
+    child,
+    document,
+    element,
+    identifier,
+    numbers,
+    read_xml,
+    renamed_note,
+    write_folder,
+)
 from lidardesign.export.common.poses import (
     Mount,
     design_losses,
@@ -29,9 +38,8 @@ from lidardesign.export.common.poses import (
     rays_rounding,
     require_rays,
 )
-from lidardesign.export.common.xml import child, document, element, numbers, read_xml
+from lidardesign.geometry.frames import rotations_of_quaternions
 from lidardesign.geometry.rays import Rays
-from lidardesign.geometry.rotation import rotations_of_quaternions
 from lidardesign.numerics import unit_vectors
 from lidardesign.space import angles
 

@@ -17,11 +17,10 @@ from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.even_grid import EvenGrid, grid_of, grid_sensor_losses
-from lidardesign.export.common.names import identifier, renamed_note
+from lidardesign.export.common.names import element, identifier, number, numbers, read_xml, renamed_note, write_xml
 from lidardesign.export.common.poses import Mount, ReadMount, mounts, mounts_rounding, quaternion
-from lidardesign.export.common.xml import element, number, numbers, read_xml, write_xml
+from lidardesign.geometry.frames import rotations_of_quaternions
 from lidardesign.geometry.rays import Rays
-from lidardesign.geometry.rotation import rotations_of_quaternions
 
 VERSION = "1.9"
 LINK = "lidar"

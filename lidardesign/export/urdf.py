@@ -18,9 +18,8 @@ from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
 from lidardesign.estimates import Estimate
-from lidardesign.export.common.names import identifier
+from lidardesign.export.common.names import element, identifier, numbers, read_xml, write_xml
 from lidardesign.export.common.poses import Mount, ReadMount, mounts, mounts_rounding
-from lidardesign.export.common.xml import element, numbers, read_xml, write_xml
 from lidardesign.export.sdf import read_sensor, sdf_losses, sensor_element
 from lidardesign.geometry.rays import Rays
 

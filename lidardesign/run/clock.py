@@ -114,7 +114,7 @@ def keep_timings(run: Path, command: str, clock: Clock, *, wait_s: float = WAIT_
         ConfigError, DataError: The run is being written, or cannot be.
     """
     # every command has a clock, `--help` too: what only some need is not imported for all
-    from lidardesign.run.lock import run_lock
+    from lidardesign.run.files import run_lock
     from lidardesign.run.manifest import read_manifest, write_manifest
 
     entry: dict[str, Any] = {

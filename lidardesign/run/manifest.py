@@ -13,8 +13,7 @@ from typing import Any
 
 from lidardesign import __version__
 from lidardesign.errors import DataError
-from lidardesign.run.files import sha256_file, write_atomic
-from lidardesign.run.lock import writer
+from lidardesign.run.files import sha256_file, write_atomic, writer
 
 FILE_NAME = "manifest.json"
 SCHEMA_VERSION = 1

@@ -19,13 +19,13 @@ from typing import Literal
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.frames import path_windows
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Rays
-from lidardesign.geometry.receiver import path_windows
 from lidardesign.run.clock import phase
 from lidardesign.run.validation import suggest
 from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import IDEAL, Detector, check_windows
+from lidardesign.simulate.detector.detector import EFFECTS, IDEAL, Detector, Physics, check_effects, check_windows
 from lidardesign.simulate.effects import (
     ambient,
     atmosphere,
@@ -42,7 +42,6 @@ from lidardesign.simulate.effects import (
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 from lidardesign.simulate.light_transport import process
-from lidardesign.simulate.physics import EFFECTS, Physics, check_effects
 from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import Metric
 

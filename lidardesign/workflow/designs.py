@@ -13,7 +13,7 @@ from lidardesign.design.fit import FitResult
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import WAIT_S, phase
-from lidardesign.run.lock import run_lock
+from lidardesign.run.files import run_lock
 from lidardesign.run.manifest import write_recorded
 from lidardesign.workflow.export import (
     DesignSource,
@@ -28,8 +28,8 @@ from lidardesign.workflow.refine import fit_design
 from lidardesign.workflow.run_folder import Notes, RunFolder, log_note, need_run, relative_folder
 
 if TYPE_CHECKING:
-    from lidardesign.evaluate.refinement.refinement import Round
-    from lidardesign.evaluate.report.notebook import Figure
+    from lidardesign.evaluate.refinement import Round
+    from lidardesign.evaluate.report.figures import Figure
 
 
 class Design(DesignSource):
@@ -166,7 +166,7 @@ class Design(DesignSource):
 
     def figure(self, count: int | None = None) -> Figure:
         """Its sensors in space, with fields of view and gates; with a number of rays these, too (plotly)."""
-        from lidardesign.evaluate.report.notebook import design_figure
+        from lidardesign.evaluate.report.figures import design_figure
 
         return design_figure(self.specification, None if count is None else self.rays(count))
 

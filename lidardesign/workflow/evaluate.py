@@ -45,7 +45,7 @@ from lidardesign.workflow.run_samples import Layouts, learned_density, twin_with
 if TYPE_CHECKING:
     from lidardesign.evaluate.cma.candidate import Show
     from lidardesign.evaluate.figures.scene_figure import FigureData
-    from lidardesign.evaluate.report.notebook import Figure
+    from lidardesign.evaluate.report.figures import Figure
 
 Progress = Callable[[int, int, str], None]
 
@@ -174,7 +174,7 @@ class ScoreRequest:
         if options.accuracy:
             # Refuse a run that is unfinished or damaged before it is evaluated, which may take minutes
             with phase("libraries"):
-                from lidardesign.density.training.snapshot_quality import check_kept
+                from lidardesign.density.learned import check_kept
 
             check_kept(learned.folder)
         overrides = settings_texts(options.settings)
@@ -374,8 +374,7 @@ class Scores:
             command: What the page says that it was made by; this program's arguments by default.
             pictured: What `figure_data` gave, to be used again.
         """
-        from lidardesign.evaluate.report.contents import evaluation_report
-        from lidardesign.evaluate.report.report import write_report
+        from lidardesign.evaluate.report.report import evaluation_report, write_report
 
         pictured = self.figure_data() if pictured is None else pictured
         run, request = self.run, self.evaluation_request
@@ -385,7 +384,7 @@ class Scores:
 
     def figure(self, against: str = "rays") -> Figure:
         """The scores with their intervals against "rays" or "bandwidth" (plotly)."""
-        from lidardesign.evaluate.report.notebook import scores_figure
+        from lidardesign.evaluate.report.figures import scores_figure
 
         return scores_figure(self.evaluation, against)
 

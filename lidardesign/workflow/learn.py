@@ -16,8 +16,7 @@ from lidardesign.config import RunConfig, load_run_config, resolve, save_run_con
 from lidardesign.errors import ConfigError, DataError, LidardesignError, check_choice
 from lidardesign.registry import load_task, plugin_guard
 from lidardesign.run.clock import Clock, outermost_clock, phase
-from lidardesign.run.files import is_temporary
-from lidardesign.run.lock import run_lock
+from lidardesign.run.files import is_temporary, run_lock
 from lidardesign.run.manifest import note, read_manifest, start_manifest
 from lidardesign.run.yaml import dump_yaml, leaves, load_yaml, parse_yaml
 from lidardesign.task import Task, notes_of

@@ -17,8 +17,7 @@ from lidardesign.design.fit import FitResult
 from lidardesign.design.fit import fit as fit_samples
 from lidardesign.design.layouts.quantise import SAMPLES_PER_RAY
 from lidardesign.design.mixture.bounds import sensor_groups
-from lidardesign.design.mixture.conditions import MOVED_SAMPLES, at_condition, condition_text
-from lidardesign.design.mixture.support import LEAST_SAMPLES
+from lidardesign.design.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, at_condition, condition_text
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError, InfeasibleError
 from lidardesign.run.clock import phase
@@ -32,9 +31,8 @@ from lidardesign.workflow.run_folder import Notes, RunFolder, log_note, provenan
 from lidardesign.workflow.run_samples import KEY, Layouts, RunTarget, Weighting
 
 if TYPE_CHECKING:
-    from lidardesign.evaluate.refinement.refinement import Refinement, Round, Shape, Trial
-    from lidardesign.evaluate.refinement.regating import Gating
-    from lidardesign.evaluate.refinement.reweighting import Attention, Reweighting
+    from lidardesign.evaluate.refinement import Gating, Refinement, Round, Shape, Trial
+    from lidardesign.evaluate.reweighting import Attention, Reweighting
 
 # The share of the training scenes whose residuals are looked at; the others judge.
 LOOK_SHARE = 0.6
@@ -237,7 +235,7 @@ def _refined(request: FitRequest, rounds: int, progress: Callable[[Round], None]
     Raises:
         ConfigError: The task does not say where its error is, or has too few training scenes.
     """
-    from lidardesign.evaluate.refinement.refinement import Refiner, Shape
+    from lidardesign.evaluate.refinement import Refiner, Shape
     from lidardesign.evaluate.scene_scores import gives_residuals
 
     run, weighting = request.run, request.weighting
@@ -268,7 +266,7 @@ def _refined(request: FitRequest, rounds: int, progress: Callable[[Round], None]
 
 def _attention(fitter: Fitter, start: Reweighting | None) -> Attention:
     """Anchors over the density, or those of an earlier refinement, which then goes on."""
-    from lidardesign.evaluate.refinement.reweighting import Attention, anchors_for
+    from lidardesign.evaluate.reweighting import Attention, anchors_for
 
     run, seed = fitter.request.run, fitter.request.seed
     places = observed_point(fitter.base.resample(ANCHOR_POOL, random_generator(seed, "anchor places")))
@@ -287,7 +285,7 @@ class _Gating:
     @cached_property
     def gating(self) -> Gating:
         """The gating, with casters of all scenes."""
-        from lidardesign.evaluate.refinement.regating import Gating
+        from lidardesign.evaluate.refinement import Gating
         from lidardesign.simulate.simulate import build_casters
 
         run = self._fitter.request.run
@@ -302,7 +300,7 @@ def _trial(fitter: Fitter, weighting: Weighting, shape: Shape, gating: _Gating) 
         InfeasibleError: It cannot be fitted, or breaks a constraint.
     """
     from lidardesign.evaluate.baselines.candidates import mean_mbps
-    from lidardesign.evaluate.refinement.refinement import Trial
+    from lidardesign.evaluate.refinement import Trial
 
     request = fitter.request
     run, constraints = request.run, request.constraints

@@ -24,7 +24,7 @@ from lidardesign.workflow.run_folder import RunFolder
 if TYPE_CHECKING:
     from lidardesign.density.target.target import Target
     from lidardesign.evaluate.baselines.catalog import Density
-    from lidardesign.evaluate.refinement.reweighting import Reweighting
+    from lidardesign.evaluate.reweighting import Reweighting
 
 
 KEY = "weighting"
@@ -67,7 +67,7 @@ class Weighting:
     @classmethod
     def from_document(cls, document: Any, where: str) -> Weighting:
         """What `as_document` gave."""
-        from lidardesign.evaluate.refinement.reweighting import FIT_AGAIN, Reweighting
+        from lidardesign.evaluate.reweighting import FIT_AGAIN, Reweighting
 
         known = {"set", "factors", "range_spread_m"}
         if not isinstance(document, Mapping) or not set(document) <= known:
@@ -207,7 +207,7 @@ def twin_without_visibility(design: DesignSpec, run: RunFolder, layouts: Layouts
         DataError: No ray of the design space comes near a target.
     """
     from lidardesign.density.target.proposals import samples_without_visibility
-    from lidardesign.evaluate.baselines.no_visibility import fitted_twin
+    from lidardesign.evaluate.baselines.simple import fitted_twin
 
     config = run.config
     samples = samples_without_visibility(

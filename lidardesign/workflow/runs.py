@@ -19,7 +19,7 @@ from lidardesign.workflow.run_folder import MANIFEST, Notes, RunFolder, folder_o
 if TYPE_CHECKING:
     from lidardesign.density.learn import LearnProgress
     from lidardesign.density.learned import LearnedDensity
-    from lidardesign.evaluate.refinement.refinement import Round
+    from lidardesign.evaluate.refinement import Round
     from lidardesign.workflow.evaluate import Scores
 
 FIGURES = ("ess", "kl_nats", "log_z", "coverage", "misplaced")

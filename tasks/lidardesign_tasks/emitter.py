@@ -3,7 +3,7 @@
 World frame and heads are those of the task `face`. The detector stands at one place and hears every ray; what is
 designed are the emitters around it: their places, directions and ranges. Light goes from an emitter to the face and
 from there to the detector, so only what both of them see counts, and the range along a ray follows from the whole
-path of its light (`lidardesign.geometry.receiver`). A flood emitter is a sensor whose rays are the dots of its pattern.
+path of its light (`lidardesign.geometry.frames`). A flood emitter is a sensor whose rays are the dots of its pattern.
 """
 
 from __future__ import annotations

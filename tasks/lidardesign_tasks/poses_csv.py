@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from lidardesign.errors import DataError
-from lidardesign.geometry.rotation import rotation_of_quaternion, rotation_of_rpy
+from lidardesign.geometry.frames import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.run.arrays import csv_rows
 from lidardesign.scene import rigid
 from lidardesign.space import FARTHEST_M

@@ -12,7 +12,7 @@ import pytest
 from support.command_line import files_under, make_run
 from support.mistakes import GARBAGE, GOOD, check_one_clear_message
 
-from lidardesign.run.lock import run_lock
+from lidardesign.run.files import run_lock
 from lidardesign.run.yaml import dump_yaml, load_yaml
 
 CORNERS = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n"

@@ -16,7 +16,7 @@ from lidardesign import __version__
 from lidardesign.cli import output as console_module
 from lidardesign.cli.output import command, plain_json
 from lidardesign.errors import InfeasibleError
-from lidardesign.run.lock import run_lock
+from lidardesign.run.files import run_lock
 from lidardesign.run.yaml import load_yaml
 from lidardesign.samples import Samples, load_samples, save_samples
 

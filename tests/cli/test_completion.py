@@ -27,7 +27,7 @@ from lidardesign.design.catalog.library import load_library
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.simple import baseline_of
 from lidardesign.export.registry import EXPORTERS
-from lidardesign.simulate.physics import EFFECTS
+from lidardesign.simulate.detector.detector import EFFECTS
 
 # What nobody can know beforehand; a metavar that is neither here nor completed is a mistake.
 FREE = {"N", "SECONDS", "SHARE", "VALUE", "MM", "DEG", "HZ", "P", "X,Y,Z", "PERCENT", "KLUX", "MB", "S"}

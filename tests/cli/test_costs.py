@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from support.command_line import caller, files_under, make_run
 
-from lidardesign.cli.tables.times import show_times
-from lidardesign.run.lock import run_lock
+from lidardesign.cli.tables.scores import show_times
+from lidardesign.run.files import run_lock
 from lidardesign.run.manifest import read_manifest
 
 TITLE = "where the time went"

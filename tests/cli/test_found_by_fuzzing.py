@@ -18,7 +18,7 @@ from support.tables import each_row
 
 from lidardesign.cli.output import Output, describe_error
 from lidardesign.density.fields.grids import _digest, _load
-from lidardesign.density.training.snapshot_quality import seconds_at
+from lidardesign.density.learned import seconds_at
 from lidardesign.density.training.training import _step_of
 from lidardesign.design.bandwidth import split_budget
 from lidardesign.design.constraints.document import MOST_FITTED, Constraints

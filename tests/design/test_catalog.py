@@ -14,18 +14,20 @@ from hypothesis import strategies as st
 from support.command_line import caller, make_run
 from support.tables import each_row
 
-from lidardesign.design.catalog.library import FOLDER, find_part, load_library
-from lidardesign.design.catalog.part import Part, conditions_of, disagreements, even_subset, to_angles, to_directions
-from lidardesign.design.catalog.placing import (
+from lidardesign.design.catalog.library import (
+    FOLDER,
     Pose,
     boresight_of,
+    find_part,
     interleaved,
+    load_library,
     part_design,
     part_rays,
     part_sensor,
     parts_for,
     side_by_side,
 )
+from lidardesign.design.catalog.part import Part, conditions_of, disagreements, even_subset, to_angles, to_directions
 from lidardesign.design.catalog.statements import FIELDS, PartFile, Statement
 from lidardesign.design.files import design_document, design_from_document, load_design, save_design
 from lidardesign.design.layouts.grid import grid_rows

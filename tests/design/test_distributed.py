@@ -17,7 +17,7 @@ from lidardesign.design.layouts import distributed as lines
 from lidardesign.design.layouts.distributed import in_region, normal_ball
 from lidardesign.design.layouts.grid import low_discrepancy
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.mixture.coupling import coupling_of
+from lidardesign.design.mixture.ensemble import coupling_of
 from lidardesign.design.sensor import Sensor, tangent_directions
 from lidardesign.space import angles, observed_point
 

@@ -138,7 +138,7 @@ def test_files_that_only_their_endings_tell_apart_are_called_by_them(call, tmp_p
 
 
 def test_a_sensor_table_of_the_research_code_may_still_lack_its_header(tmp_path):
-    from lidardesign.design.rigs.sensor_csv import write_sensor_csv
+    from lidardesign.design.rigs.ray_lists import write_sensor_csv
 
     sensor = Sensor("s", 1.0, np.zeros(3), np.zeros((3, 3)), 1.0, 0.0, 0.0, 0.1, 0.1, 0.5, 0.1)
     write_sensor_csv(DesignSpec("d", (sensor,)), tmp_path / "table.csv")

@@ -26,8 +26,8 @@ from lidardesign.design.sensor import (
 )
 from lidardesign.errors import DataError, LidardesignError
 from lidardesign.export.registry import EXPORTERS
+from lidardesign.geometry.frames import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.geometry.rays import Rays
-from lidardesign.geometry.rotation import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.run.xml import _Builder
 from lidardesign.space import DesignSpace, angles, direction
 
@@ -595,8 +595,8 @@ def test_a_scan_that_cannot_be_is_refused(tmp_path, options):
 
 
 def test_what_is_written_for_gazebo_fires_as_it_is_read(tmp_path):
+    from lidardesign.export.common.names import read_xml
     from lidardesign.export.common.poses import mounts
-    from lidardesign.export.common.xml import read_xml
     from lidardesign.export.sdf import read_sensor
 
     design = rig(3, counts=(9, 6), names=("a", "b"))

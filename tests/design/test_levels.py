@@ -14,7 +14,7 @@ from support.rings import RING
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import load_design
 from lidardesign.design.fit import fit
-from lidardesign.design.layouts.fields import seen_from
+from lidardesign.design.layouts.gates import seen_from
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import DesignSpec, interval_factor
 from lidardesign.errors import InfeasibleError

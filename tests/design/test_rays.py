@@ -12,7 +12,7 @@ from support.tables import each_row
 
 from lidardesign.design.bandwidth import split_budget
 from lidardesign.design.fit import rays_at, refitted
-from lidardesign.design.layouts.fields import log_density, members, seen_from
+from lidardesign.design.layouts.gates import log_density, members, seen_from
 from lidardesign.design.layouts.grid import grid_rows, grid_tangent
 from lidardesign.design.layouts.rays import LAYOUTS, gates_of, lay_out, own_count
 from lidardesign.design.sensor import (

@@ -17,10 +17,10 @@ from support.mixtures import drawn as drawn_from_mixture
 from support.tables import each_row
 
 from lidardesign.density.flow.objective import Coordinates
+from lidardesign.density.learned import FlatTarget
 from lidardesign.density.target.visibility import Optics
 from lidardesign.density.training.losses import Pool, draw_conditions
 from lidardesign.density.training.quality import draw_samples, log_density_of
-from lidardesign.density.training.snapshot_quality import FlatTarget
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts.grid import low_discrepancy

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from support.tables import each_row
 
 from lidardesign.design.files import load_design
-from lidardesign.design.rigs.sensor_csv import COLUMNS, begins_as_sensor_csv, read_sensor_csv, write_sensor_csv
+from lidardesign.design.rigs.ray_lists import SENSOR_COLUMNS, begins_as_sensor_csv, read_sensor_csv, write_sensor_csv
 from lidardesign.design.sensor import DesignSpec, Sensor, tangent_coordinates
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.space import direction
 
 ROW = "3,0,0,3.14,0.1,1.2,0.04,0.01,0,0.09,0.02,0.05,0.2,0.1,0.3,1"
-HEADER = ",".join(COLUMNS)
+HEADER = ",".join(SENSOR_COLUMNS)
 
 
 @st.composite

@@ -30,9 +30,9 @@ from lidardesign.design.snap.parts import (
     nearest_parts,
     part_options,
     parts_of,
+    shapes_of,
     wants_parts,
 )
-from lidardesign.design.snap.shapes import shapes_of
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace, aim
@@ -266,7 +266,7 @@ def test_losses_are_what_the_mixture_loses_by_each_part_alone():
     """The naive way: the whole mixture's density with one component exchanged."""
     from lidardesign.design.mixture.ensemble import Ensemble
     from lidardesign.design.mixture.mixture import log_density
-    from lidardesign.design.snap.shapes import shaped_mixture
+    from lidardesign.design.snap.parts import shaped_mixture
 
     ensemble = fitted_ensemble()
     assert isinstance(ensemble, Ensemble)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidardesign.evaluate.refinement.reweighting import (
+from lidardesign.evaluate.reweighting import (
     ANCHORS,
     FACTOR_DECIMALS,
     LARGEST_FACTOR,

@@ -17,8 +17,7 @@ from lidardesign.evaluate.results import Audit, AuditRow, effect_notes, summarie
 from lidardesign.evaluate.score import evaluate
 from lidardesign.scene import Ambient, Scene
 from lidardesign.simulate import plan as plan_module
-from lidardesign.simulate.detector.detector import IDEAL, Detector
-from lidardesign.simulate.physics import EFFECTS
+from lidardesign.simulate.detector.detector import EFFECTS, IDEAL, Detector
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
 
 EFFECT_KEYS = {"name", "on", "bound", "tolerance", "unit", "reason", "lost", "lost_tolerance", "scenes_on", "seconds"}

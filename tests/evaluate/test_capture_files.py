@@ -14,7 +14,7 @@ from support.captures import BINS, make_capture
 from support.tables import each_row
 
 from lidardesign.errors import DataError
-from lidardesign.evaluate.captures import matlab
+from lidardesign.evaluate.captures import arrays as matlab
 from lidardesign.evaluate.captures.arrays import read_arrays
 from lidardesign.evaluate.captures.capture import load_capture
 from lidardesign.run import arrays as npz

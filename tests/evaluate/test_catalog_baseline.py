@@ -12,10 +12,9 @@ from support.command_line import caller, make_run
 from support.tables import each_row
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.catalog.library import find_part
-from lidardesign.design.catalog.placing import Pose, part_rays
+from lidardesign.design.catalog.library import Pose, find_part, part_rays
 from lidardesign.design.sensor import boresight_frame
-from lidardesign.design.snap.shapes import PartShape, gate_inside, in_part_view, shapes_of, useful_ray_filter
+from lidardesign.design.snap.parts import PartShape, gate_inside, in_part_view, shapes_of, useful_ray_filter
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.catalog import (
     CLUTTER,

@@ -19,10 +19,7 @@ from lidardesign.density.fields.grids import Grid
 from lidardesign.density.flow.flow import DesignFlow
 from lidardesign.density.flow.objective import Coordinates
 from lidardesign.density.learn import learn
-from lidardesign.density.target.target import build_target
-from lidardesign.density.training.losses import Pool
-from lidardesign.density.training.quality import misplaced_share
-from lidardesign.density.training.snapshot_quality import (
+from lidardesign.density.learned import (
     FlowSamples,
     LearningSteps,
     gradient,
@@ -30,6 +27,9 @@ from lidardesign.density.training.snapshot_quality import (
     noise_share,
     noise_shares,
 )
+from lidardesign.density.target.target import build_target
+from lidardesign.density.training.losses import Pool
+from lidardesign.density.training.quality import misplaced_share
 from lidardesign.errors import NumericalError
 from lidardesign.evaluate.accuracy import fields, visibility
 from lidardesign.evaluate.accuracy import steps as learning_steps

@@ -15,8 +15,8 @@ from lidardesign_tasks.flatland import FlatlandTask
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError, InfeasibleError, NumericalError, PluginError
-from lidardesign.evaluate.refinement.refinement import LEVELS, PATIENCE, SPREADS, Refiner, Shape, Trial
-from lidardesign.evaluate.refinement.reweighting import Attention
+from lidardesign.evaluate.refinement import LEVELS, PATIENCE, SPREADS, Refiner, Shape, Trial
+from lidardesign.evaluate.reweighting import Attention
 from lidardesign.evaluate.scene_scores import checked_score
 from lidardesign.geometry.rays import Rays
 from lidardesign.simulate.simulate import simulate

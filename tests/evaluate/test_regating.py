@@ -15,7 +15,7 @@ from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor
-from lidardesign.evaluate.refinement.regating import Gating, has_ray_gates
+from lidardesign.evaluate.refinement import Gating, has_ray_gates
 from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Body, Scene, Sphere, rigid
 from lidardesign.simulate.simulate import build_casters, simulate

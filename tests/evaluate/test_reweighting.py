@@ -11,7 +11,7 @@ from support.tables import each_row
 from lidardesign.design.fit import fit
 from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.evaluate.refinement.reweighting import LARGEST_LOG_FACTOR, NEIGHBOURS, Reweighting
+from lidardesign.evaluate.reweighting import LARGEST_LOG_FACTOR, NEIGHBOURS, Reweighting
 from lidardesign.run.yaml import dump_yaml, parse_yaml
 from lidardesign.samples import Samples
 from lidardesign.space import RANGE, DesignSpace, observed_point

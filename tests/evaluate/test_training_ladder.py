@@ -13,11 +13,11 @@ from support.small_runs import shifted
 from lidardesign.config import load_run_config, resolve, save_run_config
 from lidardesign.density import learn as learning
 from lidardesign.density.learn import learn
+from lidardesign.density.learned import load_flow, remeasured, seconds_at
 from lidardesign.density.training import schedule as budget
 from lidardesign.density.training.checkpoint import save_arrays
 from lidardesign.density.training.quality import draw_probes
 from lidardesign.density.training.schedule import Stage, ToleranceGoal
-from lidardesign.density.training.snapshot_quality import load_flow, remeasured, seconds_at
 from lidardesign.density.training.training import Trainer
 from lidardesign.design.fit import fit
 from lidardesign.errors import DataError, NumericalError

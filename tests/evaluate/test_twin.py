@@ -13,7 +13,7 @@ from lidardesign.design.files import design_document
 from lidardesign.design.fit import fit, rays_at
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.evaluate.baselines.candidates import mean_mbps
-from lidardesign.evaluate.baselines.no_visibility import TwinCandidate, fitted_twin
+from lidardesign.evaluate.baselines.simple import TwinCandidate, fitted_twin
 from lidardesign.samples import Samples
 from lidardesign.space import DesignSpace
 

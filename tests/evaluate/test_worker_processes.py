@@ -16,8 +16,7 @@ from support.workers import make_request, random_rays, results, without_times
 
 from lidardesign.errors import ConfigError, NumericalError, PluginError
 from lidardesign.evaluate.score import evaluate
-from lidardesign.evaluate.workers.pool import WorkerScorer
-from lidardesign.evaluate.workers.processes import MOST_TRIES, Processes
+from lidardesign.evaluate.workers.pool import MOST_TRIES, Processes, WorkerScorer
 from lidardesign.registry import load_task
 
 

@@ -9,11 +9,18 @@ from support.tables import each_row
 from lidardesign.design.layouts.grid import grid_tangent
 from lidardesign.design.sensor import DesignSpec, tangent_directions
 from lidardesign.export.common.even_grid import EvenGrid, grid_losses, nearest_grid
-from lidardesign.export.common.names import identifier, identifiers, renamed_note, xml_text
+from lidardesign.export.common.names import (
+    element,
+    identifier,
+    identifiers,
+    read_xml,
+    renamed_note,
+    write_xml,
+    xml_text,
+)
 from lidardesign.export.common.poses import mounts, quaternion
-from lidardesign.export.common.xml import element, read_xml, write_xml
+from lidardesign.geometry.frames import rotations_of_quaternions
 from lidardesign.geometry.rays import Rays
-from lidardesign.geometry.rotation import rotations_of_quaternions
 from lidardesign.space import angles, direction
 
 angle = st.floats(-1.2, 1.2)

@@ -15,8 +15,8 @@ from lidardesign.design.sensor import DesignSpec, Sensor
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.export.common.poses import mounts
 from lidardesign.export.registry import EXPORTERS
+from lidardesign.geometry.frames import rotations_of_quaternions
 from lidardesign.geometry.rays import Rays
-from lidardesign.geometry.rotation import rotations_of_quaternions
 from lidardesign.space import direction
 
 SCHEMAS = Path(__file__).parents[1] / "schemas"

@@ -20,7 +20,7 @@ from pathlib import Path
 LATE = (
     "lidardesign.cli.main", "lidardesign.workflow.run_samples", "lidardesign.density.fields.body_kernels",
     "lidardesign.density.fields.body_kernels", "lidardesign.density.fields.table_kernels", "lidardesign.density.learn",
-    "lidardesign.density.flow.spline_kernels", "lidardesign.design.mixture.conditions", "lidardesign.design.fit",
+    "lidardesign.density.flow.spline_kernels", "lidardesign.design.mixture.support", "lidardesign.design.fit",
     "lidardesign.evaluate.metrics", "lidardesign.evaluate.report.report", "lidardesign.evaluate.score",
     "lidardesign.evaluate.results", "lidardesign.evaluate.workers.pool", "lidardesign_tasks.flatland", "plotly.io",
     "rich.table", "torch._dynamo",

@@ -19,7 +19,7 @@ from support.command_line import make_run
 from lidardesign.config import resolve
 from lidardesign.design.files import design_document
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.design.rigs.sensor_csv import QUERY_COLUMN, write_sensor_csv
+from lidardesign.design.rigs.ray_lists import QUERY_COLUMN, write_sensor_csv
 from lidardesign.design.sensor import Coupling, DesignSpec, Sensor, Track
 from lidardesign.export import galvo, ray_lists
 from lidardesign.geometry.rays import Rays

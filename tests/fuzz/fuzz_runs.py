@@ -75,7 +75,7 @@ def _read_samples(run: Path) -> object:
 
 def _read_progress(run: Path) -> object:
     """As `evaluate --accuracy` does."""
-    from lidardesign.density.training.snapshot_quality import seconds_at
+    from lidardesign.density.learned import seconds_at
 
     return seconds_at(run, [5, 20, 1000])
 
@@ -86,7 +86,7 @@ open_progress = _behind_hash("progress.jsonl", _read_progress)
 
 def open_locks(folder: Path) -> Read:
     """As every command does that writes into a run."""
-    from lidardesign.run.lock import run_lock
+    from lidardesign.run.files import run_lock
 
     def read(content: bytes) -> object:
         (folder / ".lock").write_bytes(content)

@@ -28,8 +28,8 @@ from lidardesign import registry as probe
 from lidardesign.config import load_run_config, save_run_config
 from lidardesign.density.training.schedule import with_steps
 from lidardesign.errors import PluginError
-from lidardesign.run import lock
-from lidardesign.run.lock import run_lock
+from lidardesign.run import files as lock
+from lidardesign.run.files import run_lock
 from lidardesign.run.manifest import note, start_manifest
 from lidardesign.task import Score
 

@@ -35,14 +35,13 @@ from lidardesign.evaluate.metrics import (
 )
 from lidardesign.evaluate.scene_scores import checked_score
 from lidardesign.evaluate.score import evaluate
+from lidardesign.geometry.frames import path_of_range, path_windows, range_of_path
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome, Rays, gate_outcomes
-from lidardesign.geometry.receiver import path_of_range, path_windows, range_of_path
 from lidardesign.geometry.surface import sample_triangles
 from lidardesign.scene import Body, Box, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector.detector import IDEAL, Detector
+from lidardesign.simulate.detector.detector import EFFECTS, IDEAL, Detector, Physics
 from lidardesign.simulate.detector.files import load_detector
-from lidardesign.simulate.physics import EFFECTS, Physics
 from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import DesignSpace, direction

@@ -21,7 +21,7 @@ from lidardesign.density.flow.objective import Coordinates
 from lidardesign.density.target.target import MINIMUM_POLE_COSINE, build_target
 from lidardesign.design.files import load_design, save_design
 from lidardesign.design.fit import fit
-from lidardesign.design.rigs.sensor_csv import COLUMNS
+from lidardesign.design.rigs.ray_lists import SENSOR_COLUMNS
 from lidardesign.design.sensor import boresight_frame, tangent_directions
 from lidardesign.errors import ConfigError, DataError, NumericalError
 from lidardesign.registry import load_task
@@ -299,10 +299,10 @@ class TestRangesThatAreNone:
 
     @pytest.mark.parametrize("value", ["-0.1", "inf", "nan"])
     def test_sensor_tables_are_refused_by_column(self, tmp_path, value):
-        good = dict.fromkeys(COLUMNS, "0.1") | {"orig_cov_xy": "0", "orig_cov_xz": "0", "orig_cov_yz": "0"}
+        good = dict.fromkeys(SENSOR_COLUMNS, "0.1") | {"orig_cov_xy": "0", "orig_cov_xz": "0", "orig_cov_yz": "0"}
         row = (good | {"time_mean": value}).values()
         path = tmp_path / "table.csv"
-        path.write_text(",".join(COLUMNS) + "\n" + ",".join(row) + "\n", encoding="utf-8")
+        path.write_text(",".join(SENSOR_COLUMNS) + "\n" + ",".join(row) + "\n", encoding="utf-8")
         with pytest.raises(DataError, match="time_mean"):
             load_design(path)
 

@@ -13,7 +13,7 @@ import pytest
 from lidardesign.errors import ConfigError
 from lidardesign.run import clock as clocks
 from lidardesign.run.clock import Clock, keep_timings, peak_memory_bytes, phase, running
-from lidardesign.run.lock import run_lock
+from lidardesign.run.files import run_lock
 from lidardesign.run.manifest import read_manifest, start_manifest
 
 

@@ -17,11 +17,11 @@ import pytest
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.run import files, lock
+from lidardesign.run import files
+from lidardesign.run import files as lock
 from lidardesign.run import files as processes
 from lidardesign.run import manifest as manifest_module
-from lidardesign.run.files import remove_stray_temporaries, sha256_file, write_atomic
-from lidardesign.run.lock import run_lock
+from lidardesign.run.files import remove_stray_temporaries, run_lock, sha256_file, write_atomic
 from lidardesign.run.manifest import (
     announce,
     note,
@@ -206,7 +206,7 @@ def test_a_second_writer_is_told_who_holds_the_run(tmp_path):
 
 HOLDER = """
 import sys, time
-from lidardesign.run.lock import run_lock
+from lidardesign.run.files import run_lock
 with run_lock(sys.argv[1]):
     print("held", flush=True)
     time.sleep(60)

@@ -13,8 +13,8 @@ from scipy.special import exp1
 from support.rays import rays_along
 from support.tables import each_row
 
+from lidardesign.geometry.frames import path_windows
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.receiver import path_windows
 from lidardesign.scene import Body, Box, Medium, Receiver, Scene, rigid
 from lidardesign.simulate.detector.detector import IDEAL, Detector, Photons
 from lidardesign.simulate.effects.atmosphere import through_air

@@ -28,7 +28,7 @@ from support.tables import each_row
 
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.scene import Ambient, Body, Box, Capsule, Medium, Mesh, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector.detector import metres
+from lidardesign.simulate.detector.detector import Physics, metres
 from lidardesign.simulate.effects.expected_counts import (
     Blindness,
     estimate_error_m,
@@ -40,10 +40,8 @@ from lidardesign.simulate.effects.expected_counts import (
 from lidardesign.simulate.effects.first_hits import FirstHits, edge_probability
 from lidardesign.simulate.effects.motion import entered_rays, moving_tracer, point_velocities
 from lidardesign.simulate.effects.multipath import _detours, _moved_m
-from lidardesign.simulate.measure import followed_light, photon_histograms
-from lidardesign.simulate.physics import Physics
 from lidardesign.simulate.plan import Planner, Tolerance
-from lidardesign.simulate.simulate import simulate
+from lidardesign.simulate.simulate import followed_light, photon_histograms, simulate
 
 
 def bound(name, scene, detector, rays=None):

@@ -14,9 +14,8 @@ from lidardesign.evaluate.baselines.candidates import even_placement, rays_at
 from lidardesign.evaluate.results import Audit, AuditRow
 from lidardesign.geometry.rays import fire_times
 from lidardesign.scene import Body, Box, rigid
-from lidardesign.simulate.detector.detector import Detector
+from lidardesign.simulate.detector.detector import Detector, Physics
 from lidardesign.simulate.detector.files import load_detector
-from lidardesign.simulate.physics import Physics
 from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import direction

@@ -13,12 +13,11 @@ from support.transients import needs_simulator, rays_from, spiral
 from lidardesign.geometry.raycast import shared_caster
 from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector.detector import Detector
+from lidardesign.simulate.detector.detector import Detector, Physics
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.light import Beams, direct_echoes
 from lidardesign.simulate.light_transport.multipath_bound import Detours, lamp_bound, pixel_bound, series
 from lidardesign.simulate.light_transport.transport import Lights, PathBins, render_transient
-from lidardesign.simulate.physics import Physics
 from lidardesign.simulate.simulate import simulate
 
 REFLECTANCE = 0.6

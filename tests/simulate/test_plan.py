@@ -14,8 +14,7 @@ from support.tables import each_row
 from lidardesign.errors import ConfigError
 from lidardesign.scene import Ambient, Body, Box, Medium, Receiver, Scene, Sphere, rigid
 from lidardesign.simulate import plan as plan_module
-from lidardesign.simulate.detector.detector import IDEAL
-from lidardesign.simulate.physics import EFFECTS
+from lidardesign.simulate.detector.detector import EFFECTS, IDEAL
 from lidardesign.simulate.plan import Planner, Tolerance, parse_effects
 from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import Metric

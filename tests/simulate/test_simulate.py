@@ -17,10 +17,9 @@ from lidardesign.errors import ConfigError
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome
 from lidardesign.scene import Ambient, Body, Box, Capsule, Medium, Mesh, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector.detector import IDEAL
+from lidardesign.simulate.detector.detector import EFFECTS, IDEAL, Physics
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.light import Beams, direct_echoes
-from lidardesign.simulate.physics import EFFECTS, Physics
 from lidardesign.simulate.simulate import build_casters, simulate, simulate_many
 
 

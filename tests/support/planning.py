@@ -7,11 +7,10 @@ import numpy as np
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Rays
 from lidardesign.scene import Body, Box, Scene, Sphere, rigid
-from lidardesign.simulate.detector.detector import Detector
+from lidardesign.simulate.detector.detector import EFFECTS, Detector
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import FirstHits
-from lidardesign.simulate.physics import EFFECTS
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import direction
 

@@ -6,9 +6,8 @@ import numpy as np
 
 from lidardesign.scene import Body, Scene, Sphere
 from lidardesign.simulate.detector.detection import ArrivingLight, count_photons, detect
-from lidardesign.simulate.detector.detector import Detector, Photons
+from lidardesign.simulate.detector.detector import Detector, Photons, Physics
 from lidardesign.simulate.light import Background, Echoes
-from lidardesign.simulate.physics import Physics
 
 WAVELENGTH_M = 905e-9
 PULSES = 1000

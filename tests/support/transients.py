@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
+from lidardesign.geometry.frames import receiver_axes
 from lidardesign.geometry.rays import Rays
-from lidardesign.geometry.receiver import receiver_axes
 from lidardesign.scene import Receiver
 from lidardesign.simulate.light_transport import process
 from support.rays import rays_along

@@ -21,19 +21,18 @@ from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.evaluate.metrics import is_received, is_visible, trial_origins
+from lidardesign.geometry.frames import in_view, path_of_range, path_windows, range_of_path
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Outcome
-from lidardesign.geometry.receiver import in_view, path_of_range, path_windows, range_of_path
 from lidardesign.run.yaml import parse_yaml
 from lidardesign.samples import Samples
 from lidardesign.scene import Body, Box, Plane, Receiver, Scene, Sphere, rigid
-from lidardesign.simulate.detector.detector import IDEAL
+from lidardesign.simulate.detector.detector import EFFECTS, IDEAL, Physics
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import FirstHits
 from lidardesign.simulate.effects.multipath import _hidden, bound
 from lidardesign.simulate.light import Beams, direct_echoes
-from lidardesign.simulate.physics import EFFECTS, Physics
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import RANGE, aim
 

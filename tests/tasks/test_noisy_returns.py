@@ -22,8 +22,7 @@ from lidardesign.evaluate.baselines.candidates import rays_at
 from lidardesign.evaluate.scene_scores import checked_score, score_lists
 from lidardesign.geometry.rays import Outcome
 from lidardesign.scene import Body, Box, Mesh, Scene, rigid
-from lidardesign.simulate.detector.detector import Detector
-from lidardesign.simulate.physics import Physics
+from lidardesign.simulate.detector.detector import Detector, Physics
 from lidardesign.simulate.simulate import build_casters, simulate
 from lidardesign.space import DIMENSIONS, RANGE, DesignSpace
 from lidardesign.task import Metric, Score, conditions_of, scenes_of

@@ -21,7 +21,7 @@ from support.rays import rays_of_points
 from support.tables import each_row
 
 from lidardesign.errors import ConfigError, DataError
-from lidardesign.geometry.rotation import rotation_of_quaternion, rotation_of_rpy
+from lidardesign.geometry.frames import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.scene import rigid
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import aim

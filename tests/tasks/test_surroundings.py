@@ -22,8 +22,8 @@ from support.tables import each_row
 
 from lidardesign.geometry.raycast import shared_caster
 from lidardesign.scene import Ambient
+from lidardesign.simulate.detector.detector import Physics
 from lidardesign.simulate.detector.files import load_detector
-from lidardesign.simulate.physics import Physics
 from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import direction

@@ -15,7 +15,7 @@ from support.small_runs import shifted
 import lidardesign
 from lidardesign.design.fit import fit
 from lidardesign.errors import ConfigError, DataError, InfeasibleError, ThresholdError
-from lidardesign.evaluate.refinement.refinement import Refiner
+from lidardesign.evaluate.refinement import Refiner
 
 SCRIPT = '''
 import lidardesign as ld

@@ -18,7 +18,7 @@ from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import design_document, load_design
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts.rays import lay_out
-from lidardesign.evaluate.refinement.reweighting import Reweighting
+from lidardesign.evaluate.reweighting import Reweighting
 from lidardesign.evaluate.scene_scores import checked_score
 from lidardesign.export.ray_lists import read_npz
 from lidardesign.geometry.rays import Rays

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Output, command, keep_times
-from lidardesign.cli.streams import claim_outputs, written_file
+from lidardesign.cli.output import Output, claim_outputs, command, keep_times, written_file
 from lidardesign.cli.tables.designs import number
 from lidardesign.cli.tables.grids import print_table
 from lidardesign.errors import ConfigError, DataError, check_choice

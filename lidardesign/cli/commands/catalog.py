@@ -202,7 +202,7 @@ def _under(part: Part, reflectance: float | None, klux: float | None) -> Part:
 
 def _placed(part: Part, given: dict[str, Any], name: str, output: Output) -> DesignSpec:
     """The design of a part that the options ask for."""
-    from lidardesign.design.catalog.placing import interleaved, part_design, parts_for, side_by_side
+    from lidardesign.design.catalog.library import interleaved, part_design, parts_for, side_by_side
     from lidardesign.design.sensor import MOST_RAYS
 
     count, number = given["--rays"], given["--parts"]
@@ -213,7 +213,7 @@ def _placed(part: Part, given: dict[str, Any], name: str, output: Output) -> Des
     # Where the options put the first part
     import numpy as np
 
-    from lidardesign.design.catalog.placing import Pose
+    from lidardesign.design.catalog.library import Pose
     from lidardesign.space import FARTHEST_M
 
     degrees = {option: given[option] or 0.0 for option in ("--azimuth-deg", "--elevation-deg", "--roll-deg")}

@@ -9,8 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Output, command
-from lidardesign.cli.streams import is_output, note_new_folders, put_on_stdout
+from lidardesign.cli.output import Output, command, is_output, note_new_folders, put_on_stdout
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.clock import phase
 

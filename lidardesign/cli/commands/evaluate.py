@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Output, command, keep_times, show_plan
-from lidardesign.cli.streams import claim_outputs, is_output, written_file
+from lidardesign.cli.output import Output, claim_outputs, command, is_output, keep_times, show_plan, written_file
 from lidardesign.cli.tables.designs import number
 from lidardesign.cli.tables.scores import show_evaluation
 from lidardesign.errors import ConfigError, ThresholdError
@@ -213,7 +212,7 @@ def evaluate(
 
         def show(rich: RichConsole) -> None:
             if scores.evaluation.accuracy is not None:
-                from lidardesign.cli.tables.times import show_accuracy
+                from lidardesign.cli.tables.scores import show_accuracy
 
                 show_accuracy(scores.evaluation.accuracy, rich)
             show_evaluation(shown, written, rich)

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lidardesign.cli import options
-from lidardesign.cli.output import Output, command, keep_times, show_plan
-from lidardesign.cli.streams import claim_stdout, note_new_folders, written_file
+from lidardesign.cli.output import Output, claim_stdout, command, keep_times, note_new_folders, show_plan, written_file
 from lidardesign.errors import ConfigError
 from lidardesign.run.clock import phase
 

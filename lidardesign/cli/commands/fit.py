@@ -1,4 +1,4 @@
-"""`lidardesign fit`: fit sensors to a learned density."""
+"""`lidardesign fit` and `constrain`: sensors for the density of a run, free or under constraints; neither trains."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lidardesign.run.clock import WAIT_S, phase
 if TYPE_CHECKING:
     from rich.console import Console as RichConsole
 
-    from lidardesign.evaluate.refinement.refinement import Round
+    from lidardesign.evaluate.refinement import Round
     from lidardesign.workflow.fit import FitRequest
 
 
@@ -111,3 +111,67 @@ def _show_refinement(document: Mapping[str, Any], rich: RichConsole) -> None:
         figures = (number(entry["score"]), number(entry["bandwidth_mbps"], 3), "yes" if entry["kept"] else "no")
         table.add_row(str(entry["round"]), escape(entry["change"]), *figures, number(entry["seconds"], 2))
     rich.print(table)
+
+
+Target = Annotated[
+    Path, typer.Argument(metavar="RUN|DESIGN", readable=False, help="A run folder, or a design that came from one.")
+]
+
+
+def constrain(
+    target: Target,
+    constraints: Annotated[
+        Path | None,
+        typer.Option("--constraints", metavar="FILE", help="YAML file; keys: docs/constraints.md.", show_default=False),
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="One constraint: gate.width_m.max=0.1; repeatable.", show_default=False
+        ),
+    ] = None,
+    sensors: options.Sensors = None,
+    layout: options.Layout = None,
+    rays: options.RayCount = None,
+    gates: options.Gates = None,
+    level: options.Level = None,
+    at: options.At = None,
+    weights: options.Weights = None,
+    refine: options.Refine = None,
+    like: options.Like = None,
+    name: options.Name = "constrained",
+    dry_run: options.DryRun = False,
+    seed: options.Seed = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Fit sensors again under constraints: seconds, nothing is learned again."""
+    with command(json=json, quiet=quiet, debug=debug) as output:
+        with phase("libraries"):
+            from lidardesign.design.constraints.document import Constraints
+            from lidardesign.workflow.fit import FitOptions, FitRequest, load_constraints
+            from lidardesign.workflow.run_folder import need_run, open_target
+
+        chosen = FitOptions(
+            sensors=options.sensor_count(sensors),
+            constraints=load_constraints(constraints, overrides or (), output.remark) or Constraints(),
+            layout=layout,
+            rays=rays,
+            gates=gates,
+            level=level,
+            at=options.parse_at(at),
+            weights=weights or (),
+            refine=refine,
+            like=like,
+            name=name,
+            seed=seed,
+        )
+        run, design = open_target(target, output.remark)
+        files = [path for path in (target if design else None, constraints) if path is not None]
+        request = FitRequest.resolve(
+            need_run(run, target), chosen, design, files=files, notes=output.remark
+        )
+        if dry_run:
+            return show_plan(request.plan(), output)
+        run_fit(request, output)

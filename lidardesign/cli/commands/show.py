@@ -1,15 +1,16 @@
-"""`lidardesign show`: print a design for people."""
+"""`lidardesign show` and `compare`: a design for people, and two designs beside each other."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from lidardesign.cli import options
 from lidardesign.cli.output import command
 from lidardesign.cli.tables.designs import number, show_constraints, show_design
+from lidardesign.cli.tables.grids import print_table
 from lidardesign.errors import LidardesignError
 from lidardesign.run.clock import phase
 
@@ -92,3 +93,97 @@ def _show_readout(readout: Readout, rich: RichConsole) -> None:
     bins = f"({number(model.bin_ps)} ps bins of {number(model.bits_per_bin)} bits, {number(model.rate_hz)} frames/s)"
     rich.print(f"bandwidth: {span} Mbit/s for {rays}", soft_wrap=True, markup=False)
     rich.print(bins, soft_wrap=True, markup=False)
+
+
+RayCounts = Annotated[
+    list[int] | None,
+    typer.Option(
+        "--rays",
+        metavar="N",
+        min=1,
+        max=1_000_000,
+        help="Rays per frame at which scores are compared; repeatable.",
+        show_default="both as they are, else the task's",
+    ),
+]
+# What rounding leaves of no difference is none.
+DECIMALS = 6
+SCORE_COLUMNS = ("design", "rays", "value", "95 % interval", "failures", "Mbit/s")
+SENSOR_COLUMNS = (
+    "first", "second", "place [m]", "looks [deg]", "field of view [deg]", "gate start [m]", "gate end [m]", "weight",
+)  # fmt: skip
+
+
+def compare(
+    first: Annotated[
+        Path, typer.Argument(metavar="DESIGN", readable=False, help="A design file, or the file of a rig.")
+    ],
+    second: Annotated[Path, typer.Argument(metavar="OTHER", readable=False, help="The design to compare it with.")],
+    space_of: options.SpaceOf = None,
+    rays: RayCounts = None,
+    seed: options.Seed = None,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
+    debug: options.Debug = False,
+) -> None:
+    """Compare two designs: what differs in their sensors, and in their scores on held-out scenes of a run."""
+    with command(json=json, quiet=quiet, debug=debug) as output:
+        with phase("libraries"):
+            from lidardesign.workflow.compare import compare_designs
+
+        document = compare_designs((first, second), space_of, rays, seed, output.remark)
+        output.result(document, lambda rich: _show(document, rich))
+
+
+def _show(document: dict[str, Any], rich: RichConsole) -> None:
+    from rich.markup import escape
+
+    for place, design in zip(("first", "second"), document["designs"], strict=True):
+        sensors = "1 sensor" if design["sensors"] == 1 else f"{design['sensors']} sensors"
+        cost = design["bandwidth"]
+        rays = "rays left open" if cost["rays"] is None else f"{cost['rays']} rays, {number(cost['high_mbps'])} Mbit/s"
+        rich.print(escape(f"{place}: {design['name']}, {sensors}, layout {design['layout']}, {rays}"), soft_wrap=True)
+    lines = []
+    for pair in document["sensors"]:
+        apart, cells = pair["difference"], ["-"] * len(SENSOR_COLUMNS[2:])
+        if apart is not None:
+            cells = [
+                *(number(round(apart[name], DECIMALS), 3) for name in ("place_m", "boresight_deg")),
+                f"{_signed(apart['horizontal_deg'])} x {_signed(apart['vertical_deg'])}",
+                *(_signed(apart[name], 3) for name in ("gate_start_m", "gate_end_m", "weight")),
+            ]
+        lines.append([pair["a"] or "-", pair["b"] or "-", *cells])
+    print_table("sensors: second minus first", SENSOR_COLUMNS, lines, rich, text=SENSOR_COLUMNS[:2])
+    metric = document["metric"]
+    if metric is None:
+        return
+    title = f"{metric['name']} [{metric['unit']}], {metric['better']} is better"
+    title += f", over {document['scenes']} held-out scenes"
+    rows = [
+        [
+            row["design"],
+            *(number(row[name]) for name in ("rays", "value")),
+            f"{number(row['ci_low'])} - {number(row['ci_high'])}",
+            *(number(row[name]) for name in ("failures", "bandwidth_mbps")),
+        ]
+        for row in document["rows"]
+    ]
+    print_table(escape(title), SCORE_COLUMNS, rows, rich)
+    for pair in document["paired"]:
+        rich.print(escape(_verdict(pair, metric)), soft_wrap=True)
+
+
+def _signed(value: float, decimals: int = 2) -> str:
+    return f"{round(value, decimals) + 0.0:+.{decimals}f}"
+
+
+def _verdict(pair: dict[str, Any], metric: dict[str, Any]) -> str:
+    """Which of two is better in the scenes that both met, and how surely."""
+    rays = f"{pair['rays']}" if pair.get("rays_b") in (None, pair["rays"]) else f"{pair['rays']} and {pair['rays_b']}"
+    low, high, unit = pair["ci_low"], pair["ci_high"], metric["unit"]
+    span = f"{pair['a']} minus {pair['b']}: {number(pair['difference'], 3)} {unit}, 95 % interval {number(low, 3)} to "
+    span += f"{number(high, 3)}, with {rays} rays"
+    if low <= 0 <= high:
+        return f"{span}: no difference is shown"
+    lower, higher = (pair["a"], pair["b"]) if pair["difference"] < 0 else (pair["b"], pair["a"])
+    return f"{span}: {lower if metric['better'] == 'lower' else higher} is better"

@@ -30,8 +30,8 @@ from lidardesign.config import DensitySettings
 from lidardesign.density.fields.bodies import Bodies, Pairs, occluding_bodies
 from lidardesign.density.fields.distance import scene_columns
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.frames import receiver_axes
 from lidardesign.geometry.raycast import shared_caster, trace_each
-from lidardesign.geometry.receiver import receiver_axes
 from lidardesign.geometry.triangles import mesh_caster
 from lidardesign.scene import Receiver, Scene
 from lidardesign.space import AZIMUTH, ELEVATION, RANGE, direction

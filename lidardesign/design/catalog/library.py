@@ -1,16 +1,36 @@
-"""The catalogue: the parts that are shipped, and a user's own files or folders of parts."""
+"""The catalogue of real parts, and parts at places: their rays, their sensors, and designs of them.
+
+A real part at a place: its rays, its sensor in the design space, and a design of one or several of it.
+
+A part fires its own pattern. Of fewer rays than it has, the evenly spread subset is taken; more rays than it has take
+more parts, whose rays share the number equally.
+"""
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
-from lidardesign.design.catalog.part import Part
+import numpy as np
+
+from lidardesign.design.catalog.part import Part, even_subset
 from lidardesign.design.catalog.statements import PartFile
+from lidardesign.design.layouts.grid import grid_rows, grid_tangent
+from lidardesign.design.sensor import (
+    DEFAULT_LEVEL,
+    MOST_RAYS,
+    DesignSpec,
+    Sensor,
+    boresight_frame,
+    boresight_of,
+    interval_factor,
+)
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
 from lidardesign.run.validation import check_model, suggest
 from lidardesign.run.yaml import load_yaml
@@ -141,3 +161,193 @@ def read_part(path: Path) -> PartFile:
     if not document.mapping:
         raise ConfigError("says nothing about a part", where=str(path), hint="docs/catalog.md shows a part file")
     return check_model(PartFile, document.mapping, document.locate)
+
+
+Wanted = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Where a part stands and how it is turned; its forward axis looks along the boresight.
+
+    Arguments:
+        origin_m: Shape (3,).
+        azimuth_rad, elevation_rad, roll_rad: Of its forward axis, as a sensor's boresight.
+    """
+
+    origin_m: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    azimuth_rad: float = 0.0
+    elevation_rad: float = 0.0
+    roll_rad: float = 0.0
+
+    @property
+    def frame(self) -> np.ndarray:
+        """Rows forward, horizontal, vertical, shape (3, 3): directions in the part's frame @ frame are the world's."""
+        return boresight_frame(self.azimuth_rad, self.elevation_rad, self.roll_rad)
+
+
+def looking_at(part: Part, origin_m: np.ndarray, azimuth_rad: float, elevation_rad: float) -> Pose:
+    """The pose in which the centre of a part's field looks somewhere, with its field upright there.
+
+    A part whose field is not centred on its forward axis is tilted by what the centre is off.
+    """
+    frame = boresight_frame(*part.centre_rad).T @ boresight_frame(azimuth_rad, elevation_rad)
+    return Pose(np.asarray(origin_m, dtype=np.float64), *boresight_of(frame))
+
+
+def parts_for(part: Part, count: int) -> int:
+    """How many parts of a kind fire `count` rays; at least one."""
+    return max(-(-count // part.rays), 1)
+
+
+def part_rays(
+    part: Part, poses: Pose | Sequence[Pose], count: int | None = None, *, wanted: Wanted | None = None
+) -> Rays:
+    """The rays of parts at poses, in the order in which each fires.
+
+    Arguments:
+        part: The kind of part; its range is the gate of every ray, its rate says how long a frame lasts.
+        poses: One part stands at each.
+        count: Rays in all; None is every ray of every part. The parts share them equally, the first ones take what
+            is left over, and each fires an evenly spread subset of its pattern.
+        wanted: Which unit vectors (N, 3) of the world are worth firing, bool (N,): the subset is taken among those
+            where there are enough, and other rays fill it up.
+
+    Raises:
+        ConfigError: No pose; more rays than the parts have, or than any design may.
+    """
+    poses = [poses] if isinstance(poses, Pose) else list(poses)
+    if not poses:
+        raise ConfigError(f"no pose for {part.name}", where="catalog", allowed="at least one")
+    capacity = part.rays * len(poses)
+    total = capacity if count is None else count
+    if not 0 <= total <= min(capacity, MOST_RAYS):
+        raise ConfigError(
+            f"{total} rays of {len(poses)} x {part.name}",
+            where="catalog",
+            allowed=f"at most {min(capacity, MOST_RAYS)} ({part.rays} each)",
+            hint=f"{parts_for(part, total)} parts have as many",
+        )
+    shares = [total // len(poses) + (index < total % len(poses)) for index in range(len(poses))]
+    looking = [_chosen(part.directions @ pose.frame, share, wanted) for pose, share in zip(poses, shares, strict=True)]
+    sensor = np.repeat(np.arange(len(poses)), shares)
+    # all parts run at once, each over its own frame
+    times = [np.arange(share) / (max(share, 1) * part.rate_hz) for share in shares]
+    return Rays(
+        np.array([pose.origin_m for pose in poses], dtype=np.float64)[sensor],
+        np.concatenate(looking),
+        np.tile(part.range_m, (total, 1)),
+        sensor,
+        np.concatenate(times),
+    )
+
+
+def _chosen(directions: np.ndarray, count: int, wanted: Wanted | None) -> np.ndarray:
+    """An evenly spread subset of a part's rays, of the wanted ones first, shape (count, 3)."""
+    if count == len(directions) or wanted is None:
+        return directions[even_subset(directions, count)]
+    mask = np.asarray(wanted(directions), dtype=bool)
+    first, other = np.flatnonzero(mask), np.flatnonzero(~mask)
+    if len(first) >= count:
+        return directions[first[even_subset(directions[first], count)]]
+    rest = other[even_subset(directions[other], count - len(first))]
+    return directions[np.sort(np.concatenate([first, rest]))]
+
+
+def part_sensor(
+    part: Part,
+    pose: Pose,
+    *,
+    name: str = "s0",
+    weight: float = 1.0,
+    rays: int | None = None,
+    level: float = DEFAULT_LEVEL,
+) -> Sensor:
+    """The part as a component of design space: its field of view and its range are the intervals that hold `level`.
+
+    The boresight is the centre of the field. A field of a full turn is a ring about the part's axis, of which the
+    component is the Gaussian of the same extents; what the part does see is said by its rays.
+    """
+    azimuth, elevation, roll = boresight_of(boresight_frame(*part.centre_rad) @ pose.frame)
+    horizontal, vertical = part.field_of_view_rad
+    near, far = part.range_m
+    half = interval_factor(level)
+    return Sensor(
+        name=name,
+        weight=weight,
+        origin_m=np.asarray(pose.origin_m, dtype=np.float64),
+        origin_covariance_m2=np.zeros((3, 3)),
+        azimuth_rad=azimuth,
+        elevation_rad=elevation,
+        roll_rad=roll,
+        spread_horizontal_rad=horizontal / (2 * half),
+        spread_vertical_rad=vertical / (2 * half),
+        range_m=(near + far) / 2,
+        spread_range_m=(far - near) / (2 * half),
+        level=level,
+        rays=rays,
+        part=part.name,
+    )
+
+
+def part_design(
+    part: Part,
+    poses: Pose | Sequence[Pose],
+    count: int | None = None,
+    *,
+    name: str | None = None,
+    level: float = DEFAULT_LEVEL,
+    wanted: Wanted | None = None,
+) -> DesignSpec:
+    """A design of real parts at poses, with the explicit rays of their patterns; see `part_rays`.
+
+    Its layout is `fixed`: at fewer rays it fires an evenly spread subset, more it does not have.
+
+    Raises:
+        ConfigError: See `part_rays`.
+    """
+    poses = [poses] if isinstance(poses, Pose) else list(poses)
+    rays = part_rays(part, poses, count, wanted=wanted)
+    shares = np.bincount(rays.sensor, minlength=len(poses))
+    sensors = tuple(
+        part_sensor(part, pose, name=f"s{index}", weight=1 / len(poses), rays=int(shares[index]), level=level)
+        for index, pose in enumerate(poses)
+    )
+    return DesignSpec(
+        name=name or part.name.replace(":", "-"),
+        sensors=sensors,
+        layout="fixed",
+        rays=len(rays),
+        ray_table=rays.as_angles(),
+        provenance={"catalog": part.name, "product": part.product, "rate_hz": part.rate_hz},
+        level=level,
+    )
+
+
+def side_by_side(part: Part, pose: Pose, number: int) -> list[Pose]:
+    """Poses at one place whose fields of view stand beside each other, around that of one pose.
+
+    Fields of more than half a turn stand above each other; line scanners are rolled evenly over half a turn.
+    """
+    horizontal, vertical = part.field_of_view_rad
+    if vertical == 0:
+        return [replace(pose, roll_rad=pose.roll_rad + math.pi * index / number) for index in range(number)]
+    rows = np.ones(number, dtype=np.int64) if horizontal > math.pi else grid_rows(horizontal, vertical, number)
+    across = np.concatenate([np.arange(n) - (n - 1) / 2 for n in rows])
+    up = np.repeat(np.arange(len(rows)) - (len(rows) - 1) / 2, rows)
+    return [_rotate(pose, *shift) for shift in zip(across * horizontal, up * vertical, strict=True)]
+
+
+def interleaved(part: Part, pose: Pose, number: int) -> list[Pose]:
+    """Poses at one place that see the same, each with its rays between those of the others.
+
+    The shifts are an even grid in one cell of the pattern: four parts of 8 x 8 zones have 16 x 16.
+    """
+    horizontal, vertical = part.field_of_view_rad
+    columns, rows = part.grid
+    return [_rotate(pose, *shift) for shift in grid_tangent(horizontal / columns, vertical / rows, number)]
+
+
+def _rotate(pose: Pose, azimuth_rad: float, elevation_rad: float) -> Pose:
+    """A pose turned about its own place by an azimuth and an elevation in its own frame."""
+    return Pose(pose.origin_m, *boresight_of(boresight_frame(azimuth_rad, elevation_rad) @ pose.frame))

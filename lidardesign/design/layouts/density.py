@@ -18,8 +18,15 @@ from scipy.special import ndtri
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.constraints.document import Constraints
-from lidardesign.design.layouts.fields import FIELD_ROUNDING_RAD, Members, members, ray_gates, rays_in_fields
-from lidardesign.design.layouts.gates import RayRanges, gates_within
+from lidardesign.design.layouts.gates import (
+    FIELD_ROUNDING_RAD,
+    Members,
+    RayRanges,
+    gates_within,
+    members,
+    ray_gates,
+    rays_in_fields,
+)
 from lidardesign.design.layouts.grid import field_on_sphere, grid_tangent
 from lidardesign.design.layouts.layout import FittedDesign, Layout, missing_samples, shares_of
 from lidardesign.design.layouts.quantise import lloyd, samples_for

@@ -35,13 +35,19 @@ from scipy.special import chdtri, ndtri
 
 from lidardesign.design.constraints.document import Constraints, rules_of
 from lidardesign.design.constraints.origins import box_around, free_boxes, inside_excluded, origin_box
-from lidardesign.design.layouts.fields import FIELD_ROUNDING_RAD, SMALLEST_ANGLE_RAD, SMALLEST_LENGTH
-from lidardesign.design.layouts.gates import SMALLEST_CELL, bounded_gates, central_intervals
+from lidardesign.design.layouts.gates import (
+    FIELD_ROUNDING_RAD,
+    SMALLEST_ANGLE_RAD,
+    SMALLEST_CELL,
+    SMALLEST_LENGTH,
+    bounded_gates,
+    central_intervals,
+)
 from lidardesign.design.layouts.grid import field_on_sphere, low_discrepancy
 from lidardesign.design.layouts.layout import Layout, shares_of
 from lidardesign.design.layouts.quantise import lloyd, samples_for
 from lidardesign.design.mixture.bounds import Bounds, bounds_of
-from lidardesign.design.mixture.coupling import conditional_means, conditional_spreads, relative
+from lidardesign.design.mixture.ensemble import conditional_means, conditional_spreads, relative
 from lidardesign.design.mixture.features import Axes, Features, ray_features
 from lidardesign.design.sensor import DesignSpec, Gates, Sensor, interval_factor, tangent_directions
 from lidardesign.geometry.rays import DEFAULT_RATE_HZ, Rays, fire_times

@@ -14,10 +14,9 @@ from lidardesign.design.bandwidth import split_budget
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.layouts.sensor_fit import FitProblem, fit_sensors
 from lidardesign.design.layouts.track import placed
-from lidardesign.design.mixture.conditions import fixed_conditions
 from lidardesign.design.mixture.ensemble import Ensemble
 from lidardesign.design.mixture.mixture import log_density
-from lidardesign.design.mixture.support import Support
+from lidardesign.design.mixture.support import Support, fixed_conditions
 from lidardesign.design.sensor import DesignSpec, Gates, LayoutName, Sensor
 from lidardesign.errors import ConfigError
 from lidardesign.estimates import Estimate

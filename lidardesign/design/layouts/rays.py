@@ -16,12 +16,11 @@ from lidardesign.design.catalog.part import even_subset
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.layouts.density import DensityLayout
 from lidardesign.design.layouts.distributed import DistributedLayout
-from lidardesign.design.layouts.fields import GridLayout
+from lidardesign.design.layouts.gates import GridLayout
 from lidardesign.design.layouts.layout import Layout
 from lidardesign.design.layouts.scan import ScanLayout, TrackLayout
 from lidardesign.design.layouts.track import moved, placed
-from lidardesign.design.mixture.conditions import conditioned
-from lidardesign.design.mixture.support import Retarget
+from lidardesign.design.mixture.support import Retarget, conditioned
 from lidardesign.design.sensor import DesignSpec, Gates
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import DEFAULT_RATE_HZ, Rays, fire_times

@@ -32,20 +32,18 @@ import numpy as np
 from lidardesign.design.constraints.budget import BandwidthBudget, fit_within_budget
 from lidardesign.design.constraints.document import Constraints, SensorRules
 from lidardesign.design.constraints.origins import free_boxes, is_mounted, origin_box
-from lidardesign.design.layouts.fields import members, ray_gates, rays_in_fields
-from lidardesign.design.layouts.gates import admissible_gates, central_intervals
+from lidardesign.design.layouts.gates import admissible_gates, central_intervals, members, ray_gates, rays_in_fields
 from lidardesign.design.layouts.layout import FittedDesign, Layout, likelihood_estimate, missing_samples, shares_of
 from lidardesign.design.layouts.quantise import SAMPLES_PER_RAY, lloyd
 from lidardesign.design.layouts.sensor_fit import FitProblem, admitted_samples, group_samples
 from lidardesign.design.layouts.track import TRAVELLED, boresight_azimuth, interpolated
 from lidardesign.design.layouts.track_kmeans import TrackSamples, aimed_rays
 from lidardesign.design.mixture.bounds import Bounds, Group, bounds_of
-from lidardesign.design.mixture.conditions import fixed_conditions
 from lidardesign.design.mixture.em import EMResult, mixture_of_labels
 from lidardesign.design.mixture.ensemble import Ensemble, GroupSamples, sensors_of
 from lidardesign.design.mixture.features import Axes, Features, ray_features
 from lidardesign.design.mixture.mixture import Mixture, log_density
-from lidardesign.design.mixture.support import check_support, restrict_samples
+from lidardesign.design.mixture.support import check_support, fixed_conditions, restrict_samples
 from lidardesign.design.sensor import DEFAULT_LEVEL, DesignSpec, Gates, Sensor, Track, interval_factor
 from lidardesign.design.snap.parts import wants_parts
 from lidardesign.errors import ConfigError, InfeasibleError

@@ -13,10 +13,10 @@ from lidardesign.design.constraints.document import Constraints, SensorRules
 from lidardesign.design.constraints.feasibility import most_rays
 from lidardesign.design.constraints.origins import is_mounted, most_mounted
 from lidardesign.design.mixture.bounds import bounds_of, sensor_groups
-from lidardesign.design.mixture.coupling import add_couplings
 from lidardesign.design.mixture.ensemble import (
     Ensemble,
     GroupSamples,
+    add_couplings,
     choose_mounts,
     fit_groups,
     heaviest_first,

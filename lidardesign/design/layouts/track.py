@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidardesign.design.mixture.conditions import condition_text
+from lidardesign.design.mixture.support import condition_text
 from lidardesign.design.sensor import DesignSpec, Sensor, Track, interval_factor
 from lidardesign.errors import ConfigError
 from lidardesign.geometry.rays import Rays

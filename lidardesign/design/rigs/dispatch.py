@@ -11,10 +11,15 @@ import re
 from pathlib import Path
 
 from lidardesign.design.rigs.mjcf import read_mjcf
-from lidardesign.design.rigs.ray_lists import read_ray_csv, read_ray_npz
+from lidardesign.design.rigs.ray_lists import (
+    QUERY_COLUMN,
+    SENSOR_COLUMNS,
+    begins_as_sensor_csv,
+    read_ray_csv,
+    read_ray_npz,
+)
 from lidardesign.design.rigs.rig import Rig, number_of
 from lidardesign.design.rigs.sdf import read_sdf
-from lidardesign.design.rigs.sensor_csv import COLUMNS, QUERY_COLUMN, begins_as_sensor_csv
 from lidardesign.errors import DataError
 from lidardesign.run.xml import read_xml
 
@@ -71,10 +76,10 @@ def read_rig(path: Path, head: bytes) -> Rig | None:
     if separator is not None:
         raise _wrong_separator(separator, f"{path}:1")
     cells = [cell.strip() for cell in next(csv.reader([first]))]
-    if not any(cell in (*COLUMNS, QUERY_COLUMN) or number_of(cell) is not None for cell in cells):
+    if not any(cell in (*SENSOR_COLUMNS, QUERY_COLUMN) or number_of(cell) is not None for cell in cells):
         return read_ray_csv(path)
     # the research code's table begins with numbers, or with names of its columns
-    if len(cells) not in (len(COLUMNS), len(COLUMNS) + 1) and not {*cells} & {*COLUMNS}:
+    if len(cells) not in (len(SENSOR_COLUMNS), len(SENSOR_COLUMNS) + 1) and not {*cells} & {*SENSOR_COLUMNS}:
         found = "line 1 has numbers and no names of columns"
         raise DataError(found, where=f"{path}:1", allowed=ALLOWED[CSV], hint=HEADER_HINT)
     return None

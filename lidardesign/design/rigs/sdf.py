@@ -23,7 +23,7 @@ import numpy as np
 from lidardesign.design.rigs.rig import MOST_SENSORS, Aim, Rig, RigSensor
 from lidardesign.design.sensor import MOST_RAYS, boresight_frame, boresight_of
 from lidardesign.errors import DataError
-from lidardesign.geometry.rotation import rotation_of_quaternion, rotation_of_rpy
+from lidardesign.geometry.frames import rotation_of_quaternion, rotation_of_rpy
 from lidardesign.run.xml import Element, numbers_of, read_xml
 from lidardesign.scene import inverse_rigid, rigid
 from lidardesign.space import FULL_TURN, angles, direction

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lidardesign.design.bandwidth import split_budget
-from lidardesign.design.catalog.placing import Pose, interleaved, part_rays, part_sensor
+from lidardesign.design.catalog.library import Pose, interleaved, part_rays, part_sensor
 from lidardesign.design.constraints.budget import BandwidthBudget
 from lidardesign.design.constraints.document import Constraints, SensorRules, rules_of
 from lidardesign.design.constraints.origins import fix_origins
@@ -24,8 +24,14 @@ from lidardesign.design.layouts.grid import field_on_sphere, grid_tangent
 from lidardesign.design.mixture.ensemble import Ensemble, sensors_of
 from lidardesign.design.mixture.features import Features
 from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor, tangent_directions
-from lidardesign.design.snap.parts import PartChoice, PartOptions, fit_part_poses, nearest_parts, part_options
-from lidardesign.design.snap.shapes import useful_ray_filter
+from lidardesign.design.snap.parts import (
+    PartChoice,
+    PartOptions,
+    fit_part_poses,
+    nearest_parts,
+    part_options,
+    useful_ray_filter,
+)
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.geometry.rays import Rays
 from lidardesign.space import DesignSpace, angles

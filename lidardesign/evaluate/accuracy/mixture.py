@@ -21,11 +21,10 @@ from lidardesign.design.fit import EM_SAMPLES, RESTARTS
 from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.layouts.sensor_fit import HELD_OUT_SHARE
 from lidardesign.design.mixture.bounds import Bounds, bounds_of, sensor_groups
-from lidardesign.design.mixture.conditions import MOVED_SAMPLES, at_condition, condition_text
 from lidardesign.design.mixture.em import fit_mixture
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.mixture import log_density
-from lidardesign.design.mixture.support import LEAST_SAMPLES
+from lidardesign.design.mixture.support import LEAST_SAMPLES, MOVED_SAMPLES, at_condition, condition_text
 from lidardesign.design.sensor import DesignSpec, interval_factor
 from lidardesign.evaluate.accuracy.probes import AccuracyRequest
 from lidardesign.evaluate.accuracy.settings import Measurement, Sweep, with_memory

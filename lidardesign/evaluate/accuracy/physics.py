@@ -16,13 +16,12 @@ from lidardesign.evaluate.accuracy.probes import AccuracyRequest
 from lidardesign.evaluate.accuracy.settings import Measurement, Sweep, timed, with_memory
 from lidardesign.evaluate.baselines.candidates import Positions
 from lidardesign.evaluate.scene_scores import score_lists
+from lidardesign.geometry.frames import path_windows
 from lidardesign.geometry.raycast import SceneCaster
-from lidardesign.geometry.receiver import path_windows
 from lidardesign.registry import plugin_guard
 from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detector import Detector, check_windows
+from lidardesign.simulate.detector.detector import EFFECTS, Detector, Physics, check_windows
 from lidardesign.simulate.detector.files import load_detector
-from lidardesign.simulate.physics import EFFECTS, Physics
 from lidardesign.simulate.plan import EffectPlan, Planner, predicted_seconds
 from lidardesign.simulate.simulate import build_casters
 from lidardesign.task import conditions_of

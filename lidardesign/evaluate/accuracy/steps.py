@@ -9,9 +9,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from lidardesign.density.learn import FLOW
-from lidardesign.density.training.losses import Pool
-from lidardesign.density.training.quality import misplaced_share
-from lidardesign.density.training.snapshot_quality import (
+from lidardesign.density.learned import (
     DTYPES,
     FlowSamples,
     LearningSteps,
@@ -22,6 +20,8 @@ from lidardesign.density.training.snapshot_quality import (
     noise_share,
     noise_shares,
 )
+from lidardesign.density.training.losses import Pool
+from lidardesign.density.training.quality import misplaced_share
 from lidardesign.evaluate.accuracy.probes import AccuracyRequest, draw_probes, run_target
 from lidardesign.evaluate.accuracy.settings import Measurement, Sweep, timed
 from lidardesign.task import random_generator

@@ -11,10 +11,10 @@ import numpy as np
 
 from lidardesign.config import PRESETS, RunConfig, load_run_config
 from lidardesign.density.learn import FLOW
+from lidardesign.density.learned import SnapshotQuality, load_flow, remeasured
 from lidardesign.density.target.target import Target
 from lidardesign.density.training.quality import IndependentProbes, draw_probes, measure
 from lidardesign.density.training.schedule import goal_of
-from lidardesign.density.training.snapshot_quality import SnapshotQuality, load_flow, remeasured
 from lidardesign.design.fit import fit_like
 from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import DesignSpec

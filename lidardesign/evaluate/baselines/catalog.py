@@ -27,9 +27,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
-from lidardesign.design.catalog.library import find_part
+from lidardesign.design.catalog.library import Pose, find_part, interleaved, part_rays, parts_for, side_by_side
 from lidardesign.design.catalog.part import Part
-from lidardesign.design.catalog.placing import Pose, interleaved, part_rays, parts_for, side_by_side
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.layouts.grid import low_discrepancy
 from lidardesign.design.mixture.bounds import bounds_of
@@ -37,7 +36,7 @@ from lidardesign.design.mixture.em import fit_mixture
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.mixture import Mixture
 from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, interval_factor
-from lidardesign.design.snap.shapes import (
+from lidardesign.design.snap.parts import (
     PartShape,
     gate_inside,
     in_part_view,

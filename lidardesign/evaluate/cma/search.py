@@ -27,7 +27,7 @@ from lidardesign.evaluate.scene_scores import score_lists
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.numerics import TINY
 from lidardesign.scene import Scene
-from lidardesign.simulate.physics import Physics
+from lidardesign.simulate.detector.detector import Physics
 from lidardesign.simulate.plan import Planner
 from lidardesign.simulate.simulate import build_casters, simulate_many
 from lidardesign.task import Task

@@ -10,8 +10,10 @@ from lidardesign.errors import ConfigError
 from lidardesign.scene import Scene
 from lidardesign.simulate.detector.dead_time import find_corrected
 from lidardesign.simulate.detector.detector import (
+    COUNTED,
     FWHM_PER_SIGMA,
     Bins,
+    Physics,
     bins_of,
     check_windows,
     metres,
@@ -32,7 +34,6 @@ from lidardesign.simulate.effects.photon_noise import draw_numbers, draw_places
 from lidardesign.simulate.effects.pile_up import survive_dead_time
 from lidardesign.simulate.effects.quantisation import round_to_bins
 from lidardesign.simulate.light import Background, Echoes
-from lidardesign.simulate.physics import COUNTED, Physics
 from lidardesign.simulate.streams import MOST_COUNTS, normal_quantiles
 
 # Rays that more photons than this are expected of are counted bin by bin, others photon by photon

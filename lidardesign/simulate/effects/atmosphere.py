@@ -25,8 +25,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lidardesign.geometry.frames import in_view, path_of_range, range_of_path
 from lidardesign.geometry.rays import Hits, Rays
-from lidardesign.geometry.receiver import in_view, path_of_range, range_of_path
 from lidardesign.numerics import safe_divide
 from lidardesign.scene import Medium, Receiver, Scene
 from lidardesign.simulate.detector.detector import Detector, Photons

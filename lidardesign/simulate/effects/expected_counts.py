@@ -23,7 +23,7 @@ from functools import cached_property
 
 import numpy as np
 
-from lidardesign.geometry.receiver import range_of_path
+from lidardesign.geometry.frames import range_of_path
 from lidardesign.numerics import COARSE_SLACK, EPSILON, TINY, safe_divide
 from lidardesign.scene import SPEED_OF_LIGHT_M_S
 from lidardesign.simulate.detector.detector import FWHM_PER_SIGMA, Detector, bin_width_m, metres

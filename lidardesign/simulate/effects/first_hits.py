@@ -8,9 +8,9 @@ from functools import cached_property
 
 import numpy as np
 
+from lidardesign.geometry.frames import path_of_range, path_windows
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Hits, Outcome, Rays, gate_outcomes
-from lidardesign.geometry.receiver import path_of_range, path_windows
 from lidardesign.numerics import safe_divide
 from lidardesign.scene import Scene
 from lidardesign.simulate.detector.detector import Detector, metres, resolution_m

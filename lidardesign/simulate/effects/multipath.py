@@ -48,18 +48,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lidardesign.geometry.frames import in_view, path_windows
 from lidardesign.geometry.raycast import shared_caster
 from lidardesign.geometry.rays import Hits, Rays
-from lidardesign.geometry.receiver import in_view, path_windows
 from lidardesign.numerics import EPSILON_FLOAT32, safe_divide
 from lidardesign.scene import Body, Box, Capsule, Mesh, Plane, Scene, Sphere
-from lidardesign.simulate.detector.detector import Detector, resolution_m
+from lidardesign.simulate.detector.detector import Detector, Physics, resolution_m
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 from lidardesign.simulate.light import Beams, Echoes, direct_echoes
 from lidardesign.simulate.light_transport.multipath_bound import Detours, lamp_bound, pixel_bound
 from lidardesign.simulate.light_transport.transport import Lights, PathBins, Transients, render_transient
-from lidardesign.simulate.physics import Physics
 
 MOST_SURFACES = 6
 # Light paths of a frame, all rays together: about a second.

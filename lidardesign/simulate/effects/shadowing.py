@@ -15,8 +15,8 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from lidardesign.geometry.frames import in_view
 from lidardesign.geometry.rays import Hits, Rays
-from lidardesign.geometry.receiver import in_view
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.scene import Mesh, Scene
 from lidardesign.simulate.detector.detector import Detector

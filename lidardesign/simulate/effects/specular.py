@@ -23,8 +23,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lidardesign.geometry.frames import in_view
 from lidardesign.geometry.rays import Hits, Rays
-from lidardesign.geometry.receiver import in_view
 from lidardesign.scene import Scene
 from lidardesign.simulate.detector.detector import Detector
 from lidardesign.simulate.effects.expected_counts import Counts

@@ -27,9 +27,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidardesign.geometry.frames import in_view
 from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Hits, Rays
-from lidardesign.geometry.receiver import in_view
 from lidardesign.numerics import COARSE_SLACK
 from lidardesign.scene import Scene
 

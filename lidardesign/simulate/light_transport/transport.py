@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 
 from lidardesign.errors import ConfigError
+from lidardesign.geometry.frames import receiver_axes
 from lidardesign.geometry.raycast import shared_caster
 from lidardesign.geometry.rays import Hits, Rays
-from lidardesign.geometry.receiver import receiver_axes
 from lidardesign.scene import Body, Box, Capsule, Plane, Receiver, Scene, Sphere
 from lidardesign.simulate.light_transport.process import ask
 

@@ -1,4 +1,4 @@
-"""What a fixed receiver looks at, and ranges along a ray from the whole path of its light to it.
+"""Rotation matrices of angles and quaternions, what a fixed receiver looks at, and ranges from a path of light.
 
 The receiver stands upright: its lateral axis is horizontal, wherever it looks. A field of view is the pyramid of the
 points whose two angles, about its upright and its lateral axis, are both within half of its extents, as behind the
@@ -6,6 +6,8 @@ rectangular stop of a camera.
 
 Light that leaves o along v, meets a surface at range r and goes on to a receiver at x has the path
 L = r + |o + r v - x|. With b = x - o: r = (L / 2) (1 - (|b| / L)^2) / (1 - b.v / L). For b = 0 it is L / 2 exactly.
+
+Rotation matrices of the angles and quaternions that files hold.
 """
 
 from __future__ import annotations
@@ -81,3 +83,36 @@ def path_windows(rays: Rays, receiver: Receiver | None) -> np.ndarray:
 def _at_the_receiver(rays: Rays, receiver: Receiver) -> np.ndarray:
     """Which rays start where the receiver is: there nothing needs to be solved."""
     return (rays.origin_m == np.asarray(receiver.origin_m)).all(axis=1)
+
+
+def rotation_of_rpy(roll_rad: float, pitch_rad: float, yaw_rad: float) -> np.ndarray:
+    """The rotation about the fixed axes x, then y, then z, as URDF, SDF and ROS mean it, shape (3, 3)."""
+    (sr, cr), (sp, cp), (sy, cy) = ((math.sin(a), math.cos(a)) for a in (roll_rad, pitch_rad, yaw_rad))
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+    about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+    return about_z @ about_y @ about_x
+
+
+def rotation_of_quaternion(w: float, x: float, y: float, z: float) -> np.ndarray:
+    """The rotation of a quaternion of any length above 0, shape (3, 3).
+
+    Raises:
+        ValueError: It has no length.
+    """
+    quaternion = np.array([w, x, y, z], dtype=np.float64)
+    largest = np.abs(quaternion).max()
+    if largest == 0:
+        raise ValueError("a quaternion has no length")
+    return rotations_of_quaternions(quaternion / largest)
+
+
+def rotations_of_quaternions(quaternions: np.ndarray) -> np.ndarray:
+    """Rotations of quaternions (w, x, y, z) that are not zero: (..., 4) to (..., 3, 3); columns are the axes."""
+    w, x, y, z = np.moveaxis(quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

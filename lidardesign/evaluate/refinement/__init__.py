@@ -1,1 +1,0 @@
-"""Refinement on training scenes."""
