@@ -178,13 +178,9 @@ def test_captures_are_as_long_as_each_gate():
     assert histograms.counts[1].sum() == 0
 
 
-def test_captures_of_no_rays_are_empty():
-    scene, _ = face_like()
-    assert captured(scene, rays_towards(np.zeros((0, 3)), (0.3, 0.6)), PHOTON_EFFECTS).counts.shape == (0, 0)
-
-
-def test_captures_need_a_detector_that_counts_photons():
+def test_captures_of_no_rays_are_empty_and_need_a_detector_that_counts_photons():
     scene, directions = face_like()
+    assert captured(scene, rays_towards(np.zeros((0, 3)), (0.3, 0.6)), PHOTON_EFFECTS).counts.shape == (0, 0)
     with pytest.raises(ConfigError, match="counts no photons"):
         captured(scene, rays_towards(directions, (0.3, 0.6)), {"jitter"}, load_detector("ideal"))
 
