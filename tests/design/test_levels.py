@@ -13,7 +13,7 @@ from support.rings import RING
 
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.files import load_design
-from lidardesign.design.fit import fit
+from lidardesign.design.fit import fit, rays_at
 from lidardesign.design.layouts.gates import seen_from
 from lidardesign.design.layouts.rays import lay_out
 from lidardesign.design.sensor import DesignSpec, interval_factor
@@ -106,7 +106,7 @@ def test_another_number_of_rays_of_a_scan_keeps_its_level():
     for level in (0.8, 0.99):
         design = fit(STILL, layout="scan", rays=20, level=level).design
         anew = fit(STILL, layout="scan", rays=30, level=level).design
-        np.testing.assert_array_equal(lay_out(design, 30, STILL).gate_m, lay_out(anew).gate_m)
+        np.testing.assert_array_equal(rays_at(design, 30, STILL).gate_m, lay_out(anew).gate_m)
 
 
 def test_a_level_and_a_bound_on_gates_hold_together_or_are_refused_by_the_bound():

@@ -272,11 +272,6 @@ def progresses(_: Path) -> list[bytes]:
     return ["".join(json.dumps(row) + "\n" for row in rows).encode()]
 
 
-def locks(_: Path) -> list[bytes]:
-    """Locks of processes here and elsewhere."""
-    return [json.dumps({"pid": pid, "host": "elsewhere", "started": "17"}).encode() for pid in (1, 4_000_000)]
-
-
 def distance_fields(_: Path) -> list[bytes]:
     """A cached distance field."""
     field = np.linspace(-1, 1, 64, dtype=np.float32)

@@ -84,21 +84,6 @@ open_samples = _behind_hash("samples.npz", _read_samples)
 open_progress = _behind_hash("progress.jsonl", _read_progress)
 
 
-def open_locks(folder: Path) -> Read:
-    """As every command does that writes into a run."""
-    from lidardesign.run.files import run_lock
-
-    def read(content: bytes) -> object:
-        (folder / ".lock").write_bytes(content)
-        try:
-            with run_lock(folder):
-                return None
-        finally:
-            (folder / ".lock").unlink(missing_ok=True)
-
-    return read
-
-
 def open_fields(folder: Path) -> Read:
     """As `learn` does with its cache: what cannot be used is built again."""
     from lidardesign.density.fields.grids import _digest, _load

@@ -16,7 +16,6 @@ from fuzz.fuzz_runs import (
     checkpoints,
     open_checkpoints,
     open_fields,
-    open_locks,
     open_manifests,
     open_progress,
     open_samples,
@@ -181,7 +180,6 @@ TARGETS = (
     Target("samples (npz)", 1_500, corpus.samples, mutate_npz, open_samples),
     Target("checkpoint (safetensors)", 1_500, checkpoints, mutate_safetensors, open_checkpoints),
     Target("progress (JSON lines)", 500, corpus.progresses, TEXTS, open_progress),
-    Target("lock (JSON)", 250, corpus.locks, mutate_json, open_locks),
     Target("distance field (npy)", 250, corpus.distance_fields, mutate_bytes, open_fields),
 )
 NAMES = tuple(target.name for target in TARGETS)

@@ -172,6 +172,6 @@ def test_an_input_that_ends_or_stops_its_process_is_kept_and_the_batch_goes_on(t
 
 
 def test_the_worker_reads_a_batch_and_counts_it(tmp_path):
-    found = run_job(Job("lock (JSON)", 25, 3), tmp_path / "kept")
+    found = run_job(Job("progress (JSON lines)", 25, 3), tmp_path / "kept")
     assert not found.faults, json.dumps(found.faults)
     assert (found.inputs, found.read + found.refused) == (25, 25)

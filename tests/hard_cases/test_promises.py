@@ -41,7 +41,6 @@ from lidardesign.errors import DataError, LidardesignError
 from lidardesign.evaluate.scene_scores import checked_score
 from lidardesign.evaluate.statistics import bootstrap_interval
 from lidardesign.geometry.rays import Rays
-from lidardesign.run import yaml as yaml_module
 from lidardesign.run.manifest import record, start_manifest
 from lidardesign.run.yaml import load_yaml
 from lidardesign.samples import Samples
@@ -49,6 +48,7 @@ from lidardesign.scene import Ambient, Body, Box, Capsule, Medium, Mesh, Scene, 
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import DesignSpace
 from lidardesign.task import Score
+from lidardesign.workflow import refine
 
 FLATLAND = (
     "learn", "flatland", "--preset", "draft", "--seed", str(shifted(3)),
@@ -609,9 +609,9 @@ class TestDesignsKeepTheirConstraints:
             assert all(check.satisfied for check in checks), [check.name for check in checks if not check.satisfied]
 
     def test_a_fit_that_broke_a_constraint_would_be_found_out_on_what_it_writes(self, lidardesign, flat, monkeypatch):
-        dump = yaml_module.dump_yaml
+        dump = refine.dump_yaml
         # as if a gate had been written a little too long
-        monkeypatch.setattr(yaml_module, "dump_yaml", lambda document: dump(longer_gates(document)))
+        monkeypatch.setattr(refine, "dump_yaml", lambda document: dump(longer_gates(document)))
         done = lidardesign("constrain", flat, "--set", "gate.width_m.max=0.4", "--name", "never", "--json")
         assert done.code == 4
         assert any("gate" in name for name in done.json["error"]["conflicts"])
