@@ -208,7 +208,7 @@ def learn(
         **{name: estimate.value for name, estimate in measured.estimates.items()},
     )
     found = {"visibility": data.target.visibility.name, "round_trip_nats": measured.round_trip_nats}
-    note(run, learn=result.as_dict(), ranks=1, **found)
+    note(run, learn=result.as_dict(), **found)
     return result
 
 

@@ -326,12 +326,12 @@ class Refiner:
 
     def _best_interval(self, number: int, best: _State, name: str) -> _State:
         """Wider intervals as long as they are worth it; narrower ones where the first wider one is not."""
-        ladder = np.array(LEVELS if name == "level" else self.spreads)
-        place = int(np.argmin(np.abs(ladder - getattr(best.shape, name))))
+        choices = np.array(LEVELS if name == "level" else self.spreads)
+        place = int(np.argmin(np.abs(choices - getattr(best.shape, name))))
         for direction in (1, -1):
             before = best
-            while 0 <= place + direction < len(ladder):
-                value = float(ladder[place + direction])
+            while 0 <= place + direction < len(choices):
+                value = float(choices[place + direction])
                 found = self._try(number, _words(name, value), best, shape=replace(best.shape, **{name: value}))
                 if found is best:
                     break

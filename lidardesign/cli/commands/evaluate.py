@@ -254,14 +254,14 @@ def search_display(request: ScoreRequest, output: Output, bar: RichProgress | No
 
 
 def _with_accuracy(scores: Scores, output: Output) -> Scores:
-    with output.progress("ladder") as bar:
-        line = bar.add_task("measuring accuracy", total=None, ladder="") if bar else None
+    with output.progress("sweep") as bar:
+        line = bar.add_task("measuring accuracy", total=None, sweep="") if bar else None
 
-        def show(done: int, total: int, ladder: str) -> None:
+        def show(done: int, total: int, sweep: str) -> None:
             if bar is not None and line is not None:
-                bar.update(line, completed=done, total=total, ladder=ladder)
-            elif ladder:
-                output.note(f"accuracy: {ladder} ...")
+                bar.update(line, completed=done, total=total, sweep=sweep)
+            elif sweep:
+                output.note(f"accuracy: {sweep} ...")
 
         return scores.with_accuracy(show)
 

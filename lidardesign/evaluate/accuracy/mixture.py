@@ -40,7 +40,7 @@ RESTART_COUNTS = (1, 2, 4, 8, 12)
 REPEATS, LEAST_REPEATS, SENSORS_FITTED = 5, 2, 40
 MORE_REPEATS = {1: 3, 2: 2, 4: 2}
 # Modules are found where this process finds them, and a folder's own files are not mistaken for libraries.
-PROGRAM = "import sys; sys.path[:] = {path!r}; from lidardesign.cli.main import run; run()"
+PROGRAM = "import runpy, sys; sys.path[:] = {path!r}; runpy.run_module('lidardesign', run_name='__main__')"
 
 
 def sweeps(request: AccuracyRequest) -> Sequence[Sweep]:
