@@ -1,4 +1,8 @@
-"""Distances between a reconstruction and the truth, and the surface that a sensor could have seen."""
+"""Chamfer and Frechet distances between a reconstruction and the truth, and the surface that a sensor could have seen.
+
+`chamfer_m` is between points; `SurfaceCloud.distance_m` goes from points to triangles, for tasks that score surfaces
+(the shipped ones do so in `lidardesign_tasks.surface.surface_score`).
+"""
 
 from __future__ import annotations
 

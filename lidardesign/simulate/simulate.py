@@ -3,12 +3,10 @@
 Rays are traced from the sensor, not from the start of the gate, so whatever stands between the sensor and the
 gate hides what is behind it.
 
-What a detector measures of a list of rays when optional effects are on.
-
-Light is followed in the order in which it travels: beams leave (`footprint`), meet what stands or moves there
-(`motion`), come back from it directly and by detours (`specular`, `multipath`), to a receiver that may stand elsewhere
-(`shadowing`), weakened by the air (`atmosphere`); then photons are counted and timed (`detection`). Each effect is one
-module of `simulate.effects`.
+With effects, light is followed in the order in which it travels: beams leave (`footprint`), meet what stands or moves
+there (`motion`), come back from it directly and by detours (`specular`, `multipath`), to a receiver that may stand
+elsewhere (`shadowing`), weakened by the air (`atmosphere`); then photons are counted and timed (`detection`). Each
+effect is one module of `simulate.effects`.
 """
 
 from __future__ import annotations

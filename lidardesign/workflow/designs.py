@@ -24,7 +24,7 @@ from lidardesign.workflow.export import (
     exporter_of,
 )
 from lidardesign.workflow.fit import FitOptions, FitRequest
-from lidardesign.workflow.refine import fit_design
+from lidardesign.workflow.fit_design import fit_design
 from lidardesign.workflow.run_folder import Notes, RunFolder, log_note, need_run, relative_folder
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""The truth and the score of tasks that reconstruct a surface from returns."""
+"""The Chamfer score (`surface_score`) and the truth of tasks that reconstruct a surface from returns."""
 
 from __future__ import annotations
 

@@ -250,7 +250,7 @@ def test_a_design_that_breaks_a_constraint_is_never_written(lidardesign, flat, m
     def refuse(design, request):
         raise InfeasibleError("broken", conflicts=["gate.width_m.max"])
 
-    monkeypatch.setattr("lidardesign.workflow.refine.check_written", refuse)
+    monkeypatch.setattr("lidardesign.workflow.fit_design.check_written", refuse)
     result = lidardesign("constrain", flat, "--set", "gate.width_m.max=0.3", "--json")
     assert result.code == 4
     assert result.json["error"]["conflicts"] == ["gate.width_m.max"]

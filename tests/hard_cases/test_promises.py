@@ -48,7 +48,7 @@ from lidardesign.scene import Ambient, Body, Box, Capsule, Medium, Mesh, Scene, 
 from lidardesign.simulate.simulate import simulate
 from lidardesign.space import DesignSpace
 from lidardesign.task import Score
-from lidardesign.workflow import refine
+from lidardesign.workflow import fit_design
 
 FLATLAND = (
     "learn", "flatland", "--preset", "draft", "--seed", str(shifted(3)),
@@ -609,9 +609,9 @@ class TestDesignsKeepTheirConstraints:
             assert all(check.satisfied for check in checks), [check.name for check in checks if not check.satisfied]
 
     def test_a_fit_that_broke_a_constraint_would_be_found_out_on_what_it_writes(self, lidardesign, flat, monkeypatch):
-        dump = refine.dump_yaml
+        dump = fit_design.dump_yaml
         # as if a gate had been written a little too long
-        monkeypatch.setattr(refine, "dump_yaml", lambda document: dump(longer_gates(document)))
+        monkeypatch.setattr(fit_design, "dump_yaml", lambda document: dump(longer_gates(document)))
         done = lidardesign("constrain", flat, "--set", "gate.width_m.max=0.4", "--name", "never", "--json")
         assert done.code == 4
         assert any("gate" in name for name in done.json["error"]["conflicts"])

@@ -16,7 +16,7 @@ from lidardesign.scene import Body, Box, Mesh, Plane, Receiver, Scene, Sphere, r
 from lidardesign.simulate.detector.detector import Detector, Physics
 from lidardesign.simulate.detector.files import load_detector
 from lidardesign.simulate.light import Beams, direct_echoes
-from lidardesign.simulate.light_transport.multipath_bound import Detours, lamp_bound, pixel_bound, series
+from lidardesign.simulate.light_transport.detours import Detours, lamp_bound, pixel_bound, series
 from lidardesign.simulate.light_transport.transport import Lights, PathBins, render_transient
 from lidardesign.simulate.simulate import simulate
 

@@ -29,7 +29,7 @@ from lidardesign.simulate.simulate import simulate
 from lidardesign.space import RANGE, direction
 from lidardesign.task import Residuals, scenes_of
 from lidardesign.workflow.fit import FitRequest
-from lidardesign.workflow.refine import refinement_scenes
+from lidardesign.workflow.fit_design import refinement_scenes
 from lidardesign.workflow.run_samples import RunTarget, Weighting
 
 SEED = 3

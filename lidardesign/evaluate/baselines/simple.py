@@ -8,9 +8,9 @@ more candidate layouts; where there are several, the best on training scenes is 
   low-discrepancy set.
 - `random`: rays uniform in the measure of the design space, with the whole range as their gate, drawn anew for
   every scene.
-- `bounding`: see `lidardesign.evaluate.baselines.simple`.
+- `bounding`: one even layout over where the training returns are, see below.
 - `occupancy`: see `lidardesign.evaluate.baselines.occupancy`.
-- `no-visibility`: see `lidardesign.evaluate.baselines.simple`.
+- `no-visibility`: the design fitted anew without its occlusion term, see below.
 - `catalog:NAME`: see `lidardesign.evaluate.baselines.catalog`.
 - `cma`: see `lidardesign.evaluate.cma.candidate`.
 

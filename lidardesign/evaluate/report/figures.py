@@ -3,11 +3,8 @@
 plotly reads a little HTML in names, so every name is escaped here. Legends are in the page itself, where they can be
 switched from the keyboard too.
 
-The learned density as plain plotly documents: marginals beside those of designs, and the field it observes.
-
-The report's section on what accuracy costs: error against seconds as an interactive figure, and a table.
-
-Designs and scores as plotly figures, for notebooks.
+They are the curves of scores, the learned density (marginals beside those of designs, and the field it observes), and
+what accuracy costs: error against seconds, with a table.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ from lidardesign.simulate.detector.detector import Detector
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import FLATTEST_COSINE, STEEPER, EffectBound, FirstHits, edge_probability
 from lidardesign.simulate.light import Beams
-from lidardesign.simulate.light_transport.multipath_bound import GOLDEN_ANGLE_RAD
+from lidardesign.simulate.light_transport.detours import GOLDEN_ANGLE_RAD
 
 # Pairs of opposite points are turned by the golden share of a half turn from one to the next: the most even spiral
 # with two arms (Vogel 1979 has one arm and a full turn, whose centre of mass lies off the axis).

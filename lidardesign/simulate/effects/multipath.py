@@ -57,7 +57,7 @@ from lidardesign.simulate.detector.detector import Detector, Physics, resolution
 from lidardesign.simulate.effects.expected_counts import Counts
 from lidardesign.simulate.effects.first_hits import EffectBound, FirstHits
 from lidardesign.simulate.light import Beams, Echoes, direct_echoes
-from lidardesign.simulate.light_transport.multipath_bound import Detours, lamp_bound, pixel_bound
+from lidardesign.simulate.light_transport.detours import Detours, lamp_bound, pixel_bound
 from lidardesign.simulate.light_transport.transport import Lights, PathBins, Transients, render_transient
 
 MOST_SURFACES = 6

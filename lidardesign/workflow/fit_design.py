@@ -1,4 +1,7 @@
-"""How a design is fitted, refined on training scenes that were drawn for that, and checked before anyone sees it."""
+"""How a design is fitted, refined on training scenes that were drawn for that, and checked before anyone sees it.
+
+The rounds of `--refine` run in `evaluate.refinement.Refiner.run`; here are its scenes, its trials and its result.
+"""
 
 from __future__ import annotations
 
