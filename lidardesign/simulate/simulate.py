@@ -23,7 +23,6 @@ from lidardesign.geometry.raycast import SceneCaster
 from lidardesign.geometry.rays import Hits, Outcome, Rays, Returns, gate_outcomes
 from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
-from lidardesign.simulate.detector.detection import ArrivingLight, count_photons, detect
 from lidardesign.simulate.detector.detector import Physics, check_windows
 from lidardesign.simulate.effects.ambient import add_ambient
 from lidardesign.simulate.effects.atmosphere import through_air
@@ -87,8 +86,6 @@ def simulate_many(
     if not lists:
         return []
     if physics is not None and physics.effects:
-        # its effects load compiled loops, which geometry alone does without
-
         each = [physics if repeats is None else replace(physics, repeat=repeats[i]) for i in range(len(lists))]
         return [
             [measure(scene, frame, rays, caster, chance) for frame, caster in enumerate(casters)]
@@ -127,6 +124,9 @@ def measure(scene: Scene, frame: int, rays: Rays, caster: SceneCaster, physics: 
         caster: Of this frame.
         physics: The detector and at least one effect.
     """
+    # it loads compiled loops, which geometry alone does without
+    from lidardesign.simulate.detector.detection import detect
+
     light = followed_light(scene, frame, rays, caster, physics)
     found = detect(scene, frame, light.windows_m, light.echoes, light.background, physics)
     # rays without a return keep the outcome of their geometry, or were not detected
@@ -209,6 +209,9 @@ def photon_histograms(
     Raises:
         ConfigError: The detector counts no photons, or its histogram does not cover a gate.
     """
+    # it loads compiled loops, which geometry alone does without
+    from lidardesign.simulate.detector.detection import ArrivingLight, count_photons
+
     detector = physics.detector
     if detector.photons is None:
         raise ConfigError(

@@ -12,10 +12,9 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from plotly.graph_objects import Figure, Scatter3d
 
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import check_choice
@@ -38,6 +37,9 @@ from lidardesign.evaluate.report.tables import plain_number, table
 from lidardesign.evaluate.report.view import encoded
 from lidardesign.evaluate.results import Evaluation
 from lidardesign.geometry.rays import Rays
+
+if TYPE_CHECKING:
+    from plotly.graph_objects import Figure
 
 FONT = {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 14, "color": "#1f2933"}
 SYMBOLS = {
@@ -443,6 +445,8 @@ MOST_DRAWN_RAYS = 2000
 
 def design_figure(design: DesignSpec, rays: Rays | None = None) -> Figure:
     """The sensors of a design with their fields of view and gates; rays are drawn inside their gates."""
+    from plotly.graph_objects import Figure
+
     figure = Figure()
     for sensor in design.sensors:
         _add_lines(figure, frustum_lines(sensor), sensor.name)
@@ -457,10 +461,12 @@ def design_figure(design: DesignSpec, rays: Rays | None = None) -> Figure:
 
 def scores_figure(evaluation: Evaluation, against: str = "rays") -> Figure:
     """Scores with their intervals against numbers of rays, or against bandwidth."""
+    from plotly.graph_objects import Figure
+
     check_choice(against, "against", ("rays", "bandwidth"))
     return Figure(curve_figure(evaluation, against)).update_layout(showlegend=True)
 
 
 def _add_lines(figure: Figure, points_m: np.ndarray, name: str) -> None:
     x, y, z = points_m.T
-    figure.add_trace(Scatter3d(x=x, y=y, z=z, mode="lines", name=name))
+    figure.add_scatter3d(x=x, y=y, z=z, mode="lines", name=name)
