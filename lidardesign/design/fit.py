@@ -13,7 +13,7 @@ import numpy as np
 
 from lidardesign.design.constraints.budget import BandwidthBudget
 from lidardesign.design.constraints.check import ConstraintCheck, check_design
-from lidardesign.design.constraints.document import MOST_FITTED, Constraints
+from lidardesign.design.constraints.document import MOST_FITTED, Constraints, wants_parts
 from lidardesign.design.constraints.feasibility import check_feasible
 from lidardesign.design.constraints.origins import placement_notes, snap_to_space
 from lidardesign.design.files import design_document
@@ -24,7 +24,6 @@ from lidardesign.design.mixture.bounds import sensor_groups
 from lidardesign.design.mixture.support import Retarget, Support, conditioned, fixed_conditions
 from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, DesignSpec, Gates, LayoutName, Sensor
 from lidardesign.design.snap.fit import fix_part_origins, snap_design
-from lidardesign.design.snap.parts import wants_parts
 from lidardesign.errors import ConfigError
 from lidardesign.estimates import ROUNDING, Estimate, as_documents, effective_share_error
 from lidardesign.geometry.rays import Rays

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lidardesign.design.fit import refitted
 from lidardesign.design.layouts.rays import lay_out, layout_of, own_count
 from lidardesign.design.layouts.track import placed
 from lidardesign.design.sensor import DesignSpec
@@ -107,7 +106,11 @@ class DesignSource:
                 weighting = Weighting.of(design)
                 retarget = RunTarget(run, weighting=weighting)
                 samples = weighted_samples(run, weighting, retarget)
-        design = refitted(design, count, samples, seed=seed, at=at, retarget=retarget)
+        if layout_of(design).one_sensor_per_ray:
+            # most exports fit nothing, and start sooner without what fits
+            from lidardesign.design.fit import refitted
+
+            design = refitted(design, count, samples, seed=seed, at=at, retarget=retarget)
         count = 0 if may_stay_open else count
         rays = lay_out(design, count, samples, seed=seed, at=at, retarget=retarget)
         return placed(design, at) if at or design.track is not None else design, rays

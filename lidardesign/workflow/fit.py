@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any, get_args
 
 from lidardesign.config import apply_override, parse_override
-from lidardesign.design.constraints.document import CATALOG, Constraints
+from lidardesign.design.constraints.document import CATALOG, Constraints, wants_parts
 from lidardesign.design.constraints.feasibility import check_feasible
 from lidardesign.design.constraints.origins import is_mounted, snap_to_space
 from lidardesign.design.constraints.rig_constraints import moved_notes, rig_constraints, rig_notes
 from lidardesign.design.layouts.rays import LAYOUTS, layout_of
 from lidardesign.design.sensor import FITTED_LAYOUTS, LEVELS, DesignSpec, Gates
-from lidardesign.design.snap.parts import parts_of, wants_parts
+from lidardesign.design.snap.parts import parts_of
 from lidardesign.errors import ConfigError, check_choice
 from lidardesign.run.manifest import verify
 from lidardesign.run.yaml import Document, KeyPath, leaves, load_yaml

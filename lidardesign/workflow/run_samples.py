@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lidardesign.config import with_task_settings
-from lidardesign.design.fit import rays_at
 from lidardesign.design.layouts.rays import gates_of, layout_of
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError
@@ -166,6 +165,8 @@ class Layouts:
         self, design: DesignSpec, count: int, samples: Samples | None, *, at: Mapping[str, float] | None = None
     ) -> Rays:
         """A design's rays at a number of rays."""
+        from lidardesign.design.fit import rays_at
+
         return rays_at(design, count, samples, at=at, retarget=self.targets.get(design.name))
 
     @classmethod

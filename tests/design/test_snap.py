@@ -16,7 +16,7 @@ from support.tables import each_row
 from lidardesign.design.catalog.library import find_part, load_library
 from lidardesign.design.constraints.budget import BandwidthBudget
 from lidardesign.design.constraints.check import check_design
-from lidardesign.design.constraints.document import Constraints
+from lidardesign.design.constraints.document import Constraints, wants_parts
 from lidardesign.design.files import design_document, design_from_document, load_design
 from lidardesign.design.fit import fit
 from lidardesign.design.layouts.rays import lay_out
@@ -31,7 +31,6 @@ from lidardesign.design.snap.parts import (
     part_options,
     parts_of,
     shapes_of,
-    wants_parts,
 )
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.samples import Samples

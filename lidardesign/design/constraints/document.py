@@ -232,6 +232,11 @@ def rules_of(rules: Sequence[SensorRules], sensor: int) -> SensorRules:
     return rules[min(sensor, len(rules) - 1)]
 
 
+def wants_parts(rules: Sequence[SensorRules]) -> bool:
+    """Whether any sensor is to become a part."""
+    return any(one.snap is not None for one in rules)
+
+
 class Constraints(SensorConstraints):
     """What a design must keep to: fields of view, gates, places, rays and bandwidth; every key is optional.
 

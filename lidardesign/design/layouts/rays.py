@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 
 from lidardesign.design.bandwidth import split_budget
-from lidardesign.design.catalog.part import even_subset
 from lidardesign.design.constraints.document import Constraints
 from lidardesign.design.layouts.density import DensityLayout
 from lidardesign.design.layouts.distributed import DistributedLayout
@@ -60,6 +59,8 @@ class FixedLayout(Layout):
         own = np.bincount(table.sensor, minlength=len(spec.sensors))
         shares = split_budget(own, count)
         of_sensor = [np.flatnonzero(table.sensor == index) for index in range(len(own))]
+        from lidardesign.design.catalog.part import even_subset
+
         chosen = [rows[even_subset(table.direction[rows], int(n))] for rows, n in zip(of_sensor, shares, strict=True)]
         rays = table.subset(np.sort(np.concatenate(chosen)))
         return replace(rays, time_s=fire_times(count, DEFAULT_RATE_HZ))

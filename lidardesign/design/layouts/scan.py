@@ -30,7 +30,7 @@ from dataclasses import replace
 import numpy as np
 
 from lidardesign.design.constraints.budget import BandwidthBudget, fit_within_budget
-from lidardesign.design.constraints.document import Constraints, SensorRules
+from lidardesign.design.constraints.document import Constraints, SensorRules, wants_parts
 from lidardesign.design.constraints.origins import free_boxes, is_mounted, origin_box
 from lidardesign.design.layouts.gates import admissible_gates, central_intervals, members, ray_gates, rays_in_fields
 from lidardesign.design.layouts.layout import FittedDesign, Layout, likelihood_estimate, missing_samples, shares_of
@@ -45,7 +45,6 @@ from lidardesign.design.mixture.features import Axes, Features, ray_features
 from lidardesign.design.mixture.mixture import Mixture, log_density
 from lidardesign.design.mixture.support import check_support, fixed_conditions, restrict_samples
 from lidardesign.design.sensor import DEFAULT_LEVEL, DesignSpec, Gates, Sensor, Track, interval_factor
-from lidardesign.design.snap.parts import wants_parts
 from lidardesign.errors import ConfigError, InfeasibleError
 from lidardesign.estimates import Estimate
 from lidardesign.geometry.rays import Rays

@@ -243,11 +243,6 @@ class PartChoice:
     losses: tuple[float, ...] = ()
 
 
-def wants_parts(rules: Sequence[SensorRules]) -> bool:
-    """Whether any sensor is to become a part."""
-    return any(one.snap is not None for one in rules)
-
-
 def part_options(rules: Sequence[SensorRules], space: DesignSpace, middles_m: Sequence[float]) -> list[PartOptions]:
     """What each of some sensors may become.
 
