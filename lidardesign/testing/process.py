@@ -192,16 +192,16 @@ def answer_check(request: dict[str, Any]) -> None:
     contract = _begin(request, result)
     if contract is None:
         os._exit(0)
-    contract.subject.watch.empty_folder = Path(_made(request, "work"))
+    contract.subject.watch.empty_folder = Path(_make_folder(request, "work"))
     os.chdir(contract.subject.watch.empty_folder)
     for finding in contract.findings():
-        _tell(result, finding)
+        _write_finding(result, finding)
     answer(result, {})
 
 
 def _settle(request: dict[str, Any]) -> None:
     """Limits on memory, a place for temporary files, and no compiled Python beside the plugin's sources."""
-    temporary = _made(request, "temporary")
+    temporary = _make_folder(request, "temporary")
     tempfile.tempdir = os.environ["TMPDIR"] = temporary
     os.environ["PYTHONDONTWRITEBYTECODE"], sys.dont_write_bytecode = "1", True
     try:
@@ -213,7 +213,7 @@ def _settle(request: dict[str, Any]) -> None:
     resource.setrlimit(resource.RLIMIT_DATA, (wanted if most == resource.RLIM_INFINITY else min(wanted, most), most))
 
 
-def _made(request: dict[str, Any], name: str) -> str:
+def _make_folder(request: dict[str, Any], name: str) -> str:
     path = Path(request["folder"]) / name
     path.mkdir()
     return str(path)
@@ -226,23 +226,25 @@ def _begin(request: dict[str, Any], result: BinaryIO) -> Contract | None:
     try:
         task, config = _loaded(request, watch)
     except registry.PluginError as error:
-        _tell(result, Finding(*LOADS, "fail", f"{error_words(error)}{place_of(error)}"))
+        _write_finding(result, Finding(*LOADS, "fail", f"{error_words(error)}{place_of(error)}"))
         return None
     except LidardesignError as error:
         if str(error.where).startswith("defaults of task"):
-            _tell(result, Finding(*LOADS, "fail", f"{error.where}: {error_words(error)}"))
+            _write_finding(result, Finding(*LOADS, "fail", f"{error.where}: {error_words(error)}"))
         else:
             _write(result, {"refused": error.as_dict()})
         return None
     except BaseException as error:
-        _tell(result, Finding(*LOADS, "fail", f"{type(error).__name__}: {error}"))
+        _write_finding(result, Finding(*LOADS, "fail", f"{type(error).__name__}: {error}"))
         return None
     # not before: a plugin that fails to load is named without the libraries that the laws need
     from lidardesign.testing.contract import Contract
     from lidardesign.testing.law import Subject
 
     version = f"version {task.api_version} of the task interface"
-    _tell(result, Finding(*LOADS, "pass", f"{version}, {type(task).__module__}", time.perf_counter() - started))
+    _write_finding(
+        result, Finding(*LOADS, "pass", f"{version}, {type(task).__module__}", time.perf_counter() - started)
+    )
     limits = Limits(request["seconds"], request["memory_bytes"])
     return Contract(Subject(task, config, limits, watch, lambda what: _write(result, {CALLED: what})))
 
@@ -258,7 +260,7 @@ def _loaded(request: dict[str, Any], watch: Watch) -> tuple[Task, RunConfig]:
         )
 
 
-def _tell(result: BinaryIO, finding: Finding) -> None:
+def _write_finding(result: BinaryIO, finding: Finding) -> None:
     _write(result, finding.as_dict())
 
 

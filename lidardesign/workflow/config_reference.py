@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import textwrap
@@ -60,11 +61,8 @@ def describe_task(task: Task) -> dict[str, Any]:
     metric, defaults = task.metric, task.defaults
     space = None  # where the user must set something first
     if not any(info.is_required() for info in task.Config.model_fields.values()):
-        try:
-            with plugin_guard(task.name):
-                space = task.space(task.Config()).as_dict()
-        except ConfigError:
-            pass
+        with contextlib.suppress(ConfigError), plugin_guard(task.name):
+            space = task.space(task.Config()).as_dict()
     return {
         "name": task.name,
         "summary": task.summary,

@@ -185,7 +185,7 @@ class LearnRequest:
             DivergenceError: Learning stayed non-finite; the last good checkpoint is kept.
         """
         folder = self.folder
-        with _made_folder(folder), run_lock(folder):
+        with _new_folder(folder), run_lock(folder):
             if not self.begun:
                 check_can_start(folder)  # another process may have been faster
             with self._undone_on_failure():
@@ -334,7 +334,7 @@ def _resumed_settings(plugin: Task, run: Path, choices: Mapping[str, Any]) -> tu
 
 
 @contextlib.contextmanager
-def _made_folder(run: Path) -> Iterator[None]:
+def _new_folder(run: Path) -> Iterator[None]:
     """Make the folder; after a failure take it away again where it is empty."""
     new = [folder for folder in (run, *run.parents) if not folder.exists()]
     try:

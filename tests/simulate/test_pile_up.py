@@ -14,7 +14,7 @@ from lidardesign.simulate.detector.dead_time import (
     DRAWS_PER_BIN,
     _across_pulses,
     _hit_pulses,
-    _one_of,
+    _share_of_counts,
     _within_pulses,
 )
 from lidardesign.simulate.detector.detection import coates
@@ -175,7 +175,7 @@ def test_light_that_hits_every_pulse_is_counted_in_every_pulse_that_is_alive(ali
 
 def test_shares_of_photons_are_even_and_lose_less_than_one_share():
     arrived = np.array([5, 0, 7, 100, 3])
-    share = _one_of(arrived, 4)
+    share = _share_of_counts(arrived, 4)
     assert share.sum() == arrived.sum() // 4
     assert (np.abs(share - arrived / 4) < 1).all()
 

@@ -86,7 +86,7 @@ def export(
 
         def show(rich: RichConsole) -> None:
             rich.print(f"wrote {target} ({content})", soft_wrap=True, markup=False)
-            rich.print(_shown_rounding(exported.rounding), soft_wrap=True, markup=False)
+            rich.print(_rounding_line(exported.rounding), soft_wrap=True, markup=False)
 
         output.result({"design": str(design), **exported.as_dict()}, show)
 
@@ -118,7 +118,7 @@ def _list(output: Output) -> None:
     output.result({"formats": formats}, show, show_costs=False)
 
 
-def _shown_rounding(rounding: Mapping[str, Estimate]) -> str:
+def _rounding_line(rounding: Mapping[str, Estimate]) -> str:
     """What reading the file back showed, in one line."""
     lost = [
         f"{name.removesuffix(f'_{estimate.unit}')} {estimate.error:.2g} {estimate.unit}".rstrip()

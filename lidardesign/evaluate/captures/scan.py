@@ -174,7 +174,7 @@ def scan(
 def scan_pixels(capture: Capture, estimation: Estimation) -> CapturedScan:
     """What every pixel measures in its whole histogram."""
     pixels = np.arange(len(capture))
-    first, last = gate_bins(capture, pixels, np.tile(_heard_m(capture), (len(capture), 1)))
+    first, last = gate_bins(capture, pixels, np.tile(_listening_windows_m(capture), (len(capture), 1)))
     captured = np.where(first < last, Captured.YES, Captured.OUT_OF_WINDOW)
     taken = np.where(first < last, pixels, -1)
     return _measured(capture, captured, taken, np.zeros(len(capture)), first, last, estimation)
@@ -192,10 +192,12 @@ def gate_bins(capture: Capture, pixel: np.ndarray, gate_m: np.ndarray) -> tuple[
 
 def whole_window(rays: Rays, capture: Capture) -> Rays:
     """The same rays without gates: they hear all that was captured."""
-    return Rays(rays.origin_m, rays.direction, np.tile(_heard_m(capture), (len(rays), 1)), rays.sensor, rays.time_s)
+    return Rays(
+        rays.origin_m, rays.direction, np.tile(_listening_windows_m(capture), (len(rays), 1)), rays.sensor, rays.time_s
+    )
 
 
-def _heard_m(capture: Capture) -> np.ndarray:
+def _listening_windows_m(capture: Capture) -> np.ndarray:
     """The captured window from the pulse on: what is counted before it left the scanner comes from no surface."""
     return np.maximum(capture.window_m, 0.0)
 

@@ -230,14 +230,14 @@ def marginals(samples: Samples, designs: Sequence[DesignSpec] = ()) -> tuple[Mar
     """One per free dimension that the density is not conditioned on: over a condition it is even by definition."""
     space, weights = samples.space, samples.weights
     start = turn_start(samples.points[:, AZIMUTH], weights, space)
-    points = _shown_points(samples.points, start)
+    points = _degrees_points(samples.points, start)
     beside = {}
     for design in designs:
         own, share = mixture_points(design)
-        beside[design.name] = _shown_points(own, start), share
+        beside[design.name] = _degrees_points(own, start), share
     bins = int(np.clip(2 * effective_count(weights) ** (1 / 3), LEAST_BINS, MOST_BINS))
     learned = [axis for axis in space.free if axis not in space.conditioned]
-    bounds = _shown_points(np.array([space.low, space.high]), None)
+    bounds = _degrees_points(np.array([space.low, space.high]), None)
     if space.full_azimuth:
         bounds[:, AZIMUTH] = np.degrees([start, start + FULL_TURN])
     return tuple(_marginal(axis, points[:, axis], weights, beside, bounds[:, axis], bins) for axis in learned)
@@ -269,7 +269,7 @@ def _marginal(
     return Marginal(DIMENSIONS[axis], label, f"% per {name}", edges, heights(values, weights), designs)
 
 
-def _shown_points(points: np.ndarray, start: float | None) -> np.ndarray:
+def _degrees_points(points: np.ndarray, start: float | None) -> np.ndarray:
     """Design points with angles in degrees, azimuths moved by whole turns to beyond a start [rad]."""
     shown = np.array(points, dtype=np.float64)
     if start is not None:

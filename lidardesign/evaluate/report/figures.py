@@ -159,7 +159,7 @@ def marginal_figure(marginal: Marginal, looks: Mapping[str, Series]) -> dict[str
         if name in looks
     ]
     layout = {
-        **_looks(),
+        **_figure_layout(),
         "xaxis": {**AXIS, "title": {"text": marginal.label}, "range": [marginal.edges[0], marginal.edges[-1]]},
         "yaxis": {**AXIS, "title": {"text": marginal.unit}, "range": [0, marginal.top]},
         "hovermode": "closest",
@@ -186,7 +186,7 @@ def plane_figure(plane: PlaneDensity) -> dict[str, Any]:
         if covered.any() and not covered.all()
     ]
     layout = {
-        **_looks(),
+        **_figure_layout(),
         "xaxis": {**AXIS, "title": {"text": plane.labels[0]}, "constrain": "domain", "showgrid": False},
         "yaxis": {**AXIS, "title": {"text": plane.labels[1]}, "constrain": "domain", "showgrid": False},
     }
@@ -223,7 +223,7 @@ def _steps(edges: np.ndarray, heights: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _looks() -> dict[str, Any]:
+def _figure_layout() -> dict[str, Any]:
     return {
         "font": {**FONT, "size": 12},
         "paper_bgcolor": "#ffffff",

@@ -103,7 +103,7 @@ def _binomial_quantile(trials, failure, share):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def _one_of(arrived, shares):  # noqa: ANN001, ANN202
+def _share_of_counts(arrived, shares):  # noqa: ANN001, ANN202
     """One of so many equal shares of photons, evenly over time."""
     total, before = 0, 0
     found = np.empty_like(arrived)
@@ -121,7 +121,7 @@ def _across_pulses(arrived, mine, pulses, dead, period, key, ray):  # noqa: ANN0
     total = arrived.sum()
     if total > MOST_PHOTONS and pulses > 1:
         shares = min(total // MOST_PHOTONS + 1, pulses)
-        _across_pulses(_one_of(arrived, shares), mine, pulses // shares, dead, period, key, ray)
+        _across_pulses(_share_of_counts(arrived, shares), mine, pulses // shares, dead, period, key, ray)
         mine *= shares
         return
     size = len(arrived)

@@ -65,7 +65,7 @@ def haze_per_pulse(first_hits: FirstHits, emitted: np.ndarray, bin_m: float) -> 
     light = emitted * photons.efficiency * medium.backscatter_per_m_sr
     light = light * np.exp(-2 * medium.extinction_per_m * start)
     if first_hits.scene.receiver is not None:
-        whole, fullest = _beside(first_hits, end, bin_m)
+        whole, fullest = _haze_beside_rays(first_hits, end, bin_m)
         return light * whole, light * fullest
     focus = 1 / np.maximum(first_hits.hits.range_m, TINY)
     sharp = 1 / (focus + math.sqrt(photons.field_of_view_sr / photons.aperture_m2))
@@ -79,7 +79,7 @@ def haze_per_pulse(first_hits: FirstHits, emitted: np.ndarray, bin_m: float) -> 
     return whole, np.minimum(2 * math.pi * light * bin_m * squared / (near * (near + sharp)), whole)
 
 
-def _beside(first_hits: FirstHits, end_m: np.ndarray, bin_m: float) -> tuple[np.ndarray, np.ndarray]:
+def _haze_beside_rays(first_hits: FirstHits, end_m: np.ndarray, bin_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Solid angle times length of the haze that a fixed receiver gets, up to half paths (N,), and in one bin, (N,).
 
     It sees all of a ray that passes it at the distance h, c from the ray's start: at most the integral of
