@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,6 @@ from lidardesign.numerics import HALF_DIGITS
 from lidardesign.run.files import write_atomic
 from lidardesign.space import direction
 
-BLUEPRINT = "sensor.lidar.ray_cast"
 MIRROR = np.diag([1.0, -1.0, 1.0])
 # A sweep of one column is as narrow as its field of view is written.
 NARROWEST_DEG = 0.001
@@ -39,14 +38,29 @@ def write_carla(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Ban
         ConfigError: A frame rate at which CARLA's whole number of points per second is not the rays of a frame.
     """
     mounted = mounts(design, rays)
-    _refuse_slow_rates(mounted, rate_hz)
+    for mount in mounted:
+        grid = grid_of(mount)
+        if round(round(len(grid) * rate_hz) / rate_hz / grid.rows) != grid.columns:
+            raise ConfigError(
+                f"{rate_hz:g} frames of {len(grid)} rays per second are no whole number of points per second, as CARLA "
+                f"counts them ({mount.name})",
+                where="--rate-hz",
+                allowed="a rate at which they are, as one of 1 or more",
+            )
     document = {
         "design": design.name,
         "fixed_delta_seconds": 1 / rate_hz,
         "sensors": [_sensor(one, rate_hz) for one in mounted],
     }
     write_atomic(path, json.dumps(document, indent=1) + "\n")
-    return _losses(design, mounted, rays)
+    notes = grid_sensor_losses(design, mounted, rays)
+    late = [one.gate_m[0] for one in mounted if one.gate_m[0] > 0]
+    if late:
+        notes.append(
+            f"CARLA has no gate start: {len(late)} of {len(mounted)} sensors also see what is nearer than theirs, of "
+            f"{min(late):.3g} to {max(late):.3g} m"
+        )
+    return [*notes, "every frame has all rays once where the world's fixed_delta_seconds is that of the file"]
 
 
 def carla_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
@@ -64,22 +78,9 @@ def carla_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Esti
     return mounts_rounding(rays, mounted, found, path)
 
 
-def _refuse_slow_rates(mounted: Sequence[Mount], rate_hz: float) -> None:
-    for mount in mounted:
-        grid = grid_of(mount)
-        if round(round(len(grid) * rate_hz) / rate_hz / grid.rows) != grid.columns:
-            raise ConfigError(
-                f"{rate_hz:g} frames of {len(grid)} rays per second are no whole number of points per second, as CARLA "
-                f"counts them ({mount.name})",
-                where="--rate-hz",
-                allowed="a rate at which they are, as one of 1 or more",
-            )
-
-
 def _sensor(mount: Mount, rate_hz: float) -> dict[str, Any]:
     grid = grid_of(mount)
-    step_deg = math.degrees(grid.azimuth_step_rad)
-    field_deg = max(step_deg * grid.columns, NARROWEST_DEG)
+    field_deg = max(math.degrees(grid.azimuth_step_rad) * grid.columns, NARROWEST_DEG)
     low_deg, high_deg = (math.degrees(value) for value in grid.elevation_rad)
     attributes = {
         "channels": str(grid.rows),
@@ -100,7 +101,7 @@ def _sensor(mount: Mount, rate_hz: float) -> dict[str, Any]:
     return {
         "id": mount.name,
         "name": mount.sensor.name,
-        "type": BLUEPRINT,
+        "type": "sensor.lidar.ray_cast",
         "attributes": attributes,
         "transform": {"location": location, "rotation": _rotation(mount, grid, field_deg)},
     }
@@ -112,8 +113,7 @@ def _rotation(mount: Mount, grid: EvenGrid, field_deg: float) -> dict[str, float
     turn_rad = math.radians(field_deg) / 2 - grid.azimuth_rad[1]
     cos_t, sin_t = math.cos(turn_rad), math.sin(turn_rad)
     turned = np.array([[cos_t, -sin_t, 0.0], [sin_t, cos_t, 0.0], [0.0, 0.0, 1.0]])
-    matrix = MIRROR @ mount.sensor.frame.T @ MIRROR @ turned
-    forward, side, up = matrix.T
+    forward, side, up = (MIRROR @ mount.sensor.frame.T @ MIRROR @ turned).T
     flat = math.hypot(forward[0], forward[1])
     # straight up or down, yaw and roll are one angle
     level = flat > HALF_DIGITS
@@ -141,25 +141,12 @@ def _axes(rotation: Mapping[str, float]) -> np.ndarray:
 
 
 def _held(sensor: Mapping[str, Any], step_s: float) -> ReadMount:
-    """What a sensor of the file fires in one frame, in our own frame."""
     attributes = sensor["attributes"]
     rows = int(attributes["channels"])
     columns = round(float(attributes["points_per_second"]) * step_s / rows)
     field, high, low = (math.radians(float(attributes[f"{name}_fov"])) for name in ("horizontal", "upper", "lower"))
     swept = -field / 2 + np.arange(columns) * field / columns
-    elevation = np.linspace(high, low, rows)
-    local = direction(np.tile(swept, rows), np.repeat(elevation, columns))
+    local = direction(np.tile(swept, rows), np.repeat(np.linspace(high, low, rows), columns))
     location = np.array([sensor["transform"]["location"][axis] for axis in "xyz"])
     world = local @ _axes(sensor["transform"]["rotation"]).T @ MIRROR
     return ReadMount(MIRROR @ location, world, (math.nan, float(attributes["range"])))
-
-
-def _losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
-    notes = grid_sensor_losses(design, mounted, rays)
-    late = [one.gate_m[0] for one in mounted if one.gate_m[0] > 0]
-    if late:
-        notes.append(
-            f"CARLA has no gate start: {len(late)} of {len(mounted)} sensors also see what is nearer than theirs, of "
-            f"{min(late):.3g} to {max(late):.3g} m"
-        )
-    return [*notes, "every frame has all rays once where the world's fixed_delta_seconds is that of the file"]

@@ -93,8 +93,7 @@ def _rows(points: np.ndarray) -> np.ndarray:
     steepness = len(points) if extent[1] >= len(points) * extent[0] else float(extent[1] / extent[0])
     rows = max(1, round(float(np.sqrt(len(points) * steepness))))
     row = np.minimum((points[:, 1] - low[1]) / extent[1] * rows, rows - 1).astype(np.int64)
-    along = np.where(row % 2 == 0, points[:, 0], -points[:, 0])
-    return np.lexsort((along, row))
+    return np.lexsort((np.where(row % 2 == 0, points[:, 0], -points[:, 0]), row))
 
 
 def _nearest(points: np.ndarray) -> np.ndarray:
@@ -323,7 +322,6 @@ def _position(origin_m: np.ndarray, rays: Rays, chosen: np.ndarray) -> Position:
 
 
 def _refuse_far_rays(design: DesignSpec, rays: Rays, positions: list[Position]) -> None:
-    """Refuse the design where mirrors would have to turn beyond `LIMIT_DEG`, with how many rays and the worst."""
     ray = np.concatenate([one.ray for one in positions] or [np.zeros(0, dtype=np.int64)])
     angles_deg = np.concatenate([one.angles_deg for one in positions] or [np.zeros((0, 2))])
     beyond = np.abs(angles_deg).max(axis=1) > LIMIT_DEG + ROUNDING_DEG
@@ -361,7 +359,6 @@ def _summary(positions: list[Position]) -> list[str]:
 
 
 def _columns(path: Path) -> dict[str, np.ndarray]:
-    """The table of a file by column, whole numbers where they must be."""
     where = str(path)
     try:
         with Path(path).open(encoding="utf-8-sig", newline="") as file:

@@ -10,23 +10,26 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
+from lidardesign.estimates import Estimate
 from lidardesign.export.common.names import child, document, element, read_xml, write_folder
-from lidardesign.export.common.poses import Mount, design_losses, mounts, rays_of_parts, rays_rounding, require_rays
+from lidardesign.export.common.poses import (
+    Mount,
+    Part,
+    design_losses,
+    mounts,
+    rays_of_parts,
+    rays_rounding,
+    require_rays,
+)
 from lidardesign.geometry.rays import Rays
 from lidardesign.scene import SPEED_OF_LIGHT_M_S
 from lidardesign.space import angles, direction
-
-if TYPE_CHECKING:
-    from xml.etree.ElementTree import Element
-
-    from lidardesign.estimates import Estimate
-    from lidardesign.export.common.poses import Part
 
 SCANNERS, PLATFORMS, SURVEY, SCENE = "scanners.xml", "platforms.xml", ".survey.xml", "scene.xml#scene"
 # HELIOS++ drops echoes whose rise begins before the gate does: a short pulse, in fine bins, loses little.
@@ -35,7 +38,6 @@ PULSE_NS, BIN_NS = 0.1, 0.01
 WINDOW_NS = PULSE_NS / 4
 NS_PER_S = 1e9
 MM_PER_M = 1000
-QUARTER_TURN_DEG = 90.0
 
 
 def write_helios(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> list[str]:
@@ -67,14 +69,12 @@ def write_helios(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> 
             headRotateStart_deg=-1, headRotateStop_deg=-0.5,
         )  # fmt: skip
         surveys[f"{mount.name}{SURVEY}"] = document(root)
-    files = {SCANNERS: document(scanners), PLATFORMS: document(_platforms()), **surveys}
-    notes = [*write_folder(path, files), *_notes(rays, rate_hz, pulse_hz)]
-    return [*notes, *design_losses(design, mounted)]
-
-
-def _notes(rays: Rays, rate_hz: float, pulse_hz: int) -> list[str]:
+    # a platform that stands still, its scanner at its own place
+    platforms = element("document")
+    child(child(platforms, "platform", id="fixed", name="fixed", type="static"), "scannerMount", x=0, y=0, z=0)
     lost_m = PULSE_NS / NS_PER_S * SPEED_OF_LIGHT_M_S
     notes = [
+        *write_folder(path, {SCANNERS: document(scanners), PLATFORMS: document(platforms), **surveys}),
         f"the surveys name the scene {SCENE}: put yours beside them, and give the folder to helios as --assets",
         f"HELIOS++ drops returns up to {MM_PER_M * lost_m:.0f} mm behind a gate's start: the rise of a {PULSE_NS} ns "
         "pulse must begin inside",
@@ -82,7 +82,7 @@ def _notes(rays: Rays, rate_hz: float, pulse_hz: int) -> list[str]:
     ]
     if pulse_hz != rate_hz:
         notes.append(f"{rate_hz:g} frames per second became {pulse_hz}: HELIOS++ knows whole numbers only")
-    return notes
+    return [*notes, *design_losses(design, mounted)]
 
 
 def _add_scanner(root: Element, mount: Mount, rays: Rays, pulse_hz: int) -> None:
@@ -98,18 +98,11 @@ def _add_scanner(root: Element, mount: Mount, rays: Rays, pulse_hz: int) -> None
     azimuth_deg, elevation_deg = (np.degrees(values) for values in angles(rays.direction))
     for number, (x, y, z) in enumerate((rays.origin_m - rays.origin_m[0]).tolist()):
         start, end = rays.gate_m[number].tolist()
-        channel = child(channels, "channel", id=number, rangeMin_m=start, rangeMax_m=end)
-        origin = child(channel, "beamOrigin", x=x, y=y, z=z)
+        origin = child(
+            child(channels, "channel", id=number, rangeMin_m=start, rangeMax_m=end), "beamOrigin", x=x, y=y, z=z
+        )
         child(origin, "rot", axis="x", angle_deg=float(elevation_deg[number]))
-        child(origin, "rot", axis="z", angle_deg=float(azimuth_deg[number] - QUARTER_TURN_DEG))
-
-
-def _platforms() -> Element:
-    """A platform that stands still, its scanner at its own place."""
-    root = element("document")
-    platform = child(root, "platform", id="fixed", name="fixed", type="static")
-    child(platform, "scannerMount", x=0, y=0, z=0)
-    return root
+        child(origin, "rot", axis="z", angle_deg=float(azimuth_deg[number] - 90.0))
 
 
 def read_helios(path: Path, design: DesignSpec, rays: Rays) -> Rays:
@@ -127,7 +120,6 @@ def read_helios(path: Path, design: DesignSpec, rays: Rays) -> Rays:
 
 
 def _part(ray: np.ndarray, scanner: Element | None, survey: Path) -> Part:
-    """The rays of one sensor, by the rotations of its channels."""
     settings = read_xml(survey, "document").find("survey/leg/platformSettings")
     if scanner is None or settings is None:
         raise DataError("holds no survey of this design", where=str(survey), hint="export it again")

@@ -60,11 +60,10 @@ class Emitters:
 def emitters_of(mount: Mount, rays: Rays, rate_hz: int) -> Emitters:
     """The emitters of a mounted sensor."""
     ranges, range_id = np.unique(rays.gate_m[mount.ray], axis=0, return_inverse=True)
-    time_ns = np.floor(fire_times_s(rays, rate_hz)[mount.ray] * NANOSECONDS_PER_SECOND).astype(np.int64)
     return Emitters(
         np.degrees(mount.azimuth_rad).astype(np.float32),
         np.degrees(mount.elevation_rad).astype(np.float32),
-        time_ns,
+        np.floor(fire_times_s(rays, rate_hz)[mount.ray] * NANOSECONDS_PER_SECOND).astype(np.int64),
         range_id.reshape(-1),
         ranges,
     )
@@ -173,7 +172,16 @@ def write_isaac_json(design: DesignSpec, rays: Rays, path: Path, rate_hz: float 
     """
     mounted, whole_hz = mounts(design, rays), whole_rate_hz(rate_hz)
     files = {f"{file_name(mount)}.json": _profile(mount, rays, whole_hz) for mount in mounted}
-    files[MOUNTS] = {"design": design.name, "sensors": [_placed(mount) for mount in mounted]}
+    placed = [
+        {
+            "config": file_name(mount),
+            "name": mount.sensor.name,
+            "translation_m": mount.origin_m.tolist(),
+            "orientation_wxyz": list(mount.quaternion),
+        }
+        for mount in mounted
+    ]
+    files[MOUNTS] = {"design": design.name, "sensors": placed}
     notes = write_folder(path, {name: f"{json.dumps(value, indent=1)}\n".encode() for name, value in files.items()})
     optics = "power, aperture, wavelength and least reflectance are those of NVIDIA's example: a design has none"
     return [*isaac_losses(design, mounted, rate_hz), f"a profile has no pose: places stand in {MOUNTS}", optics, *notes]
@@ -197,15 +205,6 @@ def isaac_json_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str,
 def file_name(mount: Mount) -> str:
     """What the profile of a sensor is called, without its suffix."""
     return f"{mount.name}_lidar" if mount.name.lower() == MOUNTS_NAME else mount.name
-
-
-def _placed(mount: Mount) -> dict[str, Any]:
-    return {
-        "config": file_name(mount),
-        "name": mount.sensor.name,
-        "translation_m": mount.origin_m.tolist(),
-        "orientation_wxyz": list(mount.quaternion),
-    }
 
 
 def _profile(mount: Mount, rays: Rays, rate_hz: int) -> dict[str, Any]:
@@ -262,12 +261,11 @@ def _profile(mount: Mount, rays: Rays, rate_hz: int) -> dict[str, Any]:
 
 def _read_profile(placed: dict[str, Any], folder: Path) -> ReadSensor:
     profile = json.loads((folder / f"{placed['config']}.json").read_text(encoding="utf-8"))["profile"]
-    ranges = [[one["min"], one["max"]] for one in profile["ranges"]]
     return ReadSensor(
         np.array(placed["translation_m"]),
         rotations_of_quaternions(np.array(placed["orientation_wxyz"])),
         profile["scanRateBaseHz"],
-        emitters_of_arrays(profile["emitterStates"][0], ranges),
+        emitters_of_arrays(profile["emitterStates"][0], [[one["min"], one["max"]] for one in profile["ranges"]]),
     )
 
 
@@ -329,8 +327,7 @@ def _prim(mount: Mount, rays: Rays, rate_hz: int) -> list[str]:
     lines = [f'    def OmniLidar "{mount.name}" (', f"        displayName = {quoted(mount.sensor.name)}"]
     lines += [f"        prepend apiSchemas = {schemas}", "    )", "    {"]
     held = emitters_of(mount, rays, rate_hz)
-    attributes = [*_core(mount, held, rate_hz), *_state(held)]
-    lines += [f"        {kind} {name} = {value}" for kind, name, value in attributes]
+    lines += [f"        {kind} {name} = {value}" for kind, name, value in [*_core(mount, held, rate_hz), *_state(held)]]
     lines += [
         f"        double3 xformOp:translate = {_vector(mount.origin_m)}",
         f"        quatd xformOp:orient = {_vector(mount.quaternion)}",
@@ -363,9 +360,8 @@ def _core(mount: Mount, held: Emitters, rate_hz: int) -> list[tuple[str, str, st
         *(("float", f"{axis}Error{what}", "0") for axis in ("azimuth", "elevation") for what in ("Mean", "Std")),
         ("float", "rangeAccuracyM", "0"),
     ]
-    named = ("string", "omni:sensor:marketName", quoted(mount.sensor.name))
     return [
-        named,
+        ("string", "omni:sensor:marketName", quoted(mount.sensor.name)),
         ("float", "omni:sensor:tickRate", str(rate_hz)),
         *((kind, CORE + name, value) for kind, name, value in values),
     ]
@@ -399,7 +395,6 @@ def _vector(values: Iterable[float]) -> str:
 
 
 def _prims(lines: Iterable[str]) -> list[dict[str, str]]:
-    """Values by attribute name of each lidar prim of a layer that `write` wrote."""
     found: list[dict[str, str]] = []
     for line in lines:
         attribute = _ATTRIBUTE.match(line)

@@ -15,12 +15,11 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lidardesign.design.layouts.grid import field_on_sphere
-from lidardesign.design.sensor import DesignSpec, tangent_directions
+from lidardesign.design.sensor import DesignSpec, Sensor, tangent_directions
 from lidardesign.errors import DataError
 from lidardesign.estimates import ROUNDING, Estimate
 from lidardesign.export.common.names import identifier, write_folder
@@ -28,12 +27,6 @@ from lidardesign.export.common.poses import angles_between, constraint_losses, r
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import unit_vectors
 from lidardesign.run.files import write_atomic
-
-if TYPE_CHECKING:
-    from lidardesign.design.sensor import Sensor
-    from lidardesign.estimates import Estimate
-    from lidardesign.geometry.rays import Rays
-
 
 RAYS, BEAMS, FRUSTA = "rays.ply", "beams.ply", "frusta.ply"
 PLACE = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]
@@ -72,7 +65,6 @@ def write_ply(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
 
 
 def _file(comments: list[str], **elements: np.ndarray) -> bytes:
-    """A binary file of elements, each a structured array."""
     header = ["ply", "format binary_little_endian 1.0", "comment lidardesign, metres, z up", *comments]
     for name, table in elements.items():
         header.append(f"element {name} {len(table)}")
@@ -112,8 +104,7 @@ def _beams(rays: Rays, comments: list[str]) -> bytes:
     places = rays.origin_m[:, None] + rays.gate_m[:, :, None] * rays.direction[:, None]
     edges = np.zeros(len(rays), dtype=EDGE)
     edges["vertex1"], edges["vertex2"] = np.arange(2 * len(rays)).reshape(-1, 2).T
-    points = _points(places.reshape(-1, 3), np.repeat(rays.sensor, 2), PLACE + COLOUR)
-    return _file(comments, vertex=points, edge=edges)
+    return _file(comments, vertex=_points(places.reshape(-1, 3), np.repeat(rays.sensor, 2), PLACE + COLOUR), edge=edges)
 
 
 def _frusta(sensors: list[tuple[int, Sensor]], comments: list[str]) -> bytes:
@@ -140,8 +131,7 @@ def _frusta(sensors: list[tuple[int, Sensor]], comments: list[str]) -> bytes:
 def _frustum(sensor: Sensor) -> np.ndarray:
     """Points of the shell at the gate's start, then of that at its end, row by row upwards: 2 (PARTS + 1)^2."""
     across, up = (np.linspace(-extent / 2, extent / 2, PARTS + 1) for extent in field_on_sphere(sensor))
-    tangent = np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2)
-    looking = tangent_directions(sensor.frame, tangent)
+    looking = tangent_directions(sensor.frame, np.stack(np.meshgrid(across, up), axis=-1).reshape(-1, 2))
     return np.concatenate([np.asarray(sensor.origin_m) + end * looking for end in sensor.gate_m])
 
 

@@ -8,15 +8,17 @@ film that listens from twice the gate's start in bins of c times their duration 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import DataError
+from lidardesign.estimates import Estimate
 from lidardesign.export.common.names import child, document, element, read_xml, write_folder
 from lidardesign.export.common.poses import (
+    Part,
     Place,
     design_losses,
     mounts,
@@ -28,14 +30,7 @@ from lidardesign.export.common.poses import (
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import unit_vectors
 
-if TYPE_CHECKING:
-    from xml.etree.ElementTree import Element
-
-    from lidardesign.estimates import Estimate
-    from lidardesign.export.common.poses import Part
-
 SUFFIX = ".xml"
-VERSION = "3.0.0"
 SAMPLES = 64
 # From the light to a surface and back to the sensor.
 DEPTH = 2
@@ -56,22 +51,17 @@ def write_mitsuba(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
         "scenes hold no shapes: include one of them in yours, or yours in it; each sensor is a scene of its own",
         f"the light is one flash for all rays: only light straight there and back (max_depth {DEPTH}) is the ray's own",
         f"gates end on whole bins of {MM_PER_M * Bandwidth().bin_m:.1f} mm; times within the frame are not held",
-        *_gate_notes(rays, found),
     ]
+    # a film has one gate
+    wider = np.concatenate([np.abs(rays.gate_m[one.ray] - _gate_m(rays, one)).max(axis=1) for one in found])
+    if wider.any():
+        notes.append(
+            f"{np.count_nonzero(wider)} of {len(rays)} rays have gates of their own: their film has the narrowest gate "
+            f"that holds all of its rays, up to {wider.max():.3g} m wider"
+        )
     if len(found) > len(mounted):
         notes.append(f"rays of {len(mounted)} sensors start at {len(found)} places: each is a scene of its own")
     return [*notes, *design_losses(design, mounted)]
-
-
-def _gate_notes(rays: Rays, found: list[Place]) -> list[str]:
-    """How many rays listen longer than they should, and by how much: a film has one gate."""
-    wider = np.concatenate([np.abs(rays.gate_m[one.ray] - _gate_m(rays, one)).max(axis=1) for one in found])
-    if not wider.any():
-        return []
-    return [
-        f"{np.count_nonzero(wider)} of {len(rays)} rays have gates of their own: their film has the narrowest gate "
-        f"that holds all of its rays, up to {wider.max():.3g} m wider"
-    ]
 
 
 def _gate_m(rays: Rays, place: Place) -> tuple[float, float]:
@@ -82,13 +72,11 @@ def _gate_m(rays: Rays, place: Place) -> tuple[float, float]:
 
 def _scene(place: Place, rays: Rays) -> Element:
     """Integrator, rays with their film, and light."""
-    root = element("scene", {"version": VERSION})
-    integrator = child(root, "integrator", type="transient_path")
-    child(integrator, "integer", name="max_depth", value=DEPTH)
+    root = element("scene", {"version": "3.0.0"})
+    child(child(root, "integrator", type="transient_path"), "integer", name="max_depth", value=DEPTH)
     batch = child(root, "sensor", type="batch", id=place.name)
     _add_film(batch, place, rays)
-    sampler = child(batch, "sampler", type="independent")
-    child(sampler, "integer", name="sample_count", value=SAMPLES)
+    child(child(batch, "sampler", type="independent"), "integer", name="sample_count", value=SAMPLES)
     for number, ray in enumerate(place.ray.tolist()):
         meter = child(batch, "sensor", type="radiancemeter", id=f"{place.name}_ray_{number}")
         _add_vector(meter, "point", "origin", rays.origin_m[ray])

@@ -8,7 +8,6 @@ included in another one. Rangefinders see neither geoms of their own body nor on
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -23,8 +22,6 @@ from lidardesign.geometry.frames import rotations_of_quaternions
 from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import SLACK, unit_vectors
 
-# In the user data of each rangefinder: gate start and end [m], number of the sensor, firing time [s].
-USER_DATA = 4
 WORLD = "world"
 # Half of what a site of one ray is drawn as [m].
 SITE_SIZE_M = 0.002
@@ -41,7 +38,14 @@ def write_mjcf(design: DesignSpec, rays: Rays, path: Path) -> list[str]:
         worldbody.append(_body(mount, name, rays, site[mount.ray]))
     sensor = element("sensor", children=[_rangefinder(str(site[ray]), rays, ray) for ray in range(len(rays))])
     write_xml(path, element("mujoco", {"model": design.name}, [worldbody, sensor]))
-    return _losses(design, mounted, rays)
+    notes = design_losses(design, mounted)
+    late = rays.gate_m[rays.gate_m[:, 0] > 0, 0]
+    if len(late):
+        notes.append(
+            f"MuJoCo has no gate start: {len(late)} of {len(rays)} rays also see what is nearer than theirs, of "
+            f"{late.min():.3g} to {late.max():.3g} m; it stands in the rangefinders' user data"
+        )
+    return [*notes, "a reading equal to the cutoff is a hit at or beyond the end of the gate; -1 is no hit"]
 
 
 def read_mjcf(path: Path) -> Rays:
@@ -66,18 +70,14 @@ def read_mjcf(path: Path) -> Rays:
 
 def mjcf_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
     """What the written numbers lose."""
-    if not len(rays):
-        return rays_rounding(rays, rays, path)
-    return rays_rounding(rays, read_mjcf(path), path)
+    return rays_rounding(rays, read_mjcf(path) if len(rays) else rays, path)
 
 
 def _body(mount: Mount, name: str, rays: Rays, sites: np.ndarray) -> Element:
-    """The body of a sensor at its mount, with the sites of its rays in its frame."""
     frame = mount.sensor.frame
     places = (rays.origin_m[mount.ray] - mount.origin_m) @ frame.T
     # The shortest rotations of +z to unit vectors (N, 3), as quaternions (w, x, y, z), shape (N, 4)
-    directions = rays.direction[mount.ray] @ frame.T
-    x, y, z = directions.T
+    x, y, z = (rays.direction[mount.ray] @ frame.T).T
     across = np.hypot(x, y)
     half = np.arctan2(across, z) / 2
     # straight down any axis across will do
@@ -91,16 +91,14 @@ def _body(mount: Mount, name: str, rays: Rays, sites: np.ndarray) -> Element:
         )
         for site, place, turn in zip(sites, places, turns, strict=True)
     ]
-    pose = {"pos": numbers(mount.origin_m), "quat": numbers(mount.quaternion)}
-    return element("body", {"name": name, **pose}, made)
+    return element("body", {"name": name, "pos": numbers(mount.origin_m), "quat": numbers(mount.quaternion)}, made)
 
 
 def _rangefinder(site: str, rays: Rays, ray: int) -> Element:
     start, end = rays.gate_m[ray]
     user = numbers([start, end, rays.sensor[ray], rays.time_s[ray]])
     # a cutoff of 0 would be none
-    cutoff = number(max(end, SLACK))
-    return element("rangefinder", {"name": site, "site": site, "cutoff": cutoff, "user": user})
+    return element("rangefinder", {"name": site, "site": site, "cutoff": number(max(end, SLACK)), "user": user})
 
 
 def _sites(body: Element) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -115,15 +113,3 @@ def _sites(body: Element) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 def _floats(one: Element, name: str) -> np.ndarray:
     return np.array(one.attrib[name].split(), dtype=np.float64)
-
-
-def _losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
-    notes = design_losses(design, mounted)
-    late = rays.gate_m[rays.gate_m[:, 0] > 0, 0]
-    if len(late):
-        notes.append(
-            f"MuJoCo has no gate start: {len(late)} of {len(rays)} rays also see what is nearer than theirs, of "
-            f"{late.min():.3g} to {late.max():.3g} m; it stands in the rangefinders' user data"
-        )
-    notes.append("a reading equal to the cutoff is a hit at or beyond the end of the gate; -1 is no hit")
-    return notes

@@ -11,7 +11,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError, DataError
 from lidardesign.estimates import Estimate
 from lidardesign.export.common.poses import (
+    Part,
     Place,
     design_losses,
     fire_times_s,
@@ -33,9 +34,6 @@ from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import FULL_TURN, unit_vectors
 from lidardesign.run.files import write_atomic
 from lidardesign.space import angles
-
-if TYPE_CHECKING:
-    from lidardesign.export.common.poses import Part
 
 MICROSECONDS_PER_S = 1e6
 NANOSECONDS_PER_S = 10**9

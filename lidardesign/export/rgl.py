@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
@@ -43,13 +43,8 @@ from lidardesign.geometry.rays import Rays
 from lidardesign.numerics import unit_vectors
 from lidardesign.space import angles
 
-if TYPE_CHECKING:
-    from xml.etree.ElementTree import Element
-
-
 MODEL, PATTERN, RANGES, TIMES = "model.sdf", ".mat3x4f", ".range2f", ".time1f"
 MS_PER_S = 1000.0
-SDF_VERSION = "1.9"
 POSE_NUMBERS = 6
 
 
@@ -62,7 +57,7 @@ def write_rgl(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
     require_rays(design, rays, "a ray pattern")
     path = Path(path)
     mounted = mounts(design, rays)
-    root = element("sdf", {"version": SDF_VERSION})
+    root = element("sdf", {"version": "1.9"})
     model = child(root, "model", name=identifier(design.name))
     child(model, "static", text=True)
     link = child(model, "link", name="lidar")
@@ -73,7 +68,6 @@ def write_rgl(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
         files[f"{mount.name}{PATTERN}"] = _matrices(mount, rays.subset(mount.ray)).astype("<f4").tobytes()
         files[f"{mount.name}{RANGES}"] = rays.gate_m[mount.ray].astype("<f4").tobytes()
         # A sensor with the plugin that fires its pattern
-        pattern = path.resolve() / f"{mount.name}{PATTERN}"
         sensor = child(link, "sensor", name=mount.name, type="custom")
         child(sensor, "pose", text=numbers([*rays.origin_m[mount.ray[0]], *mount.roll_pitch_yaw_rad]))
         plugin = child(sensor, "plugin", filename="RGLServerPluginInstance", name="rgl::RGLServerPluginInstance")
@@ -81,17 +75,17 @@ def write_rgl(design: DesignSpec, rays: Rays, path: Path, rate_hz: float) -> lis
         limits = child(plugin, "range")
         child(limits, "min", text=start)
         child(limits, "max", text=end)
-        child(plugin, "update_rate", text=float(rate_hz))
-        child(plugin, "update_on_paused_sim", text=False)
-        child(plugin, "topic", text=f"rgl/{mount.name}")
-        child(plugin, "frame", text=mount.name)
-        child(plugin, "pattern_preset_path", text=pattern)
-    notes = write_folder(path, {MODEL: document(root), **files})
-    return [*notes, *_notes(design, mounted, path)]
-
-
-def _notes(design: DesignSpec, mounted: list[Mount], path: Path) -> list[str]:
+        settings = {
+            "update_rate": float(rate_hz),
+            "update_on_paused_sim": False,
+            "topic": f"rgl/{mount.name}",
+            "frame": mount.name,
+            "pattern_preset_path": path.resolve() / f"{mount.name}{PATTERN}",
+        }
+        for tag, value in settings.items():
+            child(plugin, tag, text=value)
     notes = [
+        *write_folder(path, {MODEL: document(root), **files}),
         f"{MODEL} names the patterns by their absolute paths in {path.resolve()}: export again where they move",
         f"the plugin fires all rays of a frame at once; the {TIMES} files hold when each fires, for "
         "rgl_node_rays_set_time_offsets of the library",

@@ -96,10 +96,8 @@ def _row_counts(azimuth_rad: np.ndarray, elevation_rad: np.ndarray) -> list[int]
     """Numbers of rows that are tried: around square cells, and as many as there are distinct elevations."""
     count = len(azimuth_rad)
     width = float(np.ptp(azimuth_rad) * np.cos(np.mean(elevation_rad)))
-    height = float(np.ptp(elevation_rad))
-    square = math.sqrt(count * height / width) if width > 0 else float(count)
-    middle = min(max(round(square), 1), count)
-    low = max(middle - TRIED_ROWS // 2, 1)
+    square = math.sqrt(count * float(np.ptp(elevation_rad)) / width) if width > 0 else float(count)
+    low = max(min(max(round(square), 1), count) - TRIED_ROWS // 2, 1)
     tried = set(range(low, min(low + TRIED_ROWS, count) + 1))
     azimuths, elevations = (
         len(np.unique(np.round(values / ON_GRID_RAD / 2))) for values in (azimuth_rad, elevation_rad)
@@ -121,7 +119,6 @@ def _fitted(values: np.ndarray, count: int) -> tuple[float, float]:
 
 
 def _nearest(values: np.ndarray, bounds: tuple[float, float], count: int) -> np.ndarray:
-    """The grid's value nearest to each given one."""
     low, high = bounds
     if count == 1 or low == high:
         return np.full(len(values), low)

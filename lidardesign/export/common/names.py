@@ -33,8 +33,7 @@ def identifier(name: str) -> str:
     """
     plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
     word = re.sub(r"[^A-Za-z0-9]+", "_", plain).strip("_")[:LONGEST_NAME].rstrip("_")
-    plain_word = word[:1].isalpha() and word.lower() not in RESERVED
-    return word if plain_word else f"s_{word}".rstrip("_")
+    return word if (word[:1].isalpha() and word.lower() not in RESERVED) else f"s_{word}".rstrip("_")
 
 
 def identifiers(names: Sequence[str]) -> list[str]:

@@ -42,9 +42,8 @@ def rays_rounding(written: Rays, found: Rays, path: Path, *, times: bool = True)
             where=str(path),
             hint="export it again, to another disk",
         )
-    origin = np.linalg.norm(found.origin_m - written.origin_m, axis=1)
     errors = {
-        "origin_m": _largest(origin, "m"),
+        "origin_m": _largest(np.linalg.norm(found.origin_m - written.origin_m, axis=1), "m"),
         "direction_rad": _largest(angles_between(found.direction, written.direction), "rad"),
         "gate_m": _largest(np.abs(found.gate_m - written.gate_m), "m"),
     }
@@ -68,12 +67,11 @@ def sensors_rounding(written: Sequence[Sensor], found: Sequence[Sensor], path: P
     ]
     origin = np.linalg.norm(differences(lambda one: one.origin_m), axis=1)
     spread = differences(lambda one: (one.spread_horizontal_rad, one.spread_vertical_rad))
-    gate = differences(lambda one: (one.range_m, one.spread_range_m))
     return {
         "origin_m": _largest(origin, "m"),
         "direction_rad": _largest(angles_between(*boresights), "rad"),
         "spread_rad": _largest(np.abs(spread), "rad"),
-        "range_m": _largest(np.abs(gate), "m"),
+        "range_m": _largest(np.abs(differences(lambda one: (one.range_m, one.spread_range_m))), "m"),
         "weight": _largest(np.abs(differences(lambda one: one.weight)), ""),
     }
 
@@ -108,7 +106,6 @@ class Mount:
     Arguments:
         name: An identifier, unique in the design.
         sensor: What is mounted.
-        index: Its index in the design.
         origin_m: The mean of where its rays start, shape (3,).
         ray: Indices of its rays, shape (N,), N >= 1.
         azimuth_rad, elevation_rad: Of its rays in its frame, azimuths from -pi to pi, shape (N,).
@@ -119,7 +116,6 @@ class Mount:
 
     name: str
     sensor: Sensor
-    index: int
     origin_m: np.ndarray
     ray: np.ndarray
     azimuth_rad: np.ndarray
@@ -145,29 +141,28 @@ def mounts(design: DesignSpec, rays: Rays) -> list[Mount]:
     order = np.argsort(rays.sensor, kind="stable")
     edges = np.searchsorted(rays.sensor[order], np.arange(len(design.sensors) + 1))
     return [
-        _mount(name, sensor, index, rays, order[edges[index] : edges[index + 1]])
+        _mount(name, sensor, rays, order[edges[index] : edges[index + 1]])
         for index, (name, sensor) in enumerate(zip(names, design.sensors, strict=True))
         if edges[index] < edges[index + 1]
     ]
 
 
-def _mount(name: str, sensor: Sensor, index: int, rays: Rays, ray: np.ndarray) -> Mount:
-    origin = rays.origin_m[ray].mean(axis=0)
+def _mount(name: str, sensor: Sensor, rays: Rays, ray: np.ndarray) -> Mount:
+    starts = rays.origin_m[ray]
     # a mean of equal numbers need not be that number
-    origin = rays.origin_m[ray[0]] if (rays.origin_m[ray] == rays.origin_m[ray[0]]).all() else origin
+    origin = starts[0] if (starts == starts[0]).all() else starts.mean(axis=0)
     azimuth, elevation = angles(rays.direction[ray] @ sensor.frame.T)
     gate = rays.gate_m[ray]
     start, end = float(gate[:, 0].min()), float(gate[:, 1].max())
     return Mount(
         name,
         sensor,
-        index,
         origin,
         ray,
         np.where(azimuth > np.pi, azimuth - 2 * np.pi, azimuth),
         elevation,
         (start, end),
-        float(np.linalg.norm(rays.origin_m[ray] - origin, axis=1).max()),
+        float(np.linalg.norm(starts - origin, axis=1).max()),
         float(np.maximum(gate[:, 0] - start, end - gate[:, 1]).max()),
     )
 
@@ -255,14 +250,12 @@ def mounts_rounding(
         looking = rays.direction[mount.ray]
         nearest = held.direction[cKDTree(held.direction).query(looking)[1]]
         ray.append(float(angles_between(looking, nearest).max()))
-        difference = np.abs(rays.gate_m[mount.ray] - np.array(held.gate_m))
-        gate.append(float(np.nanmax(difference, initial=0.0)))
-    fired = sum(len(held.direction) for held in found)
+        gate.append(float(np.nanmax(np.abs(rays.gate_m[mount.ray] - np.array(held.gate_m)), initial=0.0)))
     return {
         "origin_m": Estimate(None, max(origin), "m", ROUNDING),
         "direction_rad": Estimate(None, max(ray), "rad", ROUNDING),
         "gate_m": Estimate(None, max(gate), "m", ROUNDING),
-        "rays": Estimate(None, float(abs(fired - len(rays))), "", ROUNDING),
+        "rays": Estimate(None, float(abs(sum(len(held.direction) for held in found) - len(rays))), "", ROUNDING),
     }
 
 

@@ -1,0 +1,227 @@
+"""Gazebo and ROS: a gpu_lidar per sensor, in SDF 1.9, in a URDF, or in a xacro macro.
+
+A gpu_lidar fires an even grid of azimuth and elevation, the first and the last ray on the bounds, and has one range for
+all of them. In SDF they are in one link of a static model.
+
+For ROS there is a link per sensor with Gazebo's gpu_lidar on it. Links follow REP 103: x forward, y to the left, z up,
+in metres and radians. In the URDF they are fixed to a base link, which is fixed to `world` and has a nominal mass:
+Gazebo leaves out links without one, with all that is fixed to them. The macro mounts them on a robot's own link,
+`<xacro:include filename="FILE"/>` and `<xacro:NAME parent="base_link" prefix=""/>` in the robot's description; poses
+are relative to the parent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from lidardesign.design.bandwidth import Bandwidth
+from lidardesign.design.sensor import DesignSpec
+from lidardesign.errors import DataError
+from lidardesign.estimates import Estimate
+from lidardesign.export.common.even_grid import EvenGrid, grid_of, grid_sensor_losses
+from lidardesign.export.common.names import element, identifier, number, numbers, read_xml, renamed_note, write_xml
+from lidardesign.export.common.poses import Mount, ReadMount, mounts, mounts_rounding, quaternion
+from lidardesign.geometry.frames import rotations_of_quaternions
+from lidardesign.geometry.rays import Rays
+
+LINK = "lidar"
+# Gazebo renders depth images, whose near plane must be in front of the camera.
+NEAREST_M = 0.001
+
+
+def write_sdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+    """Write the model, atomically; returns notes of what the format cannot hold."""
+    mounted = mounts(design, rays)
+    link = element("link", {"name": LINK}, [sensor_element(one, rate_hz, posed=True) for one in mounted])
+    model = element("model", {"name": identifier(design.name)}, [element("static", text="true"), link])
+    write_xml(path, element("sdf", {"version": "1.9"}, [model]))
+    return sdf_losses(design, mounted, rays)
+
+
+def sdf_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+    """How far the rays that Gazebo fires are from the design's."""
+    mounted = mounts(design, rays)
+    found = read_xml(path, "sdf").findall(f"model/link[@name='{LINK}']/sensor")
+    return mounts_rounding(rays, mounted, [read_sensor(one, path) for one in found], path)
+
+
+def sdf_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
+    """Notes of what gpu_lidar sensors cannot hold."""
+    near = [one for one in mounted if one.gate_m[0] < NEAREST_M]
+    late = [one.gate_m[0] for one in mounted if one.gate_m[0] >= NEAREST_M]
+    notes = grid_sensor_losses(design, mounted, rays)
+    if late:
+        notes.append(
+            f"Gazebo does not draw what is nearer than a gate's start: {len(late)} of {len(mounted)} sensors look "
+            f"through it, up to {max(late):.3g} m away, where this design's are blind behind it"
+        )
+    if near:
+        notes.append(
+            f"gates of {len(near)} of {len(mounted)} sensors start below {NEAREST_M:g} m, where Gazebo's depth camera "
+            f"cannot: they start at {NEAREST_M:g} m"
+        )
+    names = [design.name, *(one.sensor.name for one in mounted)]
+    return [*notes, *renamed_note(names, [identifier(design.name), *(one.name for one in mounted)])]
+
+
+def sensor_element(mount: Mount, rate_hz: float, *, posed: bool, name: str | None = None) -> Element:
+    """The <sensor> of a mount: at its pose, or at that of the link that holds it."""
+    grid = grid_of(mount)
+    start, end = max(mount.gate_m[0], NEAREST_M), max(mount.gate_m[1], NEAREST_M)
+    axes = [_axis("horizontal", grid.columns, grid.azimuth_rad), _axis("vertical", grid.rows, grid.elevation_rad)]
+    interval = [element("min", text=number(start)), element("max", text=number(end))]
+    lidar = element("lidar", children=[element("scan", children=axes), element("range", children=interval)])
+    return element(
+        "sensor",
+        {"name": name or mount.name, "type": "gpu_lidar"},
+        [
+            *([element("pose", text=numbers([*mount.origin_m, *mount.roll_pitch_yaw_rad]))] if posed else []),
+            element("topic", text=f"/{name or mount.name}"),
+            element("update_rate", text=number(rate_hz)),
+            element("always_on", text="true"),
+            element("visualize", text="true"),
+            lidar,
+        ],
+    )
+
+
+def _axis(name: str, samples: int, bounds_rad: tuple[float, float]) -> Element:
+    return element(
+        name,
+        children=[
+            element("samples", text=str(samples)),
+            element("resolution", text="1"),
+            element("min_angle", text=number(bounds_rad[0])),
+            element("max_angle", text=number(bounds_rad[1])),
+        ],
+    )
+
+
+def read_sensor(sensor: Element, path: Path, pose: np.ndarray | None = None) -> ReadMount:
+    """What a <sensor> that `sensor_element` made holds, at its own pose or at a given one (6,).
+
+    Raises:
+        DataError: An element is missing, or is no number.
+    """
+    try:
+        if pose is None:
+            pose = np.array(str(sensor.findtext("pose")).split(), dtype=np.float64)
+        start, end = (float(str(sensor.findtext(f"lidar/range/{name}"))) for name in ("min", "max"))
+        columns, rows = (int(str(sensor.findtext(f"lidar/scan/{axis}/samples"))) for axis in ("horizontal", "vertical"))
+        azimuth, elevation = (
+            tuple(float(str(sensor.findtext(f"lidar/scan/{axis}/{name}_angle"))) for name in ("min", "max"))
+            for axis in ("horizontal", "vertical")
+        )
+        turn = rotations_of_quaternions(np.array(quaternion(*pose[3:])))
+    except (ValueError, TypeError) as error:
+        raise DataError(f"holds no such lidar: {error}", where=str(path)) from error
+    grid = EvenGrid(columns, rows, (azimuth[0], azimuth[1]), (elevation[0], elevation[1]))
+    return ReadMount(pose[:3], grid.directions() @ turn.T, (start, end))
+
+
+# No sensor's link is called so: those end in _link. Nor its joint, for none has the name of the world.
+WORLD, BASE = "world", "lidar_base"
+BASE_MASS_KG, BASE_INERTIA_KG_M2 = 0.1, 0.0001
+
+
+def write_urdf(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+    """Write the description, atomically; returns notes of what the format cannot hold."""
+    mounted = mounts(design, rays)
+    parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent=BASE)]
+    write_xml(path, element("robot", {"name": identifier(design.name)}, [*_base(), *parts]))
+    mass = f"{BASE} has a nominal mass of {BASE_MASS_KG:g} kg, without which Gazebo would leave the sensors out"
+    return [*urdf_losses(design, mounted, rays), mass]
+
+
+def urdf_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+    """How far the rays of the described sensors are from the design's."""
+    mounted = mounts(design, rays)
+    return mounts_rounding(rays, mounted, read_sensors(read_xml(path, "robot"), path), path)
+
+
+def urdf_losses(design: DesignSpec, mounted: Sequence[Mount], rays: Rays) -> list[str]:
+    """Notes of what a description of links and Gazebo sensors cannot hold."""
+    return [
+        *sdf_losses(design, mounted, rays),
+        "URDF has no sensors of its own: rays, gates and rates stand in <gazebo> extensions, which Gazebo reads",
+    ]
+
+
+def _base() -> list[Element]:
+    """The base link, which has a mass, and what fixes it to the world."""
+    moments = {
+        name: numbers([BASE_INERTIA_KG_M2 * (name[1] == name[2])])
+        for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    }
+    inertial = element(
+        "inertial", children=[element("mass", {"value": numbers([BASE_MASS_KG])}), element("inertia", moments)]
+    )
+    ends = [element("parent", {"link": WORLD}), element("child", {"link": BASE})]
+    joint = element("joint", {"name": f"{WORLD}_joint", "type": "fixed"}, ends)
+    return [element("link", {"name": WORLD}), element("link", {"name": BASE}, [inertial]), joint]
+
+
+def mounted_parts(mount: Mount, rate_hz: float, *, parent: str, prefix: str = "") -> list[Element]:
+    """The link of a sensor, the joint that fixes it to a parent, and what Gazebo simulates on it."""
+    name = f"{prefix}{mount.name}_link"
+    joint = element(
+        "joint",
+        {"name": f"{prefix}{mount.name}_joint", "type": "fixed"},
+        [
+            element("parent", {"link": parent}),
+            element("child", {"link": name}),
+            element("origin", {"xyz": numbers(mount.origin_m), "rpy": numbers(mount.roll_pitch_yaw_rad)}),
+        ],
+    )
+    sensor = sensor_element(mount, rate_hz, posed=False, name=f"{prefix}{mount.name}")
+    # what Gazebo publishes is then in the frame of the link, whose name ROS knows
+    sensor.append(element("gz_frame_id", text=name))
+    return [element("link", {"name": name}), joint, element("gazebo", {"reference": name}, [sensor])]
+
+
+def read_sensors(root: Element, path: Path) -> list[ReadMount]:
+    """What the joints and Gazebo sensors below an element hold, in their order.
+
+    Raises:
+        DataError: A joint is missing, or has no origin.
+    """
+    joints = {child.get("link", ""): joint for joint in root.iterfind("joint") for child in joint.findall("child")[:1]}
+    found = []
+    for extension in root.iterfind("gazebo"):
+        try:
+            origin = next(joints[extension.attrib["reference"]].iterfind("origin"))
+            values = f"{origin.attrib['xyz']} {origin.attrib['rpy']}".split()
+            found.append(read_sensor(extension[0], path, np.array(values, dtype=np.float64)))
+        except (KeyError, StopIteration, IndexError, ValueError) as error:
+            raise DataError(f"holds no joint for a sensor: {error!r}", where=str(path)) from error
+    return found
+
+
+MACRO = "xacro:macro"
+
+
+def write_xacro(design: DesignSpec, rays: Rays, path: Path, rate_hz: float = Bandwidth().rate_hz) -> list[str]:
+    """Write the macro, atomically; returns how to use it and notes of what the format cannot hold."""
+    name, mounted = identifier(design.name), mounts(design, rays)
+    parts = [part for one in mounted for part in mounted_parts(one, rate_hz, parent="${parent}", prefix="${prefix}")]
+    macro = element(MACRO, {"name": name, "params": "parent prefix:=''"}, parts)
+    write_xml(path, element("robot", {"xmlns:xacro": "http://www.ros.org/wiki/xacro", "name": name}, [macro]))
+    usage = f'include it and call <xacro:{name} parent="base_link"/>: poses are relative to the parent'
+    return [usage, *urdf_losses(design, mounted, rays)]
+
+
+def xacro_rounding(design: DesignSpec, rays: Rays, path: Path) -> dict[str, Estimate]:
+    """How far the rays of the described sensors are from the design's.
+
+    Raises:
+        DataError: The file holds no such macro.
+    """
+    mounted = mounts(design, rays)
+    macro = next((part for part in read_xml(path, "robot") if part.tag == MACRO), None)
+    if macro is None:
+        raise DataError("holds no macro", where=str(path))
+    return mounts_rounding(rays, mounted, read_sensors(macro, path), path)
