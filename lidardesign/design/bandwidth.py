@@ -49,9 +49,7 @@ class Bandwidth:
         for name in ("bin_ps", "bits_per_bin", "rate_hz"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
-                raise ConfigError(
-                    f"{value} found", where=f"bandwidth.{name}", allowed="a finite number above 0"
-                )
+                raise ConfigError(f"{value} found", where=f"bandwidth.{name}", allowed="a finite number above 0")
 
     @property
     def bin_m(self) -> float:
@@ -66,11 +64,8 @@ class Bandwidth:
         """
         width = np.asarray(width_m, dtype=np.float64)
         if not (np.isfinite(width).all() and (width >= 0).all()):
-            raise ConfigError(
-                "a gate width is negative or not finite", where="bandwidth", allowed="0 m or more"
-            )
-        exact = np.minimum(width / self.bin_m, MOST_BINS)
-        return np.maximum(np.ceil(exact * (1 - BIN_ROUNDING)), 1.0).astype(np.int64)
+            raise ConfigError("a gate width is negative or not finite", where="bandwidth", allowed="0 m or more")
+        return np.maximum(np.ceil(np.minimum(width / self.bin_m, MOST_BINS) * (1 - BIN_ROUNDING)), 1.0).astype(np.int64)
 
     def mbps(self, rays: Rays) -> float:
         """Bandwidth of a ray list [Mbit/s]."""

@@ -43,7 +43,6 @@ class SensorPair:
         first, second = self.first, self.second
         fields = np.degrees(np.subtract(second.field_of_view_rad, first.field_of_view_rad))
         gates = np.subtract(second.gate_m, first.gate_m)
-        rays = None if first.rays is None or second.rays is None else second.rays - first.rays
         return {
             **named,
             "difference": {
@@ -54,7 +53,7 @@ class SensorPair:
                 "gate_start_m": float(gates[0]),
                 "gate_end_m": float(gates[1]),
                 "weight": second.weight - first.weight,
-                "rays": rays,
+                "rays": None if first.rays is None or second.rays is None else second.rays - first.rays,
             },
         }
 
@@ -71,16 +70,7 @@ def paired_sensors(first: DesignSpec, second: DesignSpec) -> list[SensorPair]:
         return [SensorPair(sensor, by_name[sensor.name]) for sensor in first.sensors]
     from scipy.optimize import linear_sum_assignment
 
-    rows, columns = linear_sum_assignment(_distances(first, second))
-    pairs = [SensorPair(first.sensors[row], second.sensors[column]) for row, column in zip(rows, columns, strict=True)]
-    lonely = [SensorPair(one, None) for index, one in enumerate(first.sensors) if index not in rows]
-    return pairs + lonely + [SensorPair(None, one) for index, one in enumerate(second.sensors) if index not in columns]
-
-
-def _distances(first: DesignSpec, second: DesignSpec) -> np.ndarray:
-    """How different each sensor of one design is from each of the other, shape (G, H) [m]."""
-    every = (*first.sensors, *second.sensors)
-    range_m = float(np.mean([sensor.range_m for sensor in every])) or RIGHT_ANGLE_M
+    range_m = float(np.mean([sensor.range_m for sensor in (*first.sensors, *second.sensors)])) or RIGHT_ANGLE_M
     one, other = (
         {
             "place": np.array([sensor.origin_m for sensor in design.sensors]),
@@ -90,7 +80,12 @@ def _distances(first: DesignSpec, second: DesignSpec) -> np.ndarray:
         }
         for design in (first, second)
     )
-    return sum(np.linalg.norm(one[key][:, None] - other[key][None], axis=2) for key in one)
+    # how different each sensor of one design is from each of the other, shape (G, H) [m]
+    distances_m = sum(np.linalg.norm(one[key][:, None] - other[key][None], axis=2) for key in one)
+    rows, columns = linear_sum_assignment(distances_m)
+    pairs = [SensorPair(first.sensors[row], second.sensors[column]) for row, column in zip(rows, columns, strict=True)]
+    pairs += [SensorPair(sensor, None) for index, sensor in enumerate(first.sensors) if index not in rows]
+    return pairs + [SensorPair(None, sensor) for index, sensor in enumerate(second.sensors) if index not in columns]
 
 
 @dataclass(frozen=True)

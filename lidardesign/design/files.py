@@ -63,15 +63,8 @@ SENSOR_OPTIONAL = (
 )  # fmt: skip
 COUPLING_KEYS = ("direction_rad_per_m", "range_m_per_m", "range_m_per_rad", "spread_rad", "spread_m")
 TABLE_KEYS = (
-    "origin_x_m",
-    "origin_y_m",
-    "origin_z_m",
-    "azimuth_rad",
-    "elevation_rad",
-    "gate_start_m",
-    "gate_end_m",
-    "sensor",
-)
+    "origin_x_m", "origin_y_m", "origin_z_m", "azimuth_rad", "elevation_rad", "gate_start_m", "gate_end_m", "sensor",
+)  # fmt: skip
 TRACK_KEYS = (
     "dimension", "knots_m", "azimuth_rad", "elevation_rad", "gate_start_m", "gate_end_m", "sensor",
 )  # fmt: skip
@@ -118,8 +111,7 @@ def read_track(node: Node, sensors: int) -> Track:
         knot, ray = (int(i) for i in np.argwhere(end < start)[0])
         bad = keys["gate_end_m"].child(knot).child(ray)
         raise bad.error(f"is {end[knot, ray]}, before the gate's start {start[knot, ray]}")
-    dimension = keys["dimension"].choice(TRAVELLED)
-    return Track(dimension, knots, azimuth, elevation, np.stack([start, end], axis=2), index)
+    return Track(keys["dimension"].choice(TRAVELLED), knots, azimuth, elevation, np.stack([start, end], axis=2), index)
 
 
 def design_document(design: DesignSpec) -> dict[str, Any]:
@@ -223,8 +215,7 @@ def load_design(path: Path, reach_m: float | None = None) -> DesignSpec:
     if begins_as_sensor_csv(head):
         return read_sensor_csv(path)
     document = load_yaml(path, max_bytes=MAX_BYTES)
-    design = design_from_document(document.value, str(path), locate=document.locate)
-    return replace(design, name=path.stem)
+    return replace(design_from_document(document.value, str(path), locate=document.locate), name=path.stem)
 
 
 def design_from_document(
@@ -243,7 +234,6 @@ def design_from_document(
     if isinstance(locate, Document):
         locate = locate.locate
     root = Node(document, (), locate or (lambda _path: where))
-    # The root, once it is known to be a design of a version that this program reads
     if not isinstance(root.value, dict) or "sensors" not in root.value:
         raise ConfigError(
             "this is no design: it has no key `sensors`",
@@ -254,8 +244,9 @@ def design_from_document(
     if type(version) is not int or version < SCHEMA_VERSION:
         raise root.child("schema_version").wrong(str(SCHEMA_VERSION))
     if version > SCHEMA_VERSION:
-        hint = "use a newer version of lidardesign"
-        raise root.child("schema_version").error(f"is {version}", allowed=str(SCHEMA_VERSION), hint=hint)
+        raise root.child("schema_version").error(
+            f"is {version}", allowed=str(SCHEMA_VERSION), hint="use a newer version of lidardesign"
+        )
     keys = root.mapping(REQUIRED, OPTIONAL)
     level = keys["level"].number(*LEVELS) if "level" in keys else DEFAULT_LEVEL
     sensors = _sensors(keys["sensors"], level)
@@ -293,8 +284,7 @@ def _sensors(node: Node, level: float) -> tuple[Sensor, ...]:
     if not any(given):
         return tuple(replace(sensor, weight=1 / len(sensors)) for sensor in sensors)
     if not all(given):
-        missing = nodes[given.index(False)]
-        raise missing.error("has no weight, but another sensor has", hint="give all weights or none")
+        raise nodes[given.index(False)].error("has no weight, but another sensor has", hint="give all weights or none")
     total = math.fsum(sensor.weight for sensor in sensors)
     if not (math.isfinite(total) and total > 0):
         raise node.error(f"has weights that sum to {total}", allowed="a finite sum above 0")
@@ -310,18 +300,14 @@ def _sensor(node: Node, index: int, level: float) -> Sensor:
     spreads = keys["spread"].mapping((), ("horizontal_rad", "vertical_rad", "range_m")) if "spread" in keys else {}
     fields = keys["field_of_view_rad"].mapping((), ("horizontal", "vertical")) if "field_of_view_rad" in keys else {}
     full = 2 * interval_factor(level)
-    found = []
+    spread_rad = []
     for axis in ("horizontal", "vertical"):
         spread, field = spreads.get(f"{axis}_rad"), fields.get(axis)
-        if spread is not None:
-            found.append(spread.number(0))
-            if field is not None:
-                _agree(field, full * found[-1], "radians", level)
-        elif field is not None:
-            found.append(field.number(0, 2 * math.pi) / full)
-        else:
+        if spread is None and field is None:
             raise node.error(f"has neither field_of_view_rad.{axis} nor spread.{axis}_rad", hint="give one of them")
-    horizontal, vertical = found[0], found[1]
+        spread_rad.append(field.number(0, 2 * math.pi) / full if spread is None else spread.number(0))
+        if spread is not None and field is not None:
+            _agree(field, full * spread_rad[-1], "radians", level)
     range_m, spread_range = _range(node, keys, level)
     sensor = Sensor(
         name=keys["name"].text() if "name" in keys else f"sensor_{index + 1}",
@@ -331,8 +317,8 @@ def _sensor(node: Node, index: int, level: float) -> Sensor:
         azimuth_rad=boresight["azimuth_rad"].number(),
         elevation_rad=boresight["elevation_rad"].number(-math.pi / 2, math.pi / 2),
         roll_rad=boresight["roll_rad"].number() if "roll_rad" in boresight else 0.0,
-        spread_horizontal_rad=horizontal,
-        spread_vertical_rad=vertical,
+        spread_horizontal_rad=spread_rad[0],
+        spread_vertical_rad=spread_rad[1],
         range_m=range_m,
         spread_range_m=spread_range,
         level=level,
@@ -349,8 +335,9 @@ def _coupling(node: Node) -> Coupling:
     keys = node.mapping(COUPLING_KEYS)
     rows = keys["direction_rad_per_m"].items()
     if len(rows) != 2:
-        allowed = "2 rows (horizontal, vertical) of 3 numbers [rad / m]"
-        raise keys["direction_rad_per_m"].error(f"has {len(rows)} rows", allowed=allowed)
+        raise keys["direction_rad_per_m"].error(
+            f"has {len(rows)} rows", allowed="2 rows (horizontal, vertical) of 3 numbers [rad / m]"
+        )
     return Coupling(
         direction_per_m=np.stack([row.numbers(3) for row in rows]),
         range_per_m=keys["range_m_per_m"].numbers(3),
@@ -436,21 +423,15 @@ def _agree(node: Node, expected: float, unit: str, level: float, scale: float = 
 def _ray_table(node: Node, sensors: int) -> Rays:
     keys = node.mapping(TABLE_KEYS)
     count = len(keys["sensor"].items())
-    column = {key: keys[key].numbers(count) for key in TABLE_KEYS[:3]}
-    column["azimuth_rad"] = keys["azimuth_rad"].numbers(count)
-    column["elevation_rad"] = keys["elevation_rad"].numbers(count, -math.pi / 2, math.pi / 2)
+    origin = np.stack([keys[key].numbers(count) for key in TABLE_KEYS[:3]], axis=1)
+    azimuth = keys["azimuth_rad"].numbers(count)
+    elevation = keys["elevation_rad"].numbers(count, -math.pi / 2, math.pi / 2)
     start, end = keys["gate_start_m"].numbers(count, 0), keys["gate_end_m"].numbers(count, 0)
     if (end < start).any():
         bad = int(np.argmax(end < start))
         raise keys["gate_end_m"].child(bad).error(f"is {end[bad]}, before the gate's start {start[bad]}")
-    indices = [item.integer(0, sensors - 1) for item in keys["sensor"].items()]
-    return Rays.from_angles(
-        origin_m=np.stack([column[key] for key in TABLE_KEYS[:3]], axis=1),
-        azimuth_rad=column["azimuth_rad"],
-        elevation_rad=column["elevation_rad"],
-        gate_m=np.stack([start, end], axis=1),
-        sensor=np.array(indices, dtype=np.int64),
-    )
+    sensor = np.array([item.integer(0, sensors - 1) for item in keys["sensor"].items()], dtype=np.int64)
+    return Rays.from_angles(origin, azimuth, elevation, np.stack([start, end], axis=1), sensor)
 
 
 def _check_rays(
@@ -465,16 +446,14 @@ def _check_rays(
         raise keys["track"].error("is given beside ray_table", hint="remove either of the two")
     if table is None and keys.get("layout") is not None and keys["layout"].value == "fixed":
         raise keys["layout"].error("is fixed, but there is no ray_table", hint="the layout grid needs none")
-    counts: dict[str, int] = {}
-    if rays is not None:
-        counts["rays"] = rays
-    if all(sensor.rays is not None for sensor in sensors):
-        counts["the sum of sensors[].rays"] = sum(sensor.rays or 0 for sensor in sensors)
-    if table is not None:
-        counts["ray_table"] = len(table.sensor)
-    if track is not None:
-        counts["track"] = len(track.sensor)
-    if len(set(counts.values())) > 1:
+    own = [sensor.rays for sensor in sensors]
+    counts = {
+        "rays": rays,
+        "the sum of sensors[].rays": None if None in own else sum(own),
+        "ray_table": None if table is None else len(table),
+        "track": None if track is None else len(track.sensor),
+    }
+    if len({*counts.values()} - {None}) > 1:
+        found = ", ".join(f"{name} {count}" for name, count in counts.items() if count is not None)
         node = keys.get("rays", keys["sensors"])
-        found = ", ".join(f"{name} {count}" for name, count in counts.items())
         raise node.error(f"contradicts another count of rays: {found}", hint="remove all but one")

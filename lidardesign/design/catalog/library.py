@@ -232,13 +232,12 @@ def part_rays(
     looking = [_chosen(part.directions @ pose.frame, share, wanted) for pose, share in zip(poses, shares, strict=True)]
     sensor = np.repeat(np.arange(len(poses)), shares)
     # all parts run at once, each over its own frame
-    times = [np.arange(share) / (max(share, 1) * part.rate_hz) for share in shares]
     return Rays(
         np.array([pose.origin_m for pose in poses], dtype=np.float64)[sensor],
         np.concatenate(looking),
         np.tile(part.range_m, (total, 1)),
         sensor,
-        np.concatenate(times),
+        np.concatenate([np.arange(share) / (max(share, 1) * part.rate_hz) for share in shares]),
     )
 
 

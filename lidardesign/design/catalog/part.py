@@ -158,9 +158,8 @@ class Part:
         modes = tuple(file.modes)
         first = modes[0] if modes else None
         mode = mode or first
-        name = stem if mode == first else f"{stem}:{mode}"
         return cls(
-            name=name,
+            name=stem if mode == first else f"{stem}:{mode}",
             product=f"{file.maker} {file.product}",
             kind=file.kind,
             summary=file.summary,
@@ -304,8 +303,7 @@ def disagreements(part: Part) -> list[str]:
         same: dict[tuple[Any, ...], list[tuple[str, Any]]] = {}
         for statement in statements:
             figure = statement.model_dump(exclude={"note"})
-            conditions = tuple(figure.pop(key) for key in CONDITIONS)
-            same.setdefault(conditions, []).append((figure.pop("source"), figure))
+            same.setdefault(tuple(figure.pop(key) for key in CONDITIONS), []).append((figure.pop("source"), figure))
         pairs = (pair for found in same.values() for pair in itertools.combinations(found, 2))
         if any(first[0] != second[0] and first[1] != second[1] for first, second in pairs):
             names.append(name)

@@ -308,7 +308,6 @@ class PartFile(Figures):
                         known = ", ".join(self.sources)
                         raise ValueError(f"{name}{of_mode} names the source {statement.source!r}, known are {known}")
             check_pattern(figures["pattern"][0], figures["field_of_view_deg"][0], figures["rate_hz"][0].value, of_mode)
-            near = figures["near_m"][0].value if "near_m" in figures else 0.0
-            if near >= figures["far_m"][0].value:
+            if (figures["near_m"][0].value if "near_m" in figures else 0.0) >= figures["far_m"][0].value:
                 raise ValueError(f"near_m{of_mode} is not below far_m")
         return self

@@ -98,8 +98,9 @@ class _Copier:
             self.copies += inner if inner > 1 else 0
             if self.copies > MOST_COPIES:
                 raise DataError("replicates too much", where=where, allowed=f"at most {MOST_COPIES} copies")
-            copied = ElementTree.SubElement(target, child.tag, kept)
-            self.copy_children(child, copied, path, depth=depth + 1, times=inner)
+            self.copy_children(
+                child, ElementTree.SubElement(target, child.tag, kept), path, depth=depth + 1, times=inner
+            )
 
     def included_file(self, name: str, where: str) -> Path:
         """An included file, which lies in the first file's folder, links followed, and is included once."""
@@ -111,8 +112,7 @@ class _Copier:
                 hint="copy the file into the model's folder and name it from there",
             )  # fmt: skip
         if file in self.seen or len(self.seen) > MOST_INCLUDES:
-            allowed = f"each file once, at most {MOST_INCLUDES}"
-            raise DataError(f"includes {name!r} again", where=where, allowed=allowed)
+            raise DataError(f"includes {name!r} again", where=where, allowed=f"each file once, at most {MOST_INCLUDES}")
         self.seen.append(file)
         return file
 
@@ -188,7 +188,6 @@ def read_mjcf(path: Path) -> Rig:
 
 
 def _rays(stripped: ElementTree.Element, path: Path) -> list[_Ray]:
-    """The rangefinders of what is left of a model, in its order."""
     import mujoco
 
     try:

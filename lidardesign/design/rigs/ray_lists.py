@@ -63,8 +63,9 @@ class RayColumns:
         """Raise for the first row of a mask, shape (N,), if there is one."""
         if wrong.any():
             row = int(np.argmax(wrong))
-            found = f"{name} is {self.numbers[name][row]:g}: {message}"
-            raise DataError(found, where=self.locate(row, name), allowed=allowed)
+            raise DataError(
+                f"{name} is {self.numbers[name][row]:g}: {message}", where=self.locate(row, name), allowed=allowed
+            )
 
 
 def check_names(names: tuple[str, ...], where: str) -> None:
@@ -84,8 +85,9 @@ def check_names(names: tuple[str, ...], where: str) -> None:
             missing = ", ".join(name for name in group if name not in given)
             raise DataError(f"{', '.join(given)} without {missing}", where=where, allowed=", ".join(group))
     if not any(group[0] in names for group in LOOKS):
-        allowed = " or ".join(", ".join(group) for group in LOOKS)
-        raise DataError("no column says where rays look", where=where, allowed=allowed)
+        raise DataError(
+            "no column says where rays look", where=where, allowed=" or ".join(", ".join(group) for group in LOOKS)
+        )
 
 
 def rig_of_columns(columns: RayColumns, kind: str) -> Rig:
@@ -170,8 +172,7 @@ def read_ray_csv(path: Path) -> Rig:
         raise DataError(f"{len(body)} rays", where=str(path), allowed=f"at most {MOST_RAYS}")
     for line, row in body:
         if len(row) != len(names):
-            allowed = f"{len(names)}: {', '.join(names)}"
-            raise DataError(f"{len(row)} columns", where=f"{path}:{line}", allowed=allowed)
+            raise DataError(f"{len(row)} columns", where=f"{path}:{line}", allowed=f"{len(names)}: {', '.join(names)}")
 
     def locate(row: int, name: str) -> str:
         return f"{path}:{body[row][0]}:{names.index(name) + 1}"
@@ -317,7 +318,6 @@ def _rows(path: Path) -> tuple[list[tuple[dict[str, float], str]], list[str]]:
 
 
 def _numbers(where: str, cells: list[str], names: tuple[str, ...]) -> dict[str, float]:
-    """The numbers of a row by column."""
     if len(cells) != len(names):
         raise DataError(f"{len(cells)} columns", where=where, allowed=f"{len(names)}: {', '.join(names)}")
     row = {}
@@ -333,8 +333,7 @@ def _numbers(where: str, cells: list[str], names: tuple[str, ...]) -> dict[str, 
 def _sensor(row: dict[str, float], index: int, where: str) -> Sensor:
     elevation = row["elevation_mean"]
     if abs(elevation) > math.pi / 2 + ELEVATION_ROUNDING:
-        allowed = "radians from -pi/2 to pi/2"
-        raise DataError(f"elevation_mean is {elevation!r}", where=where, allowed=allowed)
+        raise DataError(f"elevation_mean is {elevation!r}", where=where, allowed="radians from -pi/2 to pi/2")
     elevation = min(max(elevation, -math.pi / 2), math.pi / 2)
     xx, xy, xz, yy, yz, zz = (row[name] for name in SENSOR_COLUMNS[6:12])
     covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -360,15 +359,17 @@ def write_sensor_csv(design: DesignSpec, path: Path) -> list[str]:
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(SENSOR_COLUMNS)
+    lost = {
+        f"the level {design.level:g} is not held: intervals are read back at {DEFAULT_LEVEL:g}":
+            design.level != DEFAULT_LEVEL,
+        "the explicit rays of the layout are not held": design.ray_table is not None,
+        "roll is not held: spreads are those along azimuth and elevation":
+            any(sensor.roll_rad for sensor in design.sensors),
+        "couplings are not held: direction and range are read back as independent of the origin":
+            any(sensor.coupling is not None for sensor in design.sensors),
+    }  # fmt: skip
     notes = ["names, ray counts, layout, constraints and provenance are not held; a reader takes level 0.95"]
-    if design.level != DEFAULT_LEVEL:
-        notes.append(f"the level {design.level:g} is not held: intervals are read back at {DEFAULT_LEVEL:g}")
-    if design.ray_table is not None:
-        notes.append("the explicit rays of the layout are not held")
-    if any(sensor.roll_rad for sensor in design.sensors):
-        notes.append("roll is not held: spreads are those along azimuth and elevation")
-    if any(sensor.coupling is not None for sensor in design.sensors):
-        notes.append("couplings are not held: direction and range are read back as independent of the origin")
+    notes += [note for note, applies in lost.items() if applies]
     for sensor in design.sensors:
         azimuth_sigma, elevation_sigma = sensor.spread_horizontal_rad, sensor.spread_vertical_rad
         if sensor.roll_rad != 0:

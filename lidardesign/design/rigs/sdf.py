@@ -70,8 +70,9 @@ class Scope:
             if not name:
                 raise DataError(f"a {one.tag} has no name", where=self.where(one))
             if (one.tag, name) in named:
-                found = f"a second {one.tag} is called {name!r}"
-                raise DataError(found, where=self.where(one), allowed="names that differ")
+                raise DataError(
+                    f"a second {one.tag} is called {name!r}", where=self.where(one), allowed="names that differ"
+                )
             named[one.tag, name] = one
         return named
 
@@ -114,25 +115,20 @@ class Scope:
         elif element is not None:
             pose = self._pose_of_element(element)
         else:
-            allowed = "a link, frame, joint or model"
-            raise DataError(f"nothing is called {name!r}", where=self.where(asking), allowed=allowed)
+            raise DataError(
+                f"nothing is called {name!r}", where=self.where(asking), allowed="a link, frame, joint or model"
+            )
         self.waiting.pop()
         self.found[name] = pose
         return pose
 
     def _pose_of_element(self, element: ElementTree.Element) -> np.ndarray:
-        """The pose of a link, model, frame or joint in this scope's frame."""
-        usual = ""
-        if element.tag == "frame":
-            usual = element.get("attached_to", "")
-        elif element.tag == "joint":
-            usual = (element.findtext("child") or "").strip()
-        pose = self.placed(element, usual)
+        usual = {"frame": element.get("attached_to", ""), "joint": (element.findtext("child") or "").strip()}
+        pose = self.placed(element, usual.get(element.tag, ""))
         placement = element.get("placement_frame") if element.tag == "model" else None
         if placement:
             own = self if element is self.element else self.within(element)
-            inner = own.pose_of(placement, element)
-            pose = pose @ inverse_rigid(inner)
+            pose = pose @ inverse_rigid(own.pose_of(placement, element))
         return pose
 
     def placed(self, element: ElementTree.Element, usual: str) -> np.ndarray:
@@ -268,8 +264,9 @@ def _sensor(scope: Scope, link: ElementTree.Element, element: ElementTree.Elemen
     rows = scan.find("vertical")
     up = _Axis(1, 0.0, 0.0) if rows is None else _axis(rows, scope, notes, math.pi)
     if across.samples * up.samples > MOST_RAYS:
-        found = f"{across.samples} x {up.samples} rays"
-        raise DataError(found, where=scope.where(scan), allowed=f"at most {MOST_RAYS}")
+        raise DataError(
+            f"{across.samples} x {up.samples} rays", where=scope.where(scan), allowed=f"at most {MOST_RAYS}"
+        )
     pose = scope.in_world() @ scope.placed(element, link.get("name", ""))
     azimuth, elevation = (values.reshape(-1) for values in np.meshgrid(across.angles_rad, up.angles_rad))
     world = angles(direction(azimuth, elevation) @ pose[:3, :3].T)
@@ -295,7 +292,6 @@ def _needed(element: ElementTree.Element, tag: str, scope: Scope) -> ElementTree
 
 
 def _number(element: ElementTree.Element, tag: str, scope: Scope) -> float:
-    """The number in a child that must be there."""
     child = _needed(element, tag, scope)
     return numbers_of(child.text, 1, scope.where(child), tag)[0]
 

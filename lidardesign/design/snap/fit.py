@@ -124,20 +124,13 @@ def _lack(
         return budget.rays - int(np.minimum(most, budget.rays).sum()), 0
     if budget.limit_mbps is None:
         return 0, 0
-    bins = budget.model.bins(np.array(gate_widths(chosen, widths_m)))
+    own = [None if one.shape is None else one.shape.gate_m for one in chosen]
+    widths_m = [width if gate is None else gate[1] - gate[0] for gate, width in zip(own, widths_m, strict=True)]
+    bins = budget.model.bins(np.array(widths_m))
     counts = np.ones(len(chosen), dtype=np.int64)
     if budget.rays is not None:
         counts = capped_split(weights, budget.rays, most)
-    allowed = int(budget.limit_mbps / budget.model.mbps_of_widths(np.zeros(1), 1))
-    return 0, max(int(counts @ bins) - allowed, 0)
-
-
-def gate_widths(chosen: Sequence[PartChoice], widths_m: np.ndarray) -> list[float]:
-    """Gate widths of the parts, and of the sensors that stay as they are [m]."""
-    return [
-        float(width) if one.shape is None else one.shape.gate_m[1] - one.shape.gate_m[0]
-        for one, width in zip(chosen, widths_m, strict=True)
-    ]
+    return 0, max(int(counts @ bins) - int(budget.limit_mbps / budget.model.mbps_of_widths(np.zeros(1), 1)), 0)
 
 
 def _refused(chosen: Sequence[PartChoice], lack: tuple[int, int], budget: BandwidthBudget) -> InfeasibleError:
@@ -158,25 +151,6 @@ def _refused(chosen: Sequence[PartChoice], lack: tuple[int, int], budget: Bandwi
     )
 
 
-def fire_rays(shape_pose: tuple[PartChoice, Pose | None], sensor: Sensor, count: int, seen: Features) -> np.ndarray:
-    """The unit vectors that a sensor fires: of its part's pattern, or of its own even grid, shape (count, 3)."""
-    choice, pose = shape_pose
-    if choice.shape is None or pose is None:
-        return tangent_directions(sensor.frame, grid_tangent(*field_on_sphere(sensor), count))
-    part = choice.shape.part
-    wanted = useful_ray_filter(part, pose, seen.points, seen.weights, least=count)
-    return part_rays(part, pose, count, wanted=wanted).direction
-
-
-def count_useful_rays(choice: PartChoice, pose: Pose, seen: Features) -> int:
-    """How many rays of a part look at some of the density; at least one."""
-    if choice.shape is None:
-        return 0
-    part = choice.shape.part
-    wanted = useful_ray_filter(part, pose, seen.points, seen.weights)(part.directions @ pose.frame)
-    return max(int(wanted.sum()), 1)
-
-
 def count_rays(useful: np.ndarray, weights: np.ndarray, widths_m: np.ndarray, budget: BandwidthBudget) -> np.ndarray:
     """Rays of every sensor where none are asked for: what parts have to tell, as far as the bandwidth pays for it.
 
@@ -193,12 +167,10 @@ def count_rays(useful: np.ndarray, weights: np.ndarray, widths_m: np.ndarray, bu
         counts[~of_parts] = np.maximum(np.round(counts.sum() / share * weights[~of_parts]), 1)
     share = min(1.0, MOST_TABLE_RAYS / int(counts.sum()))
     if budget.limit_mbps is not None:
-        cost = budget.model.mbps_of_widths(widths_m, counts)
-        share = min(share, budget.limit_mbps / cost)
+        share = min(share, budget.limit_mbps / budget.model.mbps_of_widths(widths_m, counts))
     fewer = np.maximum(np.floor(counts * share).astype(np.int64), 1)
     while budget.limit_mbps is not None and budget.model.mbps_of_widths(widths_m, fewer) > budget.limit_mbps:
-        dearest = np.where(fewer > 1, fewer * budget.model.bins(widths_m), -1).argmax()
-        fewer[dearest] -= 1
+        fewer[np.where(fewer > 1, fewer * budget.model.bins(widths_m), -1).argmax()] -= 1
     return fewer
 
 
@@ -221,7 +193,7 @@ class SnappedDesign:
 
 @dataclass(frozen=True, eq=False)
 class _PlacedPart:
-    """One sensor as it was fitted and as the part that it becomes."""
+    """One sensor as it was fitted and as the part that it becomes; one that stays as it was has no pose."""
 
     fitted: Sensor
     sensor: Sensor
@@ -229,10 +201,47 @@ class _PlacedPart:
     pose: Pose | None
     seen: Features
 
+    @property
+    def gate_m(self) -> tuple[float, float]:
+        return self.sensor.gate_m if self.choice.shape is None else self.choice.shape.gate_m
 
-def fix_part_origins(
-    rules: Sequence[SensorRules], sensors: Sequence[Sensor]
-) -> tuple[SensorRules, ...] | None:
+    def at(self, pose: Pose) -> _PlacedPart:
+        """The part at a pose, as a sensor."""
+        (start, end), old = self.gate_m, self.sensor
+        sensor = replace(
+            part_sensor(self.choice.shape.part, pose, name=old.name, weight=old.weight, level=old.level),
+            range_m=(start + end) / 2,
+            spread_range_m=(end - start) / (2 * interval_factor(old.level)),
+        )
+        return replace(self, sensor=sensor, pose=pose)
+
+    def looks_like(self, other: _PlacedPart) -> bool:
+        """Whether two parts are of one kind, at one place, and look less than half a cell apart."""
+        part, pose = self.choice.shape.part, self.pose
+        if (part.name, self.choice.shape.turned) != (other.choice.shape.part.name, other.choice.shape.turned):
+            return False
+        cell = min(angle / cells for angle, cells in zip(part.field_of_view_rad, part.grid, strict=True))
+        cosine = min(float(a @ b) for a, b in zip(pose.frame, other.pose.frame, strict=True))
+        return np.array_equal(pose.origin_m, other.pose.origin_m) and cosine >= math.cos(cell / 2)
+
+    def useful_rays(self) -> int:
+        """How many rays of the part look at some of the density, at least one; 0 where it is none."""
+        if self.pose is None:
+            return 0
+        part = self.choice.shape.part
+        useful = useful_ray_filter(part, self.pose, self.seen.points, self.seen.weights)
+        return max(int(useful(part.directions @ self.pose.frame).sum()), 1)
+
+    def fired(self, count: int) -> np.ndarray:
+        """The unit vectors that it fires: of the part's pattern, or of its own even grid, shape (count, 3)."""
+        if self.pose is None:
+            return tangent_directions(self.sensor.frame, grid_tangent(*field_on_sphere(self.sensor), count))
+        part = self.choice.shape.part
+        useful = useful_ray_filter(part, self.pose, self.seen.points, self.seen.weights, least=count)
+        return part_rays(part, self.pose, count, wanted=useful).direction
+
+
+def fix_part_origins(rules: Sequence[SensorRules], sensors: Sequence[Sensor]) -> tuple[SensorRules, ...] | None:
     """The rules with sensors that become parts fixed at their mean origins; None where they are already."""
     spread = [
         bool(np.any(sensor.origin_covariance_m2)) and rules_of(rules, index).snap is not None
@@ -279,18 +288,16 @@ def snap_design(
     choices = nearest_parts(ensemble, options, budget.rays, seed)
     fitted_widths = np.array([sensor.gate_m[1] - sensor.gate_m[0] for sensor in before])
     choices = afford_rays(choices, options, ensemble.weights, fitted_widths, budget)
-    snaps = [rules_of(rules, index).snap for index in range(len(before))]
-    refitted = fit_part_poses(ensemble, choices, [snap is not None and snap.pose == "fitted" for snap in snaps])
+    refitted = fit_part_poses(ensemble, choices, [_is_held(rules, index) for index in range(len(before))])
     # every sensor with its part at the pose that its component has
     features = {sensor: part.features for part in ensemble.parts for sensor in part.group.sensors}
     placed = []
-    for index, (fitted, sensor, choice) in enumerate(
-        zip(before, sensors_of(refitted, space, level), choices, strict=True)
-    ):
+    sensors = zip(before, sensors_of(refitted, space, level), choices, strict=True)
+    for index, (fitted, sensor, choice) in enumerate(sensors):
         one = _PlacedPart(fitted, sensor, choice, None, features[index])
         if choice.shape is not None:
             aimed = (sensor.origin_m, sensor.azimuth_rad, sensor.elevation_rad, sensor.roll_rad)
-            one = _move_to(one, choice.shape.pose(*aimed, features[index].axes))
+            one = one.at(choice.shape.pose(*aimed, features[index].axes))
         placed.append(one)
     if not constraints.each:
         order = sorted(range(len(placed)), key=lambda i: -round(placed[i].sensor.weight, 9))
@@ -314,72 +321,43 @@ def snap_design(
     return SnappedDesign(design, refitted, report, tuple(notes))
 
 
-def _move_to(one: _PlacedPart, pose: Pose) -> _PlacedPart:
-    """A part at a pose, as a sensor."""
-    shape, old = one.choice.shape, one.sensor
-    if shape is None:
-        return one
-    start, end = shape.gate_m
-    sensor = replace(
-        part_sensor(shape.part, pose, name=old.name, weight=old.weight, level=old.level),
-        range_m=(start + end) / 2,
-        spread_range_m=(end - start) / (2 * interval_factor(old.level)),
-    )
-    return replace(one, sensor=sensor, pose=pose)
+def _is_held(rules: Sequence[SensorRules], index: int) -> bool:
+    """Whether a sensor looks as a part where it looked as it was fitted."""
+    snap = rules_of(rules, index).snap
+    return snap is not None and snap.pose == "fitted"
 
 
 def _interleave_alike(placed: Sequence[_PlacedPart], rules: Sequence[SensorRules]) -> list[_PlacedPart]:
     """Parts of a kind that stand and look alike fire between each other's rays, where they may turn that far."""
-    found = list(placed)
     alike: list[list[int]] = []
     for index, one in enumerate(placed):
-        own = rules_of(rules, index)
-        aims = own.boresight
-        bounded = (own.snap is not None and own.snap.pose == "fitted") or any(
-            value is not None for end in (aims.azimuth_deg, aims.elevation_deg) for value in (end.min, end.max)
-        )
-        if one.pose is None or bounded or one.seen.axes.angular < 2:
+        aims = rules_of(rules, index).boresight
+        bounds = (aims.azimuth_deg.min, aims.azimuth_deg.max, aims.elevation_deg.min, aims.elevation_deg.max)
+        if one.pose is None or _is_held(rules, index) or one.seen.axes.angular < 2 or bounds != (None,) * 4:
             continue
-        group = next((group for group in alike if _look_alike(placed[group[0]], one)), None)
+        group = next((group for group in alike if placed[group[0]].looks_like(one)), None)
         if group is None:
             alike.append([index])
         else:
             group.append(index)
+    turned = list(placed)
     for group in alike:
         first = placed[group[0]]
-        if len(group) > 1 and first.choice.shape is not None and first.pose is not None:
-            poses = interleaved(first.choice.shape.part, first.pose, len(group))
-            for index, pose in zip(group, poses, strict=True):
-                found[index] = _move_to(placed[index], pose)
-    return found
-
-
-def _look_alike(one: _PlacedPart, other: _PlacedPart) -> bool:
-    """Whether two parts are of one kind, at one place, and look less than half a cell apart."""
-    shape, poses = one.choice.shape, (one.pose, other.pose)
-    if shape is None or other.choice.shape is None or poses[0] is None or poses[1] is None:
-        return False
-    if (shape.part.name, shape.turned) != (other.choice.shape.part.name, other.choice.shape.turned):
-        return False
-    columns, rows = shape.part.grid
-    cell = min(shape.part.field_of_view_rad[0] / columns, shape.part.field_of_view_rad[1] / rows)
-    cosine = min(float(a @ b) for a, b in zip(poses[0].frame, poses[1].frame, strict=True))
-    return bool(np.array_equal(poses[0].origin_m, poses[1].origin_m)) and cosine >= math.cos(cell / 2)
+        if len(group) > 1:
+            for index, pose in zip(group, interleaved(first.choice.shape.part, first.pose, len(group)), strict=True):
+                turned[index] = placed[index].at(pose)
+    return turned
 
 
 def _ray_counts(placed: Sequence[_PlacedPart], budget: BandwidthBudget) -> np.ndarray:
-    """Rays of every sensor, shape (G,)."""
     weights = np.array([one.sensor.weight for one in placed])
-    choices = [one.choice for one in placed]
-    widths = np.array(gate_widths(choices, np.array([np.diff(one.sensor.gate_m)[0] for one in placed])))
-    useful = np.array(
-        [0 if one.pose is None else count_useful_rays(one.choice, one.pose, one.seen) for one in placed], dtype=np.int64
-    )
+    widths = np.array([one.gate_m[1] - one.gate_m[0] for one in placed])
+    useful = np.array([one.useful_rays() for one in placed], dtype=np.int64)
     if budget.rays is None:
         return count_rays(useful, weights, widths, budget)
-    most = np.array([budget.rays if c.shape is None else min(c.shape.part.rays, budget.rays) for c in choices])
-    first = np.where(useful > 0, np.minimum(useful, most), most)
-    counts = useful_split(weights, budget.rays, first, most)
+    shapes = [one.choice.shape for one in placed]
+    most = np.array([budget.rays if shape is None else min(shape.part.rays, budget.rays) for shape in shapes])
+    counts = useful_split(weights, budget.rays, np.where(useful > 0, np.minimum(useful, most), most), most)
     if budget.limit_mbps is not None and budget.model.mbps_of_widths(widths, counts) > budget.limit_mbps:
         # so the parts were found affordable
         counts = useful_split(weights, budget.rays, most, most)
@@ -394,19 +372,17 @@ def _design(
     sensors = tuple(
         replace(one.sensor, rays=int(n), weight=int(n) / total) for one, n in zip(placed, counts, strict=True)
     )
-    looking = np.concatenate(
-        [fire_rays((one.choice, one.pose), one.sensor, int(n), one.seen) for one, n in zip(placed, counts, strict=True)]
-    )
-    azimuth, elevation = angles(looking)
+    fired = [one.fired(int(n)) for one, n in zip(placed, counts, strict=True)]
+    azimuth, elevation = angles(np.concatenate(fired))
     owner = np.repeat(np.arange(len(placed)), counts)
-    gates = [one.sensor.gate_m if one.choice.shape is None else one.choice.shape.gate_m for one in placed]
+    gates = np.array([one.gate_m for one in placed])
     origins = np.array([sensor.origin_m for sensor in sensors], dtype=np.float64)
     return DesignSpec(
         name=name,
         sensors=sensors,
         layout="fixed",
         rays=total,
-        ray_table=Rays.from_angles(origins[owner], azimuth, elevation, np.array(gates)[owner], owner),
+        ray_table=Rays.from_angles(origins[owner], azimuth, elevation, gates[owner], owner),
         constraints=constraints.as_document(),
         level=level,
     )
@@ -416,14 +392,10 @@ def _report_rows(
     placed: Sequence[_PlacedPart], options: Sequence[PartOptions], counts: np.ndarray, budget: BandwidthBudget
 ) -> list[dict[str, Any]]:
     """What every sensor was, what it became, and what that costs alone; in the order of the design."""
-    weights = np.array([one.fitted.weight for one in placed])
-    shares = split_budget(weights, int(counts.sum()))
+    shares = split_budget(np.array([one.fitted.weight for one in placed]), int(counts.sum()))
     rows = []
     for one, option, n, share in zip(placed, options, counts, shares, strict=True):
         shape = one.choice.shape
-        loss = 0.0
-        if shape is not None:
-            loss = one.choice.losses[option.shapes.index(shape)]
         mbps = [
             budget.model.mbps_of_widths(np.diff(sensor.gate_m), int(rays))
             for sensor, rays in ((one.fitted, share), (one.sensor, n))
@@ -434,7 +406,7 @@ def _report_rows(
                 "part": None if shape is None else shape.part.name,
                 "product": None if shape is None else shape.part.product,
                 "turned": shape is not None and shape.turned,
-                "loss_nats": loss,
+                "loss_nats": 0.0 if shape is None else one.choice.losses[option.shapes.index(shape)],
                 "field_of_view_rad": {
                     "fitted": [float(angle) for angle in one.fitted.field_of_view_rad],
                     "part": [float(angle) for angle in one.sensor.field_of_view_rad],

@@ -77,8 +77,7 @@ class PartShape:
 
     def spread_rad(self, interval: float, axes: Axes) -> np.ndarray:
         """Internal standard deviations, horizontal and vertical, shape (2,)."""
-        scale = np.array([axes.angle_scale, 1.0])
-        return np.maximum(self.field_of_view_rad, LEAST_FIELD_RAD) / (2 * interval * scale)
+        return np.maximum(self.field_of_view_rad, LEAST_FIELD_RAD) / (2 * interval * np.array([axes.angle_scale, 1.0]))
 
     def pose(self, origin_m: np.ndarray, azimuth_rad: float, elevation_rad: float, roll_rad: float, axes: Axes) -> Pose:
         """The part's pose where its component has an origin and a boresight: the centre of its field looks there.
@@ -86,8 +85,7 @@ class PartShape:
         Across a plane in which the design space holds all rays, its row or column nearest to the centre looks there.
         """
         roll_rad = roll_rad + math.pi / 2 if self.turned else roll_rad
-        aimed = boresight_frame(*self._aimed(axes))
-        frame = aimed.T @ boresight_frame(azimuth_rad, elevation_rad, roll_rad)
+        frame = boresight_frame(*self._aimed(axes)).T @ boresight_frame(azimuth_rad, elevation_rad, roll_rad)
         return Pose(np.asarray(origin_m, dtype=np.float64), *boresight_of(frame))
 
     def _aimed(self, axes: Axes) -> tuple[float, float]:
@@ -221,12 +219,10 @@ class PartOptions:
 
     Arguments:
         shapes: The parts, each upright and turned where that differs; empty where the sensor stays as it is.
-        snapped: Whether the sensor is to become a part.
         lacking: Names of a smallest set of constraints that no part keeps together; empty where some do.
     """
 
     shapes: list[PartShape]
-    snapped: bool
     lacking: tuple[str, ...] = ()
 
 
@@ -264,7 +260,7 @@ def part_options(rules: Sequence[SensorRules], space: DesignSpace, middles_m: Se
     for sensor, middle_m in enumerate(middles_m):
         own, kept, broken = rules_of(rules, sensor), [], []
         if own.snap is None:
-            options.append(PartOptions([], snapped=False))
+            options.append(PartOptions([]))
             continue
         for one in shapes[min(sensor, len(rules) - 1)]:
             if one[0].gate_m[0] <= middle_m <= one[0].gate_m[1]:
@@ -276,7 +272,7 @@ def part_options(rules: Sequence[SensorRules], space: DesignSpace, middles_m: Se
         sets = (keys for size in sizes for keys in itertools.combinations(every, size))
         fewest = next((keys for keys in sets if all(set(keys) & found for found in broken)), ())
         lacking = () if kept else tuple(map(own.path, fewest)) or (SPACE_RANGE,)
-        options.append(PartOptions(kept, snapped=bool(kept), lacking=lacking))
+        options.append(PartOptions(kept, lacking))
         if lacking and own.snap.otherwise == "refuse":
             conflicts += lacking
             refused.append(sensor)
@@ -384,8 +380,9 @@ def _nearest(
                 single = shaped_mixture(singles[row], [shape], interval, features.axes)
                 known[key] = log_share[row] + log_density(single, features)
             # a part with fewer rays than its sensor's share of them has only as much weight as it has rays
-            fewer = math.log(shape.part.rays / (rays * float(mixture.weights[row])))
-            as_parts[row].append(known[key] + min(0.0, fewer))
+            as_parts[row].append(
+                known[key] + min(0.0, math.log(shape.part.rays / (rays * float(mixture.weights[row]))))
+            )
     for _ in range(MOST_SWEEPS):
         before = list(chosen)
         for row in rows:
