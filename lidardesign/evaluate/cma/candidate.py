@@ -22,6 +22,7 @@ from lidardesign.design.files import design_document
 from lidardesign.design.layouts.rays import layout_of
 from lidardesign.design.sensor import MOST_RAYS, DesignSpec
 from lidardesign.evaluate.baselines.candidates import Positions, TrainingViews, dense_points, opened_gate, whole_range
+from lidardesign.evaluate.baselines.simple import CMA
 from lidardesign.evaluate.cma.model import DesignModel, RayAllowance, Way
 from lidardesign.evaluate.cma.parameters import SearchRules
 from lidardesign.evaluate.cma.search import Progress, Search, SearchBudget, SearchResult, TrainingObjective
@@ -32,7 +33,6 @@ from lidardesign.simulate.detector.detector import IDEAL
 from lidardesign.space import DIMENSIONS, DesignSpace
 from lidardesign.task import Metric, random_generator
 
-NAME = "cma"
 # A scan within a bandwidth has at most so many times the rays of the design that it follows.
 MOST_RAYS_FACTOR = 4
 
@@ -83,7 +83,7 @@ class SearchRecord:
         """
         found = self.found
         limit = "" if self.limit_mbps is None else f" in {self.limit_mbps:.3g} Mbit/s"
-        broken = f"; it breaks {', '.join(self.broken)}" * bool(self.broken)
+        broken = f"; it breaks {', '.join(self.broken)}" if self.broken else ""
         return (
             f"cma at {self.rays} rays{limit}: {self.parameters} numbers of the sensors of {followed} varied for "
             f"{found.seconds:.0f} s, {found.candidates} candidates, {found.start_value:.4g} to {found.value:.4g} "
@@ -93,7 +93,6 @@ class SearchRecord:
     def as_dict(self) -> dict[str, Any]:
         """The JSON form."""
         found = self.found
-        names = ("seconds", "evaluations", "scenes", "value")
         return {
             "rays": self.rays,
             "limit_mbps": self.limit_mbps,
@@ -109,7 +108,9 @@ class SearchRecord:
             "value": found.value,
             "satisfied": not self.broken,
             "broken": list(self.broken),
-            "curve": [dict(zip(names, point, strict=True)) for point in found.curve],
+            "curve": [
+                dict(zip(("seconds", "evaluations", "scenes", "value"), point, strict=True)) for point in found.curve
+            ],
         }
 
 
@@ -134,27 +135,26 @@ class CmaCandidate:
     objective: TrainingObjective
     settings: CmaSettings
     seed: int
-    name: str = NAME
+    name: str = CMA
     drawn_anew: bool = False
     _known: dict[tuple[int | None, float | None], tuple[Positions, SearchRecord]] = field(default_factory=dict)
 
     def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
         """See `lidardesign.evaluate.baselines.candidates.Candidate`."""
-        return self._searched((count, None), RayAllowance(count))
+        return self._searched(RayAllowance(count))
 
     def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
         """See `lidardesign.evaluate.baselines.candidates.Candidate`: the number of rays is part of what is searched."""
-        return self._searched((None, limit_mbps), RayAllowance(None, limit_mbps, bandwidth))
+        return self._searched(RayAllowance(None, limit_mbps, bandwidth))
 
     @phase("cma")
-    def _searched(self, key: tuple[int | None, float | None], rays: RayAllowance) -> Positions:
+    def _searched(self, rays: RayAllowance) -> Positions:
+        key = rays.count, rays.limit_mbps
         if key not in self._known:
-            budget = self.settings.budget
-            began = budget.clock()
-            models = self._models(rays)
+            budget, show_search = self.settings.budget, self.settings.show
+            began, models = budget.clock(), self._models(rays)
             generator = random_generator(self.seed, "cma", str(key))
             label = f"cma, {rays.count} rays" if rays.count else f"cma, {rays.limit_mbps:.3g} Mbit/s"
-            show_search = self.settings.show
             show = None if show_search is None else (lambda progress: show_search(label, progress))
             found = Search(models, rays, self.objective, budget, generator, show, began).run()
             if not self._varies_gates(rays):
@@ -168,10 +168,10 @@ class CmaCandidate:
 
     def _varies_gates(self, rays: RayAllowance) -> bool:
         """Whether a wider gate could be worse: where it costs, where it is bounded, or where light is counted."""
-        one = self._constraints()
-        bounded = one.gate != Gate() or any(other.gate != Gate() for other in one.each)
-        ideal = self.objective.planner.detector == IDEAL
-        return not ideal or bounded or rays.limit_mbps is not None or one.budget.bandwidth_mbps is not None
+        common = self._constraints()
+        bounded = any(one.gate != Gate() for one in (common, *common.each))
+        counted = self.objective.planner.detector != IDEAL
+        return counted or bounded or rays.limit_mbps is not None or common.budget.bandwidth_mbps is not None
 
     def _cropped(self, found: SearchResult, rays: RayAllowance) -> SearchResult:
         """The same rays with gates from the nearest to the furthest return that their sensor had."""
@@ -187,11 +187,16 @@ class CmaCandidate:
 
     def _record(self, found: SearchResult, rays: RayAllowance) -> SearchRecord:
         design = found.model.design(found.vector, rays)
-        broken = []
-        if design.rays:
-            checks = check_design(design_document(design), design.constraints, self._rules(rays).space)
-            broken = [check.name for check in checks if not check.satisfied]
-        return SearchRecord(design.rays or 0, rays.limit_mbps, found, broken, found.model.size, design)
+        space = self._rules(rays).space
+        checks = check_design(design_document(design), design.constraints, space) if design.rays else []
+        return SearchRecord(
+            design.rays or 0,
+            rays.limit_mbps,
+            found,
+            [check.name for check in checks if not check.satisfied],
+            found.model.size,
+            design,
+        )
 
     def _constraints(self) -> Constraints:
         return Constraints.from_mapping(self._document(), where=f"constraints of {self.followed.name}")
@@ -221,10 +226,9 @@ class CmaCandidate:
         if track is not None:
             way = Way(DIMENSIONS.index(track.dimension), np.array([track.knots[0], track.knots[-1]]))
             middle = replace(rules, space=rules.space.at({track.dimension: float(way.places.mean())}))
-            observed = views.hits(dense_points(rules.space))
             return [
                 DesignModel(rules, [*start] * len(way.places), self.conditions, document, way)
-                for start in scan_starts(middle, views, observed, self._scan_rays(rays))
+                for start in scan_starts(middle, views, views.hits(dense_points(rules.space)), self._scan_rays(rays))
             ]
         if rules.one_sensor_per_ray:
             count = self._scan_rays(rays)
@@ -234,8 +238,6 @@ class CmaCandidate:
         """The number of rays of a scan: as asked, or what a bandwidth pays for at the followed design's gates."""
         if rays.count is not None:
             return rays.count
-        own = self.followed
-        widths = np.array([end - start for start, end in (sensor.gate_m for sensor in own.sensors)])
-        spent = rays.bandwidth.mbps_of_widths(widths)
-        affordable = math.floor(len(widths) * (rays.limit_mbps or 0.0) / spent)
+        widths = np.array([end - start for start, end in (sensor.gate_m for sensor in self.followed.sensors)])
+        affordable = math.floor(len(widths) * (rays.limit_mbps or 0.0) / rays.bandwidth.mbps_of_widths(widths))
         return int(np.clip(affordable, 1, min(MOST_RAYS, MOST_RAYS_FACTOR * len(widths))))

@@ -134,8 +134,7 @@ class DesignModel:
     def _make_columns(self) -> dict[str, tuple[int, np.ndarray]]:
         """What one sensor's part of a vector holds, by name: its width, and one unit of it, shape (G or 1, any)."""
         start, rules, axes = self._start, self.rules, self.rules.axes
-        spread, gates = len(rules.spread_axes), int(axes.range and rules.gates)
-        several = not rules.one_sensor_per_ray
+        spread, gates, several = len(rules.spread_axes), int(axes.range and rules.gates), not rules.one_sensor_per_ray
         shift = BOX_SHARE * (self._bounds.origin_high - self._bounds.origin_low)[:, list(axes.origin)]
         if spread:
             deviation = np.sqrt(np.einsum("gii->gi", start.covariance))
@@ -147,13 +146,12 @@ class DesignModel:
             spans = np.array([np.ptp(np.unwrap(values)) for values in angles(first)])
             even = np.maximum(spans, NARROWEST_RAD) / len(first) ** (1 / max(axes.angular, 1))
             turn = TURN_SHARE * even[None, [axes.horizontal, axes.vertical]]
-        middle = GATE_SHARE * np.maximum(np.diff(start.gate, axis=1), TINY)
         columns = {
             "origin": (0 if self.way is not None else len(axes.origin), np.where(shift > 0, shift, 1.0)),
             "looking": (axes.angular, turn),
             "roll": (int(several and axes.angular == 2), ROLL_RAD),
             "spread": (axes.angular * several, LOG_SPREAD),
-            "middle": (gates, middle),
+            "middle": (gates, GATE_SHARE * np.maximum(np.diff(start.gate, axis=1), TINY)),
             "width": (gates, LOG_WIDTH),
             "log_weight": (int(several and len(start) > 1), LOG_WEIGHT),
             "covariance": (spread * (spread + 1) // 2, LOG_COVARIANCE),
@@ -276,12 +274,11 @@ class DesignModel:
         return widths if self.way is None else widths.reshape(len(self.way.places), -1).max(axis=0)
 
     def _count(self, found: SensorParameters, budget: RayAllowance) -> int:
-        widths = self._widths(found)
+        widths, weights = self._widths(found), np.exp(found.log_weight)
         if self.rules.one_sensor_per_ray:
             return len(widths)
         if budget.count is not None:
             return budget.count
-        weights = np.exp(found.log_weight)
         return min(*(one.affordable_rays(widths, weights) for one in budget.read_outs(self.rules)), MOST_RAYS)
 
     def _fits(self, found: SensorParameters, count: int, read_out: BandwidthBudget) -> bool:

@@ -13,11 +13,11 @@ is what they are. Casters, and what a scene calls for, are worked out once per s
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -93,8 +93,8 @@ class TrainingObjective:
         found = np.empty((len(lists), len(scenes)))
         for column, number in enumerate(scenes):
             casters, physics = self._of_scene(number, lists)
-            scored = score_lists(self.task, self.scenes[number], lists, casters, physics)
-            found[:, column] = [self.sign * score.value for score, _ in scored]
+            scores = score_lists(self.task, self.scenes[number], lists, casters, physics)
+            found[:, column] = [self.sign * score.value for score, _ in scores]
             if column + 1 < len(scenes) and stop():
                 raise OutOfTimeError
         return found
@@ -104,11 +104,12 @@ class TrainingObjective:
         sensors, ranges_m = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]
         for number in scenes:
             casters, physics = self._of_scene(number, [positions])
-            repeats = list(range(len(positions)))
-            found = simulate_many(self.scenes[number], positions, casters=casters, physics=physics, repeats=repeats)
-            for one in (returns for frames in found for returns in frames):
-                sensors.append(np.asarray(one.rays.sensor)[one.returned])
-                ranges_m.append(one.range_m[one.returned])
+            frames = simulate_many(
+                self.scenes[number], positions, casters=casters, physics=physics, repeats=list(range(len(positions)))
+            )
+            for returns in (one for of_list in frames for one in of_list):
+                sensors.append(np.asarray(returns.rays.sensor)[returns.returned])
+                ranges_m.append(returns.range_m[returns.returned])
         return np.concatenate(sensors), np.concatenate(ranges_m)
 
     def _of_scene(self, number: int, lists: Sequence[Positions]) -> tuple[list[SceneCaster], Physics | None]:
@@ -187,7 +188,7 @@ class _Scored:
 
     model: DesignModel
     vector: np.ndarray
-    value: float
+    value: float = math.inf
 
 
 class Search:
@@ -227,26 +228,28 @@ class Search:
         """Search until the budget is used up."""
         stage = 0
         best = self._best_start(self._stages[0])
-        start = _Scored(best.model, best.vector, best.value)
+        start = replace(best)
         self._finalists = [start]
         strategy = _Strategy(best.model, best.vector, self._generator)
-        while best.model.size and not self._over(strategy.population * self._stages[stage]):
+        while best.model.size and not self._over(strategy.evolution.popsize * self._stages[stage]):
             # the number of the stage: each takes half as large a share of what is left as the one before had
             wanted = min(int(-math.log2(max(1.0 - self._share(), TINY)) * STAGE_PACE), len(self._stages) - 1)
             if wanted > stage:
                 stage = wanted
-                self._finalists.append(_Scored(best.model, best.vector, best.value))
-                best = self._rescored(best, self._stages[stage])
+                self._finalists.append(replace(best))
+                with contextlib.suppress(OutOfTimeError):
+                    best = replace(best, value=float(self._values([best], self._stages[stage])[0]))
+                    self._note(best, self._stages[stage])
             try:
                 self._step(strategy, best, self._stages[stage])
             except OutOfTimeError:
                 break
-            if strategy.converged():
+            if strategy.evolution.stop():
                 self._restarts += 1
                 strategy = _Strategy(best.model, best.vector, self._generator, self._restarts)
         self._finalists.append(best)
         if best.model.size:
-            self._finalists.append(_Scored(strategy.model, strategy.model.projected(strategy.mean), math.inf))
+            self._finalists.append(_Scored(strategy.model, strategy.model.projected(strategy.evolution.mean)))
         return self._chosen(start)
 
     def _best_start(self, scenes: int) -> _Scored:
@@ -254,7 +257,7 @@ class Search:
 
         The first one where the time ends before they are scored.
         """
-        starts = [_Scored(model, model.zero, math.inf) for model in self._starts]
+        starts = [_Scored(model, model.zero) for model in self._starts]
         if len(starts) > STARTS_AT_ONCE:
             starts = self._ranked(starts, min(START_SCENES, scenes))[:STARTS_AT_ONCE]
         best = self._ranked(starts, scenes)[0]
@@ -263,25 +266,13 @@ class Search:
 
     def _ranked(self, starts: Sequence[_Scored], scenes: int) -> list[_Scored]:
         """Starts by their scores in the first scenes, the best first; those that are not scored come last."""
-        found = [_Scored(one.model, one.vector, math.inf) for one in starts]
-        for first in range(0, len(found), STARTS_AT_ONCE):
-            group = found[first : first + STARTS_AT_ONCE]
-            try:
-                values = self._values([one.model.positions(one.vector, self._rays) for one in group], scenes)
-            except OutOfTimeError:
-                break
-            for one, value in zip(group, values, strict=True):
-                one.value = float(value)
-        return sorted(found, key=lambda one: one.value)
-
-    def _rescored(self, best: _Scored, scenes: int) -> _Scored:
-        try:
-            value = float(self._values([best.model.positions(best.vector, self._rays)], scenes)[0])
-        except OutOfTimeError:
-            return best
-        again = _Scored(best.model, best.vector, value)
-        self._note(again, scenes)
-        return again
+        ranked = [replace(start, value=math.inf) for start in starts]
+        with contextlib.suppress(OutOfTimeError):
+            for first in range(0, len(ranked), STARTS_AT_ONCE):
+                group = ranked[first : first + STARTS_AT_ONCE]
+                for start, value in zip(group, self._values(group, scenes).tolist(), strict=True):
+                    start.value = value
+        return sorted(ranked, key=lambda start: start.value)
 
     def _step(self, strategy: _Strategy, best: _Scored, scenes: int) -> None:
         """One population: asked, scored, told; the best is kept.
@@ -289,17 +280,18 @@ class Search:
         Raises:
             OutOfTimeError: The budget ended before all were scored.
         """
-        vectors = strategy.ask()
-        admitted = [strategy.model.projected(vector) for vector in vectors]
-        values = self._values([strategy.model.positions(one, self._rays) for one in admitted], scenes)
-        strategy.tell(vectors, admitted, values)
+        vectors = strategy.evolution.ask()
+        admitted = [_Scored(strategy.model, strategy.model.projected(vector)) for vector in vectors]
+        values = self._values(admitted, scenes)
+        strategy.tell(vectors, [one.vector for one in admitted], values)
         first = int(values.argmin())
         if values[first] < best.value:
-            best.model, best.vector, best.value = strategy.model, admitted[first], float(values[first])
+            best.model, best.vector, best.value = strategy.model, admitted[first].vector, float(values[first])
         self._note(best, scenes)
 
-    def _values(self, lists: Sequence[Positions], scenes: int) -> np.ndarray:
-        """Mean scores over the first scenes, lower is better, shape (lists,)."""
+    def _values(self, scored: Sequence[_Scored], scenes: int) -> np.ndarray:
+        """Mean scores over the first scenes, lower is better, one each."""
+        lists = [one.model.positions(one.vector, self._rays) for one in scored]
         began = self._budget.clock()
         values = self._objective.values(lists, range(scenes), self._over)
         self._candidates += len(lists)
@@ -316,24 +308,24 @@ class Search:
         kept = min(finalists * self._per_evaluation, FINAL_SHARE * self._budget.seconds)
         finalists = min(finalists, FINAL_SHARE * self._budget.evaluations)
         elapsed = (self._budget.clock() - self._began + kept + ahead * self._per_evaluation) / self._budget.seconds
-        counted = (self._evaluations + finalists + ahead) / self._budget.evaluations
-        return max(elapsed, counted)
+        return max(elapsed, (self._evaluations + finalists + ahead) / self._budget.evaluations)
 
     def _over(self, ahead: int = 0) -> bool:
         return self._share(ahead) >= 1.0
 
     def _chosen(self, start: _Scored) -> SearchResult:
-        """The best finalist on all scenes."""
         unique = {(id(one.model), one.vector.tobytes()): one for one in self._finalists}
         lists = [one.model.positions(one.vector, self._rays) for one in unique.values()]
         scenes = self._final_scenes(len(lists))
         values = self._objective.values(lists, range(scenes)).mean(axis=1)
         self._evaluations += len(lists) * scenes
-        scores = dict(zip(unique, (float(value) for value in values), strict=True))
-        best = min(scores, key=lambda key: scores[key])
+        scores = dict(zip(unique, values.tolist(), strict=True))
+        best = min(scores, key=scores.__getitem__)
         sign = self._objective.sign
         seconds = self._budget.clock() - self._began
         self._curve.append((seconds, self._evaluations, scenes, sign * scores[best]))
+        # the last point stays
+        places = np.linspace(0, len(self._curve) - 1, min(len(self._curve), CURVE_POINTS)).round().astype(np.int64)
         return SearchResult(
             model=unique[best].model,
             vector=unique[best].vector,
@@ -345,20 +337,19 @@ class Search:
             evaluations=self._evaluations,
             scenes=scenes,
             restarts=self._restarts,
-            curve=_thinned(self._curve),
+            curve=[self._curve[place] for place in np.unique(places)],
         )
 
     def _final_scenes(self, finalists: int) -> int:
         """The number of scenes that finalists can be compared on: all, or as many as time and evaluations are left."""
         left = self._budget.seconds - (self._budget.clock() - self._began)
-        affordable = left / max(finalists * self._per_evaluation, TINY)
-        affordable = min(affordable, (self._budget.evaluations - self._evaluations) / finalists)
+        in_time = left / max(finalists * self._per_evaluation, TINY)
+        affordable = min(in_time, (self._budget.evaluations - self._evaluations) / finalists)
         return int(np.clip(affordable, self._stages[0], self._last))
 
     def _note(self, best: _Scored, scenes: int) -> None:
         value = self._objective.sign * best.value
-        last = self._curve[-1][2:] if self._curve else None
-        if last != (scenes, value):
+        if not self._curve or self._curve[-1][2:] != (scenes, value):
             self._curve.append((self._budget.clock() - self._began, self._evaluations, scenes, value))
         if self._show is not None:
             self._show(Progress(min(self._share(), 1.0), self._evaluations, value))
@@ -372,59 +363,29 @@ def _stages(scenes: int) -> list[int]:
     return found
 
 
-def _thinned(curve: Sequence[tuple[float, int, int, float]]) -> list[tuple[float, int, int, float]]:
-    """The curve at so many of its points, its last among them."""
-    if len(curve) <= CURVE_POINTS:
-        return list(curve)
-    kept = np.unique(np.linspace(0, len(curve) - 1, CURVE_POINTS).round().astype(np.int64))
-    return [curve[index] for index in kept]
-
-
-@dataclass(eq=False)
 class _Strategy:
     """The evolution strategy about a vector of one model.
 
     Arguments:
         model: Whose vectors it varies.
-        mean_at_start: The first mean.
+        mean: The first mean.
         generator: Of its random numbers.
         restart: How often a search has begun anew; each time the population doubles, up to a limit.
     """
 
-    model: DesignModel
-    mean_at_start: np.ndarray
-    generator: np.random.Generator
-    restart: int = 0
-    _inner: Any = field(init=False)
-
-    def __post_init__(self) -> None:
+    def __init__(self, model: DesignModel, mean: np.ndarray, generator: np.random.Generator, restart: int = 0) -> None:
         # loaded here: it takes a second, and few evaluations ask for it
         import cma
 
-        usual = 4 + int(3 * math.log(max(self.model.size, 2)))
-        population = usual * min(2**self.restart, MOST_POPULATION)
+        usual = 4 + int(3 * math.log(max(model.size, 2)))
         options = {
-            "popsize": population,
-            "CMA_diagonal": self.model.size > MOST_CORRELATED,
+            "popsize": usual * min(2**restart, MOST_POPULATION),
+            "CMA_diagonal": model.size > MOST_CORRELATED,
             "seed": math.nan,  # the generator below is the only source of random numbers
-            "randn": lambda *shape: self.generator.standard_normal(shape),
+            "randn": lambda *shape: generator.standard_normal(shape),
             "verbose": -9,
         }
-        self._inner = cma.CMAEvolutionStrategy(self.mean_at_start, STEP, options)
-
-    @property
-    def population(self) -> int:
-        """The number of vectors that it asks for at a time."""
-        return int(self._inner.popsize)
-
-    @property
-    def mean(self) -> np.ndarray:
-        """The mean of the distribution."""
-        return np.asarray(self._inner.mean)
-
-    def ask(self) -> list[np.ndarray]:
-        """A population."""
-        return list(self._inner.ask())
+        self.model, self.evolution = model, cma.CMAEvolutionStrategy(mean, STEP, options)
 
     def tell(self, vectors: Sequence[np.ndarray], admitted: Sequence[np.ndarray], values: np.ndarray) -> None:
         """Scores of the admitted vectors; those beyond the constraints are ranked behind by how far they lie beyond.
@@ -433,9 +394,5 @@ class _Strategy:
         """
         spread = float(np.subtract(*np.percentile(values, [75, 25])))
         beyond = [float(np.square(one - other).mean()) for one, other in zip(vectors, admitted, strict=True)]
-        penalty = np.array(beyond) / self._inner.sigma**2
-        self._inner.tell(vectors, (values + spread * penalty).tolist())
-
-    def converged(self) -> bool:
-        """Whether it has nothing left to find."""
-        return bool(self._inner.stop())
+        penalty = np.array(beyond) / self.evolution.sigma**2
+        self.evolution.tell(vectors, (values + spread * penalty).tolist())

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from lidardesign.design.layouts.grid import low_discrepancy
+from lidardesign.design.mixture.bounds import Bounds
 from lidardesign.design.sensor import Coupling, Sensor, boresight_frame
 from lidardesign.evaluate.baselines.candidates import (
     RAY_AXES,
@@ -65,16 +66,13 @@ def starts(rules: SearchRules, views: TrainingViews, count: int) -> list[Start]:
     observed = views.hits(dense_points(rules.space))
     if rules.one_sensor_per_ray:
         return scan_starts(rules, views, observed, count)
-    if rules.spread_axes:
-        found = [*_focused(rules, observed, count), *_parallel(rules, observed, count), *_even(rules, count)]
-    else:
-        found = [*_tilings(rules, observed, count), *_even(rules, count)]
-    return found if rules.gates else [_opened(rules, start) for start in found]
-
-
-def _opened(rules: SearchRules, start: Start) -> Start:
-    """The same sensors with gates over the whole range."""
-    return tuple(with_gate(sensor, *whole_range(rules.space).tolist()) for sensor in start)
+    kinds = (_focused, _parallel) if rules.spread_axes else (_tilings,)
+    found = [start for kind in kinds if len(observed.points) for start in kind(rules, observed, count)]
+    found.append(_even(rules, count))
+    if rules.gates:
+        return found
+    whole_m = whole_range(rules.space).tolist()
+    return [tuple(with_gate(sensor, *whole_m) for sensor in start) for start in found]
 
 
 def tiles(low: np.ndarray, high: np.ndarray, count: int, rows: int) -> list[Tile]:
@@ -84,47 +82,47 @@ def tiles(low: np.ndarray, high: np.ndarray, count: int, rows: int) -> list[Tile
     for bottom, top in pairwise(edges.tolist()):
         across = top - bottom
         for column in range(across):
-            share_low = np.array([column / across, bottom / count])
-            share_high = np.array([(column + 1) / across, top / count])
-            found.append(Tile(low + share_low * (high - low), low + share_high * (high - low)))
+            shares = np.array([[column / across, bottom / count], [(column + 1) / across, top / count]])
+            found.append(Tile(*(low + shares * (high - low))))
     return found
 
 
 def _tilings(rules: SearchRules, observed: Observed, count: int) -> Iterator[Start]:
     """Every arrangement of tiles over the returns, from every set of origins."""
-    if not len(observed.points):
-        return
     for origins in _origin_sets(rules, observed, count):
         distinct, which = np.unique(origins, axis=0, return_inverse=True)
         views = [_seen(rules, observed, origin) for origin in distinct]
         ends = [Tile(*central(view.places)) for view in views]
         if len(distinct) > 1:  # from several places, each may look at everything
-            parts = enumerate(which.ravel())
-            yield tuple(_tile_sensor(rules, views[v], ends[v], index, 1.0 / count)[0] for index, v in parts)
+            yield tuple(
+                _tile_sensor(rules, views[v], ends[v], index, 1.0 / count)[0] for index, v in enumerate(which.ravel())
+            )
         for rows in range(1, count + 1):
             split = [tiles(*end, count, rows) for end in ends]
-            sensors = [
-                _tile_sensor(rules, views[view], split[view][index], index, 1.0 / count)
-                for index, view in enumerate(which.ravel())
-            ]
-            yield tuple(sensor for sensor, _ in sensors)
-            returns = np.array([seen for _, seen in sensors], dtype=np.float64)
-            if count > 1 and returns.min() > 0:
-                yield tuple(replace(one, weight=n / returns.sum()) for (one, n) in sensors)
+            sensors, returns = zip(
+                *(
+                    _tile_sensor(rules, views[view], split[view][index], index, 1.0 / count)
+                    for index, view in enumerate(which.ravel())
+                ),
+                strict=True,
+            )
+            yield sensors
+            if count > 1 and min(returns) > 0:
+                yield tuple(replace(one, weight=n / sum(returns)) for one, n in zip(sensors, returns, strict=True))
 
 
 def _origin_sets(rules: SearchRules, observed: Observed, count: int) -> list[np.ndarray]:
     """Origins (G, 3) each: the middle of what is admitted, and where that is a box, spread over it."""
     bounds = rules.bounds(count)
-    middle = (bounds.origin_low + bounds.origin_high) / 2
-    sets = [admitted_origins(middle, bounds, rules.constraints)]
+    sets = [(bounds.origin_low + bounds.origin_high) / 2]
     if rules.axes.origin:
-        spread = bounds.origin_low + low_discrepancy(count, 3) * (bounds.origin_high - bounds.origin_low)
-        sets.append(admitted_origins(spread, bounds, rules.constraints))
         low, high = central(observed.points[:, :3])
-        seen = np.tile((low + high) / 2, (count, 1))
-        sets.append(admitted_origins(seen, bounds, rules.constraints))
-    return sets
+        sets += [_spread_origins(bounds, count), np.tile((low + high) / 2, (count, 1))]
+    return [admitted_origins(origins, bounds, rules.constraints) for origins in sets]
+
+
+def _spread_origins(bounds: Bounds, count: int) -> np.ndarray:
+    return bounds.origin_low + low_discrepancy(count, 3) * (bounds.origin_high - bounds.origin_low)
 
 
 class _Seen(NamedTuple):
@@ -181,11 +179,11 @@ def _sensor(
     gate: np.ndarray,
 ) -> Sensor:
     """A sensor whose intervals are a field of view (2,) [rad] and a gate (2,) [m]."""
-    spread = np.asarray(field, dtype=np.float64) / (2 * rules.interval)
+    spread = field / (2 * rules.interval)
     return Sensor(
         name=f"s{index}",
         weight=weight,
-        origin_m=np.asarray(origin, dtype=np.float64),
+        origin_m=origin,
         origin_covariance_m2=np.zeros((3, 3)),
         azimuth_rad=boresight[0],
         elevation_rad=boresight[1],
@@ -198,26 +196,23 @@ def _sensor(
     )
 
 
-def _even(rules: SearchRules, count: int) -> list[Start]:
+def _even(rules: SearchRules, count: int) -> Start:
     """The whole space in tiles whose cells are as square as can be, with the whole range."""
-    space = rules.space
-    bounds = rules.bounds(count)
+    space, bounds = rules.space, rules.bounds(count)
     low, high = (np.array(end)[[AZIMUTH, ELEVATION]] for end in (space.low, space.high))
     width, height = (high - low) * [math.cos((low[1] + high[1]) / 2), 1.0]
     rows = int(np.clip(round(math.sqrt(count * height / max(width, NARROWEST_RAD))), 1, count))
-    origins = bounds.origin_low + low_discrepancy(count, 3) * (bounds.origin_high - bounds.origin_low)
-    origins = admitted_origins(origins, bounds, rules.constraints)
-    found = []
+    origins = admitted_origins(_spread_origins(bounds, count), bounds, rules.constraints)
+    sensors = []
     for index, tile in enumerate(tiles(low, high, count, rows)):
         azimuth, elevation = ((tile.low + tile.high) / 2).tolist()
         field = (tile.high - tile.low) * [math.cos(elevation), 1.0]
-        gate = whole_range(space)
-        one = _sensor(rules, index, 1.0 / count, origins[index], (azimuth, elevation), field, gate)
+        sensor = _sensor(rules, index, 1.0 / count, origins[index], (azimuth, elevation), field, whole_range(space))
         if rules.spread_axes:
             extent = (bounds.origin_high - bounds.origin_low)[index] / math.sqrt(count)
-            one = _spread_out(rules, one, extent, 0.0, one.spread_horizontal_rad, one.spread_vertical_rad)
-        found.append(one)
-    return [tuple(found)]
+            sensor = _spread_out(rules, sensor, extent, 0.0, sensor.spread_horizontal_rad, sensor.spread_vertical_rad)
+        sensors.append(sensor)
+    return tuple(sensors)
 
 
 def _spread_out(rules: SearchRules, sensor: Sensor, extent_m: np.ndarray, focus: float, *spread_rad: float) -> Sensor:
@@ -225,9 +220,8 @@ def _spread_out(rules: SearchRules, sensor: Sensor, extent_m: np.ndarray, focus:
     along = np.isin(np.arange(3), rules.spread_axes)
     deviation = np.where(along, np.maximum(extent_m, 0.0) / (2 * rules.interval), 0.0)
     slopes = -focus * sensor.frame[1:] / max(sensor.range_m, NARROWEST_RAD)
-    moving = np.sqrt(np.square(slopes * deviation).sum(axis=1))
     coupling = Coupling(slopes, np.zeros(3), np.zeros(2), np.array(spread_rad), sensor.spread_range_m)
-    whole = np.hypot(spread_rad, moving)
+    whole = np.hypot(spread_rad, np.sqrt(np.square(slopes * deviation).sum(axis=1)))
     return replace(
         sensor,
         origin_covariance_m2=np.diag(np.square(deviation)),
@@ -237,51 +231,44 @@ def _spread_out(rules: SearchRules, sensor: Sensor, extent_m: np.ndarray, focus:
     )
 
 
-def _origin_tiles(rules: SearchRules, low: np.ndarray, high: np.ndarray, count: int) -> Iterator[list[Tile]]:
-    """Boxes of origins (3,) each: every arrangement of tiles along the two longest spread axes."""
+def _origin_tiles(
+    rules: SearchRules, low: np.ndarray, high: np.ndarray, count: int
+) -> Iterator[list[tuple[np.ndarray, Tile]]]:
+    """Origins and the boxes (3,) about them: every arrangement of tiles along the two longest spread axes."""
     axes = sorted(rules.spread_axes, key=lambda axis: low[axis] - high[axis])[:2]
+    pair = (axes * 2)[:2]
     for rows in range(1, count + 1) if len(axes) == 2 else (1,):
-        pair = (axes * 2)[:2]
         plane = tiles(low[pair], high[pair], count, rows)
         boxes = [Tile(low.copy(), high.copy()) for _ in plane]
         for box, tile in zip(boxes, plane, strict=True):
             for place, axis in enumerate(axes):
                 box.low[axis], box.high[axis] = tile.low[place], tile.high[place]
-        yield boxes
+        middles = np.array([(box.low + box.high) / 2 for box in boxes])
+        yield list(zip(admitted_origins(middles, rules.bounds(count), rules.constraints), boxes, strict=True))
 
 
 def _parallel(rules: SearchRules, observed: Observed, count: int) -> Iterator[Start]:
     """Origins over the returns, looking straight down where that is admitted."""
-    if not len(observed.points):
-        return
     azimuth, elevation = parallel_angles(rules.space, observed)
-    bounds = rules.bounds(count)
     looking = direction(azimuth, elevation)
-    low, high = central(observed.hits_m)
-    low, high = (np.clip(end, rules.space.low[:3], rules.space.high[:3]) for end in (low, high))
-    spread = 2 * rules.interval * np.full(2, PARALLEL_RAD)
-    for boxes in _origin_tiles(rules, low, high, count):
-        origins = admitted_origins(np.array([(box.low + box.high) / 2 for box in boxes]), bounds, rules.constraints)
+    low, high = (np.clip(end, rules.space.low[:3], rules.space.high[:3]) for end in central(observed.hits_m))
+    field = 2 * rules.interval * np.full(2, PARALLEL_RAD)
+    for parts in _origin_tiles(rules, low, high, count):
         start = []
-        for index, (origin, box) in enumerate(zip(origins, boxes, strict=True)):
+        for index, (origin, box) in enumerate(parts):
             gate = _gate(rules, np.maximum((observed.hits_m - origin) @ looking, 0.0))
-            one = _sensor(rules, index, 1.0 / count, origin, (azimuth, elevation), spread, gate)
-            start.append(_spread_out(rules, one, box.high - box.low, 0.0, PARALLEL_RAD, PARALLEL_RAD))
+            sensor = _sensor(rules, index, 1.0 / count, origin, (azimuth, elevation), field, gate)
+            start.append(_spread_out(rules, sensor, box.high - box.low, 0.0, PARALLEL_RAD, PARALLEL_RAD))
         yield tuple(start)
 
 
 def _focused(rules: SearchRules, observed: Observed, count: int) -> Iterator[Start]:
     """Origins over all that see returns, each part looking at the middle of what it sees, or half as focused."""
-    if not len(observed.points):
-        return
-    bounds = rules.bounds(count)
-    low, high = central(observed.points[:, :3])
-    for boxes in _origin_tiles(rules, low, high, count):
-        origins = admitted_origins(np.array([(box.low + box.high) / 2 for box in boxes]), bounds, rules.constraints)
+    for parts in _origin_tiles(rules, *central(observed.points[:, :3]), count):
         for focus in (1.0, 0.5):
-            parts = enumerate(zip(origins, boxes, strict=True))
             yield tuple(
-                _looking_at(rules, observed, index, origin, box, count, focus) for index, (origin, box) in parts
+                _looking_at(rules, observed, index, origin, box, count, focus)
+                for index, (origin, box) in enumerate(parts)
             )
 
 
@@ -289,17 +276,17 @@ def _looking_at(
     rules: SearchRules, observed: Observed, index: int, origin: np.ndarray, box: Tile, count: int, focus: float
 ) -> Sensor:
     """The sensor whose origins fill a box, looking at what is seen from there."""
-    axes = list(rules.spread_axes)
     starts_m = observed.points[:, :3]
-    inside = ((starts_m >= box.low) & (starts_m <= box.high))[:, axes].all(axis=1)
+    inside = ((starts_m >= box.low) & (starts_m <= box.high))[:, list(rules.spread_axes)].all(axis=1)
     chosen = inside if inside.sum() >= FEWEST_RETURNS else np.ones(len(inside), dtype=bool)
     hits, middle = observed.hits_m[chosen], observed.hits_m[chosen].mean(axis=0)
     azimuth, elevation = (float(angle) for angle in angles(middle - origin))
     gate = _gate(rules, np.linalg.norm(hits - origin, axis=1))
-    one = _sensor(rules, index, 1.0 / count, origin, (azimuth, elevation), np.zeros(2), gate)
-    across = (hits - middle) @ one.frame[1:].T / max(float(np.linalg.norm(middle - origin)), NARROWEST_RAD)
-    residual = np.maximum(across.std(axis=0), NARROWEST_RAD)
-    return _spread_out(rules, one, box.high - box.low, focus, *residual.tolist())
+    sensor = _sensor(rules, index, 1.0 / count, origin, (azimuth, elevation), np.zeros(2), gate)
+    across = (hits - middle) @ sensor.frame[1:].T / max(float(np.linalg.norm(middle - origin)), NARROWEST_RAD)
+    return _spread_out(
+        rules, sensor, box.high - box.low, focus, *np.maximum(across.std(axis=0), NARROWEST_RAD).tolist()
+    )
 
 
 def scan_starts(rules: SearchRules, views: TrainingViews, observed: Observed, count: int) -> list[Start]:
@@ -308,11 +295,10 @@ def scan_starts(rules: SearchRules, views: TrainingViews, observed: Observed, co
     for points, gate in scan_layouts(rules.space, views, observed, count):
         every = np.tile(gate if rules.gates else whole_range(rules.space), (count, 1))
         for gates in (every, nearby_gates(rules, observed, points, every))[: 1 + rules.gates]:
-            rays = zip(points, gates, strict=True)
             found.append(
                 tuple(
-                    _sensor(rules, i, 1.0 / count, point[:3], (point[AZIMUTH], point[ELEVATION]), np.zeros(2), one)
-                    for i, (point, one) in enumerate(rays)
+                    _sensor(rules, i, 1.0 / count, point[:3], (point[AZIMUTH], point[ELEVATION]), np.zeros(2), gate_m)
+                    for i, (point, gate_m) in enumerate(zip(points, gates, strict=True))
                 )
             )
     return found
