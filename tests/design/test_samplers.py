@@ -14,6 +14,7 @@ from support.designs import sensor
 from support.flows import FLOWS, draw, flow_of
 from support.mixtures import POINT, features_of, random_mixture
 from support.mixtures import drawn as drawn_from_mixture
+from support.rivals import Rivals
 from support.tables import each_row
 
 from lidardesign.density.flow.objective import Coordinates
@@ -30,7 +31,6 @@ from lidardesign.design.mixture.mixture import log_density
 from lidardesign.design.mixture.support import pin_samples, restrict_samples
 from lidardesign.design.sensor import DesignSpec, tangent_coordinates, tangent_directions
 from lidardesign.evaluate.baselines.occupancy import OccupancyGrid
-from lidardesign.evaluate.baselines.simple import Baselines
 from lidardesign.geometry.surface import sample_body
 from lidardesign.numerics import systematic_draw
 from lidardesign.samples import Samples
@@ -460,7 +460,7 @@ def test_distributed_rays_without_samples_fill_their_sensors_own_gaussian():
 @pytest.mark.parametrize("name", ["random", "uniform"])
 def test_rays_of_the_plain_baselines_are_uniform_in_what_they_say(name, measure):
     space = DesignSpace((-1, 0, 0, 0.5, -1.2, 0.5), (1, 0, 0, 2.5, 1.4, 3.0), measure=measure)
-    rays = Baselines(space, (), 3).positions(name, 4000)[0]
+    rays = Rivals(space, (), 3).positions(name, 4000)[0]
     azimuth, elevation = angles(rays.direction)
     # even placements divide the angles; random ones are uniform in the space's own measure
     by_area = measure == "solid_angle" and name == "random"

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from support.rivals import Rivals
 from support.tables import each_row
 
 from lidardesign.design.bandwidth import Bandwidth
@@ -12,7 +13,6 @@ from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines import simple as baselines
 from lidardesign.evaluate.baselines.candidates import BaselineLayout, even_placement, opened_gate, unrolled
 from lidardesign.evaluate.baselines.simple import (
-    Baselines,
     Family,
     baseline_of,
     is_baseline,
@@ -35,7 +35,7 @@ BUILT = ["uniform", "random", "bounding", "occupancy"]
 
 def build_baseline(name, space, train, count, seed, judge=None):
     """A baseline at so many rays, for a space without conditions."""
-    return Baselines(space, train, seed, judge).positions(name, count)[0]
+    return Rivals(space, train, seed, judge).positions(name, count)[0]
 
 
 def balls(centre, radius=0.4, jitter=0.05, count=3):
@@ -74,7 +74,7 @@ def design_points(rays):
 @each_row("name", BUILT)
 def test_any_number_of_rays_is_met_exactly_inside_the_space_and_repeats(case, name):
     space, train = CASES[case]
-    source, same = (Baselines(space, train, seed=4) for _ in range(2))
+    source, same = (Rivals(space, train, seed=4) for _ in range(2))
     for count in (0, 1, 2, 7, 36, 101):
         (rays,) = source.positions(name, count)
         (again,) = same.positions(name, count)
@@ -165,7 +165,7 @@ def test_bounding_without_any_return_is_uniform():
 def test_as_many_rays_as_fit_in_a_bandwidth_fit_and_one_more_does_not(case, name, limit):
     space, train = CASES[case]
     bandwidth = Bandwidth()
-    source = Baselines(space, train, seed=0)
+    source = Rivals(space, train, seed=0)
     (rays,) = source.positions_within(name, limit, bandwidth)
     assert bandwidth.mbps(rays) <= limit
     fitting = [
@@ -206,7 +206,7 @@ AXES = {"x": [0, 0, 0, 0, 0], "y": [0, 0, 0, math.pi / 2, 0]}
 
 
 def test_what_follows_the_colon_reaches_the_family_and_keeps_its_layouts_apart(of_axis):
-    source = Baselines(FIXED, [], seed=0)
+    source = Rivals(FIXED, [], seed=0)
     for name, looking in (("axis:x", [1, 0, 0]), ("axis:y", [0, 1, 0])):
         (rays,) = source.positions(name, 3)
         np.testing.assert_allclose(rays.direction, np.tile(looking, (3, 1)), atol=1e-12)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from support.command_line import caller, make_run
+from support.rivals import Rivals
 from support.tables import each_row
 
 from lidardesign.design.bandwidth import Bandwidth
@@ -25,7 +26,7 @@ from lidardesign.evaluate.baselines.catalog import (
     places,
     split_argument,
 )
-from lidardesign.evaluate.baselines.simple import Baselines, baseline_of
+from lidardesign.evaluate.baselines.simple import baseline_of
 from lidardesign.numerics import effective_count
 from lidardesign.samples import Samples
 from lidardesign.scene import Body, Box, Scene, Sphere, rigid
@@ -92,7 +93,7 @@ def cloud(centre, space, count=400, spread=0.1):
 @each_row(("case", "name"), PAIRS)
 def test_any_number_of_rays_is_met_exactly_with_the_parts_range_and_repeats(case, name):
     space, train = CASES[case]
-    source, same = (Baselines(space, train, seed=4) for _ in range(2))
+    source, same = (Rivals(space, train, seed=4) for _ in range(2))
     start, end = gate_inside(find_part(name), space)
     for count in (0, 1, 7) if name == "vl53l1x" or case == "ceiling" else (0, 1, 7, 70):
         (rays,) = source.positions(f"catalog:{name}", count)
@@ -111,7 +112,7 @@ def test_rays_are_a_turned_pattern_of_the_part_and_at_its_own_number_all_of_it(n
     part = find_part(name)
     cosines = np.unique(np.round(part.directions @ part.directions.T, 9))
     for count in (part.rays // 2, part.rays):
-        (rays,) = Baselines(space, train, seed=1).positions(f"catalog:{name}", count)
+        (rays,) = Rivals(space, train, seed=1).positions(f"catalog:{name}", count)
         found = np.round(rays.direction @ rays.direction.T, 9)
         # no two rays stand at an angle that no two of the part's do
         assert cKDTree(cosines[:, None]).query(found.reshape(-1, 1))[0].max() < 1e-8
@@ -121,7 +122,7 @@ def test_rays_are_a_turned_pattern_of_the_part_and_at_its_own_number_all_of_it(n
 
 def test_more_rays_than_a_part_has_come_from_several_that_no_one_overtaxes():
     space, train = CASES["fixed origin"]
-    (rays,) = Baselines(space, train, seed=1).positions("catalog:vl53l5cx", 150)
+    (rays,) = Rivals(space, train, seed=1).positions("catalog:vl53l5cx", 150)
     shares = np.bincount(rays.sensor)
     assert shares.tolist() == [50, 50, 50]
     for sensor in range(3):
@@ -134,7 +135,7 @@ def test_more_rays_than_a_part_has_come_from_several_that_no_one_overtaxes():
 @each_row("case", CASES)
 def test_a_part_looks_where_the_target_is(case):
     space, train = CASES[case]
-    source = Baselines(space, train, seed=0)
+    source = Rivals(space, train, seed=0)
     count = 8
     rays = source.positions("catalog:vl53l5cx", count)[0]
     uniform = source.positions("uniform", count)[0]
@@ -184,7 +185,7 @@ def test_no_place_that_was_tried_is_likelier_than_the_one_taken():
     posed = PosedPart(find_part("vl53l5cx"), spots(CEILING, points), 1)
     (best,) = posed.best(1)
     found = naive_worth(posed.part, [best], points, CEILING)
-    tried = [pose for place in posed._closer for pose in posed._at(place, 1)]
+    tried = [pose for place in posed._closer for pose in posed._fitted(place, 1)]
     assert len(tried) > 5
     assert found >= max(naive_worth(posed.part, [pose], points, CEILING) for pose in tried) - 1e-9
 
@@ -226,14 +227,14 @@ def test_scene_points_are_no_more_visible_from_elsewhere_than_they_can_be():
 def test_what_carries_a_part_takes_it_along():
     space, train = CASES["aisle"]
     values = [{"x_m": -1.0}, {"x_m": 0.25}, {"x_m": 1.0}]
-    positions = Baselines(space, train, seed=2, conditions=values).positions("catalog:vl53l5cx", 20)
+    positions = Rivals(space, train, seed=2, conditions=values).positions("catalog:vl53l5cx", 20)
     for rays, value in zip(positions, values, strict=True):
         np.testing.assert_allclose(rays.origin_m, np.tile([value["x_m"], 0, 0], (20, 1)))
         assert np.array_equal(rays.direction, positions[0].direction)
 
 
 def test_a_row_of_a_part_lies_in_the_plane_that_the_space_holds_all_rays_in():
-    (rays,) = Baselines(*CASES["aisle"], seed=2, conditions=[{"x_m": 0.0}]).positions("catalog:vl53l5cx", 4)
+    (rays,) = Rivals(*CASES["aisle"], seed=2, conditions=[{"x_m": 0.0}]).positions("catalog:vl53l5cx", 4)
     # the zones of a column are even in the tangent plane: they leave the vertical one by a tenth of a degree
     assert np.abs(rays.direction[:, 0]).max() < math.radians(0.15)
     assert np.ptp(rays.direction[:, 2]) > 0.15
@@ -243,7 +244,7 @@ def test_a_row_of_a_part_lies_in_the_plane_that_the_space_holds_all_rays_in():
 @each_row("limit", [0.0, 0.05, 3.0])
 def test_as_many_rays_as_fit_in_a_bandwidth_fit_and_one_more_does_not(name, limit):
     bandwidth = Bandwidth()
-    source = Baselines(*CASES["fixed origin"], seed=0)
+    source = Rivals(*CASES["fixed origin"], seed=0)
     (rays,) = source.positions_within(f"catalog:{name}", limit, bandwidth)
     assert bandwidth.mbps(rays) <= limit
     assert bandwidth.mbps(source.positions(f"catalog:{name}", len(rays) + 1)[0]) > limit
@@ -251,16 +252,16 @@ def test_as_many_rays_as_fit_in_a_bandwidth_fit_and_one_more_does_not(name, limi
 
 def test_a_bandwidth_of_more_rays_than_any_sensor_has_is_refused():
     with pytest.raises(ConfigError, match="rays of vl53l5cx"):
-        Baselines(*CASES["fixed origin"], seed=0).positions_within("catalog:vl53l5cx", 1e9, Bandwidth())
+        Rivals(*CASES["fixed origin"], seed=0).positions_within("catalog:vl53l5cx", 1e9, Bandwidth())
 
 
 def test_a_pose_may_be_given():
-    (rays,) = Baselines(*CASES["fixed origin"], seed=0).positions("catalog:vl53l5cx@0.1,0.2,-0.3,20,-10,90", 64)
+    (rays,) = Rivals(*CASES["fixed origin"], seed=0).positions("catalog:vl53l5cx@0.1,0.2,-0.3,20,-10,90", 64)
     pose = Pose(np.array([0.1, 0.2, -0.3]), *np.radians([20.0, -10.0, 90.0]))
     expected = part_rays(find_part("vl53l5cx"), pose)
     np.testing.assert_allclose(rays.direction, expected.direction, atol=1e-12)
     np.testing.assert_allclose(rays.origin_m, expected.origin_m)
-    (three,) = Baselines(*CASES["fixed origin"], seed=0).positions("catalog:vl53l5cx@0,0,0,20,-10", 150)
+    (three,) = Rivals(*CASES["fixed origin"], seed=0).positions("catalog:vl53l5cx@0,0,0,20,-10", 150)
     assert np.bincount(three.sensor).tolist() == [50, 50, 50]
 
 
@@ -285,7 +286,7 @@ def test_what_is_no_part_or_pose_is_refused_before_anything_is_built(name, messa
 
 
 def test_a_space_of_one_ray_has_a_part_look_along_it():
-    (rays,) = Baselines(FROZEN, [ball([3.4, 0, 0])], seed=0).positions("catalog:vl53l5cx", 1)
+    (rays,) = Rivals(FROZEN, [ball([3.4, 0, 0])], seed=0).positions("catalog:vl53l5cx", 1)
     np.testing.assert_allclose(rays.direction, [[1, 0, 0]], atol=1e-12)
     assert rays.gate_m[0, 0] < 3.0 < rays.gate_m[0, 1]
 
@@ -293,12 +294,12 @@ def test_a_space_of_one_ray_has_a_part_look_along_it():
 def test_a_part_that_measures_elsewhere_says_so():
     near = DesignSpace((0, 0, 0, -0.5, -0.5, 0.05), (0, 0, 0, 0.5, 0.5, 0.5))
     with pytest.raises(ConfigError, match=r"measures from 0.9 to 100 m.*0.05 to 0.5 m"):
-        Baselines(near, [ball([0.3, 0, 0], 0.1)], seed=0).positions("catalog:vlp-16", 5)
+        Rivals(near, [ball([0.3, 0, 0], 0.1)], seed=0).positions("catalog:vlp-16", 5)
 
 
 def test_without_returns_and_samples_no_pose_is_better_than_another():
     with pytest.raises(ConfigError, match="no pose is better"):
-        Baselines(FIXED, [ball([-3.0, 0, 0])], seed=0).positions("catalog:vl53l5cx", 5)
+        Rivals(FIXED, [ball([-3.0, 0, 0])], seed=0).positions("catalog:vl53l5cx", 5)
 
 
 def test_a_learned_density_stands_before_training_returns():
@@ -306,13 +307,13 @@ def test_a_learned_density_stands_before_training_returns():
     points = FIXED.sample(3000, generator)
     away = np.square(points[:, 3] - 0.35) + np.square(points[:, 4] + 0.3)
     samples = Samples(points, np.full(3000, -FIXED.log_volume), -away / (2 * 0.02**2), FIXED)
-    source = Baselines(*CASES["fixed origin"], seed=0, density=lambda: Density(samples))
+    source = Rivals(*CASES["fixed origin"], seed=0, density=lambda: Density(samples))
     (rays,) = source.positions("catalog:vl53l5cx", 4)
     assert (rays.direction @ direction(0.35, -0.3)).min() > math.cos(math.radians(10))
 
 
 def test_rows_of_several_parts_say_how_many():
-    source = Baselines(*CASES["fixed origin"], seed=0)
+    source = Rivals(*CASES["fixed origin"], seed=0)
     rows = [(name, source.positions(name, count)) for count in (10, 150) for name in ("catalog:vl53l5cx", "uniform")]
     assert part_notes(rows) == ["catalog:vl53l5cx is 3 parts at 150 rays"]
     assert part_notes(rows[:2]) == []

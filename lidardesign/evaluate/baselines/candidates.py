@@ -64,13 +64,12 @@ def rays_at(points: np.ndarray, gate_m: np.ndarray) -> Rays:
 
     They fire one after another over a frame, as a design's do.
     """
-    count = len(points)
     return Rays(
         origin_m=points[:, :3],
         direction=direction(points[:, AZIMUTH], points[:, ELEVATION]),
-        gate_m=np.tile(gate_m, (count, 1)),
-        sensor=np.zeros(count),
-        time_s=fire_times(count, Bandwidth().rate_hz),
+        gate_m=np.tile(gate_m, (len(points), 1)),
+        sensor=np.zeros(len(points)),
+        time_s=fire_times(len(points), Bandwidth().rate_hz),
     )
 
 
@@ -80,7 +79,6 @@ def opened_gate(start_m: float, end_m: float) -> np.ndarray:
         return np.array([start_m, np.nextafter(end_m, np.inf)])
     start = max(0.0, start_m - SMALLEST_GATE_M / 2)
     return np.array([start, start + SMALLEST_GATE_M])
-
 
 
 Positions = tuple[Rays, ...]  # one list of rays per condition value, in the task's order
@@ -108,11 +106,9 @@ class Candidate(Protocol):
 
     def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
         """Exactly `count` rays in each of the spaces."""
-        ...
 
     def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
         """As many rays as fit in a bandwidth [Mbit/s], the same number in each space; none where not one fits."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +129,7 @@ class BaselineLayout:
 
     def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
         """See `Candidate`."""
-        spots = [Spot(space, number, scene) for number, space in enumerate(spaces)]
+        spots = (Spot(space, number, scene) for number, space in enumerate(spaces))
         return tuple(rays_at(self.place(count, spot), self.gate_m) for spot in spots)
 
     def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
@@ -142,20 +138,43 @@ class BaselineLayout:
         Raises:
             ConfigError: More rays than any sensor fires fit in.
         """
-        width_m = self.gate_m[1] - self.gate_m[0]
-        single = bandwidth.mbps_of_widths(np.array([width_m]))
-        # the ratio of two multiples of one bin may lie an ulp below a whole number
-        count = math.floor(limit_mbps / single * (1 + EPSILON))
-        if count > MOST_RAYS:
-            raise ConfigError(
-                f"a design of {limit_mbps:.3g} Mbit/s compares with baselines of {count:.3g} rays",
-                where="bandwidth",
-                allowed=f"at most {MOST_RAYS:,} rays",
-                hint="narrow the design's gates: they are far longer than the task's ranges",
-            )
-        while count and bandwidth.mbps_of_widths(np.array([width_m]), count) > limit_mbps:
-            count -= 1
+        count = rays_within(
+            limit_mbps,
+            bandwidth,
+            self.gate_m,
+            before="baselines of ",
+            hint="narrow the design's gates: they are far longer than the task's ranges",
+        )
         return self.positions(spaces, count)
+
+
+def rays_within(
+    limit_mbps: float,
+    bandwidth: Bandwidth,
+    gate_m: np.ndarray,
+    *,
+    before: str = "",
+    after: str = "",
+    hint: str | None = None,
+) -> int:
+    """The number of rays with one gate (2,) [m] that fit in a bandwidth [Mbit/s].
+
+    Raises:
+        ConfigError: They are more than any sensor fires; the words before and after their number say whose they are.
+    """
+    width_m = np.diff(gate_m)
+    # the ratio of two multiples of one bin may lie an ulp below a whole number
+    count = math.floor(limit_mbps / bandwidth.mbps_of_widths(width_m) * (1 + EPSILON))
+    if count > MOST_RAYS:
+        raise ConfigError(
+            f"a design of {limit_mbps:.3g} Mbit/s compares with {before}{count:.3g} rays{after}",
+            where="bandwidth",
+            allowed=f"at most {MOST_RAYS:,} rays",
+            hint=hint,
+        )
+    while count and bandwidth.mbps_of_widths(width_m, count) > limit_mbps:
+        count -= 1
+    return count
 
 
 def mean_mbps(positions: Positions, bandwidth: Bandwidth) -> float:
@@ -206,8 +225,7 @@ class TrainingViews:
     @cached_property
     def casters(self) -> list[tuple[Scene, SceneCaster]]:
         """A caster per scene and frame, built once."""
-        chosen = [(self.train[index], frame) for index, frame in spread_frames(self.train)]
-        return [(scene, SceneCaster(scene, frame)) for scene, frame in chosen]
+        return [(self.train[i], SceneCaster(self.train[i], frame)) for i, frame in spread_frames(self.train)]
 
     def hits(self, points: np.ndarray) -> Observed:
         """What rays at (N, 5 or 6) return on targets inside the space's range, over all views."""
@@ -220,10 +238,10 @@ class TrainingViews:
             seen = target & (found.range_m >= lowest) & (found.range_m < highest)
             kept.append(np.column_stack([points[seen, :RAY_AXES], found.range_m[seen]]))
         design = np.concatenate(kept)
-        spots = observed_point(design)
+        hits_m = observed_point(design)
         if self.space.full_azimuth:
             design[:, AZIMUTH] = unrolled(design[:, AZIMUTH])
-        return Observed(design, spots)
+        return Observed(design, hits_m)
 
     def missing_returns(self, lists: Sequence[Positions]) -> list[float]:
         """The share of rays without a return inside their gate, over all views."""
@@ -262,5 +280,4 @@ def unrolled(azimuth_rad: np.ndarray) -> np.ndarray:
         return azimuth_rad
     turned = np.sort(wrap_turn(azimuth_rad))
     gaps = np.diff(np.append(turned, turned[0] + FULL_TURN))
-    start = turned[(int(np.argmax(gaps)) + 1) % len(turned)]
-    return wrap_turn(azimuth_rad, start)
+    return wrap_turn(azimuth_rad, turned[(int(np.argmax(gaps)) + 1) % len(turned)])

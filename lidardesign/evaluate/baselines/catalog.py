@@ -22,7 +22,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,7 +35,7 @@ from lidardesign.design.mixture.bounds import bounds_of
 from lidardesign.design.mixture.em import fit_mixture
 from lidardesign.design.mixture.features import Axes, Features
 from lidardesign.design.mixture.mixture import Mixture
-from lidardesign.design.sensor import DEFAULT_LEVEL, MOST_RAYS, interval_factor
+from lidardesign.design.sensor import DEFAULT_LEVEL, interval_factor
 from lidardesign.design.snap.parts import (
     PartShape,
     gate_inside,
@@ -45,9 +45,15 @@ from lidardesign.design.snap.parts import (
     useful_ray_filter,
 )
 from lidardesign.errors import ConfigError
-from lidardesign.evaluate.baselines.candidates import Positions, TrainingViews, dense_points, whole_range
+from lidardesign.evaluate.baselines.candidates import (
+    Positions,
+    TrainingViews,
+    dense_points,
+    rays_within,
+    whole_range,
+)
 from lidardesign.geometry.rays import Rays
-from lidardesign.numerics import EPSILON, effective_count, systematic_draw
+from lidardesign.numerics import effective_count, systematic_draw
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.space import AZIMUTH, DIMENSIONS, FARTHEST_M, RANGE, DesignSpace, aim, observed_point
@@ -109,33 +115,17 @@ class ScenePoints:
 
     def visible(self, origin_m: np.ndarray) -> np.ndarray:
         """How visible each scene point is from an origin, relative to where it was seen from, (N,) in [0, 1]."""
-        place = tuple(float(value) for value in origin_m)
-        if place not in self._seen:
-            self._seen[place] = self._visible(origin_m)
-        return self._seen[place]
-
-    def _visible(self, origin_m: np.ndarray) -> np.ndarray:
         origins = np.tile(origin_m, (len(self.points), 1))
         origins[:, self.travelled] = self.points[:, self.travelled]
         if self.retarget is None or np.array_equal(origins, self.points[:, :3]):
             return np.ones(len(self.points))
-        aimed = self.space.wrap(aim(origins, observed_point(self.points)))
-        with np.errstate(invalid="ignore"):
-            gain = np.asarray(self.retarget(aimed), dtype=np.float64) - self.log_target
-        return np.exp(np.minimum(np.where(np.isnan(gain), -np.inf, gain), 0.0))
-
-
-@dataclass(frozen=True, eq=False)
-class Proposals:
-    """Poses to choose from.
-
-    Arguments:
-        poses: P poses.
-        density: How densely a part at each would put rays on each scene point, shape (P, N) [1 / m^2].
-    """
-
-    poses: list[Pose]
-    density: np.ndarray
+        place = tuple(map(float, origin_m))
+        if place not in self._seen:
+            aimed = self.space.wrap(aim(origins, observed_point(self.points)))
+            with np.errstate(invalid="ignore"):
+                gain = np.asarray(self.retarget(aimed), dtype=np.float64) - self.log_target
+            self._seen[place] = np.exp(np.minimum(np.where(np.isnan(gain), -np.inf, gain), 0.0))
+        return self._seen[place]
 
 
 class PosedPart:
@@ -158,9 +148,10 @@ class PosedPart:
     @phase("poses")
     def best(self, number: int) -> list[Pose]:
         """The likeliest poses of so many parts, one place per part."""
-        apart = min(number, MOST_APART)
-        every = [pose for place in self._closer for pose in self._at(place, apart)]
-        return self._greedy(self._proposals(every), number)
+        # one alone, then those that were fitted together
+        sizes = dict.fromkeys((1, min(number, MOST_APART)))
+        every = [pose for place in self._closer for size in sizes for pose in self._fitted(place, size)]
+        return self._greedy(every, number)
 
     @cached_property
     def _closer(self) -> list[int]:
@@ -172,23 +163,22 @@ class PosedPart:
         likelihood = [self._log_likelihood(self._density(pose, everything)) for pose in first]
         return sorted(np.argsort(-np.array(likelihood), kind="stable")[:CLOSER_PLACES].tolist())
 
-    def _at(self, place: int, number: int) -> list[Pose]:
-        one = self._fitted(place, 1)
-        return one if number == 1 else [*one, *self._fitted(place, number)]
-
     def _fitted(self, place: int, number: int) -> list[Pose]:
         if (place, number) not in self._fits:
             self._fits[place, number] = self._fit(place, number, self.scene.visible(self.places_m[place]))
         return self._fits[place, number]
 
     def _fit(self, place: int, number: int, visible: np.ndarray) -> list[Pose]:
-        generator = random_generator(self.seed, "part", self.part.name, place, number)
         here, space = self.places_m[place], self.scene.still
-        return fitted_poses(self.part, self._points, visible, here, space, number, generator)
-
-    def _proposals(self, poses: list[Pose]) -> Proposals:
-        rows = [self._density(pose, self.scene.visible(pose.origin_m)) for pose in poses]
-        return Proposals(poses, np.stack(rows))
+        return fitted_poses(
+            self.part,
+            self._points,
+            visible,
+            here,
+            space,
+            number,
+            random_generator(self.seed, "part", self.part.name, place, number),
+        )
 
     def _density(self, pose: Pose, visible: np.ndarray) -> np.ndarray:
         offset = observed_point(self._points) - pose.origin_m
@@ -204,20 +194,18 @@ class PosedPart:
         middle = (self.scene.space.low[RANGE] + self.scene.space.high[RANGE]) / 2
         return float(np.log((1 - CLUTTER) * density + CLUTTER / middle**2).mean())
 
-    def _greedy(self, proposals: Proposals, number: int) -> list[Pose]:
-        taken: list[int] = []
-        total = np.zeros(proposals.density.shape[1])
+    def _greedy(self, poses: Sequence[Pose], number: int) -> list[Pose]:
+        """So many of some poses, one after the other that gains most."""
+        densities = [self._density(pose, self.scene.visible(pose.origin_m)) for pose in poses]
+        taken: list[Pose] = []
+        total = np.zeros(len(self._points))
         for count in range(1, number + 1):
             # a part counts once it is there: the shares of the first ones are not those of the last
-            likelihood = [self._log_likelihood((total + one) / count) for one in proposals.density]
-            taken.append(int(np.argmax(likelihood)))
-            total = total + proposals.density[taken[-1]]
-        # the same poses; parts that have one in common fire between each other's rays
-        poses = [proposals.poses[index] for index in taken]
-        found: list[Pose] = []
-        for pose in dict.fromkeys(poses):
-            found += interleaved(self.part, pose, poses.count(pose))
-        return found
+            best = int(np.argmax([self._log_likelihood((total + one) / count) for one in densities]))
+            taken.append(poses[best])
+            total = total + densities[best]
+        # parts that have a pose in common fire between each other's rays
+        return [one for pose in dict.fromkeys(taken) for one in interleaved(self.part, pose, taken.count(pose))]
 
 
 def places(space: DesignSpace) -> np.ndarray:
@@ -263,18 +251,11 @@ def fitted_poses(
         middle = (np.array(space.low[3:5]) + np.array(space.high[3:5])) / 2
         return [shapes[0].pose(origin_m, float(middle[0]), float(middle[1]), 0.0, Axes.of(here))]
     features = Features.of(aimed[kept], weights[kept], Axes.of(here), here)
-    fits = [_fit(features, here, shape, number, generator) for shape in shapes]
-    (mixture, _), shape = max(zip(fits, shapes, strict=True), key=lambda one: one[0][1])
-    return [_pose(shape, mixture, row, origin_m, features.axes) for row in range(number)]
-
-
-def _fit(
-    features: Features, space: DesignSpace, shape: PartShape, number: int, generator: np.random.Generator
-) -> tuple[Mixture, float]:
-    free = bounds_of(Constraints().rules, space, tuple(range(number)), interval_factor(DEFAULT_LEVEL))
-    bounds = shaped_bounds(free, [shape] * number, features.axes)
-    trace = fit_mixture(features, bounds, generator, restarts=RESTARTS)
-    return trace.mixture, trace.log_likelihood
+    free = bounds_of(Constraints().rules, here, tuple(range(number)), interval_factor(DEFAULT_LEVEL))
+    bounds = [shaped_bounds(free, [shape] * number, features.axes) for shape in shapes]
+    fits = [fit_mixture(features, one, generator, restarts=RESTARTS) for one in bounds]
+    fit, shape = max(zip(fits, shapes, strict=True), key=lambda one: one[0].log_likelihood)
+    return [_pose(shape, fit.mixture, row, origin_m, features.axes) for row in range(number)]
 
 
 def _pose(shape: PartShape, mixture: Mixture, row: int, origin_m: np.ndarray, axes: Axes) -> Pose:
@@ -299,20 +280,6 @@ class Density(NamedTuple):
     retarget: Retarget | None = None
 
 
-class Surroundings(Protocol):
-    """What a part is placed by: see `lidardesign.evaluate.baselines.simple.Baselines`."""
-
-    space: DesignSpace
-    seed: int
-    views: TrainingViews
-    density: Callable[[], Density | None] | None
-
-    @property
-    def scene_points(self) -> ScenePoints:
-        """What parts are to see."""
-        ...
-
-
 def split_argument(argument: str) -> tuple[Part, Pose | None]:
     """The part and the pose that `NAME` or `NAME@POSE` names.
 
@@ -330,31 +297,41 @@ def split_argument(argument: str) -> tuple[Part, Pose | None]:
     if len(numbers) not in (5, 6) or not np.isfinite(numbers).all() or abs(numbers[4]) > 90:
         raise ConfigError(f"{text!r} is no pose", where=f"catalog:{name}", allowed=FORM)
     if np.abs(numbers[:3]).max() > FARTHEST_M:
-        allowed = f"at most {FARTHEST_M:g} m along each axis"
-        raise ConfigError(f"{text!r} is too far away", where=f"catalog:{name}", allowed=allowed)
+        raise ConfigError(
+            f"{text!r} is too far away",
+            where=f"catalog:{name}",
+            allowed=f"at most {FARTHEST_M:g} m along each axis",
+        )
     azimuth, elevation, roll = (math.radians(value) for value in [*numbers[3:], 0.0][:3])
     return part, Pose(np.array(numbers[:3]), azimuth, elevation, roll)
 
 
-def part_candidates(source: Surroundings, argument: str) -> list[PartCandidate]:
+def part_candidates(
+    argument: str, space: DesignSpace, seed: int, points: Callable[[], ScenePoints]
+) -> list[PartCandidate]:
     """The ways to place as many parts as some rays take.
+
+    Arguments:
+        argument: The part, as `split_argument` reads it.
+        space: The design space.
+        seed: Root of the random streams.
+        points: Gives what the parts are to see.
 
     Raises:
         ConfigError: The part measures nothing in the design space's range, or there is nothing to look at.
     """
     part, given = split_argument(argument)
-    if gate_inside(part, source.space) is None:
-        near, far = part.range_m
-        low, high = whole_range(source.space)
+    if gate_inside(part, space) is None:
+        (near, far), (low, high) = part.range_m, whole_range(space)
         raise ConfigError(
             f"{part.name} measures from {near:g} to {far:g} m, and the design space is {low:g} to {high:g} m away",
             where=f"catalog:{argument}",
             hint="a part that measures there: lidardesign catalog list",
         )
-    scene = source.scene_points
+    scene = points()
     if given is not None:
         return [PartCandidate("given", part, scene, lambda number: interleaved(part, given, number))]
-    posed = PosedPart(part, scene, source.seed)
+    posed = PosedPart(part, scene, seed)
     return [
         PartCandidate("apart", part, scene, posed.best),
         PartCandidate("interleaved", part, scene, lambda number: interleaved(part, posed.best(1)[0], number)),
@@ -375,23 +352,22 @@ def part_notes(rows: Sequence[tuple[str, Positions]]) -> list[str]:
     ]
 
 
-def scene_points(source: Surroundings) -> ScenePoints:
+def scene_points(views: TrainingViews, seed: int, density: Density | None) -> ScenePoints:
     """Scene points of the learned density; of training returns where no run has samples.
 
     Raises:
         ConfigError: Nothing returns from the training scenes either.
     """
-    density = None if source.density is None else source.density()
-    generator = random_generator(source.seed, "catalog")
+    space, generator = views.space, random_generator(seed, "catalog")
     if density is not None:
         samples = density.samples
         drawn = systematic_draw(samples.weights, POINTS, generator)
-        return ScenePoints(samples.points[drawn], samples.log_target[drawn], source.space, density.retarget)
-    found = source.views.hits(dense_points(source.space)).points
-    if not len(found):
+        return ScenePoints(samples.points[drawn], samples.log_target[drawn], space, density.retarget)
+    returned = views.hits(dense_points(space)).points
+    if not len(returned):
         raise ConfigError("nothing returns from the training scenes: no pose is better than another", where="catalog")
-    drawn = systematic_draw(np.ones(len(found)), POINTS, generator)
-    return ScenePoints(source.space.wrap(found[drawn]), np.zeros(POINTS), source.space)
+    drawn = systematic_draw(np.ones(len(returned)), POINTS, generator)
+    return ScenePoints(space.wrap(returned[drawn]), np.zeros(POINTS), space)
 
 
 class PartCandidate:
@@ -412,8 +388,9 @@ class PartCandidate:
 
     def positions(self, spaces: Sequence[DesignSpace], count: int, scene: int = 0) -> Positions:
         """See `lidardesign.evaluate.baselines.candidates.Candidate`."""
-        rays = self._rays(count)
-        return tuple(_carried(rays, space, self.scene.travelled) for space in spaces)
+        if count not in self._known:
+            self._known[count] = self._fired(count)
+        return tuple(_carried(self._known[count], space, self.scene.travelled) for space in spaces)
 
     def positions_within(self, spaces: Sequence[DesignSpace], limit_mbps: float, bandwidth: Bandwidth) -> Positions:
         """See `lidardesign.evaluate.baselines.candidates.Candidate`.
@@ -421,16 +398,7 @@ class PartCandidate:
         Raises:
             ConfigError: More rays than any sensor fires fit in.
         """
-        width_m = np.diff(self.gate_m)
-        count = math.floor(limit_mbps / bandwidth.mbps_of_widths(width_m) * (1 + EPSILON))
-        if count > MOST_RAYS:
-            raise ConfigError(
-                f"a design of {limit_mbps:.3g} Mbit/s compares with {count:.3g} rays of {self.part.name}",
-                where="bandwidth",
-                allowed=f"at most {MOST_RAYS:,} rays",
-            )
-        while count and bandwidth.mbps_of_widths(width_m, count) > limit_mbps:
-            count -= 1
+        count = rays_within(limit_mbps, bandwidth, self.gate_m, after=f" of {self.part.name}")
         return self.positions(spaces, count)
 
     @property
@@ -439,11 +407,6 @@ class PartCandidate:
         low, high = whole_range(self.scene.space)
         near, far = self.part.range_m
         return np.array([max(near, low), min(far, high)])
-
-    def _rays(self, count: int) -> Rays:
-        if count not in self._known:
-            self._known[count] = self._fired(count)
-        return self._known[count]
 
     def _fired(self, count: int) -> Rays:
         poses = self._poses(parts_for(self.part, count))
@@ -464,7 +427,6 @@ class PartCandidate:
 
 
 def _carried(rays: Rays, space: DesignSpace, axes: Sequence[int]) -> Rays:
-    """The rays where what carries the part stands in a space."""
     origin = rays.origin_m.copy()
     origin[:, axes] = np.array(space.low)[axes]
-    return Rays(origin, rays.direction, rays.gate_m, rays.sensor, rays.time_s)
+    return replace(rays, origin_m=origin)

@@ -76,8 +76,7 @@ def occupancy_grid(scenes: Sequence[Scene], space: DesignSpace, seed: int) -> Oc
     low, high = everything.min(axis=0), everything.max(axis=0)
     # one cell more than fits, so that the highest point has one too
     edge = float((high - low).max()) / CELLS or 1.0
-    shape = np.floor((high - low) / edge).astype(np.int64) + 1
-    times = np.zeros(shape)
+    times = np.zeros(np.floor((high - low) / edge).astype(np.int64) + 1)
     for view in points:
         times[tuple(np.unique(np.floor((view - low) / edge).astype(np.int64), axis=0).T)] += 1
     return OccupancyGrid(low, edge, times / len(views))

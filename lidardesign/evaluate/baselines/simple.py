@@ -62,6 +62,7 @@ from lidardesign.evaluate.baselines.candidates import (
 from lidardesign.evaluate.baselines.catalog import (
     FAMILY,
     Density,
+    Retarget,
     ScenePoints,
     part_candidates,
     scene_points,
@@ -72,7 +73,7 @@ from lidardesign.geometry.rays import Rays
 from lidardesign.run.clock import phase
 from lidardesign.samples import Samples
 from lidardesign.scene import Scene
-from lidardesign.space import AZIMUTH, DIMENSIONS, ELEVATION, RANGE, DesignSpace, direction
+from lidardesign.space import AZIMUTH, ELEVATION, RANGE, DesignSpace, direction
 from lidardesign.task import random_generator
 
 # an origin axis within 45 degrees of parallel rays only moves them along themselves
@@ -89,14 +90,12 @@ def bounding(views: TrainingViews) -> list[BaselineLayout]:
     cropped = _boxed("cropped", space, low, high, opened_gate(low[RANGE], high[RANGE]))
     if not [axis for axis in space.free if axis < AZIMUTH and axis not in space.conditioned]:
         return [cropped]
-    parallel = _parallel(views, observed)
-    return [cropped] if parallel is None else [parallel, cropped]
+    return [*_parallel(views, observed), cropped]
 
 
 def _boxed(name: str, space: DesignSpace, low: np.ndarray, high: np.ndarray, gate_m: np.ndarray) -> BaselineLayout:
     """Even rays in a box whose conditions take the values of the spot."""
-    conditions = [DIMENSIONS.index(one) for one in space.condition]
-    conditions = [axis for axis in conditions if axis < RAY_AXES]
+    conditions = [axis for axis in space.conditioned if axis < RAY_AXES]
 
     def place(count: int, spot: Spot) -> np.ndarray:
         lowest, highest = np.array(low[:RAY_AXES]), np.array(high[:RAY_AXES])
@@ -107,35 +106,31 @@ def _boxed(name: str, space: DesignSpace, low: np.ndarray, high: np.ndarray, gat
     return BaselineLayout(name, place, gate_m)
 
 
-def _parallel(views: TrainingViews, observed: Observed) -> BaselineLayout | None:
+def _parallel(views: TrainingViews, observed: Observed) -> list[BaselineLayout]:
     """Parallel rays from an even grid over the returns' box, within the admissible origins.
 
-    An origin axis that runs along the rays stays at the bound behind the scene. None where such rays
+    An origin axis that runs along the rays stays at the bound behind the scene. No layout where such rays
     return nothing.
     """
     space = views.space
     azimuth, elevation = parallel_angles(space, observed)
     looking = direction(azimuth, elevation)
-    low, high = central(observed.hits_m)
-    low, high = (np.clip(end, space.low[:3], space.high[:3]) for end in (low, high))
+    low, high = (np.clip(end, space.low[:3], space.high[:3]) for end in central(observed.hits_m))
     for axis in np.flatnonzero(np.abs(looking) > ALIGNED):
         low[axis] = high[axis] = space.low[axis] if looking[axis] > 0 else space.high[axis]
     low, high = np.append(low, [azimuth, elevation]), np.append(high, [azimuth, elevation])
     seen = views.hits(even_placement(low, high, DENSE_RAYS))
     if not len(seen.points):
-        return None
+        return []
     nearest, furthest = central(seen.points[:, RANGE])
-    return _boxed("parallel", space, low, high, opened_gate(float(nearest), float(furthest)))
+    return [_boxed("parallel", space, low, high, opened_gate(float(nearest), float(furthest)))]
 
 
 def parallel_angles(space: DesignSpace, observed: Observed) -> tuple[float, float]:
     """Straight down where the space allows it, else straight up, else the median direction of the returns."""
     middle = np.median(observed.points[:, AZIMUTH])
-    pole = math.pi / 2
-    for elevation in (-pole, pole):
-        if space.low[ELEVATION] <= elevation <= space.high[ELEVATION]:
-            return float(middle), elevation
-    return float(middle), float(np.median(observed.points[:, ELEVATION]))
+    vertical = [end for end in (-math.pi / 2, math.pi / 2) if space.low[ELEVATION] <= end <= space.high[ELEVATION]]
+    return float(middle), vertical[0] if vertical else float(np.median(observed.points[:, ELEVATION]))
 
 
 Judge = Callable[[Sequence[Positions]], Sequence[float]]
@@ -187,15 +182,7 @@ class Baselines:
     @cached_property
     def scene_points(self) -> ScenePoints:
         """What parts of the catalogue are to see, the same for all."""
-        return scene_points(self)
-
-    def positions(self, name: str, count: int) -> Positions:
-        """A baseline at exactly `count` rays."""
-        return self.best([(name, self.options(name, count))])[0].positions
-
-    def positions_within(self, name: str, limit_mbps: float, bandwidth: Bandwidth) -> Positions:
-        """A baseline with as many rays as fit in a bandwidth [Mbit/s]."""
-        return self.best([(name, self.options_within(name, limit_mbps, bandwidth))])[0].positions
+        return scene_points(self.views, self.seed, None if self.density is None else self.density())
 
     def options(self, name: str, count: int) -> list[Option]:
         """All candidates of a baseline at a number of rays."""
@@ -251,8 +238,7 @@ def _random(source: Baselines, argument: str) -> list[Candidate]:
     def place(count: int, spot: Spot) -> np.ndarray:
         # the first position draws what a space without conditions draws
         later = [spot.number] if spot.number else []
-        generator = random_generator(source.seed, "random baseline", count, spot.scene, *later)
-        return spot.space.sample(count, generator)
+        return spot.space.sample(count, random_generator(source.seed, "random baseline", count, spot.scene, *later))
 
     return [BaselineLayout("random", place, whole_range(source.space), drawn_anew=True)]
 
@@ -278,7 +264,7 @@ def _no_visibility(source: Baselines, argument: str) -> list[Candidate]:
 
 
 def _catalog(source: Baselines, argument: str) -> list[Candidate]:
-    return list(part_candidates(source, argument))
+    return list(part_candidates(argument, source.space, source.seed, lambda: source.scene_points))
 
 
 def _cma(source: Baselines, argument: str) -> list[Candidate]:
@@ -297,18 +283,16 @@ class Family(NamedTuple):
     Arguments:
         build: The candidates to choose from, of a source and the argument (empty where there is none).
         argument: What follows the colon, for messages; empty where nothing may.
-        optional: Whether the argument may be left out.
         check: Raises ConfigError for an argument that cannot be used, before anything is built.
     """
 
     build: Callable[[Baselines, str], list[Candidate]]
     argument: str = ""
-    optional: bool = False
     check: Callable[[str], object] | None = None
 
-    def named(self, name: str) -> list[str]:
+    def named(self, name: str) -> str:
         """How this family is asked for, for messages."""
-        return [name] * (self.optional or not self.argument) + [f"{name}:{self.argument}"] * bool(self.argument)
+        return f"{name}:{self.argument}" if self.argument else name
 
 
 BASELINES: dict[str, Family] = {
@@ -330,14 +314,13 @@ def baseline_of(name: str, *, where: str = "baselines") -> tuple[Family, str]:
     """
     kind, colon, argument = name.partition(":")
     family = BASELINES.get(kind)
-    known = ", ".join(one for kind, family in BASELINES.items() for one in family.named(kind))
     if family is None:
+        known = ", ".join(one.named(kind) for kind, one in BASELINES.items())
         raise ConfigError(f"unknown baseline {name!r}", where=where, allowed=known)
     if colon and not family.argument:
         raise ConfigError(f"the baseline {kind!r} takes nothing after its name", where=where, allowed=kind)
-    if not argument and (colon or (family.argument and not family.optional)):
-        allowed = " or ".join(family.named(kind))
-        raise ConfigError(f"the baseline {name!r} lacks what it is to be of", where=where, allowed=allowed)
+    if not argument and (colon or family.argument):
+        raise ConfigError(f"the baseline {name!r} lacks what it is to be of", where=where, allowed=family.named(kind))
     if argument and family.check is not None:
         family.check(argument)
     return family, argument
@@ -352,8 +335,6 @@ def is_baseline(name: str) -> bool:
 MOST_STEPS = 8
 CLOSE_ENOUGH = 0.98  # of the bandwidth: every further step may be another fit
 
-LogTarget = Callable[[np.ndarray], np.ndarray]
-
 
 class LayOut(Protocol):
     """How a design becomes a ray list of a given length at a condition value."""
@@ -362,10 +343,9 @@ class LayOut(Protocol):
         self, design: DesignSpec, count: int, samples: Samples | None, *, at: Mapping[str, float] | None = None
     ) -> Rays:
         """As `lidardesign.design.fit.rays_at`."""
-        ...
 
 
-def fitted_twin(design: DesignSpec, samples: Samples, *, name: str, retarget: LogTarget | None = None) -> DesignSpec:
+def fitted_twin(design: DesignSpec, samples: Samples, *, name: str, retarget: Retarget | None = None) -> DesignSpec:
     """A design fitted to other samples as a given one was fitted to its own.
 
     Arguments:
@@ -374,7 +354,7 @@ def fitted_twin(design: DesignSpec, samples: Samples, *, name: str, retarget: Lo
         name: Of the twin.
         retarget: log p* of the other density, where the fit needs it.
     """
-    seed = design.provenance.get("seed", 0)
+    seed = design.provenance.get("seed")
     seed = seed if isinstance(seed, int) else 0
     return fit_like(design, samples, rays=design.rays, seed=seed, name=name, retarget=retarget)
 
@@ -412,10 +392,7 @@ class TwinCandidate:
         count = self._design.rays or max(len(self._design.sensors), 1)
         for _ in range(MOST_STEPS):
             cost = mean_mbps(self.positions(spaces, count), bandwidth)
-            if cost <= limit_mbps:
-                low = count
-            else:
-                high = count
+            low, high = (count, high) if cost <= limit_mbps else (low, count)
             if high - low <= 1 or CLOSE_ENOUGH * limit_mbps <= cost <= limit_mbps:
                 break
             guess = math.floor(count * limit_mbps / cost) if cost > 0 else 2 * count
