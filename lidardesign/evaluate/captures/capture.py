@@ -122,14 +122,11 @@ class Capture:
         """
         edges = np.linspace(0, self.bins, min(STRETCHES, self.bins) + 1).astype(np.int64)
         rows = max(1, CHUNK // self.bins)
-        means = [_stretch_means(self.counts[first : first + rows], edges) for first in range(0, len(self), rows)]
-        found = float(np.median(np.concatenate([np.median(part, axis=1) for part in means])))
-        return found or _rare_background(np.concatenate(means)) * (len(edges) - 1) / self.bins
-
-
-def _stretch_means(counts: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    sums = np.add.reduceat(counts, edges[:-1], axis=1, dtype=np.float64)
-    return sums / np.diff(edges)
+        parts = (self.counts[first : first + rows] for first in range(0, len(self), rows))
+        sums = [np.add.reduceat(part, edges[:-1], axis=1, dtype=np.float64) for part in parts]
+        means = np.concatenate(sums) / np.diff(edges)
+        usual = float(np.median(np.median(means, axis=1)))
+        return usual or _rare_background(means) * (len(edges) - 1) / self.bins
 
 
 def _rare_background(means: np.ndarray) -> float:
@@ -172,8 +169,7 @@ def load_capture(path: Path) -> Capture:
     for first in range(0, len(counts), rows):
         part = counts[first : first + rows]
         if part.dtype.kind == "f":
-            bad = ~np.isfinite(part)
-            _refuse_counts(bad, part, first, "finite numbers", where)
+            _refuse_counts(~np.isfinite(part), part, first, "finite numbers", where)
             _refuse_counts(part != np.floor(part), part, first, "whole numbers of photons", where)
         _refuse_counts(part < 0, part, first, "0 or more", where)
         # some types of counts do not reach the limit
@@ -189,7 +185,11 @@ def load_capture(path: Path) -> Capture:
     capture = Capture(
         counts,
         _scalar(arrays, "bin_width_ps", where),
-        _starts(arrays, pixels, where),
+        (
+            np.array(_scalar(arrays, "start_ps", where))
+            if arrays["start_ps"].size == 1
+            else _finite(_per_pixel(arrays, "start_ps", pixels, where), "start_ps", where)
+        ),
         _finite(origin.reshape(3), "origin_m", where),
         _directions(arrays, pixels, where),
         _per_pixel(arrays, "true_range_m", pixels, where) if "true_range_m" in arrays else None,
@@ -213,13 +213,6 @@ def _scalar(arrays: Mapping[str, np.ndarray], name: str, where: str) -> float:
     if arrays[name].size != 1:
         raise _shape(name, arrays[name], "one number", where)
     return float(_finite(np.asarray(arrays[name], dtype=np.float64).reshape(()), name, where))
-
-
-def _starts(arrays: Mapping[str, np.ndarray], pixels: tuple[int, ...], where: str) -> np.ndarray:
-    """When histograms begin [ps]: one number, or one per pixel."""
-    if arrays["start_ps"].size == 1:
-        return np.array(_scalar(arrays, "start_ps", where))
-    return _finite(_per_pixel(arrays, "start_ps", pixels, where), "start_ps", where)
 
 
 def _per_pixel(arrays: Mapping[str, np.ndarray], name: str, pixels: tuple[int, ...], where: str) -> np.ndarray:

@@ -12,7 +12,7 @@ holds too few photons to tell the background, its threshold takes the level that
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -61,21 +61,22 @@ def measured(
             hint="add pulse_fwhm_ps to the capture, or take --estimator peak",
         )
     pulse_ps = capture.pulse_fwhm_ps or 0.0
-    half = int(pulse_ps / (2 * capture.bin_ps))
     place, photons = np.full(len(pixel), np.nan), np.zeros(len(pixel))
     for begin, end in _chunks(last - first):
-        counts, offset = _cut(capture, pixel[begin:end], first[begin:end], last[begin:end])
+        lengths = np.maximum(last - first, 0)[begin:end]
+        # the counts that rays hear one after the other, and where each begins in them
+        offset = np.concatenate([[0], np.cumsum(lengths)])
+        at = np.arange(offset[-1]) - np.repeat(offset[:-1] - first[begin:end], lengths)
+        counts = capture.counts[np.repeat(pixel[begin:end], lengths), at].astype(np.int64)
         photons[begin:end] = np.diff(np.concatenate([[0], np.cumsum(counts)])[offset])
-        known = np.full(end - begin, capture.background_per_bin)
-        sigma_ps = pulse_ps / FWHM_PER_SIGMA
         place[begin:end] = find_returns(
             counts,
             offset,
             np.ones((end - begin, 2)),
             capture.bin_ps,
-            sigma_ps,
-            half,
-            known,
+            pulse_ps / FWHM_PER_SIGMA,
+            int(pulse_ps / (2 * capture.bin_ps)),
+            np.full(end - begin, capture.background_per_bin),
             estimation.false_alarm,
             matched,
         )
@@ -84,21 +85,12 @@ def measured(
 
 def _chunks(lengths: np.ndarray) -> Iterator[tuple[int, int]]:
     """Rays whose bins are worked on together, as begin and end."""
-    ends = np.cumsum(lengths)
+    ends = np.append(0, np.cumsum(lengths))
     begin = 0
     while begin < len(lengths):
-        before = ends[begin - 1] if begin else 0
-        end = max(int(np.searchsorted(ends, before + CHUNK_BINS, side="right")), begin + 1)
+        end = max(int(np.searchsorted(ends[1:], ends[begin] + CHUNK_BINS, side="right")), begin + 1)
         yield begin, end
         begin = end
-
-
-def _cut(capture: Capture, pixel: np.ndarray, first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The counts that rays hear one after the other, and where each begins in them, (K + 1,)."""
-    lengths = np.maximum(last - first, 0)
-    offset = np.concatenate([[0], np.cumsum(lengths)])
-    at = np.arange(offset[-1]) - np.repeat(offset[:-1] - first, lengths)
-    return capture.counts[np.repeat(pixel, lengths), at].astype(np.int64), offset
 
 
 # A ray that starts further from the scanner than this was not captured: it sees other surfaces.
@@ -167,8 +159,7 @@ def scan(
     captured[away > within_rad] = Captured.OUT_OF_FIELD
     captured[offset > SAME_PLACE_M] = Captured.OTHER_PLACE
     _refuse_nothing_captured(capture, rays, captured, away, offset, name)
-    pixel = np.where(captured == Captured.YES, nearest, -1)
-    return _measured(capture, captured, pixel, away, first, last, estimation)
+    return _measured(capture, captured, nearest, away, first, last, estimation)
 
 
 def scan_pixels(capture: Capture, estimation: Estimation) -> CapturedScan:
@@ -176,8 +167,7 @@ def scan_pixels(capture: Capture, estimation: Estimation) -> CapturedScan:
     pixels = np.arange(len(capture))
     first, last = gate_bins(capture, pixels, np.tile(_listening_windows_m(capture), (len(capture), 1)))
     captured = np.where(first < last, Captured.YES, Captured.OUT_OF_WINDOW)
-    taken = np.where(first < last, pixels, -1)
-    return _measured(capture, captured, taken, np.zeros(len(capture)), first, last, estimation)
+    return _measured(capture, captured, pixels, np.zeros(len(capture)), first, last, estimation)
 
 
 def gate_bins(capture: Capture, pixel: np.ndarray, gate_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -192,9 +182,7 @@ def gate_bins(capture: Capture, pixel: np.ndarray, gate_m: np.ndarray) -> tuple[
 
 def whole_window(rays: Rays, capture: Capture) -> Rays:
     """The same rays without gates: they hear all that was captured."""
-    return Rays(
-        rays.origin_m, rays.direction, np.tile(_listening_windows_m(capture), (len(rays), 1)), rays.sensor, rays.time_s
-    )
+    return replace(rays, gate_m=np.tile(_listening_windows_m(capture), (len(rays), 1)))
 
 
 def _listening_windows_m(capture: Capture) -> np.ndarray:
@@ -215,8 +203,8 @@ def uniform_rays(capture: Capture, count: int) -> Rays:
     extents = np.maximum(high - low, EPSILON)
     looking = scan_directions(frame, low + even_unit(count, extents) * (high - low))
     none = np.zeros(count)
-    rays = Rays(np.tile(capture.origin_m, (count, 1)), looking, np.zeros((count, 2)), none, none)
-    return whole_window(rays, capture)
+    gates_m = np.tile(_listening_windows_m(capture), (count, 1))
+    return Rays(np.tile(capture.origin_m, (count, 1)), looking, gates_m, none, none)
 
 
 def default_within_rad(capture: Capture) -> float:
@@ -237,13 +225,14 @@ def default_within_rad(capture: Capture) -> float:
 def _measured(
     capture: Capture,
     captured: np.ndarray,
-    pixel: np.ndarray,
+    nearest: np.ndarray,
     away: np.ndarray,
     first: np.ndarray,
     last: np.ndarray,
     estimation: Estimation,
 ) -> CapturedScan:
-    taken = np.flatnonzero(pixel >= 0)
+    taken = np.flatnonzero(captured == Captured.YES)
+    pixel = np.where(captured == Captured.YES, nearest, -1)
     range_m, photons = np.full(len(pixel), np.nan), np.zeros(len(pixel))
     range_m[taken], photons[taken] = measured(capture, pixel[taken], first[taken], last[taken], estimation)
     points = capture.origin_m + range_m[:, None] * capture.direction[pixel]
@@ -256,15 +245,15 @@ def _refuse_nothing_captured(
     """Refuse rays of which none was captured: the two are of other places or in other frames."""
     if not len(rays) or (captured == Captured.YES).any():
         return
-    counts = {reason: int((captured == reason).sum()) for reason in Captured}
     start, end = capture.window_m
-    text = {
+    texts = {
         Captured.OTHER_PLACE: f"they start {offset.min():.4g} m from {capture.origin_m.tolist()} or further",
         Captured.OUT_OF_FIELD: f"they look {np.degrees(away.min()):.3g} degrees past the nearest pixel or more",
         Captured.OUT_OF_WINDOW: f"their gates hold no bin between {start:.4g} and {end:.4g} m",
-    }[max((Captured.OTHER_PLACE, Captured.OUT_OF_FIELD, Captured.OUT_OF_WINDOW), key=lambda reason: counts[reason])]
+    }
+    usual = max(texts, key=lambda reason: int((captured == reason).sum()))
     raise DataError(
-        f"none of the {len(rays)} rays was captured: {text}",
+        f"none of the {len(rays)} rays was captured: {texts[usual]}",
         where=name,
         hint="give the capture's origin_m and directions in the design's frame, and start_ps from the scanner",
     )

@@ -5,12 +5,11 @@ from __future__ import annotations
 import asyncio
 import importlib.metadata
 import logging
-import queue
 import threading
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from concurrent.futures import CancelledError, Future
+from concurrent.futures import CancelledError, Future, wait
 from typing import Any
 
 from lidardesign import __version__
@@ -61,8 +60,8 @@ class Cluster:
             try:
                 client = _answered(lambda: Client(address, timeout=SCHEDULER_SECONDS, set_as_default=False))
             except (OSError, ValueError) as error:
-                found = " ".join(str(error).split())
-                raise ConfigError(f"no scheduler answers at {address}: {found}", where="--workers", hint=HINT) from None
+                why = " ".join(str(error).split())
+                raise ConfigError(f"no scheduler answers at {address}: {why}", where="--workers", hint=HINT) from None
             try:
                 client.wait_for_workers(1, timeout=WORKER_SECONDS)
                 _check_versions(client)
@@ -162,32 +161,28 @@ def _answered(connect: Callable[[], Any]) -> Any:
     Raises:
         TimeoutError: Nothing came of it.
     """
-    done: queue.SimpleQueue[tuple[Any, Exception | None]] = queue.SimpleQueue()
+    answer: Future[Any] = Future()
 
     def work() -> None:
         try:
-            done.put((connect(), None))
+            answer.set_result(connect())
         except Exception as error:
             # raised where it was asked for
-            done.put((None, error))
+            answer.set_exception(error)
 
     threading.Thread(target=work, daemon=True).start()
-    try:
-        client, error = done.get(timeout=PATIENCE * SCHEDULER_SECONDS)
-    except queue.Empty:
-        raise TimeoutError("something listens there, but does not speak as a scheduler of dask does") from None
-    if error is not None:
-        raise error
-    return client
+    if not wait([answer], timeout=PATIENCE * SCHEDULER_SECONDS).done:
+        raise TimeoutError("something listens there, but does not speak as a scheduler of dask does")
+    return answer.result()
 
 
 def _check_versions(client: Any) -> None:
     """Refuse a scheduler or workers without this version of this program; they would only die of it."""
     asked = (importlib.metadata.version, "lidardesign")
     try:
-        found = {"the scheduler": client.run_on_scheduler(*asked), **client.run(*asked)}
+        versions = {"the scheduler": client.run_on_scheduler(*asked), **client.run(*asked)}
     except importlib.metadata.PackageNotFoundError as error:
         raise _unusable("the scheduler or a worker does not have it") from error
-    for place, version in found.items():
+    for place, version in versions.items():
         if version != __version__:
             raise _unusable(f"{place} has version {version} of it, not {__version__}")

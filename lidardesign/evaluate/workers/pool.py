@@ -58,10 +58,9 @@ class Processes:
             ConfigError: The system does not allow so many.
         """
         self.close()
+        spawn, others = multiprocessing.get_context("spawn"), multiprocessing.active_children()
         self._source = source
-        spawn = multiprocessing.get_context("spawn")
         self._executor = ProcessPoolExecutor(self._count, spawn, initializer=_begin, initargs=(source,))
-        others = multiprocessing.active_children()
         try:
             for _ in range(self._count):
                 # a process is started where none is idle, and none is before it has its scenes
@@ -82,14 +81,12 @@ class Processes:
 
     def submit(self, job: SceneJob) -> Future[SceneScores | SceneFailure]:
         """Hand a job over."""
-        if self._executor is None or self._source != job.source:
-            self.prepare(job.source)
-        try:
-            return self._executor.submit(score_job, job)
-        except BrokenProcessPool:
-            # one was lost while nothing was asked
-            self.prepare(job.source)
-            return self._executor.submit(score_job, job)
+        if self._executor is not None and self._source == job.source:
+            # one may be lost while nothing is asked
+            with contextlib.suppress(BrokenProcessPool):
+                return self._executor.submit(score_job, job)
+        self.prepare(job.source)
+        return self._executor.submit(score_job, job)
 
     def check(self) -> None:
         """Lost processes are told by their jobs."""
@@ -264,6 +261,5 @@ def workers_of(wanted: int | str, most: int) -> Iterator[WorkerScorer | None]:
     if isinstance(wanted, int) and min(wanted, most) == 1:
         yield None
         return
-    engine = Cluster(wanted) if isinstance(wanted, str) else Processes(min(wanted, most))
-    with WorkerScorer(engine) as scorer:
+    with WorkerScorer(Cluster(wanted) if isinstance(wanted, str) else Processes(min(wanted, most))) as scorer:
         yield scorer

@@ -80,9 +80,14 @@ class SceneJob:
     @classmethod
     def of(cls, scenes: ScenePass, number: int) -> SceneJob:
         """The job of one scene of a pass."""
-        outline = scene_outline(scenes.scenes[number])
-        source = SceneSource.of(scenes)
-        return cls(source, number, outline, list(scenes.fired(number)), scenes.planner, scenes.known(number))
+        return cls(
+            SceneSource.of(scenes),
+            number,
+            scene_outline(scenes.scenes[number]),
+            list(scenes.fired(number)),
+            scenes.planner,
+            scenes.known(number),
+        )
 
 
 class WorkerTraceback(Exception):  # noqa: N818 (it carries a worker's traceback and is never raised by itself)
@@ -119,8 +124,14 @@ def score_job(job: SceneJob) -> SceneScores | SceneFailure:
     with _one_at_a_time:
         try:
             task, scenes = make_scenes(job.source)
-            scene = _meant_scene(task, scenes, job)
-            found = score_in_scene(task, scene, job.sets, job.planner, job.plan, job.source.seed)
+            if not (job.number < len(scenes) and same_outline(scene_outline(scenes[job.number]), job.outline)):
+                raise PluginError(
+                    f"a worker made another scene {job.outline['name']!r} than this process",
+                    where=f"task {task.name}",
+                    allowed="scenes that follow from configuration, split and seed alone",
+                    hint="install the same version of the task everywhere; --workers 1 needs no second process",
+                )
+            found = score_in_scene(task, scenes[job.number], job.sets, job.planner, job.plan, job.source.seed)
             # a task may give any mapping
             scores = [(Score(one.value, one.failed, dict(one.details)), seconds) for one, seconds in found.scores]
             return SceneScores(found.plan, found.planning_seconds, scores, found.second_casts)
@@ -143,17 +154,6 @@ def make_scenes(source: SceneSource) -> tuple[Task, Sequence[Scene]]:
     config, space = task.Config.model_validate(json.loads(source.config)), json.loads(source.space)
     with plugin_guard(task.name):
         return task, list(scenes_of(task, config, "test", source.seed, DesignSpace.from_dict(space)))
-
-
-def _meant_scene(task: Task, scenes: Sequence[Scene], job: SceneJob) -> Scene:
-    if job.number < len(scenes) and same_outline(scene_outline(scenes[job.number]), job.outline):
-        return scenes[job.number]
-    raise PluginError(
-        f"a worker made another scene {job.outline['name']!r} than this process",
-        where=f"task {task.name}",
-        allowed="scenes that follow from configuration, split and seed alone",
-        hint="install the same version of the task everywhere; --workers 1 needs no second process",
-    )
 
 
 def scene_outline(scene: Scene) -> dict[str, Any]:
