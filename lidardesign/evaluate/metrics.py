@@ -78,13 +78,11 @@ def discrete_frechet_m(first: np.ndarray, second: np.ndarray) -> float:
     # leashes by row, one place to the right: a pair's three predecessors are at its place and the one before
     before, last = np.full(rows + 1, np.inf), np.full(rows + 1, np.inf)
     before[0] = -np.inf  # nothing has been walked before the first pair
-    flipped = apart[:, ::-1]
     for total in range(rows + columns - 1):
         low, high = max(0, total - columns + 1), min(rows, total + 1)
-        diagonal = np.diagonal(flipped, columns - 1 - total)
         shortest = np.minimum(np.minimum(last[low + 1 : high + 1], last[low:high]), before[low:high])
         now = np.full(rows + 1, np.inf)
-        now[low + 1 : high + 1] = np.maximum(diagonal, shortest)
+        now[low + 1 : high + 1] = np.maximum(np.diagonal(apart[:, ::-1], columns - 1 - total), shortest)
         before, last = last, now
     return float(last[rows])
 
@@ -154,9 +152,11 @@ def triangle_distance_m(points: np.ndarray, triangles: np.ndarray) -> np.ndarray
         share = np.divide(_dot(offset, along), length, out=np.zeros(len(length)), where=length > 0)
         away = offset - np.clip(share, 0.0, 1.0) * along
         squared = np.minimum(squared, _dot(away, away))
-    height = _dot(at - corners[0], normal)
-    above = np.divide(height**2, area, out=np.full(len(points), np.inf), where=inside)
-    return np.sqrt(np.minimum(squared, above))
+    return np.sqrt(
+        np.minimum(
+            squared, np.divide(_dot(at - corners[0], normal) ** 2, area, out=np.full(len(points), np.inf), where=inside)
+        )
+    )
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -180,16 +180,10 @@ def ray_spacing(directions: np.ndarray) -> np.ndarray:
         Chords of the unit sphere, shape (N,); infinite where fewer than three directions, or all on a line, have no
         triangles.
     """
-    from scipy.spatial import Delaunay, QhullError
-
     distinct, inverse = np.unique(directions, axis=0, return_inverse=True)
     spacing = np.full(len(distinct), np.inf)
-    if len(distinct) >= 3:
-        plane, seen = _stereographic(distinct)
-        try:
-            faces = Delaunay(plane[seen]).simplices
-        except QhullError:  # all of them collinear
-            return spacing[inverse.reshape(-1)]
+    faces, seen = _delaunay_faces(distinct)
+    if faces is not None:
         edges = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
         length = np.linalg.norm(np.subtract(*distinct[seen][edges].transpose(1, 0, 2)), axis=1)
         ends, count = edges.reshape(-1), int(seen.sum())
@@ -225,36 +219,39 @@ def delaunay_surface(
     Returns:
         Vertices (V, 3) and faces (F, 3), or `None` below 3 directions or when all are collinear.
     """
-    from scipy.spatial import Delaunay, QhullError
-
     points, first = np.unique(np.asarray(points, dtype=np.float64), axis=0, return_index=True)
     spacing = np.full(len(points), np.inf) if spacing is None else spacing[first]
     offset = points - viewpoint
     range_m = np.linalg.norm(offset, axis=1)
     points, offset, range_m, spacing = (values[range_m > 0] for values in (points, offset, range_m, spacing))
-    if len(points) < 3:
-        return None
     directions = offset / range_m[:, None]
-    plane, seen = _stereographic(directions)
-    try:
-        triangulation = Delaunay(plane[seen])
-    except QhullError:  # fewer than 3 points, or all of them collinear
+    faces, seen = _delaunay_faces(directions)
+    if faces is None:
         return None
-    vertices, faces = points[seen], triangulation.simplices
+    vertices = points[seen]
     # cosine of the angle between a triangle's normal and the line of sight, 0 to 1
-    triangles = vertices[faces]
-    a, b, c = np.moveaxis(triangles, 1, 0)
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
     normal, sight = np.cross(b - a, c - a), (a + b + c) / 3 - viewpoint
     lengths = np.linalg.norm(normal, axis=1) * np.linalg.norm(sight, axis=1)
     across = np.abs(np.einsum("fk,fk->f", normal, sight))
     kept = np.divide(across, lengths, out=np.zeros(len(a)), where=lengths > 0) >= math.cos(math.radians(steepest_deg))
-    kept &= _longest_edge(directions[seen][faces]) <= MOST_SPACINGS * spacing[seen][faces].mean(axis=1)
+    corners = directions[seen][faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    kept &= longest <= MOST_SPACINGS * spacing[seen][faces].mean(axis=1)
     return vertices, faces[kept] if kept.any() else faces
 
 
-def _longest_edge(corners: np.ndarray) -> np.ndarray:
-    """The longest edge of triangles (F, 3, 3), shape (F,)."""
-    return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+def _delaunay_faces(directions: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
+    """Triangles (F, 3) of those of the directions (N, 3) that a mask keeps, and it; None where they span none."""
+    from scipy.spatial import Delaunay, QhullError
+
+    if len(directions) < 3:
+        return None, np.ones(len(directions), dtype=bool)
+    plane, seen = _stereographic(directions)
+    try:
+        return Delaunay(plane[seen]).simplices, seen
+    except QhullError:  # fewer than 3 points, or all of them collinear
+        return None, seen
 
 
 def _stereographic(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -271,9 +268,7 @@ def _stereographic(directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return 2 * across / np.where(seen, scale, 1.0)[:, None], seen
 
 
-def surface_cloud(
-    vertices: np.ndarray, faces: np.ndarray, count: int, generator: np.random.Generator
-) -> SurfaceCloud:
+def surface_cloud(vertices: np.ndarray, faces: np.ndarray, count: int, generator: np.random.Generator) -> SurfaceCloud:
     """A triangle mesh as area-uniform points with their triangles."""
     points, chosen = sample_triangles(vertices, faces, count, generator)
     return SurfaceCloud(points, vertices[faces[chosen]])
@@ -322,13 +317,10 @@ def trial_origins(space: DesignSpace, generator: np.random.Generator) -> np.ndar
         return low[None]
     corners = np.repeat(low[None], 2 ** len(free), axis=0)
     corners[:, free] = list(itertools.product(*[(low[i], high[i]) for i in free]))
-    inside = generator.uniform(low, high, (RANDOM_ORIGINS, 3))
-    return np.concatenate([(low + high)[None] / 2, corners, inside])
+    return np.concatenate([(low + high)[None] / 2, corners, generator.uniform(low, high, (RANDOM_ORIGINS, 3))])
 
 
-def is_visible(
-    caster: SceneCaster, space: DesignSpace, origins: np.ndarray, points: np.ndarray
-) -> np.ndarray:
+def is_visible(caster: SceneCaster, space: DesignSpace, origins: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Which points an admissible ray from one of the origins sees first, (O, 3) and (N, 3) to (N,) bool."""
     visible = np.zeros(len(points), dtype=bool)
     for origin in origins:

@@ -25,7 +25,7 @@ from lidardesign.design.layouts.density import bandwidth_limit
 from lidardesign.design.layouts.gates import RayRanges, gates_within
 from lidardesign.design.layouts.rays import gates_of, layout_of
 from lidardesign.design.mixture.bounds import bounds_of
-from lidardesign.design.sensor import DesignSpec, Sensor, interval_factor
+from lidardesign.design.sensor import DesignSpec, interval_factor
 from lidardesign.errors import InfeasibleError, NumericalError
 from lidardesign.evaluate.baselines.candidates import Positions
 from lidardesign.evaluate.reweighting import Attention, Reweighting
@@ -222,8 +222,14 @@ class Refiner:
                 best, gains = found, None
             if idle == PATIENCE:
                 break
-        found = self._reweighting(best.log_factors)
-        return Refinement(best.trial, found, best.shape, tuple(self.rounds), len(self.look), len(self.judge))
+        return Refinement(
+            best.trial,
+            self._reweighting(best.log_factors),
+            best.shape,
+            tuple(self.rounds),
+            len(self.look),
+            len(self.judge),
+        )
 
     def _reweighting(self, log_factors: np.ndarray) -> Reweighting | None:
         return self.attention.reweighting(log_factors) if np.any(log_factors) else None
@@ -232,7 +238,7 @@ class Refiner:
         started = time.perf_counter()
         first = self.refit(self._reweighting(log_factors), shape)
         best = _State(first, self._score(first), log_factors, shape)
-        self._note(Round(0, "start", self.sign * best.score, first.bandwidth_mbps, True, _since(started)))
+        self._note(started, 0, "start", self.sign * best.score, first.bandwidth_mbps, True)
         return best
 
     def _best_interval(self, number: int, best: _State, name: str) -> _State:
@@ -243,7 +249,8 @@ class Refiner:
             before = best
             while 0 <= place + direction < len(choices):
                 value = float(choices[place + direction])
-                found = self._try(number, _words(name, value), best, shape=replace(best.shape, **{name: value}))
+                words = f"level {value:g}" if name == "level" else f"ranges spread by {MILLIMETRES * value:g} mm"
+                found = self._try(number, words, best, shape=replace(best.shape, **{name: value}))
                 if found is best:
                     break
                 best, place = found, place + direction
@@ -253,22 +260,20 @@ class Refiner:
 
     def _gains(self, best: _State) -> dict[str, np.ndarray]:
         """Where the error of a design is, in each sense that a step may follow."""
-        seen = []
-        for scene, casters in self.look:
-            returns = _returns(scene, casters, best.trial.positions)
-            seen.append((checked_residuals(self.task, scene, returns), returns))
-        return self.attention.gains(seen)
+        traced = [(scene, _returns(scene, casters, best.trial.positions)) for scene, casters in self.look]
+        return self.attention.gains(
+            [(checked_residuals(self.task, scene, returns), returns) for scene, returns in traced]
+        )
 
     def _step_to_error(self, number: int, best: _State, gains: dict[str, np.ndarray], step: float) -> _State:
         """The design after a step towards its error, where that is better; what was better last goes first."""
         for name in sorted(gains, key=lambda name: name != self._favoured):
             factors = self.attention.moved(best.log_factors, gains[name], step)
-            if not np.any(factors - best.log_factors):
-                continue
-            found = self._try(number, f"towards {name}, step {step:g}", best, log_factors=factors)
-            if found is not best:
-                self._favoured = name
-                return found
+            if np.any(factors - best.log_factors):
+                found = self._try(number, f"towards {name}, step {step:g}", best, log_factors=factors)
+                if found is not best:
+                    self._favoured = name
+                    return found
         return best
 
     def _try(self, number: int, change: str, best: _State, **changed: Any) -> _State:
@@ -282,12 +287,12 @@ class Refiner:
         try:
             trial = self.refit(self._reweighting(wanted.log_factors), wanted.shape)
         except (InfeasibleError, NumericalError) as error:
-            self._note(Round(number, f"{change}: {error.message}", None, None, False, _since(started)))
+            self._note(started, number, f"{change}: {error.message}", None, None, False)
             return best
         found = replace(wanted, trial=trial, score=self._score(trial))
         more = trial.bandwidth_mbps / best.trial.bandwidth_mbps - 1 if wanted.shape != best.shape else 0.0
         kept = found.score < best.score - SCORE_PER_BANDWIDTH * max(more, 0.0) * abs(best.score)
-        self._note(Round(number, change, self.sign * found.score, trial.bandwidth_mbps, kept, _since(started)))
+        self._note(started, number, change, self.sign * found.score, trial.bandwidth_mbps, kept)
         return found if kept else best
 
     def _score(self, trial: Trial) -> float:
@@ -298,23 +303,16 @@ class Refiner:
         ]
         return self.sign * float(np.mean(values))
 
-    def _note(self, one: Round) -> None:
-        self.rounds.append(one)
+    def _note(self, started: float, *values: Any) -> None:
+        """A round of these values, in the order of `Round`, that took from `started` until now."""
+        self.rounds.append(Round(*values, time.perf_counter() - started))
         if self.progress:
-            self.progress(one)
-
-
-def _words(name: str, value: float) -> str:
-    return f"level {value:g}" if name == "level" else f"ranges spread by {MILLIMETRES * value:g} mm"
+            self.progress(self.rounds[-1])
 
 
 def _returns(scene: Scene, casters: Sequence[SceneCaster], positions: Positions) -> list[Returns]:
     """One list of returns per condition value and frame."""
     return [frame for rays in positions for frame in simulate(scene, rays, casters=casters)]
-
-
-def _since(started: float) -> float:
-    return time.perf_counter() - started
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,13 +349,12 @@ class Gating:
         constraints = Constraints.from_mapping(design.constraints, where=f"constraints of {design.name}")
         sensors = tuple(range(len(design.sensors)))
         bounds = bounds_of(constraints.rules, self.space, sensors, interval_factor(design.level))
-        bounds = bounds.take(rays.sensor[known])
         model, limit = bandwidth_limit(constraints, len(rays))
         bins = model.bins(np.diff(rays.gate_m, axis=1)[:, 0])
         most = (int(bins.sum()) if limit is None else limit) - int(bins.sum() - bins[known].sum())
         own = RayRanges(ranges.range_m, ranges.weights, place[ranges.ray], len(known))
         gates = rays.gate_m.copy()
-        gates[known] = gates_within(own, bounds, EVERYTHING, model, most)
+        gates[known] = gates_within(own, bounds.take(rays.sensor[known]), EVERYTHING, model, most)
         too_wide = int(model.bins(gates[:, 1] - gates[:, 0])[known].sum()) > most
         if too_wide or ranges.held_by(gates) < ranges.held_by(rays.gate_m):
             return design
@@ -366,14 +363,12 @@ class Gating:
     def _ranges(self, rays: Rays, spread_m: float) -> RayRanges:
         """The targets that rays meet with open gates, over all scenes and their frames."""
         low, high = self.space.low[RANGE], self.space.high[RANGE]
-        gates = np.tile([low, high], (len(rays), 1))
-        open_rays = Rays(rays.origin_m, rays.direction, gates, rays.sensor, rays.time_s)
+        open_rays = replace(rays, gate_m=np.tile([low, high], (len(rays), 1)))
         ranges, indices = [], []
         for scene, casters in self.scenes:
-            is_target = np.array([body.is_target for body in scene.bodies])
+            is_target = np.array([*(body.is_target for body in scene.bodies), False])
             for frame in simulate(scene, open_rays, casters=casters):
-                hit = np.flatnonzero(frame.returned)
-                hit = hit[is_target[frame.body[hit]]]
+                hit = np.flatnonzero(frame.returned & is_target[frame.body])
                 ranges.append(frame.range_m[hit])
                 indices.append(hit)
         offsets = spread_m * ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES)
@@ -391,11 +386,9 @@ def has_ray_gates(design: DesignSpec) -> bool:
 def _with_gates(design: DesignSpec, gates: np.ndarray) -> DesignSpec:
     if design.ray_table is not None and not layout_of(design).one_sensor_per_ray:
         return replace(design, ray_table=replace(design.ray_table, gate_m=gates))
-    factor = interval_factor(design.level)
-    sensors = [_gated(sensor, gate, factor) for sensor, gate in zip(design.sensors, gates, strict=True)]
-    return replace(design, sensors=tuple(sensors))
-
-
-def _gated(sensor: Sensor, gate: np.ndarray, factor: float) -> Sensor:
-    """A beam that listens in another interval."""
-    return replace(sensor, range_m=float(gate.mean()), spread_range_m=float(gate[1] - gate[0]) / (2 * factor))
+    width = 2 * interval_factor(design.level)
+    beams = [
+        replace(sensor, range_m=float(gate.mean()), spread_range_m=float(gate[1] - gate[0]) / width)
+        for sensor, gate in zip(design.sensors, gates, strict=True)
+    ]
+    return replace(design, sensors=tuple(beams))

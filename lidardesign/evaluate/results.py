@@ -21,7 +21,7 @@ from lidardesign.evaluate.accuracy.settings import Accuracy
 from lidardesign.evaluate.statistics import paired_difference
 from lidardesign.run.files import write_atomic
 from lidardesign.simulate.detector.detector import EFFECTS
-from lidardesign.simulate.plan import Choice, Decision, EffectPlan, Tolerance
+from lidardesign.simulate.plan import Choice, EffectPlan, Tolerance
 from lidardesign.task import Metric
 
 if TYPE_CHECKING:
@@ -155,8 +155,7 @@ class Evaluation:
         """The designs' values and their differences to the baselines with half of their intervals, by what they are."""
         unit, rows = self.metric.unit, [row for row in self.rows if not row.baseline]
         values = {
-            f"{row.design} at {row.rays} rays": Estimate(row.value, row.half_width, unit, HALF_INTERVAL)
-            for row in rows
+            f"{row.design} at {row.rays} rays": Estimate(row.value, row.half_width, unit, HALF_INTERVAL) for row in rows
         }
         differences = {
             f"{pair.a} - {pair.b} at {pair.rays} rays": Estimate(pair.difference, pair.half_width, unit, HALF_INTERVAL)
@@ -302,24 +301,20 @@ class Audit:
 
 def audit_rows(planned: Sequence[Row], everything: Sequence[Row], seed: int) -> list[AuditRow]:
     """The same rows under both, paired."""
-    return [_audit_row(one, other, seed) for one, other in zip(planned, everything, strict=True)]
-
-
-def _audit_row(planned: Row, everything: Row, seed: int) -> AuditRow:
-    mean, low, high = paired_difference(planned.per_scene, everything.per_scene, seed)
-    return AuditRow(
-        planned.design,
-        planned.rays,
-        planned.value,
-        everything.value,
-        mean,
-        low,
-        high,
-        planned.seconds,
-        everything.seconds,
-        planned.matched_to,
-        planned.matched_rays,
-    )
+    return [
+        AuditRow(
+            row.design,
+            row.rays,
+            row.value,
+            other.value,
+            *paired_difference(row.per_scene, other.per_scene, seed),
+            row.seconds,
+            other.seconds,
+            row.matched_to,
+            row.matched_rays,
+        )
+        for row, other in zip(planned, everything, strict=True)
+    ]
 
 
 MILLIMETRES = 1000.0
@@ -378,14 +373,12 @@ class EffectSummary:
 
 def summaries(plans: Sequence[EffectPlan]) -> list[EffectSummary]:
     """One line per effect, in the order in which light meets them."""
-    return [_summary([_decision(plan, name) for plan in plans], plans[0].tolerance) for name in EFFECTS]
+    return [_summary(name, plans) for name in EFFECTS]
 
 
-def _decision(plan: EffectPlan, name: str) -> Decision:
-    return next(decision for decision in plan.decisions if decision.name == name)
-
-
-def _summary(decisions: Sequence[Decision], tolerance: Tolerance) -> EffectSummary:
+def _summary(name: str, plans: Sequence[EffectPlan]) -> EffectSummary:
+    tolerance = plans[0].tolerance
+    decisions = [decision for plan in plans for decision in plan.decisions if decision.name == name]
     worst = max(decisions, key=lambda decision: decision.bound.relative(tolerance))
     return EffectSummary(
         worst.name,

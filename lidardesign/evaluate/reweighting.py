@@ -193,7 +193,10 @@ class Attention:
             if largest > 0 and len(residuals.values):
                 nearest = tree.query(residuals.points_m)[1]
                 error += np.bincount(nearest, residuals.values / largest, minlength=count)
-            for places in _fired_places(returns):
+            for frame in returns:
+                # where its rays looked: their returns, and without one the middle of their gates
+                range_m = np.where(frame.returned, np.nan_to_num(frame.range_m), frame.rays.gate_m.mean(axis=1))
+                places = frame.rays.origin_m + range_m[:, None] * frame.rays.direction
                 rays += np.bincount(tree.query(places)[1], minlength=count)
         if error.sum() <= 0 or rays.sum() <= 0:
             return {}
@@ -219,13 +222,3 @@ def _rounded(points_m: np.ndarray) -> np.ndarray:
     """Points with no more decimals than their extent needs."""
     extent = float(np.ptp(points_m, axis=0).max())
     return np.round(points_m, max(-math.floor(math.log10(POINT_SHARE * extent)), 0)) if extent > 0 else points_m
-
-
-def _fired_places(returns: Sequence[Returns]) -> list[np.ndarray]:
-    """Where rays looked, frame by frame: their returns, and without one the middle of their gates, (N, 3) [m]."""
-    places = []
-    for frame in returns:
-        rays = frame.rays
-        range_m = np.where(frame.returned, np.nan_to_num(frame.range_m), rays.gate_m.mean(axis=1))
-        places.append(rays.origin_m + range_m[:, None] * rays.direction)
-    return places

@@ -57,8 +57,15 @@ def score_lists(
     for group in _groups(jobs, scene.frames):
         started = time.perf_counter()
         lists = [rays for positions in group for rays in positions]
-        repeats = [number for positions in group for number in range(len(positions))]
-        found = iter(simulate_many(scene, lists, casters=casters, physics=physics, repeats=repeats))
+        found = iter(
+            simulate_many(
+                scene,
+                lists,
+                casters=casters,
+                physics=physics,
+                repeats=[number for positions in group for number in range(len(positions))],
+            )
+        )
         rays = sum(_count(positions) for positions in group)
         per_ray = (time.perf_counter() - started) / max(rays, 1)
         for positions in group:
@@ -102,9 +109,7 @@ def checked_score(task: Task, scene: Scene, returns: Sequence[Returns]) -> Score
     except PluginError as error:
         raise PluginError(f"scoring failed: {error.message}", where=where, hint=error.hint) from error
     if not isinstance(score, Score):
-        raise PluginError(
-            f"score returned {type(score).__name__}", where=where, allowed="lidardesign.task.Score"
-        )
+        raise PluginError(f"score returned {type(score).__name__}", where=where, allowed="lidardesign.task.Score")
     if not isinstance(score.details, Mapping) or not all(isinstance(name, str) for name in score.details):
         raise PluginError(
             f"score returned the details {score.details!r}", where=where, allowed="numbers by name, as {'seen': 3.0}"
@@ -248,6 +253,9 @@ def score_in_scene(
     started = time.perf_counter()
     plan = known or planner.plan(scene, [rays for positions in lists for rays in positions], casters)
     seconds = time.perf_counter() - started
-    scores = list(score_lists(task, scene, lists, casters, planner.physics(plan, seed)))
-    second_casts = sum((caster.second_casts for caster in casters), SecondCasts())
-    return SceneScores(plan, seconds, scores, second_casts)
+    return SceneScores(
+        plan,
+        seconds,
+        list(score_lists(task, scene, lists, casters, planner.physics(plan, seed))),
+        sum((caster.second_casts for caster in casters), SecondCasts()),
+    )

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -19,10 +19,11 @@ import numpy as np
 from lidardesign.design.bandwidth import Bandwidth
 from lidardesign.design.compare import outside_notes
 from lidardesign.design.layouts.track import travels
+from lidardesign.design.sensor import DesignSpec
 from lidardesign.errors import ConfigError
 from lidardesign.evaluate.baselines.candidates import Candidate, Positions, TrainingViews, mean_mbps
 from lidardesign.evaluate.baselines.catalog import part_notes
-from lidardesign.evaluate.baselines.simple import CMA, Baselines, Judge, Option, TwinCandidate
+from lidardesign.evaluate.baselines.simple import CMA, Baselines, Option, TwinCandidate
 from lidardesign.evaluate.cma.candidate import CmaCandidate, SearchRecord
 from lidardesign.evaluate.cma.search import TrainingObjective
 from lidardesign.evaluate.request import EvaluationRequest, can_fire, fired_numbers, left_out
@@ -43,7 +44,7 @@ from lidardesign.run.clock import phase
 from lidardesign.scene import Scene
 from lidardesign.simulate.plan import EffectPlan, Planner
 from lidardesign.simulate.simulate import build_casters
-from lidardesign.task import conditions_of, notes_of
+from lidardesign.task import Score, conditions_of, notes_of
 
 # Candidates of a baseline are compared on this many training scenes: enough to tell a good layout from a bad one,
 # at a fraction of the held-out scenes' cost.
@@ -100,36 +101,47 @@ def entries_of(request: EvaluationRequest) -> list[Entry]:
     Raises:
         ConfigError: No design can fire any of the numbers of rays, or a track ends before where it is evaluated.
     """
-    _check_tracks(request)
-    baselines = _baselines(request)
+    conditions = _conditions(request)
+    _check_tracks(request, conditions)
+    baselines = Baselines(
+        request.space,
+        request.train,
+        request.seed,
+        partial(_judge, request),
+        conditions=conditions,
+        without_visibility=partial(_twin, request, conditions) if request.without_visibility else None,
+        density=request.density,
+        optimised=partial(_optimised, request, conditions) if request.designs else None,
+    )
     counts = fired_numbers(request.designs, request.rays)
     designs = [
-        Entry(design.name, _laid_out(request, design, count), baseline=False)
+        Entry(design.name, _laid_out(request, conditions, design, count), baseline=False)
         for design in request.designs
         for count in counts
         if can_fire(design, count)
     ]
-    wanted = [
-        _Wanted(name, baselines.options(name, count), None) for name in request.baselines for count in counts
+    wanted: list[tuple[str, list[Option], Entry | None]] = [
+        (name, baselines.options(name, count), None) for name in request.baselines for count in counts
     ]
     if request.equal_bandwidth:
         wanted += [
-            _Wanted(name, baselines.options_within(name, entry.mbps(request.bandwidth), request.bandwidth), entry)
+            (name, baselines.options_within(name, entry.mbps(request.bandwidth), request.bandwidth), entry)
             for entry in designs
             for name in request.baselines
             if name != CMA or entry.name == request.designs[0].name
         ]
-    chosen = baselines.best([(one.name, one.options) for one in wanted])
-    return designs + [_entry(baselines, one, option) for one, option in zip(wanted, chosen, strict=True)]
+    chosen = baselines.best([(name, options) for name, options, _ in wanted])
+    return designs + [
+        _entry(baselines, name, option, matched) for (name, _, matched), option in zip(wanted, chosen, strict=True)
+    ]
 
 
-def _check_tracks(request: EvaluationRequest) -> None:
-    """Refuse a track that ends before a place where designs are evaluated."""
+def _check_tracks(request: EvaluationRequest, conditions: Sequence[Mapping[str, float]]) -> None:
     for design in request.designs:
         if design.track is None:
             continue
         name, (first, last) = design.track.dimension, travels(design.track)
-        beyond = [one[name] for one in _conditions(request) if name in one and not first <= one[name] <= last]
+        beyond = [one[name] for one in conditions if name in one and not first <= one[name] <= last]
         if beyond:
             raise ConfigError(
                 f"its track goes from {name}={first:g} to {last:g}, but designs are evaluated at {beyond[0]:g} too",
@@ -138,39 +150,16 @@ def _check_tracks(request: EvaluationRequest) -> None:
             )
 
 
-@dataclass(frozen=True, eq=False)
-class _Wanted:
-    """A baseline that is asked for, maybe in the bandwidth of a design."""
-
-    name: str
-    options: list[Option]
-    matched: Entry | None
-
-
-def _entry(baselines: Baselines, wanted: _Wanted, option: Option) -> Entry:
+def _entry(baselines: Baselines, name: str, option: Option, matched: Entry | None) -> Entry:
     candidate, count = option.candidate, len(option.positions[0])
-    redraw = None
-    if candidate.drawn_anew:
-
-        def redraw(scene: int) -> Positions:
-            return candidate.positions(baselines.spaces, count, scene)
-
-    search = candidate.record_of(option.positions) if isinstance(candidate, CmaCandidate) else None
-    made = Entry(wanted.name, option.positions, True, redraw, search=search)
-    matched = wanted.matched
-    return made if matched is None else replace(made, matched_to=matched.name, matched_rays=matched.rays)
-
-
-def _baselines(request: EvaluationRequest) -> Baselines:
-    return Baselines(
-        request.space,
-        request.train,
-        request.seed,
-        _judge(request),
-        conditions=_conditions(request),
-        without_visibility=_twin(request),
-        density=request.density,
-        optimised=_optimised(request),
+    return Entry(
+        name,
+        option.positions,
+        baseline=True,
+        redraw=partial(candidate.positions, baselines.spaces, count) if candidate.drawn_anew else None,
+        matched_to=None if matched is None else matched.name,
+        matched_rays=None if matched is None else matched.rays,
+        search=candidate.record_of(option.positions) if isinstance(candidate, CmaCandidate) else None,
     )
 
 
@@ -184,51 +173,36 @@ def ordered_conditions(request: EvaluationRequest) -> list[dict[str, float]]:
     return sorted(_conditions(request), key=lambda condition: tuple(condition.values()))
 
 
-def _laid_out(request: EvaluationRequest, design: Any, count: int) -> Positions:
+def _laid_out(
+    request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], design: DesignSpec, count: int
+) -> Positions:
     samples = request.samples.get(design.name)
-    return tuple(request.lay_out(design, count, samples, at=condition) for condition in _conditions(request))
+    return tuple(request.lay_out(design, count, samples, at=condition) for condition in conditions)
 
 
-def _twin(request: EvaluationRequest) -> Callable[[], Candidate] | None:
-    make = request.without_visibility
-    if make is None:
-        return None
-
-    def candidate() -> Candidate:
-        design, samples = make()
-        return TwinCandidate(design, samples, _conditions(request), request.lay_out)
-
-    return candidate
+def _twin(request: EvaluationRequest, conditions: Sequence[Mapping[str, float]]) -> Candidate:
+    return TwinCandidate(*request.without_visibility(), conditions, request.lay_out)
 
 
-def _optimised(request: EvaluationRequest) -> Callable[[TrainingViews], Candidate] | None:
-    """What makes the layout of `cma`, about the first design."""
-    if not request.designs:
-        return None
-
-    def candidate(views: TrainingViews) -> Candidate:
-        return CmaCandidate(
-            followed=request.designs[0],
-            space=request.space,
-            conditions=_conditions(request),
-            views=views,
-            objective=TrainingObjective(request.task, request.train, request.planner, request.seed),
-            settings=request.cma,
-            seed=request.seed,
-        )
-
-    return candidate
+def _optimised(
+    request: EvaluationRequest, conditions: Sequence[Mapping[str, float]], views: TrainingViews
+) -> Candidate:
+    return CmaCandidate(
+        followed=request.designs[0],
+        space=request.space,
+        conditions=conditions,
+        views=views,
+        objective=TrainingObjective(request.task, request.train, request.planner, request.seed),
+        settings=request.cma,
+        seed=request.seed,
+    )
 
 
-def _judge(request: EvaluationRequest) -> Judge:
+def _judge(request: EvaluationRequest, lists: Sequence[Positions]) -> list[float]:
     """The mean score of sets of rays on a few training scenes, turned so that lower is better."""
     sign = 1.0 if request.task.metric.better == "lower" else -1.0
-
-    def judge(lists: Sequence[Positions]) -> Sequence[float]:
-        values = [_values(request, scene, lists) for scene in request.train[:JUDGED_SCENES]]
-        return [float(value) for value in sign * np.mean(values, axis=0)] if values else [0.0] * len(lists)
-
-    return judge
+    values = [_values(request, scene, lists) for scene in request.train[:JUDGED_SCENES]]
+    return (sign * np.mean(values, axis=0)).tolist() if values else [0.0] * len(lists)
 
 
 def _values(request: EvaluationRequest, scene: Scene, lists: Sequence[Positions]) -> list[float]:
@@ -242,21 +216,12 @@ def _values(request: EvaluationRequest, scene: Scene, lists: Sequence[Positions]
 OUTLINE_SHARE = 1e-5
 
 
-@dataclass(eq=False)
-class _Tally:
-    """What one set of rays scored so far."""
-
-    values: list[float] = field(default_factory=list)
-    details: list[Mapping[str, float]] = field(default_factory=list)
-    failures: int = 0
-    seconds: float = 0.0
-
-
 @dataclass(frozen=True, eq=False)
 class _Scored:
-    """All entries under a planner's effects: their tallies, a plan per scene, and the time to plan [s]."""
+    """All entries under a planner's effects: by key their score in every scene, each with the time that it took [s];
+    a plan per scene, and the time to plan [s]."""
 
-    tallies: Mapping[tuple[Any, ...], _Tally]
+    scores: Mapping[tuple[Any, ...], Sequence[tuple[Score, float]]]
     plans: Sequence[EffectPlan]
     planning_seconds: float
     second_casts: SecondCasts
@@ -293,7 +258,7 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
         paired_bandwidth=_bandwidth_pairs(plain, matched, request.seed),
         notes=[
             *_notes(request, entries, matched),
-            *search_notes(searches, request),
+            *(search.note(request.designs[0].name, request.task.metric) for search in searches),
             *part_notes([(entry.name, entry.positions) for entry in entries if entry.matched_to is None]),
             *slipped_notes(scored.second_casts),
             *effect_notes(effects, request.planner.choice),
@@ -307,7 +272,6 @@ def evaluate(request: EvaluationRequest, progress: Progress | None = None) -> Ev
 
 
 def _part(progress: Progress | None, number: int, passes: int) -> Progress | None:
-    """Progress of one of several passes over the scenes."""
     if progress is None:
         return None
     return lambda done, total, name: progress(number * total + done, passes * total, name)
@@ -324,12 +288,15 @@ def _audit(
     """The same entries under all effects that there are, with the same random numbers."""
     planner = replace(request.planner, choice="all")
     scored = _score_all(request, entries, planner, progress, [planner.chosen_from(plan) for plan in plans])
-    paired = zip(summaries(plans), summaries(scored.plans), strict=True)
-    skipped = [planned.name for planned, every in paired if every.scenes_on > planned.scenes_on]
-    unavailable = [effect.name for effect in summaries(scored.plans) if effect.missing is not None]
+    paired = list(zip(summaries(plans), summaries(scored.plans), strict=True))
     metric = request.task.metric
-    found = audit_rows(rows, _rows(request, entries, scored), request.seed)
-    return Audit(metric.tolerance, metric.unit, found, skipped, unavailable)
+    return Audit(
+        metric.tolerance,
+        metric.unit,
+        audit_rows(rows, _rows(request, entries, scored), request.seed),
+        skipped=[planned.name for planned, every in paired if every.scenes_on > planned.scenes_on],
+        unavailable=[every.name for _, every in paired if every.missing is not None],
+    )
 
 
 @phase("held-out scenes")
@@ -342,17 +309,11 @@ def _score_all(
 ) -> _Scored:
     """All scenes, here or by workers; plans that are known are not made again."""
     jobs = {entry.key: entry for entry in entries}
-    tallies = {key: _Tally() for key in jobs}
     scene_pass = request.scene_pass(lambda number: [entry.drawn(number) for entry in jobs.values()], planner, known)
     scenes = request.scorer(scene_pass, progress)
-    for scene in scenes:
-        for tally, (score, seconds) in zip(tallies.values(), scene.scores, strict=True):
-            tally.seconds += seconds
-            tally.values.append(score.value)
-            tally.details.append(score.details)
-            tally.failures += score.failed
+    of_entries = zip(*(scene.scores for scene in scenes), strict=True)
     return _Scored(
-        tallies,
+        dict(zip(jobs, of_entries, strict=True)),
         [scene.plan for scene in scenes],
         sum(scene.planning_seconds for scene in scenes),
         sum((scene.second_casts for scene in scenes), SecondCasts()),
@@ -361,25 +322,25 @@ def _score_all(
 
 @phase("intervals")
 def _rows(request: EvaluationRequest, entries: Sequence[Entry], scored: _Scored) -> list[Row]:
-    return [_row(request, entry, scored.tallies[entry.key]) for entry in entries]
+    return [_row(request, entry, scored.scores[entry.key]) for entry in entries]
 
 
-def _row(request: EvaluationRequest, entry: Entry, tally: _Tally) -> Row:
-    values = np.array(tally.values)
+def _row(request: EvaluationRequest, entry: Entry, scores: Sequence[tuple[Score, float]]) -> Row:
+    values = np.array([score.value for score, _ in scores])
     mean, low, high = bootstrap_interval(values, request.seed)
     # the mean of each further figure over the scenes that give it; figures that are not finite are left out
-    names = dict.fromkeys(name for details in tally.details for name in details)
-    given = {name: [float(details[name]) for details in tally.details if name in details] for name in names}
-    finite = {name: [value for value in values if math.isfinite(value)] for name, values in given.items()}
+    finite: dict[str, list[float]] = {}
+    for name, value in (item for score, _ in scores for item in score.details.items()):
+        finite.setdefault(name, []).extend([float(value)] * math.isfinite(value))
     return Row(
         design=entry.name,
         rays=entry.rays,
         value=mean,
         ci_low=low,
         ci_high=high,
-        failures=tally.failures,
+        failures=sum(score.failed for score, _ in scores),
         bandwidth_mbps=entry.mbps(request.bandwidth),
-        seconds=tally.seconds,
+        seconds=sum(seconds for _, seconds in scores),
         per_scene=values,
         details={name: float(np.mean(values)) for name, values in finite.items() if values},
         baseline=entry.baseline,
@@ -412,8 +373,7 @@ def _bandwidth_pairs(rows: Sequence[Row], matched: Sequence[Row], seed: int) -> 
 
 
 def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequence[Row]) -> list[str]:
-    notes = left_out(request.designs, request.rays)
-    positions = max(len(entry.positions) for entry in entries)
+    notes, positions = left_out(request.designs, request.rays), max(len(entry.positions) for entry in entries)
     if positions > 1:
         notes.append(f"rays and bandwidth count per position; every scene is seen from {positions} positions")
     if len(request.test) == 1:
@@ -425,15 +385,8 @@ def _notes(request: EvaluationRequest, entries: Sequence[Entry], matched: Sequen
     empty = [row for row in matched if row.rays == 0]
     if empty:
         names = ", ".join(sorted({row.design for row in empty}))
-        notes.append(
-            f"at equal bandwidth not one ray of {names} fits in {len(empty)} rows, which fail in every scene"
-        )
+        notes.append(f"at equal bandwidth not one ray of {names} fits in {len(empty)} rows, which fail in every scene")
     return notes
-
-
-def search_notes(searches: Sequence[SearchRecord], request: EvaluationRequest) -> list[str]:
-    """How the rows of `cma` were found."""
-    return [record.note(request.designs[0].name, request.task.metric) for record in searches]
 
 
 def slipped_notes(casts: SecondCasts) -> list[str]:

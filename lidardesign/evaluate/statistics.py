@@ -22,9 +22,7 @@ class Interval(NamedTuple):
     high: float
 
 
-def bootstrap_interval(
-    values: Any, seed: int, *, resamples: int = RESAMPLES, level: float = LEVEL
-) -> Interval:
+def bootstrap_interval(values: Any, seed: int, *, resamples: int = RESAMPLES, level: float = LEVEL) -> Interval:
     """The mean over scenes with its percentile bootstrap interval.
 
     Values that are all equal, a single scene among them, give an interval without width: the bootstrap knows
